@@ -1,0 +1,55 @@
+# Every target that needs the environment makes it first, once: uv where it is installed, otherwise venv and pip.
+# Another interpreter: make PYTHON=python3.12 demo
+
+PYTHON ?= python3
+VENV ?= .venv
+JOBS ?= 2
+PYTEST_ARGS ?=
+
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.hilbo-setup
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-deep lint bench clean
+
+help:  ## show the targets
+	@sed -n 's/^\([a-z-]*\):.*## /  \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
+
+setup: $(STAMP)  ## make .venv with everything that the other targets need
+
+demo: $(STAMP)  ## re-aggregate the shipped data and run the simulated study, into demo-results/
+	$(BIN)/hilbo demo --out demo-results --force
+
+test: $(STAMP)  ## the tests, without the slow ones
+	$(PYTEST) -m "not deep" $(PYTEST_ARGS)
+
+test-deep: $(STAMP)  ## all tests; with HILBO_REQUIRE_ALL=1 a skip is a failure
+	$(PYTEST) $(PYTEST_ARGS)
+
+lint: $(STAMP)  ## ruff and pyright
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+bench: $(STAMP)  ## time hilbo against the textbook NumPy form
+	$(BIN)/python benchmarks/run.py
+
+clean:  ## remove the environment, caches and results
+	rm -rf $(VENV) demo-results build dist .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
+	  echo "hilbo needs Python 3.11 or newer and '$(PYTHON)' is not: name another one, as in 'make PYTHON=python3.12 setup'." >&2; exit 1; }
+	@if command -v uv >/dev/null; then \
+	  set -x; \
+	  test -x $(BIN)/python || uv venv --quiet --python $(PYTHON) $(VENV); \
+	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[dev,hardware]'; \
+	else \
+	  test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || { \
+	    echo "'$(PYTHON) -m venv' failed: install Python's venv module, on Debian the package python3-venv." >&2; exit 1; }; \
+	  set -x; \
+	  $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,hardware]'; \
+	fi
+	@touch $@

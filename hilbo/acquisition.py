@@ -1,0 +1,170 @@
+"""Trial selection: scores of candidate renderings from the posterior, and their maximum over a search space.
+
+A score takes the posterior mean and variance of f at one point. The next rendering maximises it over a candidate set
+and is then polished by projected gradient steps in the optimiser's coordinates, in which the feasible set is a cube.
+
+    UCB (paper, section IV-3):   mu + weight * sigma
+    log expected improvement:    log( sigma * h((mu - best) / sigma) ),  h(z) = phi(z) + z Phi(z)
+    top category:                log P(highest answer) = log Phi((mu - t) / sqrt(noise^2 + sigma^2))
+    mean:                        mu
+    Thompson:                    the maximum of one draw of f over the candidates
+
+Log expected improvement after Ament et al. (2023), arXiv:2310.20708: without the logarithm it is 0, and flat, wherever
+an improvement is unlikely.
+"""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from hilbo.normal import HALF_LOG_2PI, excess_hazard
+
+__all__ = ["UCB", "Choice", "LogEI", "Mean", "Score", "TopCategory", "maximise", "thompson"]
+
+Score = Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
+"""Posterior mean and variance at a point -> how much we want to ask there."""
+
+
+class UCB(eqx.Module):
+    """Upper confidence bound, mean + weight * sd."""
+
+    weight: Float[Array, ""] = eqx.field(converter=jnp.asarray, default=0.7)
+
+    def __call__(self, mean, variance):
+        return mean + self.weight.astype(mean.dtype) * jnp.sqrt(variance)
+
+
+class LogEI(eqx.Module):
+    """Logarithm of the expected improvement over `best`, usually the largest posterior mean among the asked points."""
+
+    best: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+
+    def __call__(self, mean, variance):
+        sd = jnp.sqrt(variance)
+        return jnp.log(sd) + _log_improvement((mean - self.best.astype(mean.dtype)) / sd)
+
+
+class TopCategory(eqx.Module):
+    """Log probability of the highest category: `threshold` is its lower edge, `noise` the answers' noise."""
+
+    threshold: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    noise: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+
+    def __call__(self, mean, variance):
+        spread = jnp.sqrt(self.noise.astype(mean.dtype) ** 2 + variance)
+        return jax.scipy.special.log_ndtr((mean - self.threshold.astype(mean.dtype)) / spread)
+
+
+class Mean(eqx.Module):
+    """The posterior mean itself: pure exploitation, and what the final optimum maximises."""
+
+    def __call__(self, mean, variance):
+        del variance
+        return mean
+
+
+def _log_improvement(z):
+    """log(phi(z) + z Phi(z)). For z < 0 it is phi(z) (1 - |z| Q/phi) = phi(z) * excess / hazard: no cancellation."""
+    below = jnp.where(z < 0, -z, 0.0)
+    excess = excess_hazard(below)
+    left = -0.5 * below**2 - HALF_LOG_2PI + jnp.log(excess) - jnp.log(below + excess)
+    above = jnp.where(z < 0, 0.0, z)
+    density = jnp.exp(-0.5 * above**2 - HALF_LOG_2PI)
+    upper = above + excess_hazard(above)
+    right = jnp.log(above + density * (1.0 - above / upper))  # z Phi + phi = z + phi (1 - z / hazard)
+    return jnp.where(z < 0, left, right)
+
+
+class Choice(eqx.Module):
+    """The chosen point and how it was found."""
+
+    x: Float[Array, " d"]
+    """In the unit cube."""
+    value: Float[Array, ""]
+    """Its score."""
+    candidate: Int[Array, ""]
+    """Index of the best candidate, from which or near which it was polished."""
+    candidate_value: Float[Array, ""]
+    """That candidate's score; `value` is never below it."""
+
+
+def maximise(
+    values: Float[Array, " m"],
+    candidates: Float[Array, "m d"],
+    score: Callable[[Float[Array, " d"]], Float[Array, ""]],
+    *,
+    from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
+    to_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
+    feasible: Callable[[Float[Array, " d"]], Bool[Array, ""]],
+    allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
+    starts: int = 3,
+    steps: int = 50,
+) -> Choice:
+    """The best of the candidates and of `starts` polished ones.
+
+    **Arguments:**
+
+    - `values`: scores (m,) of the `candidates` (m, d), feasible points of the unit cube.
+    - `score`: the same score for one point, differentiable.
+    - `from_box`, `to_box`: between the optimiser's cube, in which everything is feasible, and the unit cube.
+    - `feasible`: whether a polished point may be rendered (candidates are known to).
+    - `allowed`: which points may be chosen at all, e.g. none too near to earlier ones.
+    - `starts`, `steps`: how many candidates, at least 0.1 apart, are polished, and gradient steps for each; 0 starts
+      means no polishing.
+    """
+    if allowed is not None:
+        values = jnp.where(jax.vmap(allowed)(candidates), values, -jnp.inf)
+    first = jnp.argmax(values)
+    best = Choice(candidates[first], values[first], first, values[first])
+    if starts == 0:
+        return best
+    rows = _spread(values, candidates, starts)
+    polished = jax.vmap(functools.partial(_polish, score, from_box, to_box, steps))(candidates[rows])
+    usable = jax.vmap(lambda x: feasible(x) & (True if allowed is None else allowed(x)))(polished)
+    reached = jnp.where(usable, jax.vmap(score)(polished), -jnp.inf)
+    top = jnp.argmax(reached)
+    better = reached[top] > best.value
+    return Choice(
+        jnp.where(better, polished[top], best.x), jnp.where(better, reached[top], best.value), first, best.value
+    )
+
+
+def _spread(values, candidates, count, apart=0.1):
+    """Rows of good candidates from different places: the best, the best further than `apart` from it, and so on."""
+
+    def pick(remaining, _):
+        row = jnp.argmax(remaining)
+        near = jnp.sum((candidates - candidates[row][None, :]) ** 2, axis=1) < apart**2
+        return jnp.where(near, -jnp.inf, remaining), row
+
+    return jax.lax.scan(pick, values, None, length=count)[1]
+
+
+def _polish(score, from_box, to_box, steps, x):
+    """Projected gradient ascent from `x` within the optimiser's cube, by jaxopt."""
+    from jaxopt import ProjectedGradient  # imported late: not every user of this module polishes
+    from jaxopt.projection import projection_box
+
+    solver = ProjectedGradient(
+        lambda w: -score(from_box(w)), projection_box, maxiter=steps, tol=1e-6, implicit_diff=False
+    )
+    start = to_box(x)
+    bounds = (jnp.zeros_like(start), jnp.ones_like(start))
+    return from_box(solver.run(start, hyperparams_proj=bounds).params)
+
+
+def thompson(
+    key: PRNGKeyArray, mean: Float[Array, " m"], covariance: Float[Array, "m m"]
+) -> tuple[Int[Array, ""], Float[Array, " m"]]:
+    """Row of the maximum of one joint draw of f at m candidates, and the draw (m,).
+
+    `covariance` is the joint posterior covariance, (m, m); its eigenvector root needs no jitter.
+    """
+    eigenvalues, vectors = jnp.linalg.eigh(covariance)
+    root = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
+    draw = mean + root @ jax.random.normal(key, mean.shape, mean.dtype)
+    return jnp.argmax(draw), draw

@@ -1,0 +1,157 @@
+"""Bayesian committee machine: the posteriors of M participants merged into one population map.
+
+Paper, section V, for one latent score with prior variance k and participants' posteriors N(mu_j, sigma_j^2):
+
+    1 / sigma^2 = sum_j 1 / sigma_j^2 - (M - 1) / k,        mu = sigma^2 sum_j mu_j / sigma_j^2.
+
+It is computed as 1 / sigma^2 = 1 / k + sum_j s_j with s_j = e_j / (k (k - e_j)): the precision that person j *adds*,
+from the variance e_j = k - sigma_j^2 that the answers explain. A person without data adds exactly 0, and 100,000 weak
+experts keep the digits that a difference of two large sums would lose. The sum over people is one reduction; when
+M x m does not fit in memory, [`stream`][] makes it in blocks.
+Reference: Tresp (2000), Neural Computation 12:2719.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, PyTree
+
+__all__ = ["Evidence", "average", "combine", "combine_explained", "stream"]
+
+
+class Evidence(eqx.Module):
+    """What people add to the prior at m points, a running sum: added precision, and precision-weighted means."""
+
+    added: Float[Array, " m"]
+    weighted: Float[Array, " m"]
+
+    def merge(self, prior_variance: Float[Array, "..."]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of the population map."""
+        variance = prior_variance / (1.0 + prior_variance * self.added)
+        return variance * self.weighted, variance
+
+
+def combine(
+    means: Float[Array, "M m"],
+    variances: Float[Array, "M m"],
+    prior_variance: ArrayLike,
+    *,
+    mask: Bool[Array, " M"] | None = None,
+    throw: bool = True,
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Population mean and variance (m,) from participants' posterior means and variances at the same m points.
+
+    **Arguments:**
+
+    - `means`, `variances`: (M, m).
+    - `prior_variance`: k, a scalar or (m,), the same for all participants.
+    - `mask`: (M,), False for absent participants.
+    - `throw`: raise for variances that are not positive, for more variance after the answers than before as a
+      whole (no positive precision), or for priors that differ; `False` returns NaN there.
+
+    Where the explained variance is known directly, [`combine_explained`][] is more precise for weak experts.
+    """
+    prior = _checked_prior(prior_variance, means)
+    return combine_explained(means, prior - variances, prior, mask=mask, throw=throw)
+
+
+def combine_explained(
+    means: Float[Array, "M m"],
+    explained: Float[Array, "M m"],
+    prior_variance: ArrayLike,
+    *,
+    mask: Bool[Array, " M"] | None = None,
+    throw: bool = True,
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """As [`combine`][], from the variances e_j = k - sigma_j^2 that the answers explain, (M, m)."""
+    prior = _checked_prior(prior_variance, means)
+    evidence = _evidence(means, explained, prior, mask)
+    invalid = _invalid(explained, prior, mask) | ~(1.0 + prior * evidence.added > 0.0)
+    if throw:
+        evidence = _raise_if(invalid, evidence)
+    mean, variance = evidence.merge(prior)
+    return jnp.where(invalid, jnp.nan, mean), jnp.where(invalid, jnp.nan, variance)
+
+
+def stream(
+    expert: Callable[[PyTree], tuple[Float[Array, " m"], Float[Array, " m"]]],
+    experts: PyTree,
+    prior_variance: Float[Array, ""] | Float[Array, " m"],
+    *,
+    block: int = 64,
+) -> Evidence:
+    """The evidence of many experts, never holding more than `block` of their predictions at a time.
+
+    **Arguments:**
+
+    - `expert`: gives mean and explained variance (m,) of one expert.
+    - `experts`: what `expert` is called with, stacked along a leading axis of length M.
+    - `block`: experts evaluated together.
+    """
+    count = jax.tree.leaves(experts)[0].shape[0]
+    blocks, left = divmod(count, block)
+    head = jax.tree.map(lambda leaf: leaf[: blocks * block].reshape(blocks, block, *leaf.shape[1:]), experts)
+    tail = jax.tree.map(lambda leaf: leaf[blocks * block :], experts)
+
+    def block_evidence(part):
+        means, explained = jax.vmap(expert)(part)
+        return _evidence(means, explained, jnp.broadcast_to(prior_variance, means.shape[1:]), None)
+
+    shape = jax.eval_shape(block_evidence, tail if left else jax.tree.map(lambda leaf: leaf[0], head))
+    total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
+    if blocks:
+        total, _ = jax.lax.scan(lambda sums, part: (_add(sums, block_evidence(part)), None), total, head)
+    return _add(total, block_evidence(tail)) if left else total
+
+
+def average(
+    means: Float[Array, "M m"], variances: Float[Array, "M m"], *, mask: Bool[Array, " M"] | None = None
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Plain average of the latent functions, for comparison (paper, section II-C): every person counts the same,
+    however little is known; mean (m,), and the variance (m,) of the mean of independent functions."""
+    present = jnp.ones(means.shape[0], bool) if mask is None else mask
+    share = (present / jnp.sum(present)).astype(means.dtype)
+    return share @ means, share**2 @ variances
+
+
+def _evidence(means, explained, prior, mask) -> Evidence:
+    remaining = prior[None, :] - explained
+    added, weighted = explained / (prior[None, :] * remaining), means / remaining
+    if mask is not None:
+        added, weighted = (jnp.where(mask[:, None], part, 0.0) for part in (added, weighted))
+    return Evidence(jnp.sum(added, axis=0), jnp.sum(weighted, axis=0))
+
+
+def _add(left: Evidence, right: Evidence) -> Evidence:
+    return jax.tree.map(jnp.add, left, right)
+
+
+def _checked_prior(prior_variance, means):
+    prior = jnp.asarray(prior_variance, means.dtype)
+    if prior.ndim > 1 or (prior.ndim == 1 and prior.shape != means.shape[1:]):
+        raise ValueError(
+            f"bcm: the prior variance has shape {prior.shape}; the committee machine needs one prior for all experts,"
+            f" a scalar or one value per point {means.shape[1:]}."
+        )
+    return jnp.broadcast_to(prior, means.shape[1:])
+
+
+def _invalid(explained, prior, mask):
+    """Points at which some expert's variance is not positive (or NaN)."""
+    wrong = ~(prior[None, :] - explained > 0.0)
+    return jnp.any(wrong if mask is None else wrong & mask[:, None], axis=0)
+
+
+def _raise_if(invalid, evidence):
+    message = (
+        "bcm: an expert's variance is not positive, or the experts' variances exceed the prior's so far that no positive"
+        " precision is left; check that prior_variance is the one all experts were fitted with"
+    )
+    if isinstance(invalid, jax.core.Tracer):
+        return eqx.error_if(evidence, invalid, message)
+    if bool(jnp.any(invalid)):
+        raise ValueError(f"{message} (first at point {int(jnp.argmax(invalid))}).")
+    return evidence

@@ -1,0 +1,270 @@
+"""Laplace approximation for latent values with a Gaussian prior and a sum of pointwise log-likelihood terms.
+
+Model: eta ~ N(0, K), log p(data | eta) = sum_i l_i(eta_i), each l_i concave. The terms may look at anything linear in
+the latent function: an answer at x_i has eta_i = f(x_i), a preference between two stimuli eta_i = f(x_i) - f(x_i');
+K is the prior covariance of the eta's, of whatever rank (the same stimulus asked twice makes it singular).
+
+* Coordinates. eta = R v with v ~ N(0, I) and R the symmetric-eigenvector root of K, so K is never inverted and needs
+  no jitter. The Newton matrix I + R'WR has no eigenvalue below 1, and the objective is strongly concave with modulus
+  1: the residual |R' grad l - v| *bounds* the distance to the mode, in units of the prior's standard deviations.
+* The steps are damped by Armijo's rule (`_DampedNewton`, an optimistix root finder), so every start converges.
+* Derivatives of any order come from the stationarity eta = K grad l(eta) by the implicit function theorem, and from
+  C = (K + 1/W)^-1 written so that W = 0 is no special case. R, whose derivative blows up, is not differentiated.
+
+Evidence: log q(data) = sum l - a'eta/2 - log|I + KW|/2, a = grad l(eta) at the mode.
+References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1; paper, section IV-1.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+__all__ = ["Certificate", "LaplacePosterior", "explained_variance", "laplace"]
+
+LogLikelihood = Callable[[Float[Array, " n"]], Float[Array, " n"]]
+"""Pointwise log-likelihood terms: element i of the result depends on element i of the argument alone."""
+
+
+class Certificate(eqx.Module):
+    """What a fit can say of its own accuracy; every number is measured, none assumed."""
+
+    residual: Float[Array, ""]
+    """|R' grad l - v| at the mode: a bound on its distance from the exact mode, in prior standard deviations."""
+    tolerance: Float[Array, ""]
+    """What the residual had to reach: eps^(2/3), or the rounding error of the residual itself where that is larger."""
+    iterations: Int[Array, ""]
+    """Newton steps taken, rejected ones included."""
+    jitter: Float[Array, ""]
+    """Largest change of the prior covariance by its square root, over the largest prior variance; nothing is added."""
+    condition: Float[Array, ""]
+    """Upper bound on the condition number of I + W^(1/2) K W^(1/2), the only matrix that is factorised."""
+    smallest_variance: Float[Array, ""]
+    """Smallest posterior variance among the eta's that the data say anything about."""
+    variance_resolution: Float[Array, ""]
+    """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
+    converged: Bool[Array, ""]
+    """residual <= tolerance."""
+
+
+class LaplacePosterior(eqx.Module):
+    """Gaussian approximation N(mode, K - K C K) of p(eta | data), C = (K + 1/W)^-1."""
+
+    mode: Float[Array, " n"]
+    weights: Float[Array, " n"]
+    """a = grad l at the mode; the posterior mean of any jointly Gaussian f* is k*'a."""
+    factor: Float[Array, "n n"]
+    """V with V'V = C, for values; its derivative is not defined where W = 0, so it carries none."""
+    inverse: Float[Array, "n n"]
+    """C, for derivatives."""
+    log_evidence: Float[Array, ""]
+    certificate: Certificate
+
+
+def laplace(
+    covariance: Float[Array, "n n"],
+    log_likelihood: LogLikelihood,
+    *,
+    start: Float[Array, " n"] | None = None,
+    max_steps: int = 200,
+) -> LaplacePosterior:
+    """Approximate p(eta | data) by a Gaussian at its mode.
+
+    **Arguments:**
+
+    - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
+    - `log_likelihood`: the terms, (n,) -> (n,), as a pytree (a closure over traced arrays must be an `eqx.Module` or
+      `jax.tree_util.Partial`), differentiable four times.
+    - `start`: `weights` of an earlier, similar fit; changes the number of steps, not the result.
+
+    **Returns:** a [`LaplacePosterior`][]; differentiable in `covariance` and in the arrays of `log_likelihood`. Never
+    raises: read `certificate.converged`.
+    """
+    start = jnp.zeros_like(covariance[0]) if start is None else start
+    root, discarded = _square_root(jax.lax.stop_gradient(covariance))
+    solution = optx.root_find(
+        _stationarity,
+        _DampedNewton(),
+        jnp.zeros_like(start),
+        (log_likelihood, covariance),
+        options={"root": root, "start": root.T @ jax.lax.stop_gradient(start)},
+        max_steps=max_steps,
+        throw=False,
+    )
+    mode, state = solution.value, solution.state
+    terms, gradient, curvature = _expand(log_likelihood, mode)
+    inverse, log_determinant = _inverse_and_log_determinant(covariance, curvature)
+    fixed = jax.lax.stop_gradient((covariance, curvature))
+    factor, condition = _factor(*fixed)
+    log_evidence = jnp.sum(terms) - 0.5 * gradient @ mode - 0.5 * log_determinant
+    prior_variance = jnp.diagonal(fixed[0])
+    largest = jnp.max(prior_variance)
+    variance = prior_variance - jnp.sum((factor @ fixed[0]) ** 2, axis=0)
+    certificate = Certificate(
+        residual=state.residual,
+        tolerance=state.tolerance,
+        iterations=jnp.asarray(solution.stats["num_steps"]),
+        jitter=discarded / largest,
+        condition=condition,
+        smallest_variance=jnp.min(jnp.where(fixed[1] > 0, variance, largest)),
+        variance_resolution=jnp.finfo(mode.dtype).eps * largest * mode.shape[0] ** 0.5,
+        converged=state.residual <= state.tolerance,
+    )
+    return LaplacePosterior(mode, gradient, factor, inverse, log_evidence, jax.lax.stop_gradient(certificate))
+
+
+@jax.custom_jvp
+def explained_variance(
+    factor: Float[Array, "n n"], inverse: Float[Array, "n n"], cross: Float[Array, "m n"]
+) -> Float[Array, " m"]:
+    """Prior minus posterior variance at m points, k*'C k*, as sums of squares: never negative, with all their digits.
+
+    **Arguments:** `factor` and `inverse` of a posterior, and `cross`, the prior covariances (m, n) of f* with eta.
+    """
+    del inverse
+    return jnp.sum((cross @ factor.T) ** 2, axis=1)
+
+
+@explained_variance.defjvp
+def _explained_variance_jvp(primals, tangents):
+    _, inverse, cross = primals
+    _, d_inverse, d_cross = tangents
+    tangent = jnp.sum((cross @ d_inverse) * cross + 2.0 * (cross @ inverse) * d_cross, axis=1)
+    return explained_variance(*primals), tangent
+
+
+def _expand(log_likelihood, eta):
+    """The terms, their first derivatives, and minus their second, all (n,): one tangent serves all the terms."""
+    ones = jnp.ones_like(eta)
+
+    def value_and_slope(at):
+        return jax.jvp(log_likelihood, (at,), (ones,))
+
+    (terms, slope), (_, second) = jax.jvp(value_and_slope, (eta,), (ones,))
+    return terms, slope, -second
+
+
+# --- the mode
+
+
+def _stationarity(eta, args):
+    """eta - K grad l(eta), zero at the mode: what the implicit function theorem differentiates (the steps do not use it)."""
+    log_likelihood, covariance = args
+    return eta - covariance @ jax.jvp(log_likelihood, (eta,), (jnp.ones_like(eta),))[1]
+
+
+def _square_root(covariance):
+    """R with R R' = K, and the size of the largest eigenvalue dropped.
+
+    K is positive semi-definite, so a negative eigenvalue is rounding, and without it K changes by no more than itself.
+    """
+    eigenvalues, vectors = jnp.linalg.eigh(covariance)
+    root = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
+    return root, jnp.where(eigenvalues[0] < 0, -eigenvalues[0], 0.0)
+
+
+class _NewtonState(eqx.Module):
+    v: Float[Array, " n"]  # the mode in whitened coordinates, eta = R v
+    direction: Float[Array, " n"]
+    scale: Float[Array, ""]  # of the next step along `direction`
+    gain: Float[Array, ""]  # rate of ascent along `direction`
+    objective: Float[Array, ""]
+    residual: Float[Array, ""]
+    tolerance: Float[Array, ""]
+
+
+class _DampedNewton(optx.AbstractRootFinder):
+    """Newton's method in whitened coordinates for the mode of a log-concave posterior, with Armijo's step rule.
+
+    One evaluation an iteration, at `v + scale * direction`: taken if the log posterior rose by a share of what the
+    slope promised (beyond its own rounding), else the scale is halved. `options` hold the root R and the start v.
+    """
+
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable = optx.two_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del fn, args, f_struct, aux_struct, tags
+        infinite = jnp.asarray(jnp.inf, y.dtype)
+        zero = jnp.zeros_like(infinite)
+        return _NewtonState(options["start"], jnp.zeros_like(y), zero, zero, -infinite, infinite, zero)
+
+    def step(self, fn, y, args, options, state, tags):
+        del fn, tags
+        root = options["root"]
+        trial = state.v + state.scale * state.direction
+        taken, slack = _newton_state(args[0], root, trial)
+        risen = taken.objective >= state.objective + 1e-4 * state.scale * state.gain - slack
+        refused = eqx.tree_at(lambda s: s.scale, state, 0.5 * state.scale)
+        state = jax.tree.map(lambda new, old: jnp.where(risen, new, old), taken, refused)
+        return jnp.where(risen, root @ trial, y), state, None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        del fn, y, args, options, tags
+        stalled = (state.scale > 0.0) & (state.scale < 1e-12)
+        return (state.residual <= state.tolerance) | stalled, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        del fn, args, options, state, tags, result
+        return y, aux, {}
+
+
+def _newton_state(log_likelihood, root, v):
+    """Everything at `v`: objective, residual and what it can resolve, next direction; and the objective's rounding."""
+    terms, slope, curvature = _expand(log_likelihood, root @ v)
+    uphill = root.T @ slope - v
+    newton_matrix = jnp.eye(v.shape[0], dtype=v.dtype) + (root.T * curvature[None, :]) @ root
+    direction = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(newton_matrix), True), uphill)
+    epsilon, magnitude = jnp.finfo(v.dtype).eps, jnp.abs(root)
+    summed = magnitude.T @ (jnp.abs(slope) + curvature * (magnitude @ jnp.abs(v))) + jnp.abs(v)
+    state = _NewtonState(
+        v=v,
+        direction=direction,
+        scale=jnp.ones_like(v[0]),
+        gain=uphill @ direction,
+        objective=jnp.sum(terms) - 0.5 * v @ v,
+        residual=jnp.linalg.norm(uphill),
+        tolerance=jnp.maximum(epsilon ** (2 / 3), 4.0 * epsilon * jnp.linalg.norm(summed)),
+    )
+    return state, 4.0 * epsilon * (jnp.sum(jnp.abs(terms)) + 0.5 * v @ v)
+
+
+# --- the matrix C = (K + 1/W)^-1 = W^(1/2) B^-1 W^(1/2),  B = I + W^(1/2) K W^(1/2)
+
+
+def _factorise(covariance, curvature):
+    root = jnp.sqrt(curvature)
+    matrix = jnp.eye(root.shape[0], dtype=root.dtype) + root[:, None] * covariance * root[None, :]
+    return root, matrix, jnp.linalg.cholesky(matrix)
+
+
+def _factor(covariance, curvature):
+    """V = L^-1 W^(1/2) with B = L L', so V'V = C; and a bound on B's condition, as B has no eigenvalue below 1."""
+    root, matrix, lower = _factorise(covariance, curvature)
+    factor = jax.scipy.linalg.solve_triangular(lower, jnp.diag(root), lower=True)
+    return factor, jnp.linalg.norm(matrix)
+
+
+@jax.custom_jvp
+def _inverse_and_log_determinant(covariance, curvature):
+    """C, and log|B| = log|I + K W|."""
+    root, _, lower = _factorise(covariance, curvature)
+    factor = jax.scipy.linalg.solve_triangular(lower, jnp.diag(root), lower=True)
+    return factor.T @ factor, 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
+
+
+@_inverse_and_log_determinant.defjvp
+def _inverse_and_log_determinant_jvp(primals, tangents):
+    """With T = I - C K: dC = -C dK C + T dW T' and d log|B| = tr(C dK) + tr(K T dW); no 1/W, no W^(1/2)."""
+    covariance, _ = primals
+    d_covariance, d_curvature = tangents
+    inverse, log_determinant = _inverse_and_log_determinant(*primals)
+    transfer = jnp.eye(inverse.shape[0], dtype=inverse.dtype) - inverse @ covariance
+    d_inverse = (transfer * d_curvature[None, :]) @ transfer.T - inverse @ d_covariance @ inverse
+    posterior_variance = jnp.sum(covariance * transfer.T, axis=1)
+    d_log_determinant = jnp.sum(inverse * d_covariance) + posterior_variance @ d_curvature
+    return (inverse, log_determinant), (d_inverse, d_log_determinant)

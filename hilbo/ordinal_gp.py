@@ -1,0 +1,213 @@
+"""Gaussian process with an ordinal likelihood: the model of one participant, its data and its posterior.
+
+    gp        = OrdinalGP(kernel=RBF(theta=30.0, variance=1.0), likelihood=OrdinalProbit((-0.5, 0.5), noise=0.5))
+    trials    = Trials.from_arrays(x, q)
+    posterior = fit(gp, trials)
+    mean, variance = posterior.predict(x_new)
+
+Trials are padded to a capacity and masked, so that a session that grows from 0 to 25 answers compiles once. Everything
+is a pytree: `jax.vmap(fit)` over stacked trials fits all participants, `jax.grad` through `fit` is exact.
+Reference: paper, section IV.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.errors import InputError
+from hilbo.kernels import RBF, gram
+from hilbo.laplace import Certificate, LaplacePosterior, explained_variance, laplace
+from hilbo.likelihoods import OrdinalProbit
+
+__all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
+
+_BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
+
+
+class InferenceError(RuntimeError):
+    """A fit whose certificate does not hold; the message says which figure failed and what may be done."""
+
+
+class OrdinalGP(eqx.Module):
+    """Zero-mean Gaussian process prior on the latent realism f and an ordinal likelihood of the answers."""
+
+    kernel: RBF
+    likelihood: OrdinalProbit
+
+
+class Trials(eqx.Module):
+    """Answers of one participant, padded to a fixed capacity.
+
+    `x` (capacity, d) are the asked points in the unit cube, `q` (capacity,) the categories 0..C-1, `mask` says which
+    rows hold an answer. Rows without an answer have no influence whatever they contain.
+    """
+
+    x: Float[Array, "n d"]
+    q: Int[Array, " n"]
+    mask: Bool[Array, " n"]
+
+    @classmethod
+    def from_arrays(cls, x: ArrayLike, q: ArrayLike, capacity: int | None = None) -> "Trials":
+        """Trials from points `x` (n, d) and categories `q` (n,).
+
+        `capacity` defaults to n rounded up to a multiple of 32. Raises `InputError` for shapes that do not match,
+        values that are not finite, categories that are not integers >= 0, or a capacity below n.
+        """
+        points, answers = np.asarray(x), np.asarray(q)
+        _check_arrays(points, answers)
+        count = len(points)
+        capacity = max(_BLOCK * -(-count // _BLOCK), _BLOCK) if capacity is None else capacity
+        if capacity < max(count, 1):
+            raise InputError(f"Trials: capacity is {capacity}, but {count} answers need at least {count or 1}.")
+        dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(float)
+        padded = np.zeros((capacity, points.shape[1]), jax.dtypes.canonicalize_dtype(dtype))
+        categories = np.zeros(capacity, np.int32)
+        padded[:count], categories[:count] = points, answers
+        return cls(jnp.asarray(padded), jnp.asarray(categories), jnp.arange(capacity) < count)
+
+    @classmethod
+    def empty(cls, capacity: int, dim: int) -> "Trials":
+        """No answers yet, room for `capacity` of them."""
+        return cls.from_arrays(np.zeros((0, dim)), np.zeros(0, int), capacity)
+
+    @property
+    def capacity(self) -> int:
+        """How many answers there is room for."""
+        return self.x.shape[-2]
+
+    def append(self, x: Float[Array, " d"], q: ArrayLike) -> "Trials":
+        """With one more answer in the first free row: the shapes stay, so nothing recompiles. A full table becomes NaN."""
+        row = jnp.sum(self.mask)
+        full = row >= self.capacity
+        return Trials(
+            jnp.where(full, jnp.nan, self.x.at[row].set(x.astype(self.x.dtype))),
+            self.q.at[row].set(jnp.asarray(q, self.q.dtype)),
+            self.mask.at[row].set(True),
+        )
+
+    def first(self, count: ArrayLike) -> "Trials":
+        """Only the first `count` rows, with the same capacity."""
+        keep = jnp.arange(self.capacity) < count
+        return Trials(self.x, self.q, self.mask & keep)
+
+
+def _check_arrays(points, answers):
+    if points.ndim != 2 or answers.ndim != 1 or len(points) != len(answers):
+        raise InputError(
+            f"Trials: x has shape {points.shape} and q has shape {answers.shape}; give x as (n, d) and q as (n,)."
+        )
+    if not np.all(np.isfinite(points)):
+        row = int(np.argwhere(~np.isfinite(points))[0, 0])
+        raise InputError(f"Trials: x[{row}] holds a value that is not finite; remove that answer or mend it.")
+    if len(answers) and (not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0):
+        raise InputError("Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).")
+
+
+class _OrdinalTerms(eqx.Module):
+    """The answers as pointwise log-likelihood terms, 0 where there is no answer."""
+
+    likelihood: OrdinalProbit
+    q: Int[Array, " n"]
+    mask: Bool[Array, " n"]
+
+    def __call__(self, eta: Float[Array, " n"]) -> Float[Array, " n"]:
+        return jnp.where(self.mask, jax.vmap(self.likelihood.log_prob)(eta, self.q), jnp.zeros_like(eta))
+
+
+class Posterior(eqx.Module):
+    """Posterior of the latent realism of one participant; the result of [`fit`][]."""
+
+    gp: OrdinalGP
+    trials: Trials
+    latent: LaplacePosterior
+
+    @property
+    def log_evidence(self) -> Float[Array, ""]:
+        """log p(answers) under the approximation."""
+        return self.latent.log_evidence
+
+    @property
+    def certificate(self) -> Certificate:
+        """Residual, iterations, jitter, condition and smallest variance of this fit."""
+        return self.latent.certificate
+
+    def mean(self, x: Float[Array, "m d"]) -> Float[Array, " m"]:
+        """Posterior mean (m,) of f at points of the unit cube: the variance is not computed."""
+        return _mean(self, x)
+
+    def predict(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Posterior mean and variance of f, (m,) each, at points (m, d) of the unit cube."""
+        mean, explained = _mean_and_explained(self, x)
+        return mean, jax.vmap(self.gp.kernel.diagonal)(x) - explained
+
+    def predict_explained(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Posterior mean, and the part of the prior variance that the answers explain, to all its digits."""
+        return _mean_and_explained(self, x)
+
+    def class_probabilities(self, x: Float[Array, "m d"]) -> Float[Array, "m categories"]:
+        """Probabilities (m, C) of the answers to be expected at points (m, d)."""
+        mean, variance = self.predict(x)
+        return jax.vmap(self.gp.likelihood.class_probabilities)(mean, variance)
+
+
+@jax.jit
+def _mean(posterior, x):
+    return gram(posterior.gp.kernel, x, posterior.trials.x) @ posterior.latent.weights
+
+
+@jax.jit
+def _mean_and_explained(posterior, x):
+    latent = posterior.latent
+    cross = gram(posterior.gp.kernel, x, posterior.trials.x)
+    return cross @ latent.weights, explained_variance(latent.factor, latent.inverse, cross)
+
+
+def fit(
+    gp: OrdinalGP,
+    trials: Trials,
+    *,
+    inference: str = "laplace",
+    start: Float[Array, " n"] | None = None,
+    throw: bool = True,
+) -> Posterior:
+    """Posterior of the latent function given the answers.
+
+    **Arguments:**
+
+    - `gp`: the model.
+    - `trials`: the answers; none gives the prior.
+    - `inference`: "laplace" (paper, section IV-1).
+    - `start`: `posterior.latent.weights` of a fit to nearly the same trials, to save Newton steps.
+    - `throw`: raise `InferenceError` if the certificate does not hold. Use `False` under `vmap`, and read
+      `posterior.certificate.converged`.
+
+    **Returns:** a [`Posterior`][], differentiable in every array of `gp`.
+    """
+    if inference != "laplace":
+        raise InputError(f'fit: inference is "{inference}"; this version offers "laplace".')
+    posterior = _fit(gp, trials, start)
+    return _checked(posterior) if throw else posterior
+
+
+@jax.jit
+def _fit(gp, trials, start):
+    covariance = gram(gp.kernel, trials.x, trials.x)
+    terms = _OrdinalTerms(gp.likelihood, trials.q, trials.mask)
+    return Posterior(gp, trials, laplace(covariance, terms, start=start))
+
+
+def _checked(posterior: Posterior) -> Posterior:
+    certificate = posterior.certificate
+    if isinstance(certificate.converged, jax.core.Tracer):
+        message = "the Laplace mode was not found to its tolerance; fit with throw=False and read the certificate"
+        return eqx.error_if(posterior, ~certificate.converged, message)
+    if not bool(certificate.converged):
+        raise InferenceError(
+            f"the Laplace mode was not found: its residual is {float(certificate.residual):.3g} after"
+            f" {int(certificate.iterations)} steps and should be at most {float(certificate.tolerance):.3g}; use a"
+            " larger noise, float64, or throw=False to look at the certificate."
+        )
+    return posterior

@@ -1,0 +1,97 @@
+"""Passivity of the sampled FO-SLS: the damping a device needs, and the largest K1 that a device can render.
+
+A rendering H(z) on a device with physical damping b is passive (Colgate & Schenkel 1997) if
+
+    b > (T/2) / (1 - cos ωT) · Re{(1 - e^{-jωT})·H(e^{jωT})},  0 <= ω <= π/T,   and   H(1) >= 0.
+
+For odd N the Nyquist frequency binds: b_min = (T/2)·H(-1). With K0 set by H(1) = K_eff, S = C(1), C = C(-1) (see
+`viscoelastic`) this is
+
+    b_min = (T/2)·[K_eff + β(C - S) · K1/(K1 + β·C) · K1/(K1 + β·S)],
+
+which rises in K1 from (T/2)·K_eff to (T/2)·[K_eff + β(C - S)]. Solved for K1, with Y = 2b/T - K_eff and
+A = β(C - S) - Y:
+
+    A <= 0: every K1 is passive;  Y <= 0 or K_eff < 0: none is;  otherwise
+    K1max = β·[Y(C + S) + sqrt(Y²(C + S)² + 4·A·Y·C·S)] / (2A).
+
+Units: K N/mm, B1 N·s^α/mm, T s, damping N·s/m. For even N these forms are up to 2.8 % (N = 2) too low, so even N is
+refused.
+"""
+
+from typing import Literal
+
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
+
+from hilbo.viscoelastic import check_memory, elementwise, gl_sums
+
+__all__ = ["largest_K1", "minimum_damping"]
+
+
+def minimum_damping(
+    K1: Real[ArrayLike, "..."],
+    B1: Real[ArrayLike, "..."],
+    alpha: Real[ArrayLike, "..."],
+    K_eff: Real[ArrayLike, "..."] = 0.44,
+    N: int = 101,
+    T: Real[ArrayLike, "..."] = 1e-3,
+    *,
+    memory: Literal["short", "full"] = "short",
+) -> Float[Array, "..."]:
+    """Smallest device damping b (N·s/m) with which the rendering is passive; elementwise.
+
+    `inf` where `K_eff` < 0: a negative static stiffness is active whatever the damping. For a set with a K0 of its
+    own, `K_eff` is its `viscoelastic.dc_gain`. Raises ValueError for even N.
+    """
+    _check(N, memory)
+    return elementwise(_minimum_damping, N, K1, B1, alpha, K_eff, T)
+
+
+def largest_K1(
+    B1: Real[ArrayLike, "..."],
+    alpha: Real[ArrayLike, "..."],
+    b: Real[ArrayLike, "..."] = 0.95,
+    K_eff: Real[ArrayLike, "..."] = 0.44,
+    N: int = 101,
+    T: Real[ArrayLike, "..."] = 1e-3,
+    *,
+    memory: Literal["short", "full"] = "short",
+) -> Float[Array, "..."]:
+    """Largest passive K1 (N/mm) on a device with damping `b` (N·s/m); elementwise.
+
+    `inf` where every K1 is passive, 0 where none is. Differentiable, with derivative 0 at `inf` and at 0.
+    Raises ValueError for even N.
+    """
+    _check(N, memory)
+    return elementwise(_largest_K1, N, B1, alpha, b, K_eff, T)
+
+
+def _check(N, memory):
+    check_memory(memory)
+    if N % 2 == 0:
+        raise ValueError(f"N is {N}, it must be odd: the closed passivity bound is too low for an even number of taps.")
+
+
+def _minimum_damping(N, K1, B1, alpha, K_eff, T):
+    beta = B1 * T**-alpha
+    sums = gl_sums(alpha, N)
+    fast, slow = K1 / (K1 + beta * sums.at_nyquist), K1 / (K1 + beta * sums.at_dc)
+    stiffness = K_eff + beta * sums.spread * fast * slow
+    return jnp.where(K_eff < 0, jnp.inf, 500 * T * stiffness)
+
+
+def _largest_K1(N, B1, alpha, b, K_eff, T):
+    beta = B1 * T**-alpha
+    sums = gl_sums(alpha, N)
+    room = b / (500 * T) - K_eff  # Y
+    excess = beta * sums.spread - room  # A
+    impossible = (room <= 0) | (K_eff < 0)
+    unlimited = excess <= 0
+    limited = ~impossible & ~unlimited
+    # The root is taken of harmless numbers where it is not used, so that its derivative cannot turn into NaN.
+    room, excess = jnp.where(limited, room, 1), jnp.where(limited, excess, 1)
+    half = room * (sums.at_nyquist + sums.at_dc)
+    root = jnp.sqrt(half**2 + 4 * excess * room * sums.at_nyquist * sums.at_dc)
+    return jnp.where(impossible, 0, jnp.where(unlimited, jnp.inf, beta * (half + root) / (2 * excess)))

@@ -1,0 +1,323 @@
+"""The space that is searched: named bounded parameters with units, the unit cube, and its passive part.
+
+Three coordinates of one point:
+
+- *physical*: the numbers of tables and devices, in the units of the parameters;
+- *unit cube* x: every parameter on [0, 1] over its full range, linear or logarithmic; kernels see only these;
+- *box* w: the optimiser's coordinates. With mechanics, x_K1 = w_K1 · x_K1max(B1, α), where K1max is the largest
+  passive K1 (`passivity.largest_K1`), so that the feasible set is the whole of [0, 1]^d; without, w = x.
+
+A column (B1, α) with K1max below the lowest K1 has width 0 and holds no feasible point. Points that fill the feasible
+set evenly come from uniform numbers by the Rosenblatt map whose density is the column's width; Rosenblatt (1952),
+Ann. Math. Stat. 23:470. The search keeps `SEARCH_MARGIN` away from the device's damping, so that a device that checks
+passivity again in float32 never refuses a proposal.
+"""
+
+import functools
+import math
+from collections.abc import Iterator, Mapping
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Real
+
+from hilbo import passivity, viscoelastic
+from hilbo.errors import InputError
+
+__all__ = ["SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace"]
+
+SEARCH_MARGIN = 1e-3
+"""The search uses the damping b·(1 - SEARCH_MARGIN)."""
+
+# Cells of the table of column widths. At small B1 the width falls from all to little within 1/1000 of the range, so
+# the rows crowd there: with even rows the share of the first one alone would be off by a sixth.
+_CELLS = 256
+_ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
+_COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
+_LARGEST_CHUNK = 2**18
+_LEAST_SHARE = 1e-4
+# The map puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse them.
+_ROUNDING = 64
+
+
+class Parameter(eqx.Module):
+    """One named parameter, `low` to `high` in `unit`; `scale` says how it lies on [0, 1]."""
+
+    name: str = eqx.field(static=True)
+    low: float = eqx.field(static=True, converter=float)
+    high: float = eqx.field(static=True, converter=float)
+    unit: str = eqx.field(static=True, default="")
+    scale: Literal["linear", "log"] = eqx.field(static=True, default="linear")
+
+    def __check_init__(self):
+        path = f"parameters.{self.name}"
+        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+            raise InputError(f"{path} runs from {self.low} to {self.high}, both ends must be finite numbers.")
+        if not self.low < self.high:
+            raise InputError(f"{path}.low is {self.low}, it must be below high = {self.high}.")
+        if self.scale == "log" and self.low <= 0:
+            raise InputError(f'{path}.low is {self.low}, it must be above 0 on a scale = "log".')
+
+    def to_unit(self, value: Real[Array, "..."]) -> Float[Array, "..."]:
+        """Physical value to [0, 1]; measured from the nearer end, so that both ends are met exactly."""
+        if self.scale == "log":
+            above, below = jnp.log1p((value - self.low) / self.low), jnp.log1p((self.high - value) / value)
+            width = math.log(self.high / self.low)
+        else:
+            above, below, width = value - self.low, self.high - value, self.high - self.low
+        return jnp.where(above < below, above / width, 1 - below / width)
+
+    def to_physical(self, unit: Real[Array, "..."]) -> Float[Array, "..."]:
+        """Inverse of `to_unit`; never leaves [low, high] for a `unit` in [0, 1]."""
+        if self.scale == "log":
+            ratio = self.high / self.low
+            upwards, downwards = self.low * ratio**unit, self.high * ratio ** (unit - 1)
+        else:
+            width = self.high - self.low
+            upwards, downwards = self.low + width * unit, self.high - width * (1 - unit)
+        return jnp.where(unit < 0.5, upwards, downwards)
+
+
+class Mechanics(eqx.Module):
+    """What the renderer adds to the box: the FO-SLS, its memory and rate, and the device's damping.
+
+    `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
+    optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd); `T`: s.
+    """
+
+    K_eff: float = eqx.field(static=True, converter=float)
+    damping: float = eqx.field(static=True, converter=float)
+    N: int = eqx.field(static=True, default=101)
+    T: float = eqx.field(static=True, converter=float, default=1e-3)
+    memory: Literal["short", "full"] = eqx.field(static=True, default="short")
+    effective_damping: tuple[float, float] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        for key, least in (("damping", 0.0), ("T", 0.0), ("K_eff", -math.ulp(0.0))):
+            value = getattr(self, key)
+            if not least < value < math.inf:
+                raise InputError(f"renderer.{key} is {value}, it must be {'0 or' if least else 'a number'} above 0.")
+        if self.N < 1 or self.N % 2 == 0:
+            raise InputError(f"renderer.N is {self.N}, it must be odd and at least 1; write for example N = 101.")
+        if self.effective_damping is not None and not 0 <= self.effective_damping[0] < self.effective_damping[1]:
+            raise InputError(
+                f"renderer.effective_damping is {list(self.effective_damping)}, it must be a lower end, 0 or above, "
+                "and a higher one; write for example effective_damping = [10, 80]."
+            )
+
+
+class SearchSpace(eqx.Module):
+    """Named parameters, and with `mechanics` the passive part of their box.
+
+    With mechanics the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order; further ones are
+    unconstrained. Raises InputError if no column (B1, alpha) holds a passive K1.
+    """
+
+    parameters: tuple[Parameter, ...] = eqx.field(static=True)
+    mechanics: Mechanics | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if not self.parameters:
+            raise InputError("parameters is empty, a search space needs at least one.")
+        if len(set(self.names)) < self.dim:
+            raise InputError(f"parameters has one name twice: {', '.join(self.names)}.")
+        if self.mechanics is not None:
+            self._check_mechanics(self.mechanics)
+
+    def _check_mechanics(self, mechanics):
+        missing = [name for name in ("K1", "B1", "alpha") if name not in self.names]
+        if missing:
+            raise InputError(f"parameters.{missing[0]} is missing, the renderer's model needs K1, B1 and alpha.")
+        for name in ("K1", "B1", "alpha"):
+            parameter = self.parameters[self._index(name)]
+            if parameter.low <= 0:
+                raise InputError(f"parameters.{name}.low is {parameter.low}, it must be above 0 for the FO-SLS.")
+        alpha = self.parameters[self._index("alpha")]
+        if alpha.high >= 1:
+            raise InputError(f"parameters.alpha.high is {alpha.high}, it must be below 1 for the FO-SLS.")
+        if not _column_table(self)[0][-1] > 0:
+            raise InputError(
+                f"renderer.damping is {mechanics.damping} N.s/m, with which no K1 from "
+                f"{self.parameters[self._index('K1')].low} N/mm up is passive for any B1 and alpha; "
+                "check its unit, or lower K_eff or parameters.K1.low."
+            )
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in the order of the coordinates."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def to_unit(self, physical: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
+        """Physical values to the unit cube, last axis = parameter; exact at both ends."""
+        physical = _floating(physical)
+        return jnp.stack([p.to_unit(physical[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
+
+    def to_physical(self, unit: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
+        """Unit cube to physical values, last axis = parameter; exact at both ends, and never outside them."""
+        unit = _floating(unit)
+        return jnp.stack([p.to_physical(unit[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
+
+    def from_box(self, w: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
+        """Optimiser's coordinates in [0, 1]^d to the unit cube; differentiable.
+
+        In a column without a feasible point x_K1 is 0 and `feasible` says no.
+        """
+        w = _floating(w)
+        if self.mechanics is None:
+            return w
+        return w.at[..., self._index("K1")].multiply(self._limit(self.mechanics, w))
+
+    def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
+        """Inverse of `from_box`, for `x` in the feasible set."""
+        x = _floating(x)
+        if self.mechanics is None:
+            return x
+        return x.at[..., self._index("K1")].divide(self._limit(self.mechanics, x))
+
+    def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
+        """Whether points of the unit cube are in the box, passive with the search margin, and damped as asked for."""
+        x = _floating(x)
+        inside = jnp.all((x >= 0) & (x <= 1), axis=-1)
+        mechanics = self.mechanics
+        if mechanics is None:
+            return inside
+        physical = self._split(self.to_physical(x))
+        available = mechanics.damping * (1 - SEARCH_MARGIN) * (1 + _ROUNDING * float(jnp.finfo(x.dtype).eps))
+        inside &= _minimum_damping(mechanics, physical) <= available
+        if mechanics.effective_damping is not None:
+            low, high = mechanics.effective_damping
+            damping = viscoelastic.effective_damping(*_set(physical), mechanics.N, mechanics.T, memory=mechanics.memory)
+            inside &= (low <= damping) & (damping <= high)
+        return inside
+
+    def derived(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> dict[str, Float[Array, "..."]]:
+        """What follows from the parameters: K0 (N/mm) with mechanics, nothing without."""
+        m = self.mechanics
+        if m is None:
+            return {}
+        return {"K0": viscoelastic.K0_from_effective_stiffness(*_set(physical), m.K_eff, m.N, m.T, memory=m.memory)}
+
+    def passivity_margin(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."] | None:
+        """Damping of the device less the smallest passive one, N·s/m; None without mechanics."""
+        return None if self.mechanics is None else self.mechanics.damping - _minimum_damping(self.mechanics, physical)
+
+    def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
+        """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol')."""
+        return _fill(self, m, _sobol_chunks(self.dim, m, seed))
+
+    def latin_hypercube(self, n: int, seed: int) -> Float[np.ndarray, "n d"]:
+        """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
+
+        Points that fall outside the feasible set (a few at the foot of infeasible columns, or many with an
+        `effective_damping`) are replaced from further hypercubes, at the price of the even spread.
+        """
+        return _fill(self, n, _latin_chunks(self.dim, n, seed))
+
+    def _index(self, name):
+        return self.names.index(name)
+
+    def _split(self, physical):
+        return {name: physical[..., i] for i, name in enumerate(self.names)}
+
+    def _limit(self, m, x):
+        """Width of the column of each point: the largest feasible x_K1, 0 where there is none."""
+        K1 = self.parameters[self._index("K1")]
+        B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
+        b = m.damping * (1 - SEARCH_MARGIN)
+        largest = passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory)
+        return K1.to_unit(jnp.clip(largest, K1.low, K1.high))
+
+
+def _floating(x):
+    return jnp.asarray(x, jnp.result_type(1.0, x))
+
+
+def _set(physical):
+    return physical["K1"], physical["B1"], physical["alpha"]
+
+
+def _minimum_damping(m, physical):
+    return passivity.minimum_damping(*_set(physical), m.K_eff, m.N, m.T, memory=m.memory)
+
+
+@functools.lru_cache(maxsize=16)
+def _column_table(space):
+    """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
+    x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
+    x[..., space._index("B1")], x[..., space._index("alpha")] = _ROWS[:, None], _COLUMNS
+    node = np.asarray(_limit(space, x), float)
+    mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
+    volume = mean * np.diff(_ROWS)[:, None] * np.diff(_COLUMNS)
+    within = np.pad(np.cumsum(volume, axis=1), ((0, 0), (1, 0)))
+    total = within[:, -1:]
+    within = np.where(total > 0, within, _COLUMNS) / np.where(total > 0, total, 1)
+    return np.pad(np.cumsum(total), (1, 0)), within
+
+
+def _rosenblatt(space, uniform):
+    """Uniform numbers (n, d) to box coordinates in which a column is as likely as it is wide."""
+    if space.mechanics is None:
+        return uniform
+    rows, within = _column_table(space)
+    B1, alpha = space._index("B1"), space._index("alpha")
+    w = uniform.copy()
+    w[:, B1] = np.interp(uniform[:, B1] * rows[-1], rows, _ROWS)
+    row = np.searchsorted(_ROWS[1:-1], w[:, B1], side="right")
+    # All rows at once: row r of the table climbs from r to r + 1.
+    climbing = (within + np.arange(_CELLS)[:, None]).ravel()
+    w[:, alpha] = np.interp(row + uniform[:, alpha], climbing, np.tile(_COLUMNS, _CELLS))
+    return w
+
+
+@eqx.filter_jit
+def _limit(space, x):
+    return space._limit(space.mechanics, x)
+
+
+@eqx.filter_jit
+def _from_box(space, w):
+    x = space.from_box(w)
+    return x, space.feasible(x)
+
+
+def _fill(space, count, chunks):
+    """The first `count` feasible points out of chunks of uniform numbers."""
+    kept, found, tried = [], 0, 0
+    while found < count:
+        x, feasible = map(np.asarray, _from_box(space, _rosenblatt(space, next(chunks))))
+        kept.append(x[feasible])
+        found, tried = found + len(kept[-1]), tried + len(x)
+        if tried > 10 / _LEAST_SHARE and found < _LEAST_SHARE * tried:
+            raise InputError(
+                f"renderer.effective_damping leaves {found} of {tried} passive points, too few to search; widen it."
+            )
+    return np.concatenate(kept)[:count] if kept else np.zeros((0, space.dim))
+
+
+def _sobol_chunks(dim, count, seed) -> Iterator[np.ndarray]:
+    from scipy.stats import qmc  # slow to import, and only this function needs it
+
+    engine = qmc.Sobol(dim, rng=np.random.default_rng(seed))
+    for size in _chunk_sizes(2 ** max(count - 1, 0).bit_length()):
+        yield engine.random(size)
+
+
+def _latin_chunks(dim, count, seed) -> Iterator[np.ndarray]:
+    rng = np.random.default_rng(seed)
+    for size in _chunk_sizes(max(count, 1)):
+        strata = rng.permuted(np.tile(np.arange(size), (dim, 1)), axis=1).T
+        yield (strata + rng.random((size, dim))) / size
+
+
+def _chunk_sizes(size):
+    while True:
+        yield size
+        size = max(size, min(16 * size, _LARGEST_CHUNK))

@@ -1,0 +1,226 @@
+"""One participant's session: ask for a rendering, tell the answer; every state is a new immutable record.
+
+    session = Session.start(study, seed=0)
+    point   = session.ask()              # parameter -> value in physical units
+    session = session.tell("close")
+
+The first trials are a Latin hypercube inside the feasible set, the following maximise the acquisition function over a
+low-discrepancy candidate set and are polished (paper, algorithm 1). The next point depends only on the study, the
+answers so far and the seed: fits start cold, from the physical values that a table would hold, so that a replay (of a
+log, of a table, on another day) gives the same points bit for bit.
+"""
+
+from collections.abc import Iterable, Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from hilbo import acquisition
+from hilbo.config import Study
+from hilbo.errors import InputError
+from hilbo.kernels import gram
+from hilbo.ordinal_gp import Posterior, Trials, fit
+
+__all__ = ["CANDIDATES", "Design", "Session", "best_point", "design", "next_point", "physical_trials"]
+
+CANDIDATES = 4096
+"""Points among which the acquisition function is maximised before polishing."""
+_JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
+
+
+class Design(eqx.Module):
+    """What a seed decides in advance: where the first trials are, and the candidates of the others."""
+
+    initial: Float[Array, "s d"]
+    candidates: Float[Array, "m d"]
+    key: PRNGKeyArray
+
+
+def design(study: Study, seed: int, candidates: int = CANDIDATES) -> Design:
+    """The seeded part of a session: space-filling points (s, d) and candidates (m, d), in the unit cube."""
+    first = min(study.selection.space_filling, study.selection.trials)
+    return Design(
+        jnp.asarray(study.space.latin_hypercube(first, seed)),
+        jnp.asarray(study.space.candidates(candidates, seed)),
+        jax.random.key(seed),
+    )
+
+
+def next_point(study: Study, plan: Design, trials: Trials, trial: Int[Array, ""] | int) -> Float[Array, " d"]:
+    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition function; traceable."""
+    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
+    if study.selection.acquisition == "thompson":
+        return _thompson_point(posterior, plan, trial)
+    score = _score(study, posterior)
+
+    def score_at(x):
+        mean, variance = posterior.predict(x[None, :])
+        return score(mean[0], variance[0])
+
+    distance = study.selection.minimum_distance
+    feasible = study.space.feasible
+    return acquisition.maximise(
+        score(*posterior.predict(plan.candidates)),
+        plan.candidates,
+        score_at,
+        from_box=study.space.from_box,
+        to_box=study.space.to_box,
+        feasible=feasible,
+        allowed=(lambda x: _far_from(trials, x, distance)) if distance else None,
+    ).x
+
+
+def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
+    """Where the posterior mean is largest in the feasible set: the session's optimum (paper, algorithm 1, last line)."""
+    return acquisition.maximise(
+        posterior.mean(candidates),
+        candidates,
+        lambda x: posterior.mean(x[None, :])[0],
+        from_box=study.space.from_box,
+        to_box=study.space.to_box,
+        feasible=study.space.feasible,
+    )
+
+
+def _score(study, posterior):
+    kind = study.selection.acquisition
+    if kind == "ucb":
+        return acquisition.UCB(study.selection.weight)
+    if kind == "log_ei":
+        trials = posterior.trials
+        return acquisition.LogEI(jnp.max(jnp.where(trials.mask, posterior.mean(trials.x), -jnp.inf)))
+    if kind == "top_category":
+        return acquisition.TopCategory(study.gp.likelihood.thresholds[-1], study.gp.likelihood.noise)
+    return acquisition.Mean()
+
+
+def _far_from(trials, x, distance):
+    """Whether x keeps the smallest distance to every earlier trial."""
+    apart = jnp.sum((trials.x - x[None, :]) ** 2, axis=1) >= distance**2
+    return jnp.all(apart | ~trials.mask)
+
+
+def _thompson_point(posterior, plan, trial):
+    points = plan.candidates[:_JOINT_CANDIDATES]
+    cross = gram(posterior.gp.kernel, points, posterior.trials.x)
+    covariance = gram(posterior.gp.kernel, points, points) - cross @ posterior.latent.inverse @ cross.T
+    key = jax.random.fold_in(plan.key, trial)
+    row, _ = acquisition.thompson(key, cross @ posterior.latent.weights, covariance)
+    return points[row]
+
+
+def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capacity: int) -> Trials:
+    """Trials from points (n, d) in physical units: the one way from what tables and logs hold to what a fit sees.
+
+    Rows beyond n are put in the middle of the box before the change of coordinates, so that it compiles once.
+    """
+    padded = np.tile([(p.low + p.high) / 2 for p in study.space.parameters], (capacity, 1))
+    padded[: len(points)] = points
+    categories = np.zeros(capacity, np.int32)
+    categories[: len(answers)] = answers
+    return Trials(_to_unit(study.space, padded), jnp.asarray(categories), jnp.arange(capacity) < len(points))
+
+
+@eqx.filter_jit
+def _to_unit(space, physical):
+    return space.to_unit(physical)
+
+
+@eqx.filter_jit
+def _to_physical(space, unit):
+    return space.to_physical(unit)
+
+
+@eqx.filter_jit
+def _next_physical(study, plan, trials, trial):
+    return study.space.to_physical(next_point(study, plan, trials, trial))
+
+
+class Session(eqx.Module):
+    """A participant's answers so far and the rendering to ask next; made by `start`, `tell` and `replay`.
+
+    `points` (n, d) are in physical units, `answers` (n,) categories from 0; `proposal` (d,) is the next point, None
+    when all the study's trials are answered.
+    """
+
+    study: Study
+    plan: Design
+    points: np.ndarray
+    answers: np.ndarray
+    proposal: np.ndarray | None
+    seed: int = eqx.field(static=True)
+
+    @classmethod
+    def start(cls, study: Study, seed: int = 0) -> "Session":
+        """A session without answers. The seed decides the space-filling trials and the candidates."""
+        plan = design(study, seed)
+        nothing = np.zeros((0, study.space.dim))
+        return cls(study, plan, nothing, np.zeros(0, int), _propose(study, plan, nothing, np.zeros(0, int)), seed)
+
+    @classmethod
+    def replay(cls, study: Study, responses: Iterable[str], seed: int = 0) -> "Session":
+        """The session in which these answers were given, in this order."""
+        session = cls.start(study, seed)
+        for response in responses:
+            session = session.tell(response)
+        return session
+
+    @property
+    def trials(self) -> Trials:
+        """The answers as the model's data, with the capacity of the whole session."""
+        return physical_trials(self.study, self.points, self.answers, self.study.selection.trials)
+
+    @property
+    def done(self) -> bool:
+        """Whether all the study's trials are answered."""
+        return self.proposal is None
+
+    def ask(self) -> dict[str, float]:
+        """The rendering to present next: parameter -> value in physical units."""
+        if self.proposal is None:
+            raise InputError(
+                f"Session: all {len(self.answers)} trials of the study are answered; nothing is left to ask."
+            )
+        return dict(zip(self.study.space.names, self.proposal.tolist(), strict=True))
+
+    def tell(self, response: str, at: Mapping[str, float] | None = None) -> "Session":
+        """The next state, after the participant's answer (one of the study's responses) to the asked point.
+
+        `at`: the point that was really presented, if it was not the asked one.
+        """
+        if response not in self.study.responses:
+            raise InputError(f'Session: "{response}" is no answer of this study; give one of {self.study.responses}.')
+        shown = self.ask() if at is None else at
+        point = np.array([[shown[name] for name in self.study.space.names]])
+        points = np.concatenate([self.points, point])
+        answers = np.append(self.answers, self.study.responses.index(response))
+        proposal = _propose(self.study, self.plan, points, answers)
+        return Session(self.study, self.plan, points, answers, proposal, self.seed)
+
+    def posterior(self) -> Posterior:
+        """The participant's posterior after the answers so far."""
+        return fit(self.study.gp, self.trials, inference=self.study.inference)
+
+    def best(self) -> dict[str, float]:
+        """The rendering with the largest posterior mean: parameter -> value in physical units."""
+        physical = _best_physical(self.study, self.posterior(), self.plan.candidates)
+        return dict(zip(self.study.space.names, np.asarray(physical).tolist(), strict=True))
+
+
+@eqx.filter_jit
+def _best_physical(study, posterior, candidates):
+    return study.space.to_physical(best_point(study, posterior, candidates).x)
+
+
+def _propose(study, plan, points, answers):
+    """The next point in physical units, as numbers that survive a round trip through text."""
+    count = len(answers)
+    if count >= study.selection.trials:
+        return None
+    if count < len(plan.initial):
+        return np.asarray(_to_physical(study.space, plan.initial))[count]
+    trials = physical_trials(study, points, answers, study.selection.trials)
+    return np.asarray(_next_physical(study, plan, trials, jnp.asarray(count)))

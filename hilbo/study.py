@@ -1,0 +1,232 @@
+"""A study's data: trial tables <-> participants; batch refits, and aggregation of any prefix of trials, any people.
+
+    table     = read_trials("trials.csv", study)
+    cohort    = cohort_of(table, study)
+    aggregate = aggregate_cohort(study, cohort)
+
+All participants are fitted in one compiled batch over trials padded to one capacity. The population map is a
+committee machine over their posteriors (`hilbo.bcm`); its optimum is searched like a session's.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jaxtyping import Array, Float, Int
+
+from hilbo import acquisition, bcm
+from hilbo.config import Study
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.session import CANDIDATES, best_point, physical_trials
+
+__all__ = [
+    "Aggregate",
+    "Cohort",
+    "Optimum",
+    "aggregate_cohort",
+    "cohort_of",
+    "fit_cohort",
+    "individual_optima",
+    "nrmse",
+    "pooled_posterior",
+    "population",
+    "population_optimum",
+    "progress",
+]
+
+Rule = Literal["bcm", "average"]
+_BLOCK = 64  # participants predicted together
+_LARGEST_POOL = 3000  # answers: the pooled fit is cubic in their number
+
+
+class Cohort(eqx.Module):
+    """The answers of M participants, padded to one capacity.
+
+    `trials` is stacked, (M, capacity, ...); `physical` (M, capacity, d) holds the same points as tables do.
+    """
+
+    trials: Trials
+    physical: np.ndarray
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def first(self, count: int) -> "Cohort":
+        """Only everybody's first `count` trials."""
+        return Cohort(jax.vmap(lambda t: t.first(count))(self.trials), self.physical, self.names)
+
+    def of(self, names: Sequence[str]) -> "Cohort":
+        """Only these participants."""
+        unknown = [name for name in names if name not in self.names]
+        if unknown:
+            raise InputError(
+                f'participant "{unknown[0]}" is not in the table, which has {len(self.names)} participants.'
+            )
+        rows = np.array([self.names.index(name) for name in names])
+        return Cohort(jax.tree.map(lambda leaf: leaf[rows], self.trials), self.physical[rows], tuple(names))
+
+    def counts(self) -> Int[np.ndarray, " M"]:
+        """Answers of each participant."""
+        return np.asarray(self.trials.mask.sum(axis=1))
+
+
+class Optimum(eqx.Module):
+    """A point of the unit cube at which a map is largest, and the map there; leading axes for several."""
+
+    x: Float[Array, "*s d"]
+    mean: Float[Array, "*s"]
+    sd: Float[Array, "*s"]
+    class_probabilities: Float[Array, "*s C"]
+
+
+class Aggregate(eqx.Module):
+    """A study's posteriors, its population optimum by the study's rule, and what stands beside it."""
+
+    cohort: Cohort
+    posteriors: Posterior
+    optimum: Optimum
+    individuals: Optimum
+    alternatives: dict[str, Optimum]
+    """Optimum of the plain average of the latent functions, and of one GP on all answers (if not too many)."""
+
+    @property
+    def mean_of_optima(self) -> Float[Array, " d"]:
+        """Plain average of the individuals' optima in the unit cube: what the paper compares the map with."""
+        return jnp.mean(self.individuals.x, axis=0)
+
+
+def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
+    """Participants from a checked trial table (`hilbo.tables.read_trials`), in order of their first appearance.
+
+    `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
+    """
+    groups = dict(list(table.groupby("participant", sort=False)))
+    longest = max(len(group) for group in groups.values())
+    capacity = max(longest, study.selection.trials) if capacity is None else capacity
+    columns = list(study.space.names)
+    padded = [
+        physical_trials(study, g[columns].to_numpy(float), g["category"].to_numpy(), capacity) for g in groups.values()
+    ]
+    physical = np.full((len(groups), capacity, len(columns)), np.nan)
+    for row, group in zip(physical, groups.values(), strict=True):
+        row[: len(group)] = group[columns].to_numpy(float)
+    return Cohort(jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded), physical, tuple(groups))
+
+
+def fit_cohort(study: Study, cohort: Cohort, gps: OrdinalGP | None = None) -> Posterior:
+    """Everybody's posterior, stacked; with the study's model, or with `gps`, one stacked model each."""
+    return _fit_cohort(study, cohort.trials, gps)
+
+
+@eqx.filter_jit
+def _fit_cohort(study, trials, gps):
+    if gps is None:
+        return jax.vmap(lambda t: fit(study.gp, t, inference=study.inference, throw=False))(trials)
+    return jax.vmap(lambda gp, t: fit(gp, t, inference=study.inference, throw=False))(gps, trials)
+
+
+@eqx.filter_jit
+def population(
+    posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm"
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) of the population map at points of the unit cube.
+
+    Participants' predictions are made in blocks and never held all at once.
+    """
+    prior = jax.vmap(jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel.diagonal)(x)
+    if rule == "average":
+        means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors)
+        return bcm.average(means, prior[None, :] - explained)
+    evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior, block=_BLOCK)
+    return evidence.merge(prior)
+
+
+@eqx.filter_jit
+def population_optimum(
+    study: Study, posteriors: Posterior, candidates: Float[Array, "m d"], rule: Rule = "bcm"
+) -> Optimum:
+    """Where the population map's mean is largest in the feasible set."""
+    choice = acquisition.maximise(
+        population(posteriors, candidates, rule)[0],
+        candidates,
+        lambda x: population(posteriors, x[None, :], rule)[0][0],
+        from_box=study.space.from_box,
+        to_box=study.space.to_box,
+        feasible=study.space.feasible,
+    )
+    mean, variance = population(posteriors, choice.x[None, :], rule)
+    probabilities = study.gp.likelihood.class_probabilities(mean[0], variance[0])
+    return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
+
+
+@eqx.filter_jit
+def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
+    """Where each participant's posterior mean is largest in the feasible set, stacked; one after the other."""
+
+    def one(posterior):
+        x = best_point(study, posterior, candidates).x
+        mean, variance = posterior.predict(x[None, :])
+        probabilities = posterior.gp.likelihood.class_probabilities(mean[0], variance[0])
+        return Optimum(x, mean[0], jnp.sqrt(variance[0]), probabilities)
+
+    return jax.lax.map(one, posteriors, batch_size=32)
+
+
+def pooled_posterior(study: Study, cohort: Cohort) -> Posterior | None:
+    """One GP on everybody's answers, as if from one person; None if there are too many for a dense fit."""
+    mask = np.asarray(cohort.trials.mask)
+    if mask.sum() > _LARGEST_POOL:
+        return None
+    x, q = np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
+    return fit(study.gp, Trials.from_arrays(x, q), inference=study.inference, throw=False)
+
+
+def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: bool = True) -> Aggregate:
+    """Fit everybody, merge, and find the optima; the study's `rule` decides the population optimum.
+
+    `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
+    finds them in `posteriors.certificate`.
+    """
+    candidates = jnp.asarray(study.space.candidates(CANDIDATES, seed))
+    posteriors = fit_cohort(study, cohort)
+    others = {}
+    if alternatives:
+        others["average"] = population_optimum(study, posteriors, candidates, "average")
+        pooled = pooled_posterior(study, cohort)
+        if pooled is not None:
+            stacked = jax.tree.map(lambda leaf: leaf[None], pooled)
+            others["pooled"] = jax.tree.map(lambda leaf: leaf[0], individual_optima(study, stacked, candidates))
+    return Aggregate(
+        cohort=cohort,
+        posteriors=posteriors,
+        optimum=population_optimum(study, posteriors, candidates),
+        individuals=individual_optima(study, posteriors, candidates),
+        alternatives=others,
+    )
+
+
+def progress(
+    study: Study, cohort: Cohort, seed: int = 0, prefixes: Sequence[int] | None = None
+) -> tuple[Float[Array, "p d"], Float[Array, "p M d"]]:
+    """Optima (unit cube) after the first 1, 2, ... trials: of the population map (p, d), and of everybody (p, M, d)."""
+    counts = range(1, int(cohort.counts().max()) + 1) if prefixes is None else prefixes
+    candidates = jnp.asarray(study.space.candidates(CANDIDATES, seed))
+    return _progress(study, cohort.trials, candidates, jnp.asarray(list(counts)))
+
+
+@eqx.filter_jit
+def _progress(study, trials, candidates, counts):
+    def after(count):
+        posteriors = _fit_cohort(study, jax.vmap(lambda t: t.first(count))(trials), None)
+        best = individual_optima(study, posteriors, candidates).x
+        return population_optimum(study, posteriors, candidates).x, best
+
+    return jax.lax.map(after, counts)
+
+
+def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array, "*s"]:
+    """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube."""
+    return jnp.sqrt(jnp.mean((x - reference) ** 2, axis=-1))

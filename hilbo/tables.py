@@ -1,0 +1,160 @@
+"""Trial tables: CSV or Parquet, one row per answer, read and checked before anything is fitted.
+
+Columns: `participant`, `trial`, `response` and one per parameter in physical units; optional `session`, `phase`,
+`material`, `voided`; others are kept. A number means what its decimals say (correctly rounded), so that a table and
+the log it came from give the same bits. Whatever is wrong is one sentence with the file and the line.
+"""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from hilbo.config import Study
+from hilbo.errors import InputError
+
+__all__ = ["read_trials", "write_trials"]
+
+_KEY = ("participant", "session", "phase", "material", "trial")
+_TRUE = {"1", "1.0", "true", "yes"}
+_FALSE = {"", "0", "0.0", "false", "no", "nan", "none", "<na>"}
+
+
+def read_trials(path: str | os.PathLike, study: Study, material: str | None = None) -> pd.DataFrame:
+    """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
+
+    Adds the column `category` (0 = lowest response). Warm-up and voided rows are checked and left out. `material`
+    selects the rows of one material, and must be given if there are several. Raises `InputError`.
+    """
+    source = str(path)
+    text = _read_text(Path(path), source)
+    _check_columns(text, study, source)
+    if text.empty:
+        raise InputError(f"{source}: has no rows; a trial table needs at least one answer.")
+    table = text.copy()
+    table["trial"] = _numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0)).astype(
+        int
+    )
+    _refuse(text["participant"] == "", source, lambda row: "participant is empty; give each row a participant.")
+    for parameter in study.space.parameters:
+        table[parameter.name] = _parameter(text, parameter, source)
+    table["category"] = _categories(text["response"], study.responses, source)
+    voided = _flags(text, "voided", source)
+    _check_duplicates(table, source)
+    table = table[~voided & (text["phase"] != "warm-up" if "phase" in text else True)]
+    table = _of_material(table, material, source)
+    order = ["participant", *(["session"] if "session" in table else []), "trial"]
+    ranks = table["participant"].map({name: i for i, name in enumerate(table["participant"].unique())})
+    return table.assign(_rank=ranks).sort_values(["_rank", *order[1:]], kind="stable").drop(columns="_rank")
+
+
+def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
+    """Write a trial table, numbers as the shortest decimals that read back to the same bits."""
+    if Path(path).suffix == ".parquet":
+        table.to_parquet(path, index=False)
+    else:
+        table.to_csv(path, index=False, float_format=repr)
+
+
+def _read_text(path: Path, source: str) -> pd.DataFrame:
+    """Every cell as text, so that nothing is guessed; the index is the line (CSV) or the row (Parquet)."""
+    try:
+        if path.suffix == ".parquet":
+            frame = pd.read_parquet(path)
+            frame = frame.map(lambda v: "" if v is None or v is pd.NA else repr(v) if isinstance(v, float) else str(v))
+            return frame.set_axis(np.arange(1, len(frame) + 1))
+        frame = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, encoding="utf-8-sig")
+        return frame.set_axis(np.arange(2, len(frame) + 2))
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read ({error.strerror or error}); check the path.") from error
+    except pd.errors.EmptyDataError as error:
+        raise InputError(f"{source}: is empty; a trial table needs a header and at least one answer.") from error
+    except (ValueError, UnicodeDecodeError) as error:  # pandas' and pyarrow's parser errors are ValueErrors
+        reason = str(error).strip().splitlines()[-1]
+        raise InputError(f"{source}: is not a table that can be read ({reason}); save it as CSV or Parquet.") from error
+
+
+def _check_columns(text, study, source):
+    needed = ("participant", "trial", "response", *study.space.names)
+    missing = [name for name in needed if name not in text.columns]
+    if missing:
+        raise InputError(
+            f'{source}:1: column "{missing[0]}" is missing; a trial table of this study has {", ".join(needed)}.'
+        )
+
+
+def _numbers(text, column, source, words, valid):
+    """A column as float64, each cell correctly rounded; `valid` says which values are allowed."""
+
+    def number(cell):
+        try:
+            return float(cell)
+        except ValueError:
+            return np.nan
+
+    values = pd.Series([number(cell) for cell in text[column]], text.index, dtype=float)
+    wrong = ~(np.isfinite(values) & valid(values))
+    _refuse(wrong, source, lambda row: f'{column} is "{text.at[row, column]}"; it must be {words}.')
+    return values
+
+
+def _parameter(text, parameter, source):
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    words = f"a number from {parameter.low:g} to {parameter.high:g}{unit}, the study's range"
+    return _numbers(text, parameter.name, source, words, lambda v: (v >= parameter.low) & (v <= parameter.high))
+
+
+def _categories(cells, responses, source):
+    """Categories from 0: labels compared as text; ranks from 1 only if no label of the study reads as an integer."""
+    ranks_allowed = not any(label.strip().lstrip("+-").isdigit() for label in responses)
+    lookup = {label: i for i, label in enumerate(responses)}
+    if ranks_allowed:
+        lookup |= {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0")}
+    categories = cells.map(lookup)
+    ranks = f", or a rank from 1 to {len(responses)}" if ranks_allowed else ""
+    _refuse(
+        categories.isna(),
+        source,
+        lambda row: f'response is "{cells.at[row]}"; it must be one of {", ".join(responses)}{ranks}.',
+    )
+    return categories.astype(int)
+
+
+def _flags(text, column, source):
+    if column not in text:
+        return pd.Series(False, text.index)
+    cells = text[column].str.strip().str.lower()
+    _refuse(~cells.isin(_TRUE | _FALSE), source, lambda row: f'{column} is "{text.at[row, column]}"; write 1 or 0.')
+    return cells.isin(_TRUE)
+
+
+def _check_duplicates(table, source):
+    key = [column for column in _KEY if column in table]
+    again = table.duplicated(key)
+    if again.any():
+        row = again.idxmax()
+        same = (table[key] == table.loc[row, key]).all(axis=1).idxmax()
+        raise InputError(
+            f"{source}:{row}: participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} stands in line"
+            f" {same} already; each ({', '.join(key)}) may occur once."
+        )
+
+
+def _of_material(table, material, source):
+    if "material" not in table:
+        if material is not None:
+            raise InputError(f'{source}:1: column "material" is missing; without it no material can be chosen.')
+        return table
+    found = list(table["material"].unique())
+    if material is None and len(found) > 1:
+        raise InputError(f"{source}: holds answers to {len(found)} materials ({', '.join(found)}); choose one of them.")
+    if material is not None and material not in found:
+        raise InputError(f'{source}: holds no answers to material "{material}"; it has {", ".join(found)}.')
+    return table if material is None else table[table["material"] == material]
+
+
+def _refuse(wrong, source, sentence):
+    if wrong.any():
+        row = wrong.idxmax()
+        raise InputError(f"{source}:{row}: {sentence(row)}")

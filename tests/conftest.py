@@ -1,0 +1,56 @@
+"""What every test runs under: float64, strict promotion, shapes and types checked at every call of hilbo."""
+
+import itertools
+import os
+from pathlib import Path
+
+import jax
+import pytest
+from hypothesis import settings
+from jaxtyping import install_import_hook
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+# Compiled functions are kept between runs, and shared by the workers of one run.
+if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+    jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+install_import_hook("hilbo", "beartype.beartype")  # stays for the whole run: hilbo is imported by the tests
+
+# The same examples in every run; pytest --hypothesis-profile=search draws new ones.
+settings.register_profile("fixed", deadline=None, derandomize=True)
+settings.register_profile("search", deadline=None, max_examples=500, print_blob=True)
+settings.load_profile("fixed")
+
+REQUIRE_ALL = os.environ.get("HILBO_REQUIRE_ALL", "") not in ("", "0")
+
+
+@pytest.fixture
+def getkey():
+    """A function that gives another random key at each call, the same ones in every run."""
+    seeds = itertools.count()
+    return lambda: jax.random.key(next(seeds))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    return _no_skip((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    return _no_skip((yield))
+
+
+def _no_skip(report):
+    """Under HILBO_REQUIRE_ALL a skipped test, or a skipped file, has failed; an expected failure is none."""
+    if REQUIRE_ALL and report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[-1] if isinstance(report.longrepr, tuple) else report.longrepr
+        report.outcome = "failed"
+        report.longrepr = f"skipped, and HILBO_REQUIRE_ALL allows no skip: {reason}"
+    return report

@@ -1,0 +1,85 @@
+"""The RBF covariance against its formula in mpmath; its gram matrix, dtypes and derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mpmath import mp
+
+from hilbo.kernels import RBF, gram
+
+rng = np.random.default_rng(3)
+X, Y = rng.random((7, 3)), rng.random((5, 3))
+THETAS = [30.0, 1e-2, (4.0, 9.0, 2.5)]
+
+
+def exact(x, y, theta, variance):
+    thetas = np.broadcast_to(theta, x.shape)
+    with mp.workdps(40):
+        squares = [mp.mpf(float(t)) * (mp.mpf(float(a)) - mp.mpf(float(b))) ** 2 for t, a, b in zip(thetas, x, y, strict=True)]
+        return float(mp.mpf(float(variance)) * mp.exp(-mp.fsum(squares)))
+
+
+@pytest.mark.parametrize("theta", THETAS)
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_gram_against_mpmath(theta, dtype):
+    x, y, scale = X.astype(dtype), Y.astype(dtype), np.asarray(theta, dtype)
+    found = gram(RBF(scale, dtype(1.7)), jnp.asarray(x), jnp.asarray(y))
+    expected = [[exact(p, r, scale, dtype(1.7)) for r in y] for p in x]
+    assert found.dtype == dtype
+    np.testing.assert_allclose(found, expected, rtol=60 * np.finfo(dtype).eps)
+
+
+def test_near_points_keep_their_difference():
+    """1 - k/variance = theta |x - y|^2 would be rounding if it were formed from |x|^2 + |y|^2 - 2xy."""
+    x = jnp.array([0.7, 0.3, 0.9])
+    y = x + jnp.array([1e-6, 0.0, 0.0])
+    np.testing.assert_allclose(1.0 - RBF(1e4)(x, y), 1e4 * float(y[0] - x[0]) ** 2, rtol=2e-8)
+
+
+@pytest.mark.parametrize("theta", THETAS)
+def test_gram_of_repeated_points_is_symmetric_with_the_variance_on_the_diagonal(theta):
+    x = jnp.asarray(np.concatenate([X, X[:2], X[:1]]))
+    matrix = np.asarray(gram(RBF(theta, 2.5), x, x))
+    np.testing.assert_array_equal(matrix, matrix.T)
+    np.testing.assert_array_equal(np.diagonal(matrix), jax.vmap(RBF(theta, 2.5).diagonal)(x))
+    np.testing.assert_array_equal(matrix[0], matrix[7])
+    assert np.linalg.eigvalsh(matrix)[0] > -1e-14
+
+
+def test_scalar_theta_is_the_same_theta_in_every_dimension():
+    x, y = jnp.asarray(X), jnp.asarray(Y)
+    np.testing.assert_array_equal(gram(RBF(3.0), x, y), gram(RBF((3.0, 3.0, 3.0)), x, y))
+
+
+def test_a_theta_of_the_wrong_length_is_refused():
+    with pytest.raises(ValueError, match="broadcast"):
+        RBF((1.0, 2.0))(jnp.zeros(3), jnp.zeros(3))
+
+
+def test_gradients_are_those_of_the_formula():
+    x, y, theta = jnp.asarray(X[0]), jnp.asarray(Y[0]), jnp.array([4.0, 9.0, 2.5])
+    kernel = RBF(theta, 1.7)
+    by_kernel, by_x = jax.grad(lambda k, x: k(x, y), argnums=(0, 1))(kernel, x)
+    value = kernel(x, y)
+    np.testing.assert_allclose(by_kernel.theta, -value * (x - y) ** 2, rtol=1e-14)
+    np.testing.assert_allclose(by_kernel.variance, value / 1.7, rtol=1e-14)
+    np.testing.assert_allclose(by_x, -2.0 * theta * (x - y) * value, rtol=1e-14)
+
+
+def test_dtypes_of_the_hyperparameters():
+    kernel = RBF((1.0, 2.0, 3.0), 2)
+    assert kernel.theta.dtype == kernel.variance.dtype == jnp.float64
+    assert RBF(np.float32(3.0)).theta.dtype == jnp.float32
+    assert RBF(jnp.array([1, 2])).theta.dtype == jnp.float64
+
+
+@settings(deadline=None, max_examples=40)
+@given(st.floats(1e-2, 1e4), st.floats(1e-3, 1e4), st.integers(0, 10**6))
+def test_gram_is_positive_semidefinite_up_to_rounding(theta, variance, seed):
+    x = jnp.asarray(np.random.default_rng(seed).random((12, 2)))
+    matrix = np.asarray(gram(RBF(theta, variance), x, x))
+    assert np.linalg.eigvalsh(matrix)[0] >= -1e-14 * variance * 12
+    assert matrix.max() == variance
