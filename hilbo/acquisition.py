@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from hilbo.linalg import eigh
 from hilbo.normal import HALF_LOG_2PI, excess_hazard
 
 __all__ = ["UCB", "Choice", "LogEI", "Mean", "Score", "TopCategory", "maximise", "thompson"]
@@ -164,7 +165,7 @@ def thompson(
 
     `covariance` is the joint posterior covariance, (m, m); its eigenvector root needs no jitter.
     """
-    eigenvalues, vectors = jnp.linalg.eigh(covariance)
+    eigenvalues, vectors = eigh(covariance)
     root = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
     draw = mean + root @ jax.random.normal(key, mean.shape, mean.dtype)
     return jnp.argmax(draw), draw

@@ -55,7 +55,7 @@ def combine(
     Where the explained variance is known directly, [`combine_explained`][] is more precise for weak experts.
     """
     prior = _checked_prior(prior_variance, means)
-    return combine_explained(means, prior - variances, prior, mask=mask, throw=throw)
+    return combine_explained(means, prior[None, :] - variances, prior, mask=mask, throw=throw)
 
 
 def combine_explained(
@@ -147,8 +147,8 @@ def _invalid(explained, prior, mask):
 
 def _raise_if(invalid, evidence):
     message = (
-        "bcm: an expert's variance is not positive, or the experts' variances exceed the prior's so far that no positive"
-        " precision is left; check that prior_variance is the one all experts were fitted with"
+        "bcm: an expert's variance is not positive, or the experts' variances exceed the prior's so far that no"
+        " positive precision is left; check that prior_variance is the one all experts were fitted with"
     )
     if isinstance(invalid, jax.core.Tracer):
         return eqx.error_if(evidence, invalid, message)

@@ -9,7 +9,7 @@ K is the prior covariance of the eta's, of whatever rank (the same stimulus aske
   1: the residual |R' grad l - v| *bounds* the distance to the mode, in units of the prior's standard deviations.
 * The steps are damped by Armijo's rule (`_DampedNewton`, an optimistix root finder), so every start converges.
 * Derivatives of any order come from the stationarity eta = K grad l(eta) by the implicit function theorem, and from
-  C = (K + 1/W)^-1 written so that W = 0 is no special case. R, whose derivative blows up, is not differentiated.
+  C = (K + 1/W)^-1 written so that W = 0 is no special case. R, whose derivative may not exist, has no part in them.
 
 Evidence: log q(data) = sum l - a'eta/2 - log|I + KW|/2, a = grad l(eta) at the mode.
 References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1; paper, section IV-1.
@@ -23,10 +23,27 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-__all__ = ["Certificate", "LaplacePosterior", "explained_variance", "laplace"]
+from hilbo.linalg import cholesky, eigh, solve_lower, solve_lower_transposed
 
-LogLikelihood = Callable[[Float[Array, " n"]], Float[Array, " n"]]
-"""Pointwise log-likelihood terms: element i of the result depends on element i of the argument alone."""
+__all__ = ["Certificate", "LaplacePosterior", "Pointwise", "Terms", "explained_variance", "laplace"]
+
+Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
+"""Log-likelihood terms l_i(eta_i), their slopes l_i' and curvatures -l_i'' >= 0; [`Pointwise`][] derives the latter."""
+
+
+class Pointwise(eqx.Module):
+    """Terms of which only the values are given, (n,) -> (n,) elementwise: slopes and curvatures by differentiation."""
+
+    log_likelihood: Callable[[Float[Array, " n"]], Float[Array, " n"]]
+
+    def __call__(self, eta):
+        ones = jnp.ones_like(eta)  # the terms are independent: one tangent serves them all
+
+        def value_and_slope(at):
+            return jax.jvp(self.log_likelihood, (at,), (ones,))
+
+        (value, slope), (_, second) = jax.jvp(value_and_slope, (eta,), (ones,))
+        return value, slope, -second
 
 
 class Certificate(eqx.Module):
@@ -66,52 +83,42 @@ class LaplacePosterior(eqx.Module):
 
 def laplace(
     covariance: Float[Array, "n n"],
-    log_likelihood: LogLikelihood,
+    terms: Terms,
     *,
     start: Float[Array, " n"] | None = None,
-    max_steps: int = 200,
+    max_steps: int = 100,
 ) -> LaplacePosterior:
     """Approximate p(eta | data) by a Gaussian at its mode.
 
     **Arguments:**
 
     - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
-    - `log_likelihood`: the terms, (n,) -> (n,), as a pytree (a closure over traced arrays must be an `eqx.Module` or
-      `jax.tree_util.Partial`), differentiable four times.
+    - `terms`: eta (n,) -> values, slopes and curvatures, (n,) each; a pytree (an `eqx.Module`, say) if it holds
+      arrays that are traced. [`Pointwise`][] makes one from values alone.
     - `start`: `weights` of an earlier, similar fit; changes the number of steps, not the result.
 
-    **Returns:** a [`LaplacePosterior`][]; differentiable in `covariance` and in the arrays of `log_likelihood`. Never
-    raises: read `certificate.converged`.
+    **Returns:** a [`LaplacePosterior`][]; differentiable in `covariance` and in the arrays of `terms`. Never raises:
+    read `certificate.converged`.
     """
     start = jnp.zeros_like(covariance[0]) if start is None else start
-    root, discarded = _square_root(jax.lax.stop_gradient(covariance))
-    solution = optx.root_find(
-        _stationarity,
-        _DampedNewton(),
-        jnp.zeros_like(start),
-        (log_likelihood, covariance),
-        options={"root": root, "start": root.T @ jax.lax.stop_gradient(start)},
-        max_steps=max_steps,
-        throw=False,
-    )
-    mode, state = solution.value, solution.state
-    terms, gradient, curvature = _expand(log_likelihood, mode)
+    mode, residual, tolerance, iterations, discarded = _find_mode(terms, covariance, start, max_steps)
+    values, gradient, curvature = terms(mode)
     inverse, log_determinant = _inverse_and_log_determinant(covariance, curvature)
     fixed = jax.lax.stop_gradient((covariance, curvature))
     factor, condition = _factor(*fixed)
-    log_evidence = jnp.sum(terms) - 0.5 * gradient @ mode - 0.5 * log_determinant
+    log_evidence = jnp.sum(values) - 0.5 * gradient @ mode - 0.5 * log_determinant
     prior_variance = jnp.diagonal(fixed[0])
     largest = jnp.max(prior_variance)
     variance = prior_variance - jnp.sum((factor @ fixed[0]) ** 2, axis=0)
     certificate = Certificate(
-        residual=state.residual,
-        tolerance=state.tolerance,
-        iterations=jnp.asarray(solution.stats["num_steps"]),
+        residual=residual,
+        tolerance=tolerance,
+        iterations=iterations,
         jitter=discarded / largest,
         condition=condition,
         smallest_variance=jnp.min(jnp.where(fixed[1] > 0, variance, largest)),
         variance_resolution=jnp.finfo(mode.dtype).eps * largest * mode.shape[0] ** 0.5,
-        converged=state.residual <= state.tolerance,
+        converged=residual <= tolerance,
     )
     return LaplacePosterior(mode, gradient, factor, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 
@@ -136,24 +143,46 @@ def _explained_variance_jvp(primals, tangents):
     return explained_variance(*primals), tangent
 
 
-def _expand(log_likelihood, eta):
-    """The terms, their first derivatives, and minus their second, all (n,): one tangent serves all the terms."""
-    ones = jnp.ones_like(eta)
-
-    def value_and_slope(at):
-        return jax.jvp(log_likelihood, (at,), (ones,))
-
-    (terms, slope), (_, second) = jax.jvp(value_and_slope, (eta,), (ones,))
-    return terms, slope, -second
-
-
 # --- the mode
 
 
+@eqx.filter_custom_jvp
+def _find_mode(terms, covariance, start, max_steps):
+    """The mode, its residual and the tolerance that was to be met, steps taken, and what the square root dropped."""
+    root, discarded = _square_root(covariance)
+    solution = optx.root_find(
+        _stationarity,
+        _DampedNewton(),
+        jnp.zeros_like(start),
+        (terms, covariance),
+        options={"root": root, "start": root.T @ start},
+        max_steps=max_steps,
+        throw=False,
+    )
+    state = solution.state
+    return solution.value, state.residual, state.tolerance, jnp.asarray(solution.stats["num_steps"]), discarded
+
+
+@_find_mode.def_jvp
+def _find_mode_jvp(primals, tangents):
+    """eta = K grad l(eta), hence (I + K W) d eta = d(K grad l) at fixed eta, and (I + K W)^-1 = I - K C."""
+    terms, covariance, _, _ = primals
+    found = _find_mode(*primals)
+    mode = found[0]
+
+    def image(terms, matrix):
+        _, slope, curvature = terms(mode)
+        return matrix @ slope, curvature
+
+    (_, curvature), (moved, _) = eqx.filter_jvp(image, (terms, covariance), tangents[:2])
+    inverse, _ = _inverse_and_log_determinant(covariance, curvature)
+    return found, (moved - covariance @ (inverse @ moved), None, None, None, None)
+
+
 def _stationarity(eta, args):
-    """eta - K grad l(eta), zero at the mode: what the implicit function theorem differentiates (the steps do not use it)."""
-    log_likelihood, covariance = args
-    return eta - covariance @ jax.jvp(log_likelihood, (eta,), (jnp.ones_like(eta),))[1]
+    """eta - K grad l(eta), zero at the mode: what the solver is asked for."""
+    terms, covariance = args
+    return eta - covariance @ terms(eta)[1]
 
 
 def _square_root(covariance):
@@ -161,7 +190,7 @@ def _square_root(covariance):
 
     K is positive semi-definite, so a negative eigenvalue is rounding, and without it K changes by no more than itself.
     """
-    eigenvalues, vectors = jnp.linalg.eigh(covariance)
+    eigenvalues, vectors = eigh(covariance)
     root = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
     return root, jnp.where(eigenvalues[0] < 0, -eigenvalues[0], 0.0)
 
@@ -190,8 +219,8 @@ class _DampedNewton(optx.AbstractRootFinder):
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         del fn, args, f_struct, aux_struct, tags
         infinite = jnp.asarray(jnp.inf, y.dtype)
-        zero = jnp.zeros_like(infinite)
-        return _NewtonState(options["start"], jnp.zeros_like(y), zero, zero, -infinite, infinite, zero)
+        zero, one = jnp.zeros_like(infinite), jnp.ones_like(infinite)
+        return _NewtonState(options["start"], jnp.zeros_like(y), one, zero, -infinite, infinite, zero)
 
     def step(self, fn, y, args, options, state, tags):
         del fn, tags
@@ -199,26 +228,29 @@ class _DampedNewton(optx.AbstractRootFinder):
         trial = state.v + state.scale * state.direction
         taken, slack = _newton_state(args[0], root, trial)
         risen = taken.objective >= state.objective + 1e-4 * state.scale * state.gain - slack
-        refused = eqx.tree_at(lambda s: s.scale, state, 0.5 * state.scale)
+        # A start without a finite objective has no direction in which to look for one: that ends the search.
+        halved = jnp.where(jnp.isfinite(state.objective), 0.5 * state.scale, 0.0)
+        refused = eqx.tree_at(lambda s: s.scale, state, halved)
         state = jax.tree.map(lambda new, old: jnp.where(risen, new, old), taken, refused)
         return jnp.where(risen, root @ trial, y), state, None
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
-        stalled = (state.scale > 0.0) & (state.scale < 1e-12)
-        return (state.residual <= state.tolerance) | stalled, optx.RESULTS.successful
+        return (state.residual <= state.tolerance) | (state.scale < 1e-12), optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, state, tags, result
         return y, aux, {}
 
 
-def _newton_state(log_likelihood, root, v):
+def _newton_state(terms, root, v):
     """Everything at `v`: objective, residual and what it can resolve, next direction; and the objective's rounding."""
-    terms, slope, curvature = _expand(log_likelihood, root @ v)
+    values, slope, curvature = terms(root @ v)
     uphill = root.T @ slope - v
     newton_matrix = jnp.eye(v.shape[0], dtype=v.dtype) + (root.T * curvature[None, :]) @ root
-    direction = jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(newton_matrix), True), uphill)
+    lower = cholesky(newton_matrix)
+    half = solve_lower(lower, uphill[:, None])
+    direction = solve_lower_transposed(lower, half)[:, 0]
     epsilon, magnitude = jnp.finfo(v.dtype).eps, jnp.abs(root)
     summed = magnitude.T @ (jnp.abs(slope) + curvature * (magnitude @ jnp.abs(v))) + jnp.abs(v)
     state = _NewtonState(
@@ -226,11 +258,11 @@ def _newton_state(log_likelihood, root, v):
         direction=direction,
         scale=jnp.ones_like(v[0]),
         gain=uphill @ direction,
-        objective=jnp.sum(terms) - 0.5 * v @ v,
+        objective=jnp.sum(values) - 0.5 * v @ v,
         residual=jnp.linalg.norm(uphill),
         tolerance=jnp.maximum(epsilon ** (2 / 3), 4.0 * epsilon * jnp.linalg.norm(summed)),
     )
-    return state, 4.0 * epsilon * (jnp.sum(jnp.abs(terms)) + 0.5 * v @ v)
+    return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v)
 
 
 # --- the matrix C = (K + 1/W)^-1 = W^(1/2) B^-1 W^(1/2),  B = I + W^(1/2) K W^(1/2)
@@ -239,21 +271,20 @@ def _newton_state(log_likelihood, root, v):
 def _factorise(covariance, curvature):
     root = jnp.sqrt(curvature)
     matrix = jnp.eye(root.shape[0], dtype=root.dtype) + root[:, None] * covariance * root[None, :]
-    return root, matrix, jnp.linalg.cholesky(matrix)
+    return root, matrix, cholesky(matrix)
 
 
 def _factor(covariance, curvature):
     """V = L^-1 W^(1/2) with B = L L', so V'V = C; and a bound on B's condition, as B has no eigenvalue below 1."""
     root, matrix, lower = _factorise(covariance, curvature)
-    factor = jax.scipy.linalg.solve_triangular(lower, jnp.diag(root), lower=True)
-    return factor, jnp.linalg.norm(matrix)
+    return solve_lower(lower, jnp.diag(root)), jnp.linalg.norm(matrix)
 
 
 @jax.custom_jvp
 def _inverse_and_log_determinant(covariance, curvature):
     """C, and log|B| = log|I + K W|."""
     root, _, lower = _factorise(covariance, curvature)
-    factor = jax.scipy.linalg.solve_triangular(lower, jnp.diag(root), lower=True)
+    factor = solve_lower(lower, jnp.diag(root))
     return factor.T @ factor, 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
 
 

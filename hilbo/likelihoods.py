@@ -73,6 +73,12 @@ class OrdinalProbit(eqx.Module):
         f, lower, upper, noise = self._edges(f, q)
         return _truncated(f, lower, upper, noise).log_mass
 
+    def expand(self, f: ArrayLike, q: ArrayLike) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+        """log p(q | f), its derivative in `f`, and minus its second derivative (in [0, 1 / noise^2]), at one price."""
+        f, lower, upper, noise = self._edges(f, q)
+        truncated = _truncated(f, lower, upper, noise)
+        return truncated.log_mass, truncated.mean / noise, truncated.curvature / noise**2
+
     def class_probabilities(self, mean: ArrayLike, variance: ArrayLike = 0.0) -> Float[Array, " categories"]:
         """Probabilities (C,) of the categories when f ~ N(mean, variance); they sum to 1 within rounding.
 
@@ -237,7 +243,7 @@ def _tail(low, high, width, product):
 
 
 def _centre(low, high, width, product):
-    """low < 0 <= high, -low <= high: the mass outside is a sum of tails, and log p = log1p(-outside) keeps its digits."""
+    """low < 0 <= high, -low <= high: the mass outside is a sum of tails, so log p = log1p(-outside) is precise."""
     short, rest = jnp.abs(low.short), jnp.where(low.short < 0, -low.rest, low.rest)
     density = jnp.exp(-0.5 * short**2) * jnp.exp(-rest * (short + 0.5 * rest) - HALF_LOG_2PI)
     nearest, farthest = jnp.abs(short + rest), jnp.abs(high)

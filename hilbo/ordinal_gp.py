@@ -79,7 +79,7 @@ class Trials(eqx.Module):
         return self.x.shape[-2]
 
     def append(self, x: Float[Array, " d"], q: ArrayLike) -> "Trials":
-        """With one more answer in the first free row: the shapes stay, so nothing recompiles. A full table becomes NaN."""
+        """With one more answer in the first free row: the shapes stay, nothing recompiles. A full table becomes NaN."""
         row = jnp.sum(self.mask)
         full = row >= self.capacity
         return Trials(
@@ -107,14 +107,16 @@ def _check_arrays(points, answers):
 
 
 class _OrdinalTerms(eqx.Module):
-    """The answers as pointwise log-likelihood terms, 0 where there is no answer."""
+    """The answers as log-likelihood terms with slopes and curvatures, 0 where there is no answer."""
 
     likelihood: OrdinalProbit
     q: Int[Array, " n"]
     mask: Bool[Array, " n"]
 
-    def __call__(self, eta: Float[Array, " n"]) -> Float[Array, " n"]:
-        return jnp.where(self.mask, jax.vmap(self.likelihood.log_prob)(eta, self.q), jnp.zeros_like(eta))
+    def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+        expansion = jax.vmap(self.likelihood.expand)(eta, self.q)
+        value, slope, curvature = (jnp.where(self.mask, part, jnp.zeros_like(part)) for part in expansion)
+        return value, slope, curvature
 
 
 class Posterior(eqx.Module):

@@ -50,7 +50,7 @@ def design(study: Study, seed: int, candidates: int = CANDIDATES) -> Design:
 
 
 def next_point(study: Study, plan: Design, trials: Trials, trial: Int[Array, ""] | int) -> Float[Array, " d"]:
-    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition function; traceable."""
+    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition; traceable."""
     posterior = fit(study.gp, trials, inference=study.inference, throw=False)
     if study.selection.acquisition == "thompson":
         return _thompson_point(posterior, plan, trial)
@@ -74,7 +74,7 @@ def next_point(study: Study, plan: Design, trials: Trials, trial: Int[Array, ""]
 
 
 def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
-    """Where the posterior mean is largest in the feasible set: the session's optimum (paper, algorithm 1, last line)."""
+    """Where the posterior mean is largest in the feasible set: the session's optimum (paper, algorithm 1)."""
     return acquisition.maximise(
         posterior.mean(candidates),
         candidates,

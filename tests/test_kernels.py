@@ -18,7 +18,8 @@ THETAS = [30.0, 1e-2, (4.0, 9.0, 2.5)]
 def exact(x, y, theta, variance):
     thetas = np.broadcast_to(theta, x.shape)
     with mp.workdps(40):
-        squares = [mp.mpf(float(t)) * (mp.mpf(float(a)) - mp.mpf(float(b))) ** 2 for t, a, b in zip(thetas, x, y, strict=True)]
+        triples = (map(mp.mpf, map(float, triple)) for triple in zip(thetas, x, y, strict=True))
+        squares = [t * (a - b) ** 2 for t, a, b in triples]
         return float(mp.mpf(float(variance)) * mp.exp(-mp.fsum(squares)))
 
 

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from helpers import check_grad
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp
@@ -86,14 +87,14 @@ def test_log_prob_against_mpmath(dtype):
             assert distance(value, target) <= bound * abs(target)
 
 
-@pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-10), (np.float32, 1e-4)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-4)])
 def test_gradient_against_mpmath(dtype, tolerance):
     noise = grid(dtype)[3].astype(float)
     for value, (_, target, *_), c in zip(found(dtype)[1], exact(dtype), noise, strict=True):
         assert distance(value, target) <= tolerance * max(abs(target), 1 / c)
 
 
-@pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-9), (np.float32, 1e-3)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 1e-3)])
 def test_curvature_against_mpmath(dtype, tolerance):
     noise = grid(dtype)[3].astype(float)
     for value, (_, _, target, _), c in zip(found(dtype)[2], exact(dtype), noise, strict=True):
@@ -124,7 +125,7 @@ def exact_slopes(f, q, t, noise):
     return slopes[1], slopes[2], by_noise
 
 
-@pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-10), (np.float32, 1e-4)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-4)])
 def test_gradients_in_thresholds_and_noise_against_mpmath(dtype, tolerance):
     cases = list(zip(*grid(dtype), *found(dtype)[4:], strict=True))[::7]
     for f, q, t, noise, by_thresholds, by_noise in cases:
@@ -135,7 +136,7 @@ def test_gradients_in_thresholds_and_noise_against_mpmath(dtype, tolerance):
         assert distance(by_noise, slope) <= tolerance * max(abs(slope), steepest, 1 / float(noise))
 
 
-@pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-8), (np.float32, 1e-2)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-8), (np.float32, 1e-2)])
 def test_third_derivative_against_differences_at_40_digits(dtype, tolerance):
     for f, q, t, noise, value in list(zip(*grid(dtype), found(dtype)[3], strict=True))[::37]:
         edges, c = [-mp.inf, *t, mp.inf], float(noise)
@@ -147,6 +148,18 @@ def test_third_derivative_against_differences_at_40_digits(dtype, tolerance):
 
             target = -(curvature(mp.mpf(float(f)) + step) - curvature(mp.mpf(float(f)) - step)) / (2 * step)
         assert distance(value, target) <= tolerance / c**3
+
+
+@pytest.mark.parametrize("q", [0, 1, 2])
+@pytest.mark.parametrize(("f", "width"), [(-0.4, 0.3), (0.1, 2.0), (3.9, 0.9), (-1.2, 6.0)])
+def test_second_and_third_derivatives_in_everything(q, f, width):
+    """The evidence gradient in thresholds and noise needs the mixed ones; one category in each regime of the code."""
+    args = f, np.array([-0.2, -0.2 + 0.6 * width]), 0.6
+    slopes = jax.jit(
+        lambda f, t, c: jnp.stack([gradient(f, q, t, c), second(f, q, t, c), by_parameters(f, q, t, c)[1]])
+    )
+    check_grad(slopes, *args, rtol=1e-8)
+    check_grad(jax.jit(lambda f, t, c: by_parameters(f, q, t, c)[0]), *args, rtol=1e-8)
 
 
 def test_the_oracle_agrees_with_a_plain_difference_at_2500_digits():
@@ -178,7 +191,7 @@ def test_nothing_is_lost_far_outside(dtype, noise):
     np.testing.assert_allclose(scaled[wrong], 1.0, rtol=1e-5)
 
 
-@pytest.mark.parametrize("dtype, tolerance", [(np.float64, 1e-15), (np.float32, 1e-6)])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-15), (np.float32, 1e-6)])
 @pytest.mark.parametrize("categories", range(2, 11))
 def test_class_probabilities_sum_to_one(dtype, tolerance, categories):
     rng = np.random.default_rng(categories)
@@ -240,7 +253,8 @@ def test_mirror_symmetry(z, width, noise, q):
     values = [evaluate(*(jnp.asarray(v)[None] for v in args)) for args in ((f, q, t, noise), mirrored)]
     (p, g, w, s, by_t, by_c), (p_, g_, w_, s_, by_t_, by_c_) = (list(map(np.asarray, v)) for v in values)
     found = np.array([p, g * noise, w * noise**2, s * noise**3])
-    np.testing.assert_allclose(found, np.array([p_, -g_ * noise, w_ * noise**2, -s_ * noise**3]), rtol=1e-13, atol=1e-13)
+    turned = np.array([p_, -g_ * noise, w_ * noise**2, -s_ * noise**3])
+    np.testing.assert_allclose(found, turned, rtol=1e-13, atol=1e-13)
     scale = np.max(np.abs(by_t))
     np.testing.assert_allclose(by_t, -by_t_[:, ::-1], rtol=0, atol=1e-13 * scale)
     np.testing.assert_allclose(by_c, by_c_, rtol=1e-13, atol=1e-13 * scale)
@@ -254,6 +268,6 @@ def test_two_categories_are_the_probit():
         np.testing.assert_allclose(jax.vmap(lambda s, q=q: likelihood.log_prob(s, q))(f), expected, rtol=1e-12)
 
 
-@pytest.mark.parametrize("thresholds, noise", [((0.5, -0.5), 0.5), ((-0.5, 0.5), -0.5), ((-0.5, 0.5), 0.0)])
+@pytest.mark.parametrize(("thresholds", "noise"), [((0.5, -0.5), 0.5), ((-0.5, 0.5), -0.5), ((-0.5, 0.5), 0.0)])
 def test_nonsense_gives_nan_and_no_plausible_number(thresholds, noise):
     assert np.isnan(OrdinalProbit(thresholds, noise).log_prob(0.0, 1))

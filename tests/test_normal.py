@@ -17,18 +17,19 @@ def exact_excess_hazard(z, digits=40):
 
 
 def relative_errors(found, points):
-    return [abs(float(mp.mpf(float(v)) / exact_excess_hazard(float(z)) - 1)) for v, z in zip(found, points, strict=True)]
+    pairs = zip(map(float, found), map(float, points), strict=True)
+    return [abs(float(v / exact_excess_hazard(z) - 1)) for v, z in pairs]
 
 
 POINTS = np.concatenate([[0.0, 1e-300, 1e-8, 4.0], np.linspace(0, 50, 301), np.logspace(-3, 7, 100)])
 
 
-@pytest.mark.parametrize("dtype, ulps", [(np.float64, 12), (np.float32, 12)])
-def test_excess_hazard_against_mpmath(dtype, ulps):
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_excess_hazard_against_mpmath(dtype):
     points = POINTS.astype(dtype)
     found = jax.jit(normal.excess_hazard)(jnp.asarray(points))
     assert found.dtype == dtype
-    assert max(relative_errors(found, points)) < ulps * np.finfo(dtype).eps
+    assert max(relative_errors(found, points)) < 4 * np.finfo(dtype).eps
 
 
 def test_at_infinity_it_vanishes():

@@ -1,0 +1,210 @@
+"""Hyperparameters by maximum evidence, alone or with weak priors, for one participant or shared by all.
+
+Unconstrained coordinates: log theta, log variance, log noise, the first threshold and the logs of the gaps between
+thresholds, so that learnt thresholds stay ordered. What is not learnt keeps the model's value. Two freedoms of the
+model have to be fixed: its scale (f, thresholds and noise times s, variance times s^2, give the same answers), by not
+learning all of variance, noise and thresholds together; and its shift, which the prior's mean 0 fixes.
+
+Weak priors, centred at the model's own values: log theta sd 1.5, log variance, log noise and log gaps sd 1, first
+threshold sd 1 in units of the prior's standard deviation. Few ordinal answers often leave the evidence without a
+maximum (theta to 0 or infinity); the result then says so instead of printing digits.
+Reference: Rasmussen & Williams (2006), section 5.5.1; paper, section IV-3 (robustness check).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+
+__all__ = ["Learned", "Learnable", "log_prior", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
+
+Learnable = Literal["theta", "variance", "noise", "thresholds"]
+Coordinates = dict[str, Float[Array, "..."]]
+
+_RUNAWAY = 6.9  # a factor of 1000: that far from where the search began there is no maximum to speak of
+_PRIOR_SD = {"theta": 1.5, "variance": 1.0, "noise": 1.0, "first": 1.0, "gaps": 1.0}
+_FIELDS = {"theta": ("theta",), "variance": ("variance",), "noise": ("noise",), "thresholds": ("first", "gaps")}
+
+
+class Learned(eqx.Module):
+    """A model with learnt hyperparameters, and how the search for it ended; leading axes for several people."""
+
+    gp: OrdinalGP
+    log_evidence: Float[Array, "*M"]
+    """Of the answers, without the prior's part."""
+    steps: Int[Array, "*M"]
+    converged: Bool[Array, "*M"]
+    """The gradient vanished, and every fit on the way to it held its certificate at the end."""
+    runaway: Bool[Array, "*M"]
+    """A hyperparameter moved by more than a factor 1000: the evidence has no maximum in reach."""
+    learn: tuple[Learnable, ...] = eqx.field(static=True)
+
+
+def maximise_evidence(
+    gp: OrdinalGP,
+    trials: Trials,
+    learn: Sequence[Learnable] = ("theta", "noise"),
+    *,
+    weak_priors: bool = False,
+    starts: int = 4,
+    max_steps: int = 100,
+) -> Learned:
+    """The hyperparameters under which one person's answers are most probable; under `jax.vmap`, each person's own.
+
+    **Arguments:**
+
+    - `gp`: starting values, and the values of what is not learnt.
+    - `learn`: which of "theta", "variance", "noise", "thresholds". A `theta` of shape (d,) is learnt per dimension.
+    - `weak_priors`: add the log prior above.
+    - `starts`: the search begins at the model's values with theta and noise scaled by powers of 2; the best end wins.
+    """
+    return _maximise(gp, jax.tree.map(lambda leaf: leaf[None], trials), learn, weak_priors, starts, max_steps)
+
+
+def maximise_shared_evidence(
+    gp: OrdinalGP,
+    trials: Trials,
+    learn: Sequence[Learnable] = ("theta", "noise", "thresholds"),
+    *,
+    weak_priors: bool = False,
+    starts: int = 4,
+    max_steps: int = 100,
+) -> Learned:
+    """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences."""
+    return _maximise(gp, trials, learn, weak_priors, starts, max_steps)
+
+
+def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[Learnable]) -> Float[Array, ""]:
+    """Log density of the weak priors at `gp`, up to a constant; `centre` is where they are centred."""
+    here, there = _coordinates(gp, learn), _coordinates(centre, learn)
+    scale = dict.fromkeys(here, 1.0) | {"first": jnp.sqrt(centre.kernel.variance)}
+    parts = [jnp.sum(((here[k] - there[k]) / (_PRIOR_SD[k] * scale[k])) ** 2) for k in here]
+    return -0.5 * jnp.sum(jnp.stack(parts))
+
+
+def _maximise(gp, trials, learn, weak_priors, starts, max_steps):
+    learn = _checked(learn)
+    # Per answer the cost has curvatures near 1, so that the first step, down the bare gradient, is a sensible one.
+    answers = jnp.sum(trials.mask, dtype=gp.likelihood.noise.dtype) + 1.0
+
+    def cost(coordinates, _):
+        model = _model(coordinates, gp)
+        evidence, certified = _evidence(model, trials)
+        prior = log_prior(model, gp, learn) if weak_priors else jnp.zeros_like(evidence)
+        return -(evidence + prior) / answers, (evidence, certified)
+
+    def search(start):
+        solver = optx.BFGS(rtol=1e-6, atol=1e-8)
+        return optx.minimise(cost, solver, start, has_aux=True, max_steps=max_steps, throw=False)
+
+    def ended(start):
+        solution = search(start)
+        value, (evidence, certified) = cost(solution.value, None)
+        # An evidence without its certificate is no evidence: such an end never wins.
+        value = jnp.where(certified & jnp.isfinite(value), value, jnp.inf)
+        done = (solution.result == optx.RESULTS.successful) & certified
+        return solution.value, value, evidence, done, jnp.asarray(solution.stats["num_steps"])
+
+    begin = _coordinates(gp, learn)
+    ends, values, evidences, done, steps = jax.vmap(ended)(_spread(begin, starts))
+    best = jnp.argmin(values)
+    chosen = jax.tree.map(lambda leaf: leaf[best], ends)
+    moved = [jnp.max(jnp.abs(chosen[k] - begin[k])) for k in chosen if k != "first" and chosen[k].size]
+    runaway = jnp.max(jnp.stack(moved)) > _RUNAWAY
+    return Learned(_model(chosen, gp), evidences[best], steps[best], done[best], runaway, learn)
+
+
+def _evidence(gp, trials):
+    """Summed log evidence of stacked trials, and whether every certificate holds."""
+
+    def one(person):
+        posterior = fit(gp, person, throw=False)
+        return posterior.log_evidence, posterior.certificate.converged
+
+    evidences, converged = jax.vmap(one)(trials)
+    return jnp.sum(evidences), jnp.all(converged)
+
+
+def _checked(learn):
+    learn = tuple(learn)
+    unknown = [name for name in learn if name not in get_args(Learnable)]
+    if unknown or not learn:
+        found = f'"{unknown[0]}"' if unknown else "nothing"
+        raise InputError(f"hyperparameters: asked to learn {found}; choose from {', '.join(get_args(Learnable))}.")
+    if {"variance", "noise", "thresholds"} <= set(learn):
+        raise InputError(
+            "hyperparameters: variance, noise and thresholds cannot all be learnt, because the scale of the latent"
+            " function would be free; leave one of them fixed."
+        )
+    return learn
+
+
+def _coordinates(gp: OrdinalGP, learn: Sequence[Learnable]) -> Coordinates:
+    thresholds = gp.likelihood.thresholds
+    every = {
+        "theta": jnp.log(gp.kernel.theta),
+        "variance": jnp.log(gp.kernel.variance),
+        "noise": jnp.log(gp.likelihood.noise),
+        "first": thresholds[0],
+        "gaps": jnp.log(jnp.diff(thresholds)),
+    }
+    return {field: every[field] for name in learn for field in _FIELDS[name]}
+
+
+def _model(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
+    """The model at these coordinates; what they do not mention is as in `gp`."""
+    positive = {k: jnp.exp(coordinates[k]) for k in ("theta", "variance", "noise") if k in coordinates}
+    kernel = RBF(positive.get("theta", gp.kernel.theta), positive.get("variance", gp.kernel.variance))
+    thresholds = gp.likelihood.thresholds
+    if "first" in coordinates:
+        steps = jnp.concatenate([coordinates["first"][None], jnp.exp(coordinates["gaps"])])
+        thresholds = jnp.cumsum(steps)
+    return OrdinalGP(kernel, OrdinalProbit(thresholds, positive.get("noise", gp.likelihood.noise)))
+
+
+def _spread(begin: Coordinates, starts: int) -> Coordinates:
+    """Starting points: the model itself, then theta (and noise, the other way) by alternating powers of 2."""
+    index = jnp.arange(starts)
+    power = jnp.where(index % 2 == 1, (index + 1) // 2, -(index // 2)).astype(begin[next(iter(begin))].dtype)
+    step = {"theta": 1.4, "noise": -0.7}  # 4 and 1/2, as logarithms
+    return {
+        name: value[None] + (step.get(name, 0.0) * power).reshape(-1, *(1,) * value.ndim)
+        for name, value in begin.items()
+    }
+
+
+def optimum_sensitivity(
+    height: Callable[[Float[Array, " d"], PyTree], Float[Array, ""]],
+    refit: Callable[[OrdinalGP], PyTree],
+    w: Float[Array, " d"],
+    gp: OrdinalGP,
+    from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
+    learn: Sequence[Learnable] = ("theta", "noise", "thresholds"),
+) -> Coordinates:
+    """How an optimum moves with the hyperparameters: d x / d(coordinate), (d, ...) in units of the search ranges.
+
+    At a maximum over the cube the gradient along free coordinates is 0, so that by the implicit function theorem
+    dw = -H^-1 d(gradient); coordinates at a wall stay there. Positive hyperparameters are on a log scale.
+
+    **Arguments:** `height` of the map at box coordinates, given what `refit` makes of a model; its maximum `w`; the
+    model; and `from_box`, to the unit cube.
+    """
+    coordinates = _coordinates(gp, learn)
+    slope = jax.grad(height)
+    free = (w > 1e-6) & (w < 1.0 - 1e-6)
+    hessian = jax.jacfwd(slope)(w, refit(gp))
+    held = jnp.where(free[:, None] & free[None, :], hessian, -jnp.eye(w.shape[0], dtype=w.dtype))
+    mixed = jax.jacfwd(lambda c: jnp.where(free, slope(w, refit(_model(c, gp))), 0.0))(coordinates)
+    to_unit = jax.jacfwd(from_box)(w)
+
+    def moved(block):
+        return (-to_unit @ jnp.linalg.solve(held, block.reshape(w.shape[0], -1))).reshape(block.shape)
+
+    return jax.tree.map(moved, mixed)

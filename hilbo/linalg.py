@@ -1,0 +1,56 @@
+"""Dense factorisations that may be mapped over people: one at a time on a CPU, batched elsewhere.
+
+jaxlib's batched LAPACK kernels wait for the thread pool from inside that pool. Where a program has two of them ready at
+once, as many fits have, all the workers of a small machine end up waiting for each other, for ever (seen with jaxlib
+0.10 on two cores: every worker in `ParallelBatchMap`). A kernel on one matrix does not wait. Under `jax.vmap` these
+functions therefore loop over the matrices on a CPU, and stay batched on other devices.
+They are not differentiable; their callers have derivative rules of their own.
+"""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+__all__ = ["cholesky", "eigh", "solve_lower", "solve_lower_transposed"]
+
+
+def _one_at_a_time(function: Callable) -> Callable:
+    """`function` of arrays with a rule for `vmap`: a loop on CPUs, the batched kernel elsewhere."""
+    mapped = jax.custom_batching.custom_vmap(function)
+
+    @mapped.def_vmap
+    def rule(size, in_batched, *args):
+        whole = [a if b else jnp.broadcast_to(a, (size, *a.shape)) for a, b in zip(args, in_batched, strict=True)]
+        out = jax.lax.platform_dependent(
+            *whole, cpu=lambda *stacked: jax.lax.map(lambda row: mapped(*row), stacked), default=jax.vmap(function)
+        )
+        return out, jax.tree.map(lambda _: True, out)
+
+    return mapped
+
+
+@_one_at_a_time
+def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues, increasing, and eigenvectors (columns) of a symmetric matrix."""
+    eigenvalues, vectors = jnp.linalg.eigh(matrix)
+    return eigenvalues, vectors
+
+
+@_one_at_a_time
+def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Lower Cholesky factor of a positive definite matrix."""
+    return jnp.linalg.cholesky(matrix)
+
+
+@_one_at_a_time
+def solve_lower(factor: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """X with `factor` X = `right`, for a lower triangular factor."""
+    return jax.scipy.linalg.solve_triangular(factor, right, lower=True)
+
+
+@_one_at_a_time
+def solve_lower_transposed(factor: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
+    """X with `factor`' X = `right`, for a lower triangular factor."""
+    return jax.scipy.linalg.solve_triangular(factor, right, lower=True, trans=1)

@@ -1,0 +1,213 @@
+"""Who may import whom, what the modules of the mathematics may not do, and that `import hilbo` stays lazy."""
+
+import ast
+import subprocess
+import sys
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+import hilbo
+
+PACKAGE = Path(__file__).parents[1] / "hilbo"
+EVERYWHERE = {"errors", "normal"}  # these two may be imported by every module
+
+# The mathematics: no files, clock, printing or environment.
+MATHS = {
+    "normal": set(),
+    "kernels": set(),
+    "likelihoods": set(),
+    "laplace": set(),
+    "ep": set(),
+    "exact": set(),
+    "bcm": set(),
+    "acquisition": set(),
+    "viscoelastic": set(),
+    "ordinal_gp": {"kernels", "likelihoods", "laplace", "ep", "exact"},
+    "hyperparameters": {"ordinal_gp"},
+    "passivity": {"viscoelastic"},
+    "identification": {"viscoelastic"},
+    "search_space": {"viscoelastic", "passivity"},
+    "session": {"config", "ordinal_gp", "acquisition", "search_space"},
+    "simulate": {"session"},
+    "validation": {"study"},
+}
+# What each module may import of hilbo, and with it what that one may import. Modules to come have their place already.
+MAY_IMPORT = MATHS | {
+    "errors": set(),
+    "protocol": set(),
+    "config": {"search_space", "ordinal_gp"},
+    "tables": {"config"},
+    "event_log": {"session"},
+    "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm"},
+    "robustness": {"study", "hyperparameters"},
+    "plotting": set(MATHS),
+    "hardware_bridge": {"protocol"},
+}
+MAY_IMPORT["report"] = set(MAY_IMPORT)
+MAY_IMPORT["app"] = set(MAY_IMPORT)
+MAY_IMPORT["cli"] = set(MAY_IMPORT)
+MAY_IMPORT["__main__"] = {"cli"}
+
+ONLY_IN = {"matplotlib": {"plotting"}, "serial": {"hardware_bridge"}}
+WITHOUT_JAX = {"errors", "protocol", "hardware_bridge"}
+OUTSIDE_WORLD = {"os", "io", "sys", "time", "datetime", "pathlib", "logging", "random", "socket", "subprocess"}
+MAY_ENABLE_X64 = {"cli", "app", "__main__"}
+LONGEST = 400  # lines
+
+
+def module_of(path: Path) -> str:
+    """Name in the table: `hilbo/bcm.py` is bcm, everything below `hilbo/app/` is app."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+SOURCES = sorted(path for path in PACKAGE.rglob("*.py") if path != PACKAGE / "__init__.py")
+each_source = pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+
+
+def imports(tree: ast.AST) -> set[str]:
+    """Dotted names of all imported modules, also those within functions; `from hilbo import bcm` is hilbo.bcm."""
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = "." * node.level + (node.module or "")
+            found |= {f"hilbo.{alias.name}" for alias in node.names} if base == "hilbo" else {base}
+    return found
+
+
+def below(module: str) -> set[str]:
+    """Every module that this one may import: what the table says, and what is below that."""
+    found, ahead = set(EVERYWHERE), [module]
+    while ahead:
+        direct = MAY_IMPORT.get(ahead.pop(), set())
+        ahead += direct - found
+        found |= direct
+    return found
+
+
+def siblings(tree: ast.AST) -> set[str]:
+    """Modules of hilbo that are imported. The version is no module."""
+    return {name.split(".")[1] for name in imports(tree) if name.startswith("hilbo.")} - {"__version__"}
+
+
+def faults(module: str, source: str) -> list[str]:
+    """Everything in which a module breaks the rules of this file, one sentence each."""
+    tree = ast.parse(source)
+    packages = {name.split(".")[0] for name in imports(tree)}
+    found = [f"imports hilbo.{name}" for name in siblings(tree) - below(module) - {module}]
+    if module not in MAY_IMPORT:
+        found.append("is not in the table of test_architecture.py")
+    if "" in packages:
+        found.append("has a relative import")
+    found += [f"imports {name}" for name, users in ONLY_IN.items() if name in packages and module not in users]
+    if module in WITHOUT_JAX:
+        found += [f"imports {name}" for name in packages & {"jax", "jaxlib", "equinox"}]
+    if module in MATHS:
+        found += [f"imports {name}" for name in packages & OUTSIDE_WORLD]
+        calls = [node.func for node in ast.walk(tree) if isinstance(node, ast.Call)]
+        found += [f"calls {f.id}" for f in calls if isinstance(f, ast.Name) and f.id in {"print", "open", "input"}]
+    if "enable_x64" in source and module not in MAY_ENABLE_X64:
+        found.append("switches 64-bit numbers on, or talks of it")
+    if source.count("\n") > LONGEST:
+        found.append(f"has more than {LONGEST} lines")
+    return found + public_faults(module, tree)
+
+
+def public_faults(module: str, tree: ast.Module) -> list[str]:
+    """A public module says what it is for, and which of its names are public."""
+    if module.startswith("_") or module == "app":
+        return []
+    found = [] if ast.get_docstring(tree) else ["has no docstring"]
+    exported = None
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["__all__"]:
+            exported = ast.literal_eval(node.value)
+    if exported is None:
+        return [*found, "has no __all__"]
+    defined = {name for node in tree.body for name in names_bound(node)}
+    return found + [f"exports {name}, which it does not define" for name in exported if name not in defined]
+
+
+def names_bound(node: ast.stmt) -> set[str]:
+    """Names that a statement at the top of a module brings into being."""
+    if isinstance(node, ast.FunctionDef | ast.ClassDef):
+        return {node.name}
+    if isinstance(node, ast.Import | ast.ImportFrom):
+        return {alias.asname or alias.name for alias in node.names}
+    return {name.id for name in ast.walk(node) if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store)}
+
+
+@each_source
+def test_a_module_keeps_the_rules(path):
+    assert faults(module_of(path), path.read_text(encoding="utf-8")) == []
+
+
+def test_the_modules_have_been_found():
+    assert {"errors", "kernels", "laplace"} <= {module_of(path) for path in SOURCES}
+
+
+def test_no_cycles():
+    TopologicalSorter(MAY_IMPORT).prepare()  # raises CycleError
+    graph = {}
+    for path in SOURCES:
+        module = module_of(path)
+        graph.setdefault(module, set()).update(siblings(ast.parse(path.read_text(encoding="utf-8"))) - {module})
+    TopologicalSorter(graph).prepare()
+
+
+HEAD = '"""Doc."""\n__all__ = []\n'
+
+
+@pytest.mark.parametrize(
+    ("module", "source", "fault"),
+    [
+        ("kernels", HEAD + "from hilbo.laplace import laplace\n", "imports hilbo.laplace"),
+        ("ordinal_gp", HEAD + "from hilbo import bcm, errors, kernels, normal\n", "imports hilbo.bcm"),
+        ("session", HEAD + "def f():\n    import hilbo.study\n", "imports hilbo.study"),
+        ("kernels", HEAD + "from . import errors\n", "has a relative import"),
+        ("cli", HEAD + "import matplotlib.pyplot\n", "imports matplotlib"),
+        ("hardware_bridge", HEAD + "import jax.numpy\n", "imports jax"),
+        ("bcm", HEAD + "from os import environ\n", "imports os"),
+        ("simulate", HEAD + "print(1)\n", "calls print"),
+        ("bcm", HEAD + "jax.config.update('jax_enable_x64', True)\n", "switches 64-bit numbers on, or talks of it"),
+        ("bcm", HEAD + "\n" * LONGEST, "has more than 400 lines"),
+        ("bcm", "__all__ = []\n", "has no docstring"),
+        ("bcm", '"""Doc."""\n', "has no __all__"),
+        ("bcm", '"""Doc."""\n__all__ = ["combine"]\n', "exports combine, which it does not define"),
+        ("extra", HEAD, "is not in the table of test_architecture.py"),
+    ],
+)
+def test_each_rule_can_fail(module, source, fault):
+    assert faults(module, source) == [fault]
+
+
+def test_a_module_in_order_has_no_fault():
+    source = '"""Doc."""\nfrom hilbo import viscoelastic\nfrom hilbo.errors import InputError\n__all__ = ["A"]\nA = 1\n'
+    assert faults("passivity", source) == []
+    assert faults("session", source) == []
+
+
+@pytest.mark.parametrize("name", hilbo.__all__)
+def test_a_public_name_resolves(name):
+    assert getattr(hilbo, name) is not None
+
+
+def test_type_checkers_see_the_same_names():
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    (block,) = (node for node in tree.body if isinstance(node, ast.If))
+    names = {alias.asname for node in block.body if isinstance(node, ast.ImportFrom) for alias in node.names}
+    assert names == set(hilbo.__all__)
+
+
+LIGHT = ["hilbo", "hilbo.errors", "hilbo.protocol", "hilbo.hardware_bridge", "hilbo.cli"]
+
+
+@pytest.mark.parametrize("module", [name for name in LIGHT if (PACKAGE / f"{name[6:] or '__init__'}.py").exists()])
+def test_importing_it_loads_no_jax(module):
+    heavy = {"jax", "matplotlib", "pandas", "scipy"} | ({"numpy"} if module in ("hilbo", "hilbo.errors") else set())
+    code = f"import sys, {module}; print(*sorted({heavy} & set(sys.modules)))"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
+    assert run.stdout == "\n"

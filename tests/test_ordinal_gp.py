@@ -1,0 +1,286 @@
+"""The model of one participant: gradients against 40 digits, padding, batches, dtypes, and what it refuses."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from datasets import near_separable, repeated, repeated_19, separated
+from helpers import assert_traces_once, check_grad
+from mpmath import mp
+from reference_laplace import mpmath_laplace
+
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit, ordinal_gp
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import InferenceError
+
+CAPACITY = 25
+SCALAR, PER_DIMENSION = 3.0, (3.0, 2.0, 1.2)
+CASES = [(repeated, SCALAR), (repeated, PER_DIMENSION), (near_separable, SCALAR)]
+
+
+def model(data, theta=None) -> OrdinalGP:
+    kernel = RBF(data.theta if theta is None else theta, data.variance)
+    return OrdinalGP(kernel, OrdinalProbit(data.thresholds, data.noise))
+
+
+def answers(data, capacity: int = CAPACITY) -> Trials:
+    return Trials.from_arrays(data.x, data.q, capacity)
+
+
+def hyperparameters(data, theta) -> jax.Array:
+    """One vector (theta..., variance, noise, thresholds...)."""
+    parts = theta, data.variance, data.noise, data.thresholds
+    return jnp.concatenate([jnp.atleast_1d(jnp.asarray(part, float)) for part in parts])
+
+
+def unpack(h):
+    *theta, variance, noise, first, second = h
+    return theta[0] if len(theta) == 1 else theta, variance, noise, (first, second)
+
+
+def values(h, trials, x_new):
+    """(7,): log evidence, and posterior mean and variance at the first three new points."""
+    theta, variance, noise, thresholds = unpack(h)
+    kernel = RBF(jnp.stack(theta) if isinstance(theta, list) else theta, variance)
+    gp = OrdinalGP(kernel, OrdinalProbit(jnp.stack(thresholds), noise))
+    posterior = fit(gp, trials, throw=False)
+    return jnp.concatenate([posterior.log_evidence[None], *posterior.predict(x_new[:3])])
+
+
+def exact_values(h, data):
+    theta, variance, noise, thresholds = unpack(h)
+    solved = mpmath_laplace(data.x, data.q, theta, variance, thresholds, noise, data.x_new[:3], digits=40)
+    return np.array([solved["log_evidence"], *solved["mean"], *solved["variance"]], object)
+
+
+@cache
+def exact_jacobian(make, theta):
+    """(7, p), by central differences at 40 digits."""
+    data, columns = make(), []
+    with mp.workdps(45):
+        h = [mp.mpf(float(v)) for v in hyperparameters(data, theta)]
+        for j, value in enumerate(h):
+            step = value * mp.mpf(10) ** -12
+            moved = [exact_values([*h[:j], value + s, *h[j + 1 :]], data) for s in (step, -step)]
+            columns.append((moved[0] - moved[1]) / (2 * step))
+    return np.stack(columns, axis=1).astype(float)
+
+
+reverse = jax.jit(jax.jacrev(values))
+forward = jax.jit(jax.jacfwd(values))
+evidence_slope = jax.jit(jax.grad(lambda *args: values(*args)[0]))
+evidence_hessian = jax.jit(jax.jacfwd(jax.grad(lambda *args: values(*args)[0])))
+
+
+def arguments(make, theta):
+    data = make()
+    return hyperparameters(data, theta), answers(data), jnp.asarray(data.x_new)
+
+
+@pytest.mark.parametrize(("make", "theta"), CASES)
+def test_gradients_in_every_hyperparameter(make, theta):
+    """Of evidence, means and variances, with exactly repeated stimuli, by both modes under jit."""
+    expected = exact_jacobian(make, theta)
+    assert np.all(np.max(np.abs(expected), axis=0) > 1e-3)  # no hyperparameter is without effect
+    for derivative in (reverse, forward):
+        found = np.asarray(derivative(*arguments(make, theta)))
+        scale = np.maximum(np.abs(expected), 1e-3 * np.max(np.abs(expected), axis=0))
+        assert np.max(np.abs(found - expected) / scale) < 1e-8
+
+
+def test_gradients_under_vmap():
+    h, trials, x_new = arguments(repeated, SCALAR)
+    several = h[None, :] * jnp.array([[1.0], [1.1], [0.7]])
+    batch = jax.jit(jax.vmap(jax.jacrev(values), in_axes=(0, None, None)))(several, trials, x_new)
+    for row, one in zip(batch, several, strict=True):
+        np.testing.assert_allclose(row, reverse(one, trials, x_new), rtol=1e-10, atol=1e-11)
+    np.testing.assert_allclose(batch[0], exact_jacobian(repeated, SCALAR), rtol=1e-6, atol=1e-9)
+
+
+def test_second_derivatives_of_the_evidence():
+    h, trials, x_new = arguments(repeated, PER_DIMENSION)
+    found = np.asarray(evidence_hessian(h, trials, x_new))
+    steps = 1e-5 * np.asarray(h)
+    expected = np.stack(
+        [
+            (evidence_slope(h.at[j].add(s), trials, x_new) - evidence_slope(h.at[j].add(-s), trials, x_new)) / (2 * s)
+            for j, s in enumerate(steps)
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(found, found.T, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+
+
+def test_gradients_in_the_asked_point():
+    data = repeated()
+    posterior = fit(model(data), answers(data))
+    check_grad(lambda x: jnp.stack(posterior.predict(x[None]), axis=0)[:, 0], data.x_new[1])
+
+
+def assert_same(one, other, rtol=1e-12):
+    """Two posteriors agree in evidence, mode, mean and variance."""
+    n = min(one.trials.capacity, other.trials.capacity, int(one.trials.mask.sum()))
+    x = jnp.asarray(separated().x_new)
+    np.testing.assert_allclose(one.log_evidence, other.log_evidence, rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(one.latent.mode[:n], other.latent.mode[:n], rtol=rtol, atol=rtol)
+    np.testing.assert_allclose(one.predict(x), other.predict(x), rtol=rtol, atol=rtol)
+
+
+# --- fixed capacity
+
+
+def test_no_answers_give_exactly_the_prior():
+    data = separated()
+    gp, x = OrdinalGP(RBF(SCALAR, 1.7), model(data).likelihood), jnp.asarray(data.x_new)
+    posterior = fit(gp, Trials.empty(CAPACITY, 3))
+    mean, variance = posterior.predict(x)
+    assert posterior.log_evidence == 0.0
+    np.testing.assert_array_equal(mean, np.zeros(len(x)))
+    np.testing.assert_array_equal(variance, np.full(len(x), 1.7))
+    np.testing.assert_array_equal(posterior.class_probabilities(x)[0], gp.likelihood.class_probabilities(0.0, 1.7))
+    assert posterior.certificate.converged
+    assert posterior.certificate.iterations <= 1
+    slopes = np.asarray(reverse(hyperparameters(data, SCALAR), Trials.empty(CAPACITY, 3), x))
+    np.testing.assert_array_equal(slopes, np.outer([0, 0, 0, 0, 1, 1, 1], [0, 1, 0, 0, 0]))
+
+
+@pytest.mark.parametrize("category", [0, 1, 2])
+def test_one_category_only(category):
+    data = separated()
+    q = np.full(len(data.q), category)
+    posterior = fit(model(data), Trials.from_arrays(data.x, q, CAPACITY))
+    exact = mpmath_laplace(data.x, q, *data.problem()[2:], digits=25)
+    assert posterior.certificate.converged
+    np.testing.assert_allclose(
+        posterior.predict(jnp.asarray(data.x_new)),
+        [exact["mean"].astype(float), exact["variance"].astype(float)],
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    np.testing.assert_allclose(posterior.log_evidence, float(exact["log_evidence"]), rtol=1e-12)
+
+
+def test_growing_data_are_traced_once():
+    data = repeated_19()
+    gp, trials, whole = model(data), Trials.empty(27, 3), answers(data, 27)
+
+    @jax.jit
+    def append_one(trials, x, q):
+        return trials.append(x, q)
+
+    x_new, weights = jnp.asarray(data.x_new), None
+    with assert_traces_once(ordinal_gp._fit, ordinal_gp._mean_and_explained, append_one):
+        for count, (x, q) in enumerate(zip(data.x, data.q, strict=True), start=1):
+            trials = append_one(trials, jnp.asarray(x), jnp.asarray(q))
+            posterior = fit(gp, trials, start=jnp.zeros(27) if weights is None else weights)
+            weights = posterior.latent.weights
+            posterior.predict(x_new)
+            kept = whole.first(count)
+            np.testing.assert_array_equal(trials.mask, kept.mask)
+            np.testing.assert_array_equal(trials.x[:count], kept.x[:count])
+            np.testing.assert_array_equal(trials.q[:count], kept.q[:count])
+    assert_same(posterior, fit(gp, whole), rtol=1e-11)
+
+
+@pytest.mark.parametrize("make", [repeated, near_separable])
+def test_padded_equals_unpadded(make):
+    data = make()
+    bare = fit(model(data), answers(data, len(data.q)))
+    assert_same(bare, fit(model(data), answers(data)))
+    full = answers(data)
+    rubbish = Trials(jnp.where(full.mask[:, None], full.x, 0.77), jnp.where(full.mask, full.q, 2), full.mask)
+    assert_same(bare, fit(model(data), rubbish))
+
+
+def test_default_capacity_is_a_multiple_of_32():
+    for count, capacity in ((0, 32), (1, 32), (32, 32), (33, 64)):
+        assert Trials.from_arrays(np.zeros((count, 2)), np.zeros(count, int)).capacity == capacity
+
+
+def test_a_batch_equals_a_loop():
+    data = [make() for make in (separated, near_separable, repeated, repeated_19)]
+    gp = model(data[0], theta=12.0)
+    trials = [answers(each) for each in data]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *trials)
+    batch = jax.jit(jax.vmap(lambda t: fit(gp, t, throw=False)))(stacked)
+    for index, each in enumerate(trials):
+        one = jax.tree.map(lambda leaf, i=index: leaf[i], batch)
+        assert one.certificate.converged
+        assert_same(one, fit(gp, each))
+
+
+@pytest.mark.parametrize("make", [separated, repeated, near_separable])
+def test_float32_against_float64(make):
+    """Four digits of the prior's standard deviation, in mean, variance, evidence and class probabilities."""
+    data = make()
+    low = fit(model(data), Trials.from_arrays(data.x.astype(np.float32), data.q, CAPACITY))
+    high = fit(model(data), answers(data))
+    x = data.x_new.astype(np.float32)
+    for method in ("predict", "class_probabilities"):
+        found = getattr(low, method)(jnp.asarray(x))
+        assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(found))
+        np.testing.assert_allclose(found, getattr(high, method)(jnp.asarray(x.astype(float))), rtol=0, atol=5e-5)
+    np.testing.assert_allclose(low.log_evidence, high.log_evidence, rtol=2e-5)
+
+
+def test_the_parts_of_a_prediction_agree():
+    data = repeated()
+    posterior, x = fit(model(data), answers(data)), jnp.asarray(data.x_new)
+    mean, variance = posterior.predict(x)
+    same_mean, explained = posterior.predict_explained(x)
+    np.testing.assert_array_equal(mean, same_mean)
+    np.testing.assert_allclose(mean, posterior.mean(x), rtol=1e-14, atol=1e-15)
+    np.testing.assert_array_equal(variance, data.variance - explained)
+    expected = [posterior.gp.likelihood.class_probabilities(m, v) for m, v in zip(mean, variance, strict=True)]
+    np.testing.assert_allclose(posterior.class_probabilities(x), np.stack(expected), rtol=1e-14)
+
+
+# --- what is refused
+
+
+@pytest.mark.parametrize(
+    ("x", "q", "capacity", "message"),
+    [
+        (np.zeros((3, 2)), np.zeros(2, int), None, r"x has shape \(3, 2\) and q has shape \(2,\); give x as"),
+        (np.zeros(3), np.zeros(3, int), None, r"x has shape \(3,\) .* give x as \(n, d\)"),
+        (np.array([[0.0], [np.nan]]), np.zeros(2, int), None, r"x\[1\] holds a value that is not finite"),
+        (np.array([[np.inf], [0.0]]), np.zeros(2, int), None, r"x\[0\] holds a value that is not finite"),
+        (np.zeros((2, 1)), np.array([0.0, 1.0]), None, "q must hold the categories as integers from 0"),
+        (np.zeros((2, 1)), np.array([0, -1]), None, "q must hold the categories as integers from 0"),
+        (np.zeros((2, 1)), np.zeros(2, int), 1, "capacity is 1, but 2 answers need at least 2"),
+        (np.zeros((0, 1)), np.zeros(0, int), 0, "capacity is 0, but 0 answers need at least 1"),
+    ],
+)
+def test_bad_trials_are_refused_in_a_sentence(x, q, capacity, message):
+    with pytest.raises(InputError, match=message):
+        Trials.from_arrays(x, q, capacity)
+
+
+def test_an_unknown_inference_is_refused():
+    with pytest.raises(InputError, match='inference is "magic"; this version offers "laplace"'):
+        fit(model(repeated()), answers(repeated()), inference="magic")
+
+
+def test_one_answer_too_many_is_not_forgotten_in_silence():
+    data = separated()
+    full = answers(data, CAPACITY).append(jnp.zeros(3), 1)
+    for _ in range(5):
+        full = full.append(jnp.full(3, 0.5), 2)
+    assert np.all(np.isnan(full.x))
+    with pytest.raises(InferenceError):
+        fit(model(data), full)
+
+
+def test_a_failed_fit_says_so():
+    data = separated()
+    gp = OrdinalGP(RBF(data.theta, data.variance), OrdinalProbit((0.5, -0.5), 0.5))  # out of order: NaN
+    with pytest.raises(InferenceError, match=r"mode was not found: its residual is .* after \d+ steps and should be"):
+        fit(gp, answers(data))
+    assert not fit(gp, answers(data), throw=False).certificate.converged
+    with pytest.raises(Exception, match="read the certificate") as caught:
+        jax.block_until_ready(eqx.filter_jit(lambda t: fit(gp, t).log_evidence)(answers(data)))
+    assert not isinstance(caught.value, InferenceError)

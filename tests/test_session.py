@@ -1,0 +1,122 @@
+"""Ask and tell: one compilation, the same points again, inside the passive set."""
+
+import json
+import subprocess
+import sys
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hilbo import Session, Study
+from hilbo.errors import InputError
+from hilbo.session import _next_physical, physical_trials
+
+PAPER = "hilbo/data/paper.toml"
+
+
+def answer(study, point):
+    x = np.asarray(study.space.to_unit(np.array(list(point.values()))))
+    distance = np.linalg.norm(x - [0.15, 0.18, 0.2])
+    return "close" if distance < 0.1 else "similar" if distance < 0.3 else "different"
+
+
+def run(study, seed=3, trials=None):
+    session, asked = Session.start(study, seed=seed), []
+    while not session.done and (trials is None or len(asked) < trials):
+        asked.append(session.ask())
+        session = session.tell(answer(study, asked[-1]))
+    return session, asked
+
+
+@pytest.fixture(scope="module")
+def study():
+    return Study.load(PAPER)
+
+
+@pytest.fixture(scope="module")
+def finished(study):
+    return run(study)
+
+
+def test_a_whole_session_compiles_once(study, finished):
+    before = _next_physical._cached._cache_size()  # compiled versions of the step
+    run(study, seed=4)
+    assert _next_physical._cached._cache_size() == before
+
+
+def test_replay_gives_the_same_points_bit_for_bit(study, finished):
+    session, asked = finished
+    responses = [study.responses[q] for q in session.answers]
+    again = Session.replay(study, responses, seed=3)
+    np.testing.assert_array_equal(again.points, session.points)
+    halfway = Session.replay(study, responses[:12], seed=3)
+    assert halfway.ask() == asked[12]
+
+
+def test_replay_in_another_process_gives_the_same_points_bit_for_bit(study, finished):
+    session, asked = finished
+    responses = [study.responses[q] for q in session.answers[:9]]
+    code = (
+        "import jax, json, sys; jax.config.update('jax_enable_x64', True)\n"
+        "from hilbo import Session, Study\n"
+        f"s = Session.replay(Study.load('{PAPER}'), {responses!r}, seed=3)\n"
+        "print(json.dumps(s.ask()))"
+    )
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == asked[9]
+
+
+def test_every_point_is_feasible_and_the_session_ends(study, finished):
+    session, asked = finished
+    assert len(asked) == study.selection.trials
+    assert bool(jnp.all(study.space.feasible(study.space.to_unit(session.points))))
+    with pytest.raises(InputError, match="all 25 trials"):
+        session.ask()
+
+
+def test_the_search_finds_the_region(study, finished):
+    best = finished[0].best()
+    assert answer(study, best) == "close"
+
+
+def test_states_are_immutable(study):
+    session = Session.start(study, seed=3)
+    following = session.tell("close")
+    assert len(session.answers) == 0
+    assert len(following.answers) == 1
+
+
+def test_an_unknown_answer_is_refused(study):
+    with pytest.raises(InputError, match='"closer" is no answer'):
+        Session.start(study).tell("closer")
+
+
+def test_padding_is_only_padding(study, finished):
+    session = finished[0]
+    trials = physical_trials(study, session.points[:7], session.answers[:7], 25)
+    np.testing.assert_array_equal(trials.x[:7], study.space.to_unit(session.points[:7]))
+    assert int(trials.mask.sum()) == 7
+
+
+@pytest.mark.parametrize("kind", ["log_ei", "thompson", "top_category", "mean"])
+def test_other_acquisitions_choose_feasible_points(study, kind):
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["selection"] = {"acquisition": kind, "trials": 7}
+    session, asked = run(Study.from_dict(raw))
+    assert len(asked) == 7
+    assert bool(jnp.all(study.space.feasible(study.space.to_unit(session.points))))
+
+
+def test_a_smallest_distance_keeps_trials_apart(study):
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["selection"] = {"minimum_distance": 0.2, "trials": 12}
+    session, _ = run(Study.from_dict(raw))
+    x = np.asarray(study.space.to_unit(session.points))
+    for n in range(5, 12):  # the space-filling trials come as they are
+        assert np.linalg.norm(x[:n] - x[n], axis=1).min() >= 0.2 - 1e-12
+
+
+def test_the_study_is_a_pytree_of_its_model_alone(study):
+    assert len(eqx.filter(study, eqx.is_array).gp.likelihood.thresholds) == 2
