@@ -86,7 +86,8 @@ class OrdinalProbit(eqx.Module):
         """
         mean, variance = jnp.asarray(mean), jnp.asarray(variance)
         blurred = OrdinalProbit(self.thresholds, jnp.sqrt(self.noise**2 + variance.astype(self.noise.dtype)))
-        return jnp.exp(jax.vmap(lambda q: blurred.log_prob(mean, q))(jnp.arange(self.categories)))
+        # Their sum is 1 but for rounding, which the softmax shares out in proportion.
+        return jax.nn.softmax(jax.vmap(lambda q: blurred.log_prob(mean, q))(jnp.arange(self.categories)))
 
     def _edges(self, f, q):
         """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`."""

@@ -12,6 +12,7 @@ Reference: paper, section IV.
 
 import equinox as eqx
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike

@@ -66,7 +66,19 @@ class Population(eqx.Module):
     drift_sd: float = eqx.field(static=True)
 
 
-PRESETS: dict[str, Population] = {}
+_PAPER = Population(
+    truth={"K1": 5.70, "B1": 5.89, "alpha": 0.203},
+    spread=(0.62, 0.37, 0.17),
+    tolerance=(0.56, 0.084, 0.19),
+    tolerance_sd=0.18,
+    criteria=(1.59, 1.0),
+    noise=0.63,
+    lapse=0.044,
+    drift_sd=0.14,
+)
+
+PRESETS: dict[str, Population] = {"paper": _PAPER}
+"""Populations by name; docs/simulation.md says how `paper` was made and what it is like."""
 
 
 def people(study: Study, population: Population, count: int, seed: int) -> Person:

@@ -244,7 +244,7 @@ def test_every_start_leads_to_the_mode(make, size):
 
 @pytest.mark.parametrize(("noise", "sharp"), [(None, 0.0), (10.0, 0.8)])
 def test_the_residual_bounds_the_distance_to_the_mode(noise, sharp):
-    """Stopped early, eta is no further from the mode than the residual says, in the prior's norm; with weak data, as far."""
+    """Stopped early, eta is no further from the mode than that, in the prior's norm; with weak data, just as far."""
     covariance, terms, _ = problem(near_separable)
     if noise is not None:
         terms = eqx.tree_at(lambda t: t.likelihood.noise, terms, jnp.asarray(noise))
@@ -297,5 +297,4 @@ def test_terms_that_are_nothing_leave_the_prior():
     np.testing.assert_array_equal(posterior.mode, np.zeros(3))
     np.testing.assert_array_equal(posterior.inverse, np.zeros((3, 3)))
     assert posterior.log_evidence == 0.0
-    assert posterior.certificate.iterations <= 1
     assert posterior.certificate.smallest_variance == 1.0

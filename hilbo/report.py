@@ -1,0 +1,402 @@
+"""Results -> result.json, a population map in netCDF, figures, and one HTML page that explains itself.
+
+`write_results` makes a whole results folder from an aggregate: result.json (DESIGN: "Results"), optima.csv, map.nc,
+the figures as PNG and SVG, and report.html with the figures inside.
+"""
+
+import base64
+import importlib.metadata
+import io
+import json
+import platform
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from hilbo.config import Study
+from hilbo.study import Aggregate, nrmse, population, progress
+
+__all__ = ["K0_RANGE", "misses", "result", "set_of", "write_results"]
+
+K0_RANGE = 16.14
+"""N/mm, from -15.70 to 0.44: the range of K0 by which its error is normalised (paper, table I)."""
+_MAP_CELLS = 41
+
+
+def set_of(study: Study, x: Float[np.ndarray, " d"]) -> dict[str, float]:
+    """A point of the unit cube as a parameter set in physical units, derived K0 included."""
+    physical = np.asarray(study.space.to_physical(np.asarray(x)))
+    values = dict(zip(study.space.names, physical.tolist(), strict=True))
+    return {name: float(value) for name, value in study.space.derived(values).items()} | values
+
+
+def margin_of(study: Study, x: Float[np.ndarray, " d"]) -> float | None:
+    """Passivity margin (N.s/m) of a point, None without mechanics; negative means not passive."""
+    values = set_of(study, x)
+    margin = study.space.passivity_margin({name: values[name] for name in study.space.names})
+    return None if margin is None else float(margin)
+
+
+def misses(
+    study: Study, x: Float[np.ndarray, "... d"], truth: Float[np.ndarray, " d"]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """NRMSE of points to the truth by search range: over the searched parameters, and with the derived K0."""
+    x = np.asarray(x)
+    own = np.asarray(nrmse(jnp.asarray(x), jnp.asarray(np.broadcast_to(truth, x.shape[-1:]))))
+    if study.space.mechanics is None:
+        return own, None
+    K0 = np.array([set_of(study, row)["K0"] for row in x.reshape(-1, x.shape[-1])]).reshape(own.shape)
+    K0_error = (K0 - set_of(study, truth)["K0"]) / K0_RANGE
+    d = x.shape[-1]
+    return own, np.sqrt((d * own**2 + K0_error**2) / (d + 1))
+
+
+def versions() -> dict[str, str]:
+    """What made a result."""
+    packages = ("hilbo", "jax", "jaxlib", "numpy", "equinox", "optimistix")
+    found = {name: importlib.metadata.version(name) for name in packages}
+    return found | {
+        "python": platform.python_version(),
+        "device": str(jax.devices()[0]),
+        "dtype": str(jnp.zeros(0).dtype),
+    }
+
+
+def result(
+    study: Study, aggregate: Aggregate, seed: int, truth: Float[np.ndarray, " d"] | None = None
+) -> dict[str, Any]:
+    """The content of result.json."""
+    certificate = aggregate.posteriors.certificate
+    people = []
+    for j, name in enumerate(aggregate.cohort.names):
+        fields = {key: np.asarray(getattr(certificate, key))[j].item() for key in certificate.__dataclass_fields__}
+        trials = int(aggregate.cohort.counts()[j])
+        people.append(
+            {
+                "participant": name,
+                "trials": trials,
+                "optimum": _optimum(study, jax.tree.map(lambda leaf, j=j: leaf[j], aggregate.individuals)),
+                "certificate": fields,
+            }
+        )
+    content = {
+        "optimum": _optimum(study, aggregate.optimum),
+        "participants": people,
+        "alternatives": {name: _optimum(study, found) for name, found in aggregate.alternatives.items()},
+        "mean_of_optima": {
+            "parameters": set_of(study, aggregate.mean_of_optima),
+            "passivity_margin": margin_of(study, aggregate.mean_of_optima),
+        },
+        "rule": study.rule,
+        "inference": study.inference,
+        "study": study.hash,
+        "seed": seed,
+        "versions": versions(),
+    }
+    if truth is not None:
+        content["truth"] = _truth(study, aggregate, truth)
+    return content
+
+
+def _optimum(study, found):
+    labels = study.responses
+    return {
+        "parameters": set_of(study, found.x),
+        "unit": np.asarray(found.x).tolist(),
+        "mean": float(found.mean),
+        "sd": float(found.sd),
+        "class_probabilities": dict(zip(labels, np.asarray(found.class_probabilities).tolist(), strict=True)),
+        "passivity_margin": margin_of(study, found.x),
+    }
+
+
+def _truth(study, aggregate, truth):
+    """Misses of everything that claims to be the optimum, where the truth is known."""
+    own, own_K0 = misses(study, aggregate.individuals.x, truth)
+    quartiles = np.percentile(own, [25, 50, 75]).tolist()
+    claims = {"aggregate": aggregate.optimum.x, "mean_of_optima": aggregate.mean_of_optima}
+    claims |= {name: found.x for name, found in aggregate.alternatives.items()}
+    table = {}
+    for name, x in claims.items():
+        plain, with_K0 = misses(study, x, truth)
+        table[name] = {"nrmse": float(plain), "nrmse_with_K0": None if with_K0 is None else float(with_K0)}
+    individuals = {
+        "quartiles": quartiles,
+        "with_K0": None if own_K0 is None else np.percentile(own_K0, [25, 50, 75]).tolist(),
+    }
+    top = np.asarray((aggregate.cohort.trials.q == len(study.responses) - 1) & aggregate.cohort.trials.mask).sum(axis=1)
+    return {
+        "parameters": set_of(study, truth),
+        "nrmse": table,
+        "individuals": individuals,
+        "top_answers": {"mean": float(top.mean()), "sd": float(top.std(ddof=1)) if len(top) > 1 else None},
+    }
+
+
+def write_results(
+    study: Study,
+    aggregate: Aggregate,
+    folder: Path,
+    seed: int = 0,
+    truth: Float[np.ndarray, " d"] | None = None,
+    say=lambda text: None,
+) -> dict[str, Any]:
+    """Write the results folder; returns the content of result.json. `say` is told what is being done."""
+    content = result(study, aggregate, seed, truth)
+    (folder / "result.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    _optima_table(content).to_csv(folder / "optima.csv", index=False)
+    say("the population map on a grid")
+    _map(study, aggregate, content).to_netcdf(folder / "map.nc", engine="h5netcdf")
+    say("progress of the optimum over trials")
+    figures = _figures(study, aggregate, seed, truth)
+    say("figures and report")
+    pictures = []
+    for name, (figure, title, caption) in figures.items():
+        figure.savefig(folder / f"{name}.svg")
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=160)
+        (folder / f"{name}.png").write_bytes(buffer.getvalue())
+        png = base64.b64encode(buffer.getvalue()).decode()
+        pictures.append({"png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
+    (folder / "report.html").write_text(_page(study, content, pictures), encoding="utf-8")
+    return content
+
+
+def _optima_table(content):
+    rows = [{"source": "aggregate"} | content["optimum"]["parameters"]]
+    rows += [{"source": name} | found["parameters"] for name, found in content["alternatives"].items()]
+    rows += [{"source": f"individual:{p['participant']}"} | p["optimum"]["parameters"] for p in content["participants"]]
+    return pd.DataFrame(rows)
+
+
+def _map(study, aggregate, content):
+    """The population map as an xarray Dataset: on a grid of all dimensions, or of the first two beyond three."""
+    import xarray as xr
+
+    parameters = study.space.parameters
+    shown = parameters if len(parameters) <= 3 else parameters[:2]
+    side = np.linspace(0.0, 1.0, _MAP_CELLS)
+    x = np.tile(np.asarray(aggregate.optimum.x), (*(_MAP_CELLS,) * len(shown), 1))
+    for i, grid in enumerate(np.meshgrid(*(side,) * len(shown), indexing="ij")):
+        x[..., i] = grid
+    flat = jnp.asarray(x.reshape(-1, len(parameters)))
+    mean, variance = population(aggregate.posteriors, flat)
+    names = [p.name for p in shown]
+    shape = x.shape[:-1]
+    data = xr.Dataset(
+        {
+            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": "perceived realism, posterior mean"}),
+            "variance": (
+                names,
+                np.asarray(variance).reshape(shape),
+                {"long_name": "perceived realism, posterior variance"},
+            ),
+            "feasible": (
+                names,
+                np.asarray(study.space.feasible(flat)).reshape(shape),
+                {"long_name": "may be rendered"},
+            ),
+        },
+        coords={p.name: (p.name, np.asarray(p.to_physical(jnp.asarray(side))), {"units": p.unit}) for p in shown},
+        attrs={
+            "study": content["study"],
+            "rule": content["rule"],
+            "optimum": json.dumps(content["optimum"]["parameters"]),
+        },
+    )
+    return data
+
+
+def _figures(study, aggregate, seed, truth):
+    from hilbo import plotting
+
+    cohort = aggregate.cohort
+    longest = int(cohort.counts().max())
+    counts = sorted(
+        {*range(1, min(longest, 25) + 1), *np.unique(np.linspace(1, longest, 25).round().astype(int)).tolist()}
+    )
+    counts = counts if longest <= 25 else np.unique(np.linspace(1, longest, 25).round().astype(int)).tolist()
+    merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts))
+    stages = [counts.index(n) for n in (5, 15, 25) if n in counts] or sorted({0, len(counts) // 2, len(counts) - 1})
+    after = [counts[i] for i in stages]
+    white = "White: not passive, never rendered. " if study.space.mechanics is not None else ""
+    third = f" Slices at the optimum's {study.space.names[2]} and beside it." if study.space.dim > 2 else ""
+    marks = {"population map": np.asarray(aggregate.optimum.x), "mean of optima": np.asarray(aggregate.mean_of_optima)}
+    if truth is not None:
+        marks["truth"] = truth
+    top = study.responses[-1]
+    settled = "the truth" if truth is not None else "where it ends"
+    return {
+        "map": (
+            plotting.map_slices(study, aggregate.posteriors, np.asarray(aggregate.optimum.x), cohort),
+            "The population map",
+            f'Brighter is perceived as more realistic; the star is the optimum. {white}Circles are answers "{top}", crosses'
+            f" all others, of all participants, near the slice.{third}",
+        ),
+        "progress": (
+            plotting.progress_figure(study, cohort, merged, own, truth, np.asarray(counts)),
+            "Progress of the optimum",
+            f"Left: how far the optimum after so many trials is from {settled}, in per cent of the search ranges, for the"
+            f' individuals and for the population map. Right: how often people had answered "{top}" by then.',
+        ),
+        "slices": (
+            plotting.slices_after(study, cohort, merged[stages], after),
+            "The population map after fewer trials",
+            f"Every map through its own optimum, the star. {white}",
+        ),
+        "optima": (
+            plotting.optima_scatter(study, np.asarray(aggregate.individuals.x), marks),
+            "Individual optima",
+            "Each dot is one participant's own optimum; the plain mean of the dots need not be good for anybody.",
+        ),
+    }
+
+
+def _page(study, content, pictures):
+    from jinja2 import Environment, PackageLoader, select_autoescape
+
+    template = Environment(loader=PackageLoader("hilbo"), autoescape=select_autoescape()).get_template("report.html")
+    best, gp = content["optimum"], study.gp
+    failed = [p["participant"] for p in content["participants"] if not p["certificate"]["converged"]]
+    people, answers = len(content["participants"]), sum(p["trials"] for p in content["participants"])
+    worst = max(p["certificate"]["residual"] for p in content["participants"])
+    return template.render(
+        title=f"{study.name}: the population's optimum",
+        lead=f"{people} participants gave {answers} answers ({', '.join(study.responses)}). Each person's answers were turned into a"
+        " map of perceived realism; the maps were merged, and this is where the merged map is highest.",
+        warnings=[f"The fit of {', '.join(failed)} did not reach its tolerance; see the certificates in result.json."]
+        if failed
+        else [],
+        optimum=[(_head(study, name), f"{value:.4g}") for name, value in best["parameters"].items()],
+        probabilities=[(label, f"{100 * p:.0f} %") for label, p in best["class_probabilities"].items()],
+        realism=f"{best['mean']:.2f} ± {best['sd']:.2f} (mean and standard deviation of f)",
+        passivity=_passivity_words(best["passivity_margin"]),
+        **_comparison(study, content),
+        figures=pictures,
+        people_head=["participant", "trials", *(_head(study, n) for n in best["parameters"]), "f", "sd"],
+        people=[
+            [
+                p["participant"],
+                p["trials"],
+                *(f"{v:.3g}" for v in p["optimum"]["parameters"].values()),
+                f"{p['optimum']['mean']:.2f}",
+                f"{p['optimum']['sd']:.2f}",
+            ]
+            for p in content["participants"]
+        ],
+        variance=f"{float(gp.kernel.variance):g}",
+        theta=np.array2string(np.asarray(gp.kernel.theta)),
+        noise=f"{float(gp.likelihood.noise):g}",
+        thresholds=", ".join(f"{float(t):g}" for t in gp.likelihood.thresholds),
+        search=_search_words(study),
+        certificate=f"Certificates: every mode was found by Newton's method to a residual of at most {worst:.1e} prior standard"
+        " deviations (which bounds its distance from the exact mode); nothing was added to a covariance.",
+        study_hash=content["study"],
+        seed=content["seed"],
+        versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
+    )
+
+
+def _head(study, name):
+    unit = {p.name: p.unit for p in study.space.parameters}.get(name, "N/mm" if name == "K0" else "")
+    return f"{name} ({unit})" if unit else name
+
+
+def _passivity_words(margin):
+    if margin is None:
+        return ""
+    kind = "passive" if margin >= 0 else "not passive"
+    return f"The rendering is {kind} on the study's device: its damping exceeds the smallest passive one by {margin:.3f} N·s/m."
+
+
+def _search_words(study):
+    mechanics = study.space.mechanics
+    if mechanics is None:
+        return "The optimum was searched over the whole box."
+    return (
+        f"The optimum was searched among the passive parameter sets (FO-SLS, N = {mechanics.N}, T = {1000 * mechanics.T:g} ms,"
+        f" device damping {mechanics.damping:g} N·s/m less 0.1 %), with K0 from the effective stiffness {mechanics.K_eff:g} N/mm."
+    )
+
+
+def _comparison(study, content):
+    """Rows: what else one might ship, with its passivity and, where the truth is known, its miss."""
+    truth = content.get("truth")
+    claims = {"population map (bcm)": ("aggregate", content["optimum"])}
+    words = {"average": "plain average of the latent functions", "pooled": "one model of all answers"}
+    claims |= {words[name]: (name, found) for name, found in content["alternatives"].items()}
+    claims["mean of the individual optima"] = ("mean_of_optima", content["mean_of_optima"])
+    rows = []
+    for words_, (name, found) in claims.items():
+        row = [words_, *(f"{v:.4g}" for v in found["parameters"].values())]
+        if found["passivity_margin"] is not None:
+            row.append(f"{found['passivity_margin']:+.3f}")
+        if truth:
+            row.append(f"{100 * truth['nrmse'][name]['nrmse']:.1f} %")
+        rows.append(row)
+    head = ["", *(_head(study, n) for n in content["optimum"]["parameters"])]
+    head += ["passivity margin (N·s/m)"] if content["optimum"]["passivity_margin"] is not None else []
+    caption = "Other ways to choose one rendering for all; a negative margin is not passive."
+    if truth:
+        head.append("miss (NRMSE)")
+        rows.append(
+            [
+                "truth",
+                *(f"{v:.4g}" for v in truth["parameters"].values()),
+                *[""] * (len(head) - len(truth["parameters"]) - 1),
+            ]
+        )
+        q = [f"{100 * v:.0f}" for v in truth["individuals"]["quartiles"]]
+        caption += f" The individuals' own optima miss the truth by {q[1]} % (median; quartiles {q[0]} and {q[2]} %)."
+    return {"comparison": rows, "comparison_head": head, "comparison_caption": caption}
+
+
+def robustness_result(study: Study, cohort, found, seed: int) -> dict[str, Any]:
+    """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
+    learned, people = found.learned, len(cohort.names)
+    stacked = [np.broadcast_to(np.asarray(part), (people,)) for part in (learned.converged, learned.runaway)]
+    rows = [
+        {
+            "participant": name,
+            "nrmse": float(found.individual_nrmse[j]),
+            "flagged": bool(found.flagged_individuals[j]),
+            "converged": bool(stacked[0][j]),
+            "runaway": bool(stacked[1][j]),
+        }
+        for j, name in enumerate(cohort.names)
+    ]
+    model = learned.gp
+    return {
+        "fixed": _optimum(study, found.fixed),
+        "optimised": _optimum(study, found.optimised),
+        "nrmse": float(found.nrmse),
+        "flagged": bool(found.flagged),
+        "participants": rows,
+        "learned": {
+            "parameters": list(learned.learn),
+            "shared": found.shared,
+            "theta": np.asarray(model.kernel.theta).tolist(),
+            "noise": np.asarray(model.likelihood.noise).tolist(),
+            "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
+        },
+        "sensitivity": {name: np.asarray(block).tolist() for name, block in found.sensitivity.items()},
+        "study": study.hash,
+        "seed": seed,
+        "versions": versions(),
+    }
+
+
+def robustness_page(study: Study, content: dict[str, Any]) -> str:
+    """One self-contained page of the robustness check."""
+    from jinja2 import Environment, PackageLoader, select_autoescape
+
+    template = Environment(loader=PackageLoader("hilbo"), autoescape=select_autoescape()).get_template(
+        "robustness.html"
+    )
+    flagged = [p["participant"] for p in content["participants"] if p["flagged"]]
+    return template.render(study=study, content=content, flagged=flagged, names=study.space.names)
