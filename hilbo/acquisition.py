@@ -109,7 +109,8 @@ def maximise(
 
     **Arguments:**
 
-    - `values`: scores (m,) of the `candidates` (m, d), feasible points of the unit cube.
+    - `values`: scores (m,) of the `candidates` (m, d), feasible points of the unit cube. They only rank the
+      candidates, so single precision will do: the best ones are scored again.
     - `score`: the same score for one point, differentiable.
     - `from_box`, `to_box`: between the optimiser's cube, in which everything is feasible, and the unit cube.
     - `feasible`: whether a polished point may be rendered (candidates are known to).
@@ -119,18 +120,22 @@ def maximise(
     """
     if allowed is not None:
         values = jnp.where(jax.vmap(allowed)(candidates), values, -jnp.inf)
-    first = jnp.argmax(values)
-    best = Choice(candidates[first], values[first], first, values[first])
+    rows = _spread(values, candidates, max(starts, 1))
+    begun = jnp.where(values[rows] > -jnp.inf, jax.vmap(score)(candidates[rows]), -jnp.inf)
+    first = jnp.argmax(begun)
+    best = Choice(candidates[rows[first]], begun[first], rows[first], begun[first])
     if starts == 0:
         return best
-    rows = _spread(values, candidates, starts)
     polished = jax.vmap(functools.partial(_polish, score, from_box, to_box, steps))(candidates[rows])
     usable = jax.vmap(lambda x: feasible(x) & (True if allowed is None else allowed(x)))(polished)
     reached = jnp.where(usable, jax.vmap(score)(polished), -jnp.inf)
     top = jnp.argmax(reached)
     better = reached[top] > best.value
     return Choice(
-        jnp.where(better, polished[top], best.x), jnp.where(better, reached[top], best.value), first, best.value
+        jnp.where(better, polished[top], best.x),
+        jnp.where(better, reached[top], best.value),
+        best.candidate,
+        best.candidate_value,
     )
 
 

@@ -15,7 +15,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 
@@ -108,7 +108,7 @@ def robustness(
         from hilbo.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
-        found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
+        found = check(chosen, cohort, seed, learn=cast(Any, tuple(learn.split(","))), shared=not own)
         content = report.robustness_result(chosen, cohort, found, seed)
         (folder / "result.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
         (folder / "report.html").write_text(report.robustness_page(chosen, content), encoding="utf-8")

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 
-__all__ = ["Learned", "Learnable", "log_prior", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
+__all__ = ["Learnable", "Learned", "log_prior", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
 
 Learnable = Literal["theta", "variance", "noise", "thresholds"]
 Coordinates = dict[str, Float[Array, "..."]]
@@ -101,7 +101,7 @@ def _maximise(gp, trials, learn, weak_priors, starts, max_steps):
         return -(evidence + prior) / answers, (evidence, certified)
 
     def search(start):
-        solver = optx.BFGS(rtol=1e-6, atol=1e-8)
+        solver = optx.BFGS(rtol=1e-4, atol=1e-6)
         return optx.minimise(cost, solver, start, has_aux=True, max_steps=max_steps, throw=False)
 
     def ended(start):
@@ -113,7 +113,8 @@ def _maximise(gp, trials, learn, weak_priors, starts, max_steps):
         return solution.value, value, evidence, done, jnp.asarray(solution.stats["num_steps"])
 
     begin = _coordinates(gp, learn)
-    ends, values, evidences, done, steps = jax.vmap(ended)(_spread(begin, starts))
+    # One search after the other: each stops when it is done, where a batch would wait for its slowest.
+    ends, values, evidences, done, steps = jax.lax.map(ended, _spread(begin, starts))
     best = jnp.argmin(values)
     chosen = jax.tree.map(lambda leaf: leaf[best], ends)
     moved = [jnp.max(jnp.abs(chosen[k] - begin[k])) for k in chosen if k != "first" and chosen[k].size]

@@ -43,7 +43,7 @@ class RBF(eqx.Module):
     theta: Float[Array, "*d"]
     variance: Float[Array, ""]
 
-    def __init__(self, theta: ArrayLike | Sequence[float], variance: ArrayLike = 1.0):
+    def __init__(self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0):
         self.theta = jnp.asarray(theta, dtype=_float_dtype(theta))
         self.variance = jnp.asarray(variance, dtype=_float_dtype(variance))
 

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.linalg import cholesky, eigh, solve_lower, solve_lower_transposed
 
-__all__ = ["Certificate", "LaplacePosterior", "Pointwise", "Terms", "explained_variance", "laplace"]
+__all__ = ["Certificate", "LaplacePosterior", "Pointwise", "Terms", "laplace", "mean_and_explained"]
 
 Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 """Log-likelihood terms l_i(eta_i), their slopes l_i' and curvatures -l_i'' >= 0; [`Pointwise`][] derives the latter."""
@@ -86,7 +86,7 @@ def laplace(
     terms: Terms,
     *,
     start: Float[Array, " n"] | None = None,
-    max_steps: int = 100,
+    max_steps: int = 200,
 ) -> LaplacePosterior:
     """Approximate p(eta | data) by a Gaussian at its mode.
 
@@ -118,29 +118,34 @@ def laplace(
         condition=condition,
         smallest_variance=jnp.min(jnp.where(fixed[1] > 0, variance, largest)),
         variance_resolution=jnp.finfo(mode.dtype).eps * largest * mode.shape[0] ** 0.5,
-        converged=residual <= tolerance,
+        converged=(residual <= tolerance) & jnp.isfinite(log_evidence),
     )
     return LaplacePosterior(mode, gradient, factor, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 
 
 @jax.custom_jvp
-def explained_variance(
-    factor: Float[Array, "n n"], inverse: Float[Array, "n n"], cross: Float[Array, "m n"]
-) -> Float[Array, " m"]:
-    """Prior minus posterior variance at m points, k*'C k*, as sums of squares: never negative, with all their digits.
+def mean_and_explained(
+    weights: Float[Array, " n"], factor: Float[Array, "n n"], inverse: Float[Array, "n n"], cross: Float[Array, "n m"]
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Posterior mean k*'a at m points, and k*'C k*, the prior variance less the posterior's.
 
-    **Arguments:** `factor` and `inverse` of a posterior, and `cross`, the prior covariances (m, n) of f* with eta.
+    The latter is a sum of squares: never negative, with all its digits however little is explained.
+
+    **Arguments:** `weights`, `factor` and `inverse` of a posterior; `cross`, prior covariances (n, m) of eta and f*.
     """
     del inverse
-    return jnp.sum((cross @ factor.T) ** 2, axis=1)
+    # One product for both; the barrier keeps XLA from computing every covariance once more for each row of it.
+    product = jnp.concatenate([factor, weights[None, :]]) @ jax.lax.optimization_barrier(cross)
+    return product[-1], jnp.sum(product[:-1] ** 2, axis=0)
 
 
-@explained_variance.defjvp
-def _explained_variance_jvp(primals, tangents):
-    _, inverse, cross = primals
-    _, d_inverse, d_cross = tangents
-    tangent = jnp.sum((cross @ d_inverse) * cross + 2.0 * (cross @ inverse) * d_cross, axis=1)
-    return explained_variance(*primals), tangent
+@mean_and_explained.defjvp
+def _mean_and_explained_jvp(primals, tangents):
+    weights, _, inverse, cross = primals
+    d_weights, _, d_inverse, d_cross = tangents
+    d_mean = d_weights @ cross + weights @ d_cross
+    d_explained = jnp.sum((d_inverse @ cross) * cross + 2.0 * (inverse @ cross) * d_cross, axis=0)
+    return mean_and_explained(*primals), (d_mean, d_explained)
 
 
 # --- the mode
@@ -260,7 +265,7 @@ def _newton_state(terms, root, v):
         gain=uphill @ direction,
         objective=jnp.sum(values) - 0.5 * v @ v,
         residual=jnp.linalg.norm(uphill),
-        tolerance=jnp.maximum(epsilon ** (2 / 3), 4.0 * epsilon * jnp.linalg.norm(summed)),
+        tolerance=jnp.clip(4.0 * epsilon * jnp.linalg.norm(summed), epsilon ** (2 / 3), epsilon**0.25),
     )
     return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v)
 

@@ -86,8 +86,7 @@ class OrdinalProbit(eqx.Module):
         """
         mean, variance = jnp.asarray(mean), jnp.asarray(variance)
         blurred = OrdinalProbit(self.thresholds, jnp.sqrt(self.noise**2 + variance.astype(self.noise.dtype)))
-        # Their sum is 1 but for rounding, which the softmax shares out in proportion.
-        return jax.nn.softmax(jax.vmap(lambda q: blurred.log_prob(mean, q))(jnp.arange(self.categories)))
+        return jnp.exp(jax.vmap(lambda q: blurred.log_prob(mean, q))(jnp.arange(self.categories)))
 
     def _edges(self, f, q):
         """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`."""
@@ -239,7 +238,7 @@ def _tail(low, high, width, product):
         -0.5 * low**2 - HALF_LOG_2PI - jnp.log(hazard) + jnp.log(remaining),
         hazard / remaining,
         far,
-        *_cumulants(low, offset, far, jnp.where(bounded, width, 0.0)),
+        *_cumulants(low + offset, offset, far, jnp.where(bounded, width, 0.0)),
     )
 
 
@@ -255,13 +254,13 @@ def _centre(low, high, width, product):
     outside = density / hazard * (1.0 + falloff * hazard / hazard_high)
     near = density / (1.0 - outside)
     far = falloff * near
-    offset = near - far - sum(low)
-    return jnp.log1p(-outside), near, far, *_cumulants(sum(low), offset, far, jnp.where(bounded, width, 0.0))
+    mean = near * -jnp.expm1(-product)  # not low + (mean - low): a certain answer keeps the digits of its small slope
+    log_mass = jnp.where(outside > 0.25, jnp.log(1.0 - outside), jnp.log1p(-outside))  # XLA's log1p errs near -0.4
+    return log_mass, near, far, *_cumulants(mean, mean - sum(low), far, jnp.where(bounded, width, 0.0))
 
 
-def _cumulants(low, offset, far, width):
+def _cumulants(mean, offset, far, width):
     """Mean, 1 - variance (a sum of non-negative terms) and third cumulant; `width` is 0 where `far` is."""
-    mean = low + offset
     curvature = mean * offset + width * far
     skew = curvature * offset - mean * (1.0 - curvature) - width * far * (width - offset)
     return mean, curvature, skew

@@ -18,7 +18,7 @@ from hilbo.study import Cohort, fit_cohort, population
 __all__ = ["map_slices", "optima_scatter", "progress_figure", "slices_after"]
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
-_STYLE = {
+_STYLE: dict = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
@@ -56,7 +56,7 @@ def slices_after(study: Study, cohort: Cohort, optima: Float[np.ndarray, "k d"],
     """The population map after the first `counts` trials of everybody, each at its own optimum (the star)."""
     grids = [
         _slice(study, fit_cohort(study, cohort.first(n)), x, x[2] if len(x) > 2 else None)
-        for n, x in zip(counts, optima)
+        for n, x in zip(counts, optima, strict=True)
     ]
     low, high = _limits(grids)
     with mpl.rc_context(_STYLE):
@@ -161,8 +161,9 @@ def _axes(axes, study, i, j):
         getattr(axes, f"set_{which}lim")(parameter.low, parameter.high)
 
 
-def _name(name):
-    return {"alpha": "α", "K1": "$K_1$", "B1": "$B_1$"}.get(name, name.replace("_", " "))
+def _name(name: str) -> str:
+    symbols = {"alpha": "α", "K1": "$K_1$", "B1": "$B_1$"}
+    return symbols[name] if name in symbols else name.replace("_", " ")
 
 
 def _unit(unit):
@@ -171,7 +172,8 @@ def _unit(unit):
 
 def _level(study, index, unit_value):
     parameter = study.space.parameters[index]
-    return f"{_name(parameter.name)} = {float(parameter.to_physical(jnp.asarray(float(unit_value)))):.3g} {parameter.unit}".strip()
+    value = float(parameter.to_physical(jnp.asarray(float(unit_value))))
+    return f"{_name(parameter.name)} = {value:.3g} {parameter.unit}".strip()
 
 
 def _mark_trials(axes, study, cohort, third):

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from hilbo.config import Study
@@ -28,14 +29,14 @@ K0_RANGE = 16.14
 _MAP_CELLS = 41
 
 
-def set_of(study: Study, x: Float[np.ndarray, " d"]) -> dict[str, float]:
+def set_of(study: Study, x: ArrayLike) -> dict[str, float]:
     """A point of the unit cube as a parameter set in physical units, derived K0 included."""
     physical = np.asarray(study.space.to_physical(np.asarray(x)))
     values = dict(zip(study.space.names, physical.tolist(), strict=True))
     return {name: float(value) for name, value in study.space.derived(values).items()} | values
 
 
-def margin_of(study: Study, x: Float[np.ndarray, " d"]) -> float | None:
+def margin_of(study: Study, x: ArrayLike) -> float | None:
     """Passivity margin (N.s/m) of a point, None without mechanics; negative means not passive."""
     values = set_of(study, x)
     margin = study.space.passivity_margin({name: values[name] for name in study.space.names})
@@ -235,14 +236,14 @@ def _figures(study, aggregate, seed, truth):
         "map": (
             plotting.map_slices(study, aggregate.posteriors, np.asarray(aggregate.optimum.x), cohort),
             "The population map",
-            f'Brighter is perceived as more realistic; the star is the optimum. {white}Circles are answers "{top}", crosses'
-            f" all others, of all participants, near the slice.{third}",
+            "Brighter is perceived as more realistic; the star is the optimum. "
+            f'{white}Circles are answers "{top}", crosses all others, of all participants, near the slice.{third}',
         ),
         "progress": (
             plotting.progress_figure(study, cohort, merged, own, truth, np.asarray(counts)),
             "Progress of the optimum",
-            f"Left: how far the optimum after so many trials is from {settled}, in per cent of the search ranges, for the"
-            f' individuals and for the population map. Right: how often people had answered "{top}" by then.',
+            f"Left: how far the optimum after so many trials is from {settled}, in per cent of the search ranges, for"
+            f' the individuals and for the population map. Right: how often people had answered "{top}" by then.',
         ),
         "slices": (
             plotting.slices_after(study, cohort, merged[stages], after),
@@ -267,8 +268,8 @@ def _page(study, content, pictures):
     worst = max(p["certificate"]["residual"] for p in content["participants"])
     return template.render(
         title=f"{study.name}: the population's optimum",
-        lead=f"{people} participants gave {answers} answers ({', '.join(study.responses)}). Each person's answers were turned into a"
-        " map of perceived realism; the maps were merged, and this is where the merged map is highest.",
+        lead=f"{people} participants gave {answers} answers ({', '.join(study.responses)}). Each person's answers were"
+        " turned into a map of perceived realism; the maps were merged, and this is where the merged map is highest.",
         warnings=[f"The fit of {', '.join(failed)} did not reach its tolerance; see the certificates in result.json."]
         if failed
         else [],
@@ -294,8 +295,8 @@ def _page(study, content, pictures):
         noise=f"{float(gp.likelihood.noise):g}",
         thresholds=", ".join(f"{float(t):g}" for t in gp.likelihood.thresholds),
         search=_search_words(study),
-        certificate=f"Certificates: every mode was found by Newton's method to a residual of at most {worst:.1e} prior standard"
-        " deviations (which bounds its distance from the exact mode); nothing was added to a covariance.",
+        certificate=f"Certificates: every mode was found by Newton's method to a residual of at most {worst:.1e}"
+        " prior standard deviations (which bounds its distance from the exact mode).",
         study_hash=content["study"],
         seed=content["seed"],
         versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
@@ -311,7 +312,8 @@ def _passivity_words(margin):
     if margin is None:
         return ""
     kind = "passive" if margin >= 0 else "not passive"
-    return f"The rendering is {kind} on the study's device: its damping exceeds the smallest passive one by {margin:.3f} N·s/m."
+    by = f"its damping less the smallest passive one is {margin:.3f} N·s/m"
+    return f"The rendering is {kind} on the study's device: {by}."
 
 
 def _search_words(study):
@@ -319,8 +321,9 @@ def _search_words(study):
     if mechanics is None:
         return "The optimum was searched over the whole box."
     return (
-        f"The optimum was searched among the passive parameter sets (FO-SLS, N = {mechanics.N}, T = {1000 * mechanics.T:g} ms,"
-        f" device damping {mechanics.damping:g} N·s/m less 0.1 %), with K0 from the effective stiffness {mechanics.K_eff:g} N/mm."
+        f"The optimum was searched among the passive parameter sets (FO-SLS, N = {mechanics.N},"
+        f" T = {1000 * mechanics.T:g} ms, device damping {mechanics.damping:g} N·s/m less 0.1 %), with K0 from the"
+        f" effective stiffness {mechanics.K_eff:g} N/mm."
     )
 
 

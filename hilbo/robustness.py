@@ -97,7 +97,7 @@ def robustness(
 def _learn(gp, trials, learn, shared, weak_priors):
     if shared:
         return maximise_shared_evidence(gp, trials, learn, weak_priors=weak_priors)
-    return jax.vmap(lambda t: maximise_evidence(gp, t, learn, weak_priors=weak_priors))(trials)
+    return jax.lax.map(lambda t: maximise_evidence(gp, t, learn, weak_priors=weak_priors), trials)
 
 
 @eqx.filter_jit

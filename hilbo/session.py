@@ -63,7 +63,7 @@ def next_point(study: Study, plan: Design, trials: Trials, trial: Int[Array, ""]
     distance = study.selection.minimum_distance
     feasible = study.space.feasible
     return acquisition.maximise(
-        score(*posterior.predict(plan.candidates)),
+        score(*posterior.astype(jnp.float32).predict(plan.candidates.astype(jnp.float32))),
         plan.candidates,
         score_at,
         from_box=study.space.from_box,
@@ -76,7 +76,7 @@ def next_point(study: Study, plan: Design, trials: Trials, trial: Int[Array, ""]
 def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
     """Where the posterior mean is largest in the feasible set: the session's optimum (paper, algorithm 1)."""
     return acquisition.maximise(
-        posterior.mean(candidates),
+        posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
         candidates,
         lambda x: posterior.mean(x[None, :])[0],
         from_box=study.space.from_box,

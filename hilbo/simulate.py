@@ -68,13 +68,13 @@ class Population(eqx.Module):
 
 _PAPER = Population(
     truth={"K1": 5.70, "B1": 5.89, "alpha": 0.203},
-    spread=(0.62, 0.37, 0.17),
-    tolerance=(0.56, 0.084, 0.19),
-    tolerance_sd=0.18,
-    criteria=(1.59, 1.0),
-    noise=0.63,
-    lapse=0.044,
-    drift_sd=0.14,
+    spread=(0.20, 0.075, 0.074),
+    tolerance=(0.238, 0.362, 0.087),
+    tolerance_sd=0.41,
+    criteria=(1.36, 1.0),
+    noise=0.98,
+    lapse=0.062,
+    drift_sd=0.38,
 )
 
 PRESETS: dict[str, Population] = {"paper": _PAPER}

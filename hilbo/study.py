@@ -40,7 +40,6 @@ __all__ = [
 ]
 
 Rule = Literal["bcm", "average"]
-_BLOCK = 64  # participants predicted together
 _LARGEST_POOL = 3000  # answers: the pooled fit is cubic in their number
 
 
@@ -140,7 +139,7 @@ def population(
     if rule == "average":
         means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors)
         return bcm.average(means, prior[None, :] - explained)
-    evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior, block=_BLOCK)
+    evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior)
     return evidence.merge(prior)
 
 

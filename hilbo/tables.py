@@ -54,7 +54,7 @@ def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
     if Path(path).suffix == ".parquet":
         table.to_parquet(path, index=False)
     else:
-        table.to_csv(path, index=False, float_format=repr)
+        table.to_csv(path, index=False)  # pandas writes the shortest decimals that read back the same
 
 
 def _read_text(path: Path, source: str) -> pd.DataFrame:
@@ -62,7 +62,9 @@ def _read_text(path: Path, source: str) -> pd.DataFrame:
     try:
         if path.suffix == ".parquet":
             frame = pd.read_parquet(path)
-            frame = frame.map(lambda v: "" if v is None or v is pd.NA else repr(v) if isinstance(v, float) else str(v))
+            frame = frame.map(
+                lambda v: "" if v is None or v is pd.NA else repr(float(v)) if isinstance(v, float) else str(v)
+            )
             return frame.set_axis(np.arange(1, len(frame) + 1))
         frame = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, encoding="utf-8-sig")
         return frame.set_axis(np.arange(2, len(frame) + 2))

@@ -33,8 +33,8 @@ def hill(x):
     return -jnp.sum((x - jnp.array([0.31, 0.62])) ** 2)
 
 
-def find(**settings):
-    candidates = jnp.asarray(np.random.default_rng(0).random((64, 2)))
+def find(width=1.0, **settings):
+    candidates = jnp.asarray(np.random.default_rng(0).random((64, 2)) * [width, 1.0])
     identity = lambda w: w  # noqa: E731
     arguments = {"from_box": identity, "to_box": identity, "feasible": lambda x: jnp.asarray(True)} | settings
     return acquisition.maximise(jax.vmap(hill)(candidates), candidates, hill, **arguments), candidates
@@ -47,7 +47,7 @@ def test_polishing_reaches_the_maximum():
 
 
 def test_polishing_reaches_the_wall():
-    choice, _ = find(from_box=lambda w: w * jnp.array([0.2, 1.0]), to_box=lambda x: x / jnp.array([0.2, 1.0]))
+    choice, _ = find(0.2, from_box=lambda w: w * jnp.array([0.2, 1.0]), to_box=lambda x: x / jnp.array([0.2, 1.0]))
     np.testing.assert_allclose(choice.x, [0.2, 0.62], atol=1e-5)
 
 
@@ -58,7 +58,7 @@ def test_without_polishing_it_is_the_best_candidate():
 
 def test_what_is_not_feasible_is_not_chosen_by_polishing():
     choice, candidates = find(feasible=lambda x: jnp.asarray(False))
-    assert jnp.any(jnp.all(choice.x == candidates, axis=1))
+    assert jnp.any(jnp.all(choice.x[None, :] == candidates, axis=1))
 
 
 def test_a_smallest_distance_is_kept():

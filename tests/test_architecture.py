@@ -43,7 +43,7 @@ MAY_IMPORT = MATHS | {
     "event_log": {"session"},
     "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm"},
     "robustness": {"study", "hyperparameters"},
-    "plotting": set(MATHS),
+    "plotting": set(MATHS) | {"study"},
     "hardware_bridge": {"protocol"},
 }
 MAY_IMPORT["report"] = set(MAY_IMPORT)

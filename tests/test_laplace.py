@@ -15,7 +15,7 @@ from reference_laplace import mpmath_laplace, numpy_laplace
 from scipy.special import log_ndtr
 
 from hilbo.kernels import RBF, gram
-from hilbo.laplace import Pointwise, explained_variance, laplace
+from hilbo.laplace import Pointwise, laplace, mean_and_explained
 from hilbo.likelihoods import OrdinalProbit
 
 QUANTITIES = ("mode", "mean", "variance", "log_evidence")
@@ -87,7 +87,7 @@ solve = jax.jit(laplace, static_argnames="max_steps")
 def results(covariance, terms, cross, variance, **options):
     posterior = solve(covariance, terms, **options)
     count = int(terms.answered.sum())
-    explained = explained_variance(posterior.factor, posterior.inverse, cross)
+    explained = mean_and_explained(posterior.weights, posterior.factor, posterior.inverse, cross.T)[1]
     values = posterior.mode[:count], cross @ posterior.weights, variance - explained, posterior.log_evidence
     return posterior, dict(zip(QUANTITIES, values, strict=True))
 
@@ -131,7 +131,7 @@ KERNEL = RBF((3.0, 7.0), 1.3)
 def by_laplace(kernel, terms):
     posterior = laplace(gram(kernel, X, X), Pointwise(terms))
     cross = gram(kernel, X_NEW, X)
-    explained = explained_variance(posterior.factor, posterior.inverse, cross)
+    explained = mean_and_explained(posterior.weights, posterior.factor, posterior.inverse, cross.T)[1]
     return jnp.concatenate([posterior.log_evidence[None], cross @ posterior.weights, kernel.variance - explained])
 
 

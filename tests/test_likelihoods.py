@@ -109,6 +109,21 @@ def test_curvature_is_that_of_a_log_concave_function_and_all_is_finite(dtype):
     assert all(np.all(np.isfinite(values)) for values in found(dtype))
 
 
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 1e-4)])
+@pytest.mark.parametrize("noise", [1e-3, 0.5])
+def test_a_certain_answer_keeps_the_digits_of_its_small_slope(dtype, tolerance, noise):
+    """Relative, where the grid asks for 1/noise: with a wide prior the mode lies where this slope is all there is."""
+    c = dtype(noise)
+    for t in (np.array([-0.5, 0.5], dtype), np.array([-40, 0], dtype) * c):
+        for q, edge, side in ((2, t[1], 1), (0, t[0], -1), (1, t[1], -1)):
+            f = (edge + side * c * np.array([1.5, 3, 5, 8, 12])).astype(dtype)
+            columns = evaluate(f, np.full(5, q), np.tile(t, (5, 1)), np.full(5, c))
+            for s, slope, curvature in zip(f, columns[1], columns[2], strict=True):
+                _, *targets = ordinal_log_prob_mp(s, *np.array([-np.inf, *t, np.inf])[q : q + 2], c, 60)
+                for value, target in zip((slope, curvature), targets, strict=True):
+                    assert distance(value, target) <= tolerance * abs(target)
+
+
 def exact_slopes(f, q, t, noise):
     """d log p / d(t_0, t_1, noise), from densities at 60 digits beyond those that the difference of tails loses."""
     with mp.workdps(60):

@@ -1,0 +1,52 @@
+# %% [markdown]
+# # Re-aggregating a data set
+# Seventeen people rated compressed video clips from bad to excellent. Their answers become one population map over
+# bitrate and height; any subset of people and any prefix of trials can be merged again.
+
+# %%
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import jax.numpy as jnp
+import numpy as np
+
+from hilbo import Study
+from hilbo.study import aggregate_cohort, cohort_of, fit_cohort, population, population_optimum
+from hilbo.tables import read_trials
+
+study = Study.load("hilbo/data/video_quality.toml")
+cohort = cohort_of(read_trials("hilbo/data/video_quality.csv", study), study)
+print(len(cohort.names), "people,", int(cohort.counts().sum()), "answers")
+
+# %% [markdown]
+# ## The map and its optimum
+
+# %%
+aggregate = aggregate_cohort(study, cohort)
+best = dict(zip(study.space.names, np.asarray(study.space.to_physical(aggregate.optimum.x)), strict=True))
+print("highest at", best, "with", float(aggregate.optimum.mean), "±", float(aggregate.optimum.sd))
+print(
+    "answers to expect there:",
+    dict(zip(study.responses, np.asarray(aggregate.optimum.class_probabilities), strict=True)),
+)
+
+# %% [markdown]
+# ## Half the people, or a third of the trials
+# The map is a sum of what each person adds, so that leaving people out is cheap.
+
+# %%
+candidates = jnp.asarray(study.space.candidates(2048, 0))
+for words, part in (("first eight people", cohort.of(cohort.names[:8])), ("first 23 trials", cohort.first(23))):
+    optimum = population_optimum(study, fit_cohort(study, part), candidates)
+    print(words, np.asarray(study.space.to_physical(optimum.x)), "sd", float(optimum.sd))
+
+# %% [markdown]
+# More people make the map more certain everywhere, if they are noisy views of one function: the committee machine's
+# assumption.
+
+# %%
+points = candidates[:5]
+for count in (1, 4, 17):
+    _, variance = population(fit_cohort(study, cohort.of(cohort.names[:count])), points)
+    print(count, "people: sd", np.round(np.sqrt(variance), 3))

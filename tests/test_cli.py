@@ -1,0 +1,118 @@
+"""The commands as a user types them: what they write, and bad input in one sentence with exit code 2."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+from hilbo import cli
+
+VIDEO = ["hilbo/data/video_quality.csv", "--study", "hilbo/data/video_quality.toml"]
+
+
+def run(capsys, monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["hilbo", *map(str, arguments)])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    captured = capsys.readouterr()
+    return stopped.value.code or 0, captured.out, captured.err
+
+
+HELP = """
+import sys
+sys.argv = ["hilbo", "--help"]
+from hilbo import cli
+try:
+    cli.main()
+finally:
+    assert "jax" not in sys.modules
+"""
+
+
+def test_help_answers_without_jax():
+    done = subprocess.run([sys.executable, "-c", HELP], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "aggregate" in done.stdout
+
+
+def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
+    out = tmp_path / "results"
+    code, stdout, _ = run(
+        capsys, monkeypatch, "aggregate", *VIDEO, "--out", out, "--participants", "V01,V02,V03", "--json"
+    )
+    assert code == 0
+    content = json.loads(stdout)
+    assert content == json.loads((out / "result.json").read_text())
+    assert [p["participant"] for p in content["participants"]] == ["V01", "V02", "V03"]
+    assert sum(content["optimum"]["class_probabilities"].values()) == pytest.approx(1.0, abs=1e-12)
+    assert all(p["certificate"]["converged"] for p in content["participants"])
+    data = xr.load_dataset(out / "map.nc", engine="h5netcdf")
+    assert data["mean"].dims == ("bitrate_kbps", "height_px")
+    assert data["bitrate_kbps"].attrs["units"] == "kbit/s"
+    assert float(data["mean"].max()) <= content["optimum"]["mean"] + 1e-9
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 4
+    assert "http://" not in page and "https://" not in page
+    assert len(pd.read_csv(out / "optima.csv")) == 6
+    before = (out / "result.json").read_bytes()
+    code, _, stderr = run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", out)
+    assert (code, (out / "result.json").read_bytes()) == (2, before)
+    assert "--force" in stderr
+
+
+def test_robustness_writes_its_check(capsys, monkeypatch, tmp_path):
+    table = pd.read_csv(VIDEO[0], dtype=str)
+    table[table["participant"].isin(["V01", "V02"])].to_csv(tmp_path / "two.csv", index=False)
+    out = tmp_path / "check"
+    code, _, _ = run(
+        capsys, monkeypatch, "robustness", tmp_path / "two.csv", *VIDEO[1:], "--out", out, "--learn", "theta,noise"
+    )
+    assert code == 0
+    content = json.loads((out / "result.json").read_text())
+    assert content["learned"]["parameters"] == ["theta", "noise"]
+    assert np.isfinite(content["nrmse"])
+    assert "robust" in (out / "report.html").read_text()
+
+
+STUDY = Path("hilbo/data/paper.toml").read_text()
+BAD_STUDIES = {
+    "unknown key": (STUDY.replace("[gp]", "[gp]\nlength = 3"), "gp.length is not a key"),
+    "wrong type": (STUDY.replace("theta = 30.0", 'theta = "long"'), 'gp.theta is "long"'),
+    "thresholds out of order": (STUDY.replace("[-0.5, 0.5]", "[0.5, -0.5]"), "gp.thresholds"),
+    "noise of 0": (STUDY.replace("noise = 0.5", "noise = 0"), "gp.noise is 0"),
+}
+
+
+@pytest.mark.parametrize("what", BAD_STUDIES)
+def test_bad_studies_write_nothing(capsys, monkeypatch, tmp_path, what):
+    text, words = BAD_STUDIES[what]
+    (tmp_path / "study.toml").write_text(text)
+    code, stdout, stderr = run(
+        capsys, monkeypatch, "aggregate", VIDEO[0], "--study", tmp_path / "study.toml", "--out", tmp_path / "out"
+    )
+    assert (code, stdout) == (2, "")
+    assert words in stderr
+    assert "study.toml:" in stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["study.toml"]
+
+
+def test_a_bad_table_writes_nothing(capsys, monkeypatch, tmp_path):
+    (tmp_path / "t.csv").write_text("participant,trial,response,bitrate_kbps,height_px\nA,1,superb,500,480\n")
+    code, _, stderr = run(capsys, monkeypatch, "aggregate", tmp_path / "t.csv", *VIDEO[1:], "--out", tmp_path / "out")
+    assert code == 2
+    assert 't.csv:2: response is "superb"' in stderr
+    assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
+
+
+@pytest.mark.parametrize("arguments", [["aggregate"], ["simulate", "--preset", "nobody", "--out", "x"], ["fly"]])
+def test_bad_usage_ends_with_2(capsys, monkeypatch, tmp_path, arguments):
+    monkeypatch.chdir(tmp_path)
+    code, _, stderr = run(capsys, monkeypatch, *arguments)
+    assert code == 2
+    assert stderr
+    assert not list(tmp_path.iterdir())
