@@ -15,7 +15,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 
@@ -104,14 +104,14 @@ def robustness(
     """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
     with _results(out, force) as folder, _progress() as say:
         chosen, cohort = _read(trials, study, material, say)
-        from hilbo import report
+        from hilbo import page, report
         from hilbo.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
-        found = check(chosen, cohort, seed, learn=cast(Any, tuple(learn.split(","))), shared=not own)
+        found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
         content = report.robustness_result(chosen, cohort, found, seed)
         (folder / "result.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
-        (folder / "report.html").write_text(report.robustness_page(chosen, content), encoding="utf-8")
+        (folder / "report.html").write_text(page.robustness_page(chosen, content), encoding="utf-8")
     _finish(content, out, as_json)
 
 

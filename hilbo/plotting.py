@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
 from hilbo.config import Study
@@ -76,7 +76,7 @@ def progress_figure(
     population_optima: Float[np.ndarray, "p d"],
     individual: Float[np.ndarray, "p M d"],
     truth: Float[np.ndarray, " d"] | None = None,
-    counts: Float[np.ndarray, " p"] | None = None,
+    counts: Int[np.ndarray, " p"] | None = None,
 ) -> Figure:
     """How the optima settle (left, NRMSE to the last trial's, or to the truth), and answers in the top category."""
     trials = np.arange(1, len(population_optima) + 1) if counts is None else counts

@@ -20,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from hilbo.config import Study
+from hilbo.page import results_page
 from hilbo.study import Aggregate, nrmse, population, progress
 
 __all__ = ["K0_RANGE", "misses", "result", "set_of", "write_results"]
@@ -164,7 +165,7 @@ def write_results(
         (folder / f"{name}.png").write_bytes(buffer.getvalue())
         png = base64.b64encode(buffer.getvalue()).decode()
         pictures.append({"png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
-    (folder / "report.html").write_text(_page(study, content, pictures), encoding="utf-8")
+    (folder / "report.html").write_text(results_page(study, content, pictures), encoding="utf-8")
     return content
 
 
@@ -258,107 +259,6 @@ def _figures(study, aggregate, seed, truth):
     }
 
 
-def _page(study, content, pictures):
-    from jinja2 import Environment, PackageLoader, select_autoescape
-
-    template = Environment(loader=PackageLoader("hilbo"), autoescape=select_autoescape()).get_template("report.html")
-    best, gp = content["optimum"], study.gp
-    failed = [p["participant"] for p in content["participants"] if not p["certificate"]["converged"]]
-    people, answers = len(content["participants"]), sum(p["trials"] for p in content["participants"])
-    worst = max(p["certificate"]["residual"] for p in content["participants"])
-    return template.render(
-        title=f"{study.name}: the population's optimum",
-        lead=f"{people} participants gave {answers} answers ({', '.join(study.responses)}). Each person's answers were"
-        " turned into a map of perceived realism; the maps were merged, and this is where the merged map is highest.",
-        warnings=[f"The fit of {', '.join(failed)} did not reach its tolerance; see the certificates in result.json."]
-        if failed
-        else [],
-        optimum=[(_head(study, name), f"{value:.4g}") for name, value in best["parameters"].items()],
-        probabilities=[(label, f"{100 * p:.0f} %") for label, p in best["class_probabilities"].items()],
-        realism=f"{best['mean']:.2f} ± {best['sd']:.2f} (mean and standard deviation of f)",
-        passivity=_passivity_words(best["passivity_margin"]),
-        **_comparison(study, content),
-        figures=pictures,
-        people_head=["participant", "trials", *(_head(study, n) for n in best["parameters"]), "f", "sd"],
-        people=[
-            [
-                p["participant"],
-                p["trials"],
-                *(f"{v:.3g}" for v in p["optimum"]["parameters"].values()),
-                f"{p['optimum']['mean']:.2f}",
-                f"{p['optimum']['sd']:.2f}",
-            ]
-            for p in content["participants"]
-        ],
-        variance=f"{float(gp.kernel.variance):g}",
-        theta=np.array2string(np.asarray(gp.kernel.theta)),
-        noise=f"{float(gp.likelihood.noise):g}",
-        thresholds=", ".join(f"{float(t):g}" for t in gp.likelihood.thresholds),
-        search=_search_words(study),
-        certificate=f"Certificates: every mode was found by Newton's method to a residual of at most {worst:.1e}"
-        " prior standard deviations (which bounds its distance from the exact mode).",
-        study_hash=content["study"],
-        seed=content["seed"],
-        versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
-    )
-
-
-def _head(study, name):
-    unit = {p.name: p.unit for p in study.space.parameters}.get(name, "N/mm" if name == "K0" else "")
-    return f"{name} ({unit})" if unit else name
-
-
-def _passivity_words(margin):
-    if margin is None:
-        return ""
-    kind = "passive" if margin >= 0 else "not passive"
-    by = f"its damping less the smallest passive one is {margin:.3f} N·s/m"
-    return f"The rendering is {kind} on the study's device: {by}."
-
-
-def _search_words(study):
-    mechanics = study.space.mechanics
-    if mechanics is None:
-        return "The optimum was searched over the whole box."
-    return (
-        f"The optimum was searched among the passive parameter sets (FO-SLS, N = {mechanics.N},"
-        f" T = {1000 * mechanics.T:g} ms, device damping {mechanics.damping:g} N·s/m less 0.1 %), with K0 from the"
-        f" effective stiffness {mechanics.K_eff:g} N/mm."
-    )
-
-
-def _comparison(study, content):
-    """Rows: what else one might ship, with its passivity and, where the truth is known, its miss."""
-    truth = content.get("truth")
-    claims = {"population map (bcm)": ("aggregate", content["optimum"])}
-    words = {"average": "plain average of the latent functions", "pooled": "one model of all answers"}
-    claims |= {words[name]: (name, found) for name, found in content["alternatives"].items()}
-    claims["mean of the individual optima"] = ("mean_of_optima", content["mean_of_optima"])
-    rows = []
-    for words_, (name, found) in claims.items():
-        row = [words_, *(f"{v:.4g}" for v in found["parameters"].values())]
-        if found["passivity_margin"] is not None:
-            row.append(f"{found['passivity_margin']:+.3f}")
-        if truth:
-            row.append(f"{100 * truth['nrmse'][name]['nrmse']:.1f} %")
-        rows.append(row)
-    head = ["", *(_head(study, n) for n in content["optimum"]["parameters"])]
-    head += ["passivity margin (N·s/m)"] if content["optimum"]["passivity_margin"] is not None else []
-    caption = "Other ways to choose one rendering for all; a negative margin is not passive."
-    if truth:
-        head.append("miss (NRMSE)")
-        rows.append(
-            [
-                "truth",
-                *(f"{v:.4g}" for v in truth["parameters"].values()),
-                *[""] * (len(head) - len(truth["parameters"]) - 1),
-            ]
-        )
-        q = [f"{100 * v:.0f}" for v in truth["individuals"]["quartiles"]]
-        caption += f" The individuals' own optima miss the truth by {q[1]} % (median; quartiles {q[0]} and {q[2]} %)."
-    return {"comparison": rows, "comparison_head": head, "comparison_caption": caption}
-
-
 def robustness_result(study: Study, cohort, found, seed: int) -> dict[str, Any]:
     """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
     learned, people = found.learned, len(cohort.names)
@@ -392,14 +292,3 @@ def robustness_result(study: Study, cohort, found, seed: int) -> dict[str, Any]:
         "seed": seed,
         "versions": versions(),
     }
-
-
-def robustness_page(study: Study, content: dict[str, Any]) -> str:
-    """One self-contained page of the robustness check."""
-    from jinja2 import Environment, PackageLoader, select_autoescape
-
-    template = Environment(loader=PackageLoader("hilbo"), autoescape=select_autoescape()).get_template(
-        "robustness.html"
-    )
-    flagged = [p["participant"] for p in content["participants"] if p["flagged"]]
-    return template.render(study=study, content=content, flagged=flagged, names=study.space.names)

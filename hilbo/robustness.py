@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.config import Study
 from hilbo.errors import InputError
-from hilbo.hyperparameters import Learnable, Learned, maximise_evidence, maximise_shared_evidence, optimum_sensitivity
+from hilbo.hyperparameters import Learned, maximise_evidence, maximise_shared_evidence, optimum_sensitivity
 from hilbo.ordinal_gp import fit
 from hilbo.session import CANDIDATES
 from hilbo.study import Cohort, Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
@@ -58,7 +58,7 @@ def robustness(
     cohort: Cohort,
     seed: int = 0,
     *,
-    learn: Sequence[Learnable] = ("theta", "noise", "thresholds"),
+    learn: Sequence[str] = ("theta", "noise", "thresholds"),
     shared: bool = True,
     weak_priors: bool = True,
 ) -> Robustness:

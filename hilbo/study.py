@@ -155,6 +155,7 @@ def population_optimum(
         from_box=study.space.from_box,
         to_box=study.space.to_box,
         feasible=study.space.feasible,
+        steps=300,
     )
     mean, variance = population(posteriors, choice.x[None, :], rule)
     probabilities = study.gp.likelihood.class_probabilities(mean[0], variance[0])

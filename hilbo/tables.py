@@ -5,6 +5,7 @@ Columns: `participant`, `trial`, `response` and one per parameter in physical un
 the log it came from give the same bits. Whatever is wrong is one sentence with the file and the line.
 """
 
+import csv
 import os
 from pathlib import Path
 
@@ -43,10 +44,19 @@ def read_trials(path: str | os.PathLike, study: Study, material: str | None = No
     voided = _flags(text, "voided", source)
     _check_duplicates(table, source)
     table = table[~voided & (text["phase"] != "warm-up" if "phase" in text else True)]
+    if table.empty:
+        raise InputError(f"{source}: has no rows to fit; all are warm-up or voided.")
     table = _of_material(table, material, source)
-    order = ["participant", *(["session"] if "session" in table else []), "trial"]
     ranks = table["participant"].map({name: i for i, name in enumerate(table["participant"].unique())})
-    return table.assign(_rank=ranks).sort_values(["_rank", *order[1:]], kind="stable").drop(columns="_rank")
+    sessions = _session_order(table["session"]) if "session" in table else 0
+    order = table.assign(_person=ranks, _session=sessions).sort_values(["_person", "_session", "trial"], kind="stable")
+    return order.drop(columns=["_person", "_session"])
+
+
+def _session_order(names: pd.Series) -> pd.Series:
+    """Sessions follow their numbers where all have one, else the alphabet."""
+    numbers = pd.to_numeric(names, errors="coerce")
+    return names if numbers.isna().any() else numbers
 
 
 def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
@@ -60,21 +70,44 @@ def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
 def _read_text(path: Path, source: str) -> pd.DataFrame:
     """Every cell as text, so that nothing is guessed; the index is the line (CSV) or the row (Parquet)."""
     try:
-        if path.suffix == ".parquet":
-            frame = pd.read_parquet(path)
-            frame = frame.map(
-                lambda v: "" if v is None or v is pd.NA else repr(float(v)) if isinstance(v, float) else str(v)
-            )
-            return frame.set_axis(np.arange(1, len(frame) + 1))
-        frame = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, encoding="utf-8-sig")
-        return frame.set_axis(np.arange(2, len(frame) + 2))
+        frame = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, source)
+    except InputError:
+        raise
     except OSError as error:
         raise InputError(f"{source}: cannot be read ({error.strerror or error}); check the path.") from error
-    except pd.errors.EmptyDataError as error:
-        raise InputError(f"{source}: is empty; a trial table needs a header and at least one answer.") from error
-    except (ValueError, UnicodeDecodeError) as error:  # pandas' and pyarrow's parser errors are ValueErrors
+    except (ValueError, csv.Error) as error:  # pyarrow's errors, and text that is no UTF-8, are ValueErrors
         reason = str(error).strip().splitlines()[-1]
         raise InputError(f"{source}: is not a table that can be read ({reason}); save it as CSV or Parquet.") from error
+    again = frame.columns[frame.columns.duplicated()]
+    if len(again):
+        raise InputError(f'{source}:1: column "{again[0]}" stands there twice; keep one of them.')
+    return frame
+
+
+def _read_parquet(path):
+    frame = pd.read_parquet(path)
+    frame = frame.map(lambda v: "" if v is None or v is pd.NA else repr(float(v)) if isinstance(v, float) else str(v))
+    return frame.set_axis(np.arange(1, len(frame) + 1))
+
+
+def _read_csv(path, source):
+    """By Python's csv module: it knows the line of a row, and a row that is too long is no reason to guess."""
+    rows, lines = [], []
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.reader(file, skipinitialspace=True, strict=True)
+        begin = 1
+        for row in reader:
+            if any(row):  # not an empty line, nor a spreadsheet's row of commas
+                rows.append(row)
+                lines.append(begin)
+            begin = reader.line_num + 1
+    if not rows:
+        raise InputError(f"{source}: is empty; a trial table needs a header and at least one answer.")
+    header = rows[0]
+    for row, line in zip(rows, lines, strict=True):
+        if len(row) != len(header):
+            raise InputError(f"{source}:{line}: has {len(row)} cells, the header has {len(header)}; mend that line.")
+    return pd.DataFrame(rows[1:], index=lines[1:], columns=header, dtype=str)
 
 
 def _check_columns(text, study, source):
@@ -91,7 +124,7 @@ def _numbers(text, column, source, words, valid):
 
     def number(cell):
         try:
-            return float(cell)
+            return np.nan if "_" in cell else float(cell)  # Python reads 1_5 as 15
         except ValueError:
             return np.nan
 

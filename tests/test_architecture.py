@@ -44,6 +44,7 @@ MAY_IMPORT = MATHS | {
     "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm"},
     "robustness": {"study", "hyperparameters"},
     "plotting": set(MATHS) | {"study"},
+    "page": {"config"},
     "hardware_bridge": {"protocol"},
 }
 MAY_IMPORT["report"] = set(MAY_IMPORT)

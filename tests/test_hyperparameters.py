@@ -95,4 +95,4 @@ def test_the_optimum_moves_as_its_derivative_says(checked):
 
     middle = float(jnp.log(study.gp.likelihood.noise))
     moved = (optimum(middle + step) - optimum(middle - step)) / (2 * step)
-    np.testing.assert_allclose(found.sensitivity["noise"], moved, atol=5e-3)
+    np.testing.assert_allclose(found.sensitivity["noise"], moved, atol=1e-3)
