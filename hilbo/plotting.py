@@ -8,6 +8,9 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import matplotlib as mpl
+import matplotlib.cm
+import matplotlib.colors
+import matplotlib.ticker
 import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.figure import Figure
@@ -22,51 +25,52 @@ _STYLE: dict = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
+    "legend.fontsize": 8,
     "axes.spines.top": False,
     "axes.spines.right": False,
+    "svg.hashsalt": "hilbo",  # the same figure gives the same file
 }
-_CELLS = 61
+_CELLS = 101
 _NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are drawn on it
+_APART = 0.15  # between slices, in the unit cube
+_OTHER: dict = {"s": 7, "marker": "o", "facecolor": "white", "edgecolor": "black", "linewidth": 0.4}
+_TOP: dict = {"s": 16, "marker": "o", "facecolor": ORANGE, "edgecolor": "black", "linewidth": 0.5}
+_REALISM = "perceived realism f"
 
 
-def map_slices(
-    study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohort: Cohort, levels=(0.25, 0.5)
-) -> Figure:
+def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
     """Slices of the population map's mean through the optimum, the non-passive part white, near trials marked.
 
-    The first two parameters span the slices; for a third one there is a slice at the optimum and at the quantiles
-    `levels` of its range beside it. The optimum is the star.
+    The first two parameters span the slices; there is one at the optimum's value of the third, and one on either side.
+    Further parameters stay at the optimum. With one parameter, the map is a curve with its standard deviation.
     """
-    thirds = [None] if study.space.dim == 2 else sorted({round(float(v), 3) for v in (optimum[2], *levels)})
+    if study.space.dim == 1:
+        return _map_curve(study, posteriors, optimum, cohort)
+    thirds = [None] if study.space.dim == 2 else _levels(float(optimum[2]))
     grids = [_slice(study, posteriors, optimum, third) for third in thirds]
-    low, high = _limits(grids)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.3 * len(grids) + 0.9, 3.2), layout="constrained")
-        for axes, third, values in zip(_row(figure, len(grids)), thirds, grids, strict=True):
-            image = _draw_slice(axes, study, values, low, high)
-            _mark_trials(axes, study, cohort, third)
-            if third is None or abs(third - optimum[2]) < 1e-2:
-                _star(axes, study, optimum)
-            axes.set_title("population map" if third is None else _level(study, 2, third))
-        figure.colorbar(image, ax=figure.axes, label="perceived realism f (mean)")
+    figure, panels, draw = _slices(study, grids)
+    for axes, third, values in zip(panels, thirds, grids, strict=True):
+        draw(axes, values)
+        _mark_trials(axes, study, cohort, third)
+        here = third is None or third == optimum[2]
+        if here:
+            _star(axes, study, optimum)
+        axes.set_title("population map" if third is None else _level(study, 2, third) + (", the optimum's" * here))
     return figure
 
 
 def slices_after(study: Study, cohort: Cohort, optima: Float[np.ndarray, "k d"], counts: Sequence[int]) -> Figure:
     """The population map after the first `counts` trials of everybody, each at its own optimum (the star)."""
-    grids = [
-        _slice(study, fit_cohort(study, cohort.first(n)), x, x[2] if len(x) > 2 else None)
-        for n, x in zip(counts, optima, strict=True)
-    ]
-    low, high = _limits(grids)
-    with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.3 * len(grids) + 0.9, 3.2), layout="constrained")
-        for axes, count, x, values in zip(_row(figure, len(grids)), counts, optima, grids, strict=True):
-            image = _draw_slice(axes, study, values, low, high)
-            _star(axes, study, x)
-            level = f", {_level(study, 2, x[2])}" if study.space.dim > 2 else ""
-            axes.set_title(f"after {count} trials{level}")
-        figure.colorbar(image, ax=figure.axes, label="perceived realism f (mean)")
+    posteriors = [fit_cohort(study, cohort.first(n)) for n in counts]
+    if study.space.dim == 1:
+        return _curves_after(study, posteriors, optima, counts)
+    thirds = [float(x[2]) if study.space.dim > 2 else None for x in optima]
+    grids = [_slice(study, p, x, third) for p, x, third in zip(posteriors, optima, thirds, strict=True)]
+    figure, panels, draw = _slices(study, grids)
+    for axes, count, x, third, values in zip(panels, counts, optima, thirds, grids, strict=True):
+        draw(axes, values)
+        _star(axes, study, x)
+        axes.set_title(f"{count} trials" + (f", {_level(study, 2, third)}" if third is not None else ""))
     return figure
 
 
@@ -90,11 +94,15 @@ def progress_figure(
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(7.2, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
+        goal = "the final optimum" if truth is None else "the truth"
         _band(left, trials, 100 * own.T, BLUE, "individuals: median, quartiles")
         left.plot(trials, 100 * merged, color=RED, marker="o", markersize=3, label="population map")
-        left.set(xlabel="trials of each participant", ylim=(0, None))
-        left.set_ylabel(f"NRMSE to {'the final optimum' if truth is None else 'the truth'} (%)")
-        left.legend(frameon=False)
+        if truth is not None:
+            own_end = np.sqrt(np.mean((population_optima - population_optima[-1]) ** 2, axis=1))
+            left.plot(trials, 100 * own_end, color=GREY, linestyle="--", label="population map, to its final optimum")
+        left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
+        left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
+        left.legend(frameon=False, loc="upper right")
         _band(right, trials, top, GREEN, "median, quartiles")
         right.set(xlabel="trials of each participant", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
         right.legend(frameon=False, loc="upper left")
@@ -103,28 +111,62 @@ def progress_figure(
 
 def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[str, Float[np.ndarray, " d"]]) -> Figure:
     """Everybody's own optimum, pair by pair of parameters, with named points (the population optimum, ...)."""
-    pairs = [(0, 1), (0, 2), (1, 2)] if study.space.dim > 2 else [(0, 1)]
+    d = study.space.dim
+    pairs = [(0, 1), (0, 2), (1, 2)] if d > 2 else [(0, d - 1)]
     physical = np.asarray(study.space.to_physical(optima))
-    styles = zip(
-        marks.items(), (("*", RED, 140), ("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40)), strict=False
-    )
-    styles = list(styles)
+    points = {name: np.asarray(study.space.to_physical(x)) for name, x in marks.items()}
+    styles = (("*", RED, 140), ("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40))
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(3.2 * len(pairs), 3.2), layout="constrained")
+        figure = Figure(figsize=(max(2.4 * len(pairs), 3.4), 2.9), layout="constrained")
         for axes, (i, j) in zip(_row(figure, len(pairs)), pairs, strict=True):
-            axes.scatter(physical[:, i], physical[:, j], s=22, color=BLUE, alpha=0.7, label="individuals")
-            for (name, x), (marker, colour, size) in styles:
-                point = np.asarray(study.space.to_physical(x))
-                axes.scatter(
-                    point[i], point[j], marker=marker, s=size, color=colour, edgecolor="white", label=name, zorder=3
-                )
+            axes.scatter(
+                physical[:, i], physical[:, j], s=20, color=BLUE, alpha=0.7, label="individuals", clip_on=False
+            )
+            for (name, point), (marker, colour, size) in zip(points.items(), styles, strict=False):
+                look = {"marker": marker, "s": size, "color": colour, "edgecolor": "white", "linewidth": 0.6}
+                axes.scatter(point[i], point[j], label=name, zorder=3, clip_on=False, **look)
             _axes(axes, study, i, j)
-        figure.axes[0].legend(frameon=True, fontsize=8)
+        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False)
     return figure
 
 
 def _row(figure, count):
     return np.atleast_1d(figure.subplots(1, count))
+
+
+def _levels(third):
+    """The optimum's value of the third parameter and one on either side, as far as the unit cube goes."""
+    beside = (third - _APART, third + _APART)
+    if beside[0] < 0:
+        beside = (third + _APART, third + 2 * _APART)
+    elif beside[1] > 1:
+        beside = (third - 2 * _APART, third - _APART)
+    return sorted((third, *beside))
+
+
+def _slices(study, grids):
+    """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
+    low, high = min(np.nanmin(g) for g in grids), max(np.nanmax(g) for g in grids)
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(max(2.25 * len(grids), 3.0) + 0.7, 2.7), layout="constrained")
+        panels = _row(figure, len(grids))
+        scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(low, high), "cividis")
+        figure.colorbar(scale, ax=list(panels), label=f"{_REALISM} (mean)", fraction=0.05, pad=0.02)
+        for axes in panels:
+            _axes(axes, study, 0, 1)
+        for axes in panels[1:]:
+            axes.set_ylabel("")
+
+    def draw(axes, values):
+        first, second = _sides(study)
+        axes.pcolormesh(first, second, values, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
+
+    return figure, panels, draw
+
+
+def _sides(study):
+    side = np.linspace(0.0, 1.0, _CELLS)
+    return [np.asarray(p.to_physical(jnp.asarray(side))) for p in study.space.parameters[:2]]
 
 
 def _slice(study, posteriors, optimum, third):
@@ -139,26 +181,64 @@ def _slice(study, posteriors, optimum, third):
     return np.where(np.asarray(study.space.feasible(flat)), mean, np.nan).reshape(_CELLS, _CELLS)
 
 
-def _limits(grids):
-    return min(np.nanmin(g) for g in grids), max(np.nanmax(g) for g in grids)
+def _curve(study, posteriors):
+    """Physical values, mean and standard deviation of a map of one parameter."""
+    side = jnp.linspace(0.0, 1.0, _CELLS)
+    mean, variance = population(posteriors, side[:, None])
+    return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
 
 
-def _draw_slice(axes, study, values, low, high):
-    side = np.linspace(0.0, 1.0, _CELLS)
-    first, second = (np.asarray(p.to_physical(jnp.asarray(side))) for p in study.space.parameters[:2])
-    image = axes.pcolormesh(
-        first, second, values, cmap="cividis", vmin=low, vmax=high, shading="nearest", rasterized=True
-    )
-    _axes(axes, study, 0, 1)
-    return image
+def _curve_axes(study):
+    figure = Figure(figsize=(4.5, 2.9), layout="constrained")
+    axes = figure.subplots()
+    _axes(axes, study, 0, 0)
+    axes.set(yscale="linear", ylabel=_REALISM)
+    return figure, axes
+
+
+def _map_curve(study, posteriors, optimum, cohort):
+    with mpl.rc_context(_STYLE):
+        figure, axes = _curve_axes(study)
+        at, mean, sd = _curve(study, posteriors)
+        axes.fill_between(at, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label="± standard deviation")
+        axes.plot(at, mean, color=BLUE, label="population map")
+        axes.autoscale(axis="y")
+        mask = np.asarray(cohort.trials.mask)
+        answers = np.asarray(study.space.to_physical(np.asarray(cohort.trials.x)[mask]))[:, 0]
+        top = np.asarray(cohort.trials.q)[mask] == len(study.responses) - 1
+        for shown, height, look in ((~top, 0.03, _OTHER), (top, 0.08, _TOP)):
+            at_height = np.full(int(shown.sum()), height)
+            axes.scatter(answers[shown], at_height, transform=axes.get_xaxis_transform(), clip_on=False, **look)
+        best = np.asarray(study.space.to_physical(np.asarray(optimum)))[0]
+        axes.axvline(float(best), color=RED, linewidth=1, label="optimum")
+        axes.legend(frameon=False)
+    return figure
+
+
+def _curves_after(study, posteriors, optima, counts):
+    with mpl.rc_context(_STYLE):
+        figure, axes = _curve_axes(study)
+        for person, x, count, colour in zip(posteriors, optima, counts, (ORANGE, GREEN, BLUE, RED), strict=False):
+            at, mean, _ = _curve(study, person)
+            axes.plot(at, mean, color=colour, label=f"{count} trials")
+            best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
+            axes.plot(best, np.interp(best, at, mean), "*", color=colour, markersize=11, markeredgecolor="white")
+        axes.autoscale(axis="y")
+        axes.legend(frameon=False)
+    return figure
 
 
 def _axes(axes, study, i, j):
     for which, parameter in (("x", study.space.parameters[i]), ("y", study.space.parameters[j])):
         unit = f" ({_unit(parameter.unit)})" if parameter.unit else ""
         getattr(axes, f"set_{which}label")(_name(parameter.name) + unit)
-        getattr(axes, f"set_{which}scale")("log" if parameter.scale == "log" else "linear")
         getattr(axes, f"set_{which}lim")(parameter.low, parameter.high)
+        if parameter.scale == "log":
+            getattr(axes, f"set_{which}scale")("log")
+            axis = getattr(axes, f"{which}axis")
+            axis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
+            axis.set_major_formatter(mpl.ticker.FormatStrFormatter("%g"))
+            axis.set_minor_formatter(mpl.ticker.NullFormatter())
 
 
 def _name(name: str) -> str:
@@ -182,8 +262,8 @@ def _mark_trials(axes, study, cohort, third):
     near = np.ones(len(x), bool) if third is None else np.abs(x[:, 2] - third) < _NEAR
     physical = np.asarray(study.space.to_physical(x))[near]
     top = q[near] == len(study.responses) - 1
-    axes.scatter(*physical[~top, :2].T, s=7, marker="x", color="white", linewidth=0.7, alpha=0.8)
-    axes.scatter(*physical[top, :2].T, s=13, marker="o", facecolor="none", edgecolor=ORANGE, linewidth=0.9)
+    axes.scatter(*physical[~top, :2].T, **_OTHER)
+    axes.scatter(*physical[top, :2].T, **_TOP)
 
 
 def _star(axes, study, x):

@@ -173,7 +173,7 @@ def test_growing_data_are_traced_once():
         return trials.append(x, q)
 
     x_new, weights = jnp.asarray(data.x_new), None
-    with assert_traces_once(ordinal_gp._fit, ordinal_gp._mean_and_explained, append_one):
+    with assert_traces_once(ordinal_gp._fit, ordinal_gp._predict, append_one):
         for count, (x, q) in enumerate(zip(data.x, data.q, strict=True), start=1):
             trials = append_one(trials, jnp.asarray(x), jnp.asarray(q))
             posterior = fit(gp, trials, start=jnp.zeros(27) if weights is None else weights)
