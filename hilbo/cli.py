@@ -38,6 +38,14 @@ Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.
 Table = Annotated[Path, typer.Argument(help="Trial table (CSV or Parquet).", show_default=False)]
 
 
+# What the commands write: a folder with anything else in it is never replaced.
+_FIGURES = ("map", "progress", "slices", "optima")
+_PARTS = ("video-quality", "simulated-memory-foam")
+_WRITTEN = {"result.json", "report.html", "map.nc", "optima.csv", "trials.csv", "truth.csv", "study.toml", *_PARTS} | {
+    f"{figure}.{kind}" for figure in _FIGURES for kind in ("png", "svg")
+}
+
+
 def main() -> None:
     """Entry point: runs a command, and turns bad input into one sentence and exit code 2."""
     try:
@@ -110,7 +118,7 @@ def robustness(
         say("hyperparameters by maximum evidence")
         found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
         content = report.robustness_result(chosen, cohort, found, seed)
-        (folder / "result.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+        (folder / "result.json").write_text(report.as_json(content))
         (folder / "report.html").write_text(page.robustness_page(chosen, content), encoding="utf-8")
     _finish(content, out, as_json)
 
@@ -122,11 +130,11 @@ def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) 
 
     data = files("hilbo") / "data"
     with _results(out, force) as folder, _progress() as say:
-        for part in ("video-quality", "simulated-memory-foam"):
+        for part in _PARTS:
             (folder / part).mkdir()
         chosen, cohort = _read(Path(str(data / "video_quality.csv")), Path(str(data / "video_quality.toml")), None, say)
-        real = _aggregate(chosen, cohort, folder / "video-quality", seed, say)
-        simulated = _simulate("paper", None, 24, seed, folder / "simulated-memory-foam", say)
+        real = _aggregate(chosen, cohort, folder / _PARTS[0], seed, say)
+        simulated = _simulate("paper", None, 24, seed, folder / _PARTS[1], say)
     _print_demo(real, simulated, out)
 
 
@@ -161,11 +169,7 @@ def _aggregate(study, cohort, folder, seed, say, truth=None) -> dict[str, Any]:
 
     say(f"fitting {len(cohort.names)} participants ({study.name})")
     found = aggregate_cohort(study, cohort, seed)
-    content = report.write_results(study, found, folder, seed, truth, say)
-    failed = [p["participant"] for p in content["participants"] if not p["certificate"]["converged"]]
-    if failed:
-        say(f"the fits of {', '.join(failed)} did not reach their tolerance; their certificates are in result.json")
-    return content
+    return report.write_results(study, found, folder, seed, truth, say)
 
 
 def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
@@ -189,6 +193,7 @@ def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
     trials = simulation.simulate_study(chosen, people, seed)
     table = simulation.to_table(chosen, trials)
     write_trials(table, folder / "trials.csv")
+    write_trials(simulation.truth_table(chosen, population, people), folder / "truth.csv")
     shutil.copyfile(source, folder / "study.toml")
     truth = np.asarray(chosen.space.to_unit(np.array([population.truth[name] for name in chosen.space.names])))
     table["category"] = table["response"].map({label: i for i, label in enumerate(chosen.responses)})
@@ -198,44 +203,61 @@ def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
 @contextlib.contextmanager
 def _results(out: Path, force: bool) -> Iterator[Path]:
     """A new folder that becomes `out` when everything in it is complete."""
-    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not force:
-        raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
+    out = out.resolve()
+    _check_free(out, force)
     try:
-        out.absolute().parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.absolute().parent))
+        out.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
     try:
         yield made
         made.chmod(0o755)
-        if out.is_dir():
+        if out.exists():
             shutil.rmtree(out)
-        elif out.exists():
-            out.unlink()
         made.rename(out)
     finally:
         shutil.rmtree(made, ignore_errors=True)
 
 
+def _check_free(out: Path, force: bool) -> None:
+    """Refuse to replace anything without `force`, and with it anything that is not hilbo's."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise InputError(f"{out}: is a file; choose a folder for --out.")
+    if any(out.iterdir()) and not force:
+        raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
+    foreign = next((path for path in out.rglob("*") if path.name not in _WRITTEN), None)
+    if foreign is not None:
+        raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
+
+
 @contextlib.contextmanager
 def _progress() -> Iterator[Callable[[str], None]]:
-    """Says on stderr what is being done, and how long the last thing took."""
-    begun, last = time.perf_counter(), [time.perf_counter(), ""]
+    """Says on stderr what is being done: in one changing line on a terminal, else in a line for each thing."""
+    from rich.console import Console
 
-    def say(text: str) -> None:
-        now = time.perf_counter()
-        if last[1] and now - last[0] > 1.0:
-            print(f"  {last[1]}: {now - last[0]:.1f} s", file=sys.stderr, flush=True)
-        last[:] = [now, text]
+    console, begun = Console(stderr=True, highlight=False, markup=False, soft_wrap=True), time.perf_counter()
+    with console.status("starting") as status:
 
-    yield say
-    say("")
-    print(f"  done in {time.perf_counter() - begun:.1f} s", file=sys.stderr, flush=True)
+        def say(text: str) -> None:
+            if console.is_terminal:
+                status.update(text)
+            else:
+                console.print(text)
+
+        yield say
+    console.print(f"done in {time.perf_counter() - begun:.1f} s")
 
 
 def _finish(content, out, as_json):
+    from hilbo.report import as_json as text
+
+    for warning in content.get("warnings", []):
+        print(f"hilbo: {warning}", file=sys.stderr)
     if as_json:
-        print(json.dumps(content, allow_nan=False))
+        print(text(content), end="")
     else:
         print(f"{out / 'report.html'}", file=sys.stderr)
 
@@ -247,32 +269,39 @@ def _fail(sentence: str, code: int) -> None:
 
 def _print_demo(real, simulated, out) -> None:
     """The demo's last words: the real optimum in a line, the simulated misses beside the paper's."""
+    from rich import box
     from rich.console import Console
     from rich.table import Table as RichTable
 
-    console = Console()
+    console = Console(highlight=False, soft_wrap=True)
     best = real["optimum"]["parameters"]
     console.print(f"\nVideo quality, {len(real['participants'])} people: the map is highest at", end=" ")
     console.print(", ".join(f"{name} = {value:.0f}" for name, value in best.items()) + ".\n")
     truth = simulated["truth"]
-    table = RichTable(title="Simulated memory foam, 24 x 25: how far from the truth (NRMSE by search range)")
-    for head in ("", "K1, B1, alpha", "with K0", "passivity margin (N.s/m)", "paper"):
+    table = RichTable(
+        title="Simulated memory foam, 24 people x 25 trials: NRMSE to the truth, of the search ranges",
+        box=box.SIMPLE_HEAD,
+        title_justify="left",
+    )
+    for head in ("", "K1, B1, alpha", "with K0", "passive (N.s/m)", "the paper"):
         table.add_column(head, justify="left" if not head else "right")
 
     def row(name, key, found, paper):
-        miss = truth["nrmse"][key]
-        margin = found["passivity_margin"]
-        passive = f"{margin:+.3f} ({'passive' if margin >= 0 else 'not passive'})"
+        miss, margin = truth["nrmse"][key], found["passivity_margin"]
+        passive = f"{'yes' if margin >= 0 else 'no'}, {margin:+.3f}"
         table.add_row(name, f"{100 * miss['nrmse']:.1f} %", f"{100 * miss['nrmse_with_K0']:.1f} %", passive, paper)
 
-    row("population map (BCM)", "aggregate", simulated["optimum"], "4 %")
+    row("population map (BCM)", "aggregate", simulated["optimum"], "4 %, yes")
     q, qk = truth["individuals"]["quartiles"], truth["individuals"]["with_K0"]
     spread = [f"{100 * v[1]:.0f} % [{100 * v[0]:.0f}, {100 * v[2]:.0f}]" for v in (q, qk)]
-    table.add_row("individuals, median [quartiles]", *spread, "", "24 % [13, 41]")
-    row("mean of the individual optima", "mean_of_optima", simulated["mean_of_optima"], "10.5 %, not passive")
-    row("plain average of the maps", "average", simulated["alternatives"]["average"], "")
+    margins = [person["optimum"]["passivity_margin"] for person in simulated["participants"]]
+    passive = f"{sum(margin >= 0 for margin in margins)} of {len(margins)}"
+    table.add_row("individual optima", *spread, passive, "24 % [13, 41]")
+    row("mean of these optima", "mean_of_optima", simulated["mean_of_optima"], "10.5 %, no")
+    row("mean of their maps", "average", simulated["alternatives"]["average"], "")
     console.print(table)
+    console.print("Individuals: median and quartiles. Passive: by how much the device's damping exceeds the least.")
     top = truth["top_answers"]
     console.print(f'"close" answers of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)\n')
-    for part in ("video-quality", "simulated-memory-foam"):
+    for part in _PARTS:
         console.print(str(out / part / "report.html"))

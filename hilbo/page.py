@@ -6,6 +6,14 @@ import numpy as np
 
 from hilbo.config import Study
 
+_RULES = {
+    "ucb": "by the upper confidence bound",
+    "log_ei": "by expected improvement",
+    "thompson": "by Thompson sampling",
+    "top_category": "by the probability of the highest answer",
+    "mean": "by the posterior mean",
+}
+
 __all__ = ["results_page", "robustness_page"]
 
 
@@ -13,16 +21,14 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
     """The page of an aggregation; `pictures` have png (base64), title, caption and alt."""
     template = _template("report.html")
     best, gp = content["optimum"], study.gp
-    failed = [p["participant"] for p in content["participants"] if not p["certificate"]["converged"]]
     people, answers = len(content["participants"]), sum(p["trials"] for p in content["participants"])
     worst = max(p["certificate"]["residual"] for p in content["participants"])
     return template.render(
         title=f"{study.name}: the population's optimum",
         lead=f"{people} participants gave {answers} answers ({', '.join(study.responses)}). Each person's answers were"
         " turned into a map of perceived realism; the maps were merged, and this is where the merged map is highest.",
-        warnings=[f"The fit of {', '.join(failed)} did not reach its tolerance; see the certificates in result.json."]
-        if failed
-        else [],
+        warnings=content["warnings"],
+        study_rows=_study_rows(study),
         optimum=[(_head(study, name), f"{value:.4g}") for name, value in best["parameters"].items()],
         probabilities=[(label, f"{100 * p:.0f} %") for label, p in best["class_probabilities"].items()],
         realism=f"{best['mean']:.2f} ± {best['sd']:.2f} (mean and standard deviation of f)",
@@ -41,7 +47,7 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
             for p in content["participants"]
         ],
         variance=f"{float(gp.kernel.variance):g}",
-        theta=np.array2string(np.asarray(gp.kernel.theta)),
+        theta=", ".join(f"{t:g}" for t in np.atleast_1d(np.asarray(gp.kernel.theta))),
         noise=f"{float(gp.likelihood.noise):g}",
         thresholds=", ".join(f"{float(t):g}" for t in gp.likelihood.thresholds),
         search=_search_words(study),
@@ -54,16 +60,40 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
 
 
 def _head(study, name):
-    unit = {p.name: p.unit for p in study.space.parameters}.get(name, "N/mm" if name == "K0" else "")
+    unit = _unit({p.name: p.unit for p in study.space.parameters}.get(name, "N/mm" if name == "K0" else ""))
+    name = {"alpha": "α"}.get(name, name)
     return f"{name} ({unit})" if unit else name
+
+
+def _unit(unit):
+    return unit.replace("^alpha", "^α").replace("s^α", "sᵅ").replace(".", "·")
+
+
+def _study_rows(study):
+    """What was studied, as pairs of words."""
+    for p in study.space.parameters:
+        scale = ", on a logarithmic scale" if p.scale == "log" else ""
+        yield {"alpha": "α"}.get(p.name, p.name), f"{p.low:g} to {p.high:g} {_unit(p.unit)}".strip() + scale
+    yield "answers, lowest first", ", ".join(study.responses)
+    chosen = study.selection
+    yield (
+        "trials",
+        f"{chosen.trials}, the first {chosen.space_filling} spread evenly, then {_RULES[chosen.acquisition]}",
+    )
+    mechanics = study.space.mechanics
+    if mechanics is not None:
+        model = (
+            f"FO-SLS, N = {mechanics.N}, T = {1000 * mechanics.T:g} ms, effective stiffness {mechanics.K_eff:g} N/mm"
+        )
+        yield "renderer", f"{model}; the device has {mechanics.damping:g} N·s/m of damping"
 
 
 def _passivity_words(margin):
     if margin is None:
         return ""
     kind = "passive" if margin >= 0 else "not passive"
-    by = f"its damping less the smallest passive one is {margin:.3f} N·s/m"
-    return f"The rendering is {kind} on the study's device: {by}."
+    by = f"{abs(margin):.3f} N·s/m {'more' if margin >= 0 else 'less'} damping than it needs"
+    return f"The rendering is {kind} on the study's device, which has {by}."
 
 
 def _search_words(study):

@@ -28,7 +28,6 @@ _STYLE: dict = {
     "legend.fontsize": 8,
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "svg.hashsalt": "hilbo",  # the same figure gives the same file
 }
 _CELLS = 101
 _NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are drawn on it
@@ -98,8 +97,8 @@ def progress_figure(
         _band(left, trials, 100 * own.T, BLUE, "individuals: median, quartiles")
         left.plot(trials, 100 * merged, color=RED, marker="o", markersize=3, label="population map")
         if truth is not None:
-            own_end = np.sqrt(np.mean((population_optima - population_optima[-1]) ** 2, axis=1))
-            left.plot(trials, 100 * own_end, color=GREY, linestyle="--", label="population map, to its final optimum")
+            to_end = np.sqrt(np.mean((population_optima - population_optima[-1]) ** 2, axis=1))
+            left.plot(trials, 100 * to_end, color=GREY, linestyle="--", label="population map, to its final optimum")
         left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
         left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
         left.legend(frameon=False, loc="upper right")
@@ -218,8 +217,8 @@ def _map_curve(study, posteriors, optimum, cohort):
 def _curves_after(study, posteriors, optima, counts):
     with mpl.rc_context(_STYLE):
         figure, axes = _curve_axes(study)
-        for person, x, count, colour in zip(posteriors, optima, counts, (ORANGE, GREEN, BLUE, RED), strict=False):
-            at, mean, _ = _curve(study, person)
+        for posterior, x, count, colour in zip(posteriors, optima, counts, (ORANGE, GREEN, BLUE, RED), strict=False):
+            at, mean, _ = _curve(study, posterior)
             axes.plot(at, mean, color=colour, label=f"{count} trials")
             best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
             axes.plot(best, np.interp(best, at, mean), "*", color=colour, markersize=11, markeredgecolor="white")

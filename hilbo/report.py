@@ -8,6 +8,7 @@ import base64
 import importlib.metadata
 import io
 import json
+import math
 import platform
 from pathlib import Path
 from typing import Any
@@ -23,10 +24,8 @@ from hilbo.config import Study
 from hilbo.page import results_page
 from hilbo.study import Aggregate, nrmse, population, progress
 
-__all__ = ["K0_RANGE", "misses", "result", "set_of", "write_results"]
+__all__ = ["K0_range", "as_json", "misses", "result", "set_of", "write_results"]
 
-K0_RANGE = 16.14
-"""N/mm, from -15.70 to 0.44: the range of K0 by which its error is normalised (paper, table I)."""
 _MAP_CELLS = 41
 
 
@@ -44,6 +43,29 @@ def margin_of(study: Study, x: ArrayLike) -> float | None:
     return None if margin is None else float(margin)
 
 
+def K0_range(study: Study) -> float:
+    """N/mm, from the K0 at the box's most elastic corner to K_eff, by which errors of K0 are normalised.
+
+    16.14 for the paper's study: from -15.70 to 0.44 (paper, table I).
+    """
+    ends = {p.name: p.low if p.name == "alpha" else p.high for p in study.space.parameters}
+    assert study.space.mechanics is not None
+    return study.space.mechanics.K_eff - float(study.space.derived(ends)["K0"])
+
+
+def as_json(content: dict[str, Any]) -> str:
+    """The text of result.json; a number that is not finite (after a failed fit) is null."""
+
+    def clean(value):
+        if isinstance(value, dict):
+            return {key: clean(v) for key, v in value.items()}
+        if isinstance(value, list):
+            return [clean(v) for v in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(clean(content), indent=2, allow_nan=False) + "\n"
+
+
 def misses(
     study: Study, x: Float[np.ndarray, "... d"], truth: Float[np.ndarray, " d"]
 ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -53,7 +75,7 @@ def misses(
     if study.space.mechanics is None:
         return own, None
     K0 = np.array([set_of(study, row)["K0"] for row in x.reshape(-1, x.shape[-1])]).reshape(own.shape)
-    K0_error = (K0 - set_of(study, truth)["K0"]) / K0_RANGE
+    K0_error = (K0 - set_of(study, truth)["K0"]) / K0_range(study)
     d = x.shape[-1]
     return own, np.sqrt((d * own**2 + K0_error**2) / (d + 1))
 
@@ -100,9 +122,19 @@ def result(
         "seed": seed,
         "versions": versions(),
     }
+    failed = [person["participant"] for person in people if not person["certificate"]["converged"]]
+    content["warnings"] = [_not_converged(failed)] if failed else []
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content
+
+
+def _not_converged(names):
+    one = len(names) == 1
+    return (
+        f"The {'fit' if one else 'fits'} of {', '.join(names)} did not reach {'its' if one else 'their'} tolerance, so"
+        " that the results may be off by more than rounding; see the certificates in result.json."
+    )
 
 
 def _optimum(study, found):
@@ -150,7 +182,7 @@ def write_results(
 ) -> dict[str, Any]:
     """Write the results folder; returns the content of result.json. `say` is told what is being done."""
     content = result(study, aggregate, seed, truth)
-    (folder / "result.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n")
+    (folder / "result.json").write_text(as_json(content))
     _optima_table(content).to_csv(folder / "optima.csv", index=False)
     say("the population map on a grid")
     _map(study, aggregate, content).to_netcdf(folder / "map.nc", engine="h5netcdf")
@@ -161,7 +193,7 @@ def write_results(
     for name, (figure, title, caption) in figures.items():
         figure.savefig(folder / f"{name}.svg")
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=160)
+        figure.savefig(buffer, format="png", dpi=200)
         (folder / f"{name}.png").write_bytes(buffer.getvalue())
         png = base64.b64encode(buffer.getvalue()).decode()
         pictures.append({"png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
@@ -215,46 +247,63 @@ def _map(study, aggregate, content):
 
 
 def _figures(study, aggregate, seed, truth):
+    """Name -> figure, title, caption."""
     from hilbo import plotting
 
     cohort = aggregate.cohort
     longest = int(cohort.counts().max())
-    counts = sorted(
-        {*range(1, min(longest, 25) + 1), *np.unique(np.linspace(1, longest, 25).round().astype(int)).tolist()}
-    )
-    counts = counts if longest <= 25 else np.unique(np.linspace(1, longest, 25).round().astype(int)).tolist()
-    merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts))
-    stages = [counts.index(n) for n in (5, 15, 25) if n in counts] or sorted({0, len(counts) // 2, len(counts) - 1})
-    after = [counts[i] for i in stages]
-    white = "White: not passive, never rendered. " if study.space.mechanics is not None else ""
-    third = f" Slices at the optimum's {study.space.names[2]} and beside it." if study.space.dim > 2 else ""
-    marks = {"population map": np.asarray(aggregate.optimum.x), "mean of optima": np.asarray(aggregate.mean_of_optima)}
-    if truth is not None:
-        marks["truth"] = truth
-    top = study.responses[-1]
-    settled = "the truth" if truth is not None else "where it ends"
+    after = [n for n in (5, 15, 25) if n <= longest] or [longest]
+    after += [longest] if longest > 25 else []
+    counts = np.unique([*np.linspace(1, longest, min(longest, 25)).round().astype(int), *after])
+    merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts.tolist()))
+    best = np.asarray(aggregate.optimum.x)
+    marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
+    marks |= {} if truth is None else {"truth": truth}
+    captions = _captions(study, truth)
+    found = {
+        "map": plotting.map_slices(study, aggregate.posteriors, best, cohort),
+        "progress": plotting.progress_figure(study, cohort, merged, own, truth, counts),
+        "slices": plotting.slices_after(study, cohort, merged[np.searchsorted(counts, after)], after),
+    }
+    if study.space.dim > 1:
+        found["optima"] = plotting.optima_scatter(study, np.asarray(aggregate.individuals.x), marks)
+    return {name: (figure, *captions[name]) for name, figure in found.items()}
+
+
+def _captions(study, truth):
+    """Title and caption of each figure: what is to be seen, and how to read it."""
+    top, names = study.responses[-1], study.space.names
+    white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
+    third = ""
+    if study.space.dim > 2:
+        third = (
+            f" The slices are at the optimum's {names[2]} and on either side of it; an answer is drawn on every slice"
+            f" that is near its own {names[2]}, so that it may lie in another slice's white."
+        )
+    rest = f" Further parameters ({', '.join(names[3:])}) are those of the optimum." if study.space.dim > 3 else ""
+    settled = "where it ends" if truth is None else "the truth"
+    dashed = "" if truth is None else " Dashed: how far the map's optimum is from where it ends."
     return {
         "map": (
-            plotting.map_slices(study, aggregate.posteriors, np.asarray(aggregate.optimum.x), cohort),
             "The population map",
-            "Brighter is perceived as more realistic; the star is the optimum. "
-            f'{white}Circles are answers "{top}", crosses all others, of all participants, near the slice.{third}',
+            "How real people find each rendering, as far as the answers tell: brighter is more realistic, and the star"
+            f' is the optimum.{white} Dots are everybody\'s answers, orange ones "{top}".{third}{rest}',
         ),
         "progress": (
-            plotting.progress_figure(study, cohort, merged, own, truth, np.asarray(counts)),
             "Progress of the optimum",
             f"Left: how far the optimum after so many trials is from {settled}, in per cent of the search ranges, for"
-            f' the individuals and for the population map. Right: how often people had answered "{top}" by then.',
+            f" the individuals and for the population map.{dashed} Right: how often people had answered"
+            f' "{top}" by then. Bands hold the middle half of the people.',
         ),
         "slices": (
-            plotting.slices_after(study, cohort, merged[stages], after),
             "The population map after fewer trials",
-            f"Every map through its own optimum, the star. {white}",
+            "The map from everybody's first answers only, each through its own optimum, the star; if the star and the"
+            f" bright region stay where they are, further trials only refine them.{white}{rest}",
         ),
         "optima": (
-            plotting.optima_scatter(study, np.asarray(aggregate.individuals.x), marks),
             "Individual optima",
-            "Each dot is one participant's own optimum; the plain mean of the dots need not be good for anybody.",
+            "Each dot is one participant's own optimum. Where the dots scatter widely, their plain mean need not be"
+            " good for anybody.",
         ),
     }
 

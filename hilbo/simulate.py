@@ -23,7 +23,7 @@ from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials
 from hilbo.session import Design, design, next_point
 
-__all__ = ["PRESETS", "Person", "Population", "people", "simulate_study", "to_table"]
+__all__ = ["PRESETS", "Person", "Population", "people", "simulate_study", "to_table", "truth_table"]
 
 
 class Person(eqx.Module):
@@ -158,4 +158,14 @@ def to_table(study: Study, trials: Trials) -> pd.DataFrame:
     for i, name in enumerate(study.space.names):
         table[name] = physical[..., i][tuple(rows.T)]
     del capacity
+    return table
+
+
+def truth_table(study: Study, population: Population, persons: Person) -> pd.DataFrame:
+    """The optima that were simulated, in physical units: the population's, and everybody's own."""
+    own = np.asarray(study.space.to_physical(persons.optimum))
+    width = max(2, len(str(len(own))))
+    centre = [population.truth[name] for name in study.space.names]
+    table = pd.DataFrame(np.vstack([centre, own]), columns=list(study.space.names))
+    table.insert(0, "source", ["population", *(f"individual:P{i + 1:0{width}d}" for i in range(len(own)))])
     return table
