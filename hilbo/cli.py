@@ -6,7 +6,6 @@ complete, so that a failure leaves nothing behind and nothing is overwritten wit
 """
 
 import contextlib
-import json
 import os
 import shutil
 import sys
@@ -283,24 +282,24 @@ def _print_demo(real, simulated, out) -> None:
         box=box.SIMPLE_HEAD,
         title_justify="left",
     )
-    for head in ("", "K1, B1, alpha", "with K0", "passive (N.s/m)", "the paper"):
-        table.add_column(head, justify="left" if not head else "right")
+    for head in ("", "K1, B1, alpha", "with K0", "passive by", "the paper"):
+        table.add_column(head, justify="right" if head else "left", no_wrap=True)
 
     def row(name, key, found, paper):
         miss, margin = truth["nrmse"][key], found["passivity_margin"]
         passive = f"{'yes' if margin >= 0 else 'no'}, {margin:+.3f}"
         table.add_row(name, f"{100 * miss['nrmse']:.1f} %", f"{100 * miss['nrmse_with_K0']:.1f} %", passive, paper)
 
-    row("population map (BCM)", "aggregate", simulated["optimum"], "4 %, yes")
+    row("population (BCM)", "aggregate", simulated["optimum"], "4 %, yes")
     q, qk = truth["individuals"]["quartiles"], truth["individuals"]["with_K0"]
     spread = [f"{100 * v[1]:.0f} % [{100 * v[0]:.0f}, {100 * v[2]:.0f}]" for v in (q, qk)]
     margins = [person["optimum"]["passivity_margin"] for person in simulated["participants"]]
     passive = f"{sum(margin >= 0 for margin in margins)} of {len(margins)}"
     table.add_row("individual optima", *spread, passive, "24 % [13, 41]")
-    row("mean of these optima", "mean_of_optima", simulated["mean_of_optima"], "10.5 %, no")
-    row("mean of their maps", "average", simulated["alternatives"]["average"], "")
+    row("mean of optima", "mean_of_optima", simulated["mean_of_optima"], "10.5 %, no")
+    row("mean of maps", "average", simulated["alternatives"]["average"], "")
     console.print(table)
-    console.print("Individuals: median and quartiles. Passive: by how much the device's damping exceeds the least.")
+    console.print("Individuals: median and quartiles. Passive by so many N.s/m of damping more than the least.")
     top = truth["top_answers"]
     console.print(f'"close" answers of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)\n')
     for part in _PARTS:

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 
 import jax.numpy as jnp
 import matplotlib as mpl
-import matplotlib.cm
-import matplotlib.colors
-import matplotlib.ticker
 import numpy as np
 from jaxtyping import Float, Int
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from hilbo.config import Study
 from hilbo.study import Cohort, fit_cohort, population
@@ -51,10 +51,10 @@ def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohor
     for axes, third, values in zip(panels, thirds, grids, strict=True):
         draw(axes, values)
         _mark_trials(axes, study, cohort, third)
-        here = third is None or third == optimum[2]
+        here = third is None or third == float(optimum[2])
         if here:
             _star(axes, study, optimum)
-        axes.set_title("population map" if third is None else _level(study, 2, third) + (", the optimum's" * here))
+        axes.set_title("" if third is None else _level(study, 2, third) + (" (optimum)" if here else ""), fontsize=9)
     return figure
 
 
@@ -69,7 +69,7 @@ def slices_after(study: Study, cohort: Cohort, optima: Float[np.ndarray, "k d"],
     for axes, count, x, third, values in zip(panels, counts, optima, thirds, grids, strict=True):
         draw(axes, values)
         _star(axes, study, x)
-        axes.set_title(f"{count} trials" + (f", {_level(study, 2, third)}" if third is not None else ""))
+        axes.set_title(f"{count} trials" + (f", {_level(study, 2, third)}" if third is not None else ""), fontsize=9)
     return figure
 
 
@@ -116,7 +116,7 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
     points = {name: np.asarray(study.space.to_physical(x)) for name, x in marks.items()}
     styles = (("*", RED, 140), ("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40))
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(max(2.4 * len(pairs), 3.4), 2.9), layout="constrained")
+        figure = Figure(figsize=(7.4 if len(pairs) > 1 else 4.0, 2.9), layout="constrained")
         for axes, (i, j) in zip(_row(figure, len(pairs)), pairs, strict=True):
             axes.scatter(
                 physical[:, i], physical[:, j], s=20, color=BLUE, alpha=0.7, label="individuals", clip_on=False
@@ -125,7 +125,8 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
                 look = {"marker": marker, "s": size, "color": colour, "edgecolor": "white", "linewidth": 0.6}
                 axes.scatter(point[i], point[j], label=name, zorder=3, clip_on=False, **look)
             _axes(axes, study, i, j)
-        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=5, frameon=False)
+        labels = figure.axes[0].get_legend_handles_labels()
+        figure.legend(*labels, loc="outside upper center", ncols=4 if len(pairs) > 1 else 2, frameon=False)
     return figure
 
 
@@ -147,9 +148,9 @@ def _slices(study, grids):
     """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
     low, high = min(np.nanmin(g) for g in grids), max(np.nanmax(g) for g in grids)
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(max(2.25 * len(grids), 3.0) + 0.7, 2.7), layout="constrained")
-        panels = _row(figure, len(grids))
-        scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(low, high), "cividis")
+        figure = Figure(figsize=(4.0 if len(grids) == 1 else 7.4, 2.7), layout="constrained")
+        panels = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
+        scale = ScalarMappable(Normalize(low, high), "cividis")
         figure.colorbar(scale, ax=list(panels), label=f"{_REALISM} (mean)", fraction=0.05, pad=0.02)
         for axes in panels:
             _axes(axes, study, 0, 1)
@@ -235,9 +236,9 @@ def _axes(axes, study, i, j):
         if parameter.scale == "log":
             getattr(axes, f"set_{which}scale")("log")
             axis = getattr(axes, f"{which}axis")
-            axis.set_major_locator(mpl.ticker.LogLocator(subs=(1.0, 2.0, 5.0)))
-            axis.set_major_formatter(mpl.ticker.FormatStrFormatter("%g"))
-            axis.set_minor_formatter(mpl.ticker.NullFormatter())
+            axis.set_major_locator(LogLocator(subs=(1.0,) if parameter.high > 20 * parameter.low else (1.0, 3.0, 5.0)))
+            axis.set_major_formatter(FormatStrFormatter("%g"))
+            axis.set_minor_formatter(NullFormatter())
 
 
 def _name(name: str) -> str:

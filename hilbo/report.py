@@ -22,7 +22,7 @@ from jaxtyping import Float
 
 from hilbo.config import Study
 from hilbo.page import results_page
-from hilbo.study import Aggregate, nrmse, population, progress
+from hilbo.study import Aggregate, population, progress
 
 __all__ = ["K0_range", "as_json", "misses", "result", "set_of", "write_results"]
 
@@ -71,13 +71,13 @@ def misses(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """NRMSE of points to the truth by search range: over the searched parameters, and with the derived K0."""
     x = np.asarray(x)
-    own = np.asarray(nrmse(jnp.asarray(x), jnp.asarray(np.broadcast_to(truth, x.shape[-1:]))))
+    own = np.asarray(np.sqrt(np.mean((x - truth) ** 2, axis=-1)))
     if study.space.mechanics is None:
         return own, None
     K0 = np.array([set_of(study, row)["K0"] for row in x.reshape(-1, x.shape[-1])]).reshape(own.shape)
     K0_error = (K0 - set_of(study, truth)["K0"]) / K0_range(study)
     d = x.shape[-1]
-    return own, np.sqrt((d * own**2 + K0_error**2) / (d + 1))
+    return own, np.asarray(np.sqrt((d * own**2 + K0_error**2) / (d + 1)))
 
 
 def versions() -> dict[str, str]:
@@ -286,8 +286,9 @@ def _captions(study, truth):
     return {
         "map": (
             "The population map",
-            "How real people find each rendering, as far as the answers tell: brighter is more realistic, and the star"
-            f' is the optimum.{white} Dots are everybody\'s answers, orange ones "{top}".{third}{rest}',
+            "How realistic people find each rendering, as far as their answers tell: brighter is better, and the star"
+            f" is the optimum.{white} Dots are renderings that were asked, orange where somebody answered"
+            f' "{top}".{third}{rest}',
         ),
         "progress": (
             "Progress of the optimum",

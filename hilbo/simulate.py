@@ -68,12 +68,12 @@ class Population(eqx.Module):
 
 _PAPER = Population(
     truth={"K1": 5.70, "B1": 5.89, "alpha": 0.203},
-    spread=(0.20, 0.075, 0.074),
+    spread=(0.36, 0.135, 0.133),
     tolerance=(0.238, 0.362, 0.087),
     tolerance_sd=0.41,
     criteria=(1.36, 1.0),
     noise=0.98,
-    lapse=0.062,
+    lapse=0.1,
     drift_sd=0.38,
 )
 
