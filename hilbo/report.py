@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from hilbo.config import Study
 from hilbo.page import results_page
@@ -67,7 +67,7 @@ def as_json(content: dict[str, Any]) -> str:
 
 
 def misses(
-    study: Study, x: Float[np.ndarray, "... d"], truth: Float[np.ndarray, " d"]
+    study: Study, x: Float[Array, "... d"] | Float[np.ndarray, "... d"], truth: Float[np.ndarray, " d"]
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """NRMSE of points to the truth by search range: over the searched parameters, and with the derived K0."""
     x = np.asarray(x)

@@ -116,3 +116,32 @@ def test_bad_usage_ends_with_2(capsys, monkeypatch, tmp_path, arguments):
     assert code == 2
     assert stderr
     assert not list(tmp_path.iterdir())
+
+
+def test_force_replaces_nothing_but_results(capsys, monkeypatch, tmp_path):
+    notes = tmp_path / "out" / "notes.txt"
+    notes.parent.mkdir()
+    notes.write_text("mine")
+    (tmp_path / "out" / "result.json").write_text("{}")
+    code, _, stderr = run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", notes.parent, "--force")
+    assert (code, notes.read_text()) == (2, "mine")
+    assert "notes.txt: is not a result of hilbo's" in stderr
+    code, _, stderr = run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", notes, "--force")
+    assert (code, notes.read_text()) == (2, "mine")
+    assert "notes.txt: is a file" in stderr
+
+
+def test_simulate_keeps_what_it_simulated(capsys, monkeypatch, tmp_path):
+    text = STUDY.replace("trials = 25", "trials = 6")
+    (tmp_path / "short.toml").write_text(text)
+    out = tmp_path / "out"
+    arguments = ["simulate", "--participants", "2", "--study", tmp_path / "short.toml", "--out", out]
+    assert run(capsys, monkeypatch, *arguments)[0] == 0
+    assert (out / "study.toml").read_text() == text
+    assert pd.read_csv(out / "truth.csv")["source"].tolist() == ["population", "individual:P01", "individual:P02"]
+    content = json.loads((out / "result.json").read_text())
+    assert set(content["truth"]["nrmse"]) == {"aggregate", "mean_of_optima", "average", "pooled"}
+    again = ["aggregate", out / "trials.csv", "--study", out / "study.toml", "--out", tmp_path / "again", "--json"]
+    code, stdout, _ = run(capsys, monkeypatch, *again)
+    assert code == 0
+    assert json.loads(stdout)["optimum"] == content["optimum"]  # the table holds the same bits
