@@ -281,6 +281,7 @@ def _print_demo(real, simulated, out) -> None:
         title="Simulated memory foam, 24 people x 25 trials: NRMSE to the truth, of the search ranges",
         box=box.SIMPLE_HEAD,
         title_justify="left",
+        pad_edge=False,
     )
     for head in ("", "K1, B1, alpha", "with K0", "passive by", "the paper"):
         table.add_column(head, justify="right" if head else "left", no_wrap=True)
@@ -292,10 +293,10 @@ def _print_demo(real, simulated, out) -> None:
 
     row("population (BCM)", "aggregate", simulated["optimum"], "4 %, yes")
     q, qk = truth["individuals"]["quartiles"], truth["individuals"]["with_K0"]
-    spread = [f"{100 * v[1]:.0f} % [{100 * v[0]:.0f}, {100 * v[2]:.0f}]" for v in (q, qk)]
+    spread = [f"{100 * v[1]:.0f} % ({100 * v[0]:.0f}–{100 * v[2]:.0f})" for v in (q, qk)]
     margins = [person["optimum"]["passivity_margin"] for person in simulated["participants"]]
     passive = f"{sum(margin >= 0 for margin in margins)} of {len(margins)}"
-    table.add_row("individual optima", *spread, passive, "24 % [13, 41]")
+    table.add_row("individuals", *spread, passive, "24 % (13–41)")
     row("mean of optima", "mean_of_optima", simulated["mean_of_optima"], "10.5 %, no")
     row("mean of maps", "average", simulated["alternatives"]["average"], "")
     console.print(table)

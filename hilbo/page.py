@@ -29,7 +29,7 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
         " turned into a map of perceived realism; the maps were merged, and this is where the merged map is highest.",
         warnings=content["warnings"],
         study_rows=_study_rows(study),
-        optimum=[(_head(study, name), f"{value:.4g}") for name, value in best["parameters"].items()],
+        optimum=[(_head(study, name), _number(value)) for name, value in best["parameters"].items()],
         probabilities=[(label, f"{100 * p:.0f} %") for label, p in best["class_probabilities"].items()],
         realism=f"{best['mean']:.2f} ± {best['sd']:.2f} (mean and standard deviation of f)",
         passivity=_passivity_words(best["passivity_margin"]),
@@ -40,7 +40,7 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
             [
                 p["participant"],
                 p["trials"],
-                *(f"{v:.3g}" for v in p["optimum"]["parameters"].values()),
+                *(_number(v) for v in p["optimum"]["parameters"].values()),
                 f"{p['optimum']['mean']:.2f}",
                 f"{p['optimum']['sd']:.2f}",
             ]
@@ -63,6 +63,11 @@ def _head(study, name):
     unit = _unit({p.name: p.unit for p in study.space.parameters}.get(name, "N/mm" if name == "K0" else ""))
     name = {"alpha": "α"}.get(name, name)
     return f"{name} ({unit})" if unit else name
+
+
+def _number(value):
+    """Four significant digits, never with an exponent."""
+    return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
 
 
 def _unit(unit):
@@ -116,7 +121,7 @@ def _comparison(study, content):
     claims["mean of the individual optima"] = ("mean_of_optima", content["mean_of_optima"])
     rows = []
     for words_, (name, found) in claims.items():
-        row = [words_, *(f"{v:.4g}" for v in found["parameters"].values())]
+        row = [words_, *(_number(v) for v in found["parameters"].values())]
         if found["passivity_margin"] is not None:
             row.append(f"{found['passivity_margin']:+.3f}")
         if truth:
@@ -124,13 +129,14 @@ def _comparison(study, content):
         rows.append(row)
     head = ["", *(_head(study, n) for n in content["optimum"]["parameters"])]
     head += ["passivity margin (N·s/m)"] if content["optimum"]["passivity_margin"] is not None else []
-    caption = "Other ways to choose one rendering for all; a negative margin is not passive."
+    caption = "Other ways to choose one rendering for all"
+    caption += "." if content["optimum"]["passivity_margin"] is None else "; a negative margin is not passive."
     if truth:
         head.append("miss (NRMSE)")
         rows.append(
             [
                 "truth",
-                *(f"{v:.4g}" for v in truth["parameters"].values()),
+                *(_number(v) for v in truth["parameters"].values()),
                 *[""] * (len(head) - len(truth["parameters"]) - 1),
             ]
         )
