@@ -229,4 +229,4 @@ def _progress(study, trials, candidates, counts):
 
 def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array, "*s"]:
     """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube."""
-    return jnp.sqrt(jnp.mean((x - reference) ** 2, axis=-1))
+    return jnp.sqrt(jnp.mean((x - jnp.broadcast_to(reference, x.shape)) ** 2, axis=-1))
