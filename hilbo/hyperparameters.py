@@ -8,6 +8,9 @@ learning all of variance, noise and thresholds together; and its shift, which th
 Weak priors, centred at the model's own values: log theta sd 1.5, log variance, log noise and log gaps sd 1, first
 threshold sd 1 in units of the prior's standard deviation. Few ordinal answers often leave the evidence without a
 maximum (theta to 0 or infinity); the result then says so instead of printing digits.
+
+The search is Newton's method with a trust radius. An exact Hessian of the evidence costs a fifth more than its
+gradient, since the mode is found once for both, and saves most of the steps that a quasi-Newton search needs.
 Reference: Rasmussen & Williams (2006), section 5.5.1; paper, section IV-3 (robustness check).
 """
 
@@ -18,9 +21,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.errors import InputError
+from hilbo.linalg import eigh
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 
 __all__ = ["Learnable", "Learned", "log_prior", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
@@ -29,6 +34,7 @@ Learnable = Literal["theta", "variance", "noise", "thresholds"]
 Coordinates = dict[str, Float[Array, "..."]]
 
 _RUNAWAY = 6.9  # a factor of 1000: that far from where the search began there is no maximum to speak of
+_FLAT = 1e-3  # curvature of the log evidence: less leaves a hyperparameter open by a factor exp(30) either way
 _PRIOR_SD = {"theta": 1.5, "variance": 1.0, "noise": 1.0, "first": 1.0, "gaps": 1.0}
 _FIELDS = {"theta": ("theta",), "variance": ("variance",), "noise": ("noise",), "thresholds": ("first", "gaps")}
 
@@ -43,7 +49,8 @@ class Learned(eqx.Module):
     converged: Bool[Array, "*M"]
     """The gradient vanished, and every fit on the way to it held its certificate at the end."""
     runaway: Bool[Array, "*M"]
-    """A hyperparameter moved by more than a factor 1000: the evidence has no maximum in reach."""
+    """A hyperparameter moved by more than a factor 1000, or may move by more than exp(30) at no cost: the evidence has
+    no maximum in reach."""
     learn: tuple[str, ...] = eqx.field(static=True)
 
 
@@ -100,26 +107,95 @@ def _maximise(gp, trials, learn, weak_priors, starts, max_steps):
         prior = log_prior(model, gp, learn) if weak_priors else jnp.zeros_like(evidence)
         return -(evidence + prior) / answers, (evidence, certified)
 
-    def search(start):
-        solver = optx.BFGS(rtol=1e-4, atol=1e-6)
-        return optx.minimise(cost, solver, start, has_aux=True, max_steps=max_steps, throw=False)
-
     def ended(start):
-        solution = search(start)
-        value, (evidence, certified) = cost(solution.value, None)
+        solver = _TrustRegionNewton()
+        solution = optx.minimise(cost, solver, start, has_aux=True, max_steps=max_steps, throw=False)
+        evidence, certified = solution.aux
         # An evidence without its certificate is no evidence: such an end never wins.
-        value = jnp.where(certified & jnp.isfinite(value), value, jnp.inf)
+        value = jnp.where(certified & jnp.isfinite(solution.state.value), solution.state.value, jnp.inf)
         done = (solution.result == optx.RESULTS.successful) & certified
-        return solution.value, value, evidence, done, jnp.asarray(solution.stats["num_steps"])
+        flat = jnp.min(solution.state.eigenvalues) * answers < _FLAT
+        return solution.value, value, evidence, done, flat, jnp.asarray(solution.stats["num_steps"])
 
     begin = _coordinates(gp, learn)
     # One search after the other: each stops when it is done, where a batch would wait for its slowest.
-    ends, values, evidences, done, steps = jax.lax.map(ended, _spread(begin, starts))
+    ends, values, evidences, done, flat, steps = jax.lax.map(ended, _spread(begin, starts))
     best = jnp.argmin(values)
     chosen = jax.tree.map(lambda leaf: leaf[best], ends)
     moved = [jnp.max(jnp.abs(chosen[k] - begin[k])) for k in chosen if k != "first" and chosen[k].size]
-    runaway = jnp.max(jnp.stack(moved)) > _RUNAWAY
+    runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | flat[best]
     return Learned(_model(chosen, gp), evidences[best], steps[best], done[best], runaway, learn)
+
+
+class _NewtonState(eqx.Module):
+    value: Float[Array, ""]
+    gradient: Float[Array, " p"]  # along the Hessian's eigenvectors, as `eigenvalues` and `move`
+    eigenvalues: Float[Array, " p"]
+    vectors: Float[Array, "p p"]
+    aux: PyTree
+    move: Float[Array, " p"]  # the next step,
+    promised: Float[Array, ""]  # and by how much it lowers the quadratic model
+    radius: Float[Array, ""]
+
+
+class _TrustRegionNewton(optx.AbstractMinimiser):
+    """Newton's method for a few variables, each a logarithm or of order 1, under a trust radius.
+
+    Along each eigenvector of the Hessian the step is -g_i / (|h_i| + |g| / radius): Newton's where the gradient is
+    small, never longer than the radius, and downhill along negative curvature. One evaluation an iteration.
+    Reference: Nocedal & Wright (2006), chapter 4.
+    """
+
+    rtol: float = 0.0
+    atol: float = 1e-6
+    norm: Callable = optx.max_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del fn, args, options, f_struct, tags
+        flat, _ = ravel_pytree(y)
+        infinite = jnp.full_like(flat, jnp.inf)
+        aux = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
+        zero = jnp.zeros_like(flat[0])
+        return _NewtonState(
+            infinite[0], infinite, infinite, jnp.diag(jnp.ones_like(flat)), aux, jnp.zeros_like(flat), zero, zero + 0.5
+        )
+
+    def step(self, fn, y, args, options, state, tags):
+        del options, tags
+        flat, restore = ravel_pytree(y)
+        ahead = flat + state.vectors @ state.move
+
+        def slope(at):
+            value, pull, aux = jax.vjp(lambda flat: fn(restore(flat), args), at, has_aux=True)
+            (gradient,) = pull(jnp.ones_like(value))
+            return gradient, (value, gradient, aux)
+
+        hessian, (value, gradient, aux) = jax.jacfwd(slope, has_aux=True)(ahead)
+        eigenvalues, vectors = eigh(hessian)
+        achieved = state.value - value
+        taken = achieved > 1e-4 * state.promised  # never of a value that is not a number
+        trusted = jnp.where(achieved > 0.75 * state.promised, 2.0, jnp.where(taken, 1.0, 0.25))
+        new = (value, gradient @ vectors, eigenvalues, vectors, aux)
+        old = (state.value, state.gradient, state.eigenvalues, state.vectors, state.aux)
+        kept = jax.tree.map(lambda n, o: jnp.where(taken, n, o), new, old)
+        state = _NewtonState(*kept, *_move(kept[1], kept[2], trusted * state.radius), trusted * state.radius)
+        return restore(jnp.where(taken, ahead, flat)), state, state.aux
+
+    def terminate(self, fn, y, args, options, state, tags):
+        del fn, y, args, options, tags
+        stuck = state.radius < jnp.finfo(state.radius.dtype).eps
+        return (self.norm(state.gradient) <= self.atol) | stuck, optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        del fn, args, options, state, tags, result
+        return y, aux, {}
+
+
+def _move(gradient, eigenvalues, radius):
+    """The step along the eigenvectors, and what the quadratic model promises of it. No gradient, no step."""
+    stiffness = jnp.abs(eigenvalues) + jnp.linalg.norm(gradient) / radius
+    move = -gradient / jnp.where(stiffness > 0, stiffness, 1.0)
+    return move, -jnp.sum(gradient * move + 0.5 * eigenvalues * move**2)
 
 
 def _evidence(gp, trials):
