@@ -38,7 +38,7 @@ Table = Annotated[Path, typer.Argument(help="Trial table (CSV or Parquet).", sho
 
 
 # What the commands write: a folder with anything else in it is never replaced.
-_FIGURES = ("map", "progress", "slices", "optima")
+_FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
 _PARTS = ("video-quality", "simulated-memory-foam")
 _WRITTEN = {"result.json", "report.html", "map.nc", "optima.csv", "trials.csv", "truth.csv", "study.toml", *_PARTS} | {
     f"{figure}.{kind}" for figure in _FIGURES for kind in ("png", "svg")
@@ -111,14 +111,13 @@ def robustness(
     """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
     with _results(out, force) as folder, _progress() as say:
         chosen, cohort = _read(trials, study, material, say)
-        from hilbo import page, report
+        from hilbo.report_robustness import write_robustness
         from hilbo.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
         found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
-        content = report.robustness_result(chosen, cohort, found, seed)
-        (folder / "result.json").write_text(report.as_json(content))
-        (folder / "report.html").write_text(page.robustness_page(chosen, content), encoding="utf-8")
+        say("maps, figures and report")
+        content = write_robustness(chosen, cohort, found, folder, seed)
     _finish(content, out, as_json)
 
 

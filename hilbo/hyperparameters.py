@@ -177,8 +177,10 @@ class _TrustRegionNewton(optx.AbstractMinimiser):
         trusted = jnp.where(achieved > 0.75 * state.promised, 2.0, jnp.where(taken, 1.0, 0.25))
         new = (value, gradient @ vectors, eigenvalues, vectors, aux)
         old = (state.value, state.gradient, state.eigenvalues, state.vectors, state.aux)
-        kept = jax.tree.map(lambda n, o: jnp.where(taken, n, o), new, old)
-        state = _NewtonState(*kept, *_move(kept[1], kept[2], trusted * state.radius), trusted * state.radius)
+        value, gradient, eigenvalues, vectors, aux = jax.tree.map(lambda n, o: jnp.where(taken, n, o), new, old)
+        radius = trusted * state.radius
+        move, promised = _move(gradient, eigenvalues, radius)
+        state = _NewtonState(value, gradient, eigenvalues, vectors, aux, move, promised, radius)
         return restore(jnp.where(taken, ahead, flat)), state, state.aux
 
     def terminate(self, fn, y, args, options, state, tags):

@@ -48,6 +48,7 @@ MAY_IMPORT = MATHS | {
     "hardware_bridge": {"protocol"},
 }
 MAY_IMPORT["report"] = set(MAY_IMPORT)
+MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
