@@ -21,11 +21,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.errors import InputError
 from hilbo.linalg import eigh
+from hilbo.newton import TrustRegionNewton
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 
 __all__ = ["Learnable", "Learned", "log_prior", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
@@ -108,13 +108,13 @@ def _maximise(gp, trials, learn, weak_priors, starts, max_steps):
         return -(evidence + prior) / answers, (evidence, certified)
 
     def ended(start):
-        solver = _TrustRegionNewton()
-        solution = optx.minimise(cost, solver, start, has_aux=True, max_steps=max_steps, throw=False)
+        solution = optx.minimise(cost, TrustRegionNewton(), start, has_aux=True, max_steps=max_steps, throw=False)
         evidence, certified = solution.aux
         # An evidence without its certificate is no evidence: such an end never wins.
-        value = jnp.where(certified & jnp.isfinite(solution.state.value), solution.state.value, jnp.inf)
+        end = solution.state.here
+        value = jnp.where(certified & jnp.isfinite(end.value), end.value, jnp.inf)
         done = (solution.result == optx.RESULTS.successful) & certified
-        flat = jnp.min(solution.state.eigenvalues) * answers < _FLAT
+        flat = eigh(end.hessian)[0][0] * answers < _FLAT
         return solution.value, value, evidence, done, flat, jnp.asarray(solution.stats["num_steps"])
 
     begin = _coordinates(gp, learn)
@@ -125,79 +125,6 @@ def _maximise(gp, trials, learn, weak_priors, starts, max_steps):
     moved = [jnp.max(jnp.abs(chosen[k] - begin[k])) for k in chosen if k != "first" and chosen[k].size]
     runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | flat[best]
     return Learned(_model(chosen, gp), evidences[best], steps[best], done[best], runaway, learn)
-
-
-class _NewtonState(eqx.Module):
-    value: Float[Array, ""]
-    gradient: Float[Array, " p"]  # along the Hessian's eigenvectors, as `eigenvalues` and `move`
-    eigenvalues: Float[Array, " p"]
-    vectors: Float[Array, "p p"]
-    aux: PyTree
-    move: Float[Array, " p"]  # the next step,
-    promised: Float[Array, ""]  # and by how much it lowers the quadratic model
-    radius: Float[Array, ""]
-
-
-class _TrustRegionNewton(optx.AbstractMinimiser):
-    """Newton's method for a few variables, each a logarithm or of order 1, under a trust radius.
-
-    Along each eigenvector of the Hessian the step is -g_i / (|h_i| + |g| / radius): Newton's where the gradient is
-    small, never longer than the radius, and downhill along negative curvature. One evaluation an iteration.
-    Reference: Nocedal & Wright (2006), chapter 4.
-    """
-
-    rtol: float = 0.0
-    atol: float = 1e-6
-    norm: Callable = optx.max_norm
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        del fn, args, options, f_struct, tags
-        flat, _ = ravel_pytree(y)
-        infinite = jnp.full_like(flat, jnp.inf)
-        aux = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
-        zero = jnp.zeros_like(flat[0])
-        return _NewtonState(
-            infinite[0], infinite, infinite, jnp.diag(jnp.ones_like(flat)), aux, jnp.zeros_like(flat), zero, zero + 0.5
-        )
-
-    def step(self, fn, y, args, options, state, tags):
-        del options, tags
-        flat, restore = ravel_pytree(y)
-        ahead = flat + state.vectors @ state.move
-
-        def slope(at):
-            value, pull, aux = jax.vjp(lambda flat: fn(restore(flat), args), at, has_aux=True)
-            (gradient,) = pull(jnp.ones_like(value))
-            return gradient, (value, gradient, aux)
-
-        hessian, (value, gradient, aux) = jax.jacfwd(slope, has_aux=True)(ahead)
-        eigenvalues, vectors = eigh(hessian)
-        achieved = state.value - value
-        taken = achieved > 1e-4 * state.promised  # never of a value that is not a number
-        trusted = jnp.where(achieved > 0.75 * state.promised, 2.0, jnp.where(taken, 1.0, 0.25))
-        new = (value, gradient @ vectors, eigenvalues, vectors, aux)
-        old = (state.value, state.gradient, state.eigenvalues, state.vectors, state.aux)
-        value, gradient, eigenvalues, vectors, aux = jax.tree.map(lambda n, o: jnp.where(taken, n, o), new, old)
-        radius = trusted * state.radius
-        move, promised = _move(gradient, eigenvalues, radius)
-        state = _NewtonState(value, gradient, eigenvalues, vectors, aux, move, promised, radius)
-        return restore(jnp.where(taken, ahead, flat)), state, state.aux
-
-    def terminate(self, fn, y, args, options, state, tags):
-        del fn, y, args, options, tags
-        stuck = state.radius < jnp.finfo(state.radius.dtype).eps
-        return (self.norm(state.gradient) <= self.atol) | stuck, optx.RESULTS.successful
-
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        del fn, args, options, state, tags, result
-        return y, aux, {}
-
-
-def _move(gradient, eigenvalues, radius):
-    """The step along the eigenvectors, and what the quadratic model promises of it. No gradient, no step."""
-    stiffness = jnp.abs(eigenvalues) + jnp.linalg.norm(gradient) / radius
-    move = -gradient / jnp.where(stiffness > 0, stiffness, 1.0)
-    return move, -jnp.sum(gradient * move + 0.5 * eigenvalues * move**2)
 
 
 def _evidence(gp, trials):

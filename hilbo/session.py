@@ -82,7 +82,6 @@ def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d
         from_box=study.space.from_box,
         to_box=study.space.to_box,
         feasible=study.space.feasible,
-        steps=300,
     )
 
 

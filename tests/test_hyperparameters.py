@@ -4,7 +4,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 import pytest
 from datasets import noisy, separated
 from reference_laplace import numpy_laplace
@@ -105,32 +104,3 @@ def test_a_hyperparameter_without_influence_is_said_to_run_away():
     learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("theta",), starts=1))(single)
     assert bool(learned.converged)
     assert bool(learned.runaway)
-
-
-def rosenbrock(y, _):
-    return (1 - y[0]) ** 2 + 100 * (y[1] - y[0] ** 2) ** 2
-
-
-def saddle(y, _):
-    return (y[0] ** 2 - 1) ** 2 + y[0] * 1e-3 + y[1] ** 2
-
-
-def walled(y, _):
-    return jnp.where(y[0] < 0.1, jnp.nan, y[0] - jnp.log(y[0])) + (y[1] - 2) ** 2
-
-
-@pytest.mark.parametrize(
-    ("function", "start", "end"),
-    [(rosenbrock, (-1.2, 1.0), (1.0, 1.0)), (saddle, (0.0, 1.0), (-1.000125, 0.0)), (walled, (0.2, 9.0), (1.0, 2.0))],
-)
-def test_the_search_follows_valleys_leaves_saddles_and_turns_at_walls(function, start, end):
-    solver = hyper._TrustRegionNewton(atol=1e-9)
-    solution = optx.minimise(function, solver, jnp.array(start), max_steps=60, throw=False)
-    np.testing.assert_allclose(solution.value, end, atol=1e-6)
-    assert bool(solution.result == optx.RESULTS.successful)
-
-
-def test_a_search_that_cannot_begin_ends_where_it_began():
-    solution = optx.minimise(walled, hyper._TrustRegionNewton(), jnp.array([0.0, 2.0]), max_steps=60, throw=False)
-    np.testing.assert_array_equal(solution.value, [0.0, 2.0])
-    assert not np.isfinite(solution.state.value)
