@@ -7,7 +7,6 @@ what one gets by averaging the optima, by averaging the maps and by the committe
 """
 
 import argparse
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +44,6 @@ def main():
     options.add_argument("--seeds", type=int, default=20)
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    warnings.filterwarnings("ignore", category=DeprecationWarning)
     import jax
     import jax.numpy as jnp
 

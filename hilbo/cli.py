@@ -11,7 +11,6 @@ import shutil
 import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -138,7 +137,6 @@ def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) 
 
 def _start() -> None:
     """Float64, and compiled functions kept in the user's cache folder from one command to the next."""
-    warnings.filterwarnings("ignore", message=".*no longer maintained.*", category=DeprecationWarning)
     import jax
 
     jax.config.update("jax_enable_x64", True)
