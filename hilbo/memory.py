@@ -6,7 +6,9 @@ Sampled every T seconds, a derivative of order α is T^{-α}·C(z). With the par
     full memory:            C(z) = (1 - z^{-1})·Σ_{i>=0} S_i z^{-i} = (1 - z^{-1})^α
 
 The S_i are the moments E[λ^i] of a beta distribution, λ ~ Beta(1 - α, α), so that full memory is a mixture of decays,
-C(z) = E[(1 - z^{-1})/(1 - λ z^{-1})], and a positive quadrature p_k, λ_k turns it into a few exponentials.
+C(z) = E[(1 - z^{-1})/(1 - λ z^{-1})], and a positive quadrature p_k, λ_k turns it into a few exponentials: see
+`exponentials`. There C(1) = 0, C(-1) = 2^α, and M1 = Σ p_k/(1 - λ_k) measures how far back the slowest one looks:
+that of (1 - z^{-1})^α itself is infinite.
 
 |c_i| = (α/i)·S_{i-1} are products of positive numbers, in which no digit is lost at either end of α.
 Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
@@ -20,6 +22,8 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Real
+
+from hilbo.exponentials import STATES, exponentials
 
 __all__ = ["GLSums", "Memory", "Span", "gl_coefficients", "gl_sums", "response", "span", "sums"]
 
@@ -49,6 +53,8 @@ def span(memory: Memory, N: int, states: int = 10) -> Span:
         raise ValueError(f'memory is {memory!r}, it must be "short" (N taps) or "full" (exponentials).')
     if memory == "short" and N < 1:
         raise ValueError(f"N is {N}, it must be at least 1: the number of past samples in the sum.")
+    if memory == "full" and states not in STATES:
+        raise ValueError(f"states is {states}, it must be one of {', '.join(map(str, STATES))}.")
     return Span("short", N, 0) if memory == "short" else Span("full", 0, states)
 
 
@@ -56,7 +62,9 @@ def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:
     """C(1), C(-1), their difference and the first moment of one order α, for either memory."""
     if span.memory == "short":
         return gl_sums(alpha, span.N)
-    raise NotImplementedError('memory="full" is not written yet.')
+    alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
+    weight, loss = exponentials(alpha, span.states)
+    return GLSums(jnp.zeros_like(alpha), 2**alpha, 2**alpha, jnp.sum(weight / loss))
 
 
 def response(alpha: Real[ArrayLike, ""], angle: Real[Array, "*w"], span: Span) -> Complex[Array, "*w"]:
@@ -66,7 +74,8 @@ def response(alpha: Real[ArrayLike, ""], angle: Real[Array, "*w"], span: Span) -
     difference = jax.lax.complex(2 * jnp.sin(angle / 2) ** 2, jnp.sin(angle))  # 1 - z^{-1}
     if span.memory == "short":
         return _short_response(alpha, angle, difference, span.N)
-    raise NotImplementedError('memory="full" is not written yet.')
+    weight, loss = (value.astype(difference.dtype) for value in exponentials(alpha, span.states))
+    return jnp.vectorize(lambda d: jnp.sum(weight * d / (loss + (1 - loss) * d)))(difference)
 
 
 def _short_response(alpha, angle, difference, N):

@@ -3,7 +3,7 @@
 Position and force drive the FO-SLS through the same recursion, with another a and ρ (see `viscoelastic`). With c_0 = 1
 
     short memory:  s_n = Σ_{i=1..N} |c_i|·y_{n-i}                          state: the last N values of y
-    full memory:   s_n = Σ_k p_k(1 - λ_k)·g_k,  g_k <- λ_k·g_k + y_{n-1}   state: g_k, one number per exponential
+    full memory:   s_n = Σ_k p_k·m_k,  m_k <- λ_k·m_k + (1 - λ_k)·y_{n-1}  state: one fading mean for each exponential
 
 Both are linear, so that m samples are two matrix products: with the impulse response d of 1/(1 - ρ·Σ|c_i|z^{-i}),
 its lower triangular Toeplitz matrix D, and the rows M that carry the state at the start of a block on to each sample,
@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hilbo.exponentials import exponentials
 from hilbo.memory import Span, gl_coefficients
 
 __all__ = ["BLOCK", "past_of"]
@@ -41,7 +42,8 @@ def past_of(
     """
     blocks = -(-u.shape[0] // block)
     driven = gain * jnp.zeros(blocks * block, u.dtype).at[: u.shape[0]].set(u).reshape(blocks, block)
-    taps, carry, write, state = _short(alpha, before, span.N, block)
+    describe = _taps if span.memory == "short" else _means
+    taps, carry, write, state = describe(alpha, before, span, block)
     impulse, echo = _impulse(taps, feedback)
     carry = _toeplitz(impulse) @ carry
 
@@ -54,9 +56,9 @@ def past_of(
     return past.reshape(-1)[: u.shape[0]]
 
 
-def _short(alpha, before, N, block):
+def _taps(alpha, before, span, block):
     """Taps |c_1| … |c_m|; the last values of y, the newest last, how they act on a block, and how they move on."""
-    length = max(N, block)
+    N, length = span.N, max(span.N, block)
     taps = jnp.zeros(length + block, alpha.dtype).at[:N].set(-gl_coefficients(alpha, N)[1:])
     delay = jnp.arange(block)[:, None] + length - jnp.arange(length)[None, :]
 
@@ -64,6 +66,19 @@ def _short(alpha, before, N, block):
         return jnp.concatenate([state[block:], y])
 
     return taps[:block], taps[delay - 1], write, jnp.full(length, before)
+
+
+def _means(alpha, before, span, block):
+    """The same for exponentials: |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
+    weight, loss = exponentials(alpha, span.states)
+    # As products, which have derivatives at λ = 0.
+    powers = jnp.cumprod(jnp.concatenate([jnp.ones_like(loss)[None], jnp.tile(1 - loss, (block, 1))]), axis=0)
+    carry, entry = weight[None, :] * powers[:-1], loss[:, None] * powers[:-1][::-1].T
+
+    def write(state, y):
+        return powers[-1] * state + entry @ y
+
+    return carry @ loss, carry, write, jnp.full(span.states, before)
 
 
 def _impulse(taps, feedback):

@@ -123,7 +123,7 @@ class FOSLS(eqx.Module):
     def effective_damping(self) -> Float[Array, ""]:
         """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1."""
         found = sums(self.alpha, self.span)
-        return 1000 * self.T * self.beta * found.moment * _share(self.K1, self.beta * found.at_dc) ** 2
+        return 1000 * self.T * self.beta * found.moment * share(self.K1, self.beta * found.at_dc) ** 2
 
     def simulate(
         self, x: Real[ArrayLike, " n"], *, start: Start = "rest", unilateral: bool = False, block: int = BLOCK
@@ -157,17 +157,17 @@ class FOSLS(eqx.Module):
 
 def series(K1, pot):
     """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`."""
-    stiff = jnp.abs(pot) <= K1
-    compliance = (1 / jnp.where(stiff & (K1 > 0), K1, 1)).astype(pot.dtype)
-    softer = jnp.where(stiff, 0, K1).astype(pot.dtype)
-    return jnp.where(stiff, pot / (1 + compliance * pot), softer / (1 + softer / jnp.where(stiff, 1, pot)))
+    firm = (jnp.abs(pot) <= K1) & (K1 > 0)
+    compliance = (1 / jnp.where(firm, K1, 1)).astype(pot.dtype)
+    spring, pot_of_soft = jnp.where(firm, 0, K1).astype(pot.dtype), jnp.where(firm | (pot == 0), 1, pot)
+    return jnp.where(firm, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
 
 
-def _share(K1, pot):
-    """Elongation of the pot in series with a spring, K1/(K1 + pot), for every K1 from 0 to inf."""
-    stiff = pot <= K1
-    ratio = jnp.where(stiff, 0, K1) / jnp.where(stiff, 1, pot)
-    return jnp.where(stiff, 1 / (1 + pot / jnp.where(stiff & (K1 > 0), K1, 1)), ratio / (1 + ratio))
+def share(K1, pot):
+    """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf."""
+    firm = (pot <= K1) & (K1 > 0)
+    ratio = jnp.where(firm, 0, K1) / jnp.where(firm | (pot == 0), 1, pot)
+    return jnp.where(firm, 1 / (1 + pot / jnp.where(firm, K1, 1)), ratio / (1 + ratio))
 
 
 @eqx.filter_jit
@@ -179,12 +179,12 @@ def _frequency_response(model, omega):
 @eqx.filter_jit
 def _force(model, x, start, unilateral, block):
     beta = model.beta
-    share, stiffness = _share(model.K1, beta), series(model.K1, beta)
+    gain, stiffness = share(model.K1, beta), series(model.K1, beta)
     x = jnp.maximum(x, 0) if unilateral else x
     before = jnp.zeros_like(beta)
     if start == "equilibrium":
-        before = x[0] * _share(model.K1, beta * sums(model.alpha, model.span).at_dc)
-    past = past_of(model.alpha, share, _share(beta, model.K1), x, before, model.span, block)
+        before = x[0] * share(model.K1, beta * sums(model.alpha, model.span).at_dc)
+    past = past_of(model.alpha, gain, share(beta, model.K1), x, before, model.span, block)
     force = model.K0 * x + stiffness * (x - past)
     return jnp.maximum(force, 0) if unilateral else force
 
@@ -192,12 +192,12 @@ def _force(model, x, start, unilateral, block):
 @eqx.filter_jit
 def _position(model, F, start, block):
     beta = model.beta
-    share, stiffness = _share(model.K1, beta), series(model.K1, beta)
+    gain, stiffness = share(model.K1, beta), series(model.K1, beta)
     total = model.K0 + stiffness
     before = jnp.zeros_like(beta)
     if start == "equilibrium":
-        before = F[0] / model.dc_gain() * _share(model.K1, beta * sums(model.alpha, model.span).at_dc)
-    past = past_of(model.alpha, share / total, 1 - share * model.K0 / total, F, before, model.span, block)
+        before = F[0] / model.dc_gain() * share(model.K1, beta * sums(model.alpha, model.span).at_dc)
+    past = past_of(model.alpha, gain / total, 1 - gain * model.K0 / total, F, before, model.span, block)
     return (F + stiffness * past) / total
 
 
@@ -205,8 +205,8 @@ def _position(model, F, start, block):
 def _settling_time(model, fraction):
     """First sample n with s_n >= fraction·s_inf after a unit step: the force relaxes as s grows, and s only grows."""
     beta, found = model.beta, sums(model.alpha, model.span)
-    share, feedback = _share(model.K1, beta), _share(beta, model.K1)
-    goal = fraction * (1 - found.at_dc) * _share(model.K1, beta * found.at_dc)
+    gain, feedback = share(model.K1, beta), share(beta, model.K1)
+    goal = fraction * (1 - found.at_dc) * share(model.K1, beta * found.at_dc)
     taps = -gl_coefficients(model.alpha, model.N)[1:]
 
     def unfinished(carry):
@@ -215,7 +215,7 @@ def _settling_time(model, fraction):
 
     def step(carry):
         n, past, history = carry
-        history = jnp.concatenate([(share + feedback * past)[None], history[:-1]])
+        history = jnp.concatenate([(gain + feedback * past)[None], history[:-1]])
         return n + 1, taps @ history, history
 
     n, past, _ = jax.lax.while_loop(unfinished, step, (0, jnp.zeros_like(beta), jnp.zeros_like(taps)))
@@ -318,4 +318,4 @@ def _dc_gain(span, K0, K1, B1, alpha, T):
 
 def _effective_damping(span, K1, B1, alpha, T):
     beta, found = B1 * T**-alpha, sums(alpha, span)
-    return 1000 * T * beta * found.moment * _share(K1, beta * found.at_dc) ** 2
+    return 1000 * T * beta * found.moment * share(K1, beta * found.at_dc) ** 2
