@@ -131,7 +131,8 @@ def maximise(
     best = Choice(candidates[rows[first]], begun[first], rows[first], begun[first])
     if starts == 0:
         return best
-    polished = jax.vmap(functools.partial(_polish, score, from_box, to_box, steps))(candidates[rows])
+    # One after the other: each stops when it is done, where a batch would wait for its slowest.
+    polished = jax.lax.map(functools.partial(_polish, score, from_box, to_box, steps), candidates[rows])
     usable = jax.vmap(lambda x: feasible(x) & (True if allowed is None else allowed(x)))(polished)
     reached = jnp.where(usable, jax.vmap(score)(polished), -jnp.inf)
     top = jnp.argmax(reached)
