@@ -17,7 +17,7 @@ from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.hyperparameters import Learned, maximise_evidence, maximise_shared_evidence, optimum_sensitivity
 from hilbo.ordinal_gp import Posterior, fit
-from hilbo.session import CANDIDATES
+from hilbo.session import search_points
 from hilbo.study import Cohort, Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
 
 __all__ = ["LIMIT", "Robustness", "robustness"]
@@ -73,7 +73,7 @@ def robustness(
     """
     if "variance" in learn:
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
-    candidates = jnp.asarray(study.space.candidates(CANDIDATES, seed))
+    candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
     learned = _learn(study.gp, cohort.trials, tuple(learn), shared, weak_priors)
     if shared:
