@@ -135,7 +135,8 @@ def _short_enclosure(model):
 def _polynomials(model):
     """Cosine coefficients of A and B, and the least value of A."""
     beta = model.beta
-    g, h, k = share(model.K1, beta), share(beta, model.K1), series(model.K1, beta)
+    k = series(model.K1, beta)
+    g, h = jnp.where(k > 0, share(model.K1, beta), 1), jnp.where(k > 0, share(beta, model.K1), 0)
     c = gl_coefficients(model.alpha, model.N)
     partial = jnp.cumprod(1 - model.alpha / jnp.arange(1, model.N + 1, dtype=c.dtype))
     last = partial[-1]
