@@ -45,13 +45,13 @@ def main():
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
     import jax
-    import jax.numpy as jnp
 
     jax.config.update("jax_enable_x64", True)
     from hilbo.config import Study
+    from hilbo.session import search_points
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
-    candidates = jnp.asarray(study.space.candidates(4096, 0))
+    candidates = search_points(study.space, 0)
     found = [one_study(study, seed, candidates) for seed in range(chosen.seeds)]
     text = report(found)
     print(text)
