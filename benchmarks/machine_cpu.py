@@ -97,9 +97,10 @@ def table(rows, count):
     lines = [
         "# Machine CPU",
         "",
-        "Ordinal regression on the data of Chu & Ghahramani (2005), JMLR 6:1019, over their partitions (150 training, 59",
-        "test rows): made by `python benchmarks/machine_cpu.py FOLDER --inference laplace ep --ard --write`. Mean ± sd over"
-        f" {count} partitions.",
+        "Ordinal regression on the data of Chu & Ghahramani (2005), JMLR 6:1019, over their partitions (150",
+        "training and 59 test rows): made by",
+        "`python benchmarks/machine_cpu.py FOLDER --inference laplace ep --ard --write`.",
+        f"Mean ± sd over {count} partitions.",
         "Hyperparameters by maximum Laplace evidence in every row; published: Laplace with one theta.",
         "",
         "| bins | inference | error (%) | mean absolute error | mean log p | seconds a partition |",
