@@ -11,7 +11,6 @@ import shutil
 import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -38,7 +37,7 @@ Table = Annotated[Path, typer.Argument(help="Trial table (CSV or Parquet).", sho
 
 
 # What the commands write: a folder with anything else in it is never replaced.
-_FIGURES = ("map", "progress", "slices", "optima")
+_FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
 _PARTS = ("video-quality", "simulated-memory-foam")
 _WRITTEN = {"result.json", "report.html", "map.nc", "optima.csv", "trials.csv", "truth.csv", "study.toml", *_PARTS} | {
     f"{figure}.{kind}" for figure in _FIGURES for kind in ("png", "svg")
@@ -111,14 +110,13 @@ def robustness(
     """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
     with _results(out, force) as folder, _progress() as say:
         chosen, cohort = _read(trials, study, material, say)
-        from hilbo import page, report
+        from hilbo.report_robustness import write_robustness
         from hilbo.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
         found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
-        content = report.robustness_result(chosen, cohort, found, seed)
-        (folder / "result.json").write_text(report.as_json(content))
-        (folder / "report.html").write_text(page.robustness_page(chosen, content), encoding="utf-8")
+        say("maps, figures and report")
+        content = write_robustness(chosen, cohort, found, folder, seed)
     _finish(content, out, as_json)
 
 
@@ -139,7 +137,6 @@ def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) 
 
 def _start() -> None:
     """Float64, and compiled functions kept in the user's cache folder from one command to the next."""
-    warnings.filterwarnings("ignore", message=".*no longer maintained.*", category=DeprecationWarning)
     import jax
 
     jax.config.update("jax_enable_x64", True)

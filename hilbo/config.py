@@ -156,8 +156,8 @@ class Study(eqx.Module):
 
     @staticmethod
     def from_dict(raw: Mapping[str, Any], source: str = "") -> "Study":
-        """As `load`, from the parsed tables."""
-        return _checked(raw, source, "")
+        """As `load`, from the parsed tables; numbers and lists may be NumPy's."""
+        return _checked(_plain(raw), source, "")
 
     @property
     def hash(self) -> str:
@@ -175,6 +175,15 @@ class Study(eqx.Module):
             known = ", ".join(self.materials) or "there are none"
             raise InputError(f"{_prefix(self.source)}materials.{name} is not in the study, its materials: {known}.")
         return _checked(_override({"schema": 1} | json.loads(self.content), name), self.source, "")
+
+
+def _plain(raw):
+    """With Python's own numbers, lists and dicts in place of NumPy's and other mappings."""
+    if isinstance(raw, Mapping):
+        return {key: _plain(value) for key, value in raw.items()}
+    if isinstance(raw, list | tuple):
+        return [_plain(value) for value in raw]
+    return raw.tolist() if hasattr(raw, "tolist") else raw
 
 
 def _checked(raw, source, text):
@@ -201,6 +210,11 @@ def _study(raw, source):
     if len(thresholds) != len(labels) - 1:
         raise InputError(
             f"gp.thresholds has {len(thresholds)} numbers, it must have one fewer than the {len(labels)} responses."
+        )
+    if content.selection.space_filling > content.selection.trials:
+        raise InputError(
+            f"selection.space_filling is {content.selection.space_filling}, it must be at most"
+            f" trials = {content.selection.trials}."
         )
     if any(low >= high for low, high in itertools.pairwise(thresholds)):
         raise InputError(f"gp.thresholds is {_shown(thresholds)}, it must rise from each number to the next.")

@@ -17,13 +17,14 @@ EVERYWHERE = {"errors", "normal", "linalg"}  # may be imported by every module, 
 MATHS = {
     "normal": set(),
     "linalg": set(),
+    "newton": set(),
     "kernels": set(),
     "likelihoods": set(),
     "laplace": set(),
     "ep": set(),
     "exact": set(),
     "bcm": set(),
-    "acquisition": set(),
+    "acquisition": {"newton"},
     "mittag_leffler": set(),
     "exponentials": set(),
     "memory": {"exponentials"},
@@ -34,11 +35,12 @@ MATHS = {
     "switching": {"fosls"},
     "viscoelastic": {"fosls", "continuous", "materials", "switching"},
     "ordinal_gp": {"kernels", "likelihoods", "laplace", "ep", "exact"},
-    "hyperparameters": {"ordinal_gp"},
+    "hyperparameters": {"ordinal_gp", "newton"},
     "passivity_certificate": {"viscoelastic"},
     "passivity": {"viscoelastic", "passivity_certificate"},
     "identification": {"viscoelastic"},
-    "search_space": {"viscoelastic", "passivity"},
+    "space_filling": set(),
+    "search_space": {"viscoelastic", "passivity", "space_filling"},
     "session": {"config", "ordinal_gp", "acquisition", "search_space"},
     "simulate": {"session"},
     "validation": {"study"},
@@ -57,6 +59,7 @@ MAY_IMPORT = MATHS | {
     "hardware_bridge": {"protocol"},
 }
 MAY_IMPORT["report"] = set(MAY_IMPORT)
+MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}

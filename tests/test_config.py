@@ -210,6 +210,7 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ),
     ("damping = 0.95", "damping = 0.95\neffective_damping = 10", "25: renderer.effective_damping is 10, it must be a "),
     ("trials = 25", "trials = 2.5", "33: selection.trials is 2.5, it must be a whole number, 1 or above; "),
+    ("trials = 25", "trials = 4", "32: selection.space_filling is 5, it must be at most trials = 4."),
     ('"ucb"', '"best"', '34: selection.acquisition is "best", it must be one of "ucb", '),
     ("weight = 0.7", "weight = -1", "35: selection.weight is -1, it must be a number, 0 or above; "),
     ('rule = "bcm"', 'rule = "mean"', '37: aggregation.rule is "mean", it must be "bcm"; '),
@@ -230,6 +231,13 @@ def test_a_bad_file_gets_one_sentence_with_its_place(load, old, new, sentence):
     message = str(caught.value)
     assert message.startswith(f"study.toml:{sentence}"), message
     assert message.endswith(".") and "\n" not in message
+
+
+def test_tables_may_hold_numpys_numbers():
+    raw = tomllib.loads(GOOD)
+    raw["gp"] |= {"thresholds": np.array([-0.5, 0.5]), "noise": np.float64(0.5), "theta": np.float32(30)}
+    raw["selection"]["trials"] = np.int64(25)
+    assert Study.from_dict(raw).hash == Study.from_dict(tomllib.loads(GOOD)).hash
 
 
 def test_a_table_must_be_a_table():
