@@ -23,7 +23,7 @@ from hilbo.memory import Span, gl_coefficients
 
 __all__ = ["BLOCK", "past_of"]
 
-BLOCK = 64
+BLOCK = 32
 """Samples at once."""
 
 
