@@ -21,6 +21,7 @@ import equinox as eqx
 import msgspec
 
 from hilbo.errors import InputError
+from hilbo.memory import Memory
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.search_space import Mechanics, Parameter, SearchSpace
 
@@ -60,8 +61,9 @@ class _RendererTable(_Table, frozen=True):
     K_eff: Annotated[_NotNegative, msgspec.Meta(examples=["0.44"])]
     damping: Annotated[_Positive, msgspec.Meta(examples=["0.95"])]
     model: Annotated[Literal["fosls"], _text('"fosls"', '"fosls"')] = "fosls"
-    memory: Annotated[Literal["short"], _text('"short"', '"short"')] = "short"
+    memory: Annotated[Memory, _text('"short" or "full"', '"short"')] = "short"
     N: Annotated[int, msgspec.Meta(ge=1), _text("an odd whole number, 1 or above", "101")] = 101
+    states: Annotated[int, _text("a number of exponentials, for full memory", "10")] = 10
     T: Annotated[_Positive, msgspec.Meta(examples=["0.001"])] = 1e-3
     effective_damping: Annotated[tuple[float, float] | None, _text("a list of two numbers", "[10, 80]")] = None
 

@@ -88,9 +88,13 @@ def _study_rows(study):
     mechanics = study.space.mechanics
     if mechanics is not None:
         model = (
-            f"FO-SLS, N = {mechanics.N}, T = {1000 * mechanics.T:g} ms, effective stiffness {mechanics.K_eff:g} N/mm"
+            f"FO-SLS, {_memory(mechanics)}, T = {1000 * mechanics.T:g} ms, effective stiffness {mechanics.K_eff:g} N/mm"
         )
         yield "renderer", f"{model}; the device has {mechanics.damping:g} N·s/m of damping"
+
+
+def _memory(mechanics):
+    return f"N = {mechanics.N}" if mechanics.memory == "short" else f"full memory, {mechanics.states} exponentials"
 
 
 def _passivity_words(margin):
@@ -106,7 +110,7 @@ def _search_words(study):
     if mechanics is None:
         return "The optimum was searched over the whole box."
     return (
-        f"The optimum was searched among the passive parameter sets (FO-SLS, N = {mechanics.N},"
+        f"The optimum was searched among the passive parameter sets (FO-SLS, {_memory(mechanics)},"
         f" T = {1000 * mechanics.T:g} ms, device damping {mechanics.damping:g} N·s/m less 0.1 %), with K0 from the"
         f" effective stiffness {mechanics.K_eff:g} N/mm."
     )

@@ -200,7 +200,8 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ("N = 101", "N = 101.5", "21: renderer.N is 101.5, it must be an odd whole number, 1 or above; "),
     ("T = 0.001", "T = 0", "22: renderer.T is 0, it must be a number above 0; "),
     ("K_eff = 0.44", "K_eff = -1", "23: renderer.K_eff is -1, it must be a number, 0 or above; "),
-    ('memory = "short"', 'memory = "full"', '20: renderer.memory is "full", it must be "short"; '),
+    ('memory = "short"', 'memory = "long"', '20: renderer.memory is "long", it must be "short" or "full"; '),
+    ('memory = "short"', 'memory = "full"\nstates = 9', "21: renderer.states is 9, it must be one of 8, 10, 12."),
     ("damping = 0.95\n", "", "18: renderer.damping is missing, add it."),
     ("damping = 0.95", "damping = 0.1", "24: renderer.damping is 0.1 N.s/m, with which no K1 from 1.0 N/mm up is "),
     (

@@ -127,7 +127,8 @@ def model_of(K1, B1, alpha, N=101, memory="short"):
 
 
 def random_sets(count, seed=0):
-    return qmc.scale(qmc.Sobol(3, rng=seed).random(count), (1, 0.001, 0.01), (32, 32, 0.99)).T
+    points = qmc.Sobol(3, rng=seed).random(2 ** (count - 1).bit_length())[:count]
+    return qmc.scale(points, (1, 0.001, 0.01), (32, 32, 0.99)).T
 
 
 @functools.partial(jax.jit, static_argnames=("N", "memory", "angles"))
