@@ -243,7 +243,7 @@ def test_full_memory_binds_at_nyquist(b):
 
 @pytest.mark.parametrize(("N", "memory"), [(101, "short"), (100, "short"), (2, "short"), (101, "full")])
 def test_a_witness_creates_the_energy_of_the_formula(N, memory):
-    for K1, B1, alpha in random_sets(8, 4).T:
+    for K1, B1, alpha in random_sets(3, 4).T:
         model = model_of(K1, B1, alpha, N, memory)
         needed = 0.95 - float(passivity.certify(model, 0.95).upper)
         b = 0.9 * needed
