@@ -275,8 +275,7 @@ class SearchSpace(eqx.Module):
         first, last = _K1_range(m, B1, alpha)
         low, high = K1.to_unit(jnp.clip(first, K1.low, K1.high)), K1.to_unit(jnp.clip(last, K1.low, K1.high))
         high = jnp.minimum(high, self._limit(m, x))
-        empty = (first > K1.high) | (last < K1.low) | (high <= low)
-        return low, jnp.where(empty, 0, high - low)
+        return low, jnp.maximum(high - low, 0)
 
 
 def _K1_range(m, B1, alpha):
