@@ -4,12 +4,13 @@ import importlib
 
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import pytest
 from helpers import check_grad
 
 from hilbo.exponentials import STATES, exponentials
-from hilbo.memory import gl_coefficients, response, span, sums
+from hilbo.memory import gl_coefficients, gl_sums, response, span, sums
 from hilbo.viscoelastic import FOSLS, creep_load, relaxation_load
 
 ORDERS = np.concatenate([[1e-6, 1e-3], np.linspace(0.01, 0.99, 50), [0.999, 1 - 1e-6, 1.0]])
@@ -52,6 +53,32 @@ def test_sums_are_those_of_the_response():
         np.testing.assert_allclose(at[jnp.array([0, 2])], [found.at_dc, found.at_nyquist], atol=1e-14)
         assert at[1].imag / 1e-7 == pytest.approx(float(found.moment), rel=1e-4 if memory.memory == "full" else 1e-8)
 
+
+def test_derivatives_of_the_sums_are_those_of_their_polynomials():
+    """The sums are polynomials in alpha; their derivatives of first and second order, along several directions."""
+    alpha, N = mp.mpf("0.203"), 7
+
+    def exact(order):
+        def c(i):
+            return lambda a: mp.binomial(a, i) * (-1) ** i
+
+        mp.mp.dps = 40
+        return [float(sum(w(i) * mp.diff(c(i), alpha, order) for i in range(N + 1))) for w in WEIGHTS]
+
+    def ours(a):
+        found = gl_sums(a, N)
+        return jnp.stack([found.at_dc, found.at_nyquist, found.spread, found.moment])
+
+    for derivative, order in ((jax.jacfwd, 1), (jax.jacrev, 1), (lambda f: jax.jacfwd(jax.jacrev(f)), 2)):
+        np.testing.assert_allclose(derivative(ours)(0.203), exact(order), rtol=1e-12)
+    mixed = jax.hessian(lambda w: gl_sums(w[0] * w[1], N).spread)(jnp.array([0.406, 0.5]))
+    first, second = exact(1)[2], exact(2)[2]
+    np.testing.assert_allclose(
+        mixed, [[0.25 * second, first + 0.203 * second], [first + 0.203 * second, 0.406**2 * second]]
+    )
+
+
+WEIGHTS = (lambda i: 1, lambda i: (-1) ** i, lambda i: (-1) ** i - 1, lambda i: -i)
 
 # Corners and centre of the search box: (K1, B1).
 CASES = jnp.array([(1.0, 0.001), (1.0, 32.0), (32.0, 0.001), (32.0, 32.0), (16.5, 16.0005)])

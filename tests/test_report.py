@@ -33,6 +33,14 @@ def test_misses_are_those_of_the_paper(values, three, with_K0):
     assert found == pytest.approx((three, with_K0), abs=5e-4)
 
 
+def test_errors_by_search_range_are_those_of_the_paper():
+    for values, percent in ((AGGREGATE, (1.8, 0.4, 6.2, 2.8)), (MEAN_OF_OPTIMA, (13.1, 8.8, 13.7, 8.1))):
+        off = unit(values) - unit(SYSTEM_IDENTIFICATION)
+        K0 = [report.set_of(PAPER, unit(v))["K0"] for v in (values, SYSTEM_IDENTIFICATION)]
+        found = 100 * np.abs([(K0[0] - K0[1]) / report.K0_range(PAPER), *off])
+        np.testing.assert_allclose(found, percent, atol=0.06)
+
+
 def test_misses_of_many_points_are_those_of_each():
     points = np.stack([unit(AGGREGATE), unit(MEAN_OF_OPTIMA)])
     many = np.stack(report.misses(PAPER, points, unit(SYSTEM_IDENTIFICATION)), axis=1)
