@@ -1,0 +1,301 @@
+"""From creep and relaxation tests to the parameters of the FO-SLS that make the same curves.
+
+A sampled model is fitted to what was measured: the recorded input (position in relaxation, force in creep) goes through
+the model and its output is compared, so that no ideal step is assumed. Coordinates (physics of the three parts, each
+in its own time range, so that the column-scaled Jacobian has a condition number of about 30 instead of 30,000):
+
+    q = (K_inst, K_eff, log κ, logit α),  K_inst = K0 + K1/(1 + κ) = H(∞),  K_eff = H(1),  κ = K1·T^α/B1
+    H(z) = K_eff + (K_inst - K_eff)·(1 + κ)·(C(z) - S) / ((1 - S)·(κ + C(z))),  S = C(1)
+
+with C(z) = Σ_{i=0..N} c_i z^{-i} (`viscoelastic`), or (1 - 1/z)^α with full memory, where S = 0. A response is the
+inverse transform of H(z)·X(z) (of X(z)/H(z) for creep) on a circle |z| = r > 1: two FFTs whatever N is. The circle
+damps what wraps around by r^{-L} = eps^0.8, so the curves are those of the recursion to about eps^0.75.
+Modulus data G(t), J(t) have no sampled input; they are fitted by the exact Mittag-Leffler forms (`moduli`).
+
+Residuals are divided by the range of their curve; the cost is the sum over tests of NRMSE².
+Units: N, mm, s; B1 N·s^α/mm. Moduli keep their own unit.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo import viscoelastic
+from hilbo.errors import InputError
+from hilbo.least_squares import Solution, least_squares
+
+__all__ = ["Curve", "Fit", "Sampled", "Test", "curve_residuals", "fit", "nrmse", "residuals"]
+
+Kind = Literal["relaxation", "creep", "modulus", "compliance"]
+MEASURED = ("relaxation", "creep")  # kinds with a recorded input
+FEWEST = 8  # points of a test
+
+
+class Test(eqx.Module):
+    """One kind of test and its repeats, which share their times.
+
+    `time` (m,) in s, increasing; `output` (R, m): force (N) of relaxation, position (mm) of creep, modulus or
+    compliance; `input` (R, m): the position (mm) or force (N) that was applied, None for moduli. Before the first row
+    the material is at rest with no input (`start="rest"`), or in equilibrium with the first one.
+    Raises `InputError` for too few points, times that do not increase, numbers that are not finite, and flat curves.
+    """
+
+    __test__ = False  # no test of pytest's
+
+    kind: Kind = eqx.field(static=True)
+    time: Float[np.ndarray, " m"]
+    output: Float[np.ndarray, "R m"]
+    input: Float[np.ndarray, "R m"] | None = None
+    start: Literal["rest", "equilibrium"] = eqx.field(static=True, default="rest")
+
+    def __check_init__(self):
+        m = self.time.size
+        if m < FEWEST:
+            raise InputError(f"The {self.kind} test has {m} points; at least {FEWEST} are needed for four parameters.")
+        if not np.all(np.diff(self.time) > 0):
+            raise InputError(f"The times of the {self.kind} test do not increase from row to row; sort its rows.")
+        if (self.input is None) == (self.kind in MEASURED):
+            needs = "needs the recorded input beside the output" if self.input is None else "has no input"
+            raise InputError(f"A {self.kind} test {needs}.")
+        parts = (self.time, self.output) if self.input is None else (self.time, self.output, self.input)
+        if not all(np.all(np.isfinite(part)) for part in parts):
+            raise InputError(f"The {self.kind} test has numbers that are not finite; leave those rows out.")
+        if not np.ptp(self.output.mean(axis=0)) > 0:
+            raise InputError(f"The output of the {self.kind} test does not change; there is nothing to fit.")
+        if self.input is not None and not np.any(self.input):
+            raise InputError(f"The input of the {self.kind} test is 0 throughout; check the columns.")
+
+    @property
+    def repeats(self) -> int:
+        """How often it was done."""
+        return self.output.shape[0]
+
+
+class Curve(eqx.Module):
+    """A test made ready for one model: its mean over weighted repeats is what is fitted.
+
+    The model is linear in its input, so the mean of the repeats is the response to the mean of their inputs, exactly.
+    `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: where the
+    measured times lie on it; `scale`: what residuals are divided by.
+    """
+
+    kind: Kind = eqx.field(static=True)
+    time: Float[Array, " m"]
+    output: Float[Array, "R m"]
+    offset: Float[Array, " R"]  # input of the equilibrium before the test
+    scale: Float[Array, " m"]
+    spectra: Array | None = None
+    before: Int[Array, " m"] | None = None
+    share: Float[Array, " m"] | None = None
+    length: int = eqx.field(static=True, default=0)
+
+
+class Sampled(eqx.Module):
+    """The FO-SLS as it is rendered: sampled every `T` s, with the last `N` samples or full memory.
+
+    Full memory is the infinite sum, which `viscoelastic`'s sum of exponentials meets to 1e-4 of the largest force.
+    """
+
+    N: int = eqx.field(static=True, default=101)
+    T: float = eqx.field(static=True, default=1e-3)
+    memory: Literal["short", "full"] = eqx.field(static=True, default="short")
+
+    names = ("K_inst", "K_eff", "log_kappa", "logit_alpha")
+    kinds = MEASURED
+
+    def __check_init__(self):
+        if self.N < 1:
+            raise InputError(f"N is {self.N}, it must be at least 1: the number of past samples.")
+        if not 0 < self.T < np.inf:
+            raise InputError(f"T is {self.T}, it must be a time in s above 0.")
+
+    def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of q: stiffness up to 50 times the largest secant, κ from 1e-6 to 1e4, α from 0.01 to 0.99."""
+        top = max(_secant(test) for test in tests)
+        ends = np.log(0.99 / 0.01)
+        lower = np.array([1e-3 * top, 0.0, np.log(1e-6), -ends])
+        return lower, np.array([50 * top, 50 * top, np.log(1e4), ends])
+
+    def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts 4"]:
+        """Five places spread over slow and fast, weak and strong relaxation."""
+        top, mean = max(_secant(test) for test in tests), min(_mean_secant(test) for test in tests)
+        pairs = [(0.03, 0.2), (0.3, 0.25), (0.1, 0.5), (1.0, 0.5), (0.01, 0.8)]
+        stiff, soft = 1.3 * top, 0.8 * mean
+        return np.array([[stiff, soft, np.log(kappa), np.log(alpha / (1 - alpha))] for kappa, alpha in pairs])
+
+    def prepare(self, test: Test) -> Curve:
+        """Inputs on the grid of the model, transformed; positions between grid points by linear interpolation."""
+        assert test.input is not None
+        elapsed = test.time - test.time[0]
+        place = elapsed / self.T
+        near = np.round(place)
+        place = np.where(np.abs(place - near) < 1e-6, near, place)
+        count = int(np.ceil(place[-1])) + 1
+        grid = np.arange(count) * self.T
+        offset = test.input[:, 0] if test.start == "equilibrium" else np.zeros(test.repeats)
+        inputs = np.stack([np.interp(grid, elapsed, row) for row in test.input]) - offset[:, None]
+        length = _transform_length(count)
+        damped = inputs * _circle(length, inputs.dtype) ** -np.arange(count, dtype=inputs.dtype)
+        before = np.minimum(place.astype(int), count - 2)
+        return Curve(
+            test.kind,
+            jnp.asarray(elapsed),
+            jnp.asarray(test.output),
+            jnp.asarray(offset),
+            jnp.asarray(np.full(test.time.size, np.ptp(test.output.mean(axis=0)))),
+            jnp.asarray(np.fft.rfft(damped, length)),
+            jnp.asarray(before),
+            jnp.asarray(place - before),
+            length,
+        )
+
+    def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
+        """The response to the weighted mean of the inputs, at the measured times."""
+        assert curve.spectra is not None and curve.share is not None and curve.before is not None
+        H = self._transfer(q, curve.length)
+        creep = curve.kind == "creep"
+        spectrum = weights.astype(curve.spectra.dtype) @ curve.spectra
+        spectrum = spectrum / H if creep else spectrum * H
+        growth = _circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
+        found = jnp.fft.irfft(spectrum, curve.length)[: curve.length // 2] * growth
+        rest = weights @ curve.offset
+        rest = rest / q[1] if creep else rest * q[1]
+        return rest + found[curve.before] * (1 - curve.share) + found[curve.before + 1] * curve.share
+
+    def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
+        """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them."""
+        K_inst, K_eff, kappa, alpha = q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])
+        S = jnp.zeros_like(alpha) if self.memory == "full" else viscoelastic.gl_sums(alpha, self.N).at_dc
+        K1 = (K_inst - K_eff) * (1 + kappa) * (kappa + S) / (kappa * (1 - S))
+        K0, B1 = K_eff - K1 * S / (kappa + S), K1 / kappa * self.T**alpha
+        return {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "K_inst": K_inst, "K_eff": K_eff}
+
+    def coordinates(self, K0: float, K1: float, B1: float, alpha: float) -> Float[np.ndarray, " 4"]:
+        """q of a parameter set."""
+        kappa = K1 * self.T**alpha / B1
+        S = 0.0 if self.memory == "full" else float(viscoelastic.gl_sum(alpha, self.N))
+        ends = K0 + K1 / (1 + kappa), K0 + K1 * S / (kappa + S)
+        return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha))])
+
+    def _transfer(self, q, length):
+        """H on the circle, at the upper half of `length` points."""
+        kappa, alpha = jnp.exp(q[2]), jax.nn.sigmoid(q[3])
+        radius = _circle(length, q.dtype)
+        if self.memory == "full":
+            angle = 2 * jnp.pi * jnp.arange(length // 2 + 1, dtype=q.dtype) / length
+            C, S = (1 - jnp.exp(-1j * angle) / radius) ** alpha, jnp.zeros_like(alpha)
+        else:
+            N = min(self.N, length // 2)  # taps beyond the data do not act within them, but through S
+            c = viscoelastic.gl_coefficients(alpha, N)
+            C = jnp.fft.rfft(c * radius ** -jnp.arange(N + 1, dtype=q.dtype), length)
+            S = viscoelastic.gl_sums(alpha, self.N).at_dc
+        return q[1] + (q[0] - q[1]) * (1 + kappa) / (1 - S) * (C - S) / (kappa + C)
+
+
+class Fit(eqx.Module):
+    """The best fit of a model to tests.
+
+    `solution` is its minimum (`least_squares.Solution`), `start_costs` those that the starts ended in, `weights` (R,)
+    of the repeats of each curve.
+    """
+
+    model: Sampled
+    curves: tuple[Curve, ...]
+    solution: Solution
+    lower: Float[Array, " p"]
+    upper: Float[Array, " p"]
+    start_costs: Float[Array, " starts"]
+    weights: tuple[Float[Array, " R"], ...]
+
+    @property
+    def q(self) -> Float[Array, " p"]:
+        """The coordinates of the fit."""
+        return self.solution.q
+
+    def parameters(self) -> dict[str, float]:
+        """The parameter set in physical units."""
+        return {name: float(value) for name, value in self.model.parameters(self.q).items()}
+
+    def held(self) -> Bool[Array, " p"]:
+        """Coordinates within a millionth of the box's width of a bound: the data pull them out of it."""
+        reach = 1e-6 * (self.upper - self.lower)
+        return (self.q - self.lower <= reach) | (self.upper - self.q <= reach)
+
+
+def fit(tests: Sequence[Test], model: Sampled, *, max_steps: int = 100) -> Fit:
+    """Fit one parameter set to all tests; pass one test for a fit of its own.
+
+    Every start of the model is tried in one compiled call, and the lowest cost taken. Raises `InputError` for tests
+    the model cannot make.
+    """
+    if not tests:
+        raise InputError("There is no test to fit.")
+    for test in tests:
+        if test.kind not in model.kinds:
+            raise InputError(f"A {test.kind} test cannot be fitted by this model, which makes {', '.join(model.kinds)}.")
+    curves = tuple(model.prepare(test) for test in tests)
+    weights = tuple(jnp.full(test.repeats, 1 / test.repeats) for test in tests)
+    lower, upper = (jnp.asarray(end) for end in model.box(tests))
+    found = _solve(model, curves, weights, jnp.asarray(model.starts(tests)), lower, upper, max_steps)
+    costs = jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf)
+    best = jax.tree.map(lambda leaf: leaf[jnp.argmin(costs)], found)
+    return Fit(model, curves, best, lower, upper, found.cost, weights)
+
+
+def residuals(model, curves, weights, q) -> Float[Array, " m"]:
+    """Residuals of all curves; their sum of squares is the sum over curves of NRMSE²."""
+    return jnp.concatenate([curve_residuals(model, c, w, q) for c, w in zip(curves, weights, strict=True)])
+
+
+def curve_residuals(model, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
+    """Mean of the weighted repeats less the model's, over the curve's scale and the root of its length."""
+    misfit = weights @ curve.output - model.predict(q, curve, weights)
+    return misfit / (curve.scale * np.sqrt(curve.time.size).astype(curve.scale.dtype))
+
+
+def nrmse(found: Fit) -> dict[str, float]:
+    """Root mean square of each test's residuals over its range."""
+    parts = [curve_residuals(found.model, c, w, found.q) for c, w in zip(found.curves, found.weights, strict=True)]
+    return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(found.curves, parts, strict=True)}
+
+
+@eqx.filter_jit
+def _solve(model, curves, weights, starts, lower, upper, max_steps):
+    def run(start):
+        return least_squares(
+            lambda q: residuals(model, curves, weights, q), start, lower, upper, max_steps=max_steps
+        )
+
+    return jax.vmap(run)(starts)
+
+
+def _force_and_position(test):
+    return (test.output, test.input) if test.kind == "relaxation" else (test.input, test.output)
+
+
+def _secant(test):
+    """Largest force over largest position."""
+    force, position = _force_and_position(test)
+    return float(np.max(np.abs(force)) / np.max(np.abs(position)))
+
+
+def _mean_secant(test):
+    force, position = _force_and_position(test)
+    return float(np.mean(np.abs(force)) / np.mean(np.abs(position)))
+
+
+def _transform_length(count):
+    """A length that transforms fast, at least four times as long as the data."""
+    from scipy.fft import next_fast_len
+
+    return 2 * next_fast_len(2 * count)
+
+
+def _circle(length, dtype):
+    """Radius of the circle on which `length` points damp what wraps around to eps^0.8."""
+    return float(np.finfo(dtype).eps ** (-0.8 / length))
