@@ -29,11 +29,12 @@ from hilbo import viscoelastic
 from hilbo.errors import InputError
 from hilbo.least_squares import Solution, least_squares
 
-__all__ = ["Curve", "Fit", "Sampled", "Test", "curve_residuals", "fit", "nrmse", "residuals"]
+__all__ = ["Curve", "Fit", "Sampled", "Test", "curve_residuals", "fit", "nrmse", "residuals", "search"]
 
 Kind = Literal["relaxation", "creep", "modulus", "compliance"]
 MEASURED = ("relaxation", "creep")  # kinds with a recorded input
 FEWEST = 8  # points of a test
+_RACE, _LONGEST = 12, 100  # steps of every start, and of the best one
 
 
 class Test(eqx.Module):
@@ -227,24 +228,22 @@ class Fit(eqx.Module):
         return (self.q - self.lower <= reach) | (self.upper - self.q <= reach)
 
 
-def fit(tests: Sequence[Test], model: Sampled, *, max_steps: int = 100) -> Fit:
+def fit(tests: Sequence[Test], model: Sampled) -> Fit:
     """Fit one parameter set to all tests; pass one test for a fit of its own.
 
-    Every start of the model is tried in one compiled call, and the lowest cost taken. Raises `InputError` for tests
-    the model cannot make.
+    Every start of the model takes a few steps in one compiled call, and the best one is followed to the end.
+    Raises `InputError` for tests the model cannot make.
     """
     if not tests:
         raise InputError("There is no test to fit.")
     for test in tests:
         if test.kind not in model.kinds:
-            raise InputError(f"A {test.kind} test cannot be fitted by this model, which makes {', '.join(model.kinds)}.")
+            raise InputError(f"A {test.kind} test cannot be fitted by a model that makes {', '.join(model.kinds)}.")
     curves = tuple(model.prepare(test) for test in tests)
     weights = tuple(jnp.full(test.repeats, 1 / test.repeats) for test in tests)
     lower, upper = (jnp.asarray(end) for end in model.box(tests))
-    found = _solve(model, curves, weights, jnp.asarray(model.starts(tests)), lower, upper, max_steps)
-    costs = jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf)
-    best = jax.tree.map(lambda leaf: leaf[jnp.argmin(costs)], found)
-    return Fit(model, curves, best, lower, upper, found.cost, weights)
+    solution, costs = search(model, curves, weights, jnp.asarray(model.starts(tests)), lower, upper)
+    return Fit(model, curves, solution, lower, upper, costs, weights)
 
 
 def residuals(model, curves, weights, q) -> Float[Array, " m"]:
@@ -265,13 +264,15 @@ def nrmse(found: Fit) -> dict[str, float]:
 
 
 @eqx.filter_jit
-def _solve(model, curves, weights, starts, lower, upper, max_steps):
-    def run(start):
-        return least_squares(
-            lambda q: residuals(model, curves, weights, q), start, lower, upper, max_steps=max_steps
-        )
+def search(model, curves, weights, starts, lower, upper) -> tuple[Solution, Float[Array, " starts"]]:
+    """All starts for a few steps, the best of them to the end; with the costs that the race ended in."""
 
-    return jax.vmap(run)(starts)
+    def run(start, steps):
+        return least_squares(lambda q: residuals(model, curves, weights, q), start, lower, upper, max_steps=steps)
+
+    race = jax.vmap(lambda start: run(start, _RACE))(starts)
+    costs = jnp.where(jnp.isfinite(race.cost), race.cost, jnp.inf)
+    return run(race.q[jnp.argmin(costs)], _LONGEST), race.cost
 
 
 def _force_and_position(test):
@@ -290,10 +291,10 @@ def _mean_secant(test):
 
 
 def _transform_length(count):
-    """A length that transforms fast, at least four times as long as the data."""
+    """A length that transforms fast, at least three times as long as the data."""
     from scipy.fft import next_fast_len
 
-    return 2 * next_fast_len(2 * count)
+    return 2 * next_fast_len((3 * count + 1) // 2)
 
 
 def _circle(length, dtype):

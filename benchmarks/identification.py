@@ -1,0 +1,164 @@
+"""Do the intervals of an identification hold what they promise? And how long does one take?
+
+    python benchmarks/identification.py coverage --noise white --sets 1000   a study in pieces, kept in --keep
+    python benchmarks/identification.py coverage --noise ar1 --sets 1000
+    python benchmarks/identification.py select                               N-selection on two materials
+    python benchmarks/identification.py time                                 against scipy's least_squares and lfilter
+    python benchmarks/identification.py write                                the tables into docs/identification.md
+
+Every simulated data set is the set S of the paper (N = 101) under both loads, as a device would apply them (ramps of
+20 ms), each with 16 repeats and noise of 4 % of the curve's range, white or AR(1) with 0.9 from one ms to the next.
+"""
+
+import argparse
+import json
+import os
+import time
+import warnings
+from pathlib import Path
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+TRUTH = (-2.89, 5.70, 5.89, 0.203)
+REPEATS, NOISE, MEMORY = 16, 0.04, {"white": 0.0, "ar1": 0.9}
+NAMES = ("K_inst", "K_eff", "log κ", "logit α")
+LEVEL = 0.95
+
+
+def loads(T=1e-3, rise=0.02):
+    """Times and inputs of the paper's tests: 5 mm for 3 s; 3 N for 3 s, then 0.5 N for 3 s."""
+    t, u = np.arange(0, 3 + T / 2, T), np.arange(0, 6 + T / 2, T)
+    x = 5 * np.minimum(t / rise, 1)
+    F = 3 * np.minimum(u / rise, 1) - 2.5 * np.clip((u - 3) / rise, 0, 1)
+    return (t, x), (u, F)
+
+
+def rational(K0, K1, B1, alpha, N, T=1e-3):
+    """Numerator and denominator of H(z), as anybody would write them."""
+    c = np.cumprod(np.concatenate([[1.0], (np.arange(1, N + 1) - 1 - alpha) / np.arange(1, N + 1)]))
+    beta = B1 * T**-alpha
+    denominator = beta * c
+    denominator[0] += K1
+    return K0 * denominator + K1 * beta * c, denominator
+
+
+def clean(parameters=TRUTH, N=101):
+    """Curves without noise."""
+    from scipy.signal import lfilter
+
+    (t, x), (u, F) = loads()
+    top, bottom = rational(*parameters, N)
+    return (t, x, lfilter(top, bottom, x)), (u, F, lfilter(bottom / top[0], top / top[0], F))
+
+
+def tests_of(parameters=TRUTH, N=101, repeats=1):
+    from hilbo.identification import Test
+
+    curves = zip(("relaxation", "creep"), clean(parameters, N), strict=True)
+    return [Test(kind, t, np.tile(out, (repeats, 1)), np.tile(put, (repeats, 1))) for kind, (t, put, out) in curves]
+
+
+def study(rho):
+    """A compiled function from a random key to estimates and intervals of one data set."""
+    import equinox as eqx
+    import jax
+    import jax.numpy as jnp
+
+    from hilbo import identification, intervals
+
+    model, tests = identification.Sampled(), tests_of(repeats=REPEATS)
+    curves = tuple(model.prepare(test) for test in tests)
+    weights = tuple(jnp.full(REPEATS, 1 / REPEATS) for _ in tests)
+    lower, upper = (jnp.asarray(end) for end in model.box(tests))
+    starts = jnp.asarray(model.starts(tests))
+
+    def noisy(key, curve):
+        fresh = jax.random.normal(key, curve.output.shape)
+        old = jnp.concatenate([fresh[:, :1], np.sqrt(1 - rho**2) * fresh[:, 1:]], axis=1)
+        if rho:
+            combine = lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1])  # noqa: E731
+            old = jax.lax.associative_scan(combine, (jnp.full_like(old, rho), old), axis=1)[1]
+        return eqx.tree_at(lambda c: c.output, curve, curve.output + NOISE * curve.scale[None, :] * old)
+
+    def one(key):
+        first, second, third = jax.random.split(key, 3)
+        data = (noisy(first, curves[0]), noisy(second, curves[1]))
+        best, costs = identification.search(model, data, weights, starts, lower, upper)
+        fitted = identification.Fit(model, data, best, lower, upper, costs, weights)
+        profile = intervals.profile_intervals(fitted)
+        boot = intervals.block_bootstrap(fitted, third, 1000)
+        return best.q, profile, boot
+
+    return jax.jit(lambda keys: jax.lax.map(one, keys))
+
+
+def coverage(chosen):
+    """Runs what is missing of a study, in pieces that are kept."""
+    import jax
+
+    chosen.keep.mkdir(parents=True, exist_ok=True)
+    run = study(MEMORY[chosen.noise])
+    for begin in range(0, chosen.sets, chosen.piece):
+        path = chosen.keep / f"{chosen.noise}-{begin:05d}-{chosen.piece}.npz"
+        if path.exists():
+            continue
+        count = min(chosen.piece, chosen.sets - begin)
+        keys = jax.random.split(jax.random.key(20 + len(chosen.noise)), chosen.sets)[begin : begin + count]
+        start = time.perf_counter()
+        q, profile, boot = jax.block_until_ready(run(keys))
+        fields = {name: np.asarray(value) for name, value in vars(profile).items()}
+        np.savez(path, q=q, boot_lower=boot[0], boot_upper=boot[1], **fields)
+        print(f"{path.name}: {(time.perf_counter() - start) / count:.2f} s a set", flush=True)
+    print(json.dumps(summary(chosen.keep, chosen.noise), indent=1))
+
+
+def summary(folder, noise):
+    """Shares of intervals that hold the truth, one-sided ones apart."""
+    from hilbo.identification import Sampled
+
+    pieces = [np.load(path) for path in sorted(folder.glob(f"{noise}-*.npz"))]
+    if not pieces:
+        return None
+    data = {key: np.concatenate([np.atleast_1d(piece[key]) for piece in pieces]) for key in pieces[0]}
+    truth = Sampled().coordinates(*TRUTH)
+    lower = np.where(data["open_lower"], -np.inf, data["lower"])
+    upper = np.where(data["open_upper"], np.inf, data["upper"])
+    two = ~data["open_lower"] & ~data["open_upper"] & data["found"]
+    holds = (lower <= truth) & (truth <= upper)
+    boot = (data["boot_lower"] <= truth) & (truth <= data["boot_upper"])
+    rows = {}
+    for j, name in enumerate(NAMES):
+        chosen, open_ = two[:, j], ~two[:, j] & data["found"][:, j]
+        rows[name] = {
+            "profile": holds[chosen, j].mean(),
+            "two-sided": int(chosen.sum()),
+            "one-sided": int(open_.sum()),
+            "one-sided holds": int(holds[open_, j].sum()),
+            "failed": int((~data["found"][:, j]).sum()),
+            "bootstrap": boot[:, j].mean(),
+            "bias": float((data["q"][:, j] - truth[j]).mean() / data["q"][:, j].std()),
+        }
+    return {"sets": len(data["q"]), "rows": rows}
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("task", choices=("coverage", "select", "time", "write"))
+    options.add_argument("--noise", choices=tuple(MEMORY), default="white")
+    options.add_argument("--sets", type=int, default=1000)
+    options.add_argument("--piece", type=int, default=50)
+    options.add_argument("--keep", type=Path, default=ROOT / "identification-study", help="folder for the pieces")
+    chosen = options.parse_args()
+    warnings.filterwarnings("ignore", category=DeprecationWarning)
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    {"coverage": coverage}[chosen.task](chosen)
+
+
+if __name__ == "__main__":
+    main()
