@@ -31,6 +31,7 @@ LONGEST_MEMORY = 8  # largest order of the autoregression
 FEWEST_REPEATS = 5  # of a test, below which resampling them says nothing
 _CLOSE = 1e-3  # of the half-width, to which an end of an interval is found
 _FARTHEST = 4.0  # growth of a step away from the estimate
+_IMPATIENCE = 0.05  # least growth, times the steps taken: profiles may be flat beyond some distance
 _SEARCH_STEPS = 25
 
 
@@ -160,7 +161,8 @@ def _end(found, around, j, sign):
         inner, inner_root = _pick(outside, (state.inside, state.inside_root), (distance, root))
         outer, outer_root = _pick(outside, (distance, root), (state.outside, state.outside_root))
         chord = inner + (outer - inner) * (1 - inner_root) / (outer_root - inner_root)
-        away = distance * jnp.minimum(1 / jnp.maximum(root, 1 / _FARTHEST), _FARTHEST)
+        growth = jnp.maximum(1 / jnp.maximum(root, 1 / _FARTHEST), 1 + _IMPATIENCE * state.steps.astype(q.dtype))
+        away = distance * growth
         unbounded = ~outside & (distance >= room)
         met = (jnp.abs(root - 1) < _CLOSE) | (outer - inner <= _CLOSE * inner)
         done = unbounded | met
