@@ -19,13 +19,12 @@ Units: K N/mm, B1 N·s^α/mm, T s, damping N·s/m. For even N these forms are up
 refused.
 """
 
-from typing import Literal
-
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
-from hilbo.viscoelastic import check_memory, elementwise, gl_sums
+from hilbo.memory import Memory, Span, span, sums
+from hilbo.viscoelastic import elementwise
 
 __all__ = ["largest_K1", "minimum_damping"]
 
@@ -38,15 +37,14 @@ def minimum_damping(
     N: int = 101,
     T: Real[ArrayLike, "..."] = 1e-3,
     *,
-    memory: Literal["short", "full"] = "short",
+    memory: Memory = "short",
 ) -> Float[Array, "..."]:
     """Smallest device damping b (N·s/m) with which the rendering is passive; elementwise.
 
     `inf` where `K_eff` < 0: a negative static stiffness is active whatever the damping. For a set with a K0 of its
     own, `K_eff` is its `viscoelastic.dc_gain`. Raises ValueError for even N.
     """
-    _check(N, memory)
-    return elementwise(_minimum_damping, N, K1, B1, alpha, K_eff, T)
+    return elementwise(_minimum_damping, _closed(memory, N), K1, B1, alpha, K_eff, T)
 
 
 def largest_K1(
@@ -57,41 +55,40 @@ def largest_K1(
     N: int = 101,
     T: Real[ArrayLike, "..."] = 1e-3,
     *,
-    memory: Literal["short", "full"] = "short",
+    memory: Memory = "short",
 ) -> Float[Array, "..."]:
     """Largest passive K1 (N/mm) on a device with damping `b` (N·s/m); elementwise.
 
     `inf` where every K1 is passive, 0 where none is. Differentiable, with derivative 0 at `inf` and at 0.
     Raises ValueError for even N.
     """
-    _check(N, memory)
-    return elementwise(_largest_K1, N, B1, alpha, b, K_eff, T)
+    return elementwise(_largest_K1, _closed(memory, N), B1, alpha, b, K_eff, T)
 
 
-def _check(N, memory):
-    check_memory(memory)
-    if N % 2 == 0:
+def _closed(memory: Memory, N: int) -> Span:
+    if memory == "short" and N % 2 == 0:
         raise ValueError(f"N is {N}, it must be odd: the closed passivity bound is too low for an even number of taps.")
+    return span(memory, N)
 
 
-def _minimum_damping(N, K1, B1, alpha, K_eff, T):
+def _minimum_damping(span, K1, B1, alpha, K_eff, T):
     beta = B1 * T**-alpha
-    sums = gl_sums(alpha, N)
-    fast, slow = K1 / (K1 + beta * sums.at_nyquist), K1 / (K1 + beta * sums.at_dc)
-    stiffness = K_eff + beta * sums.spread * fast * slow
+    found = sums(alpha, span)
+    fast, slow = K1 / (K1 + beta * found.at_nyquist), K1 / (K1 + beta * found.at_dc)
+    stiffness = K_eff + beta * found.spread * fast * slow
     return jnp.where(K_eff < 0, jnp.inf, 500 * T * stiffness)
 
 
-def _largest_K1(N, B1, alpha, b, K_eff, T):
+def _largest_K1(span, B1, alpha, b, K_eff, T):
     beta = B1 * T**-alpha
-    sums = gl_sums(alpha, N)
+    found = sums(alpha, span)
     room = b / (500 * T) - K_eff  # Y
-    excess = beta * sums.spread - room  # A
+    excess = beta * found.spread - room  # A
     impossible = (room <= 0) | (K_eff < 0)
     unlimited = excess <= 0
     limited = ~impossible & ~unlimited
     # The root is taken of harmless numbers where it is not used, so that its derivative cannot turn into NaN.
     room, excess = jnp.where(limited, room, 1), jnp.where(limited, excess, 1)
-    half = room * (sums.at_nyquist + sums.at_dc)
-    root = jnp.sqrt(half**2 + 4 * excess * room * sums.at_nyquist * sums.at_dc)
+    half = room * (found.at_nyquist + found.at_dc)
+    root = jnp.sqrt(half**2 + 4 * excess * room * found.at_nyquist * found.at_dc)
     return jnp.where(impossible, 0, jnp.where(unlimited, jnp.inf, beta * (half + root) / (2 * excess)))

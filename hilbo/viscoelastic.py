@@ -1,18 +1,22 @@
-"""The fractional-order standard linear solid (FO-SLS): its coefficients and its closed forms.
+"""The fractional-order standard linear solid (FO-SLS): the record, its closed forms and its recursion.
 
-Continuous model H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α), 0 < α < 1. Sampled every T seconds with N past samples
-(Grünwald-Letnikov, short memory):
+Continuous model H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α), 0 < α <= 1. Sampled every T seconds (see `memory` for C)
 
-    c_0 = 1, c_i = c_{i-1}·(i-1-α)/i (negative for i >= 1),  C(z) = Σ_{i=0..N} c_i z^{-i},  β = B1·T^{-α}
-    H(z) = K0 + K1·β·C(z) / (K1 + β·C(z))
+    β = B1·T^{-α},   H(z) = K0 + K1·β·C(z) / (K1 + β·C(z))
 
-Everything below follows from the partial sums S_i = c_0 + … + c_i = Π_{j=1..i} (1 - α/j), because
-|c_i| = (α/i)·S_{i-1}: products of positive numbers, in which no digit is lost at either end of α.
+One history, the elongation y of the spring-pot, gives force from position or position from force. With
+g = K1/(K1 + β), k = K1·β/(K1 + β) and s_n = Σ |c_i|·y_{n-i}
 
-Units: stiffness N/mm, B1 N·s^α/mm, T s, damping N·s/m. N and T belong to a parameter set: α means another material
-under another N. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
+    F_n = K0·x_n + k·(x_n - s_n),   x_n = (F_n + k·s_n)/(K0 + k),   y_n = s_n + g·(x_n - s_n)
+
+g and k are written through β/K1 or K1/β, whichever is at most 1, so that a spring (K1 = 0), a spring-pot (K1 = inf) and
+what lies between are one code.
+
+Units: stiffness N/mm, B1 N·s^α/mm, T s, x mm, F N, damping N·s/m. Memory, N and T belong to a parameter set: α means
+another material under another N. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3.
 """
 
+import math
 from collections.abc import Callable
 from functools import partial
 from typing import Literal
@@ -21,9 +25,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Complex, Float, Real
+
+from hilbo.errors import InputError
+from hilbo.memory import GLSums, Memory, Span, gl_coefficients, gl_sums, response, span, sums
+from hilbo.recursion import BLOCK, past_of
 
 __all__ = [
+    "FOSLS",
     "GLSums",
     "K0_from_effective_stiffness",
     "dc_gain",
@@ -34,53 +43,208 @@ __all__ = [
     "gl_sums",
 ]
 
-Memory = Literal["short", "full"]
+Start = Literal["rest", "equilibrium"]
+_LONGEST_RELAXATION = 1_000_000  # samples
 
 
-class GLSums(eqx.Module):
-    """The four sums of Grünwald-Letnikov coefficients that the closed forms need."""
+class FOSLS(eqx.Module):
+    """One parameter set of the FO-SLS, with the memory (short: `N` taps; full: `states` exponentials) and T it is for.
 
-    at_dc: Float[Array, ""]  # S_N = C(1)
-    at_nyquist: Float[Array, ""]  # C(-1), close to 2^α
-    spread: Float[Array, ""]  # C(-1) - C(1) = 2·Σ_{odd i} |c_i|
-    moment: Float[Array, ""]  # M1 = -Σ i·c_i
+    K0, K1 (N/mm), B1 (N·s^α/mm) and alpha are scalars of one floating dtype; `jax.vmap` over records or over
+    constructors for several. K1 may be `inf`: K0 beside a spring-pot. Raises InputError for K1 < 0, B1 < 0, α outside
+    (0, 1], numbers that are not finite, and for K0 < 0 with full memory; not inside `jit`, where values are unknown.
+    """
+
+    K0: Float[Array, ""]
+    K1: Float[Array, ""]
+    B1: Float[Array, ""]
+    alpha: Float[Array, ""]
+    N: int = eqx.field(static=True)
+    T: float = eqx.field(static=True)
+    memory: Memory = eqx.field(static=True)
+    states: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        K0: Real[ArrayLike, ""],
+        K1: Real[ArrayLike, ""],
+        B1: Real[ArrayLike, ""],
+        alpha: Real[ArrayLike, ""],
+        N: int = 101,
+        T: float = 1e-3,
+        *,
+        memory: Memory = "short",
+        states: int = 10,
+    ):
+        dtype = jnp.result_type(1.0, K0, K1, B1, alpha)
+        self.K0, self.K1, self.B1, self.alpha = (jnp.asarray(value, dtype) for value in (K0, K1, B1, alpha))
+        self.N, self.T, self.memory, self.states = N, float(T), memory, states
+
+    def __check_init__(self):
+        span(self.memory, self.N, self.states)
+        if not 0 < self.T < math.inf:
+            raise InputError(f"T is {self.T} s, it must be a number above 0; write for example T = 0.001.")
+        if not any(isinstance(value, jax.core.Tracer) for value in (self.K0, self.K1, self.B1, self.alpha)):
+            _check_values(float(self.K0), float(self.K1), float(self.B1), float(self.alpha), self.memory)
+
+    @property
+    def span(self) -> Span:
+        """How far the model looks back."""
+        return span(self.memory, self.N, self.states)
+
+    @property
+    def beta(self) -> Float[Array, ""]:
+        """β = B1·T^{-α}, N/mm."""
+        return self.B1 * self.T**-self.alpha
+
+    def frequency_response(self, omega: Real[ArrayLike, "*w"]) -> Complex[Array, "*w"]:
+        """H(e^{jωT}) (N/mm) at angular frequencies ω (rad/s) up to π/T."""
+        return _frequency_response(self, jnp.asarray(omega, self.K0.dtype))
+
+    def continuous_response(self, omega: Real[ArrayLike, "*w"]) -> Complex[Array, "*w"]:
+        """H(jω) (N/mm) of the continuous model with the same parameters; ω >= 0 in rad/s."""
+        size = self.B1 * jnp.asarray(omega, self.K0.dtype) ** self.alpha
+        lead = jnp.pi / 2 * self.alpha
+        pot = jax.lax.complex(size * jnp.cos(lead), size * jnp.sin(lead))
+        return self.K0.astype(pot.dtype) + series(self.K1, pot)
+
+    def dc_gain(self) -> Float[Array, ""]:
+        """Static stiffness H(1), N/mm."""
+        return self.K0 + series(self.K1, self.beta * sums(self.alpha, self.span).at_dc)
+
+    def high_frequency_gain(self) -> Float[Array, ""]:
+        """H(-1), N/mm: the stiffness at the Nyquist frequency."""
+        return self.K0 + series(self.K1, self.beta * sums(self.alpha, self.span).at_nyquist)
+
+    def instantaneous_stiffness(self) -> Float[Array, ""]:
+        """K0 + k, N/mm: force per step of position in the sample of the step."""
+        return self.K0 + series(self.K1, self.beta)
+
+    def effective_damping(self) -> Float[Array, ""]:
+        """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1."""
+        found = sums(self.alpha, self.span)
+        return 1000 * self.T * self.beta * found.moment * share(self.K1, self.beta * found.at_dc) ** 2
+
+    def simulate(
+        self, x: Real[ArrayLike, " n"], *, start: Start = "rest", unilateral: bool = False, block: int = BLOCK
+    ) -> Float[Array, " n"]:
+        """Force (N) that follows positions `x` (mm), one every T; differentiable in `x` and in every parameter.
+
+        `start`: from rest at x = 0, or from the equilibrium at x[0], held for ever before. `unilateral`: contact can
+        only push: x below 0 counts as 0 in the history, and forces below 0 as 0. `block` = 1 is the plain recursion,
+        sample by sample; larger blocks give the same numbers up to rounding, faster.
+        """
+        return _force(self, jnp.asarray(x, self.K0.dtype), start, unilateral, block)
+
+    def simulate_force(
+        self, F: Real[ArrayLike, " n"], *, start: Start = "rest", block: int = BLOCK
+    ) -> Float[Array, " n"]:
+        """Position (mm) that follows forces `F` (N): the inverse of `simulate`, see there.
+
+        An equilibrium under force needs H(1) > 0; without it, the positions from such a start are not finite.
+        """
+        return _position(self, jnp.asarray(F, self.K0.dtype), start, block)
+
+    def settling_time(self, fraction: float) -> Float[Array, ""]:
+        """Time (s) of the first sample at which this `fraction` of the relaxation after a step is over.
+
+        0.9 for t90. Counted sample by sample; `inf` beyond a million samples.
+        """
+        if not 0 <= fraction < 1:
+            raise InputError(f"fraction is {fraction}, it must be at least 0 and below 1; write 0.9 for t90.")
+        return _settling_time(self, jnp.asarray(fraction, self.K0.dtype))
 
 
-@partial(jax.jit, static_argnames="N")
-def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"]:
-    """Coefficients c_0 … c_N of one order α; `jax.vmap` over `alpha` for several."""
-    alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
-    _, tail = jax.lax.scan(partial(_tap, alpha), jnp.ones_like(alpha), _indices(alpha, N))
-    return jnp.concatenate([jnp.ones(1, alpha.dtype), -tail])
+def series(K1, pot):
+    """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`."""
+    firm = (jnp.abs(pot) <= K1) & (K1 > 0)
+    compliance = (1 / jnp.where(firm, K1, 1)).astype(pot.dtype)
+    spring, pot_of_soft = jnp.where(firm, 0, K1).astype(pot.dtype), jnp.where(firm | (pot == 0), 1, pot)
+    return jnp.where(firm, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
 
 
-@partial(jax.jit, static_argnames="N")
-def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
-    """C(1), C(-1), their difference and the first moment of one order α, without cancellation."""
-    alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
+def share(K1, pot):
+    """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf."""
+    firm = (pot <= K1) & (K1 > 0)
+    ratio = jnp.where(firm, 0, K1) / jnp.where(firm | (pot == 0), 1, pot)
+    return jnp.where(firm, 1 / (1 + pot / jnp.where(firm, K1, 1)), ratio / (1 + ratio))
 
-    def add(sums, i):
-        following, tap = _tap(alpha, sums.at_dc, i)
-        odd = i % 2 == 1
-        return GLSums(
-            at_dc=following,
-            at_nyquist=sums.at_nyquist + jnp.where(odd, tap, -tap),
-            spread=sums.spread + jnp.where(odd, 2 * tap, 0),
-            moment=sums.moment + i * tap,
-        ), None
 
-    zero, one = jnp.zeros_like(alpha), jnp.ones_like(alpha)
-    return jax.lax.scan(add, GLSums(one, one, zero, zero), _indices(alpha, N))[0]
+@eqx.filter_jit
+def _frequency_response(model, omega):
+    pot = response(model.alpha, omega * model.T, model.span)
+    return model.K0.astype(pot.dtype) + series(model.K1, model.beta.astype(pot.dtype) * pot)
+
+
+@eqx.filter_jit
+def _force(model, x, start, unilateral, block):
+    beta = model.beta
+    gain, stiffness = share(model.K1, beta), series(model.K1, beta)
+    x = jnp.maximum(x, 0) if unilateral else x
+    before = jnp.zeros_like(beta)
+    if start == "equilibrium":
+        before = x[0] * share(model.K1, beta * sums(model.alpha, model.span).at_dc)
+    past = past_of(model.alpha, gain, share(beta, model.K1), x, before, model.span, block)
+    force = model.K0 * x + stiffness * (x - past)
+    return jnp.maximum(force, 0) if unilateral else force
+
+
+@eqx.filter_jit
+def _position(model, F, start, block):
+    beta = model.beta
+    gain, stiffness = share(model.K1, beta), series(model.K1, beta)
+    total = model.K0 + stiffness
+    before = jnp.zeros_like(beta)
+    if start == "equilibrium":
+        before = F[0] / model.dc_gain() * share(model.K1, beta * sums(model.alpha, model.span).at_dc)
+    past = past_of(model.alpha, gain / total, 1 - gain * model.K0 / total, F, before, model.span, block)
+    return (F + stiffness * past) / total
+
+
+@eqx.filter_jit
+def _settling_time(model, fraction):
+    """First sample n with s_n >= fraction·s_inf after a unit step: the force relaxes as s grows, and s only grows."""
+    beta, found = model.beta, sums(model.alpha, model.span)
+    gain, feedback = share(model.K1, beta), share(beta, model.K1)
+    goal = fraction * (1 - found.at_dc) * share(model.K1, beta * found.at_dc)
+    taps = -gl_coefficients(model.alpha, model.N)[1:]
+
+    def unfinished(carry):
+        n, past, _ = carry
+        return (past < goal) & (n < _LONGEST_RELAXATION)
+
+    def step(carry):
+        n, past, history = carry
+        history = jnp.concatenate([(gain + feedback * past)[None], history[:-1]])
+        return n + 1, taps @ history, history
+
+    n, past, _ = jax.lax.while_loop(unfinished, step, (0, jnp.zeros_like(beta), jnp.zeros_like(taps)))
+    return jnp.where(past < goal, jnp.inf, model.T * n)
+
+
+def _check_values(K0, K1, B1, alpha, memory):
+    if not 0 < alpha <= 1:
+        raise InputError(f"alpha is {alpha}, it must be above 0 and at most 1: the order of the fractional element.")
+    for name, value, most in (("K1", K1, math.inf), ("B1", B1, math.nextafter(math.inf, 0))):
+        if not 0 <= value <= most:
+            raise InputError(f"{name} is {value}, it must be 0 or above.")
+    if not math.isfinite(K0):
+        raise InputError(f"K0 is {K0}, it must be a finite number.")
+    if memory == "full" and K0 < 0:
+        raise InputError(
+            f"K0 is {K0}, it must be 0 or above with full memory, where it is the static stiffness; a set with a "
+            'negative K0 was identified with short memory: use memory = "short" and the N it belongs to.'
+        )
 
 
 def gl_sum(alpha: Real[ArrayLike, "..."], N: int) -> Float[Array, "..."]:
     """S_N = C(1) = Π_{i=1..N} (1 - α/i), elementwise in `alpha`."""
-    return elementwise(_gl_sum, N, alpha)
+    return elementwise(_gl_sum, span("short", N), alpha)
 
 
 def gl_alternating_sum(alpha: Real[ArrayLike, "..."], N: int) -> Float[Array, "..."]:
     """C(-1) = Σ (-1)^i c_i, elementwise in `alpha`; within 3.4e-4 of 2^α at N = 101."""
-    return elementwise(_gl_alternating_sum, N, alpha)
+    return elementwise(_gl_alternating_sum, span("short", N), alpha)
 
 
 def K0_from_effective_stiffness(
@@ -94,8 +258,7 @@ def K0_from_effective_stiffness(
     memory: Memory = "short",
 ) -> Float[Array, "..."]:
     """K0 (N/mm) with which the rendering has the static stiffness H(1) = `K_eff` (N/mm); elementwise."""
-    check_memory(memory)
-    return elementwise(_K0, N, K1, B1, alpha, K_eff, T)
+    return elementwise(_K0, span(memory, N), K1, B1, alpha, K_eff, T)
 
 
 def dc_gain(
@@ -109,8 +272,7 @@ def dc_gain(
     memory: Memory = "short",
 ) -> Float[Array, "..."]:
     """Static stiffness H(1) (N/mm) of the sampled model; elementwise."""
-    check_memory(memory)
-    return elementwise(_dc_gain, N, K0, K1, B1, alpha, T)
+    return elementwise(_dc_gain, span(memory, N), K0, K1, B1, alpha, T)
 
 
 def effective_damping(
@@ -121,64 +283,39 @@ def effective_damping(
     T: Real[ArrayLike, "..."] = 1e-3,
     *,
     memory: Memory = "short",
+    states: int = 10,
 ) -> Float[Array, "..."]:
     """dH/ds at s = 0 (N·s/m): the damping felt in slow motion, T·K1²·β·M1/(K1 + β·S_N)²; elementwise."""
-    check_memory(memory)
-    return elementwise(_effective_damping, N, K1, B1, alpha, T)
+    return elementwise(_effective_damping, span(memory, N, states), K1, B1, alpha, T)
 
 
-def check_memory(memory: str) -> None:
-    """The closed forms for full memory (K0 >= 0, states instead of taps) are not written yet."""
-    if memory != "short":
-        raise NotImplementedError(f'The closed forms know memory="short" only so far, not {memory!r}.')
-
-
-def elementwise(function: Callable, N: int, *args: Real[ArrayLike, "..."]):
-    """Apply `function(N, *scalars)` over broadcast arguments in their common floating dtype, compiled once."""
-    if N < 1:
-        raise ValueError(f"N is {N}, it must be at least 1: the number of past samples in the sum.")
+def elementwise(function: Callable, span: Span, *args: Real[ArrayLike, "..."]):
+    """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once."""
     dtype = jnp.result_type(1.0, *args)
-    return _compiled(function, N, *(jnp.asarray(arg, dtype) for arg in args))
+    return _compiled(function, span, *(jnp.asarray(arg, dtype) for arg in args))
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _compiled(function, N, *args):
-    return jnp.vectorize(partial(function, N))(*args)
+def _compiled(function, span, *args):
+    return jnp.vectorize(partial(function, span))(*args)
 
 
-def _tap(alpha, partial_sum, i):
-    """From S_{i-1} to S_i and |c_i|."""
-    return partial_sum * (1 - alpha / i), alpha / i * partial_sum
+def _gl_sum(span, alpha):
+    return sums(alpha, span).at_dc
 
 
-def _indices(alpha, N):
-    return jnp.arange(1, N + 1, dtype=alpha.dtype)
+def _gl_alternating_sum(span, alpha):
+    return sums(alpha, span).at_nyquist
 
 
-def _gl_sum(N, alpha):
-    return gl_sums(alpha, N).at_dc
+def _K0(span, K1, B1, alpha, K_eff, T):
+    return K_eff - series(K1, B1 * T**-alpha * sums(alpha, span).at_dc)
 
 
-def _gl_alternating_sum(N, alpha):
-    return gl_sums(alpha, N).at_nyquist
+def _dc_gain(span, K0, K1, B1, alpha, T):
+    return K0 + series(K1, B1 * T**-alpha * sums(alpha, span).at_dc)
 
 
-def _K0(N, K1, B1, alpha, K_eff, T):
-    return K_eff - _branch_gain(N, K1, B1, alpha, T)
-
-
-def _dc_gain(N, K0, K1, B1, alpha, T):
-    return K0 + _branch_gain(N, K1, B1, alpha, T)
-
-
-def _branch_gain(N, K1, B1, alpha, T):
-    """DC gain of spring K1 and spring-pot in series."""
-    pot = B1 * T**-alpha * gl_sums(alpha, N).at_dc
-    return K1 * pot / (K1 + pot)
-
-
-def _effective_damping(N, K1, B1, alpha, T):
-    beta = B1 * T**-alpha
-    sums = gl_sums(alpha, N)
-    share = K1 / (K1 + beta * sums.at_dc)
-    return 1000 * T * beta * sums.moment * share**2
+def _effective_damping(span, K1, B1, alpha, T):
+    beta, found = B1 * T**-alpha, sums(alpha, span)
+    return 1000 * T * beta * found.moment * share(K1, beta * found.at_dc) ** 2
