@@ -62,8 +62,8 @@ def tests_of(parameters=TRUTH, N=101, repeats=1):
     return [Test(kind, t, np.tile(out, (repeats, 1)), np.tile(put, (repeats, 1))) for kind, (t, put, out) in curves]
 
 
-def study(rho):
-    """A compiled function from a random key to estimates and intervals of one data set."""
+def study():
+    """A compiled function from the outputs of many data sets to estimates and intervals, and one that makes outputs."""
     import equinox as eqx
     import jax
     import jax.numpy as jnp
@@ -76,24 +76,29 @@ def study(rho):
     lower, upper = (jnp.asarray(end) for end in model.box(tests))
     starts = jnp.asarray(model.starts(tests))
 
-    def noisy(key, curve):
-        fresh = jax.random.normal(key, curve.output.shape)
-        old = jnp.concatenate([fresh[:, :1], np.sqrt(1 - rho**2) * fresh[:, 1:]], axis=1)
-        if rho:
-            combine = lambda a, b: (a[0] * b[0], b[0] * a[1] + b[1])  # noqa: E731
-            old = jax.lax.associative_scan(combine, (jnp.full_like(old, rho), old), axis=1)[1]
-        return eqx.tree_at(lambda c: c.output, curve, curve.output + NOISE * curve.scale[None, :] * old)
+    def one(data):
+        key, *outputs = data
+        measured = tuple(eqx.tree_at(lambda c: c.output, c, o) for c, o in zip(curves, outputs, strict=True))
+        best, costs = identification.search(model, measured, weights, starts, lower, upper)
+        found = identification.Fit(model, measured, best, lower, upper, costs, weights)
+        return best.q, intervals.profile_intervals(found), intervals.block_bootstrap(found, key, 1000)
 
-    def one(key):
-        first, second, third = jax.random.split(key, 3)
-        data = (noisy(first, curves[0]), noisy(second, curves[1]))
-        best, costs = identification.search(model, data, weights, starts, lower, upper)
-        fitted = identification.Fit(model, data, best, lower, upper, costs, weights)
-        profile = intervals.profile_intervals(fitted)
-        boot = intervals.block_bootstrap(fitted, third, 1000)
-        return best.q, profile, boot
+    return jax.jit(lambda data: jax.lax.map(one, data)), tests
 
-    return jax.jit(lambda keys: jax.lax.map(one, keys))
+
+def noisy(tests, noise, numbers):
+    """Outputs of the data sets with these numbers, each with random numbers of its own."""
+    from scipy.signal import lfilter
+
+    rho, outputs = MEMORY[noise], [[] for _ in tests]
+    for number in numbers:
+        rng = np.random.default_rng((7, number, len(noise)))
+        for test, rows in zip(tests, outputs, strict=True):
+            fresh = rng.standard_normal(test.output.shape)
+            fresh[:, 1:] *= np.sqrt(1 - rho**2)
+            size = NOISE * np.ptp(test.output[0])
+            rows.append(test.output + size * lfilter([1.0], [1.0, -rho], fresh, axis=1))
+    return tuple(np.stack(rows) for rows in outputs)
 
 
 def coverage(chosen):
@@ -101,15 +106,15 @@ def coverage(chosen):
     import jax
 
     chosen.keep.mkdir(parents=True, exist_ok=True)
-    run = study(MEMORY[chosen.noise])
+    run, tests = study()
     for begin in range(0, chosen.sets, chosen.piece):
         path = chosen.keep / f"{chosen.noise}-{begin:05d}-{chosen.piece}.npz"
         if path.exists():
             continue
         count = min(chosen.piece, chosen.sets - begin)
-        keys = jax.random.split(jax.random.key(20 + len(chosen.noise)), chosen.sets)[begin : begin + count]
         start = time.perf_counter()
-        q, profile, boot = jax.block_until_ready(run(keys))
+        keys = jax.random.split(jax.random.key(begin), count)
+        q, profile, boot = jax.block_until_ready(run((keys, *noisy(tests, chosen.noise, range(begin, begin + count)))))
         fields = {name: np.asarray(value) for name, value in vars(profile).items()}
         np.savez(path, q=q, boot_lower=boot[0], boot_upper=boot[1], **fields)
         print(f"{path.name}: {(time.perf_counter() - start) / count:.2f} s a set", flush=True)

@@ -25,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hilbo import viscoelastic
 from hilbo.errors import InputError
 from hilbo.least_squares import Solution, least_squares
 
@@ -34,7 +33,9 @@ __all__ = ["Curve", "Fit", "Sampled", "Test", "curve_residuals", "fit", "nrmse",
 Kind = Literal["relaxation", "creep", "modulus", "compliance"]
 MEASURED = ("relaxation", "creep")  # kinds with a recorded input
 FEWEST = 8  # points of a test
-_RACE, _LONGEST = 12, 100  # steps of every start, and of the best one
+_RACE, _LONGEST = 12, 200  # steps of every start, and of the best one
+_LOG_KAPPA = np.log(10.0) * np.arange(-5.0, 3.1, 0.5)
+_LOGIT_ALPHA = np.array([-3.5, -2.2, -1.4, -0.6, 0.0, 0.6, 1.4, 2.2, 3.5, 4.4])
 
 
 class Test(eqx.Module):
@@ -102,32 +103,44 @@ class Sampled(eqx.Module):
     Full memory is the infinite sum, which `viscoelastic`'s sum of exponentials meets to 1e-4 of the largest force.
     """
 
-    N: int = eqx.field(static=True, default=101)
+    N: int | Int[Array, ""] = 101
     T: float = eqx.field(static=True, default=1e-3)
     memory: Literal["short", "full"] = eqx.field(static=True, default="short")
+    capacity: int = eqx.field(static=True, default=0)  # taps that are computed; models with one capacity compile once
 
     names = ("K_inst", "K_eff", "log_kappa", "logit_alpha")
     kinds = MEASURED
 
     def __check_init__(self):
-        if self.N < 1:
+        if isinstance(self.N, int) and self.N < 1:
             raise InputError(f"N is {self.N}, it must be at least 1: the number of past samples.")
         if not 0 < self.T < np.inf:
             raise InputError(f"T is {self.T}, it must be a time in s above 0.")
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of q: stiffness up to 50 times the largest secant, κ from 1e-6 to 1e4, α from 0.01 to 0.99."""
+        """Bounds of q: stiffness up to 50 times the largest secant, κ up to 1e4, α from 0.01 to 0.99.
+
+        κ goes down to 1e-4, or 1e-6 with full memory. Far below S(α) the curve no longer depends on it, and K1 would
+        grow as 1/κ for ever.
+        """
         top = max(_secant(test) for test in tests)
         ends = np.log(0.99 / 0.01)
-        lower = np.array([1e-3 * top, 0.0, np.log(1e-6), -ends])
+        least = 1e-6 if self.memory == "full" else 1e-4
+        lower = np.array([1e-3 * top, 0.0, np.log(least), -ends])
         return lower, np.array([50 * top, 50 * top, np.log(1e4), ends])
 
     def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts 4"]:
-        """Five places spread over slow and fast, weak and strong relaxation."""
-        top, mean = max(_secant(test) for test in tests), min(_mean_secant(test) for test in tests)
-        pairs = [(0.03, 0.2), (0.3, 0.25), (0.1, 0.5), (1.0, 0.5), (0.01, 0.8)]
-        stiff, soft = 1.3 * top, 0.8 * mean
-        return np.array([[stiff, soft, np.log(kappa), np.log(alpha / (1 - alpha))] for kappa, alpha in pairs])
+        """The five best separate places of a grid in (κ, α).
+
+        Read from position to force, every test is linear in K_inst and K_eff, which are solved for at each place.
+        """
+        curves = tuple(self.prepare(_position_driven(test)) for test in tests)
+        lower, upper = self.box(tests)
+        scales = [jnp.asarray(np.ptp(test.output.mean(axis=0)) * _unit_of_force(test)) for test in tests]
+        grid = jnp.asarray(np.stack(np.meshgrid(_LOG_KAPPA, _LOGIT_ALPHA, indexing="ij"), axis=-1))
+        costs, stiffness = (np.asarray(part) for part in _screen(self, curves, scales, grid))
+        found = [np.concatenate([stiffness[at], np.asarray(grid[at])]) for at in _separate(costs, 5)]
+        return np.clip(np.stack(found), lower, upper)
 
     def prepare(self, test: Test) -> Curve:
         """Inputs on the grid of the model, transformed; positions between grid points by linear interpolation."""
@@ -171,7 +184,7 @@ class Sampled(eqx.Module):
     def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
         """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them."""
         K_inst, K_eff, kappa, alpha = q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])
-        S = jnp.zeros_like(alpha) if self.memory == "full" else viscoelastic.gl_sums(alpha, self.N).at_dc
+        S = self._taps(alpha)[1]
         K1 = (K_inst - K_eff) * (1 + kappa) * (kappa + S) / (kappa * (1 - S))
         K0, B1 = K_eff - K1 * S / (kappa + S), K1 / kappa * self.T**alpha
         return {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "K_inst": K_inst, "K_eff": K_eff}
@@ -179,7 +192,7 @@ class Sampled(eqx.Module):
     def coordinates(self, K0: float, K1: float, B1: float, alpha: float) -> Float[np.ndarray, " 4"]:
         """q of a parameter set."""
         kappa = K1 * self.T**alpha / B1
-        S = 0.0 if self.memory == "full" else float(viscoelastic.gl_sum(alpha, self.N))
+        S = float(self._taps(jnp.asarray(alpha))[1])
         ends = K0 + K1 / (1 + kappa), K0 + K1 * S / (kappa + S)
         return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha))])
 
@@ -187,15 +200,23 @@ class Sampled(eqx.Module):
         """H on the circle, at the upper half of `length` points."""
         kappa, alpha = jnp.exp(q[2]), jax.nn.sigmoid(q[3])
         radius = _circle(length, q.dtype)
+        taps, S = self._taps(alpha)
         if self.memory == "full":
             angle = 2 * jnp.pi * jnp.arange(length // 2 + 1, dtype=q.dtype) / length
-            C, S = (1 - jnp.exp(-1j * angle) / radius) ** alpha, jnp.zeros_like(alpha)
+            C = (1 - jnp.exp(-1j * angle) / radius) ** alpha
         else:
-            N = min(self.N, length // 2)  # taps beyond the data do not act within them, but through S
-            c = viscoelastic.gl_coefficients(alpha, N)
-            C = jnp.fft.rfft(c * radius ** -jnp.arange(N + 1, dtype=q.dtype), length)
-            S = viscoelastic.gl_sums(alpha, self.N).at_dc
+            taps = taps[: length // 2]  # those beyond the data act through S only
+            C = jnp.fft.rfft(taps * radius ** -jnp.arange(taps.size, dtype=q.dtype), length)
         return q[1] + (q[0] - q[1]) * (1 + kappa) / (1 - S) * (C - S) / (kappa + C)
+
+    def _taps(self, alpha):
+        """c_0 … c_N, zero beyond, and S = C(1), by products of positive numbers."""
+        if self.memory == "full":
+            return jnp.ones(1, alpha.dtype), jnp.zeros_like(alpha)
+        i = jnp.arange(1, (self.capacity or int(self.N)) + 1, dtype=alpha.dtype)
+        sums = jnp.cumprod(jnp.where(i <= self.N, 1 - alpha / i, 1))
+        taps = jnp.where(i <= self.N, alpha / i, 0) * jnp.concatenate([jnp.ones(1, alpha.dtype), sums[:-1]])
+        return jnp.concatenate([jnp.ones(1, alpha.dtype), -taps]), sums[-1]
 
 
 class Fit(eqx.Module):
@@ -277,6 +298,49 @@ def search(model, curves, weights, starts, lower, upper) -> tuple[Solution, Floa
 
 def _force_and_position(test):
     return (test.output, test.input) if test.kind == "relaxation" else (test.input, test.output)
+
+
+def _position_driven(test):
+    """The test with force as its output."""
+    force, position = _force_and_position(test)
+    return Test("relaxation", test.time, force, position, test.start)
+
+
+def _unit_of_force(test):
+    """What turns the scale of an output into one of force: the mean stiffness for positions."""
+    return _mean_secant(test) if test.kind == "creep" else 1.0
+
+
+@eqx.filter_jit
+def _screen(model, curves, scales, grid):
+    """Cost and stiffnesses (K_inst, K_eff) of the best combination at each place of the grid."""
+    weights = [jnp.full(c.output.shape[0], 1 / c.output.shape[0], c.scale.dtype) for c in curves]
+    ends = jnp.eye(2, dtype=grid.dtype)
+
+    def place(at):
+        normal, right, total = 0, 0, 0
+        for curve, scale, w in zip(curves, scales, weights, strict=True):
+            parts = [model.predict(jnp.concatenate([end, at]), curve, w) for end in ends]
+            basis = jnp.stack(parts) / (scale * np.sqrt(curve.time.size))
+            goal = w @ curve.output / (scale * np.sqrt(curve.time.size))
+            normal, right, total = normal + basis @ basis.T, right + basis @ goal, total + goal @ goal
+        (a, b), (_, c) = normal
+        K_eff = jnp.maximum((a * right[1] - b * right[0]) / (a * c - b * b), 0)
+        stiffness = jnp.stack([(right[0] - b * K_eff) / a, K_eff])
+        return total - 2 * right @ stiffness + stiffness @ normal @ stiffness, stiffness
+
+    costs, stiffness = jax.lax.map(place, grid.reshape(-1, 2))
+    return costs.reshape(grid.shape[:-1]), stiffness.reshape(grid.shape)
+
+
+def _separate(costs, count):
+    """Places of the lowest costs, none beside another."""
+    left, places = np.where(np.isfinite(costs), costs, np.inf), []
+    while len(places) < count and np.isfinite(left).any():
+        i, j = np.unravel_index(np.argmin(left), left.shape)
+        places.append((i, j))
+        left[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = np.inf
+    return places
 
 
 def _secant(test):
