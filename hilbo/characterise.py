@@ -7,19 +7,20 @@ coordinates; their intervals are quantiles under the normal approximation in tho
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from hilbo import intervals, passivity
-from hilbo.identification import Fit, Sampled, Test, fit, nrmse
+from hilbo.identification import Fit, Sampled, Test, fit, nrmse, polish
 from hilbo.memory_selection import Row, select_memory
 
 __all__ = ["Characterisation", "Estimate", "characterise"]
 
-_COORDINATES = {"K_inst": 0, "K_eff": 1, "kappa": 2, "alpha": 3}
 _DRAWS = 4000
+_RESTARTS = 3  # from a better place that the search for intervals came through
 _UNRELATED = 3.0  # times the repeats' own noise, above which the model misses something
 
 
@@ -53,7 +54,7 @@ class Characterisation(NamedTuple):
 
 def characterise(
     tests: Sequence[Test],
-    model: Sampled,
+    model: Any,
     seed: int = 0,
     choices: Sequence[int | None] = (),
     say=lambda text: None,
@@ -63,6 +64,11 @@ def characterise(
     found = fit(tests, model)
     say("profile intervals")
     sides = intervals.profile_intervals(found)
+    for _ in range(_RESTARTS):
+        if not bool(sides.lowest < found.solution.cost * (1 - 1e-6)):
+            break
+        found = polish(found, sides.lowest_q)
+        sides = intervals.profile_intervals(found)
     around = intervals.spread(found)
     boot = None
     if min(test.repeats for test in tests) >= intervals.FEWEST_REPEATS:
@@ -75,32 +81,32 @@ def characterise(
         say("memory")
     rows = select_memory(tests, model.T, choices) if choices else ()
     words = _warnings(found, sides, estimates, residuals, tests)
-    named = None if boot is None else _named(*(np.asarray(end) for end in boot))
+    ends = None if boot is None else [np.asarray(found.model.natural(end)) for end in boot]
+    named = None if ends is None else dict(zip(found.model.labels, zip(*map(np.ndarray.tolist, ends), strict=True), strict=True))
     return Characterisation(
         found, estimates, named, residuals, nrmse(found), float(around.freedom), damping, rows, words
     )
 
 
 def _estimates(found, sides, around, seed):
-    q, held = np.asarray(found.q), np.asarray(found.held())
+    model, labels, held = found.model, found.model.labels, np.asarray(found.held())
     open_lower, open_upper = np.asarray(sides.open_lower), np.asarray(sides.open_upper)
     ok = np.asarray(sides.found) & np.isfinite(np.asarray(sides.lower)) & np.isfinite(np.asarray(sides.upper))
-    lower, upper = _natural(np.asarray(sides.lower)), _natural(np.asarray(sides.upper))
-    values = _natural(q)
+    value, lower, upper = (np.asarray(model.natural(q)) for q in (found.q, sides.lower, sides.upper))
     estimates = {}
-    for name, j in _COORDINATES.items():
+    for j, name in enumerate(labels):
         status = _status(ok[j] and bool(found.solution.converged), open_lower[j], open_upper[j], held[j])
-        ends = (
-            None if bad or not ok[j] else float(e) for e, bad in ((lower[j], open_lower[j]), (upper[j], open_upper[j]))
-        )
-        estimates[name] = Estimate(float(values[j]), *ends, status)
-    whole = all(estimates[name].known for name in _COORDINATES)
+        low = float(lower[j]) if ok[j] and not open_lower[j] else None
+        high = float(upper[j]) if ok[j] and not open_upper[j] else None
+        estimates[name] = Estimate(float(value[j]), low, high, status)
+    whole = all(estimate.known for estimate in estimates.values())
     derived = _quantiles(found, around, seed) if whole else {}
-    for name, value in found.parameters().items():
-        if name in ("K0", "K1", "B1"):
-            ends = derived.get(name, (None, None))
-            estimates[name] = Estimate(value, *ends, "identified" if whole else "not identifiable")
-    return {name: estimates[name] for name in ("K0", "K1", "B1", "alpha", "K_inst", "K_eff", "kappa")}
+    rest = {
+        name: Estimate(number, *derived.get(name, (None, None)), "identified" if whole else "not identifiable")
+        for name, number in found.parameters().items()
+        if name not in labels
+    }
+    return rest | estimates
 
 
 def _status(ok, open_lower, open_upper, held):
@@ -113,22 +119,12 @@ def _status(ok, open_lower, open_upper, held):
     return "one-sided" if open_lower or open_upper else "identified"
 
 
-def _natural(q):
-    """K_inst, K_eff, κ and α themselves."""
-    return np.array([q[0], q[1], np.exp(q[2]), 1 / (1 + np.exp(-q[3]))])
-
-
-def _named(lower, upper):
-    low, high = _natural(lower), _natural(upper)
-    return {name: (float(low[j]), float(high[j])) for name, j in _COORDINATES.items()}
-
-
 def _quantiles(found, around, seed):
-    """95 % of K0, K1 and B1 over draws of the coordinates."""
+    """95 % of what follows from all coordinates, over draws of these."""
     rng = np.random.default_rng(seed)
     draws = rng.multivariate_normal(np.asarray(found.q), np.asarray(around.covariance), _DRAWS, method="eigh")
-    sets = jax.vmap(found.model.parameters)(draws)
-    return {name: tuple(np.quantile(np.asarray(sets[name]), [0.025, 0.975]).tolist()) for name in ("K0", "K1", "B1")}
+    sets = jax.vmap(found.model.parameters)(jnp.asarray(draws))
+    return {name: tuple(np.quantile(np.asarray(v), [0.025, 0.975]).tolist()) for name, v in sets.items()}
 
 
 def _noise(found, tests):
@@ -149,8 +145,10 @@ def _noise(found, tests):
 
 
 def _minimum_damping(found):
-    """Smallest passive damping of the set, N·s/m; None for an even number of taps, whose closed form is too low."""
+    """Smallest passive damping of the set, N·s/m; None for an even number of taps (closed form too low) and moduli."""
     model, values = found.model, found.parameters()
+    if not isinstance(model, Sampled):
+        return None
     if model.memory == "short" and int(model.N) % 2 == 0:
         return None
     place = values["K1"], values["B1"], values["alpha"], values["K_eff"]
@@ -176,10 +174,11 @@ def _warnings(found, sides, estimates, residuals, tests):
                 f"The residuals of the {kind} test are {row['over_repeat_noise']:.0f} times the noise of its repeats:"
                 " the model misses part of the curve, and the intervals take that as correlated noise."
             )
-    coarse = [t.kind for t in tests if np.median(np.diff(t.time)) > 1.001 * found.model.T]
+    T = getattr(found.model, "T", np.inf)
+    coarse = [t.kind for t in tests if np.median(np.diff(t.time)) > 1.001 * T]
     if coarse:
         words.append(
-            f"The samples of the {' and '.join(coarse)} test are further apart than T = {1000 * found.model.T:g} ms;"
+            f"The samples of the {' and '.join(coarse)} test are further apart than T = {1000 * T:g} ms;"
             " the input was interpolated linearly in between."
         )
     return tuple(words)

@@ -17,7 +17,7 @@ Units: N, mm, s; B1 N·s^α/mm. Moduli keep their own unit.
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal, Protocol
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.errors import InputError
 from hilbo.least_squares import Solution, least_squares
 
-__all__ = ["Curve", "Fit", "Sampled", "Test", "curve_residuals", "fit", "nrmse", "residuals", "search"]
+__all__ = ["Curve", "Fit", "Model", "Sampled", "Test", "curve_residuals", "fit", "nrmse", "polish", "residuals", "search"]
 
 Kind = Literal["relaxation", "creep", "modulus", "compliance"]
 MEASURED = ("relaxation", "creep")  # kinds with a recorded input
@@ -78,6 +78,25 @@ class Test(eqx.Module):
         return self.output.shape[0]
 
 
+class Model(Protocol):
+    """What is fitted: a prediction of four coordinates q, with bounds and starts that the data suggest.
+
+    `Sampled` (below), `moduli.Continuous` and `moduli.FractionalMaxwell`. `labels` name the coordinates, `kinds` the tests
+    that it can make.
+    """
+
+    labels: tuple[str, ...]
+    kinds: tuple[str, ...]
+
+    def at(self, tests: Sequence[Test]) -> "Model": ...
+    def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]: ...
+    def starts(self, tests: Sequence[Test]) -> np.ndarray: ...
+    def prepare(self, test: Test) -> "Curve": ...
+    def predict(self, q: Array, curve: "Curve", weights: Array) -> Array: ...
+    def natural(self, q: Array) -> Array: ...
+    def parameters(self, q: Array) -> dict[str, Array]: ...
+
+
 class Curve(eqx.Module):
     """A test made ready for one model: its mean over weighted repeats is what is fitted.
 
@@ -108,7 +127,7 @@ class Sampled(eqx.Module):
     memory: Literal["short", "full"] = eqx.field(static=True, default="short")
     capacity: int = eqx.field(static=True, default=0)  # taps that are computed; models with one capacity compile once
 
-    names = ("K_inst", "K_eff", "log_kappa", "logit_alpha")
+    labels = ("K_inst", "K_eff", "kappa", "alpha")
     kinds = MEASURED
 
     def __check_init__(self):
@@ -189,6 +208,15 @@ class Sampled(eqx.Module):
         K0, B1 = K_eff - K1 * S / (kappa + S), K1 / kappa * self.T**alpha
         return {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "K_inst": K_inst, "K_eff": K_eff}
 
+    def natural(self, q: Float[Array, " 4"]) -> Float[Array, " 4"]:
+        """The coordinates under their labels: K_inst, K_eff (N/mm), κ and α."""
+        return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])])
+
+    def at(self, tests: Sequence[Test]) -> "Sampled":
+        """Itself: its coordinates belong to T and not to the data."""
+        del tests
+        return self
+
     def coordinates(self, K0: float, K1: float, B1: float, alpha: float) -> Float[np.ndarray, " 4"]:
         """q of a parameter set."""
         kappa = K1 * self.T**alpha / B1
@@ -226,7 +254,7 @@ class Fit(eqx.Module):
     of the repeats of each curve.
     """
 
-    model: Sampled
+    model: Any  # a Model
     curves: tuple[Curve, ...]
     solution: Solution
     lower: Float[Array, " p"]
@@ -249,7 +277,7 @@ class Fit(eqx.Module):
         return (self.q - self.lower <= reach) | (self.upper - self.q <= reach)
 
 
-def fit(tests: Sequence[Test], model: Sampled) -> Fit:
+def fit(tests: Sequence[Test], model: Any) -> Fit:
     """Fit one parameter set to all tests; pass one test for a fit of its own.
 
     Every start of the model takes a few steps in one compiled call, and the best one is followed to the end.
@@ -260,11 +288,30 @@ def fit(tests: Sequence[Test], model: Sampled) -> Fit:
     for test in tests:
         if test.kind not in model.kinds:
             raise InputError(f"A {test.kind} test cannot be fitted by a model that makes {', '.join(model.kinds)}.")
+    model = model.at(tests)
     curves = tuple(model.prepare(test) for test in tests)
     weights = tuple(jnp.full(test.repeats, 1 / test.repeats) for test in tests)
     lower, upper = (jnp.asarray(end) for end in model.box(tests))
     solution, costs = search(model, curves, weights, jnp.asarray(model.starts(tests)), lower, upper)
     return Fit(model, curves, solution, lower, upper, costs, weights)
+
+
+def polish(found: Fit, start: Float[Array, " p"]) -> Fit:
+    """The fit found from another start, if that is better."""
+    again = _polished(found, start)
+    better = again.cost < found.solution.cost
+    return eqx.tree_at(lambda f: f.solution, found, again) if better else found
+
+
+@eqx.filter_jit
+def _polished(found, start):
+    return least_squares(
+        lambda q: residuals(found.model, found.curves, found.weights, q),
+        start,
+        found.lower,
+        found.upper,
+        max_steps=_LONGEST,
+    )
 
 
 def residuals(model, curves, weights, q) -> Float[Array, " m"]:

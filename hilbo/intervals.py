@@ -72,6 +72,7 @@ class Intervals(eqx.Module):
     open_upper: Bool[Array, " p"]
     found: Bool[Array, " p"]
     lowest: Float[Array, ""]
+    lowest_q: Float[Array, " p"]
 
 
 @eqx.filter_jit
@@ -121,6 +122,7 @@ class _Search(NamedTuple):
     outside_root: Array
     q: Array
     lowest: Array
+    lowest_q: Array
     steps: Array
     done: Array
     open: Array
@@ -134,7 +136,8 @@ def _profile(found, around):
     place, open_, done = (leaf.reshape(size, 2) for leaf in (ends.place, ends.open, ends.done))
     found_both = jnp.all(done & jnp.isfinite(place), axis=1)
     lower, upper = found.q - place[:, 0], found.q + place[:, 1]
-    return Intervals(lower, upper, open_[:, 0], open_[:, 1], found_both, jnp.min(ends.lowest))
+    best = jnp.argmin(ends.lowest)
+    return Intervals(lower, upper, open_[:, 0], open_[:, 1], found_both, ends.lowest[best], ends.lowest_q[best])
 
 
 def _end(found, around, j, sign):
@@ -153,7 +156,7 @@ def _end(found, around, j, sign):
 
     def step(state: _Search) -> _Search:
         distance = jnp.minimum(state.place, room)
-        start = jnp.where(own, q + sign * distance, state.q)
+        start = jnp.where(own, q + sign * distance, state.q)  # beside the best point known to be inside
         solution = fixed(distance, start)
         rise = solution.cost - found.solution.cost
         root = jnp.sqrt(jnp.maximum(rise, 0) / cut)
@@ -167,16 +170,19 @@ def _end(found, around, j, sign):
         met = (jnp.abs(root - 1) < _CLOSE) | (outer - inner <= _CLOSE * inner)
         done = unbounded | met
         place = jnp.where(done, distance, jnp.where(jnp.isfinite(outer), chord, away))
-        lowest = jnp.minimum(state.lowest, jnp.where(solution.converged, solution.cost, jnp.inf))
-        return _Search(
-            place, inner, inner_root, outer, outer_root, solution.q, lowest, state.steps + 1, done, unbounded
-        )
+        lower = solution.cost < state.lowest  # false for NaN
+        lowest, lowest_q = _pick(lower, (solution.cost, solution.q), (state.lowest, state.lowest_q))
+        steps = state.steps + 1
+        kept = jnp.where(outside, jnp.where(state.steps == 0, q, state.q), solution.q)
+        return _Search(place, inner, inner_root, outer, outer_root, kept, lowest, lowest_q, steps, done, unbounded)
 
     zero, infinite = jnp.zeros_like(cut), jnp.full_like(cut, jnp.inf)
     guess = jnp.sqrt(cut * row[j])
     start = jnp.where(own, q, q + sign * guess * row / row[j])
     bad = ~jnp.isfinite(guess)
-    first = _Search(guess, zero, zero, infinite, infinite, start, infinite, jnp.asarray(0), bad, jnp.zeros_like(bad))
+    first = _Search(
+        guess, zero, zero, infinite, infinite, start, infinite, q, jnp.asarray(0), bad, jnp.zeros_like(bad)
+    )
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < _SEARCH_STEPS), step, first)
 
 

@@ -6,7 +6,8 @@ improves. The Jacobian is exact (forward mode) and only its products of size (p,
 solver maps over starts, fixed values and data sets, and a fixed parameter is the same compiled function.
 Normal equations square the condition number; `identification` chooses coordinates in which it is about 30.
 
-Reference: Kanzow, Yamashita & Fukushima (2004), J. Comput. Appl. Math. 172:375 (projected Levenberg-Marquardt).
+References: Kanzow, Yamashita & Fukushima (2004), J. Comput. Appl. Math. 172:375 (projected Levenberg-Marquardt);
+Nielsen (1999), IMM report 1999-05 (damping).
 """
 
 from collections.abc import Callable
@@ -42,6 +43,7 @@ class _State(NamedTuple):
     gradient: Array
     normal: Array
     damping: Array
+    growth: Array  # of the damping at the next failure
     steps: Array
     done: Array
 
@@ -76,18 +78,21 @@ def least_squares(
         better = cost < state.cost
         gain = -(2 * state.gradient + state.normal @ moved) @ moved  # predicted
         settled = (gain <= enough * state.cost) | jnp.all(jnp.abs(moved) <= tiny * jnp.abs(state.q))
-        damping = jnp.where(better, state.damping / 10, jnp.maximum(4 * state.damping, eps))
+        trust = (state.cost - cost) / gain  # 1 where the model is right
+        eased = state.damping * jnp.clip(1 - (2 * trust - 1) ** 3, 0.1, 2.0)
+        damping = jnp.where(better, eased, jnp.maximum(state.growth * state.damping, eps))
+        growth = jnp.where(better, 2, 2 * state.growth)
         reached = (settled & (state.damping < 1)) | (damping > _STALLED)
         kept = jax.tree.map(
             lambda new, old: jnp.where(better, new, old),
             (q, cost, gradient, normal),
             (state.q, state.cost, state.gradient, state.normal),
         )
-        return _State(*kept, damping, state.steps + 1, reached)
+        return _State(*kept, damping, growth, state.steps + 1, reached)
 
     cost, gradient, normal = evaluate(start)
-    damping, steps = jnp.asarray(_FIRST_DAMPING, start.dtype), jnp.asarray(0)
-    first = _State(start, cost, gradient, normal, damping, steps, ~jnp.isfinite(cost))
+    damping, growth = (jnp.asarray(value, start.dtype) for value in (_FIRST_DAMPING, 2))
+    first = _State(start, cost, gradient, normal, damping, growth, jnp.asarray(0), ~jnp.isfinite(cost))
     last = jax.lax.while_loop(lambda state: ~state.done & (state.steps < max_steps), step, first)
     ended = last.done & jnp.isfinite(last.cost)
     return Solution(last.q, last.cost, last.normal, last.gradient, last.steps, ended)
