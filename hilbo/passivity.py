@@ -4,7 +4,8 @@ A rendering H(z) on a device with physical damping b is passive (Colgate & Schen
 
     b > (T/2) / (1 - cos ωT) · Re{(1 - e^{-jωT})·H(e^{jωT})},  0 <= ω <= π/T,   and   H(1) >= 0.
 
-For odd N the Nyquist frequency binds: b_min = (T/2)·H(-1). With K0 set by H(1) = K_eff, S = C(1), C = C(-1) (see
+For odd N and for full memory the Nyquist frequency binds (docs/mechanics.md says what of this is proved):
+b_min = (T/2)·H(-1). With K0 set by H(1) = K_eff, S = C(1), C = C(-1) (see
 `viscoelastic`) this is
 
     b_min = (T/2)·[K_eff + β(C - S) · K1/(K1 + β·C) · K1/(K1 + β·S)],
@@ -15,8 +16,10 @@ A = β(C - S) - Y:
     A <= 0: every K1 is passive;  Y <= 0 or K_eff < 0: none is;  otherwise
     K1max = β·[Y(C + S) + sqrt(Y²(C + S)² + 4·A·Y·C·S)] / (2A).
 
-Units: K N/mm, B1 N·s^α/mm, T s, damping N·s/m. For even N these forms are up to 2.8 % (N = 2) too low, so even N is
-refused.
+With full memory S = 0, C = 2^α and K_eff = K0. For even N these forms are up to 2.8 % (N = 2) too low, so even N is
+refused; `certify` decides every N, and K1, B1 at their limits, for one parameter set at a time.
+
+Units: K N/mm, B1 N·s^α/mm, T s, damping N·s/m.
 """
 
 import jax.numpy as jnp
@@ -24,9 +27,18 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hilbo.memory import Memory, Span, span, sums
-from hilbo.viscoelastic import elementwise
+from hilbo.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
+from hilbo.viscoelastic import elementwise, share
 
-__all__ = ["largest_K1", "minimum_damping"]
+__all__ = [
+    "Certificate",
+    "Witness",
+    "certify",
+    "largest_K1",
+    "minimum_damping",
+    "needed_damping",
+    "witness",
+]
 
 
 def minimum_damping(
@@ -74,7 +86,7 @@ def _closed(memory: Memory, N: int) -> Span:
 def _minimum_damping(span, K1, B1, alpha, K_eff, T):
     beta = B1 * T**-alpha
     found = sums(alpha, span)
-    fast, slow = K1 / (K1 + beta * found.at_nyquist), K1 / (K1 + beta * found.at_dc)
+    fast, slow = share(K1, beta * found.at_nyquist), share(K1, beta * found.at_dc)
     stiffness = K_eff + beta * found.spread * fast * slow
     return jnp.where(K_eff < 0, jnp.inf, 500 * T * stiffness)
 
