@@ -4,6 +4,7 @@
     python benchmarks/identification.py coverage --noise ar1 --sets 1000
     python benchmarks/identification.py select                               N-selection on two materials
     python benchmarks/identification.py time                                 against scipy's least_squares and lfilter
+    python benchmarks/identification.py example                              the shipped table, simulated again
     python benchmarks/identification.py write                                the tables into docs/identification.md
 
 Every simulated data set is the set S of the paper (N = 101) under both loads, as a device would apply them (ramps of
@@ -55,7 +56,7 @@ def clean(parameters=TRUTH, N=101):
     return (t, x, lfilter(top, bottom, x)), (u, F, lfilter(bottom / top[0], top / top[0], F))
 
 
-def tests_of(parameters=TRUTH, N=101, repeats=1):
+def measured(parameters=TRUTH, N=101, repeats=1):
     from hilbo.identification import Test
 
     curves = zip(("relaxation", "creep"), clean(parameters, N), strict=True)
@@ -70,7 +71,7 @@ def study():
 
     from hilbo import identification, intervals
 
-    model, tests = identification.Sampled(), tests_of(repeats=REPEATS)
+    model, tests = identification.Sampled(), measured(repeats=REPEATS)
     curves = tuple(model.prepare(test) for test in tests)
     weights = tuple(jnp.full(REPEATS, 1 / REPEATS) for _ in tests)
     lower, upper = (jnp.asarray(end) for end in model.box(tests))
@@ -150,9 +151,29 @@ def summary(folder, noise):
     return {"sets": len(data["q"]), "rows": rows}
 
 
+def example():
+    """The shipped table of simulated memory foam: 16 repeats a test, every 10 ms, as a careful logger writes them."""
+    import pandas as pd
+    from scipy.signal import lfilter
+
+    rng, rows = np.random.default_rng(2026), []
+    top, bottom = rational(*TRUTH, 101)
+    for kind, (t, load), forward in zip(("relaxation", "creep"), loads(), (True, False), strict=True):
+        for repeat in range(1, REPEATS + 1):
+            applied = load * (1 + 0.01 * rng.standard_normal())
+            model = (top, bottom) if forward else (bottom, top)
+            answer = lfilter(model[0] / model[1][0], model[1] / model[1][0], applied)
+            answer += lfilter([1], [1, -0.7], 0.006 * np.ptp(answer) * rng.standard_normal(t.size))
+            pair = (applied, answer) if forward else (answer, applied)
+            columns = {"test": kind, "repeat": repeat, "time_s": t.round(3), "position_mm": pair[0], "force_N": pair[1]}
+            rows.append(pd.DataFrame(columns)[::10])
+    table = pd.concat(rows).round({"position_mm": 4, "force_N": 4})
+    table.to_csv(ROOT / "hilbo" / "data" / "memory_foam_simulated.csv", index=False)
+
+
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    options.add_argument("task", choices=("coverage", "select", "time", "write"))
+    options.add_argument("task", choices=("coverage", "select", "time", "example", "write"))
     options.add_argument("--noise", choices=tuple(MEMORY), default="white")
     options.add_argument("--sets", type=int, default=1000)
     options.add_argument("--piece", type=int, default=50)
@@ -162,7 +183,8 @@ def main():
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    {"coverage": coverage}[chosen.task](chosen)
+    tasks = {"coverage": lambda: coverage(chosen), "example": example}
+    tasks[chosen.task]()
 
 
 if __name__ == "__main__":

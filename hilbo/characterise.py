@@ -1,8 +1,8 @@
 """All that is to be known about a material from its tests: fit, intervals, residuals, memory, passivity.
 
 The best curve is always there (`Characterisation.fit`). Whether its parameters mean something is said apart: a
-parameter is *identified* if its 95 % profile interval has two ends, *one-sided* if it has one, *at bound* if the fit ran
-to the edge of the search, and *not identifiable* if the data set no end at all. K0, K1 and B1 follow from all four
+parameter is *identified* if its 95 % profile interval has two ends, *one-sided* if it has one, *at bound* if the fit
+ran to the edge of the search, and *not identifiable* if the data set no end at all. K0, K1 and B1 follow from all four
 coordinates; their intervals are quantiles under the normal approximation in those.
 """
 
@@ -82,7 +82,11 @@ def characterise(
     rows = select_memory(tests, model.T, choices) if choices else ()
     words = _warnings(found, sides, estimates, residuals, tests)
     ends = None if boot is None else [np.asarray(found.model.natural(end)) for end in boot]
-    named = None if ends is None else dict(zip(found.model.labels, zip(*map(np.ndarray.tolist, ends), strict=True), strict=True))
+    named = (
+        None
+        if ends is None
+        else dict(zip(found.model.labels, zip(*map(np.ndarray.tolist, ends), strict=True), strict=True))
+    )
     return Characterisation(
         found, estimates, named, residuals, nrmse(found), float(around.freedom), damping, rows, words
     )
@@ -110,10 +114,10 @@ def _estimates(found, sides, around, seed):
 
 
 def _status(ok, open_lower, open_upper, held):
-    if not ok:
-        return "not identifiable"
     if held:
         return "at bound"
+    if not ok:
+        return "not identifiable"
     if open_lower and open_upper:
         return "not identifiable"
     return "one-sided" if open_lower or open_upper else "identified"

@@ -1,8 +1,8 @@
-"""The command line: `hilbo aggregate | simulate | robustness | demo`; the only place that parses arguments.
+"""The command line: `hilbo aggregate | simulate | robustness | identify | passivity | demo`.
 
-Results go to a folder, machine-readable ones with `--json` to stdout, progress to stderr. Exit code 0: done, 1: failed,
-2: bad usage or bad input, said in one sentence. A folder is written beside its final place and moved there when it is
-complete, so that a failure leaves nothing behind and nothing is overwritten without `--force`.
+This module and `cli_material` are the only places that parse arguments. Results go to a folder, machine-readable ones
+with `--json` to stdout, progress to stderr (`console`). Exit code 0: done, 1: failed, 2: bad usage or bad input, said
+in one sentence.
 """
 
 import shutil
@@ -11,6 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
+from hilbo import cli_material
+from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, results, start
 from hilbo.errors import InputError
 
 __all__ = ["app", "main"]
@@ -101,6 +103,10 @@ def robustness(
         (folder / "result.json").write_text(report.as_json(content))
         (folder / "report.html").write_text(page.robustness_page(chosen, content), encoding="utf-8")
     finish(content, out, as_json)
+
+
+app.command()(cli_material.identify)
+app.command()(cli_material.passivity)
 
 
 @app.command()

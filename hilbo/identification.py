@@ -28,11 +28,24 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.errors import InputError
 from hilbo.least_squares import Solution, least_squares
 
-__all__ = ["Curve", "Fit", "Model", "Sampled", "Test", "curve_residuals", "fit", "nrmse", "polish", "residuals", "search"]
+__all__ = [
+    "Curve",
+    "Fit",
+    "Model",
+    "Sampled",
+    "Test",
+    "curve_residuals",
+    "fit",
+    "nrmse",
+    "polish",
+    "residuals",
+    "search",
+]
 
 Kind = Literal["relaxation", "creep", "modulus", "compliance"]
 MEASURED = ("relaxation", "creep")  # kinds with a recorded input
 FEWEST = 8  # points of a test
+_TAPS = 1024
 _RACE, _LONGEST = 12, 200  # steps of every start, and of the best one
 _LOG_KAPPA = np.log(10.0) * np.arange(-5.0, 3.1, 0.5)
 _LOGIT_ALPHA = np.array([-3.5, -2.2, -1.4, -0.6, 0.0, 0.6, 1.4, 2.2, 3.5, 4.4])
@@ -81,8 +94,8 @@ class Test(eqx.Module):
 class Model(Protocol):
     """What is fitted: a prediction of four coordinates q, with bounds and starts that the data suggest.
 
-    `Sampled` (below), `moduli.Continuous` and `moduli.FractionalMaxwell`. `labels` name the coordinates, `kinds` the tests
-    that it can make.
+    `Sampled` (below), `moduli.Continuous` and `moduli.FractionalMaxwell`. `labels` name the coordinates, `kinds` the
+    tests that it can make.
     """
 
     labels: tuple[str, ...]
@@ -213,9 +226,11 @@ class Sampled(eqx.Module):
         return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])])
 
     def at(self, tests: Sequence[Test]) -> "Sampled":
-        """Itself: its coordinates belong to T and not to the data."""
+        """The same with N as an array among at least 1024 taps, so that every N is the same compiled function."""
         del tests
-        return self
+        if self.memory == "full" or self.capacity:
+            return self
+        return Sampled(jnp.asarray(self.N), self.T, self.memory, max(_TAPS, int(self.N)))
 
     def coordinates(self, K0: float, K1: float, B1: float, alpha: float) -> Float[np.ndarray, " 4"]:
         """q of a parameter set."""

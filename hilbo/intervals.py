@@ -180,9 +180,7 @@ def _end(found, around, j, sign):
     guess = jnp.sqrt(cut * row[j])
     start = jnp.where(own, q, q + sign * guess * row / row[j])
     bad = ~jnp.isfinite(guess)
-    first = _Search(
-        guess, zero, zero, infinite, infinite, start, infinite, q, jnp.asarray(0), bad, jnp.zeros_like(bad)
-    )
+    first = _Search(guess, zero, zero, infinite, infinite, start, infinite, q, jnp.asarray(0), bad, jnp.zeros_like(bad))
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < _SEARCH_STEPS), step, first)
 
 

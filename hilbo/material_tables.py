@@ -4,7 +4,8 @@ Columns carry their unit: `time_s`, `time (ms)` and `time [s]` are the same to t
 (position applied, force measured) or creep (force applied, position measured), with `time`, `position` and `force` in
 every row; `repeat` tells repetitions apart and `material` materials. A table of moduli has `time` and `modulus`
 (relaxation) or `compliance` (creep) instead, and needs no `test`. Other columns are ignored.
-Everything is turned into s, mm, N, Pa (or N/mm) and 1/Pa (or mm/N). Whatever is wrong is one sentence with file and line.
+Everything is turned into s, mm, N, Pa (or N/mm) and 1/Pa (or mm/N). Whatever is wrong is one sentence with file and
+line.
 """
 
 import os
@@ -52,8 +53,18 @@ class Material(NamedTuple):
     notes: tuple[str, ...]
 
 
-def read_material(path: str | os.PathLike, material: str | None = None, *, start: str = "rest") -> Material:
-    """The tests of one material; `start` says how they begin (`identification.Test`). Raises `InputError`."""
+def read_material(
+    path: str | os.PathLike,
+    material: str | None = None,
+    *,
+    begin: str = "rest",
+    only: str | None = None,
+    longest: float | None = None,
+) -> Material:
+    """The tests of one material, or `only` one kind of them, up to `longest` s.
+
+    `begin` says how they start (`identification.Test`). Raises `InputError`.
+    """
     source = str(path)
     text = read_cells(path, "a material table needs a header with units and the samples of a test")
     columns, units = _columns(text, source)
@@ -67,12 +78,14 @@ def read_material(path: str | os.PathLike, material: str | None = None, *, start
         }
     )
     kinds = _kinds(text, columns, source)
+    if only is not None and only not in set(kinds):
+        raise InputError(f'{source}: holds no test "{only}"; it has {", ".join(kinds.unique())}.')
     repeats = text["repeat"].str.strip() if "repeat" in text else pd.Series("", text.index)
     notes: list[str] = []
     tests = [
-        _test(kind, values[kinds == kind], repeats[kinds == kind], source, start, notes)
+        _test(kind, values[kinds == kind], repeats[kinds == kind], source, begin, longest, notes)
         for kind in ("relaxation", "creep", "modulus", "compliance")
-        if (kinds == kind).any()
+        if (kinds == kind).any() and only in (None, kind)
     ]
     lengths = {units[q] in _OF_LENGTH for q in columns if q in ("modulus", "compliance")}
     if len(lengths) > 1:
@@ -103,8 +116,8 @@ def _columns(text, source):
     measured, derived = {"position", "force"} & set(columns), {"modulus", "compliance"} & set(columns)
     if "time" not in columns or not (len(measured) == 2 or (derived and not measured)):
         raise InputError(
-            f"{source}:1: a material table has time, position and force, or time and modulus or compliance, each with its"
-            f" unit as in time_s; found {', '.join(columns) or 'none of them'}."
+            f"{source}:1: a material table has time, position and force, or time and modulus or compliance, each with"
+            f" its unit as in time_s; found {', '.join(columns) or 'none of them'}."
         )
     return columns, units
 
@@ -142,7 +155,7 @@ def _of_material(text, material, source):
     return text if material is None else text[text["material"] == material]
 
 
-def _test(kind, values, repeats, source, start, notes):
+def _test(kind, values, repeats, source, begin, longest, notes):
     """One kind of test, its repeats on common times."""
     output = {"relaxation": "force", "creep": "position"}.get(kind, kind)
     put = {"relaxation": "position", "creep": "force"}.get(kind)
@@ -153,8 +166,9 @@ def _test(kind, values, repeats, source, start, notes):
     if put is None:
         refuse(values["time"] <= 0, source, lambda row: "time is not above 0; moduli are counted from the step.")
         refuse(values[output] <= 0, source, lambda row: f"{output} is not above 0.")
-    begin = [0.0 if put is None else part["time"].iloc[0] for part in parts]
-    times = [part["time"].to_numpy() - first for part, first in zip(parts, begin, strict=True)]
+    first = [0.0 if put is None else part["time"].iloc[0] for part in parts]
+    times = [part["time"].to_numpy() - zero for part, zero in zip(parts, first, strict=True)]
+    times, parts = _shortened(times, parts, longest)
     time, resampled = _common(times)
     if resampled:
         notes.append(
@@ -163,9 +177,16 @@ def _test(kind, values, repeats, source, start, notes):
     columns = [output] + ([put] if put else [])
     stacked = {c: np.stack([np.interp(time, t, p[c]) for t, p in zip(times, parts, strict=True)]) for c in columns}
     try:
-        return Test(kind, time, stacked[output], stacked.get(put) if put else None, "rest" if put is None else start)
+        return Test(kind, time, stacked[output], stacked.get(put) if put else None, "rest" if put is None else begin)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def _shortened(times, parts, longest):
+    if longest is None:
+        return times, parts
+    kept = [t <= longest for t in times]
+    return [t[k] for t, k in zip(times, kept, strict=True)], [p[k] for p, k in zip(parts, kept, strict=True)]
 
 
 def _common(times):

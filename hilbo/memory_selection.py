@@ -7,8 +7,6 @@ tests; its own errors at N = 101 are 3.92 % (creep with recovery) and 0.32 % (re
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 
 from hilbo.errors import InputError
@@ -31,16 +29,13 @@ class Row(NamedTuple):
 
 
 def select_memory(tests: Sequence[Test], T: float = 1e-3, choices: Sequence[int | None] = CHOICES) -> tuple[Row, ...]:
-    """Fit the tests with each memory; all numbers of taps share one compilation."""
+    """Fit the tests with each memory."""
     if not choices:
         raise InputError("There is no number of taps to choose from.")
-    capacity = max([N for N in choices if N is not None], default=1)
     rows = []
     for N in choices:
-        memory = Sampled(T=T, memory="full") if N is None else Sampled(jnp.asarray(N), T, capacity=capacity)
-        found = fit(tests, memory)
-        own = memory if N is None else Sampled(N, T)
-        rows.append(Row(N, eqx.tree_at(lambda f: f.model, found, own), nrmse(found)))
+        found = fit(tests, Sampled(T=T, memory="full") if N is None else Sampled(N, T))
+        rows.append(Row(N, found, nrmse(found)))
     return tuple(rows)
 
 

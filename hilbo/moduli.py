@@ -9,8 +9,8 @@ Fractional Maxwell model, a spring-pot V (order α) in series with a spring-pot 
 
     G(t) = G_c·(t/τ)^{-β}·E_{α-β,1-β}(-(t/τ)^{α-β}),  τ = (V/G)^{1/(α-β)},  G_c = V·τ^{-α}
 
-The first is the model that is rendered; the second is for comparison only. t0 is the middle of the data on a logarithmic
-scale, so that κ and α are measured where the data are. Units: t in s; moduli keep their own unit.
+The first is the model that is rendered; the second is for comparison only. t0 is the middle of the data on a log scale,
+so that κ and α are measured where the data are. Units: t in s; moduli keep their own unit.
 Reference: Bonfanti, Kaplan, Charras & Kabla (2020), Soft Matter 16:6002 (fractional models and their moduli).
 """
 

@@ -14,16 +14,16 @@ _RULES = {
     "mean": "by the posterior mean",
 }
 
-__all__ = ["results_page", "robustness_page"]
+__all__ = ["results_page", "robustness_page", "template"]
 
 
 def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str, str]]) -> str:
     """The page of an aggregation; `pictures` have png (base64), title, caption and alt."""
-    template = _template("report.html")
+    sheet = template("report.html")
     best, gp = content["optimum"], study.gp
     people, answers = len(content["participants"]), sum(p["trials"] for p in content["participants"])
     worst = max(p["certificate"]["residual"] for p in content["participants"])
-    return template.render(
+    return sheet.render(
         title=f"{study.name}: the population's optimum",
         lead=f"{people} participants gave {answers} answers ({', '.join(study.responses)}). Each person's answers were"
         " turned into a map of perceived realism; the maps were merged, and this is where the merged map is highest.",
@@ -147,12 +147,13 @@ def _comparison(study, content):
 
 def robustness_page(study: Study, content: dict[str, Any]) -> str:
     """One self-contained page of the robustness check."""
-    template = _template("robustness.html")
+    sheet = template("robustness.html")
     flagged = [p["participant"] for p in content["participants"] if p["flagged"]]
-    return template.render(study=study, content=content, flagged=flagged, names=study.space.names)
+    return sheet.render(study=study, content=content, flagged=flagged, names=study.space.names)
 
 
-def _template(name: str):
+def template(name: str):
+    """A page of hilbo.templates, escaping what it is given."""
     from jinja2 import Environment, PackageLoader, select_autoescape
 
     return Environment(loader=PackageLoader("hilbo"), autoescape=select_autoescape()).get_template(name)

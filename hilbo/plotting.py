@@ -18,10 +18,21 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from hilbo.config import Study
 from hilbo.study import Cohort, fit_cohort, population
 
-__all__ = ["map_slices", "optima_scatter", "progress_figure", "slices_after"]
+__all__ = [
+    "BLUE",
+    "GREEN",
+    "GREY",
+    "ORANGE",
+    "RED",
+    "STYLE",
+    "map_slices",
+    "optima_scatter",
+    "progress_figure",
+    "slices_after",
+]
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
-_STYLE: dict = {
+STYLE: dict = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
@@ -90,7 +101,7 @@ def progress_figure(
     top = np.cumsum(np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask), axis=1)[
         :, trials - 1
     ]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
         goal = "the final optimum" if truth is None else "the truth"
@@ -115,7 +126,7 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
     physical = np.asarray(study.space.to_physical(optima))
     points = {name: np.asarray(study.space.to_physical(x)) for name, x in marks.items()}
     styles = (("*", RED, 140), ("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40))
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.4 if len(pairs) > 1 else 4.0, 2.9), layout="constrained")
         for axes, (i, j) in zip(_row(figure, len(pairs)), pairs, strict=True):
             axes.scatter(
@@ -147,7 +158,7 @@ def _levels(third):
 def _slices(study, grids):
     """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
     low, high = min(np.nanmin(g) for g in grids), max(np.nanmax(g) for g in grids)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.0 if len(grids) == 1 else 7.4, 2.7), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
         scale = ScalarMappable(Normalize(low, high), "cividis")
@@ -197,7 +208,7 @@ def _curve_axes(study):
 
 
 def _map_curve(study, posteriors, optimum, cohort):
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
         at, mean, sd = _curve(study, posteriors)
         axes.fill_between(at, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label="± standard deviation")
@@ -216,7 +227,7 @@ def _map_curve(study, posteriors, optimum, cohort):
 
 
 def _curves_after(study, posteriors, optima, counts):
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
         for posterior, x, count, colour in zip(posteriors, optima, counts, (ORANGE, GREEN, BLUE, RED), strict=False):
             at, mean, _ = _curve(study, posterior)

@@ -124,7 +124,7 @@ def _check_columns(text, study, source):
 
 
 def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> pd.Series:
-    """A column as float64, each cell correctly rounded; `valid` says which values are allowed, `words` what they are."""
+    """A column as float64, each cell correctly rounded; `valid` says which values may be, `words` which those are."""
 
     def number(cell):
         try:

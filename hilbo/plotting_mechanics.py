@@ -1,0 +1,210 @@
+"""Figures of the mechanics: tests and fits, the price of short memory, passivity, the passive set, frequency response.
+
+Like `plotting`: a figure is a function from results to a matplotlib `Figure`, with axes in physical units.
+"""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter
+
+from hilbo import passivity
+from hilbo.characterise import Characterisation
+from hilbo.identification import Fit, Test
+from hilbo.memory_selection import LIMIT, Row
+from hilbo.plotting import BLUE, GREEN, GREY, ORANGE, RED, STYLE
+from hilbo.viscoelastic import FOSLS
+
+__all__ = ["bode_figure", "curves_figure", "memory_figure", "passive_set_figure", "passivity_figure", "predicted"]
+
+_LABELS = {
+    "relaxation": ("time (s)", "force (N)"),
+    "creep": ("time (s)", "position (mm)"),
+    "modulus": ("time (s)", "relaxation modulus ({})"),
+    "compliance": ("time (s)", "creep compliance (1/{})"),
+}
+_LINES = ((ORANGE, "-."), (GREEN, "--"), (RED, ":"), ("#CC79A7", "--"), ("black", ":"), ("#56B4E9", "-."))
+
+
+def predicted(found: Fit, kind: str) -> np.ndarray:
+    """The fit's curve of one kind of test, at its times."""
+    place = [c.kind for c in found.curves].index(kind)
+    return np.asarray(found.model.predict(found.q, found.curves[place], found.weights[place]))
+
+
+def curves_figure(
+    tests: Sequence[Test],
+    result: Characterisation,
+    unit: str = "N/mm",
+    shown: Sequence[int | None] = (2, 25, 201, None),
+) -> Figure:
+    """Above: mean and ± sd of the repeats, the fit, and fits with other memories; below: residuals of the fit."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(3.7 * max(len(tests), 1.35), 4.4), layout="constrained")
+        panels = figure.subplots(2, len(tests), sharex="col", squeeze=False, height_ratios=(3, 1))
+        for (upper, lower), test in zip(panels.T, tests, strict=True):
+            _measured(upper, test)
+            own = predicted(result.fit, test.kind)
+            others = [row for row in result.rows if row.N in shown]
+            for row, (colour, dash) in zip(others, _LINES, strict=False):
+                name = "full memory" if row.N is None else f"N = {row.N}"
+                upper.plot(
+                    test.time, predicted(row.fit, test.kind), color=colour, linestyle=dash, linewidth=1, label=name
+                )
+            upper.plot(test.time, own, color=BLUE, linewidth=1.4, label=_fit_name(result.fit))
+            lower.axhline(0, color=GREY, linewidth=0.6)
+            lower.plot(test.time, test.output.mean(axis=0) - own, color=BLUE, linewidth=0.6)
+            if test.input is None:
+                upper.set(xscale="log")
+                upper.set(yscale="log")
+            upper.set(title=test.kind, ylabel=_LABELS[test.kind][1].format(unit))
+            lower.set(xlabel="time (s)", ylabel="residual")
+            upper.legend(frameon=False)
+    return figure
+
+
+def _measured(axes, test):
+    mean = test.output.mean(axis=0)
+    if test.repeats > 1:
+        sd = test.output.std(axis=0, ddof=1)
+        label = f"measured, mean ± sd of {test.repeats}"
+        axes.fill_between(test.time, mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0, label=label)
+        axes.plot(test.time, mean, color=GREY, linewidth=0.8)
+    else:
+        axes.plot(test.time, mean, ".", color=GREY, markersize=2, label="measured")
+
+
+def _fit_name(found):
+    model = found.model
+    if getattr(model, "memory", None) == "short":
+        return f"fit, N = {int(model.N)}"
+    return "fit, full memory" if hasattr(model, "memory") else "fit"
+
+
+def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
+    """Error of the best fit against the number of taps, test by test; full memory as a level line."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.4, 2.9), layout="constrained")
+        axes = figure.subplots()
+        taps = [row for row in rows if row.N is not None]
+        for (kind, colour), marker in zip((("relaxation", BLUE), ("creep", ORANGE)), "os", strict=True):
+            if kind not in rows[0].nrmse:
+                continue
+            axes.plot([r.N for r in taps], [100 * r.nrmse[kind] for r in taps], marker=marker, color=colour, label=kind)
+            for row in rows:
+                if row.N is None:
+                    axes.axhline(100 * row.nrmse[kind], color=colour, linestyle=":", label=f"{kind}, full memory")
+        axes.axhline(100 * limit, color=GREY, linewidth=0.8, linestyle="--", label=f"{100 * limit:g} %")
+        axes.set(xscale="log", yscale="log", xlabel="past samples N", ylabel="NRMSE of the best fit (%)")
+        axes.set_xticks([r.N for r in taps], [str(r.N) for r in taps], minor=False)
+        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        axes.minorticks_off()
+        axes.legend(frameon=False)
+    return figure
+
+
+def _needed(model, count=600):
+    """Frequencies (Hz), the damping they ask for (N·s/m), and the curve whose real part that is."""
+    omega = np.geomspace(2 * np.pi * 0.5, np.pi / model.T, count)
+    response = np.asarray(model.frequency_response(jnp.asarray(omega)))
+    cotangent = np.tan((np.pi - omega * model.T) / 2)
+    return omega / (2 * np.pi), 500 * model.T * (1 + 1j * cotangent) * response
+
+
+def passivity_figure(model: FOSLS, b: float) -> Figure:
+    """Left: Nyquist-type plot of (T/2)(1 + j cot(ωT/2))·H, which must stay left of b. Right: its real part over f."""
+    frequency, curve = _needed(model)
+    worst = int(np.argmax(curve.real))
+    margin = b - curve.real[worst]
+    colour, word = (GREEN, "margin") if margin >= 0 else (RED, "lacking")
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, 3.2), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        left.plot(curve.real, curve.imag, color=BLUE)
+        left.plot(curve.real[worst], curve.imag[worst], "o", color=colour, markersize=5, clip_on=False)
+        left.axvline(b, color="black", linewidth=1)
+        left.axvspan(b, max(b, curve.real.max()) * 1.25, color=GREY, alpha=0.15, linewidth=0)
+        left.set_yscale("symlog", linthresh=0.1)
+        left.set(xlabel="real part: damping needed (N·s/m)", ylabel="imaginary part (N·s/m)")
+        left.set_title("passive if the curve stays left of the device's b")
+        right.semilogx(frequency, curve.real, color=BLUE, label="needed by the rendering")
+        right.axhline(b, color="black", linewidth=1, label=f"device, b = {b:g} N·s/m")
+        right.annotate(
+            "",
+            (frequency[worst], b),
+            (frequency[worst], curve.real[worst]),
+            arrowprops={"arrowstyle": "<->", "color": colour, "shrinkA": 0, "shrinkB": 0},
+            annotation_clip=False,
+        )
+        right.plot(frequency[worst], curve.real[worst], "o", color=colour, markersize=5, clip_on=False)
+        right.set(xlabel="frequency (Hz)", ylabel="damping (N·s/m)")
+        right.set_title(f"{word} {abs(margin):.3f} N·s/m at {frequency[worst]:.0f} Hz")
+        right.legend(frameon=False, loc="lower right")
+    return figure
+
+
+def passive_set_figure(model: FOSLS, b: float, K_eff: float) -> Figure:
+    """Largest passive K1 over (B1, α) of the paper's box, and slices of the passive set through it; odd N or full."""
+    B1, alpha = np.geomspace(0.1, 32, 121), np.linspace(0.01, 0.99, 121)
+    limit = np.asarray(_largest(model, B1[None, :], alpha[:, None], b, K_eff))
+    own = float(model.B1), float(model.alpha), float(model.K1)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, 3.2), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        shown = np.clip(limit, 1, 32)
+        picture = left.pcolormesh(
+            B1, alpha, np.where(limit < 1, np.nan, shown), cmap="cividis", vmin=1, vmax=32, rasterized=True
+        )
+        figure.colorbar(picture, ax=left, label="largest passive $K_1$ (N/mm; 32: the box)")
+        left.plot(own[0], own[1], "*", color=RED, markersize=12, markeredgecolor="white")
+        left.set(xscale="log", xlabel="$B_1$ (N·s$^α$/mm)", ylabel="α", xlim=(0.1, 32))
+        left.set_title("white: no $K_1$ from 1 N/mm up is passive")
+        for order, (colour, dash) in zip(
+            (0.1, own[1], 0.35, 0.6), ((ORANGE, "--"), (BLUE, "-"), (GREEN, "-."), (GREY, ":")), strict=True
+        ):
+            line = np.asarray(_largest(model, B1, np.full_like(B1, order), b, K_eff))
+            width = 2.0 if order == own[1] else 1.2
+            right.plot(
+                B1, np.minimum(line, 64), color=colour, linestyle=dash, linewidth=width, label=f"α = {order:.3g}"
+            )
+        right.plot(own[0], own[2], "*", color=RED, markersize=12, markeredgecolor="white", label="this set")
+        right.set(xscale="log", xlabel="$B_1$ (N·s$^α$/mm)", ylabel="$K_1$ (N/mm)", xlim=(0.1, 32), ylim=(0, 32))
+        right.set_title(f"passive below the line; b = {b:g} N·s/m")
+        right.legend(frameon=False)
+        for axes in (left, right):
+            axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    return figure
+
+
+def _largest(model, B1, alpha, b, K_eff):
+    return passivity.largest_K1(B1, alpha, b, K_eff, model.N, model.T, memory=model.memory)
+
+
+def bode_figure(model: FOSLS) -> Figure:
+    """Magnitude and phase of the rendering, beside the continuous model with the same parameters (which may differ)."""
+    omega = np.geomspace(2 * np.pi * 0.05, np.pi / model.T, 400)
+    frequency = omega / (2 * np.pi)
+    both = {
+        f"rendered, {'full memory' if model.memory == 'full' else f'N = {model.N}'}": (
+            model.frequency_response,
+            BLUE,
+            "-",
+        ),
+        "continuous, same parameters": (model.continuous_response, ORANGE, "--"),
+    }
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.6, 4.0), layout="constrained")
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        for name, (function, colour, dash) in both.items():
+            response = np.asarray(function(jnp.asarray(omega)))
+            upper.loglog(frequency, np.abs(response), color=colour, linestyle=dash, label=name)
+            lower.semilogx(frequency, np.degrees(np.unwrap(np.angle(response))), color=colour, linestyle=dash)
+        upper.set(ylabel="|H| (N/mm)")
+        upper.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        upper.yaxis.set_minor_formatter(FormatStrFormatter("%g"))
+        lower.set(xlabel="frequency (Hz)", ylabel="phase (°)")
+        upper.legend(frameon=False)
+    return figure
