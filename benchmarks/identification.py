@@ -70,8 +70,10 @@ def study():
     import jax.numpy as jnp
 
     from hilbo import identification, intervals
+    from hilbo.sampled import Sampled
 
-    model, tests = identification.Sampled(), measured(repeats=REPEATS)
+    tests = measured(repeats=REPEATS)
+    model = Sampled().at(tests)
     curves = tuple(model.prepare(test) for test in tests)
     weights = tuple(jnp.full(REPEATS, 1 / REPEATS) for _ in tests)
     lower, upper = (jnp.asarray(end) for end in model.box(tests))
@@ -124,7 +126,7 @@ def coverage(chosen):
 
 def summary(folder, noise):
     """Shares of intervals that hold the truth, one-sided ones apart."""
-    from hilbo.identification import Sampled
+    from hilbo.sampled import Sampled
 
     pieces = [np.load(path) for path in sorted(folder.glob(f"{noise}-*.npz"))]
     if not pieces:

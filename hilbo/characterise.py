@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hilbo import intervals, passivity
-from hilbo.identification import Fit, Sampled, Test, fit, nrmse, polish
+from hilbo.identification import Fit, Test, fit, nrmse, polish
 from hilbo.memory_selection import Row, select_memory
+from hilbo.sampled import Sampled
 
 __all__ = ["Characterisation", "Estimate", "characterise"]
 

@@ -62,8 +62,8 @@ def identify(
 
 
 def _model(measured, model, weights, taps, period, memory) -> Any:
-    from hilbo.identification import Sampled
     from hilbo.moduli import Continuous, FractionalMaxwell
+    from hilbo.sampled import Sampled
 
     if measured:
         if model != "fosls" or weights:

@@ -33,6 +33,7 @@ _CLOSE = 1e-3  # of the half-width, to which an end of an interval is found
 _FARTHEST = 4.0  # growth of a step away from the estimate
 _IMPATIENCE = 0.05  # least growth, times the steps taken: profiles may be flat beyond some distance
 _SEARCH_STEPS = 25
+_ENOUGH = 1e-8  # of the cost: cuts are 1e-4 of it and more
 
 
 class Noise(eqx.Module):
@@ -132,7 +133,8 @@ class _Search(NamedTuple):
 def _profile(found, around):
     size = found.q.size
     which, side = jnp.repeat(jnp.arange(size), 2), jnp.tile(jnp.array([-1.0, 1.0], found.q.dtype), size)
-    ends = jax.vmap(lambda j, sign: _end(found, around, j, sign))(which, side)
+    # One after the other: together, all would wait for the slowest.
+    ends = jax.lax.map(lambda at: _end(found, around, *at), (which, side))
     place, open_, done = (leaf.reshape(size, 2) for leaf in (ends.place, ends.open, ends.done))
     found_both = jnp.all(done & jnp.isfinite(place), axis=1)
     lower, upper = found.q - place[:, 0], found.q + place[:, 1]
@@ -150,7 +152,12 @@ def _end(found, around, j, sign):
         value = q[j] + sign * distance
         lower, upper = (jnp.where(own, value, bound) for bound in (found.lower, found.upper))
         solution = least_squares(
-            lambda x: residuals(found.model, found.curves, found.weights, x), start, lower, upper, max_steps=40
+            lambda x: residuals(found.model, found.curves, found.weights, x),
+            start,
+            lower,
+            upper,
+            max_steps=40,
+            enough=_ENOUGH,
         )
         return solution
 

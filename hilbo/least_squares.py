@@ -55,15 +55,16 @@ def least_squares(
     upper: Float[Array, " p"],
     *,
     max_steps: int = 100,
+    enough: float | None = None,
 ) -> Solution:
     """Minimise |`residuals`(q)|² over the box from `start`; parameters with lower = upper stay there.
 
-    Ends when a step changes the fit by less than eps^(3/8) (1e-6 in float64) of the residual's norm, or when rounding
-    lets no step improve. A start with residuals that are not finite ends unconverged.
+    Ends when a step promises to lower the cost by less than `enough` of it (eps^0.75, 2e-12 in float64, by default), or
+    when rounding lets no step improve. A start with residuals that are not finite ends unconverged.
     """
     start = jnp.clip(start, lower, upper)
     eps = jnp.finfo(start.dtype).eps
-    enough, tiny = eps**0.75, eps**0.6
+    tiny, least = eps**0.6, eps**0.75 if enough is None else enough
 
     def evaluate(q):
         r, forward = jax.linearize(residuals, q)
@@ -77,7 +78,8 @@ def least_squares(
         cost, gradient, normal = evaluate(q)
         better = cost < state.cost
         gain = -(2 * state.gradient + state.normal @ moved) @ moved  # predicted
-        settled = (gain <= enough * state.cost) | jnp.all(jnp.abs(moved) <= tiny * jnp.abs(state.q))
+        # A step that was cut off may promise nothing: then the damping grows until it goes downhill along the box.
+        settled = ((gain >= 0) & (gain <= least * state.cost)) | jnp.all(jnp.abs(moved) <= tiny * jnp.abs(state.q))
         trust = (state.cost - cost) / gain  # 1 where the model is right
         eased = state.damping * jnp.clip(1 - (2 * trust - 1) ** 3, 0.1, 2.0)
         damping = jnp.where(better, eased, jnp.maximum(state.growth * state.damping, eps))

@@ -10,7 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from hilbo.errors import InputError
-from hilbo.identification import Fit, Sampled, Test, fit, nrmse
+from hilbo.identification import Fit, Test, fit, nrmse
+from hilbo.sampled import Sampled
 
 __all__ = ["CHOICES", "LIMIT", "PAPER", "Row", "select_memory", "smallest"]
 

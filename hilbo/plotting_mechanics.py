@@ -41,28 +41,31 @@ def curves_figure(
     unit: str = "N/mm",
     shown: Sequence[int | None] = (2, 25, 201, None),
 ) -> Figure:
-    """Above: mean and ± sd of the repeats, the fit, and fits with other memories; below: residuals of the fit."""
+    """Above: mean and ± sd of the repeats, the fit, and fits with other memories; below: what each leaves over."""
+    others = [row for row in result.rows if row.N in shown and getattr(result.fit.model, "N", None) != row.N]
+    lines = [
+        (row.fit, colour, dash, 0.9, "full memory" if row.N is None else f"N = {row.N}")
+        for row, (colour, dash) in zip(others, _LINES, strict=False)
+    ]
+    lines.append((result.fit, BLUE, "-", 1.4, _fit_name(result.fit)))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(3.7 * max(len(tests), 1.35), 4.4), layout="constrained")
-        panels = figure.subplots(2, len(tests), sharex="col", squeeze=False, height_ratios=(3, 1))
+        figure = Figure(figsize=(3.7 * max(len(tests), 1.35), 4.8), layout="constrained")
+        panels = figure.subplots(2, len(tests), sharex="col", squeeze=False, height_ratios=(3, 2))
         for (upper, lower), test in zip(panels.T, tests, strict=True):
             _measured(upper, test)
-            own = predicted(result.fit, test.kind)
-            others = [row for row in result.rows if row.N in shown]
-            for row, (colour, dash) in zip(others, _LINES, strict=False):
-                name = "full memory" if row.N is None else f"N = {row.N}"
-                upper.plot(
-                    test.time, predicted(row.fit, test.kind), color=colour, linestyle=dash, linewidth=1, label=name
-                )
-            upper.plot(test.time, own, color=BLUE, linewidth=1.4, label=_fit_name(result.fit))
             lower.axhline(0, color=GREY, linewidth=0.6)
-            lower.plot(test.time, test.output.mean(axis=0) - own, color=BLUE, linewidth=0.6)
+            for found, colour, dash, width, name in lines:
+                curve = predicted(found, test.kind)
+                upper.plot(test.time, curve, color=colour, linestyle=dash, linewidth=width, label=name)
+                left = test.output.mean(axis=0) - curve
+                lower.plot(test.time, left, color=colour, linestyle=dash, linewidth=0.6 * width)
             if test.input is None:
-                upper.set(xscale="log")
-                upper.set(yscale="log")
+                upper.set(xscale="log", yscale="log")
+            elif test.kind == "relaxation":
+                upper.set(xscale="log", xlim=(test.time[1], test.time[-1]))
             upper.set(title=test.kind, ylabel=_LABELS[test.kind][1].format(unit))
-            lower.set(xlabel="time (s)", ylabel="residual")
-            upper.legend(frameon=False)
+            lower.set(xlabel="time (s)", ylabel="measured - fit")
+        figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
     return figure
 
 
@@ -87,7 +90,7 @@ def _fit_name(found):
 def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
     """Error of the best fit against the number of taps, test by test; full memory as a level line."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.4, 2.9), layout="constrained")
+        figure = Figure(figsize=(6.0, 2.9), layout="constrained")
         axes = figure.subplots()
         taps = [row for row in rows if row.N is not None]
         for (kind, colour), marker in zip((("relaxation", BLUE), ("creep", ORANGE)), "os", strict=True):
@@ -100,9 +103,11 @@ def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
         axes.axhline(100 * limit, color=GREY, linewidth=0.8, linestyle="--", label=f"{100 * limit:g} %")
         axes.set(xscale="log", yscale="log", xlabel="past samples N", ylabel="NRMSE of the best fit (%)")
         axes.set_xticks([r.N for r in taps], [str(r.N) for r in taps], minor=False)
-        axes.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        low, high = axes.get_ylim()
+        ticks = [t for t in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low <= t <= high]
+        axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
         axes.minorticks_off()
-        axes.legend(frameon=False)
+        axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 
@@ -118,30 +123,28 @@ def passivity_figure(model: FOSLS, b: float) -> Figure:
     """Left: Nyquist-type plot of (T/2)(1 + j cot(ωT/2))·H, which must stay left of b. Right: its real part over f."""
     frequency, curve = _needed(model)
     worst = int(np.argmax(curve.real))
-    margin = b - curve.real[worst]
+    margin, most = b - curve.real[worst], max(b, curve.real[worst])
     colour, word = (GREEN, "margin") if margin >= 0 else (RED, "lacking")
+    near = curve.real > -2 * most  # far to the left, in slow motion, nothing is decided
+    frequency, near_curve = frequency[near], curve[near]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.4, 3.2), layout="constrained")
         left, right = figure.subplots(1, 2)
-        left.plot(curve.real, curve.imag, color=BLUE)
+        left.plot(near_curve.real, near_curve.imag, color=BLUE)
         left.plot(curve.real[worst], curve.imag[worst], "o", color=colour, markersize=5, clip_on=False)
         left.axvline(b, color="black", linewidth=1)
-        left.axvspan(b, max(b, curve.real.max()) * 1.25, color=GREY, alpha=0.15, linewidth=0)
-        left.set_yscale("symlog", linthresh=0.1)
+        left.axvspan(b, 1.5 * most, color=GREY, alpha=0.2, linewidth=0)
+        left.set(xlim=(-2 * most, 1.5 * most), ylim=(0, None))
         left.set(xlabel="real part: damping needed (N·s/m)", ylabel="imaginary part (N·s/m)")
         left.set_title("passive if the curve stays left of the device's b")
-        right.semilogx(frequency, curve.real, color=BLUE, label="needed by the rendering")
-        right.axhline(b, color="black", linewidth=1, label=f"device, b = {b:g} N·s/m")
-        right.annotate(
-            "",
-            (frequency[worst], b),
-            (frequency[worst], curve.real[worst]),
-            arrowprops={"arrowstyle": "<->", "color": colour, "shrinkA": 0, "shrinkB": 0},
-            annotation_clip=False,
-        )
-        right.plot(frequency[worst], curve.real[worst], "o", color=colour, markersize=5, clip_on=False)
-        right.set(xlabel="frequency (Hz)", ylabel="damping (N·s/m)")
-        right.set_title(f"{word} {abs(margin):.3f} N·s/m at {frequency[worst]:.0f} Hz")
+        right.semilogx(frequency, near_curve.real, color=BLUE, label="needed by the rendering")
+        right.axhline(b, color="black", linewidth=1, label=f"device, b = {b:.4g} N·s/m")
+        at = frequency[int(np.argmax(near_curve.real))]
+        right.plot([at, at], [b, curve.real[worst]], color=colour, linewidth=2.5)
+        right.plot(at, curve.real[worst], "o", color=colour, markersize=5, clip_on=False)
+        right.set(xlabel="frequency (Hz)", ylabel="damping (N·s/m)", ylim=(-2 * most, 1.5 * most))
+        right.set_title(f"{word} {abs(margin):.3f} N·s/m at {at:.0f} Hz")
+        right.xaxis.set_major_formatter(FormatStrFormatter("%g"))
         right.legend(frameon=False, loc="lower right")
     return figure
 

@@ -15,10 +15,11 @@ import pandas as pd
 
 from hilbo import passivity
 from hilbo.characterise import Characterisation
-from hilbo.identification import Sampled, Test
+from hilbo.identification import Test
 from hilbo.memory_selection import LIMIT, PAPER, smallest
 from hilbo.page import template
 from hilbo.report import as_json, versions
+from hilbo.sampled import Sampled
 from hilbo.viscoelastic import FOSLS
 
 __all__ = ["identification_result", "passivity_result", "renderer_block", "write_identification", "write_passivity"]
@@ -302,8 +303,8 @@ def passivity_words(content: dict[str, Any]) -> str:
         return f"violated: the static stiffness H(1) = {K_eff:.4g} N/mm is negative, which no damping makes good."
     margin = content["margin"][0] if content["margin"][0] > 0 else content["margin"][1]
     words = (
-        f"{content['status']}: the device has {b:g} N·s/m, {abs(margin):.4g} {'more' if margin > 0 else 'less'} than the"
-        f" {content['minimum_damping']:.5g} N·s/m that the set needs; {content['binding_frequency']:.4g} Hz binds."
+        f"{content['status']}: the device has {b:g} N·s/m, {abs(margin):.4g} {'more' if margin > 0 else 'less'} than"
+        f" the {content['minimum_damping']:.5g} N·s/m that the set needs; {content['binding_frequency']:.4g} Hz binds."
     )
     largest, cycle = content["largest_K1"], content.get("witness")
     if largest is not None:
