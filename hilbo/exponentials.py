@@ -15,8 +15,9 @@ slowest, λ = 1, and C(z) = 1. The polynomials are Chebyshev sums fitted to S_n 
 `benchmarks/exponentials.py` makes the table and measures its error.
 """
 
+import math
+
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 __all__ = ["STATES", "decode", "exponentials"]
@@ -49,7 +50,7 @@ def decode(
     weight = weight / jnp.sum(weight)
     rate = jnp.exp(rates).at[-1].multiply(alpha)
     # (1 - λ)/(1 + λ) = tanh(r/2), whose mean is C(-1) - 1.
-    speed = (jnp.expm1(alpha * np.log(2)) - weight[1:] @ jnp.tanh(rate / 2)) / weight[0]
+    speed = (jnp.expm1(alpha * math.log(2)) - weight[1:] @ jnp.tanh(rate / 2)) / weight[0]
     return weight, jnp.concatenate([(2 * speed / (1 + speed))[None], -jnp.expm1(-rate)])
 
 

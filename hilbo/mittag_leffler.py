@@ -64,7 +64,8 @@ def _increment(alpha, z):
 
 def _safe(a, b, z, nodes):
     """The value at z = 0 apart, where the logarithm is infinite."""
-    return jnp.where(z > 0, _integral(a, b, jnp.where(z > 0, z, 1), nodes), 1 / gamma(b))
+    at_zero = jnp.where(b == 1, 1, 1 / gamma(b))
+    return jnp.where(z > 0, _integral(a, b, jnp.where(z > 0, z, 1), nodes), at_zero)
 
 
 def _integral(a, b, z, nodes):

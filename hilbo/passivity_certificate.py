@@ -135,7 +135,8 @@ def _short_enclosure(model):
 def _polynomials(model):
     """Cosine coefficients of A and B, and the least value of A."""
     beta = model.beta
-    g, h, k = share(model.K1, beta), share(beta, model.K1), series(model.K1, beta)
+    k = series(model.K1, beta)
+    g, h = jnp.where(k > 0, share(model.K1, beta), 1), jnp.where(k > 0, share(beta, model.K1), 0)
     c = gl_coefficients(model.alpha, model.N)
     partial = jnp.cumprod(1 - model.alpha / jnp.arange(1, model.N + 1, dtype=c.dtype))
     last = partial[-1]
@@ -148,7 +149,7 @@ def _polynomials(model):
 
 
 def _rows(p, count):
-    """p_j·(j/N)^m/m! for m < `count`: with cos, sin, -cos, -sin of jθ in turn, the Taylor terms of p in units of 1/N."""
+    """p_j·(j/N)^m/m! for m < `count`: with cos, -sin, -cos, sin of jθ in turn, Taylor terms of p in units of 1/N."""
     j = jnp.arange(p.shape[0], dtype=p.dtype) / (p.shape[0] - 1)
     rows = [p]
     for m in range(1, count):
@@ -199,7 +200,9 @@ def _climb(A, B, start, width):
         curved = bend > 0
         return jnp.where(curved, jnp.clip(angle - slope / jnp.where(curved, bend, 1) / N, low, high), angle)
 
-    angle = jax.lax.fori_loop(0, 8, step, start)
+    # At π the slope is 0 even where the largest value is beside it.
+    bent = _ratio(A, B, start)[2] > 0
+    angle = jax.lax.fori_loop(0, 12, step, jnp.where(bent, start, start - width / 2))
     return jnp.where(_ratio(A, B, angle)[0] > _ratio(A, B, start)[0], angle, start)
 
 

@@ -7,10 +7,14 @@ Three coordinates of one point:
 - *box* w: the optimiser's coordinates. With mechanics, x_K1 = w_K1 · x_K1max(B1, α), where K1max is the largest
   passive K1 (`passivity.largest_K1`), so that the feasible set is the whole of [0, 1]^d; without, w = x.
 
-A column (B1, α) with K1max below the lowest K1 has width 0 and holds no feasible point. Points that fill the feasible
-set evenly come from uniform numbers by the Rosenblatt map whose density is the column's width; Rosenblatt (1952),
-Ann. Math. Stat. 23:470. The search keeps `SEARCH_MARGIN` away from the device's damping, so that a device that checks
-passivity again in float32 never refuses a proposal.
+With a range of effective damping B_eff the column starts above the lowest K1 too. B_eff = 1000·T·β·M1·(K1/(K1 + β·S))²
+rises with K1 from 0 to 1000·T·β·M1, so that the range is an interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are
+K1 = β·S·r/(1 - r), infinite for r >= 1; and x_K1 = start + w_K1 · width.
+
+A column (B1, α) with K1max below the lowest K1, or no K1 in the range, has width 0 and holds no feasible point. Points
+that fill the feasible set evenly come from uniform numbers by the Rosenblatt map whose density is the column's width;
+Rosenblatt (1952), Ann. Math. Stat. 23:470. The search keeps `SEARCH_MARGIN` away from the device's damping, so that a
+device that checks passivity again in float32 never refuses a proposal.
 """
 
 import functools
@@ -26,6 +30,8 @@ from jaxtyping import Array, Bool, Float, Real
 
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
+from hilbo.exponentials import STATES
+from hilbo.memory import Memory, span, sums
 
 __all__ = ["SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace"]
 
@@ -85,14 +91,16 @@ class Mechanics(eqx.Module):
     """What the renderer adds to the box: the FO-SLS, its memory and rate, and the device's damping.
 
     `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
-    optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd); `T`: s.
+    optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd) of short memory; `states`: exponentials of full memory,
+    for which alone the effective damping depends on them, and not on K1; `T`: s.
     """
 
     K_eff: float = eqx.field(static=True, converter=float)
     damping: float = eqx.field(static=True, converter=float)
     N: int = eqx.field(static=True, default=101)
     T: float = eqx.field(static=True, converter=float, default=1e-3)
-    memory: Literal["short", "full"] = eqx.field(static=True, default="short")
+    memory: Memory = eqx.field(static=True, default="short")
+    states: int = eqx.field(static=True, default=10)
     effective_damping: tuple[float, float] | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
@@ -100,7 +108,9 @@ class Mechanics(eqx.Module):
             value = getattr(self, key)
             if not least < value < math.inf:
                 raise InputError(f"renderer.{key} is {value}, it must be {'0 or' if least else 'a number'} above 0.")
-        if self.N < 1 or self.N % 2 == 0:
+        if self.memory == "full" and self.states not in STATES:
+            raise InputError(f"renderer.states is {self.states}, it must be one of {', '.join(map(str, STATES))}.")
+        if self.memory == "short" and (self.N < 1 or self.N % 2 == 0):
             raise InputError(f"renderer.N is {self.N}, it must be odd and at least 1; write for example N = 101.")
         if self.effective_damping is not None and not 0 <= self.effective_damping[0] < self.effective_damping[1]:
             raise InputError(
@@ -139,6 +149,12 @@ class SearchSpace(eqx.Module):
         if alpha.high >= 1:
             raise InputError(f"parameters.alpha.high is {alpha.high}, it must be below 1 for the FO-SLS.")
         if not _column_table(self)[0][-1] > 0:
+            if mechanics.effective_damping is not None:
+                raise InputError(
+                    f"renderer.effective_damping leaves no parameter set: none is passive with renderer.damping = "
+                    f"{mechanics.damping} N.s/m and between {mechanics.effective_damping[0]} and "
+                    f"{mechanics.effective_damping[1]} N.s/m; widen it."
+                )
             raise InputError(
                 f"renderer.damping is {mechanics.damping} N.s/m, with which no K1 from "
                 f"{self.parameters[self._index('K1')].low} N/mm up is passive for any B1 and alpha; "
@@ -173,14 +189,22 @@ class SearchSpace(eqx.Module):
         w = _floating(w)
         if self.mechanics is None:
             return w
-        return w.at[..., self._index("K1")].multiply(self._limit(self.mechanics, w))
+        if self.mechanics.effective_damping is None:
+            return w.at[..., self._index("K1")].multiply(self._limit(self.mechanics, w))
+        low, width = self._interval(self.mechanics, w)
+        K1 = self._index("K1")
+        return w.at[..., K1].set(low + w[..., K1] * width)
 
     def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Inverse of `from_box`, for `x` in the feasible set."""
         x = _floating(x)
         if self.mechanics is None:
             return x
-        return x.at[..., self._index("K1")].divide(self._limit(self.mechanics, x))
+        if self.mechanics.effective_damping is None:
+            return x.at[..., self._index("K1")].divide(self._limit(self.mechanics, x))
+        low, width = self._interval(self.mechanics, x)
+        K1 = self._index("K1")
+        return x.at[..., K1].set((x[..., K1] - low) / width)
 
     def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
         """Whether points of the unit cube are in the box, passive with the search margin, and damped as asked for."""
@@ -194,8 +218,9 @@ class SearchSpace(eqx.Module):
         inside &= _minimum_damping(mechanics, physical) <= available
         if mechanics.effective_damping is not None:
             low, high = mechanics.effective_damping
-            damping = viscoelastic.effective_damping(*_set(physical), mechanics.N, mechanics.T, memory=mechanics.memory)
-            inside &= (low <= damping) & (damping <= high)
+            damping = _effective_damping(mechanics, physical)
+            slack = 4 * _ROUNDING * float(jnp.finfo(x.dtype).eps)
+            inside &= (low * (1 - slack) <= damping) & (damping <= high * (1 + slack))
         return inside
 
     def derived(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> dict[str, Float[Array, "..."]]:
@@ -209,6 +234,10 @@ class SearchSpace(eqx.Module):
         """Damping of the device less the smallest passive one, N·s/m; None without mechanics."""
         return None if self.mechanics is None else self.mechanics.damping - _minimum_damping(self.mechanics, physical)
 
+    def volume(self) -> float:
+        """Share of the unit cube that is feasible: the mean width of its columns, on a grid; 1 without mechanics."""
+        return 1.0 if self.mechanics is None else float(_column_table(self)[0][-1])
+
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol')."""
         return _fill(self, m, _sobol_chunks(self.dim, m, seed))
@@ -216,8 +245,8 @@ class SearchSpace(eqx.Module):
     def latin_hypercube(self, n: int, seed: int) -> Float[np.ndarray, "n d"]:
         """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
 
-        Points that fall outside the feasible set (a few at the foot of infeasible columns, or many with an
-        `effective_damping`) are replaced from further hypercubes, at the price of the even spread.
+        Points that fall outside the feasible set (a few, at the foot of infeasible columns) are replaced from further
+        hypercubes, at the price of the even spread.
         """
         return _fill(self, n, _latin_chunks(self.dim, n, seed))
 
@@ -234,6 +263,36 @@ class SearchSpace(eqx.Module):
         b = m.damping * (1 - SEARCH_MARGIN)
         largest = passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory)
         return K1.to_unit(jnp.clip(largest, K1.low, K1.high))
+
+    def _interval(self, m, x):
+        """Start and width of the column of each point, in x_K1, with a range of effective damping."""
+        K1 = self.parameters[self._index("K1")]
+        B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
+        first, last = _K1_range(m, B1, alpha)
+        low, high = K1.to_unit(jnp.clip(first, K1.low, K1.high)), K1.to_unit(jnp.clip(last, K1.low, K1.high))
+        high = jnp.minimum(high, self._limit(m, x))
+        empty = (first > K1.high) | (last < K1.low) | (high <= low)
+        return low, jnp.where(empty, 0, high - low)
+
+
+def _K1_range(m, B1, alpha):
+    """The K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
+    memory = span(m.memory, m.N, m.states)
+    return tuple(viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
+
+
+def _K1_of(span, damping, B1, alpha, T):
+    """The K1 with this effective damping."""
+    beta, found = B1 * T**-alpha, sums(alpha, span)
+    square = damping / (1000 * T * beta * found.moment)
+    possible = (square > 0) & (square < 1)
+    share = jnp.sqrt(jnp.where(possible, square, 0.25))
+    K1 = beta * found.at_dc * share / (1 - share)
+    return jnp.where(possible, K1, jnp.where(square > 0, jnp.inf, 0))
+
+
+def _effective_damping(m, physical):
+    return viscoelastic.effective_damping(*_set(physical), m.N, m.T, memory=m.memory, states=m.states)
 
 
 def _floating(x):
@@ -253,7 +312,7 @@ def _column_table(space):
     """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
     x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
     x[..., space._index("B1")], x[..., space._index("alpha")] = _ROWS[:, None], _COLUMNS
-    node = np.asarray(_limit(space, x), float)
+    node = np.asarray(_width(space, x), float)
     mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
     volume = mean * np.diff(_ROWS)[:, None] * np.diff(_COLUMNS)
     within = np.pad(np.cumsum(volume, axis=1), ((0, 0), (1, 0)))
@@ -278,8 +337,10 @@ def _rosenblatt(space, uniform):
 
 
 @eqx.filter_jit
-def _limit(space, x):
-    return space._limit(space.mechanics, x)
+def _width(space, x):
+    if space.mechanics.effective_damping is None:
+        return space._limit(space.mechanics, x)
+    return space._interval(space.mechanics, x)[1]
 
 
 @eqx.filter_jit

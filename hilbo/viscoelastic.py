@@ -7,8 +7,8 @@ Continuous model H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α), 0 < α <= 1. Sample
     H(z) = K0 + K1·β·C(z) / (K1 + β·C(z))
 
 The record `FOSLS` is in `fosls`, the exact continuous functions in `continuous`, presets, special cases and loads in
-`materials`; all of them are names of this module too. Here are the closed forms over arrays of parameters, which need
-S_N = C(1), M1 = -Σ i·c_i and C(-1) alone.
+`materials`, the change of sets in contact in `switching`; all of them are names of this module too. Here are the closed
+forms over arrays of parameters, which need S_N = C(1), M1 = -Σ i·c_i and C(-1) alone.
 
 Units: stiffness N/mm, B1 N·s^α/mm, T s, damping N·s/m. N and T belong to a parameter set: α means another material
 under another N. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
@@ -36,6 +36,7 @@ from hilbo.materials import (
     springpot,
 )
 from hilbo.memory import GLSums, Memory, Span, gl_coefficients, gl_sums, span, sums
+from hilbo.switching import switched_force
 
 __all__ = [
     "FOSLS",
@@ -59,6 +60,7 @@ __all__ = [
     "sls",
     "spring",
     "springpot",
+    "switched_force",
 ]
 
 

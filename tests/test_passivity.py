@@ -1,6 +1,9 @@
 """The closed passivity bounds against the frequency response, the numbers of the paper, and each other."""
 
+import functools
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -8,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.stats import qmc
 
 from hilbo import passivity, viscoelastic
+from hilbo.viscoelastic import FOSLS
 
 SETS = ((-2.89, 5.70, 5.89, 0.203), (-3.18, 5.58, 7.88, 0.176), (-5.01, 8.44, 10.28, 0.282))
 B1s, orders = st.floats(0.001, 32), st.floats(0.01, 0.99)
@@ -112,8 +116,140 @@ def test_gradients_are_zero_where_the_limit_is_infinite_or_nothing(b):
 
 
 @pytest.mark.parametrize("call", [passivity.minimum_damping, passivity.largest_K1])
-def test_even_N_and_full_memory_are_refused(call):
+def test_even_N_is_refused(call):
     with pytest.raises(ValueError, match="odd"):
         call(1.0, 1.0, 0.5, N=100)
-    with pytest.raises(NotImplementedError, match="full"):
-        call(1.0, 1.0, 0.5, memory="full")
+
+
+def model_of(K1, B1, alpha, N=101, memory="short"):
+    K0 = viscoelastic.K0_from_effective_stiffness(K1, B1, alpha, 0.44, N, memory=memory)
+    return FOSLS(K0, K1, B1, alpha, N=N, memory=memory)
+
+
+def random_sets(count, seed=0):
+    return qmc.scale(qmc.Sobol(3, rng=seed).random(count), (1, 0.001, 0.01), (32, 32, 0.99)).T
+
+
+@functools.partial(jax.jit, static_argnames=("N", "memory", "angles"))
+def certified(K1, B1, alpha, b, N=101, memory="short", angles=0):
+    """Lower and upper bound of the margin and frequency of each set; the least margin on a grid of frequencies."""
+
+    def one(q):
+        model = model_of(*q[:3], N=N, memory=memory)
+        found = passivity.certify(model, q[3])
+        grid = jnp.linspace(0, np.pi / model.T, angles) if angles else jnp.zeros(1)
+        return found.lower, found.upper, found.frequency, q[3] - jnp.max(passivity.needed_damping(model, grid))
+
+    return jax.lax.map(one, (K1, B1, alpha, jnp.broadcast_to(b, K1.shape)), batch_size=32)
+
+
+def disagreements(count, N=101):
+    K1, B1, alpha = random_sets(count)
+    lower, upper, frequency, _ = map(np.asarray, certified(K1, B1, alpha, 0.95, N))
+    closed = 0.95 - np.asarray(passivity.minimum_damping(K1, B1, alpha, 0.44, N))
+    undecided = (lower <= 0) & (upper > 0)
+    assert np.all(undecided | ((lower > 0) == (closed > 0)))
+    assert np.all((lower <= closed) & (closed <= upper)) and np.max(upper - lower) <= 1e-11
+    np.testing.assert_allclose(frequency, np.pi * 1e3)
+    return undecided.sum()
+
+
+@pytest.mark.parametrize("N", [1, 25, 101])
+def test_the_certificate_agrees_with_the_closed_form(N):
+    assert disagreements(256, N) == 0
+
+
+@pytest.mark.deep
+def test_the_certificate_agrees_with_the_closed_form_on_twenty_thousand_sets():
+    undecided = disagreements(20_000)
+    print(f"{undecided} of 20,000 sets undecided")
+    assert undecided == 0
+
+
+def test_only_the_rounding_of_the_boundary_is_undecided():
+    _, B1, alpha = random_sets(256, 1)
+    K1 = np.asarray(passivity.largest_K1(B1, alpha))
+    limited = np.isfinite(K1) & (K1 > 0)
+    K1, B1, alpha = K1[limited], B1[limited], alpha[limited]
+    below = certified(K1 * (1 - 1e-10), B1, alpha, 0.95)
+    above = certified(K1 * (1 + 1e-10), B1, alpha, 0.95)
+    decided = np.asarray((below[0] > 0) & (above[1] <= 0))
+    # b hardly depends on K1 where the pot is much the softer: there 1e-10 of K1 is less than rounding.
+    soft = B1 * 1e-3**-alpha < 0.1 * K1
+    assert np.all(decided | soft) and np.mean(decided) > 0.9
+
+
+@pytest.mark.parametrize("N", [2, 100])
+def test_even_N_is_decided_by_the_certificate(N):
+    K1, B1, alpha = random_sets(128, 2)
+    lower, upper, _, on_grid = map(np.asarray, certified(K1, B1, alpha, 0.95, N, angles=4097))
+    assert np.all(lower <= on_grid) and np.all(upper <= on_grid + 1e-11) and np.min(upper - on_grid) > -1e-3
+    assert np.max(upper - lower) <= 1e-4 and np.median(upper - lower) <= 1e-11
+    assert np.all((lower > 0) | (upper <= 0))
+    at_nyquist = 0.95 - np.asarray(jax.vmap(lambda *q: 0.5 * model_of(*q, N=N).high_frequency_gain())(K1, B1, alpha))
+    needed, closed = 0.95 - upper, 0.95 - at_nyquist
+    assert np.all(needed >= closed * (1 - 1e-9)) and np.max(needed / closed) > 1 + 1e-5
+
+
+def test_the_certificate_at_the_limits_of_the_model():
+    """Spring-pot, Kelvin-Voigt, spring and SLS, with the closed forms of their H(-1)."""
+    for model, damping in (
+        (viscoelastic.spring(2.0), 1.0),
+        (viscoelastic.kelvin_voigt(2.0, 0.001), 0.5 * (2 + 2 * 1.0)),
+        (viscoelastic.sls(2.0, 5.0, 0.001), 0.5 * (2 + 5 * 2 / 7)),
+    ):
+        found = passivity.certify(model, 4.0)
+        assert found.lower <= 4 - damping <= found.upper + 1e-13 and found.status == "passive"
+        assert passivity.certify(model, damping * 0.999).status == "violated"
+
+
+def test_a_negative_static_stiffness_is_a_violation_of_its_own():
+    found = passivity.certify(FOSLS(-0.1, 1.0, 0.001, 0.9), 10.0)
+    assert (
+        found.lower > 0 and found.status == "violated" and passivity.witness(FOSLS(-0.1, 1.0, 0.001, 0.9), 10.0) is None
+    )
+
+
+@pytest.mark.parametrize("b", [0.5, 0.95, 2.0])
+def test_full_memory_binds_at_nyquist(b):
+    K1, B1, alpha = random_sets(128, 3)
+    lower, upper, _, on_grid = map(np.asarray, certified(K1, B1, alpha, b, memory="full", angles=2049))
+    closed = b - np.asarray(passivity.minimum_damping(K1, B1, alpha, memory="full"))
+    np.testing.assert_allclose(closed, on_grid, rtol=1e-10, atol=1e-12)
+    assert np.all((lower <= closed) & (closed <= upper))
+    limit = np.asarray(passivity.largest_K1(B1, alpha, b, memory="full"))
+    np.testing.assert_array_equal(limit >= K1, closed >= 0)
+
+
+@pytest.mark.parametrize(("N", "memory"), [(101, "short"), (100, "short"), (2, "short"), (101, "full")])
+def test_a_witness_creates_the_energy_of_the_formula(N, memory):
+    for K1, B1, alpha in random_sets(8, 4).T:
+        model = model_of(K1, B1, alpha, N, memory)
+        needed = 0.95 - float(passivity.certify(model, 0.95).upper)
+        b = 0.9 * needed
+        found = passivity.witness(model, b)
+        # Σ Δx² of a cycle is 2·(1 - cos θ)·Σ x², and each Δx²/T takes up b - b(θ).
+        angle = found.frequency * model.T
+        short = b - float(passivity.needed_damping(model, found.frequency))
+        squares = 2 * (1 - np.cos(angle)) * np.sum(found.x[1:] ** 2)
+        assert found.energy < 0 and found.lost > 0
+        assert found.energy == pytest.approx(1e-3 * short * squares / model.T, rel=1e-9)
+        assert passivity.witness(model, 1.1 * needed) is None
+
+
+def test_the_witness_is_what_the_recursion_renders():
+    """After a warm-up of many cycles, for a fast set."""
+    for model, b in ((FOSLS(-2.89, 5.7, 5.89, 0.203), 0.9), (FOSLS(0.44, 5.7, 5.89, 0.203, N=100), 0.5)):
+        found = passivity.witness(model, b)
+        cycles = 2 + 2000 // len(found.force)
+        force = np.asarray(model.simulate(np.tile(found.x[:-1], cycles)))[-len(found.force) :]
+        np.testing.assert_allclose(force, found.force, atol=1e-9)
+        taken = np.sum(force * np.diff(found.x) + b / 1000 / model.T * np.diff(found.x) ** 2)
+        assert taken == pytest.approx(found.energy, rel=1e-9)
+
+
+def test_needed_damping_at_both_ends():
+    model = FOSLS(-2.89, 5.7, 5.89, 0.203)
+    found = passivity.needed_damping(model, np.array([0.0, 1e-3, 1e3 * np.pi]))
+    assert found[0] == pytest.approx(float(found[1]), rel=1e-6)
+    assert found[2] == pytest.approx(0.91664, abs=5e-6)

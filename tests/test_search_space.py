@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import qmc
 
-from hilbo import passivity
+from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
 from hilbo.search_space import SEARCH_MARGIN, Mechanics, Parameter, SearchSpace
 
@@ -173,9 +173,72 @@ def test_a_range_of_effective_damping_is_kept(draw):
     space = fosls(effective_damping=(10.0, 80.0))
     x = getattr(space, draw)(500, seed=0)
     assert len(x) == 500 and np.all(space.feasible(x))
+    damping = effective_damping(space, x)
+    assert np.all((damping >= 10 * (1 - 1e-12)) & (damping <= 80 * (1 + 1e-12)))
     assert np.mean(space.feasible(fosls().candidates(500, seed=0))) < 0.9
-    with pytest.raises(InputError, match="effective_damping leaves"):
-        getattr(fosls(effective_damping=(1e7, 1e8)), draw)(500, seed=0)
+    with pytest.raises(InputError, match="effective_damping leaves no parameter set"):
+        fosls(effective_damping=(1e7, 1e8))
+
+
+def effective_damping(space, x):
+    physical = dict(zip(space.names, np.asarray(space.to_physical(x)).T, strict=True))
+    m = space.mechanics
+    return np.asarray(
+        viscoelastic.effective_damping(physical["K1"], physical["B1"], physical["alpha"], m.N, m.T, memory=m.memory)
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_box_of_a_damping_range_reaches_its_walls(dtype):
+    space = fosls(effective_damping=(10.0, 80.0))
+    w = np.random.default_rng(0).random((2000, 3)).astype(dtype)
+    width = np.asarray(
+        space.from_box(np.insert(w[:, 1:], 0, 1, axis=1)) - space.from_box(np.insert(w[:, 1:], 0, 0, axis=1))
+    )
+    some = width[:, 0] > 1e-3
+    assert 0.8 < np.mean(some) < 0.95  # the rest of the columns hold no feasible point, and say so
+    for end in (0, 1):
+        w[:, 0] = end
+        x = space.from_box(w)
+        np.testing.assert_array_equal(space.feasible(x), width[:, 0] > 0)
+        beyond = np.asarray(x).copy()
+        beyond[:, 0] += (2 * end - 1) * 1e-3
+        assert not np.any(np.asarray(space.feasible(beyond)))
+        if dtype is np.float64:
+            np.testing.assert_allclose(space.to_box(x)[some], w[some], atol=1e-10)
+            damping = effective_damping(space, x)[some]
+            held = np.abs(damping / (10, 80)[end] - 1) < 1e-9
+            assert np.mean(held) > 0.1  # the others end at the passive limit, or at the ends of K1
+
+
+@pytest.mark.parametrize(
+    "mechanics",
+    [{}, {"effective_damping": (10.0, 80.0)}, {"memory": "full"}, {"memory": "full", "effective_damping": (1e3, 1e5)}],
+)
+def test_volume_is_the_feasible_share_of_the_box(mechanics):
+    space = fosls(**mechanics)
+    uniform = qmc.Sobol(3, rng=7).random(2**16)
+    assert space.volume() == pytest.approx(np.mean(np.asarray(space.feasible(uniform))), abs=1.5e-3)
+    x = space.candidates(1000, seed=1)
+    assert np.all(space.feasible(x))
+    assert float(space.derived({"K1": 5.0, "B1": 5.0, "alpha": 0.2})["K0"]) == pytest.approx(
+        0.44 if space.mechanics.memory == "full" else -2.53, abs=0.1
+    )
+
+
+def test_volume_of_the_paper_and_of_a_plain_box():
+    assert fosls(0.917 / (1 - SEARCH_MARGIN)).volume() == pytest.approx(0.233, abs=0.002)
+    assert PLAIN.volume() == 1
+
+
+def test_a_damping_range_fills_evenly():
+    space = fosls(effective_damping=(10.0, 80.0))
+    uniform = qmc.Sobol(3, rng=7).random(2**17)
+    accepted, drawn = uniform[np.asarray(space.feasible(uniform))], space.candidates(20_000, seed=3)
+    levels = np.linspace(0.02, 0.98, 25)
+    for column in range(3):
+        shares = np.mean(drawn[:, column, None] <= np.quantile(accepted[:, column], levels), axis=0)
+        np.testing.assert_allclose(shares, levels, atol=6e-3)
 
 
 @pytest.mark.parametrize(

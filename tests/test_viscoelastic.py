@@ -131,8 +131,15 @@ def test_gradients_match_finite_differences(argument):
         assert jax.grad(along)(point[argument]) == pytest.approx(float(difference), rel=1e-7)
 
 
-def test_what_is_not_written_yet_says_so():
-    with pytest.raises(NotImplementedError, match="full"):
-        viscoelastic.dc_gain(0.0, 1.0, 1.0, 0.5, memory="full")
+@pytest.mark.parametrize("alpha", [0.01, 0.3, 1.0])
+def test_full_memory_has_the_gains_of_the_fractional_power(alpha):
+    assert viscoelastic.dc_gain(0.44, 5.7, 5.89, alpha, memory="full") == 0.44
+    assert viscoelastic.K0_from_effective_stiffness(5.7, 5.89, alpha, memory="full") == 0.44
+    assert viscoelastic.effective_damping(5.7, 5.89, 1.0, memory="full") == pytest.approx(5890)
+
+
+def test_a_memory_that_cannot_be_is_refused():
     with pytest.raises(ValueError, match="at least 1"):
         viscoelastic.gl_sum(0.5, 0)
+    with pytest.raises(ValueError, match="one of 8, 10, 12"):
+        viscoelastic.effective_damping(1.0, 1.0, 0.5, memory="full", states=9)
