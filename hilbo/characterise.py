@@ -107,11 +107,15 @@ def _estimates(found, sides, around, seed):
     whole = all(estimate.known for estimate in estimates.values())
     derived = _quantiles(found, around, seed) if whole else {}
     rest = {
-        name: Estimate(number, *derived.get(name, (None, None)), "identified" if whole else "not identifiable")
-        for name, number in found.parameters().items()
-        if name not in labels
+        name: _derived(number, derived.get(name)) for name, number in found.parameters().items() if name not in labels
     }
     return rest | estimates
+
+
+def _derived(value, ends):
+    if ends is None:
+        return Estimate(value, None, None, "not identifiable")
+    return Estimate(value, ends[0], ends[1], "identified")
 
 
 def _status(ok, open_lower, open_upper, held):

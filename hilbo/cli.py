@@ -142,7 +142,7 @@ def _aggregate(study, cohort, folder, seed, say, truth=None) -> dict[str, Any]:
 
     say(f"fitting {len(cohort.names)} participants ({study.name})")
     found = aggregate_cohort(study, cohort, seed)
-    return report.writeresults(study, found, folder, seed, truth, say)
+    return report.write_results(study, found, folder, seed, truth, say)
 
 
 def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:

@@ -90,9 +90,9 @@ def passivity(
     as_json: Json = False,
 ) -> None:
     """Is a parameter set passive on a device, by how much, and what is the largest K1?"""
-    for name, value in (("K1", K1), ("B1", B1), ("alpha", alpha)):
-        if value is None:
-            raise InputError(f"--{name} is missing; a set has --K1, --B1 and --alpha.")
+    if K1 is None or B1 is None or alpha is None:
+        name = "K1" if K1 is None else "B1" if B1 is None else "alpha"
+        raise InputError(f"--{name} is missing; a set has --K1, --B1 and --alpha.")
     _one_of("memory", memory, (None, "short", "full"))
     _positive("T", period)
     _positive("damping", damping)

@@ -1,8 +1,9 @@
 """From creep and relaxation tests to the parameters of the FO-SLS that make the same curves.
 
 What was measured is fitted: the recorded input (position in relaxation, force in creep) goes through a model
-(`sampled`) and its output is compared, so that no ideal step is assumed. Modulus data G(t), J(t) have no input; they are fitted by
-exact forms (`moduli`). A model has four coordinates, bounds and starts; this module brings models and tests together.
+(`sampled`) and its output is compared, so that no ideal step is assumed. Modulus data G(t), J(t) have no input; they
+are fitted by exact forms (`moduli`). A model has four coordinates, bounds and starts; this module brings models and
+tests together.
 
 Residuals are divided by the range of their curve; the cost is the sum over tests of NRMSE².
 Units: N, mm, s; B1 N·s^α/mm. Moduli keep their own unit.

@@ -85,12 +85,9 @@ def least_squares(
         damping = jnp.where(better, eased, jnp.maximum(state.growth * state.damping, eps))
         growth = jnp.where(better, 2, 2 * state.growth)
         reached = (settled & (state.damping < 1)) | (damping > _STALLED)
-        kept = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old),
-            (q, cost, gradient, normal),
-            (state.q, state.cost, state.gradient, state.normal),
-        )
-        return _State(*kept, damping, growth, state.steps + 1, reached)
+        tried = _State(q, cost, gradient, normal, damping, growth, state.steps + 1, reached)
+        stayed = state._replace(damping=damping, growth=growth, steps=state.steps + 1, done=reached)
+        return jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, stayed)
 
     cost, gradient, normal = evaluate(start)
     damping, growth = (jnp.asarray(value, start.dtype) for value in (_FIRST_DAMPING, 2))

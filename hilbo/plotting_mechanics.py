@@ -92,17 +92,23 @@ def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(6.0, 2.9), layout="constrained")
         axes = figure.subplots()
-        taps = [row for row in rows if row.N is not None]
+        taps = [(row.N, row.nrmse) for row in rows if row.N is not None]
         for (kind, colour), marker in zip((("relaxation", BLUE), ("creep", ORANGE)), "os", strict=True):
             if kind not in rows[0].nrmse:
                 continue
-            axes.plot([r.N for r in taps], [100 * r.nrmse[kind] for r in taps], marker=marker, color=colour, label=kind)
+            axes.plot(
+                [N for N, _ in taps],
+                [100 * errors[kind] for _, errors in taps],
+                marker=marker,
+                color=colour,
+                label=kind,
+            )
             for row in rows:
                 if row.N is None:
                     axes.axhline(100 * row.nrmse[kind], color=colour, linestyle=":", label=f"{kind}, full memory")
         axes.axhline(100 * limit, color=GREY, linewidth=0.8, linestyle="--", label=f"{100 * limit:g} %")
         axes.set(xscale="log", yscale="log", xlabel="past samples N", ylabel="NRMSE of the best fit (%)")
-        axes.set_xticks([r.N for r in taps], [str(r.N) for r in taps], minor=False)
+        axes.set_xticks([N for N, _ in taps], [str(N) for N, _ in taps])
         low, high = axes.get_ylim()
         ticks = [t for t in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low <= t <= high]
         axes.set_yticks(ticks, [f"{t:g}" for t in ticks])

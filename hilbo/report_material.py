@@ -202,7 +202,8 @@ def _parameter_row(name, estimate, unit, bootstrap):
     interval = "" if estimate.lower is None and estimate.upper is None else f"{ends[0]} to {ends[1]}"
     boot = (bootstrap or {}).get(name)
     resampled = "" if boot is None else " to ".join(_rounded(end, *boot) for end in boot)
-    head = _SYMBOLS.get(name, name) + (f" ({shown[kind]})" if kind else "")
+    symbol = _SYMBOLS.get(name, name)
+    head = f"{symbol} ({shown[kind]})" if kind else symbol
     row = [head, value, interval]
     return row if bootstrap is None else [*row, resampled if estimate.known else ""]
 

@@ -191,13 +191,13 @@ def _screen(model, curves, scales, grid):
     ends = jnp.eye(2, dtype=grid.dtype)
 
     def place(at):
-        normal, right, total = 0, 0, 0
+        normal, right, total = jnp.zeros((2, 2), grid.dtype), jnp.zeros(2, grid.dtype), jnp.zeros((), grid.dtype)
         for curve, scale, w in zip(curves, scales, weights, strict=True):
             parts = [model.predict(jnp.concatenate([end, at]), curve, w) for end in ends]
             basis = jnp.stack(parts) / (scale * np.sqrt(curve.time.size))
             goal = w @ curve.output / (scale * np.sqrt(curve.time.size))
             normal, right, total = normal + basis @ basis.T, right + basis @ goal, total + goal @ goal
-        (a, b), (_, c) = normal
+        a, b, c = normal[0, 0], normal[0, 1], normal[1, 1]
         K_eff = jnp.maximum((a * right[1] - b * right[0]) / (a * c - b * b), 0)
         stiffness = jnp.stack([(right[0] - b * K_eff) / a, K_eff])
         return total - 2 * right @ stiffness + stiffness @ normal @ stiffness, stiffness

@@ -27,8 +27,8 @@ for test in material.tests:
 
 # %% [markdown]
 # ## Fit
-# One parameter set for both tests, in the memory that will be rendered: N = 101 samples of 1 ms. The recorded input goes
-# through the model, so that the ramp of the test is no problem.
+# One parameter set for both tests, in the memory that will be rendered: N = 101 samples of 1 ms. The recorded input
+# goes through the model, so that the ramp of the test is no problem.
 
 # %%
 found = fit(material.tests, Sampled(N=101, T=1e-3))
