@@ -18,11 +18,11 @@ jax.config.update("jax_enable_x64", True)
 from hilbo.exponentials import decode  # noqa: E402
 
 LONGEST = 10_000
-SAMPLES = np.unique(np.round(np.concatenate([np.arange(40), np.geomspace(40, LONGEST, 200)])).astype(int))
+SAMPLES = np.unique(np.round(np.concatenate([np.arange(40), np.geomspace(40, LONGEST, 200)])))
 
 
 def partial_sums(alpha):
-    return np.cumprod(np.concatenate([[1.0], 1 - alpha / np.arange(1, LONGEST + 1)]))[SAMPLES]
+    return np.cumprod(np.concatenate([[1.0], 1 - alpha / np.arange(1, LONGEST + 1)]))[SAMPLES.astype(int)]
 
 
 @jax.jit

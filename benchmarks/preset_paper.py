@@ -7,7 +7,6 @@ what one gets by averaging the optima, by averaging the maps and by the committe
 """
 
 import argparse
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -45,15 +44,14 @@ def main():
     options.add_argument("--seeds", type=int, default=20)
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    warnings.filterwarnings("ignore", category=DeprecationWarning)
     import jax
-    import jax.numpy as jnp
 
     jax.config.update("jax_enable_x64", True)
     from hilbo.config import Study
+    from hilbo.session import search_points
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
-    candidates = jnp.asarray(study.space.candidates(4096, 0))
+    candidates = search_points(study.space, 0)
     found = [one_study(study, seed, candidates) for seed in range(chosen.seeds)]
     text = report(found)
     print(text)

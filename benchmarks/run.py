@@ -14,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 import time
-import warnings
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -47,7 +46,6 @@ def data():
     import jax.numpy as jnp
     import numpy as np
 
-    warnings.filterwarnings("ignore", category=DeprecationWarning)
     jax.config.update("jax_enable_x64", True)
     from hilbo.config import Study
     from hilbo.ordinal_gp import Trials

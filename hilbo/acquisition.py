@@ -1,7 +1,7 @@
 """Trial selection: scores of candidate renderings from the posterior, and their maximum over a search space.
 
 A score takes the posterior mean and variance of f at one point. The next rendering maximises it over a candidate set
-and is then polished by projected gradient steps in the optimiser's coordinates, in which the feasible set is a cube.
+and is then polished by Newton's method in the optimiser's coordinates, in which the feasible set is a cube.
 
     UCB (paper, section IV-3):   mu + weight * sigma
     log expected improvement:    log( sigma * h((mu - best) / sigma) ),  h(z) = phi(z) + z Phi(z)
@@ -19,15 +19,20 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.linalg import eigh
+from hilbo.newton import TrustRegionNewton
 from hilbo.normal import HALF_LOG_2PI, excess_hazard
 
 __all__ = ["UCB", "Choice", "LogEI", "Mean", "Score", "TopCategory", "maximise", "thompson"]
 
 Score = Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
 """Posterior mean and variance at a point -> how much we want to ask there."""
+
+_STATIONARY = 1e-8  # gradient of the score in the optimiser's coordinates,
+_RESOLUTION = 1e-6  # and the trust radius at a kink of the passive set's wall: in units of the search ranges
 
 
 class UCB(eqx.Module):
@@ -115,8 +120,8 @@ def maximise(
     - `from_box`, `to_box`: between the optimiser's cube, in which everything is feasible, and the unit cube.
     - `feasible`: whether a polished point may be rendered (candidates are known to).
     - `allowed`: which points may be chosen at all, e.g. none too near to earlier ones.
-    - `starts`, `steps`: how many candidates, at least 0.1 apart, are polished, and gradient steps for each; 0 starts
-      means no polishing.
+    - `starts`, `steps`: how many candidates, at least 0.1 apart, are polished, and at most how many Newton steps each
+      may take; 0 starts means no polishing.
     """
     if allowed is not None:
         values = jnp.where(jax.vmap(allowed)(candidates), values, -jnp.inf)
@@ -126,7 +131,8 @@ def maximise(
     best = Choice(candidates[rows[first]], begun[first], rows[first], begun[first])
     if starts == 0:
         return best
-    polished = jax.vmap(functools.partial(_polish, score, from_box, to_box, steps))(candidates[rows])
+    # One after the other: each stops when it is done, where a batch would wait for its slowest.
+    polished = jax.lax.map(functools.partial(_polish, score, from_box, to_box, steps), candidates[rows])
     usable = jax.vmap(lambda x: feasible(x) & (True if allowed is None else allowed(x)))(polished)
     reached = jnp.where(usable, jax.vmap(score)(polished), -jnp.inf)
     top = jnp.argmax(reached)
@@ -151,16 +157,18 @@ def _spread(values, candidates, count, apart=0.1):
 
 
 def _polish(score, from_box, to_box, steps, x):
-    """Projected gradient ascent from `x` within the optimiser's cube, by jaxopt."""
-    from jaxopt import ProjectedGradient  # imported late: not every user of this module polishes
-    from jaxopt.projection import projection_box
-
-    solver = ProjectedGradient(
-        lambda w: -score(from_box(w)), projection_box, maxiter=steps, tol=1e-6, implicit_diff=False
+    """Newton's method from `x` within the optimiser's cube."""
+    begin = to_box(x)
+    bounds = {"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)}
+    solution = optx.minimise(
+        lambda w, _: -score(from_box(w)),
+        TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION),
+        begin,
+        options=bounds,
+        max_steps=steps,
+        throw=False,
     )
-    start = to_box(x)
-    bounds = (jnp.zeros_like(start), jnp.ones_like(start))
-    return from_box(solver.run(start, hyperparams_proj=bounds).params)
+    return from_box(solution.value)
 
 
 def thompson(

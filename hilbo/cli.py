@@ -94,14 +94,13 @@ def robustness(
     """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
     with results(out, force) as folder, progress() as say:
         chosen, cohort = _read(trials, study, material, say)
-        from hilbo import page, report
+        from hilbo.report_robustness import write_robustness
         from hilbo.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
         found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
-        content = report.robustness_result(chosen, cohort, found, seed)
-        (folder / "result.json").write_text(report.as_json(content))
-        (folder / "report.html").write_text(page.robustness_page(chosen, content), encoding="utf-8")
+        say("maps, figures and report")
+        content = write_robustness(chosen, cohort, found, folder, seed)
     finish(content, out, as_json)
 
 

@@ -21,6 +21,7 @@ import equinox as eqx
 import msgspec
 
 from hilbo.errors import InputError
+from hilbo.memory import Memory
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.search_space import Mechanics, Parameter, SearchSpace
 
@@ -60,8 +61,9 @@ class _RendererTable(_Table, frozen=True):
     K_eff: Annotated[_NotNegative, msgspec.Meta(examples=["0.44"])]
     damping: Annotated[_Positive, msgspec.Meta(examples=["0.95"])]
     model: Annotated[Literal["fosls"], _text('"fosls"', '"fosls"')] = "fosls"
-    memory: Annotated[Literal["short"], _text('"short"', '"short"')] = "short"
+    memory: Annotated[Memory, _text('"short" or "full"', '"short"')] = "short"
     N: Annotated[int, msgspec.Meta(ge=1), _text("an odd whole number, 1 or above", "101")] = 101
+    states: Annotated[int, _text("a number of exponentials, for full memory", "10")] = 10
     T: Annotated[_Positive, msgspec.Meta(examples=["0.001"])] = 1e-3
     effective_damping: Annotated[tuple[float, float] | None, _text("a list of two numbers", "[10, 80]")] = None
 
@@ -156,8 +158,8 @@ class Study(eqx.Module):
 
     @staticmethod
     def from_dict(raw: Mapping[str, Any], source: str = "") -> "Study":
-        """As `load`, from the parsed tables."""
-        return _checked(raw, source, "")
+        """As `load`, from the parsed tables; numbers and lists may be NumPy's."""
+        return _checked(_plain(raw), source, "")
 
     @property
     def hash(self) -> str:
@@ -175,6 +177,15 @@ class Study(eqx.Module):
             known = ", ".join(self.materials) or "there are none"
             raise InputError(f"{_prefix(self.source)}materials.{name} is not in the study, its materials: {known}.")
         return _checked(_override({"schema": 1} | json.loads(self.content), name), self.source, "")
+
+
+def _plain(raw):
+    """With Python's own numbers, lists and dicts in place of NumPy's and other mappings."""
+    if isinstance(raw, Mapping):
+        return {key: _plain(value) for key, value in raw.items()}
+    if isinstance(raw, list | tuple):
+        return [_plain(value) for value in raw]
+    return raw.tolist() if hasattr(raw, "tolist") else raw
 
 
 def _checked(raw, source, text):
@@ -201,6 +212,11 @@ def _study(raw, source):
     if len(thresholds) != len(labels) - 1:
         raise InputError(
             f"gp.thresholds has {len(thresholds)} numbers, it must have one fewer than the {len(labels)} responses."
+        )
+    if content.selection.space_filling > content.selection.trials:
+        raise InputError(
+            f"selection.space_filling is {content.selection.space_filling}, it must be at most"
+            f" trials = {content.selection.trials}."
         )
     if any(low >= high for low, high in itertools.pairwise(thresholds)):
         raise InputError(f"gp.thresholds is {_shown(thresholds)}, it must rise from each number to the next.")

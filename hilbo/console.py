@@ -10,7 +10,6 @@ import shutil
 import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated
@@ -27,17 +26,28 @@ Force = Annotated[bool, typer.Option("--force", help="Replace an existing result
 Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
 
 # What the commands write: a folder with anything else in it is never replaced.
-_FIGURES = ("map", "progress", "slices", "optima", "tests", "memory", "passivity", "passive-set", "bode")
+_FIGURES = (
+    "map",
+    "progress",
+    "slices",
+    "optima",
+    "maps",
+    "moves",
+    "tests",
+    "memory",
+    "passivity",
+    "passive-set",
+    "bode",
+)
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
 _WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
-    f"{figure}.{kind}" for figure in _FIGURES for kind in ("png", "svg")
+    f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES for kind in ("png", "svg")
 }
 
 
 def start() -> None:
     """Float64, and compiled functions kept in the user's cache folder from one command to the next."""
-    warnings.filterwarnings("ignore", message=".*no longer maintained.*", category=DeprecationWarning)
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -22,6 +22,7 @@ from typing import Literal
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Real
 
@@ -73,7 +74,7 @@ class FOSLS(eqx.Module):
         span(self.memory, self.N, self.states)
         if not 0 < self.T < math.inf:
             raise InputError(f"T is {self.T} s, it must be a number above 0; write for example T = 0.001.")
-        if not any(isinstance(value, jax.core.Tracer) for value in (self.K0, self.K1, self.B1, self.alpha)):
+        if not any(isinstance(value, Tracer) for value in (self.K0, self.K1, self.B1, self.alpha)):
             _check_values(float(self.K0), float(self.K1), float(self.B1), float(self.alpha), self.memory)
 
     @property

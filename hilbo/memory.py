@@ -101,8 +101,32 @@ def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"
 @partial(jax.jit, static_argnames="N")
 def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
     """C(1), C(-1), their difference and the first moment of one order α, without cancellation."""
-    alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
+    return _gl_sums_derivative(jnp.asarray(alpha, jnp.result_type(1.0, alpha)), N, 0)
 
+
+@partial(jax.custom_jvp, nondiff_argnums=(1, 2))
+def _gl_sums_derivative(alpha, N, order):
+    """The derivative of the sums by α of that order: d/dα is taken once, however many directions α moves in.
+
+    Without this rule a Hessian carries every direction through the N additions, at ten times the time.
+    """
+    function = partial(_gl_sums, N=N)
+    for _ in range(order):
+        function = _derivative(function)
+    return function(alpha)
+
+
+@_gl_sums_derivative.defjvp
+def _gl_sums_derivative_jvp(N, order, primals, tangents):
+    slope = _gl_sums_derivative(*primals, N, order + 1)
+    return _gl_sums_derivative(*primals, N, order), jax.tree.map(lambda part: part * tangents[0], slope)
+
+
+def _derivative(function):
+    return lambda alpha: jax.jvp(function, (alpha,), (jnp.ones_like(alpha),))[1]
+
+
+def _gl_sums(alpha, N):
     def add(sums, i):
         following, tap = _tap(alpha, sums.at_dc, i)
         odd = i % 2 == 1

@@ -218,6 +218,13 @@ def _checked(posterior: Posterior) -> Posterior:
         message = "the Laplace mode was not found to its tolerance; fit with throw=False and read the certificate"
         return eqx.error_if(posterior, ~certificate.converged, message)
     if not bool(certificate.converged):
+        categories = len(posterior.gp.likelihood.thresholds) + 1
+        highest = int(jnp.max(jnp.where(posterior.trials.mask, posterior.trials.q, 0)))
+        if highest >= categories:
+            raise InputError(
+                f"fit: an answer has category {highest}, but the likelihood has {categories - 1} thresholds and so the"
+                f" categories 0 to {categories - 1}; check the answers or the thresholds."
+            )
         raise InferenceError(
             f"the Laplace mode was not found: its residual is {float(certificate.residual):.3g} after"
             f" {int(certificate.iterations)} steps and should be at most {float(certificate.tolerance):.3g}; use a"

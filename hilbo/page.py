@@ -88,9 +88,13 @@ def _study_rows(study):
     mechanics = study.space.mechanics
     if mechanics is not None:
         model = (
-            f"FO-SLS, N = {mechanics.N}, T = {1000 * mechanics.T:g} ms, effective stiffness {mechanics.K_eff:g} N/mm"
+            f"FO-SLS, {_memory(mechanics)}, T = {1000 * mechanics.T:g} ms, effective stiffness {mechanics.K_eff:g} N/mm"
         )
         yield "renderer", f"{model}; the device has {mechanics.damping:g} N·s/m of damping"
+
+
+def _memory(mechanics):
+    return f"N = {mechanics.N}" if mechanics.memory == "short" else f"full memory, {mechanics.states} exponentials"
 
 
 def _passivity_words(margin):
@@ -106,7 +110,7 @@ def _search_words(study):
     if mechanics is None:
         return "The optimum was searched over the whole box."
     return (
-        f"The optimum was searched among the passive parameter sets (FO-SLS, N = {mechanics.N},"
+        f"The optimum was searched among the passive parameter sets (FO-SLS, {_memory(mechanics)},"
         f" T = {1000 * mechanics.T:g} ms, device damping {mechanics.damping:g} N·s/m less 0.1 %), with K0 from the"
         f" effective stiffness {mechanics.K_eff:g} N/mm."
     )
@@ -145,11 +149,39 @@ def _comparison(study, content):
     return {"comparison": rows, "comparison_head": head, "comparison_caption": caption}
 
 
-def robustness_page(study: Study, content: dict[str, Any]) -> str:
+def robustness_page(study: Study, content: dict[str, Any], pictures: list[dict[str, str]]) -> str:
     """One self-contained page of the robustness check."""
-    sheet = template("robustness.html")
-    flagged = [p["participant"] for p in content["participants"] if p["flagged"]]
-    return sheet.render(study=study, content=content, flagged=flagged, names=study.space.names)
+    learned = content["learned"]
+    return template("robustness.html").render(
+        study=study,
+        content=content,
+        flagged=[p["participant"] for p in content["participants"] if p["flagged"]],
+        figures=pictures,
+        head=[_head(study, name) for name in content["fixed"]["parameters"]],
+        optima=[
+            (label, [_number(v) for v in content[key]["parameters"].values()], content[key])
+            for label, key in (("fixed", "fixed"), ("by evidence", "optimised"))
+        ],
+        learned=[(name, _numbers(learned[name])) for name in ("theta", "noise", "thresholds")],
+        sensitivity_head=[_head(study, name) for name in study.space.names],
+        sensitivity=list(_sensitivity_rows(content["sensitivity"])),
+    )
+
+
+_COORDINATES = {"theta": "ln theta", "noise": "ln noise", "first": "lowest threshold", "gaps": "ln gap"}
+
+
+def _sensitivity_rows(blocks):
+    """A row for each hyperparameter, in percent of the search ranges for a change by 0.1."""
+    for name, block in blocks.items():
+        columns = np.atleast_2d(np.asarray(block).T)
+        for i, column in enumerate(columns):
+            label = _COORDINATES[name] + (f" {i + 1}" if len(columns) > 1 else "")
+            yield label, [f"{10 * value:+.2f} %" for value in column]
+
+
+def _numbers(values):
+    return ", ".join(_number(v) for v in np.ravel(values))
 
 
 def template(name: str):

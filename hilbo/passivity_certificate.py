@@ -200,9 +200,7 @@ def _climb(A, B, start, width):
         curved = bend > 0
         return jnp.where(curved, jnp.clip(angle - slope / jnp.where(curved, bend, 1) / N, low, high), angle)
 
-    # At π the slope is 0 even where the largest value is beside it.
-    bent = _ratio(A, B, start)[2] > 0
-    angle = jax.lax.fori_loop(0, 12, step, jnp.where(bent, start, start - width / 2))
+    angle = jax.lax.fori_loop(0, 8, step, start)
     return jnp.where(_ratio(A, B, angle)[0] > _ratio(A, B, start)[0], angle, start)
 
 

@@ -4,11 +4,12 @@ A figure is a function from results to a matplotlib `Figure`; nothing is shown o
 the Okabe-Ito colours, which people with colour-blindness can tell apart. Axes are in physical units.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Float, Int
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
@@ -16,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from hilbo.config import Study
+from hilbo.ordinal_gp import Posterior
 from hilbo.study import Cohort, fit_cohort, population
 
 __all__ = [
@@ -26,6 +28,8 @@ __all__ = [
     "RED",
     "STYLE",
     "map_slices",
+    "maps_beside",
+    "moved_optima",
     "optima_scatter",
     "progress_figure",
     "slices_after",
@@ -71,16 +75,36 @@ def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohor
 
 def slices_after(study: Study, cohort: Cohort, optima: Float[np.ndarray, "k d"], counts: Sequence[int]) -> Figure:
     """The population map after the first `counts` trials of everybody, each at its own optimum (the star)."""
-    posteriors = [fit_cohort(study, cohort.first(n)) for n in counts]
+    return maps_beside(study, {f"{n} trials": fit_cohort(study, cohort.first(n)) for n in counts}, optima)
+
+
+def maps_beside(study: Study, maps: Mapping[str, Posterior], optima: Float[np.ndarray, "k d"]) -> Figure:
+    """Named population maps side by side, each sliced through its own optimum (the star), on one colour scale."""
     if study.space.dim == 1:
-        return _curves_after(study, posteriors, optima, counts)
+        return _curves_beside(study, maps, optima)
     thirds = [float(x[2]) if study.space.dim > 2 else None for x in optima]
-    grids = [_slice(study, p, x, third) for p, x, third in zip(posteriors, optima, thirds, strict=True)]
+    grids = [_slice(study, p, x, third) for p, x, third in zip(maps.values(), optima, thirds, strict=True)]
     figure, panels, draw = _slices(study, grids)
-    for axes, count, x, third, values in zip(panels, counts, optima, thirds, grids, strict=True):
+    for axes, name, x, third, values in zip(panels, maps, optima, thirds, grids, strict=True):
         draw(axes, values)
         _star(axes, study, x)
-        axes.set_title(f"{count} trials" + (f", {_level(study, 2, third)}" if third is not None else ""), fontsize=9)
+        axes.set_title(name + (f", {_level(study, 2, third)}" if third is not None else ""), fontsize=9)
+    return figure
+
+
+def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population_move: float, limit: float) -> Figure:
+    """How far everybody's own optimum moved (dots, in order) and the population's (line), in % of the search ranges."""
+    percent = 100 * np.asarray(moves)
+    order, rows = np.argsort(percent), np.arange(len(percent))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.6, 1.2 + 0.16 * len(percent)), layout="constrained")
+        axes = figure.subplots()
+        axes.scatter(percent[order], rows, s=20, color=np.where(percent[order] < 100 * limit, BLUE, ORANGE), zorder=3)
+        axes.axvline(100 * population_move, color=RED, label="population map")
+        axes.axvline(100 * limit, color=GREY, linestyle="--", linewidth=1, label=f"flagged from {100 * limit:g} %")
+        axes.set_yticks(rows, [names[int(i)] for i in order], fontsize=7)
+        axes.set(xlabel="NRMSE between the optima (%)", xlim=(0, None), ylim=(-0.7, len(percent) - 0.3))
+        figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
 
 
@@ -226,12 +250,12 @@ def _map_curve(study, posteriors, optimum, cohort):
     return figure
 
 
-def _curves_after(study, posteriors, optima, counts):
+def _curves_beside(study, maps, optima):
     with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
-        for posterior, x, count, colour in zip(posteriors, optima, counts, (ORANGE, GREEN, BLUE, RED), strict=False):
+        for (name, posterior), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
             at, mean, _ = _curve(study, posterior)
-            axes.plot(at, mean, color=colour, label=f"{count} trials")
+            axes.plot(at, mean, color=colour, label=name)
             best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
             axes.plot(best, np.interp(best, at, mean), "*", color=colour, markersize=11, markeredgecolor="white")
         axes.autoscale(axis="y")

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from hilbo import passivity
 from hilbo.characterise import Characterisation
@@ -150,7 +150,9 @@ def passivity_figure(model: FOSLS, b: float) -> Figure:
         right.plot(at, curve.real[worst], "o", color=colour, markersize=5, clip_on=False)
         right.set(xlabel="frequency (Hz)", ylabel="damping (N·s/m)", ylim=(-2 * most, 1.5 * most))
         right.set_title(f"{word} {abs(margin):.3f} N·s/m at {at:.0f} Hz")
+        right.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         right.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        right.xaxis.set_minor_formatter(NullFormatter())
         right.legend(frameon=False, loc="lower right")
     return figure
 

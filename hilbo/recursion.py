@@ -23,7 +23,7 @@ from hilbo.memory import Span, gl_coefficients
 
 __all__ = ["BLOCK", "past_of"]
 
-BLOCK = 64
+BLOCK = 32
 """Samples at once."""
 
 
@@ -72,11 +72,12 @@ def _means(alpha, before, span, block):
     """The same for exponentials: |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
     weight, loss = exponentials(alpha, span.states)
     # As products, which have derivatives at λ = 0.
-    powers = jnp.cumprod(jnp.concatenate([jnp.ones_like(loss)[None], jnp.tile(1 - loss, (block, 1))]), axis=0)
-    carry, entry = weight[None, :] * powers[:-1], loss[:, None] * powers[:-1][::-1].T
+    powers = jnp.cumprod(jnp.concatenate([jnp.ones_like(loss)[None], jnp.tile(1 - loss, (block - 1, 1))]), axis=0)
+    carry, entry = weight[None, :] * powers, loss[:, None] * powers[::-1].T
+    decay = jnp.sum(entry, axis=1)  # 1 - λ^m, with all its digits where λ is close to 1
 
     def write(state, y):
-        return powers[-1] * state + entry @ y
+        return state + (entry @ y - decay * state)
 
     return carry @ loss, carry, write, jnp.full(span.states, before)
 

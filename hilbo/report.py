@@ -10,6 +10,7 @@ import io
 import json
 import math
 import platform
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +18,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+import xarray as xr
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from hilbo.config import Study
+from hilbo.ordinal_gp import Posterior
 from hilbo.page import results_page
-from hilbo.study import Aggregate, population, progress
+from hilbo.study import Aggregate, Optimum, population, progress
 
-__all__ = ["K0_range", "as_json", "misses", "result", "set_of", "write_results"]
+__all__ = [
+    "K0_range",
+    "as_json",
+    "map_dataset",
+    "misses",
+    "optimum_content",
+    "result",
+    "save_figures",
+    "set_of",
+    "versions",
+    "write_results",
+]
 
 _MAP_CELLS = 41
 
@@ -104,14 +118,14 @@ def result(
             {
                 "participant": name,
                 "trials": trials,
-                "optimum": _optimum(study, jax.tree.map(lambda leaf, j=j: leaf[j], aggregate.individuals)),
+                "optimum": optimum_content(study, jax.tree.map(lambda leaf, j=j: leaf[j], aggregate.individuals)),
                 "certificate": fields,
             }
         )
     content = {
-        "optimum": _optimum(study, aggregate.optimum),
+        "optimum": optimum_content(study, aggregate.optimum),
         "participants": people,
-        "alternatives": {name: _optimum(study, found) for name, found in aggregate.alternatives.items()},
+        "alternatives": {name: optimum_content(study, found) for name, found in aggregate.alternatives.items()},
         "mean_of_optima": {
             "parameters": set_of(study, aggregate.mean_of_optima),
             "passivity_margin": margin_of(study, aggregate.mean_of_optima),
@@ -137,7 +151,8 @@ def _not_converged(names):
     )
 
 
-def _optimum(study, found):
+def optimum_content(study: Study, found: Optimum) -> dict[str, Any]:
+    """An optimum as result.json holds it."""
     labels = study.responses
     return {
         "parameters": set_of(study, found.x),
@@ -185,10 +200,19 @@ def write_results(
     (folder / "result.json").write_text(as_json(content))
     _optima_table(content).to_csv(folder / "optima.csv", index=False)
     say("the population map on a grid")
-    _map(study, aggregate, content).to_netcdf(folder / "map.nc", engine="h5netcdf")
+    data = map_dataset(study, aggregate.posteriors, aggregate.optimum.x)
+    data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
+    data.to_netcdf(folder / "map.nc", engine="h5netcdf")
     say("progress of the optimum over trials")
     figures = _figures(study, aggregate, seed, truth)
     say("figures and report")
+    pictures = save_figures(figures, folder)
+    (folder / "report.html").write_text(results_page(study, content, pictures), encoding="utf-8")
+    return content
+
+
+def save_figures(figures: Mapping[str, tuple[Any, str, str]], folder: Path) -> list[dict[str, str]]:
+    """Write name -> (figure, title, caption) as PNG and SVG; returns what a page needs to hold them."""
     pictures = []
     for name, (figure, title, caption) in figures.items():
         figure.savefig(folder / f"{name}.svg")
@@ -197,8 +221,7 @@ def write_results(
         (folder / f"{name}.png").write_bytes(buffer.getvalue())
         png = base64.b64encode(buffer.getvalue()).decode()
         pictures.append({"png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
-    (folder / "report.html").write_text(results_page(study, content, pictures), encoding="utf-8")
-    return content
+    return pictures
 
 
 def _optima_table(content):
@@ -208,21 +231,20 @@ def _optima_table(content):
     return pd.DataFrame(rows)
 
 
-def _map(study, aggregate, content):
-    """The population map as an xarray Dataset: on a grid of all dimensions, or of the first two beyond three."""
-    import xarray as xr
-
+def map_dataset(study: Study, posteriors: Posterior, at: Float[Array, " d"]) -> xr.Dataset:
+    """The population map on a grid of all dimensions, or of the first two where there are more than three (then
+    through the point `at` of the unit cube)."""
     parameters = study.space.parameters
     shown = parameters if len(parameters) <= 3 else parameters[:2]
     side = np.linspace(0.0, 1.0, _MAP_CELLS)
-    x = np.tile(np.asarray(aggregate.optimum.x), (*(_MAP_CELLS,) * len(shown), 1))
+    x = np.tile(np.asarray(at), (*(_MAP_CELLS,) * len(shown), 1))
     for i, grid in enumerate(np.meshgrid(*(side,) * len(shown), indexing="ij")):
         x[..., i] = grid
     flat = jnp.asarray(x.reshape(-1, len(parameters)))
-    mean, variance = population(aggregate.posteriors, flat)
+    mean, variance = population(posteriors, flat)
     names = [p.name for p in shown]
     shape = x.shape[:-1]
-    data = xr.Dataset(
+    return xr.Dataset(
         {
             "mean": (names, np.asarray(mean).reshape(shape), {"long_name": "perceived realism, posterior mean"}),
             "variance": (
@@ -237,13 +259,8 @@ def _map(study, aggregate, content):
             ),
         },
         coords={p.name: (p.name, np.asarray(p.to_physical(jnp.asarray(side))), {"units": p.unit}) for p in shown},
-        attrs={
-            "study": content["study"],
-            "rule": content["rule"],
-            "optimum": json.dumps(content["optimum"]["parameters"]),
-        },
+        attrs={"study": study.hash},
     )
-    return data
 
 
 def _figures(study, aggregate, seed, truth):
@@ -306,39 +323,4 @@ def _captions(study, truth):
             "Each dot is one participant's own optimum. Where the dots scatter widely, their plain mean need not be"
             " good for anybody.",
         ),
-    }
-
-
-def robustness_result(study: Study, cohort, found, seed: int) -> dict[str, Any]:
-    """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
-    learned, people = found.learned, len(cohort.names)
-    stacked = [np.broadcast_to(np.asarray(part), (people,)) for part in (learned.converged, learned.runaway)]
-    rows = [
-        {
-            "participant": name,
-            "nrmse": float(found.individual_nrmse[j]),
-            "flagged": bool(found.flagged_individuals[j]),
-            "converged": bool(stacked[0][j]),
-            "runaway": bool(stacked[1][j]),
-        }
-        for j, name in enumerate(cohort.names)
-    ]
-    model = learned.gp
-    return {
-        "fixed": _optimum(study, found.fixed),
-        "optimised": _optimum(study, found.optimised),
-        "nrmse": float(found.nrmse),
-        "flagged": bool(found.flagged),
-        "participants": rows,
-        "learned": {
-            "parameters": list(learned.learn),
-            "shared": found.shared,
-            "theta": np.asarray(model.kernel.theta).tolist(),
-            "noise": np.asarray(model.likelihood.noise).tolist(),
-            "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
-        },
-        "sensitivity": {name: np.asarray(block).tolist() for name, block in found.sensitivity.items()},
-        "study": study.hash,
-        "seed": seed,
-        "versions": versions(),
     }

@@ -16,8 +16,8 @@ from jaxtyping import Array, Bool, Float
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.hyperparameters import Learned, maximise_evidence, maximise_shared_evidence, optimum_sensitivity
-from hilbo.ordinal_gp import fit
-from hilbo.session import CANDIDATES
+from hilbo.ordinal_gp import Posterior, fit
+from hilbo.session import search_points
 from hilbo.study import Cohort, Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
 
 __all__ = ["LIMIT", "Robustness", "robustness"]
@@ -35,6 +35,10 @@ class Robustness(eqx.Module):
     optimised: Optimum
     fixed_individuals: Optimum
     optimised_individuals: Optimum
+    posteriors: Posterior
+    """Of all participants, under the fixed hyperparameters,"""
+    posteriors_learnt: Posterior
+    """and under the learnt ones."""
     nrmse: Float[Array, ""]
     """Between the population optima."""
     individual_nrmse: Float[Array, " M"]
@@ -69,7 +73,7 @@ def robustness(
     """
     if "variance" in learn:
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
-    candidates = jnp.asarray(study.space.candidates(CANDIDATES, seed))
+    candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
     learned = _learn(study.gp, cohort.trials, tuple(learn), shared, weak_priors)
     if shared:
@@ -86,6 +90,8 @@ def robustness(
         optimised=optimised,
         fixed_individuals=before,
         optimised_individuals=after,
+        posteriors=posteriors,
+        posteriors_learnt=again,
         nrmse=nrmse(optimised.x, fixed.x),
         individual_nrmse=jnp.sqrt(jnp.mean((after.x - before.x) ** 2, axis=1)),
         sensitivity=_sensitivity(study, cohort.trials, fixed.x, tuple(learn)),

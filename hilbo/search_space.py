@@ -19,7 +19,7 @@ device that checks passivity again in float32 never refuses a proposal.
 
 import functools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Literal
 
 import equinox as eqx
@@ -32,6 +32,7 @@ from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
 from hilbo.exponentials import STATES
 from hilbo.memory import Memory, span, sums
+from hilbo.space_filling import latin_chunks, sobol_chunks, take, wall_chunks
 
 __all__ = ["SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace"]
 
@@ -43,8 +44,6 @@ SEARCH_MARGIN = 1e-3
 _CELLS = 256
 _ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
 _COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
-_LARGEST_CHUNK = 2**18
-_LEAST_SHARE = 1e-4
 # The map puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse them.
 _ROUNDING = 64
 
@@ -240,7 +239,12 @@ class SearchSpace(eqx.Module):
 
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol')."""
-        return _fill(self, m, _sobol_chunks(self.dim, m, seed))
+        return _take(self, m, sobol_chunks(self.dim, m, seed))
+
+    def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
+        """`m` points on the walls, edges and corners of the feasible set, the passive boundary included."""
+        count = 2 ** max(m - 1, 0).bit_length()
+        return _take(self, m, sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed))
 
     def latin_hypercube(self, n: int, seed: int) -> Float[np.ndarray, "n d"]:
         """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
@@ -248,7 +252,7 @@ class SearchSpace(eqx.Module):
         Points that fall outside the feasible set (a few, at the foot of infeasible columns) are replaced from further
         hypercubes, at the price of the even spread.
         """
-        return _fill(self, n, _latin_chunks(self.dim, n, seed))
+        return _take(self, n, latin_chunks(self.dim, n, seed))
 
     def _index(self, name):
         return self.names.index(name)
@@ -271,8 +275,7 @@ class SearchSpace(eqx.Module):
         first, last = _K1_range(m, B1, alpha)
         low, high = K1.to_unit(jnp.clip(first, K1.low, K1.high)), K1.to_unit(jnp.clip(last, K1.low, K1.high))
         high = jnp.minimum(high, self._limit(m, x))
-        empty = (first > K1.high) | (last < K1.low) | (high <= low)
-        return low, jnp.where(empty, 0, high - low)
+        return low, jnp.maximum(high - low, 0)
 
 
 def _K1_range(m, B1, alpha):
@@ -349,36 +352,19 @@ def _from_box(space, w):
     return x, space.feasible(x)
 
 
-def _fill(space, count, chunks):
-    """The first `count` feasible points out of chunks of uniform numbers."""
-    kept, found, tried = [], 0, 0
-    while found < count:
-        x, feasible = map(np.asarray, _from_box(space, _rosenblatt(space, next(chunks))))
-        kept.append(x[feasible])
-        found, tried = found + len(kept[-1]), tried + len(x)
-        if tried > 10 / _LEAST_SHARE and found < _LEAST_SHARE * tried:
-            raise InputError(
-                f"renderer.effective_damping leaves {found} of {tried} passive points, too few to search; widen it."
-            )
-    return np.concatenate(kept)[:count] if kept else np.zeros((0, space.dim))
+def _take(space, count, chunks, hold=None):
+    """The first `count` feasible points out of chunks of uniform numbers, some coordinates held at an end."""
 
+    def place(uniform):
+        w = _rosenblatt(space, uniform)
+        if hold is not None:
+            ends = next(hold)
+            w = np.where(np.isnan(ends), w, ends)
+        return _from_box(space, w)
 
-def _sobol_chunks(dim, count, seed) -> Iterator[np.ndarray]:
-    from scipy.stats import qmc  # slow to import, and only this function needs it
-
-    engine = qmc.Sobol(dim, rng=np.random.default_rng(seed))
-    for size in _chunk_sizes(2 ** max(count - 1, 0).bit_length()):
-        yield engine.random(size)
-
-
-def _latin_chunks(dim, count, seed) -> Iterator[np.ndarray]:
-    rng = np.random.default_rng(seed)
-    for size in _chunk_sizes(max(count, 1)):
-        strata = rng.permuted(np.tile(np.arange(size), (dim, 1)), axis=1).T
-        yield (strata + rng.random((size, dim))) / size
-
-
-def _chunk_sizes(size):
-    while True:
-        yield size
-        size = max(size, min(16 * size, _LARGEST_CHUNK))
+    kept, found, tried = take(count, chunks, place)
+    if found < count:
+        raise InputError(
+            f"renderer.effective_damping leaves {found} of {tried} passive points, too few to search; widen it."
+        )
+    return np.concatenate(kept) if kept else np.zeros((0, space.dim))

@@ -23,11 +23,21 @@ from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.kernels import gram
 from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.search_space import SearchSpace
 
-__all__ = ["CANDIDATES", "Design", "Session", "best_point", "design", "next_point", "physical_trials"]
+__all__ = [
+    "CANDIDATES",
+    "Design",
+    "Session",
+    "best_point",
+    "design",
+    "next_point",
+    "physical_trials",
+    "search_points",
+]
 
 CANDIDATES = 4096
-"""Points among which the acquisition function is maximised before polishing."""
+"""Points inside the feasible set among which a function is maximised before polishing; a quarter more on its walls."""
 _JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
 
 
@@ -39,12 +49,17 @@ class Design(eqx.Module):
     key: PRNGKeyArray
 
 
-def design(study: Study, seed: int, candidates: int = CANDIDATES) -> Design:
+def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Float[Array, "m d"]:
+    """Points of the unit cube among which to look for a maximum: `count` inside the feasible set, a quarter of that
+    on its walls, edges and corners."""
+    return jnp.concatenate([jnp.asarray(space.candidates(count, seed)), jnp.asarray(space.walls(count // 4, seed))])
+
+
+def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
     """The seeded part of a session: space-filling points (s, d) and candidates (m, d), in the unit cube."""
-    first = min(study.selection.space_filling, study.selection.trials)
     return Design(
-        jnp.asarray(study.space.latin_hypercube(first, seed)),
-        jnp.asarray(study.space.candidates(candidates, seed)),
+        jnp.asarray(study.space.latin_hypercube(study.selection.space_filling, seed)),
+        search_points(study.space, seed, count),
         jax.random.key(seed),
     )
 
@@ -82,7 +97,6 @@ def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d
         from_box=study.space.from_box,
         to_box=study.space.to_box,
         feasible=study.space.feasible,
-        steps=300,
     )
 
 

@@ -22,7 +22,7 @@ from hilbo import acquisition, bcm
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
-from hilbo.session import CANDIDATES, best_point, physical_trials
+from hilbo.session import best_point, physical_trials, search_points
 
 __all__ = [
     "Aggregate",
@@ -190,7 +190,7 @@ def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: 
     `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
     finds them in `posteriors.certificate`.
     """
-    candidates = jnp.asarray(study.space.candidates(CANDIDATES, seed))
+    candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
     others = {}
     if alternatives:
@@ -213,7 +213,7 @@ def progress(
 ) -> tuple[Float[Array, "p d"], Float[Array, "p M d"]]:
     """Optima (unit cube) after the first 1, 2, ... trials: of the population map (p, d), and of everybody (p, M, d)."""
     counts = range(1, int(cohort.counts().max()) + 1) if prefixes is None else prefixes
-    candidates = jnp.asarray(study.space.candidates(CANDIDATES, seed))
+    candidates = search_points(study.space, seed)
     return _progress(study, cohort.trials, candidates, jnp.asarray(list(counts)))
 
 

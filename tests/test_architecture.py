@@ -17,13 +17,14 @@ EVERYWHERE = {"errors", "normal", "linalg"}  # may be imported by every module, 
 MATHS = {
     "normal": set(),
     "linalg": set(),
+    "newton": set(),
     "kernels": set(),
     "likelihoods": set(),
     "laplace": set(),
     "ep": set(),
     "exact": set(),
     "bcm": set(),
-    "acquisition": set(),
+    "acquisition": {"newton"},
     "mittag_leffler": set(),
     "exponentials": set(),
     "memory": {"exponentials"},
@@ -34,7 +35,7 @@ MATHS = {
     "switching": {"fosls"},
     "viscoelastic": {"fosls", "continuous", "materials", "switching"},
     "ordinal_gp": {"kernels", "likelihoods", "laplace", "ep", "exact"},
-    "hyperparameters": {"ordinal_gp"},
+    "hyperparameters": {"ordinal_gp", "newton"},
     "passivity_certificate": {"viscoelastic"},
     "passivity": {"viscoelastic", "passivity_certificate"},
     "least_squares": set(),
@@ -44,7 +45,8 @@ MATHS = {
     "intervals": {"identification", "least_squares"},
     "memory_selection": {"sampled"},
     "characterise": {"intervals", "memory_selection", "moduli", "passivity"},
-    "search_space": {"viscoelastic", "passivity"},
+    "space_filling": set(),
+    "search_space": {"viscoelastic", "passivity", "space_filling"},
     "session": {"config", "ordinal_gp", "acquisition", "search_space"},
     "simulate": {"session"},
     "validation": {"study"},
@@ -67,6 +69,7 @@ MAY_IMPORT = MATHS | {
     "hardware_bridge": {"protocol"},
 }
 MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material"}
+MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)

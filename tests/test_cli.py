@@ -76,7 +76,17 @@ def test_robustness_writes_its_check(capsys, monkeypatch, tmp_path):
     content = json.loads((out / "result.json").read_text())
     assert content["learned"]["parameters"] == ["theta", "noise"]
     assert np.isfinite(content["nrmse"])
-    assert "robust" in (out / "report.html").read_text()
+    page = (out / "report.html").read_text()
+    assert "robust" in page and page.count("data:image/png;base64,") == 2
+    assert all((out / f"{name}.{kind}").stat().st_size for name in ("maps", "moves") for kind in ("png", "svg"))
+    data = xr.load_dataset(out / "map.nc", engine="h5netcdf")
+    assert data["hyperparameters"].values.tolist() == ["fixed", "by evidence"]
+    assert float(abs(data["mean"][0] - data["mean"][1]).max()) > 0.01
+    code, _, _ = run(
+        capsys, monkeypatch, "robustness", tmp_path / "two.csv", *VIDEO[1:], "--out", out, "--own", "--force"
+    )
+    assert code == 0
+    assert json.loads((out / "result.json").read_text())["learned"]["shared"] is False
 
 
 STUDY = Path("hilbo/data/paper.toml").read_text()

@@ -200,7 +200,8 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ("N = 101", "N = 101.5", "21: renderer.N is 101.5, it must be an odd whole number, 1 or above; "),
     ("T = 0.001", "T = 0", "22: renderer.T is 0, it must be a number above 0; "),
     ("K_eff = 0.44", "K_eff = -1", "23: renderer.K_eff is -1, it must be a number, 0 or above; "),
-    ('memory = "short"', 'memory = "full"', '20: renderer.memory is "full", it must be "short"; '),
+    ('memory = "short"', 'memory = "long"', '20: renderer.memory is "long", it must be "short" or "full"; '),
+    ('memory = "short"', 'memory = "full"\nstates = 9', "21: renderer.states is 9, it must be one of 8, 10, 12."),
     ("damping = 0.95\n", "", "18: renderer.damping is missing, add it."),
     ("damping = 0.95", "damping = 0.1", "24: renderer.damping is 0.1 N.s/m, with which no K1 from 1.0 N/mm up is "),
     (
@@ -210,6 +211,7 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ),
     ("damping = 0.95", "damping = 0.95\neffective_damping = 10", "25: renderer.effective_damping is 10, it must be a "),
     ("trials = 25", "trials = 2.5", "33: selection.trials is 2.5, it must be a whole number, 1 or above; "),
+    ("trials = 25", "trials = 4", "32: selection.space_filling is 5, it must be at most trials = 4."),
     ('"ucb"', '"best"', '34: selection.acquisition is "best", it must be one of "ucb", '),
     ("weight = 0.7", "weight = -1", "35: selection.weight is -1, it must be a number, 0 or above; "),
     ('rule = "bcm"', 'rule = "mean"', '37: aggregation.rule is "mean", it must be "bcm"; '),
@@ -230,6 +232,13 @@ def test_a_bad_file_gets_one_sentence_with_its_place(load, old, new, sentence):
     message = str(caught.value)
     assert message.startswith(f"study.toml:{sentence}"), message
     assert message.endswith(".") and "\n" not in message
+
+
+def test_tables_may_hold_numpys_numbers():
+    raw = tomllib.loads(GOOD)
+    raw["gp"] |= {"thresholds": np.array([-0.5, 0.5]), "noise": np.float64(0.5), "theta": np.float32(30)}
+    raw["selection"]["trials"] = np.int64(25)
+    assert Study.from_dict(raw).hash == Study.from_dict(tomllib.loads(GOOD)).hash
 
 
 def test_a_table_must_be_a_table():

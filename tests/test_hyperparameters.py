@@ -96,3 +96,11 @@ def test_the_optimum_moves_as_its_derivative_says(checked):
     middle = float(jnp.log(study.gp.likelihood.noise))
     moved = (optimum(middle + step) - optimum(middle - step)) / (2 * step)
     np.testing.assert_allclose(found.sensitivity["noise"], moved, atol=1e-3)
+
+
+def test_a_hyperparameter_without_influence_is_said_to_run_away():
+    _, gp, _ = problem()
+    single = Trials.from_arrays(np.full((1, 3), 0.4), np.array([1]), 25)
+    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("theta",), starts=1))(single)
+    assert bool(learned.converged)
+    assert bool(learned.runaway)

@@ -284,3 +284,10 @@ def test_a_failed_fit_says_so():
     with pytest.raises(Exception, match="read the certificate") as caught:
         jax.block_until_ready(eqx.filter_jit(lambda t: fit(gp, t).log_evidence)(answers(data)))
     assert not isinstance(caught.value, InferenceError)
+
+
+def test_a_category_that_the_model_lacks_is_named():
+    gp = OrdinalGP(RBF(30.0, 1.0), OrdinalProbit((-0.5, 0.5), 0.5))
+    trials = Trials.from_arrays(np.full((2, 3), 0.5), np.array([1, 3]))
+    with pytest.raises(InputError, match="an answer has category 3, but the likelihood has 2 thresholds and so"):
+        fit(gp, trials)

@@ -168,6 +168,28 @@ def test_candidates_have_low_discrepancy():
     np.testing.assert_array_equal(counts, np.ones((32, 32)))
 
 
+@pytest.mark.parametrize("space", [PLAIN, fosls(), fosls(0.5), fosls(effective_damping=(10.0, 80.0))])
+def test_wall_points_lie_on_every_wall_of_the_feasible_set(space):
+    x = space.walls(2000, seed=0)
+    assert x.shape == (2000, space.dim) and np.all(space.feasible(x))
+    w = np.asarray(space.to_box(x))
+    at_end = np.minimum(np.abs(w), np.abs(1 - w)) < 1e-9
+    assert np.all(at_end.any(axis=1))
+    assert 0.05 < np.mean(at_end.sum(axis=1) > 1) < 0.5  # some on edges
+    for column in range(space.dim):
+        for end in (0, 1):
+            held = np.random.default_rng(column).random((1000, space.dim))
+            held[:, column] = end
+            # Some walls, as B1 = 0 where damping is asked for, hold nothing feasible.
+            feasible = np.mean(np.asarray(space.feasible(space.from_box(held)))) > 0.1
+            assert (np.mean(np.abs(w[:, column] - end) < 1e-9) > 0.02) == feasible
+    np.testing.assert_array_equal(space.walls(2000, seed=0), x)
+
+
+def test_walls_of_one_parameter_are_its_ends():
+    assert set(SearchSpace((Parameter("p", 0, 1),)).walls(8, seed=0).ravel()) == {0.0, 1.0}
+
+
 @pytest.mark.parametrize("draw", ["candidates", "latin_hypercube"])
 def test_a_range_of_effective_damping_is_kept(draw):
     space = fosls(effective_damping=(10.0, 80.0))

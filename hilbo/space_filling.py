@@ -1,0 +1,67 @@
+"""Streams of points in the unit cube, in chunks of growing size, from which a search space takes those it can use.
+
+Low-discrepancy points (scrambled Sobol'), Latin hypercubes, and points on the walls, edges and corners: a function
+that grows away from the data has its maximum there, and no number of points inside finds it.
+"""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+__all__ = ["latin_chunks", "sobol_chunks", "take", "wall_chunks"]
+
+Chunks = Iterator[Float[np.ndarray, "n d"]]
+
+LEAST_SHARE = 1e-4
+"""`take` gives up where fewer of the points are usable."""
+_LARGEST_CHUNK = 2**18
+_HELD = (0.7, 0.2, 0.1)  # shares of the wall points with one, two and three coordinates at an end
+
+
+def take(
+    count: int, chunks: Chunks, place: Callable[[np.ndarray], tuple[Float[np.ndarray, "n d"], Bool[np.ndarray, " n"]]]
+) -> tuple[list[Float[np.ndarray, "_ d"]], int, int]:
+    """The first `count` usable points, in parts; how many were found, and how many were tried.
+
+    `place` turns a chunk into points and says which are usable. Fewer than `count` are found only where less than
+    `LEAST_SHARE` is usable.
+    """
+    kept, found, tried = [], 0, 0
+    while found < count and not (tried > 10 / LEAST_SHARE and found < LEAST_SHARE * tried):
+        points, usable = map(np.asarray, place(next(chunks)))
+        kept.append(points[usable][: count - found])
+        found, tried = found + len(kept[-1]), tried + len(points)
+    return kept, found, tried
+
+
+def sobol_chunks(dim: int, count: int, seed: int) -> Chunks:
+    """Scrambled Sobol' points, about `count` in the first chunk."""
+    from scipy.stats import qmc  # slow to import, and only this module needs it
+
+    engine = qmc.Sobol(dim, rng=np.random.default_rng(seed))
+    for size in _sizes(2 ** max(count - 1, 0).bit_length()):
+        yield engine.random(size)
+
+
+def latin_chunks(dim: int, count: int, seed: int) -> Chunks:
+    """Latin hypercubes, the first of `count` points."""
+    rng = np.random.default_rng(seed)
+    for size in _sizes(max(count, 1)):
+        strata = rng.permuted(np.tile(np.arange(size), (dim, 1)), axis=1).T
+        yield (strata + rng.random((size, dim))) / size
+
+
+def wall_chunks(dim: int, count: int, seed: int) -> Chunks:
+    """What is held at 0 or 1, NaN where a coordinate is free: one or more of each point's, drawn at random."""
+    rng = np.random.default_rng(seed)
+    shares = np.array(_HELD[:dim]) / sum(_HELD[:dim])
+    for size in _sizes(max(count, 1)):
+        held = np.argsort(rng.random((size, dim)), axis=1) < rng.choice(len(shares), size, p=shares)[:, None] + 1
+        yield np.where(held, rng.integers(0, 2, (size, dim)), np.nan)
+
+
+def _sizes(size: int) -> Iterator[int]:
+    while True:
+        yield size
+        size = max(size, min(16 * size, _LARGEST_CHUNK))

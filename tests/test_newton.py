@@ -1,0 +1,77 @@
+"""Newton's method in a box: valleys, saddles, walls, and starts from which nothing can be done."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+from jaxopt import ProjectedGradient
+from jaxopt.projection import projection_box
+
+from hilbo.newton import TrustRegionNewton
+
+
+def rosenbrock(y, _):
+    return (1 - y[0]) ** 2 + 100 * (y[1] - y[0] ** 2) ** 2
+
+
+def saddle(y, _):
+    return (y[0] ** 2 - 1) ** 2 + y[0] * 1e-3 + y[1] ** 2
+
+
+def walled(y, _):
+    return jnp.where(y[0] < 0.1, jnp.nan, y[0] - jnp.log(y[0])) + (y[1] - 2) ** 2
+
+
+@pytest.mark.parametrize(
+    ("function", "start", "end"),
+    [(rosenbrock, (-1.2, 1.0), (1.0, 1.0)), (saddle, (0.0, 1.0), (-1.000125, 0.0)), (walled, (0.2, 9.0), (1.0, 2.0))],
+)
+def test_the_search_follows_valleys_leaves_saddles_and_turns_at_walls(function, start, end):
+    solver = TrustRegionNewton(atol=1e-9)
+    solution = optx.minimise(function, solver, jnp.array(start), max_steps=60, throw=False)
+    np.testing.assert_allclose(solution.value, end, atol=1e-6)
+    assert bool(solution.result == optx.RESULTS.successful)
+
+
+def test_a_search_that_cannot_begin_ends_where_it_began():
+    solution = optx.minimise(walled, TrustRegionNewton(), jnp.array([0.0, 2.0]), max_steps=60, throw=False)
+    np.testing.assert_array_equal(solution.value, [0.0, 2.0])
+    assert not np.isfinite(solution.state.here.value)
+
+
+def bumps(y, centres):
+    """A smooth function with many minima."""
+    return -jnp.sum(jnp.exp(-8.0 * jnp.sum((y[None, :] - centres) ** 2, axis=1)) * jnp.arange(1.0, 6.0))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_end_in_a_box_is_a_minimum_that_jaxopt_cannot_better(seed):
+    rng = np.random.default_rng(seed)
+    centres, start = jnp.asarray(rng.uniform(-0.3, 1.3, (5, 3))), rng.uniform(size=3)
+    box = {"lower": jnp.zeros(3), "upper": jnp.ones(3)}
+    solution = optx.minimise(
+        bumps, TrustRegionNewton(atol=1e-9), jnp.asarray(start), centres, options=box, max_steps=60, throw=False
+    )
+    end = np.asarray(solution.value)
+    assert bool(solution.result == optx.RESULTS.successful)
+    assert np.all((end >= 0) & (end <= 1))
+    reference = ProjectedGradient(lambda y: bumps(y, centres), projection_box, maxiter=500, tol=1e-9)
+    again = reference.run(jnp.asarray(end), hyperparams_proj=(jnp.zeros(3), jnp.ones(3)))
+    assert float(solution.state.here.value) <= float(bumps(again.params, centres)) + 1e-12
+
+
+def test_a_start_at_a_wall_may_leave_it():
+    box = {"lower": jnp.zeros(2), "upper": jnp.ones(2)}
+    solution = optx.minimise(
+        lambda y, _: jnp.sum((y - jnp.array([0.5, -1.0])) ** 2), TrustRegionNewton(), jnp.array([1.0, 1.0]), options=box
+    )
+    np.testing.assert_allclose(solution.value, [0.5, 0.0], atol=1e-9)
+
+
+def test_every_lane_of_a_batch_ends():
+    starts = jnp.array([[-1.2, 1.0], [3.0, 3.0], [0.0, jnp.nan]])
+    solve = jax.vmap(lambda y: optx.minimise(rosenbrock, TrustRegionNewton(), y, max_steps=80, throw=False).value)
+    ends = solve(starts)
+    np.testing.assert_allclose(ends[:2], 1.0, atol=1e-5)
+    assert not np.isfinite(ends[2]).all()
