@@ -26,19 +26,8 @@ Force = Annotated[bool, typer.Option("--force", help="Replace an existing result
 Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
 
 # What the commands write: a folder with anything else in it is never replaced.
-_FIGURES = (
-    "map",
-    "progress",
-    "slices",
-    "optima",
-    "maps",
-    "moves",
-    "tests",
-    "memory",
-    "passivity",
-    "passive-set",
-    "bode",
-)
+_FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
+_MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
 _WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
