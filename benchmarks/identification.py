@@ -9,7 +9,7 @@
 
 Every simulated data set is the set S of the paper (N = 101) under both loads, as a device would apply them (ramps of
 20 ms), each with 16 repeats and noise of 4 % of the curve's range if it is white, of 1 % if it is AR(1) with 0.9 from
-one ms to the next, which leaves the data about as much to say.
+one ms to the next, which leaves the data about as much to say. `loud` is AR(1) noise of 4 %.
 """
 
 import argparse
@@ -26,7 +26,9 @@ import numpy as np
 
 ROOT = Path(__file__).parents[1]
 TRUTH = (-2.89, 5.70, 5.89, 0.203)
-REPEATS, MEMORY, NOISE = 16, {"white": 0.0, "ar1": 0.9}, {"white": 0.04, "ar1": 0.01}
+REPEATS = 16
+MEMORY = {"white": 0.0, "ar1": 0.9, "loud": 0.9}  # correlation from one ms to the next
+NOISE = {"white": 0.04, "ar1": 0.01, "loud": 0.04}  # of the range, in each repeat
 NAMES = ("K_inst", "K_eff", "log κ", "logit α")
 LEVEL = 0.95
 
