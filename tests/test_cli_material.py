@@ -1,6 +1,8 @@
 """`hilbo identify` and `hilbo passivity` as a user types them."""
 
 import json
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -84,9 +86,9 @@ def test_identify_writes_everything(capsys, monkeypatch, tmp_path):
         assert row["lower"] < truth < row["upper"]
     assert [row["N"] for row in content["memory"]] == [2, 25, 101, 201, 1000, None]
     assert content["renderer"] == (out / "renderer.toml").read_text()
-    text = open(STUDY).read()  # noqa: SIM115
+    text = Path(STUDY).read_text()
     before, _, rest = text.partition("[renderer]")
-    study = Study.from_dict(__import__("tomllib").loads(before + content["renderer"] + rest[rest.index("[gp]") :]))
+    study = Study.from_dict(tomllib.loads(before + content["renderer"] + rest[rest.index("[gp]") :]))
     assert study.space.mechanics.K_eff == pytest.approx(0.44325, abs=2e-3)
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 5
