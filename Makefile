@@ -35,6 +35,7 @@ lint: $(STAMP)  ## ruff and pyright
 bench: $(STAMP)  ## time hilbo against the textbook NumPy form
 	$(BIN)/python benchmarks/run.py
 	$(BIN)/python benchmarks/mechanics.py
+	$(BIN)/python benchmarks/identification.py time
 
 clean:  ## remove the environment, caches and results
 	rm -rf $(VENV) demo-results build dist .pytest_cache .ruff_cache .hypothesis

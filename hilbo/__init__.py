@@ -15,6 +15,7 @@ _names, __dir__, __all__ = lazy_loader.attach(
         "config",
         "errors",
         "hyperparameters",
+        "identification",
         "kernels",
         "laplace",
         "likelihoods",
@@ -42,6 +43,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors; a test compar
     from hilbo import config as config
     from hilbo import errors as errors
     from hilbo import hyperparameters as hyperparameters
+    from hilbo import identification as identification
     from hilbo import kernels as kernels
     from hilbo import laplace as laplace
     from hilbo import likelihoods as likelihoods

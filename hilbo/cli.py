@@ -1,22 +1,18 @@
-"""The command line: `hilbo aggregate | simulate | robustness | demo`; the only place that parses arguments.
+"""The command line: `hilbo aggregate | simulate | robustness | identify | passivity | demo`.
 
-Results go to a folder, machine-readable ones with `--json` to stdout, progress to stderr. Exit code 0: done, 1: failed,
-2: bad usage or bad input, said in one sentence. A folder is written beside its final place and moved there when it is
-complete, so that a failure leaves nothing behind and nothing is overwritten without `--force`.
+This module and `cli_material` are the only places that parse arguments. Results go to a folder, machine-readable ones
+with `--json` to stdout, progress to stderr (`console`). Exit code 0: done, 1: failed, 2: bad usage or bad input, said
+in one sentence.
 """
 
-import contextlib
-import os
 import shutil
-import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from hilbo import cli_material
+from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, results, start
 from hilbo.errors import InputError
 
 __all__ = ["app", "main"]
@@ -29,19 +25,7 @@ app = typer.Typer(
 )
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
-Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
-Seed = Annotated[int, typer.Option("--seed", help="Decides candidates, and in simulations everything random.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
-Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
 Table = Annotated[Path, typer.Argument(help="Trial table (CSV or Parquet).", show_default=False)]
-
-
-# What the commands write: a folder with anything else in it is never replaced.
-_FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
-_PARTS = ("video-quality", "simulated-memory-foam")
-_WRITTEN = {"result.json", "report.html", "map.nc", "optima.csv", "trials.csv", "truth.csv", "study.toml", *_PARTS} | {
-    f"{figure}.{kind}" for figure in _FIGURES for kind in ("png", "svg")
-}
 
 
 def main() -> None:
@@ -49,9 +33,9 @@ def main() -> None:
     try:
         app()
     except InputError as error:
-        _fail(str(error), 2)
+        fail(str(error), 2)
     except (OSError, RuntimeError) as error:
-        _fail(f"{type(error).__name__}: {error}", 1)
+        fail(f"{type(error).__name__}: {error}", 1)
 
 
 @app.command()
@@ -67,12 +51,12 @@ def aggregate(
     as_json: Json = False,
 ) -> None:
     """Merge people's answers into one population map and find its optimum."""
-    with _results(out, force) as folder, _progress() as say:
+    with results(out, force) as folder, progress() as say:
         chosen, cohort = _read(trials, study, material, say)
         cohort = cohort.of(participants.split(",")) if participants else cohort
         cohort = cohort.first(first) if first else cohort
         content = _aggregate(chosen, cohort, folder, seed, say)
-    _finish(content, out, as_json)
+    finish(content, out, as_json)
 
 
 @app.command()
@@ -86,9 +70,9 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Simulate a study whose truth is known, and aggregate it."""
-    with _results(out, force) as folder, _progress() as say:
+    with results(out, force) as folder, progress() as say:
         content = _simulate(preset, study, participants, seed, folder, say)
-    _finish(content, out, as_json)
+    finish(content, out, as_json)
 
 
 @app.command()
@@ -108,7 +92,7 @@ def robustness(
     as_json: Json = False,
 ) -> None:
     """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
-    with _results(out, force) as folder, _progress() as say:
+    with results(out, force) as folder, progress() as say:
         chosen, cohort = _read(trials, study, material, say)
         from hilbo.report_robustness import write_robustness
         from hilbo.robustness import robustness as check
@@ -117,7 +101,11 @@ def robustness(
         found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
         say("maps, figures and report")
         content = write_robustness(chosen, cohort, found, folder, seed)
-    _finish(content, out, as_json)
+    finish(content, out, as_json)
+
+
+app.command()(cli_material.identify)
+app.command()(cli_material.passivity)
 
 
 @app.command()
@@ -126,30 +114,18 @@ def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) 
     from importlib.resources import files
 
     data = files("hilbo") / "data"
-    with _results(out, force) as folder, _progress() as say:
-        for part in _PARTS:
+    with results(out, force) as folder, progress() as say:
+        for part in PARTS:
             (folder / part).mkdir()
         chosen, cohort = _read(Path(str(data / "video_quality.csv")), Path(str(data / "video_quality.toml")), None, say)
-        real = _aggregate(chosen, cohort, folder / _PARTS[0], seed, say)
-        simulated = _simulate("paper", None, 24, seed, folder / _PARTS[1], say)
+        real = _aggregate(chosen, cohort, folder / PARTS[0], seed, say)
+        simulated = _simulate("paper", None, 24, seed, folder / PARTS[1], say)
     _print_demo(real, simulated, out)
-
-
-def _start() -> None:
-    """Float64, and compiled functions kept in the user's cache folder from one command to the next."""
-    import jax
-
-    jax.config.update("jax_enable_x64", True)
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "hilbo" / "jax"))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def _read(trials, study, material, say):
     say("reading")
-    _start()
+    start()
     from hilbo.config import Study
     from hilbo.study import cohort_of
     from hilbo.tables import read_trials
@@ -170,7 +146,7 @@ def _aggregate(study, cohort, folder, seed, say, truth=None) -> dict[str, Any]:
 
 def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
     say("simulating")
-    _start()
+    start()
     from importlib.resources import files
 
     import numpy as np
@@ -194,73 +170,6 @@ def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
     truth = np.asarray(chosen.space.to_unit(np.array([population.truth[name] for name in chosen.space.names])))
     table["category"] = table["response"].map({label: i for i, label in enumerate(chosen.responses)})
     return _aggregate(chosen, cohort_of(table, chosen), folder, seed, say, truth)
-
-
-@contextlib.contextmanager
-def _results(out: Path, force: bool) -> Iterator[Path]:
-    """A new folder that becomes `out` when everything in it is complete."""
-    out = out.resolve()
-    _check_free(out, force)
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
-    try:
-        yield made
-        made.chmod(0o755)
-        if out.exists():
-            shutil.rmtree(out)
-        made.rename(out)
-    finally:
-        shutil.rmtree(made, ignore_errors=True)
-
-
-def _check_free(out: Path, force: bool) -> None:
-    """Refuse to replace anything without `force`, and with it anything that is not hilbo's."""
-    if not out.exists():
-        return
-    if not out.is_dir():
-        raise InputError(f"{out}: is a file; choose a folder for --out.")
-    if any(out.iterdir()) and not force:
-        raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
-    foreign = next((path for path in out.rglob("*") if path.name not in _WRITTEN), None)
-    if foreign is not None:
-        raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Callable[[str], None]]:
-    """Says on stderr what is being done: in one changing line on a terminal, else in a line for each thing."""
-    from rich.console import Console
-
-    console, begun = Console(stderr=True, highlight=False, markup=False, soft_wrap=True), time.perf_counter()
-    with console.status("starting") as status:
-
-        def say(text: str) -> None:
-            if console.is_terminal:
-                status.update(text)
-            else:
-                console.print(text)
-
-        yield say
-    console.print(f"done in {time.perf_counter() - begun:.1f} s")
-
-
-def _finish(content, out, as_json):
-    from hilbo.report import as_json as text
-
-    for warning in content.get("warnings", []):
-        print(f"hilbo: {warning}", file=sys.stderr)
-    if as_json:
-        print(text(content), end="")
-    else:
-        print(f"{out / 'report.html'}", file=sys.stderr)
-
-
-def _fail(sentence: str, code: int) -> None:
-    print(f"hilbo: {sentence}", file=sys.stderr)
-    sys.exit(code)
 
 
 def _print_demo(real, simulated, out) -> None:
@@ -300,5 +209,5 @@ def _print_demo(real, simulated, out) -> None:
     console.print("Individuals: median and quartiles. Passive by so many N.s/m of damping more than the least.")
     top = truth["top_answers"]
     console.print(f'"close" answers of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)\n')
-    for part in _PARTS:
+    for part in PARTS:
         console.print(str(out / part / "report.html"))

@@ -14,16 +14,16 @@ _RULES = {
     "mean": "by the posterior mean",
 }
 
-__all__ = ["results_page", "robustness_page"]
+__all__ = ["results_page", "robustness_page", "template"]
 
 
 def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str, str]]) -> str:
     """The page of an aggregation; `pictures` have png (base64), title, caption and alt."""
-    template = _template("report.html")
+    sheet = template("report.html")
     best, gp = content["optimum"], study.gp
     people, answers = len(content["participants"]), sum(p["trials"] for p in content["participants"])
     worst = max(p["certificate"]["residual"] for p in content["participants"])
-    return template.render(
+    return sheet.render(
         title=f"{study.name}: the population's optimum",
         lead=f"{people} participants gave {answers} answers ({', '.join(study.responses)}). Each person's answers were"
         " turned into a map of perceived realism; the maps were merged, and this is where the merged map is highest.",
@@ -152,7 +152,7 @@ def _comparison(study, content):
 def robustness_page(study: Study, content: dict[str, Any], pictures: list[dict[str, str]]) -> str:
     """One self-contained page of the robustness check."""
     learned = content["learned"]
-    return _template("robustness.html").render(
+    return template("robustness.html").render(
         study=study,
         content=content,
         flagged=[p["participant"] for p in content["participants"] if p["flagged"]],
@@ -184,7 +184,8 @@ def _numbers(values):
     return ", ".join(_number(v) for v in np.ravel(values))
 
 
-def _template(name: str):
+def template(name: str):
+    """A page of hilbo.templates, escaping what it is given."""
     from jinja2 import Environment, PackageLoader, select_autoescape
 
     return Environment(loader=PackageLoader("hilbo"), autoescape=select_autoescape()).get_template(name)

@@ -20,10 +20,23 @@ from hilbo.config import Study
 from hilbo.ordinal_gp import Posterior
 from hilbo.study import Cohort, fit_cohort, population
 
-__all__ = ["map_slices", "maps_beside", "moved_optima", "optima_scatter", "progress_figure", "slices_after"]
+__all__ = [
+    "BLUE",
+    "GREEN",
+    "GREY",
+    "ORANGE",
+    "RED",
+    "STYLE",
+    "map_slices",
+    "maps_beside",
+    "moved_optima",
+    "optima_scatter",
+    "progress_figure",
+    "slices_after",
+]
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
-_STYLE: dict = {
+STYLE: dict = {
     "font.size": 9,
     "axes.titlesize": 9,
     "axes.labelsize": 9,
@@ -83,7 +96,7 @@ def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population
     """How far everybody's own optimum moved (dots, in order) and the population's (line), in % of the search ranges."""
     percent = 100 * np.asarray(moves)
     order, rows = np.argsort(percent), np.arange(len(percent))
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.6, 1.2 + 0.16 * len(percent)), layout="constrained")
         axes = figure.subplots()
         axes.scatter(percent[order], rows, s=20, color=np.where(percent[order] < 100 * limit, BLUE, ORANGE), zorder=3)
@@ -112,7 +125,7 @@ def progress_figure(
     top = np.cumsum(np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask), axis=1)[
         :, trials - 1
     ]
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
         goal = "the final optimum" if truth is None else "the truth"
@@ -137,7 +150,7 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
     physical = np.asarray(study.space.to_physical(optima))
     points = {name: np.asarray(study.space.to_physical(x)) for name, x in marks.items()}
     styles = (("*", RED, 140), ("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40))
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.4 if len(pairs) > 1 else 4.0, 2.9), layout="constrained")
         for axes, (i, j) in zip(_row(figure, len(pairs)), pairs, strict=True):
             axes.scatter(
@@ -169,7 +182,7 @@ def _levels(third):
 def _slices(study, grids):
     """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
     low, high = min(np.nanmin(g) for g in grids), max(np.nanmax(g) for g in grids)
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.0 if len(grids) == 1 else 7.4, 2.7), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
         scale = ScalarMappable(Normalize(low, high), "cividis")
@@ -219,7 +232,7 @@ def _curve_axes(study):
 
 
 def _map_curve(study, posteriors, optimum, cohort):
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
         at, mean, sd = _curve(study, posteriors)
         axes.fill_between(at, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label="± standard deviation")
@@ -238,7 +251,7 @@ def _map_curve(study, posteriors, optimum, cohort):
 
 
 def _curves_beside(study, maps, optima):
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
         for (name, posterior), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
             at, mean, _ = _curve(study, posterior)

@@ -15,7 +15,7 @@ import pandas as pd
 from hilbo.config import Study
 from hilbo.errors import InputError
 
-__all__ = ["read_trials", "write_trials"]
+__all__ = ["numbers", "read_cells", "read_trials", "refuse", "write_trials"]
 
 _KEY = ("participant", "session", "phase", "material", "trial")
 _TRUE = {"1", "1.0", "true", "yes"}
@@ -29,15 +29,15 @@ def read_trials(path: str | os.PathLike, study: Study, material: str | None = No
     selects the rows of one material, and must be given if there are several. Raises `InputError`.
     """
     source = str(path)
-    text = _read_text(Path(path), source)
+    text = read_cells(path)
     _check_columns(text, study, source)
     if text.empty:
         raise InputError(f"{source}: has no rows; a trial table needs at least one answer.")
     table = text.copy()
-    table["trial"] = _numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0)).astype(
+    table["trial"] = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0)).astype(
         int
     )
-    _refuse(text["participant"] == "", source, lambda row: "participant is empty; give each row a participant.")
+    refuse(text["participant"] == "", source, lambda row: "participant is empty; give each row a participant.")
     for parameter in study.space.parameters:
         table[parameter.name] = _parameter(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
@@ -67,10 +67,14 @@ def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
         table.to_csv(path, index=False)  # pandas writes the shortest decimals that read back the same
 
 
-def _read_text(path: Path, source: str) -> pd.DataFrame:
-    """Every cell as text, so that nothing is guessed; the index is the line (CSV) or the row (Parquet)."""
+def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a header and an answer") -> pd.DataFrame:
+    """Every cell as text, so that nothing is guessed; the index is the line (CSV) or the row (Parquet).
+
+    Raises `InputError` for what is no table; `needs` is said of an empty file.
+    """
+    source, path = str(path), Path(path)
     try:
-        frame = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, source)
+        frame = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path, source, needs)
     except InputError:
         raise
     except OSError as error:
@@ -90,7 +94,7 @@ def _read_parquet(path):
     return frame.set_axis(np.arange(1, len(frame) + 1))
 
 
-def _read_csv(path, source):
+def _read_csv(path, source, needs):
     """By Python's csv module: it knows the line of a row, and a row that is too long is no reason to guess."""
     rows, lines = [], []
     with path.open(newline="", encoding="utf-8-sig") as file:
@@ -102,7 +106,7 @@ def _read_csv(path, source):
                 lines.append(begin)
             begin = reader.line_num + 1
     if not rows:
-        raise InputError(f"{source}: is empty; a trial table needs a header and at least one answer.")
+        raise InputError(f"{source}: is empty; {needs}.")
     header = rows[0]
     for row, line in zip(rows, lines, strict=True):
         if len(row) != len(header):
@@ -119,8 +123,8 @@ def _check_columns(text, study, source):
         )
 
 
-def _numbers(text, column, source, words, valid):
-    """A column as float64, each cell correctly rounded; `valid` says which values are allowed."""
+def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> pd.Series:
+    """A column as float64, each cell correctly rounded; `valid` says which values may be, `words` which those are."""
 
     def number(cell):
         try:
@@ -130,14 +134,14 @@ def _numbers(text, column, source, words, valid):
 
     values = pd.Series([number(cell) for cell in text[column]], text.index, dtype=float)
     wrong = ~(np.isfinite(values) & valid(values))
-    _refuse(wrong, source, lambda row: f'{column} is "{text.at[row, column]}"; it must be {words}.')
+    refuse(wrong, source, lambda row: f'{column} is "{text.at[row, column]}"; it must be {words}.')
     return values
 
 
 def _parameter(text, parameter, source):
     unit = f" {parameter.unit}" if parameter.unit else ""
     words = f"a number from {parameter.low:g} to {parameter.high:g}{unit}, the study's range"
-    return _numbers(text, parameter.name, source, words, lambda v: (v >= parameter.low) & (v <= parameter.high))
+    return numbers(text, parameter.name, source, words, lambda v: (v >= parameter.low) & (v <= parameter.high))
 
 
 def _categories(cells, responses, source):
@@ -148,7 +152,7 @@ def _categories(cells, responses, source):
         lookup |= {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0")}
     categories = cells.map(lookup)
     ranks = f", or a rank from 1 to {len(responses)}" if ranks_allowed else ""
-    _refuse(
+    refuse(
         categories.isna(),
         source,
         lambda row: f'response is "{cells.at[row]}"; it must be one of {", ".join(responses)}{ranks}.',
@@ -160,7 +164,7 @@ def _flags(text, column, source):
     if column not in text:
         return pd.Series(False, text.index)
     cells = text[column].str.strip().str.lower()
-    _refuse(~cells.isin(_TRUE | _FALSE), source, lambda row: f'{column} is "{text.at[row, column]}"; write 1 or 0.')
+    refuse(~cells.isin(_TRUE | _FALSE), source, lambda row: f'{column} is "{text.at[row, column]}"; write 1 or 0.')
     return cells.isin(_TRUE)
 
 
@@ -189,7 +193,8 @@ def _of_material(table, material, source):
     return table if material is None else table[table["material"] == material]
 
 
-def _refuse(wrong, source, sentence):
+def refuse(wrong: pd.Series, source: str, sentence) -> None:
+    """Raise `InputError` with `sentence(row)` for the first row that is wrong."""
     if wrong.any():
         row = wrong.idxmax()
         raise InputError(f"{source}:{row}: {sentence(row)}")

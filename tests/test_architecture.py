@@ -38,7 +38,13 @@ MATHS = {
     "hyperparameters": {"ordinal_gp", "newton"},
     "passivity_certificate": {"viscoelastic"},
     "passivity": {"viscoelastic", "passivity_certificate"},
-    "identification": {"viscoelastic"},
+    "least_squares": set(),
+    "identification": {"least_squares"},
+    "sampled": {"identification"},
+    "moduli": {"identification", "mittag_leffler"},
+    "intervals": {"identification", "least_squares"},
+    "memory_selection": {"sampled"},
+    "characterise": {"intervals", "memory_selection", "moduli", "passivity"},
     "space_filling": set(),
     "search_space": {"viscoelastic", "passivity", "space_filling"},
     "session": {"config", "ordinal_gp", "acquisition", "search_space"},
@@ -51,23 +57,28 @@ MAY_IMPORT = MATHS | {
     "protocol": set(),
     "config": {"search_space", "ordinal_gp"},
     "tables": {"config"},
+    "material_tables": {"tables", "identification"},
+    "console": {"report"},
+    "cli_material": {"console", "characterise", "material_tables", "report_material"},
     "event_log": {"session"},
     "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm"},
     "robustness": {"study", "hyperparameters"},
     "plotting": set(MATHS) | {"study"},
+    "plotting_mechanics": {"plotting", "characterise"},
     "page": {"config"},
     "hardware_bridge": {"protocol"},
 }
-MAY_IMPORT["report"] = set(MAY_IMPORT)
+MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material"}
 MAY_IMPORT["report_robustness"] = {"report"}
+MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 
-ONLY_IN = {"matplotlib": {"plotting"}, "serial": {"hardware_bridge"}}
+ONLY_IN = {"matplotlib": {"plotting", "plotting_mechanics"}, "serial": {"hardware_bridge"}}
 WITHOUT_JAX = {"errors", "protocol", "hardware_bridge"}
 OUTSIDE_WORLD = {"os", "io", "sys", "time", "datetime", "pathlib", "logging", "random", "socket", "subprocess"}
-MAY_ENABLE_X64 = {"cli", "app", "__main__"}
+MAY_ENABLE_X64 = {"console", "app", "__main__"}
 LONGEST = 400  # lines
 
 

@@ -1,0 +1,114 @@
+"""What every command does around its work: float64 and caches, a results folder that is whole or absent, progress.
+
+A folder is written beside its final place and moved there when it is complete, so that a failure leaves nothing behind
+and nothing is overwritten without `--force`. Progress goes to stderr, results with `--json` to stdout.
+"""
+
+import contextlib
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilbo.errors import InputError
+
+__all__ = ["PARTS", "Force", "Json", "Out", "Seed", "fail", "finish", "progress", "results", "start"]
+
+Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+Seed = Annotated[int, typer.Option("--seed", help="Decides candidates, and in simulations everything random.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
+Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
+
+# What the commands write: a folder with anything else in it is never replaced.
+_FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
+_MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
+PARTS = ("video-quality", "simulated-memory-foam")
+_TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
+_WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
+    f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES for kind in ("png", "svg")
+}
+
+
+def start() -> None:
+    """Float64, and compiled functions kept in the user's cache folder from one command to the next."""
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "hilbo" / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@contextlib.contextmanager
+def results(out: Path, force: bool) -> Iterator[Path]:
+    """A new folder that becomes `out` when everything in it is complete."""
+    out = out.resolve()
+    _check_free(out, force)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
+    try:
+        yield made
+        made.chmod(0o755)
+        if out.exists():
+            shutil.rmtree(out)
+        made.rename(out)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _check_free(out: Path, force: bool) -> None:
+    """Refuse to replace anything without `force`, and with it anything that is not hilbo's."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise InputError(f"{out}: is a file; choose a folder for --out.")
+    if any(out.iterdir()) and not force:
+        raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
+    foreign = next((path for path in out.rglob("*") if path.name not in _WRITTEN), None)
+    if foreign is not None:
+        raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Callable[[str], None]]:
+    """Says on stderr what is being done: in one changing line on a terminal, else in a line for each thing."""
+    from rich.console import Console
+
+    console, begun = Console(stderr=True, highlight=False, markup=False, soft_wrap=True), time.perf_counter()
+    with console.status("starting") as status:
+
+        def say(text: str) -> None:
+            if console.is_terminal:
+                status.update(text)
+            else:
+                console.print(text)
+
+        yield say
+    console.print(f"done in {time.perf_counter() - begun:.1f} s")
+
+
+def finish(content, out, as_json):
+    from hilbo.report import as_json as text
+
+    for warning in content.get("warnings", []):
+        print(f"hilbo: {warning}", file=sys.stderr)
+    if as_json:
+        print(text(content), end="")
+    else:
+        print(f"{out / 'report.html'}", file=sys.stderr)
+
+
+def fail(sentence: str, code: int) -> None:
+    print(f"hilbo: {sentence}", file=sys.stderr)
+    sys.exit(code)
