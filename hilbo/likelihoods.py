@@ -79,6 +79,23 @@ class OrdinalProbit(eqx.Module):
         truncated = _truncated(f, lower, upper, noise)
         return truncated.log_mass, truncated.mean / noise, truncated.curvature / noise**2
 
+    def smoothed(
+        self, mean: ArrayLike, variance: ArrayLike, q: ArrayLike
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+        """log of the integral of p(q | f) over f ~ N(mean, variance), its derivative in `mean`, and the precision t of
+        the Gaussian site with which that normal would get the variance that the answer gives it.
+
+        The integral is the same likelihood with its noise grown to s, s^2 = noise^2 + variance; minus the second
+        derivative in `mean` is t / (1 + variance t). With k_2 the variance of the truncated normal,
+        t = (1 - k_2) / (noise^2 + variance k_2): never negative, at most 1 / noise^2.
+        """
+        mean, lower, upper, noise = self._edges(mean, q)
+        variance = jnp.asarray(variance, mean.dtype)
+        spread = jnp.sqrt(noise**2 + variance)
+        truncated = _truncated(mean, lower, upper, spread)
+        precision = truncated.curvature / (noise**2 + variance * (1.0 - truncated.curvature))
+        return truncated.log_mass, truncated.mean / spread, precision
+
     def class_probabilities(self, mean: ArrayLike, variance: ArrayLike = 0.0) -> Float[Array, " categories"]:
         """Probabilities (C,) of the categories when f ~ N(mean, variance); they sum to 1 within rounding.
 

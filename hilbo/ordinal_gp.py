@@ -10,6 +10,8 @@ is a pytree: `jax.vmap(fit)` over stacked trials fits all participants, `jax.gra
 Reference: paper, section IV.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.core
@@ -18,6 +20,7 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float, Int
 
+from hilbo.ep import ep
 from hilbo.errors import InputError
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import Certificate, LaplacePosterior, laplace, mean_and_explained
@@ -25,6 +28,7 @@ from hilbo.likelihoods import OrdinalProbit
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
 
+_SOUGHT = {"laplace": "Laplace mode", "ep": "fixed point of expectation propagation"}
 _BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
 
 
@@ -120,6 +124,21 @@ class _OrdinalTerms(eqx.Module):
         return value, slope, curvature
 
 
+class _TiltedTerms(eqx.Module):
+    """The same answers averaged over cavities, for expectation propagation."""
+
+    likelihood: OrdinalProbit
+    q: Int[Array, " n"]
+    mask: Bool[Array, " n"]
+
+    def __call__(
+        self, mean: Float[Array, " n"], variance: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+        smoothed = jax.vmap(self.likelihood.smoothed)(mean, variance, self.q)
+        value, slope, precision = (jnp.where(self.mask, part, jnp.zeros_like(part)) for part in smoothed)
+        return value, slope, precision
+
+
 class Posterior(eqx.Module):
     """Posterior of the latent realism of one participant; the result of [`fit`][]."""
 
@@ -192,34 +211,38 @@ def fit(
 
     - `gp`: the model.
     - `trials`: the answers; none gives the prior.
-    - `inference`: "laplace" (paper, section IV-1).
+    - `inference`: "laplace" (paper, section IV-1), or "ep", expectation propagation: the same kind of posterior with
+      a far smaller error (docs/inference.md).
     - `start`: `posterior.latent.weights` of a fit to nearly the same trials, to save Newton steps.
     - `throw`: raise `InferenceError` if the certificate does not hold. Use `False` under `vmap`, and read
       `posterior.certificate.converged`.
 
     **Returns:** a [`Posterior`][], differentiable in every array of `gp`.
     """
-    if inference != "laplace":
-        raise InputError(f'fit: inference is "{inference}"; this version offers "laplace".')
-    posterior = _fit(gp, trials, start)
-    return _checked(posterior) if throw else posterior
+    if inference not in _SOUGHT:
+        raise InputError(f'fit: inference is "{inference}"; this version offers {", ".join(map(repr, _SOUGHT))}.')
+    posterior = _fit(gp, trials, start, inference)
+    return _checked(posterior, _SOUGHT[inference]) if throw else posterior
 
 
-@jax.jit
-def _fit(gp, trials, start):
+@functools.partial(jax.jit, static_argnames="inference")
+def _fit(gp, trials, start, inference):
     covariance = gram(gp.kernel, trials.x, trials.x)
+    if inference == "ep":
+        tilted = _TiltedTerms(gp.likelihood, trials.q, trials.mask)
+        return Posterior(gp, trials, ep(covariance, tilted, start=start))
     terms = _OrdinalTerms(gp.likelihood, trials.q, trials.mask)
     return Posterior(gp, trials, laplace(covariance, terms, start=start))
 
 
-def _checked(posterior: Posterior) -> Posterior:
+def _checked(posterior: Posterior, sought: str) -> Posterior:
     certificate = posterior.certificate
     if isinstance(certificate.converged, jax.core.Tracer):
-        message = "the Laplace mode was not found to its tolerance; fit with throw=False and read the certificate"
+        message = f"the {sought} was not found to its tolerance; fit with throw=False and read the certificate"
         return eqx.error_if(posterior, ~certificate.converged, message)
     if not bool(certificate.converged):
         raise InferenceError(
-            f"the Laplace mode was not found: its residual is {float(certificate.residual):.3g} after"
+            f"the {sought} was not found: its residual is {float(certificate.residual):.3g} after"
             f" {int(certificate.iterations)} steps and should be at most {float(certificate.tolerance):.3g}; use a"
             " larger noise, float64, or throw=False to look at the certificate."
         )
