@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 
 from hilbo.normal import HALF_LOG_2PI, excess_hazard
 
-__all__ = ["OrdinalProbit"]
+__all__ = ["OrdinalProbit", "confined_normal"]
 
 # An interval is narrow below this width, and below this product of width and distance from the middle of the bell.
 _NARROW_WIDTH, _NARROW_PRODUCT = 1.0, 4.0
@@ -111,6 +111,16 @@ class OrdinalProbit(eqx.Module):
         ends = jnp.full((1,), jnp.inf, f.dtype)
         edges = jnp.concatenate([-ends, self.thresholds.astype(f.dtype), ends])
         return f, edges[q], edges[q + 1], self.noise.astype(f.dtype)
+
+
+def confined_normal(
+    mean: Float[Array, ""], lower: Float[Array, ""], upper: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """N(mean, 1) between two edges, which may be infinite: log of its mass there, and of what is left, confined, the
+    mean's distance from `mean` and 1 - variance; the latter are also the first and minus the second derivative of the
+    log mass in `mean`."""
+    truncated = _truncated(mean, lower, upper, jnp.ones_like(mean))
+    return truncated.log_mass, truncated.mean, truncated.curvature
 
 
 class _Truncated(NamedTuple):

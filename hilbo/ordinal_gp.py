@@ -18,17 +18,18 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.ep import ep
 from hilbo.errors import InputError
+from hilbo.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import Certificate, LaplacePosterior, laplace, mean_and_explained
 from hilbo.likelihoods import OrdinalProbit
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
 
-_SOUGHT = {"laplace": "Laplace mode", "ep": "fixed point of expectation propagation"}
+_SOUGHT = {"laplace": "Laplace mode", "ep": "fixed point of expectation propagation", "exact": "exact posterior"}
 _BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
 
 
@@ -144,7 +145,7 @@ class Posterior(eqx.Module):
 
     gp: OrdinalGP
     trials: Trials
-    latent: LaplacePosterior
+    latent: LaplacePosterior | ExactPosterior
 
     @property
     def log_evidence(self) -> Float[Array, ""]:
@@ -152,8 +153,8 @@ class Posterior(eqx.Module):
         return self.latent.log_evidence
 
     @property
-    def certificate(self) -> Certificate:
-        """Residual, iterations, jitter, condition and smallest variance of this fit."""
+    def certificate(self) -> Certificate | SamplingCertificate:
+        """Residual, iterations, jitter, condition and smallest variance of this fit; standard errors if sampled."""
         return self.latent.certificate
 
     def mean(self, x: Float[Array, "m d"]) -> Float[Array, " m"]:
@@ -174,9 +175,46 @@ class Posterior(eqx.Module):
         return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self)
 
     def class_probabilities(self, x: Float[Array, "m d"]) -> Float[Array, "m categories"]:
-        """Probabilities (m, C) of the answers to be expected at points (m, d)."""
+        """Probabilities (m, C) of the answers to be expected at points (m, d).
+
+        From mean and variance, f being taken for normal; after `inference="exact"` from the samples themselves.
+        """
+        if isinstance(self.latent, ExactPosterior):
+            return _sampled_probabilities(self, x)[0]
         mean, variance = self.predict(x)
         return jax.vmap(self.gp.likelihood.class_probabilities)(mean, variance)
+
+    def standard_errors(
+        self, x: Float[Array, "m d"]
+    ) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, "m categories"]]:
+        """Of mean (m,), variance (m,) and class probabilities (m, C): of an exact posterior, which is sampled."""
+        latent = _sampled(self, "standard_errors")
+        mean, variance = latent.moment_errors(gram(self.gp.kernel, self.trials.x, x))
+        return mean, variance, _sampled_probabilities(self, x)[1]
+
+    def draw(self, key: PRNGKeyArray, x: Float[Array, "m d"], count: int) -> Float[Array, "count m"]:
+        """Independent draws (count, m) of the latent function from the exact posterior, jointly at all points."""
+        latent = _sampled(self, "draw")
+        prior = gram(self.gp.kernel, x, x)
+        return latent.draw(key, gram(self.gp.kernel, self.trials.x, x), prior, count)
+
+
+def _sampled(posterior, wanted) -> ExactPosterior:
+    if not isinstance(posterior.latent, ExactPosterior):
+        raise InputError(f'Posterior.{wanted}: this posterior is not sampled; fit with inference="exact".')
+    return posterior.latent
+
+
+@jax.jit
+def _sampled_probabilities(posterior, x):
+    """Class probabilities (m, C) and their standard errors, point by point."""
+
+    def one(point):
+        cross = gram(posterior.gp.kernel, posterior.trials.x, point[None, :])[:, 0]
+        of = posterior.gp.likelihood.class_probabilities
+        return posterior.latent.expectation(of, cross, posterior.gp.kernel.diagonal(point))
+
+    return jax.lax.map(one, x)
 
 
 @jax.jit
@@ -212,7 +250,8 @@ def fit(
     - `gp`: the model.
     - `trials`: the answers; none gives the prior.
     - `inference`: "laplace" (paper, section IV-1), or "ep", expectation propagation: the same kind of posterior with
-      a far smaller error (docs/inference.md).
+      a far smaller error; or "exact", sampled, for up to about 100 answers and without derivatives
+      (docs/inference.md). The samples are the same ones in every fit.
     - `start`: `posterior.latent.weights` of a fit to nearly the same trials, to save Newton steps.
     - `throw`: raise `InferenceError` if the certificate does not hold. Use `False` under `vmap`, and read
       `posterior.certificate.converged`.
@@ -231,8 +270,17 @@ def _fit(gp, trials, start, inference):
     if inference == "ep":
         tilted = _TiltedTerms(gp.likelihood, trials.q, trials.mask)
         return Posterior(gp, trials, ep(covariance, tilted, start=start))
+    if inference == "exact":
+        return Posterior(gp, trials, _exactly(gp.likelihood, trials, covariance))
     terms = _OrdinalTerms(gp.likelihood, trials.q, trials.mask)
     return Posterior(gp, trials, laplace(covariance, terms, start=start))
+
+
+def _exactly(likelihood, trials, covariance):
+    ends = jnp.full((1,), jnp.inf, covariance.dtype)
+    edges = jnp.concatenate([-ends, likelihood.thresholds.astype(covariance.dtype), ends])
+    noise = likelihood.noise.astype(covariance.dtype)
+    return exact(jax.random.key(0), covariance, edges[trials.q], edges[trials.q + 1], noise, trials.mask)
 
 
 def _checked(posterior: Posterior, sought: str) -> Posterior:
