@@ -32,7 +32,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from hilbo.laplace import Certificate, LaplacePosterior, _factor, _inverse_and_log_determinant, _square_root
 from hilbo.linalg import _one_at_a_time, cholesky, solve_lower
@@ -156,9 +156,10 @@ class _Sites(eqx.Module):
 
 
 def _sites(terms, mean, variance):
-    ones = jnp.ones_like(mean)  # the terms are independent: one tangent serves them all
-    (_, slope, precision), (_, _, precision_m) = jax.jvp(lambda at: terms(at, variance), (mean,), (ones,))
-    _, (_, slope_v, precision_v) = jax.jvp(lambda at: terms(mean, at), (variance,), (ones,))
+    (_, slope, precision), push = jax.linearize(terms, mean, variance)
+    ones, zeros = jnp.ones_like(mean), jnp.zeros_like(mean)  # the terms are independent: one tangent serves them all
+    _, _, precision_m = push(ones, zeros)
+    _, slope_v, precision_v = push(zeros, ones)
     return _Sites(slope, precision, slope_v, precision_m, precision_v)
 
 

@@ -259,7 +259,7 @@ def fit(
     **Returns:** a [`Posterior`][], differentiable in every array of `gp`.
     """
     if inference not in _SOUGHT:
-        raise InputError(f'fit: inference is "{inference}"; this version offers {", ".join(map(repr, _SOUGHT))}.')
+        raise InputError(f'fit: inference is "{inference}"; it must be one of {", ".join(_SOUGHT)}.')
     posterior = _fit(gp, trials, start, inference)
     return _checked(posterior, _SOUGHT[inference]) if throw else posterior
 
