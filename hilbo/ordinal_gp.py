@@ -194,9 +194,14 @@ class Posterior(eqx.Module):
 
     def draw(self, key: PRNGKeyArray, x: Float[Array, "m d"], count: int) -> Float[Array, "count m"]:
         """Independent draws (count, m) of the latent function from the exact posterior, jointly at all points."""
-        latent = _sampled(self, "draw")
-        prior = gram(self.gp.kernel, x, x)
-        return latent.draw(key, gram(self.gp.kernel, self.trials.x, x), prior, count)
+        _sampled(self, "draw")
+        return _draw(self, key, x, count)
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _draw(posterior, key, x, count):
+    kernel = posterior.gp.kernel
+    return posterior.latent.draw(key, gram(kernel, posterior.trials.x, x), gram(kernel, x, x), count)
 
 
 def _sampled(posterior, wanted) -> ExactPosterior:

@@ -188,7 +188,7 @@ def accepted(key, box, tilt, count):
         tiny = jnp.finfo(kept.dtype).tiny
         x, psi = propose(box, tilt.mu, jax.random.uniform(first, (n, batch), kept.dtype, minval=tiny))
         taken = jnp.log(jax.random.uniform(second, (batch,), kept.dtype, minval=tiny)) < psi - tilt.highest
-        place = jnp.where(taken, filled + jnp.cumsum(taken) - 1, count)
+        place = jnp.where(taken, filled + jnp.cumsum(taken, dtype=filled.dtype) - 1, count)
         x = jnp.where(box.answered[:, None], x, 0.0)
         return key, kept.at[place].set(x.T, mode="drop"), filled + jnp.sum(taken, dtype=filled.dtype), rounds + 1
 

@@ -106,10 +106,10 @@ def test_the_standard_errors_cover_in_95_percent():
 
     truth = np.concatenate([[evidence], mean[rows], variance[rows], probabilities[rows].ravel()])
     found, errors = map(np.stack, zip(*(once(jax.random.key(seed)) for seed in range(200)), strict=True))
-    covered = np.mean(np.abs(found - truth) <= 2 * errors, axis=0)
+    covered = np.mean(np.abs(found - truth) <= 2 * errors + 1e-12, axis=0)
     assert np.all(covered >= 0.90), covered  # 95 % of 200 has a standard error of 1.5 %
-    assert 0.93 <= np.mean(covered) <= 0.97
-    assert np.all(np.abs(np.mean(found - truth, axis=0)) <= 4 * np.std(found, axis=0) / np.sqrt(200))
+    assert 0.93 <= np.mean(covered) <= 0.97, covered
+    assert np.all(np.abs(np.mean(found - truth, axis=0)) <= 4 * np.std(found, axis=0) / np.sqrt(200) + 1e-12)
 
 
 def test_one_answer_by_hand():
@@ -121,8 +121,9 @@ def test_one_answer_by_hand():
         blurred = OrdinalProbit((-0.5, 0.7), np.sqrt(0.3**2 + 1.7))
         np.testing.assert_allclose(posterior.log_evidence, blurred.log_prob(0.0, category), rtol=1e-12)
         by_ep = fit(gp, trials, inference="ep")
-        mean, variance = posterior.predict(trials.x[:1])
-        np.testing.assert_allclose([mean, variance], by_ep.predict(trials.x[:1]), rtol=0, atol=1e-4)
+        found, errors = posterior.predict(trials.x[:1]), posterior.standard_errors(trials.x[:1])
+        for value, expected, error in zip(found, by_ep.predict(trials.x[:1]), errors, strict=False):
+            assert errors_apart(value, expected, error) < 3.5 and error < 1e-3
 
 
 # --- what the approximations miss (docs/inference.md has the table)
