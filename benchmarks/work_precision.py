@@ -1,6 +1,7 @@
 """Run time against error of every inference method, on fixed data; writes docs/work_precision.md and .svg.
 
-    python benchmarks/work_precision.py
+    python benchmarks/work_precision.py            all four sizes (a quarter of an hour, most of it compilation)
+    python benchmarks/work_precision.py 25 100     these only
 
 Each of four kinds of data at n = 10, 25, 50 and 100 answers: separated (no mistakes), noisy with repeated stimuli,
 near-separable (noise 0.1) and real people (the shipped video ratings; 100 answers are two people's). The reference is
@@ -32,7 +33,7 @@ from hilbo.tables import read_trials  # noqa: E402
 
 __all__ = ["main"]
 
-SIZES = (10, 25, 50, 100)
+SIZES = tuple(int(size) for size in sys.argv[1:]) or (10, 25, 50, 100)
 KINDS = ("separated", "noisy, repeats", "near-separable", "real people")
 QUANTITIES = ("mean", "sd", "class probability", "log evidence", "next point")
 
@@ -159,9 +160,9 @@ def table(results) -> str:
 
 
 def by_kind(results) -> str:
-    head = "| data, n = 25 | method | " + " | ".join(QUANTITIES) + " |\n|---|---|" + "---:|" * len(QUANTITIES)
+    head = "| data | method | " + " | ".join(QUANTITIES) + " |\n|---|---|" + "---:|" * len(QUANTITIES)
     rows = [
-        f"| {kind} | {name} | " + " | ".join(f"{v:.1e}" for v in results[name, 25][0][row]) + " |"
+        f"| {kind} | {name} | " + " | ".join(f"{v:.1e}" for v in results[name, SIZES[-1]][0][row]) + " |"
         for row, kind in enumerate(KINDS)
         for name in ("laplace", "ep", "exact, 16,384")
     ]
@@ -172,9 +173,11 @@ def draw(results, path):
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(1, len(SIZES), figsize=(13, 3.6), sharex=True, sharey=True, layout="constrained")
+    figure, axes = plt.subplots(
+        1, len(SIZES), figsize=(1 + 3 * len(SIZES), 3.6), sharex=True, sharey=True, squeeze=False, layout="constrained"
+    )
     colours = {"laplace": "C0", "ep": "C1", "exact": "C2"}
-    for axis, n in zip(axes, SIZES, strict=True):
+    for axis, n in zip(axes[0], SIZES, strict=True):
         for name in METHODS:
             errors, seconds = results[name, n]
             family = name.split(",")[0]
@@ -192,7 +195,7 @@ def draw(results, path):
         axis.set_title(f"{n} answers")
         axis.set_xlabel("time of a fit and 200 predictions (ms)")
         axis.margins(x=0.25)
-    axes[0].set_ylabel("error of the mean, worst of four data sets (prior sd)")
+    axes[0, 0].set_ylabel("error of the mean, worst of four data sets (prior sd)")
     figure.savefig(path, metadata={"Date": None})
 
 
@@ -211,7 +214,7 @@ reference's posterior, the point has that the method would ask next. "exact, N":
 
 {table(results)}
 
-What the kinds of data do, at 25 answers:
+What the kinds of data do, at {SIZES[-1]} answers:
 
 {by_kind(results)}
 """
