@@ -234,7 +234,7 @@ def _newton_step(sites, posterior, variance, apart, wider):
     """
     follow, spread, matrix = _coupling(sites, posterior, variance)
     free = (1.0 + variance * sites.precision) * apart
-    dv = _inverse(matrix) @ (wider - spread @ (sites.precision_m * free))
+    dv = _solve(matrix, wider - spread @ (sites.precision_m * free))
     return free + follow @ dv, dv
 
 
@@ -250,6 +250,11 @@ def _coupling(sites, posterior, variance):
     spread = posterior.covariance**2 * (1.0 - eye) / (posterior.left**2)[:, None]
     matrix = eye + spread * sites.precision_v[None, :] + spread @ (sites.precision_m[:, None] * follow)
     return follow, spread, matrix
+
+
+@_one_at_a_time
+def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.linalg.solve(matrix, right)
 
 
 @jax.custom_jvp
