@@ -13,7 +13,9 @@ _names, __dir__, __all__ = lazy_loader.attach(
         "acquisition",
         "bcm",
         "config",
+        "ep",
         "errors",
+        "exact",
         "hyperparameters",
         "identification",
         "kernels",
@@ -41,7 +43,9 @@ if TYPE_CHECKING:  # the same names for type checkers and editors; a test compar
     from hilbo import acquisition as acquisition
     from hilbo import bcm as bcm
     from hilbo import config as config
+    from hilbo import ep as ep
     from hilbo import errors as errors
+    from hilbo import exact as exact
     from hilbo import hyperparameters as hyperparameters
     from hilbo import identification as identification
     from hilbo import kernels as kernels

@@ -25,7 +25,7 @@ from hilbo.memory import Memory
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.search_space import Mechanics, Parameter, SearchSpace
 
-__all__ = ["RBF", "OrdinalGP", "OrdinalProbit", "Selection", "Study"]
+__all__ = ["RBF", "Inference", "OrdinalGP", "OrdinalProbit", "Selection", "Study"]
 
 
 def _text(words: str, example: str):
@@ -68,6 +68,9 @@ class _RendererTable(_Table, frozen=True):
     effective_damping: Annotated[tuple[float, float] | None, _text("a list of two numbers", "[10, 80]")] = None
 
 
+Inference = Literal["laplace", "ep", "exact"]
+
+
 class _GPTable(_Table, frozen=True):
     theta: Annotated[
         _Positive | Annotated[tuple[_Positive, ...], msgspec.Meta(min_length=1)],
@@ -76,7 +79,7 @@ class _GPTable(_Table, frozen=True):
     variance: Annotated[_Positive, msgspec.Meta(examples=["1.0"])]
     thresholds: Annotated[tuple[float, ...], _text("a list of rising numbers", "[-0.5, 0.5]")]
     noise: Annotated[_Positive, msgspec.Meta(examples=["0.5"])]
-    inference: Annotated[Literal["laplace"], _text('"laplace"', '"laplace"')] = "laplace"
+    inference: Annotated[Inference, _text('"laplace", "ep" or "exact"', '"laplace"')] = "laplace"
 
 
 Acquisition = Literal["ucb", "log_ei", "thompson", "top_category", "mean"]
@@ -132,7 +135,7 @@ class Study(eqx.Module):
     name: str = eqx.field(static=True)
     responses: tuple[str, ...] = eqx.field(static=True)
     selection: Selection = eqx.field(static=True)
-    inference: Literal["laplace"] = eqx.field(static=True)
+    inference: Inference = eqx.field(static=True)
     rule: Literal["bcm"] = eqx.field(static=True)
     source: str = eqx.field(static=True)
     content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON

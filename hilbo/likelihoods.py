@@ -33,7 +33,7 @@ from jaxtyping import Array, Float
 
 from hilbo.normal import HALF_LOG_2PI, excess_hazard
 
-__all__ = ["OrdinalProbit"]
+__all__ = ["OrdinalProbit", "confined_normal"]
 
 # An interval is narrow below this width, and below this product of width and distance from the middle of the bell.
 _NARROW_WIDTH, _NARROW_PRODUCT = 1.0, 4.0
@@ -79,6 +79,23 @@ class OrdinalProbit(eqx.Module):
         truncated = _truncated(f, lower, upper, noise)
         return truncated.log_mass, truncated.mean / noise, truncated.curvature / noise**2
 
+    def smoothed(
+        self, mean: ArrayLike, variance: ArrayLike, q: ArrayLike
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+        """log of the integral of p(q | f) over f ~ N(mean, variance), its derivative in `mean`, and the precision t of
+        the Gaussian site with which that normal would get the variance that the answer gives it.
+
+        The integral is the same likelihood with its noise grown to s, s^2 = noise^2 + variance; minus the second
+        derivative in `mean` is t / (1 + variance t). With k_2 the variance of the truncated normal,
+        t = (1 - k_2) / (noise^2 + variance k_2): never negative, at most 1 / noise^2.
+        """
+        mean, lower, upper, noise = self._edges(mean, q)
+        variance = jnp.asarray(variance, mean.dtype)
+        spread = jnp.sqrt(noise**2 + variance)
+        truncated = _truncated(mean, lower, upper, spread)
+        precision = truncated.curvature / (noise**2 + variance * (1.0 - truncated.curvature))
+        return truncated.log_mass, truncated.mean / spread, precision
+
     def class_probabilities(self, mean: ArrayLike, variance: ArrayLike = 0.0) -> Float[Array, " categories"]:
         """Probabilities (C,) of the categories when f ~ N(mean, variance); they sum to 1 within rounding.
 
@@ -94,6 +111,16 @@ class OrdinalProbit(eqx.Module):
         ends = jnp.full((1,), jnp.inf, f.dtype)
         edges = jnp.concatenate([-ends, self.thresholds.astype(f.dtype), ends])
         return f, edges[q], edges[q + 1], self.noise.astype(f.dtype)
+
+
+def confined_normal(
+    mean: Float[Array, ""], lower: Float[Array, ""], upper: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """N(mean, 1) between two edges, which may be infinite: log of its mass there, and of what is left, confined, the
+    mean's distance from `mean` and 1 - variance; the latter are also the first and minus the second derivative of the
+    log mass in `mean`."""
+    truncated = _truncated(mean, lower, upper, jnp.ones_like(mean))
+    return truncated.log_mass, truncated.mean, truncated.curvature
 
 
 class _Truncated(NamedTuple):

@@ -10,21 +10,26 @@ is a pytree: `jax.vmap(fit)` over stacked trials fits all participants, `jax.gra
 Reference: paper, section IV.
 """
 
+import functools
+
 import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
+from hilbo.ep import ep
 from hilbo.errors import InputError
+from hilbo.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import Certificate, LaplacePosterior, laplace, mean_and_explained
 from hilbo.likelihoods import OrdinalProbit
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
 
+_SOUGHT = {"laplace": "Laplace mode", "ep": "fixed point of expectation propagation", "exact": "exact posterior"}
 _BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
 
 
@@ -120,12 +125,27 @@ class _OrdinalTerms(eqx.Module):
         return value, slope, curvature
 
 
+class _TiltedTerms(eqx.Module):
+    """The same answers averaged over cavities, for expectation propagation."""
+
+    likelihood: OrdinalProbit
+    q: Int[Array, " n"]
+    mask: Bool[Array, " n"]
+
+    def __call__(
+        self, mean: Float[Array, " n"], variance: Float[Array, " n"]
+    ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
+        smoothed = jax.vmap(self.likelihood.smoothed)(mean, variance, self.q)
+        value, slope, precision = (jnp.where(self.mask, part, jnp.zeros_like(part)) for part in smoothed)
+        return value, slope, precision
+
+
 class Posterior(eqx.Module):
     """Posterior of the latent realism of one participant; the result of [`fit`][]."""
 
     gp: OrdinalGP
     trials: Trials
-    latent: LaplacePosterior
+    latent: LaplacePosterior | ExactPosterior
 
     @property
     def log_evidence(self) -> Float[Array, ""]:
@@ -133,8 +153,8 @@ class Posterior(eqx.Module):
         return self.latent.log_evidence
 
     @property
-    def certificate(self) -> Certificate:
-        """Residual, iterations, jitter, condition and smallest variance of this fit."""
+    def certificate(self) -> Certificate | SamplingCertificate:
+        """Residual, iterations, jitter, condition and smallest variance of this fit; standard errors if sampled."""
         return self.latent.certificate
 
     def mean(self, x: Float[Array, "m d"]) -> Float[Array, " m"]:
@@ -155,9 +175,51 @@ class Posterior(eqx.Module):
         return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self)
 
     def class_probabilities(self, x: Float[Array, "m d"]) -> Float[Array, "m categories"]:
-        """Probabilities (m, C) of the answers to be expected at points (m, d)."""
+        """Probabilities (m, C) of the answers to be expected at points (m, d).
+
+        From mean and variance, f being taken for normal; after `inference="exact"` from the samples themselves.
+        """
+        if isinstance(self.latent, ExactPosterior):
+            return _sampled_probabilities(self, x)[0]
         mean, variance = self.predict(x)
         return jax.vmap(self.gp.likelihood.class_probabilities)(mean, variance)
+
+    def standard_errors(
+        self, x: Float[Array, "m d"]
+    ) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, "m categories"]]:
+        """Of mean (m,), variance (m,) and class probabilities (m, C): of an exact posterior, which is sampled."""
+        latent = _sampled(self, "standard_errors")
+        mean, variance = latent.moment_errors(gram(self.gp.kernel, self.trials.x, x))
+        return mean, variance, _sampled_probabilities(self, x)[1]
+
+    def draw(self, key: PRNGKeyArray, x: Float[Array, "m d"], count: int) -> Float[Array, "count m"]:
+        """Independent draws (count, m) of the latent function from the exact posterior, jointly at all points."""
+        _sampled(self, "draw")
+        return _draw(self, key, x, count)
+
+
+@functools.partial(jax.jit, static_argnames="count")
+def _draw(posterior, key, x, count):
+    kernel = posterior.gp.kernel
+    return posterior.latent.draw(key, gram(kernel, posterior.trials.x, x), gram(kernel, x, x), count)
+
+
+def _sampled(posterior, wanted) -> ExactPosterior:
+    if not isinstance(posterior.latent, ExactPosterior):
+        raise InputError(f'Posterior.{wanted}: this posterior is not sampled; fit with inference="exact".')
+    return posterior.latent
+
+
+@jax.jit
+def _sampled_probabilities(posterior, x):
+    """Class probabilities (m, C) and their standard errors, point by point."""
+
+    def one(point):
+        cross = gram(posterior.gp.kernel, posterior.trials.x, point[None, :])[:, 0]
+        of = posterior.gp.likelihood.class_probabilities
+        return posterior.latent.expectation(of, cross, posterior.gp.kernel.diagonal(point))
+
+    return jax.lax.map(one, x)
 
 
 @jax.jit
@@ -192,30 +254,44 @@ def fit(
 
     - `gp`: the model.
     - `trials`: the answers; none gives the prior.
-    - `inference`: "laplace" (paper, section IV-1).
+    - `inference`: "laplace" (paper, section IV-1), or "ep", expectation propagation: the same kind of posterior with
+      a far smaller error; or "exact", sampled, for up to about 100 answers and without derivatives
+      (docs/inference.md). The samples are the same ones in every fit.
     - `start`: `posterior.latent.weights` of a fit to nearly the same trials, to save Newton steps.
     - `throw`: raise `InferenceError` if the certificate does not hold. Use `False` under `vmap`, and read
       `posterior.certificate.converged`.
 
     **Returns:** a [`Posterior`][], differentiable in every array of `gp`.
     """
-    if inference != "laplace":
-        raise InputError(f'fit: inference is "{inference}"; this version offers "laplace".')
-    posterior = _fit(gp, trials, start)
-    return _checked(posterior) if throw else posterior
+    if inference not in _SOUGHT:
+        raise InputError(f'fit: inference is "{inference}"; it must be one of {", ".join(_SOUGHT)}.')
+    posterior = _fit(gp, trials, start, inference)
+    return _checked(posterior, _SOUGHT[inference]) if throw else posterior
 
 
-@jax.jit
-def _fit(gp, trials, start):
+@functools.partial(jax.jit, static_argnames="inference")
+def _fit(gp, trials, start, inference):
     covariance = gram(gp.kernel, trials.x, trials.x)
+    if inference == "ep":
+        tilted = _TiltedTerms(gp.likelihood, trials.q, trials.mask)
+        return Posterior(gp, trials, ep(covariance, tilted, start=start))
+    if inference == "exact":
+        return Posterior(gp, trials, _exactly(gp.likelihood, trials, covariance))
     terms = _OrdinalTerms(gp.likelihood, trials.q, trials.mask)
     return Posterior(gp, trials, laplace(covariance, terms, start=start))
 
 
-def _checked(posterior: Posterior) -> Posterior:
+def _exactly(likelihood, trials, covariance):
+    ends = jnp.full((1,), jnp.inf, covariance.dtype)
+    edges = jnp.concatenate([-ends, likelihood.thresholds.astype(covariance.dtype), ends])
+    noise = likelihood.noise.astype(covariance.dtype)
+    return exact(jax.random.key(0), covariance, edges[trials.q], edges[trials.q + 1], noise, trials.mask)
+
+
+def _checked(posterior: Posterior, sought: str) -> Posterior:
     certificate = posterior.certificate
     if isinstance(certificate.converged, jax.core.Tracer):
-        message = "the Laplace mode was not found to its tolerance; fit with throw=False and read the certificate"
+        message = f"the {sought} was not found to its tolerance; fit with throw=False and read the certificate"
         return eqx.error_if(posterior, ~certificate.converged, message)
     if not bool(certificate.converged):
         categories = len(posterior.gp.likelihood.thresholds) + 1
@@ -226,7 +302,7 @@ def _checked(posterior: Posterior) -> Posterior:
                 f" categories 0 to {categories - 1}; check the answers or the thresholds."
             )
         raise InferenceError(
-            f"the Laplace mode was not found: its residual is {float(certificate.residual):.3g} after"
+            f"the {sought} was not found: its residual is {float(certificate.residual):.3g} after"
             f" {int(certificate.iterations)} steps and should be at most {float(certificate.tolerance):.3g}; use a"
             " larger noise, float64, or throw=False to look at the certificate."
         )

@@ -51,8 +51,9 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
         noise=f"{float(gp.likelihood.noise):g}",
         thresholds=", ".join(f"{float(t):g}" for t in gp.likelihood.thresholds),
         search=_search_words(study),
-        certificate=f"Certificates: every mode was found by Newton's method to a residual of at most {worst:.1e}"
-        " prior standard deviations (which bounds its distance from the exact mode).",
+        method=_METHODS[study.inference],
+        certificate=_CERTIFICATES[study.inference].format(worst=f"{worst:.1e}"),
+        other=_other_words(content),
         study_hash=content["study"],
         seed=content["seed"],
         versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
@@ -97,6 +98,30 @@ def _memory(mechanics):
     return f"N = {mechanics.N}" if mechanics.memory == "short" else f"full memory, {mechanics.states} exponentials"
 
 
+_METHODS = {
+    "laplace": "a Gaussian at its mode (Laplace)",
+    "ep": "a Gaussian with the moments of expectation propagation",
+    "exact": "sampled exactly (minimax tilting) and enters with its mean and variance",
+}
+_CERTIFICATES = {
+    "laplace": "Certificates: every mode was found by Newton's method to a residual of at most {worst} prior standard"
+    " deviations (which bounds its distance from the exact mode).",
+    "ep": "Certificates: the moments of every fit agree to {worst} (means in prior standard deviations, or logarithms"
+    " of variances).",
+    "exact": "Certificates: the largest standard error of a latent mean (in prior standard deviations) or of a log"
+    " evidence is {worst}.",
+}
+
+
+def _other_words(content):
+    """By how much the optimum would move with another inference; nothing if it was not computed."""
+    other = content.get("other_inference")
+    if other is None:
+        return ""
+    name = {"ep": "expectation propagation", "laplace": "Laplace's approximation"}[other["inference"]]
+    return f"With {name} instead, the optimum would move by {100 * other['nrmse']:.1f} % of the search ranges (NRMSE)."
+
+
 def _passivity_words(margin):
     if margin is None:
         return ""
@@ -121,6 +146,7 @@ def _comparison(study, content):
     truth = content.get("truth")
     claims = {"population map (bcm)": ("aggregate", content["optimum"])}
     words = {"average": "plain average of the latent functions", "pooled": "one model of all answers"}
+    words |= {"ep": "population map, expectation propagation", "laplace": "population map, Laplace"}
     claims |= {words[name]: (name, found) for name, found in content["alternatives"].items()}
     claims["mean of the individual optima"] = ("mean_of_optima", content["mean_of_optima"])
     rows = []

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from hilbo.config import Study
 from hilbo.ordinal_gp import Posterior
 from hilbo.page import results_page
-from hilbo.study import Aggregate, Optimum, population, progress
+from hilbo.study import Aggregate, Optimum, nrmse, other_inference, population, progress
 
 __all__ = [
     "K0_range",
@@ -136,6 +136,10 @@ def result(
         "seed": seed,
         "versions": versions(),
     }
+    other = other_inference(study)
+    if other in aggregate.alternatives:
+        moved = nrmse(aggregate.alternatives[other].x, aggregate.optimum.x)
+        content["other_inference"] = {"inference": other, "nrmse": float(moved)}
     failed = [person["participant"] for person in people if not person["certificate"]["converged"]]
     content["warnings"] = [_not_converged(failed)] if failed else []
     if truth is not None:

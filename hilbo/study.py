@@ -19,7 +19,7 @@ import pandas as pd
 from jaxtyping import Array, Float, Int
 
 from hilbo import acquisition, bcm
-from hilbo.config import Study
+from hilbo.config import Inference, Study
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.session import best_point, physical_trials, search_points
@@ -33,6 +33,7 @@ __all__ = [
     "fit_cohort",
     "individual_optima",
     "nrmse",
+    "other_inference",
     "pooled_posterior",
     "population",
     "population_optimum",
@@ -89,7 +90,8 @@ class Aggregate(eqx.Module):
     optimum: Optimum
     individuals: Optimum
     alternatives: dict[str, Optimum]
-    """Optimum of the plain average of the latent functions, and of one GP on all answers (if not too many)."""
+    """Optimum of the plain average of the latent functions, of one GP on all answers (if not too many), and of the
+    population map by another inference: "ep", or "laplace" where the study itself says "ep"."""
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"]:
@@ -115,16 +117,20 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     return Cohort(jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded), physical, tuple(groups))
 
 
-def fit_cohort(study: Study, cohort: Cohort, gps: OrdinalGP | None = None) -> Posterior:
-    """Everybody's posterior, stacked; with the study's model, or with `gps`, one stacked model each."""
-    return _fit_cohort(study, cohort.trials, gps)
+def fit_cohort(
+    study: Study, cohort: Cohort, gps: OrdinalGP | None = None, inference: Inference | None = None
+) -> Posterior:
+    """Everybody's posterior, stacked; with the study's model, or with `gps`, one stacked model each; by the study's
+    inference, or by another."""
+    return _fit_cohort(study, cohort.trials, gps, inference)
 
 
 @eqx.filter_jit
-def _fit_cohort(study, trials, gps):
+def _fit_cohort(study, trials, gps, inference=None):
+    inference = study.inference if inference is None else inference
     if gps is None:
-        return jax.vmap(lambda t: fit(study.gp, t, inference=study.inference, throw=False))(trials)
-    return jax.vmap(lambda gp, t: fit(gp, t, inference=study.inference, throw=False))(gps, trials)
+        return jax.vmap(lambda t: fit(study.gp, t, inference=inference, throw=False))(trials)
+    return jax.vmap(lambda gp, t: fit(gp, t, inference=inference, throw=False))(gps, trials)
 
 
 @eqx.filter_jit
@@ -175,6 +181,11 @@ def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Arr
     return jax.lax.map(one, posteriors, batch_size=32)
 
 
+def other_inference(study: Study) -> Inference:
+    """The inference beside which a study's results are shown."""
+    return "laplace" if study.inference == "ep" else "ep"
+
+
 def pooled_posterior(study: Study, cohort: Cohort) -> Posterior | None:
     """One GP on everybody's answers, as if from one person; None if there are too many for a dense fit."""
     mask = np.asarray(cohort.trials.mask)
@@ -195,6 +206,8 @@ def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: 
     others = {}
     if alternatives:
         others["average"] = population_optimum(study, posteriors, candidates, "average")
+        other = other_inference(study)
+        others[other] = population_optimum(study, fit_cohort(study, cohort, inference=other), candidates)
         pooled = pooled_posterior(study, cohort)
         if pooled is not None:
             stacked = jax.tree.map(lambda leaf: leaf[None], pooled)

@@ -58,7 +58,9 @@ def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert "http://" not in page and "https://" not in page
-    assert len(pd.read_csv(out / "optima.csv")) == 6
+    assert len(pd.read_csv(out / "optima.csv")) == 7
+    assert content["other_inference"]["inference"] == "ep" and 0 <= content["other_inference"]["nrmse"] < 0.5
+    assert "With expectation propagation instead, the optimum would move by" in page
     before = (out / "result.json").read_bytes()
     code, _, stderr = run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", out)
     assert (code, (out / "result.json").read_bytes()) == (2, before)
@@ -150,7 +152,7 @@ def test_simulate_keeps_what_it_simulated(capsys, monkeypatch, tmp_path):
     assert (out / "study.toml").read_text() == text
     assert pd.read_csv(out / "truth.csv")["source"].tolist() == ["population", "individual:P01", "individual:P02"]
     content = json.loads((out / "result.json").read_text())
-    assert set(content["truth"]["nrmse"]) == {"aggregate", "mean_of_optima", "average", "pooled"}
+    assert set(content["truth"]["nrmse"]) == {"aggregate", "mean_of_optima", "average", "pooled", "ep"}
     again = ["aggregate", out / "trials.csv", "--study", out / "study.toml", "--out", tmp_path / "again", "--json"]
     code, stdout, _ = run(capsys, monkeypatch, *again)
     assert code == 0

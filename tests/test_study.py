@@ -1,5 +1,6 @@
 """Trial tables, cohorts, and aggregation of prefixes and subsets, against one person at a time."""
 
+import dataclasses
 from pathlib import Path
 
 import jax
@@ -136,10 +137,21 @@ def test_the_optimum_is_where_the_map_is_highest(cohort):
     mean, _ = population(found.posteriors, many)
     assert float(found.optimum.mean) >= float(mean.max())
     assert bool(STUDY.space.feasible(found.optimum.x))
-    assert set(found.alternatives) == {"average", "pooled"}
+    assert set(found.alternatives) == {"average", "pooled", "ep"}
     merged, own = progress(STUDY, cohort, 0, [5, 9])
     np.testing.assert_allclose(merged[-1], found.optimum.x, atol=1e-4)
     np.testing.assert_allclose(own[-1], found.individuals.x, atol=1e-3)
+
+
+@pytest.mark.parametrize("inference", ["ep", "exact"])
+def test_a_study_may_ask_for_another_inference(cohort, inference):
+    study = dataclasses.replace(STUDY, inference=inference)
+    posteriors = fit_cohort(study, cohort)
+    assert bool(jnp.all(posteriors.certificate.converged))
+    x = jnp.asarray(STUDY.space.candidates(50, 1))
+    apart = population(posteriors, x)[0] - population(fit_cohort(STUDY, cohort, inference="ep"), x)[0]
+    moved = population(posteriors, x)[0] - population(fit_cohort(STUDY, cohort), x)[0]
+    assert jnp.max(jnp.abs(apart)) < 0.1 * jnp.max(jnp.abs(moved))
 
 
 def test_nrmse_is_the_root_mean_square():

@@ -1,0 +1,324 @@
+"""Expectation propagation for latent values with a Gaussian prior and a product of pointwise likelihood terms.
+
+Model: eta ~ N(0, K), p(data | eta) = prod_i p_i(eta_i), each log-concave. The posterior is approximated by a Gaussian
+that has the mean and the variance of every *tilted* distribution p_i(eta_i) N(eta_i; m_i, v_i), where the cavity
+N(m_i, v_i) is what all the other answers say of eta_i. All that is asked of a term is
+L_i(m, v) = log of the integral of p_i(eta) N(eta; m, v), its slope a_i = dL_i/dm, and the precision t_i >= 0 of the
+Gaussian site that stands for it. With these the fixed point reads
+
+    m + v a = K a  (the means agree),      v_i = s_i / (1 - t_i s_i),  s = diag (K^-1 + T)^-1  (the variances agree),
+
+that is, the posterior N(K a, K - K C K), C = (K + 1/T)^-1, has Laplace's form with a for the slopes and t for the
+curvatures, and `predict`, the committee machine and the acquisition work on it unchanged. The log evidence is
+
+    log Z = sum_i [L_i + log(1 + t_i v_i) / 2] - a'm / 2 - log|I + KT| / 2,
+
+Rasmussen & Williams' (3.65) without its differences of large terms, and without 1/t, so that t = 0 is no special case.
+
+* Coordinates as in `laplace`: eta = R w, R the eigenvector root of K, and only I + R'TR >= 1 is factorised. K may be
+  singular (the same stimulus asked twice); nothing is added to it.
+* For given v the means are the maximum of a concave function, so that only v is in need of a careful search. Far from
+  the fixed point damped parallel updates, near it Newton's steps in (m, v), the mean eliminated: n unknowns. A Newton
+  step that does not halve the mismatch sends the search back to updates, which are damped more the longer they take.
+* Derivatives by the implicit function theorem with the matrix of the Newton steps. The evidence is stationary in the
+  sites, so that its gradient, a'dK a / 2 - tr(C dK) / 2 + sum_i dL_i, needs none of them.
+
+References: Minka (2001), UAI; Rasmussen & Williams (2006), section 3.6; Seeger (2005), "Expectation propagation for
+exponential families". The elimination of the mean is derived in docs/design.md, "Expectation propagation".
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from hilbo.laplace import Certificate, LaplacePosterior, _factor, _inverse_and_log_determinant, _square_root
+from hilbo.linalg import _one_at_a_time, cholesky, solve_lower
+
+__all__ = ["Tilted", "ep"]
+
+Tilted = Callable[
+    [Float[Array, " n"], Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
+]
+"""Cavity means and variances -> L_i, its slopes in the mean, and the sites' precisions t_i >= 0, elementwise."""
+
+_BASIN = 3.0  # a mismatch, in posterior sds, below which Newton's step is tried
+
+
+def ep(
+    covariance: Float[Array, "n n"],
+    terms: Tilted,
+    *,
+    start: Float[Array, " n"] | None = None,
+    max_steps: int = 200,
+) -> LaplacePosterior:
+    """Approximate p(eta | data) by the Gaussian that matches the tilted moments.
+
+    **Arguments:**
+
+    - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
+    - `terms`: cavity means and variances (n,) -> L, slopes and precisions, (n,) each; a pytree (an `eqx.Module`, say)
+      if it holds arrays that are traced.
+    - `start`: `weights` of an earlier, similar fit (also Laplace's); changes the number of steps, not the result.
+
+    **Returns:** the posterior in the record of [`laplace`][hilbo.laplace.laplace]: `mode` is its mean, `weights` are
+    the slopes a. Differentiable in `covariance` and in the arrays of `terms`. Never raises: read
+    `certificate.converged`. In the certificate, `residual` is the largest mismatch of a mean, in prior standard
+    deviations, or of a log variance, whichever is the worse beside its tolerance.
+    """
+    mean, variance, found = _fixed_point(terms, covariance, start, max_steps)
+    _, slope, precision = terms(mean, variance)
+    inverse, _ = _inverse_and_log_determinant(covariance, precision)
+    log_evidence = _log_evidence(terms, covariance, mean, variance)
+    fixed = jax.lax.stop_gradient((covariance, precision))
+    factor, condition = _factor(*fixed)
+    prior_variance = jnp.diagonal(fixed[0])
+    largest = jnp.max(prior_variance)
+    explained = jnp.sum((factor @ fixed[0]) ** 2, axis=0)
+    certificate = Certificate(
+        residual=found.residual,
+        tolerance=found.tolerance,
+        iterations=found.iterations,
+        jitter=found.discarded / largest,
+        condition=condition,
+        smallest_variance=jnp.min(jnp.where(fixed[1] > 0, prior_variance - explained, largest)),
+        variance_resolution=jnp.finfo(mean.dtype).eps * largest * mean.shape[0] ** 0.5,
+        converged=(found.residual <= found.tolerance) & jnp.isfinite(log_evidence),
+    )
+    return LaplacePosterior(
+        covariance @ slope, slope, factor, inverse, log_evidence, jax.lax.stop_gradient(certificate)
+    )
+
+
+# --- the fixed point
+
+
+class _Found(eqx.Module):
+    """How the search ended."""
+
+    residual: Float[Array, ""]
+    tolerance: Float[Array, ""]
+    iterations: Int[Array, ""]
+    discarded: Float[Array, ""]
+
+
+class _Search(eqx.Module):
+    mean: Float[Array, " n"]  # of the cavities, as is the variance
+    variance: Float[Array, " n"]
+    residual: Float[Array, ""]
+    tolerance: Float[Array, ""]
+    mismatch: Float[Array, ""]  # before a Newton step, infinite before an update
+    basin: Float[Array, ""]
+    updates: Int[Array, ""]
+    steps: Int[Array, ""]
+
+
+@eqx.filter_custom_jvp
+def _fixed_point(terms, covariance, start, max_steps):
+    """Cavity means and variances, and how they were found."""
+    root, discarded = _square_root(covariance)
+    largest = jnp.asarray(jnp.inf, covariance.dtype)
+    count = jnp.zeros((), jnp.int32)
+    begin = _Search(
+        *_begin(terms, covariance, root, start), largest, jnp.zeros_like(largest), largest,
+        jnp.full_like(largest, _BASIN), count, count,
+    )  # fmt: skip
+
+    def unfinished(search):
+        return (search.steps < max_steps) & ~(search.residual <= search.tolerance) & ~jnp.isnan(search.mismatch)
+
+    end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
+    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, discarded)
+
+
+def _begin(terms, covariance, root, start):
+    """The prior's cavities; or those around the mean K start, with the sites' precisions at that mean."""
+    prior = jnp.diagonal(covariance)
+    if start is None:
+        return jnp.zeros_like(prior), prior
+    mean = covariance @ start
+    _, _, precision = terms(mean, jnp.zeros_like(mean))
+    posterior = _posterior(root, precision)
+    variance = posterior.variance / posterior.left
+    return mean - variance * start, variance
+
+
+class _Sites(eqx.Module):
+    """Slopes and precisions of the sites, and how they change with the cavities (elementwise)."""
+
+    slope: Float[Array, " n"]
+    precision: Float[Array, " n"]
+    slope_v: Float[Array, " n"]
+    precision_m: Float[Array, " n"]
+    precision_v: Float[Array, " n"]
+
+
+def _sites(terms, mean, variance):
+    (_, slope, precision), push = jax.linearize(terms, mean, variance)
+    ones, zeros = jnp.ones_like(mean), jnp.zeros_like(mean)  # the terms are independent: one tangent serves them all
+    _, _, precision_m = push(ones, zeros)
+    _, slope_v, precision_v = push(zeros, ones)
+    return _Sites(slope, precision, slope_v, precision_m, precision_v)
+
+
+class _Posterior(eqx.Module):
+    covariance: Float[Array, "n n"]  # S = (K^-1 + T)^-1
+    variance: Float[Array, " n"]
+    left: Float[Array, " n"]  # 1 - t s: the share of the variance that is left when the site joins its cavity
+
+
+def _posterior(root, precision):
+    """S = G'G with L G = R', LL' = I + R'TR: a sum of squares, no inverse of K or T."""
+    matrix = jnp.eye(root.shape[0], dtype=root.dtype) + (root.T * precision[None, :]) @ root
+    half = solve_lower(cholesky(matrix), root.T)
+    variance = jnp.sum(half**2, axis=0)
+    return _Posterior(half.T @ half, variance, 1.0 - precision * variance)
+
+
+def _advance(terms, covariance, root, search):
+    """Evaluate the mismatch of the cavities and move them, by Newton's step or a damped update."""
+    m, v = search.mean, search.variance
+    sites = _sites(terms, m, v)
+    posterior = _posterior(root, sites.precision)
+    tilted = m + v * sites.slope
+    natural = sites.slope + sites.precision * tilted
+    matched = posterior.covariance @ natural
+    cavity = posterior.variance / posterior.left
+    residual, tolerance, mismatch = _mismatch(covariance, root, search, sites, posterior, (tilted, natural, matched))
+
+    failed = mismatch > 0.5 * search.mismatch
+    basin = jnp.where(failed, jnp.minimum(0.3 * search.basin, 0.9 * mismatch), search.basin)
+    newton = mismatch < basin
+    share = 0.5 / (1 + search.updates // 8).astype(v.dtype)
+    target = matched - cavity * (natural - sites.precision * matched)
+    dm, dv = _newton_step(sites, posterior, v, matched - tilted, cavity - v)
+    growth = jnp.clip(dv / v, -1.0, 1.0)
+    return _Search(
+        mean=jnp.where(newton, m + dm, m + share * (target - m)),
+        variance=jnp.where(newton, v * jnp.exp(growth), v * (cavity / v) ** share),
+        residual=residual,
+        tolerance=tolerance,
+        mismatch=jnp.where(newton | jnp.isnan(mismatch), mismatch, jnp.inf),
+        basin=basin,
+        updates=search.updates + jnp.where(newton, 0, 1),
+        steps=search.steps + 1,
+    )
+
+
+def _mismatch(covariance, root, search, sites, posterior, means):
+    """Residual and tolerance of the worse of mean and variance, and the mismatch in posterior sds that steers."""
+    tilted, natural, matched = means
+    epsilon = jnp.finfo(tilted.dtype).eps
+    apart = jnp.where(sites.precision > 0, jnp.abs(matched - tilted), 0.0)
+    ratio = posterior.variance / (posterior.left * search.variance)
+    stretched = jnp.where(sites.precision > 0, jnp.abs(jnp.log(ratio)), 0.0)
+    prior = jnp.diagonal(covariance)
+    summed = jnp.abs(root).T @ (jnp.abs(natural) + sites.precision * jnp.abs(matched))
+    residuals = jnp.stack([jnp.max(apart / jnp.sqrt(prior)), jnp.max(stretched)])
+    rounding = jnp.stack([jnp.linalg.norm(summed), jnp.max(1.0 + sites.precision * search.variance)])
+    tolerances = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
+    worse = jnp.argmax(residuals / tolerances)
+    mismatch = jnp.maximum(jnp.max(apart / jnp.sqrt(posterior.variance)), residuals[1])
+    return residuals[worse], tolerances[worse], mismatch
+
+
+# --- how cavities move together
+
+
+def _newton_step(sites, posterior, variance, apart, wider):
+    """Changes of m and v that close the gaps `apart` of the means and `wider` of the cavity variances, to first order.
+
+    dm = W dv + (1 + v t) apart,      J dv = wider - Q (dt/dm (1 + v t) apart).
+    """
+    follow, spread, matrix = _coupling(sites, posterior, variance)
+    free = (1.0 + variance * sites.precision) * apart
+    dv = _solve(matrix, wider - spread @ (sites.precision_m * free))
+    return free + follow @ dv, dv
+
+
+def _coupling(sites, posterior, variance):
+    """W: how the means follow the cavity variances; Q: how these follow the precisions; J = I + Q (dt/dv + dt/dm W).
+
+    The means' equation has the inverse diag(1 + v t) (I - S T); dv_i = -(s_i / left_i s_i)^2 sum_{j != i} S_ij^2 dt_j.
+    """
+    eye = jnp.eye(variance.shape[0], dtype=variance.dtype)
+    moved = posterior.covariance * sites.slope_v[None, :]
+    held = (eye - posterior.covariance * sites.precision[None, :]) * (variance * sites.slope_v + sites.slope)[None, :]
+    follow = (1.0 + variance * sites.precision)[:, None] * (moved - held)
+    spread = posterior.covariance**2 * (1.0 - eye) / (posterior.left**2)[:, None]
+    matrix = eye + spread * sites.precision_v[None, :] + spread @ (sites.precision_m[:, None] * follow)
+    return follow, spread, matrix
+
+
+@_one_at_a_time
+def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.linalg.solve(matrix, right)
+
+
+@jax.custom_jvp
+@_one_at_a_time
+def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return jnp.linalg.inv(matrix)
+
+
+@_inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    inverse = _inverse(*primals)
+    return inverse, -inverse @ tangents[0] @ inverse
+
+
+@_fixed_point.def_jvp
+def _fixed_point_jvp(primals, tangents):
+    """Both conditions differentiated: with P = I - K C = I - S T,
+
+    dm = W dv + (1 + v t) [P (dK a - v da) + S da],    J dv = diag(P dK P') / left^2 - Q (dt/dm (dm - W dv) + dt),
+
+    where da and dt are the changes of slopes and precisions at fixed cavities.
+    """
+    terms, covariance, _, _ = primals
+    mean, variance, found = _fixed_point(*primals)
+    sites = _sites(terms, mean, variance)
+    inverse, _ = _inverse_and_log_determinant(covariance, sites.precision)
+    transfer = jnp.eye(mean.shape[0], dtype=mean.dtype) - covariance @ inverse
+    joint = transfer @ covariance
+    ratio = 1.0 + variance * sites.precision
+    posterior = _Posterior(joint, jnp.diagonal(joint), 1.0 / ratio)
+    follow, spread, matrix = _coupling(sites, posterior, variance)
+
+    def changes(terms, covariance):
+        _, slope, precision = terms(mean, variance)
+        moved = transfer @ (covariance @ sites.slope - variance * slope) + joint @ slope
+        return moved, precision, jnp.sum((transfer @ covariance) * transfer, axis=1)
+
+    _, (moved, d_precision, widened) = eqx.filter_jvp(changes, (terms, covariance), tangents[:2])
+    free = ratio * moved
+    dv = _inverse(matrix) @ (widened * ratio**2 - spread @ (sites.precision_m * free + d_precision))
+    return (mean, variance, found), (free + follow @ dv, dv, jax.tree.map(lambda _: None, found))
+
+
+# --- the evidence
+
+
+@eqx.filter_custom_jvp
+def _log_evidence(terms, covariance, mean, variance):
+    values, slope, precision = terms(mean, variance)
+    _, log_determinant = _inverse_and_log_determinant(covariance, precision)
+    joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
+    return joined - 0.5 * slope @ mean - 0.5 * log_determinant
+
+
+@_log_evidence.def_jvp
+def _log_evidence_jvp(primals, tangents):
+    """At the fixed point the evidence is stationary in the cavities: their tangents have no part."""
+    terms, covariance, mean, variance = primals
+    _, slope, precision = terms(mean, variance)
+    inverse, _ = _inverse_and_log_determinant(covariance, precision)
+
+    def explicit(terms, covariance):
+        quadratic = 0.5 * slope @ covariance @ slope - 0.5 * jnp.sum(inverse * covariance)
+        return jnp.sum(terms(mean, variance)[0]) + quadratic
+
+    _, tangent = eqx.filter_jvp(explicit, (terms, covariance), tangents[:2])
+    return _log_evidence(*primals), tangent
