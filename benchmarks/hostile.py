@@ -23,7 +23,7 @@ from datasets import Dataset, hostile_cases  # noqa: E402
 from reference_laplace import mpmath_laplace  # noqa: E402
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit  # noqa: E402
-from hilbo.laplace import Certificate  # noqa: E402
+from hilbo.gaussian import Certificate  # noqa: E402
 
 __all__ = ["main"]
 

@@ -34,8 +34,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hilbo.laplace import Certificate, LaplacePosterior, _factor, _inverse_and_log_determinant, _square_root
-from hilbo.linalg import _one_at_a_time, cholesky, solve_lower
+from hilbo.gaussian import Certificate, GaussianPosterior, factor, inverse_and_log_determinant, square_root
+from hilbo.linalg import cholesky, one_at_a_time, solve_lower
 
 __all__ = ["Tilted", "ep"]
 
@@ -53,7 +53,7 @@ def ep(
     *,
     start: Float[Array, " n"] | None = None,
     max_steps: int = 200,
-) -> LaplacePosterior:
+) -> GaussianPosterior:
     """Approximate p(eta | data) by the Gaussian that matches the tilted moments.
 
     **Arguments:**
@@ -70,13 +70,13 @@ def ep(
     """
     mean, variance, found = _fixed_point(terms, covariance, start, max_steps)
     _, slope, precision = terms(mean, variance)
-    inverse, _ = _inverse_and_log_determinant(covariance, precision)
+    inverse, _ = inverse_and_log_determinant(covariance, precision)
     log_evidence = _log_evidence(terms, covariance, mean, variance)
     fixed = jax.lax.stop_gradient((covariance, precision))
-    factor, condition = _factor(*fixed)
+    root, condition = factor(*fixed)
     prior_variance = jnp.diagonal(fixed[0])
     largest = jnp.max(prior_variance)
-    explained = jnp.sum((factor @ fixed[0]) ** 2, axis=0)
+    explained = jnp.sum((root @ fixed[0]) ** 2, axis=0)
     certificate = Certificate(
         residual=found.residual,
         tolerance=found.tolerance,
@@ -87,9 +87,7 @@ def ep(
         variance_resolution=jnp.finfo(mean.dtype).eps * largest * mean.shape[0] ** 0.5,
         converged=(found.residual <= found.tolerance) & jnp.isfinite(log_evidence),
     )
-    return LaplacePosterior(
-        covariance @ slope, slope, factor, inverse, log_evidence, jax.lax.stop_gradient(certificate)
-    )
+    return GaussianPosterior(covariance @ slope, slope, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 
 
 # --- the fixed point
@@ -118,7 +116,7 @@ class _Search(eqx.Module):
 @eqx.filter_custom_jvp
 def _fixed_point(terms, covariance, start, max_steps):
     """Cavity means and variances, and how they were found."""
-    root, discarded = _square_root(covariance)
+    root, discarded = square_root(covariance)
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
     begin = _Search(
@@ -252,13 +250,13 @@ def _coupling(sites, posterior, variance):
     return follow, spread, matrix
 
 
-@_one_at_a_time
+@one_at_a_time
 def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
     return jnp.linalg.solve(matrix, right)
 
 
 @jax.custom_jvp
-@_one_at_a_time
+@one_at_a_time
 def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.linalg.inv(matrix)
 
@@ -280,7 +278,7 @@ def _fixed_point_jvp(primals, tangents):
     terms, covariance, _, _ = primals
     mean, variance, found = _fixed_point(*primals)
     sites = _sites(terms, mean, variance)
-    inverse, _ = _inverse_and_log_determinant(covariance, sites.precision)
+    inverse, _ = inverse_and_log_determinant(covariance, sites.precision)
     transfer = jnp.eye(mean.shape[0], dtype=mean.dtype) - covariance @ inverse
     joint = transfer @ covariance
     ratio = 1.0 + variance * sites.precision
@@ -304,7 +302,7 @@ def _fixed_point_jvp(primals, tangents):
 @eqx.filter_custom_jvp
 def _log_evidence(terms, covariance, mean, variance):
     values, slope, precision = terms(mean, variance)
-    _, log_determinant = _inverse_and_log_determinant(covariance, precision)
+    _, log_determinant = inverse_and_log_determinant(covariance, precision)
     joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
     return joined - 0.5 * slope @ mean - 0.5 * log_determinant
 
@@ -314,7 +312,7 @@ def _log_evidence_jvp(primals, tangents):
     """At the fixed point the evidence is stationary in the cavities: their tangents have no part."""
     terms, covariance, mean, variance = primals
     _, slope, precision = terms(mean, variance)
-    inverse, _ = _inverse_and_log_determinant(covariance, precision)
+    inverse, _ = inverse_and_log_determinant(covariance, precision)
 
     def explicit(terms, covariance):
         quadratic = 0.5 * slope @ covariance @ slope - 0.5 * jnp.sum(inverse * covariance)

@@ -21,11 +21,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 
-from hilbo.linalg import cholesky, eigh, solve_lower, solve_lower_transposed
+from hilbo.gaussian import Certificate, GaussianPosterior, factor, inverse_and_log_determinant, square_root
+from hilbo.linalg import cholesky, solve_lower, solve_lower_transposed
 
-__all__ = ["Certificate", "LaplacePosterior", "Pointwise", "Terms", "laplace", "mean_and_explained"]
+__all__ = ["Pointwise", "Terms", "laplace"]
 
 Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 """Log-likelihood terms l_i(eta_i), their slopes l_i' and curvatures -l_i'' >= 0; [`Pointwise`][] derives the latter."""
@@ -46,48 +47,13 @@ class Pointwise(eqx.Module):
         return value, slope, -second
 
 
-class Certificate(eqx.Module):
-    """What a fit can say of its own accuracy; every number is measured, none assumed."""
-
-    residual: Float[Array, ""]
-    """|R' grad l - v| at the mode: a bound on its distance from the exact mode, in prior standard deviations."""
-    tolerance: Float[Array, ""]
-    """What the residual had to reach: eps^(2/3), or the rounding error of the residual itself where that is larger."""
-    iterations: Int[Array, ""]
-    """Newton steps taken, rejected ones included."""
-    jitter: Float[Array, ""]
-    """Largest change of the prior covariance by its square root, over the largest prior variance; nothing is added."""
-    condition: Float[Array, ""]
-    """Upper bound on the condition number of I + W^(1/2) K W^(1/2), the only matrix that is factorised."""
-    smallest_variance: Float[Array, ""]
-    """Smallest posterior variance among the eta's that the data say anything about."""
-    variance_resolution: Float[Array, ""]
-    """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
-    converged: Bool[Array, ""]
-    """residual <= tolerance."""
-
-
-class LaplacePosterior(eqx.Module):
-    """Gaussian approximation N(mode, K - K C K) of p(eta | data), C = (K + 1/W)^-1."""
-
-    mode: Float[Array, " n"]
-    weights: Float[Array, " n"]
-    """a = grad l at the mode; the posterior mean of any jointly Gaussian f* is k*'a."""
-    factor: Float[Array, "n n"]
-    """V with V'V = C, for values; its derivative is not defined where W = 0, so it carries none."""
-    inverse: Float[Array, "n n"]
-    """C, for derivatives."""
-    log_evidence: Float[Array, ""]
-    certificate: Certificate
-
-
 def laplace(
     covariance: Float[Array, "n n"],
     terms: Terms,
     *,
     start: Float[Array, " n"] | None = None,
     max_steps: int = 200,
-) -> LaplacePosterior:
+) -> GaussianPosterior:
     """Approximate p(eta | data) by a Gaussian at its mode.
 
     **Arguments:**
@@ -97,19 +63,19 @@ def laplace(
       arrays that are traced. [`Pointwise`][] makes one from values alone.
     - `start`: `weights` of an earlier, similar fit; changes the number of steps, not the result.
 
-    **Returns:** a [`LaplacePosterior`][]; differentiable in `covariance` and in the arrays of `terms`. Never raises:
+    **Returns:** a [`GaussianPosterior`][]; differentiable in `covariance` and in the arrays of `terms`. Never raises:
     read `certificate.converged`.
     """
     start = jnp.zeros_like(covariance[0]) if start is None else start
     mode, residual, tolerance, iterations, discarded = _find_mode(terms, covariance, start, max_steps)
     values, gradient, curvature = terms(mode)
-    inverse, log_determinant = _inverse_and_log_determinant(covariance, curvature)
+    inverse, log_determinant = inverse_and_log_determinant(covariance, curvature)
     fixed = jax.lax.stop_gradient((covariance, curvature))
-    factor, condition = _factor(*fixed)
+    root, condition = factor(*fixed)
     log_evidence = jnp.sum(values) - 0.5 * gradient @ mode - 0.5 * log_determinant
     prior_variance = jnp.diagonal(fixed[0])
     largest = jnp.max(prior_variance)
-    variance = prior_variance - jnp.sum((factor @ fixed[0]) ** 2, axis=0)
+    variance = prior_variance - jnp.sum((root @ fixed[0]) ** 2, axis=0)
     certificate = Certificate(
         residual=residual,
         tolerance=tolerance,
@@ -120,32 +86,7 @@ def laplace(
         variance_resolution=jnp.finfo(mode.dtype).eps * largest * mode.shape[0] ** 0.5,
         converged=(residual <= tolerance) & jnp.isfinite(log_evidence),
     )
-    return LaplacePosterior(mode, gradient, factor, inverse, log_evidence, jax.lax.stop_gradient(certificate))
-
-
-@jax.custom_jvp
-def mean_and_explained(
-    weights: Float[Array, " n"], factor: Float[Array, "n n"], inverse: Float[Array, "n n"], cross: Float[Array, "n m"]
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Posterior mean k*'a at m points, and k*'C k*, the prior variance less the posterior's.
-
-    The latter is a sum of squares: never negative, with all its digits however little is explained.
-
-    **Arguments:** `weights`, `factor` and `inverse` of a posterior; `cross`, prior covariances (n, m) of eta and f*.
-    """
-    del inverse
-    # One product for both; the barrier keeps XLA from computing every covariance once more for each row of it.
-    product = jnp.concatenate([factor, weights[None, :]]) @ jax.lax.optimization_barrier(cross)
-    return product[-1], jnp.sum(product[:-1] ** 2, axis=0)
-
-
-@mean_and_explained.defjvp
-def _mean_and_explained_jvp(primals, tangents):
-    weights, _, inverse, cross = primals
-    d_weights, _, d_inverse, d_cross = tangents
-    d_mean = d_weights @ cross + weights @ d_cross
-    d_explained = jnp.sum((d_inverse @ cross) * cross + 2.0 * (inverse @ cross) * d_cross, axis=0)
-    return mean_and_explained(*primals), (d_mean, d_explained)
+    return GaussianPosterior(mode, gradient, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 
 
 # --- the mode
@@ -154,7 +95,7 @@ def _mean_and_explained_jvp(primals, tangents):
 @eqx.filter_custom_jvp
 def _find_mode(terms, covariance, start, max_steps):
     """The mode, its residual and the tolerance that was to be met, steps taken, and what the square root dropped."""
-    root, discarded = _square_root(covariance)
+    root, discarded = square_root(covariance)
     solution = optx.root_find(
         _stationarity,
         _DampedNewton(),
@@ -180,7 +121,7 @@ def _find_mode_jvp(primals, tangents):
         return matrix @ slope, curvature
 
     (_, curvature), (moved, _) = eqx.filter_jvp(image, (terms, covariance), tangents[:2])
-    inverse, _ = _inverse_and_log_determinant(covariance, curvature)
+    inverse, _ = inverse_and_log_determinant(covariance, curvature)
     return found, (moved - covariance @ (inverse @ moved), None, None, None, None)
 
 
@@ -188,16 +129,6 @@ def _stationarity(eta, args):
     """eta - K grad l(eta), zero at the mode: what the solver is asked for."""
     terms, covariance = args
     return eta - covariance @ terms(eta)[1]
-
-
-def _square_root(covariance):
-    """R with R R' = K, and the size of the largest eigenvalue dropped.
-
-    K is positive semi-definite, so a negative eigenvalue is rounding, and without it K changes by no more than itself.
-    """
-    eigenvalues, vectors = eigh(covariance)
-    root = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
-    return root, jnp.where(eigenvalues[0] < 0, -eigenvalues[0], 0.0)
 
 
 class _NewtonState(eqx.Module):
@@ -268,39 +199,3 @@ def _newton_state(terms, root, v):
         tolerance=jnp.clip(4.0 * epsilon * jnp.linalg.norm(summed), epsilon ** (2 / 3), epsilon**0.25),
     )
     return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v)
-
-
-# --- the matrix C = (K + 1/W)^-1 = W^(1/2) B^-1 W^(1/2),  B = I + W^(1/2) K W^(1/2)
-
-
-def _factorise(covariance, curvature):
-    root = jnp.sqrt(curvature)
-    matrix = jnp.eye(root.shape[0], dtype=root.dtype) + root[:, None] * covariance * root[None, :]
-    return root, matrix, cholesky(matrix)
-
-
-def _factor(covariance, curvature):
-    """V = L^-1 W^(1/2) with B = L L', so V'V = C; and a bound on B's condition, as B has no eigenvalue below 1."""
-    root, matrix, lower = _factorise(covariance, curvature)
-    return solve_lower(lower, jnp.diag(root)), jnp.linalg.norm(matrix)
-
-
-@jax.custom_jvp
-def _inverse_and_log_determinant(covariance, curvature):
-    """C, and log|B| = log|I + K W|."""
-    root, _, lower = _factorise(covariance, curvature)
-    factor = solve_lower(lower, jnp.diag(root))
-    return factor.T @ factor, 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
-
-
-@_inverse_and_log_determinant.defjvp
-def _inverse_and_log_determinant_jvp(primals, tangents):
-    """With T = I - C K: dC = -C dK C + T dW T' and d log|B| = tr(C dK) + tr(K T dW); no 1/W, no W^(1/2)."""
-    covariance, _ = primals
-    d_covariance, d_curvature = tangents
-    inverse, log_determinant = _inverse_and_log_determinant(*primals)
-    transfer = jnp.eye(inverse.shape[0], dtype=inverse.dtype) - inverse @ covariance
-    d_inverse = (transfer * d_curvature[None, :]) @ transfer.T - inverse @ d_covariance @ inverse
-    posterior_variance = jnp.sum(covariance * transfer.T, axis=1)
-    d_log_determinant = jnp.sum(inverse * d_covariance) + posterior_variance @ d_curvature
-    return (inverse, log_determinant), (d_inverse, d_log_determinant)

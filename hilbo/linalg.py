@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["cholesky", "eigh", "solve_lower", "solve_lower_transposed"]
+__all__ = ["cholesky", "eigh", "one_at_a_time", "solve_lower", "solve_lower_transposed"]
 
 
-def _one_at_a_time(function: Callable) -> Callable:
+def one_at_a_time(function: Callable) -> Callable:
     """`function` of arrays with a rule for `vmap`: a loop on CPUs, the batched kernel elsewhere."""
     mapped = jax.custom_batching.custom_vmap(function)
 
@@ -31,26 +31,26 @@ def _one_at_a_time(function: Callable) -> Callable:
     return mapped
 
 
-@_one_at_a_time
+@one_at_a_time
 def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
     """Eigenvalues, increasing, and eigenvectors (columns) of a symmetric matrix."""
     eigenvalues, vectors = jnp.linalg.eigh(matrix)
     return eigenvalues, vectors
 
 
-@_one_at_a_time
+@one_at_a_time
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower Cholesky factor of a positive definite matrix."""
     return jnp.linalg.cholesky(matrix)
 
 
-@_one_at_a_time
+@one_at_a_time
 def solve_lower(factor: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """X with `factor` X = `right`, for a lower triangular factor."""
     return jax.scipy.linalg.solve_triangular(factor, right, lower=True)
 
 
-@_one_at_a_time
+@one_at_a_time
 def solve_lower_transposed(factor: Float[Array, "n n"], right: Float[Array, "n m"]) -> Float[Array, "n m"]:
     """X with `factor`' X = `right`, for a lower triangular factor."""
     return jax.scipy.linalg.solve_triangular(factor, right, lower=True, trans=1)

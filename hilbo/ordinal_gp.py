@@ -23,8 +23,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from hilbo.ep import ep
 from hilbo.errors import InputError
 from hilbo.exact import ExactPosterior, SamplingCertificate, exact
+from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained
 from hilbo.kernels import RBF, gram
-from hilbo.laplace import Certificate, LaplacePosterior, laplace, mean_and_explained
+from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
@@ -145,7 +146,7 @@ class Posterior(eqx.Module):
 
     gp: OrdinalGP
     trials: Trials
-    latent: LaplacePosterior | ExactPosterior
+    latent: GaussianPosterior | ExactPosterior
 
     @property
     def log_evidence(self) -> Float[Array, ""]:

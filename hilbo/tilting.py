@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.likelihoods import confined_normal
-from hilbo.linalg import _one_at_a_time, cholesky, solve_lower
+from hilbo.linalg import cholesky, one_at_a_time, solve_lower
 from hilbo.normal import HALF_LOG_2PI, excess_hazard
 
 __all__ = ["Box", "Tilt", "accepted", "ordered_box", "propose", "tilting"]
@@ -118,7 +118,7 @@ def _saddle(box, x, mu):
     return _Saddle(x, mu, (step[: len(x)], step[len(x) :]), jnp.ones_like(psi), size, psi, jnp.zeros((), jnp.int32))
 
 
-@_one_at_a_time
+@one_at_a_time
 def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
     return jnp.linalg.solve(matrix, right)
 

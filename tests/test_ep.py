@@ -12,8 +12,8 @@ from reference_ep import textbook_ep, tilted_moments
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit, ordinal_gp
 from hilbo.ep import ep
+from hilbo.gaussian import mean_and_explained
 from hilbo.kernels import gram
-from hilbo.laplace import mean_and_explained
 from hilbo.ordinal_gp import InferenceError
 
 CAPACITY = 25

@@ -14,8 +14,9 @@ from mpmath import mp
 from reference_laplace import mpmath_laplace, numpy_laplace
 from scipy.special import log_ndtr
 
+from hilbo.gaussian import mean_and_explained
 from hilbo.kernels import RBF, gram
-from hilbo.laplace import Pointwise, laplace, mean_and_explained
+from hilbo.laplace import Pointwise, laplace
 from hilbo.likelihoods import OrdinalProbit
 
 QUANTITIES = ("mode", "mean", "variance", "log_evidence")
