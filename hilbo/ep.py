@@ -290,7 +290,9 @@ def _fixed_point_jvp(primals, tangents):
         moved = transfer @ (covariance @ sites.slope - variance * slope) + joint @ slope
         return moved, precision, jnp.sum((transfer @ covariance) * transfer, axis=1)
 
-    _, (moved, d_precision, widened) = eqx.filter_jvp(changes, (terms, covariance), tangents[:2])
+    at, tangent = eqx.filter_jvp(changes, (terms, covariance), tangents[:2])
+    # What does not depend on the side that moves has no tangent at all.
+    moved, d_precision, widened = (jnp.zeros_like(a) if t is None else t for a, t in zip(at, tangent, strict=True))
     free = ratio * moved
     dv = _inverse(matrix) @ (widened * ratio**2 - spread @ (sites.precision_m * free + d_precision))
     return (mean, variance, found), (free + follow @ dv, dv, jax.tree.map(lambda _: None, found))

@@ -62,6 +62,7 @@ def maximise_evidence(
     weak_priors: bool = False,
     starts: int = 4,
     max_steps: int = 100,
+    inference: str = "laplace",
 ) -> Learned:
     """The hyperparameters under which one person's answers are most probable; under `jax.vmap`, each person's own.
 
@@ -70,9 +71,12 @@ def maximise_evidence(
     - `gp`: starting values, and the values of what is not learnt.
     - `learn`: which of "theta", "variance", "noise", "thresholds". A `theta` of shape (d,) is learnt per dimension.
     - `weak_priors`: add the log prior above.
+    - `inference`: whose evidence, "laplace" or "ep"; "exact" has no derivatives.
     - `starts`: the search begins at the model's values with theta and noise scaled by powers of 2; the best end wins.
     """
-    return _maximise(gp, jax.tree.map(lambda leaf: leaf[None], trials), learn, weak_priors, starts, max_steps)
+    return _maximise(
+        gp, jax.tree.map(lambda leaf: leaf[None], trials), learn, weak_priors, starts, max_steps, inference
+    )
 
 
 def maximise_shared_evidence(
@@ -83,9 +87,10 @@ def maximise_shared_evidence(
     weak_priors: bool = False,
     starts: int = 4,
     max_steps: int = 100,
+    inference: str = "laplace",
 ) -> Learned:
     """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences."""
-    return _maximise(gp, trials, learn, weak_priors, starts, max_steps)
+    return _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference)
 
 
 def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Float[Array, ""]:
@@ -96,14 +101,18 @@ def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Float[A
     return -0.5 * jnp.sum(jnp.stack(parts))
 
 
-def _maximise(gp, trials, learn, weak_priors, starts, max_steps):
+def _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference):
     learn = _checked(learn)
+    if inference == "exact":
+        raise InputError(
+            'hyperparameters: inference "exact" has no derivatives to learn by; use "ep", which is near it.'
+        )
     # Per answer the cost has curvatures near 1, so that the first step, down the bare gradient, is a sensible one.
     answers = jnp.sum(trials.mask, dtype=gp.likelihood.noise.dtype) + 1.0
 
     def cost(coordinates, _):
         model = _model(coordinates, gp)
-        evidence, certified = _evidence(model, trials)
+        evidence, certified = _evidence(model, trials, inference)
         prior = log_prior(model, gp, learn) if weak_priors else jnp.zeros_like(evidence)
         return -(evidence + prior) / answers, (evidence, certified)
 
@@ -127,11 +136,11 @@ def _maximise(gp, trials, learn, weak_priors, starts, max_steps):
     return Learned(_model(chosen, gp), evidences[best], steps[best], done[best], runaway, learn)
 
 
-def _evidence(gp, trials):
+def _evidence(gp, trials, inference):
     """Summed log evidence of stacked trials, and whether every certificate holds."""
 
     def one(person):
-        posterior = fit(gp, person, throw=False)
+        posterior = fit(gp, person, inference=inference, throw=False)
         return posterior.log_evidence, posterior.certificate.converged
 
     evidences, converged = jax.vmap(one)(trials)

@@ -75,7 +75,7 @@ def robustness(
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
-    learned = _learn(study.gp, cohort.trials, tuple(learn), shared, weak_priors)
+    learned = _learn(study, cohort.trials, tuple(learn), shared, weak_priors)
     if shared:
         study_learnt = eqx.tree_at(lambda s: s.gp, study, learned.gp)
         again = fit_cohort(study_learnt, cohort)
@@ -100,10 +100,11 @@ def robustness(
 
 
 @eqx.filter_jit
-def _learn(gp, trials, learn, shared, weak_priors):
+def _learn(study, trials, learn, shared, weak_priors):
+    settings = {"weak_priors": weak_priors, "inference": study.inference}
     if shared:
-        return maximise_shared_evidence(gp, trials, learn, weak_priors=weak_priors)
-    return jax.lax.map(lambda t: maximise_evidence(gp, t, learn, weak_priors=weak_priors), trials)
+        return maximise_shared_evidence(study.gp, trials, learn, **settings)
+    return jax.lax.map(lambda t: maximise_evidence(study.gp, t, learn, **settings), trials)
 
 
 @eqx.filter_jit

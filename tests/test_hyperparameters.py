@@ -98,6 +98,19 @@ def test_the_optimum_moves_as_its_derivative_says(checked):
     np.testing.assert_allclose(found.sensitivity["noise"], moved, atol=1e-3)
 
 
+def test_evidence_may_be_that_of_expectation_propagation():
+    _, gp, trials = problem()
+    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("noise",), starts=1, inference="ep"))(trials)
+    assert bool(learned.converged)
+    nearby = [
+        eqx.tree_at(lambda g: g.likelihood.noise, learned.gp, learned.gp.likelihood.noise * f) for f in (0.9, 1.1)
+    ]
+    for other in nearby:
+        assert float(fit(other, trials, inference="ep").log_evidence) < float(learned.log_evidence)
+    with pytest.raises(InputError, match="has no derivatives"):
+        hyper.maximise_evidence(gp, trials, inference="exact")
+
+
 def test_a_hyperparameter_without_influence_is_said_to_run_away():
     _, gp, _ = problem()
     single = Trials.from_arrays(np.full((1, 3), 0.4), np.array([1]), 25)
