@@ -62,8 +62,8 @@ def test_derivatives_of_the_sums_are_those_of_their_polynomials():
         def c(i):
             return lambda a: mp.binomial(a, i) * (-1) ** i
 
-        mp.mp.dps = 40
-        return [float(sum(w(i) * mp.diff(c(i), alpha, order) for i in range(N + 1))) for w in WEIGHTS]
+        with mp.workdps(40):
+            return [float(sum(w(i) * mp.diff(c(i), alpha, order) for i in range(N + 1))) for w in WEIGHTS]
 
     def ours(a):
         found = gl_sums(a, N)
