@@ -84,10 +84,15 @@ def test_robustness_writes_its_check(capsys, monkeypatch, tmp_path):
     data = xr.load_dataset(out / "map.nc", engine="h5netcdf")
     assert data["hyperparameters"].values.tolist() == ["fixed", "by evidence"]
     assert float(abs(data["mean"][0] - data["mean"][1]).max()) > 0.01
-    code, _, _ = run(
-        capsys, monkeypatch, "robustness", tmp_path / "two.csv", *VIDEO[1:], "--out", out, "--own", "--force"
-    )
-    assert code == 0
+
+
+@pytest.mark.deep
+def test_robustness_may_give_everybody_their_own(capsys, monkeypatch, tmp_path):
+    table = pd.read_csv(VIDEO[0], dtype=str)
+    table[table["participant"].isin(["V01", "V02"])].to_csv(tmp_path / "two.csv", index=False)
+    out = tmp_path / "check"
+    arguments = ["robustness", tmp_path / "two.csv", *VIDEO[1:], "--out", out, "--own"]
+    assert run(capsys, monkeypatch, *arguments)[0] == 0
     assert json.loads((out / "result.json").read_text())["learned"]["shared"] is False
 
 
@@ -143,6 +148,7 @@ def test_force_replaces_nothing_but_results(capsys, monkeypatch, tmp_path):
     assert "notes.txt: is a file" in stderr
 
 
+@pytest.mark.deep
 def test_simulate_keeps_what_it_simulated(capsys, monkeypatch, tmp_path):
     text = STUDY.replace("trials = 25", "trials = 6")
     (tmp_path / "short.toml").write_text(text)

@@ -143,7 +143,7 @@ def differences(fn, h):
     return np.stack(columns, axis=-1)
 
 
-@pytest.mark.parametrize("make", [repeated, near_separable])
+@pytest.mark.parametrize("make", [near_separable, pytest.param(repeated, marks=pytest.mark.deep)])
 def test_gradients_in_every_hyperparameter(make):
     """Evidence, means and variances, by both modes, with exactly repeated stimuli; second derivatives of the
     evidence, whose slope uses no derivative of the sites."""

@@ -98,6 +98,7 @@ def test_the_optimum_moves_as_its_derivative_says(checked):
     np.testing.assert_allclose(found.sensitivity["noise"], moved, atol=1e-3)
 
 
+@pytest.mark.deep
 def test_evidence_may_be_that_of_expectation_propagation():
     _, gp, trials = problem()
     learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("noise",), starts=1, inference="ep"))(trials)

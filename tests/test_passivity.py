@@ -241,7 +241,10 @@ def test_full_memory_binds_at_nyquist(b):
     np.testing.assert_array_equal(limit >= K1, closed >= 0)
 
 
-@pytest.mark.parametrize(("N", "memory"), [(101, "short"), (100, "short"), (2, "short"), (101, "full")])
+@pytest.mark.parametrize(
+    ("N", "memory"),
+    [(101, "short"), (101, "full"), *(pytest.param(N, "short", marks=pytest.mark.deep) for N in (100, 2))],
+)
 def test_a_witness_creates_the_energy_of_the_formula(N, memory):
     for K1, B1, alpha in random_sets(3, 4).T:
         model = model_of(K1, B1, alpha, N, memory)

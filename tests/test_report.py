@@ -85,7 +85,9 @@ def answered(study, people=2, trials=6):
     return cohort_of(table, study)
 
 
-@pytest.fixture(scope="module", params=[1, 2, 4])
+@pytest.fixture(
+    scope="module", params=[pytest.param(1, marks=pytest.mark.deep), 2, pytest.param(4, marks=pytest.mark.deep)]
+)
 def written(request, tmp_path_factory):
     """Study, aggregate, content and folder of a small study in one, two and four dimensions."""
     study = plain_study(request.param)

@@ -103,7 +103,7 @@ def test_padding_is_only_padding(study, finished):
     assert int(trials.mask.sum()) == 7
 
 
-@pytest.mark.parametrize("kind", ["log_ei", "thompson", "top_category", "mean"])
+@pytest.mark.parametrize("kind", ["thompson", "top_category", "mean", pytest.param("log_ei", marks=pytest.mark.deep)])
 def test_other_acquisitions_choose_feasible_points(study, kind):
     raw = json.loads(study.content) | {"schema": 1}
     raw["selection"] = {"acquisition": kind, "trials": 7}
