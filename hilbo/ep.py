@@ -81,7 +81,7 @@ def ep(
         residual=found.residual,
         tolerance=found.tolerance,
         iterations=found.iterations,
-        jitter=found.discarded / largest,
+        jitter=found.changed / largest,
         condition=condition,
         smallest_variance=jnp.min(jnp.where(fixed[1] > 0, prior_variance - explained, largest)),
         variance_resolution=jnp.finfo(mean.dtype).eps * largest * mean.shape[0] ** 0.5,
@@ -99,7 +99,7 @@ class _Found(eqx.Module):
     residual: Float[Array, ""]
     tolerance: Float[Array, ""]
     iterations: Int[Array, ""]
-    discarded: Float[Array, ""]
+    changed: Float[Array, ""]
 
 
 class _Search(eqx.Module):
@@ -116,7 +116,7 @@ class _Search(eqx.Module):
 @eqx.filter_custom_jvp
 def _fixed_point(terms, covariance, start, max_steps):
     """Cavity means and variances, and how they were found."""
-    root, discarded = square_root(covariance)
+    root, changed = square_root(covariance)
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
     begin = _Search(
@@ -128,7 +128,7 @@ def _fixed_point(terms, covariance, start, max_steps):
         return (search.steps < max_steps) & ~(search.residual <= search.tolerance) & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
-    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, discarded)
+    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, changed)
 
 
 def _begin(terms, covariance, root, start):

@@ -83,13 +83,20 @@ def _mean_and_explained_jvp(primals, tangents):
 
 
 def square_root(covariance: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """R with R R' = K, and the size of the largest eigenvalue dropped.
+    """R with R R' = K, and the largest element of R R' - K.
 
-    K is positive semi-definite, so a negative eigenvalue is rounding, and without it K changes by no more than itself.
+    One Cholesky step takes out what all eta's share, which is most of a large K; the eigenvectors of the rest are found
+    to eps times a much smaller norm. What is left is positive semi-definite, so a negative eigenvalue is rounding and
+    is dropped; what that and all other rounding did to K is measured, as the product says.
     """
-    eigenvalues, vectors = eigh(covariance)
-    root = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
-    return root, jnp.where(eigenvalues[0] < 0, -eigenvalues[0], 0.0)
+    first = covariance[0, 0]
+    shared = covariance[:, 0] / jnp.sqrt(jnp.where(first > 0, first, 1.0))
+    root = jnp.zeros_like(covariance).at[:, 0].set(shared)
+    if covariance.shape[0] > 1:
+        eigenvalues, vectors = eigh(covariance[1:, 1:] - shared[1:, None] * shared[None, 1:])
+        own = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
+        root = root.at[1:, 1:].set(own)
+    return root, jnp.max(jnp.abs(root @ root.T - covariance))
 
 
 def _factorise(covariance, curvature):

@@ -67,7 +67,7 @@ def laplace(
     read `certificate.converged`.
     """
     start = jnp.zeros_like(covariance[0]) if start is None else start
-    mode, residual, tolerance, iterations, discarded = _find_mode(terms, covariance, start, max_steps)
+    mode, residual, tolerance, iterations, changed = _find_mode(terms, covariance, start, max_steps)
     values, gradient, curvature = terms(mode)
     inverse, log_determinant = inverse_and_log_determinant(covariance, curvature)
     fixed = jax.lax.stop_gradient((covariance, curvature))
@@ -80,7 +80,7 @@ def laplace(
         residual=residual,
         tolerance=tolerance,
         iterations=iterations,
-        jitter=discarded / largest,
+        jitter=changed / largest,
         condition=condition,
         smallest_variance=jnp.min(jnp.where(fixed[1] > 0, variance, largest)),
         variance_resolution=jnp.finfo(mode.dtype).eps * largest * mode.shape[0] ** 0.5,
@@ -95,7 +95,7 @@ def laplace(
 @eqx.filter_custom_jvp
 def _find_mode(terms, covariance, start, max_steps):
     """The mode, its residual and the tolerance that was to be met, steps taken, and what the square root dropped."""
-    root, discarded = square_root(covariance)
+    root, changed = square_root(covariance)
     solution = optx.root_find(
         _stationarity,
         _DampedNewton(),
@@ -106,7 +106,7 @@ def _find_mode(terms, covariance, start, max_steps):
         throw=False,
     )
     state = solution.state
-    return solution.value, state.residual, state.tolerance, jnp.asarray(solution.stats["num_steps"]), discarded
+    return solution.value, state.residual, state.tolerance, jnp.asarray(solution.stats["num_steps"]), changed
 
 
 @_find_mode.def_jvp

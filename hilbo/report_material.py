@@ -4,8 +4,6 @@ Digits are printed only of parameters that the data identify; elsewhere the tabl
 always there: the numbers of the best curve, which belong together and to their N and T.
 """
 
-import base64
-import io
 import math
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,7 @@ from hilbo.characterise import Characterisation
 from hilbo.identification import Test
 from hilbo.memory_selection import LIMIT, PAPER, smallest
 from hilbo.page import template
-from hilbo.report import as_json, versions
+from hilbo.report import as_json, save_figures, versions
 from hilbo.sampled import Sampled
 from hilbo.viscoelastic import FOSLS
 
@@ -111,7 +109,7 @@ def write_identification(
     if content["renderer"] is not None:
         (folder / "renderer.toml").write_text(content["renderer"])
         figures |= _set_figures(_model(result), damping or result.minimum_damping)
-    pictures = _save(figures, folder)
+    pictures = save_figures(figures, folder)
     page = template("material.html").render(**_words(content, result), figures=pictures)
     (folder / "report.html").write_text(page, encoding="utf-8")
 
@@ -135,18 +133,6 @@ def _set_figures(model, b):
             K_eff = float(model.dc_gain())
             figures["passive-set"] = (plotting.passive_set_figure(model, b, K_eff), "The passive set", _SET)
     return figures
-
-
-def _save(figures, folder):
-    pictures = []
-    for name, (figure, title, caption) in figures.items():
-        figure.savefig(folder / f"{name}.svg")
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=200)
-        (folder / f"{name}.png").write_bytes(buffer.getvalue())
-        png = base64.b64encode(buffer.getvalue()).decode()
-        pictures.append({"png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
-    return pictures
 
 
 def _curves(tests, result, predicted):
@@ -281,7 +267,7 @@ def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
 def write_passivity(model: FOSLS, content: dict[str, Any], folder: Path) -> None:
     """Write result.json and the figures of the set, with a page around them."""
     (folder / "result.json").write_text(as_json(content))
-    pictures = _save(_set_figures(model, content["damping"]), folder)
+    pictures = save_figures(_set_figures(model, content["damping"]), folder)
     page = template("material.html").render(
         title=f"Passivity: {content['status']}",
         lead=passivity_words(content),
