@@ -4,6 +4,7 @@
 #include <fcntl.h>
 #include <stdlib.h>
 #include <string.h>
+#include <sys/stat.h>
 #include <termios.h>
 #include <unistd.h>
 
@@ -42,6 +43,16 @@ static bool open_slave(struct line *line)
     return line->slave >= 0 && make_raw(line->slave) && not_waiting(line->master);
 }
 
+/* A link of that name from before is replaced; a file is not. */
+static bool make_link(const char *target, const char *link)
+{
+    struct stat found;
+    if (lstat(link, &found) == 0 && S_ISLNK(found.st_mode)) {
+        (void)unlink(link);
+    }
+    return symlink(target, link) == 0;
+}
+
 bool line_open(struct line *line, const char *link)
 {
     *line = (struct line){.master = posix_openpt(O_RDWR | O_NOCTTY), .slave = -1};
@@ -50,8 +61,7 @@ bool line_open(struct line *line, const char *link)
     }
     bool ready = open_slave(line);
     if (ready && link != NULL) {
-        (void)unlink(link);
-        ready = symlink(line->name, link) == 0;
+        ready = make_link(line->name, link);
         line->link = ready ? link : NULL;
     }
     if (!ready) {

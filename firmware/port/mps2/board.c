@@ -9,7 +9,6 @@ static volatile uint32_t *at(uintptr_t address)
 }
 
 #define CPACR at(0xE000ED88U)      /* coprocessor access */
-#define ICSR at(0xE000ED04U)       /* pending interrupts */
 #define NVIC_ENABLE at(0xE000E100U)
 #define SYSTICK_CONTROL at(0xE000E010U)
 #define SYSTICK_RELOAD at(0xE000E014U)
@@ -31,8 +30,6 @@ enum {
     UART_RECEIVED_INTERRUPTS = 1 << 3,
     UART_RECEIVED = 1 << 1,
 };
-
-static const uint32_t ICSR_SYSTICK_PENDING = UINT32_C(1) << 26;
 
 void board_enable_fpu(void)
 {
@@ -57,11 +54,6 @@ void board_start_counter(void)
 uint32_t board_counter(void)
 {
     return *SYSTICK_VALUE;
-}
-
-bool board_tick_pending(void)
-{
-    return (*ICSR & ICSR_SYSTICK_PENDING) != 0;
 }
 
 void board_wait(void)

@@ -21,9 +21,8 @@ uint32_t board_stack_bytes_used(void);
 void board_start_ticks(void);
 void board_start_counter(void);
 uint32_t board_counter(void);
-bool board_tick_pending(void);
 
-/* The processor waits for an interrupt. */
+/* The processor waits for an interrupt; with interrupts off too, in which case it is served when they are on again. */
 void board_wait(void);
 void board_interrupts_off(void);
 void board_interrupts_on(void);

@@ -20,8 +20,6 @@ static void nothing(void)
 {
 }
 
-#pragma GCC diagnostic push
-#pragma GCC diagnostic ignored "-Wmissing-prototypes"
 void __attribute__((weak)) systick_interrupt(void)
 {
 }
@@ -29,23 +27,25 @@ void __attribute__((weak)) systick_interrupt(void)
 void __attribute__((weak)) uart_received_interrupt(void)
 {
 }
-#pragma GCC diagnostic pop
 
-typedef void (*vector)(void);
+union vector {
+    const void *stack;
+    void (*handler)(void);
+};
 
-__attribute__((section(".vectors"), used)) static const vector VECTORS[FIRST_INTERRUPT + INTERRUPTS] = {
-    (vector)stack_high,
-    reset,
-    nothing, /* NMI */
-    fault,   /* hard fault */
-    fault,   /* memory */
-    fault,   /* bus */
-    fault,   /* usage */
-    [11] = fault, /* SVC */
-    [12] = fault, /* debug */
-    [14] = fault, /* PendSV */
-    [15] = systick_interrupt,
-    [16] = uart_received_interrupt,
+__attribute__((section(".vectors"), used)) static const union vector VECTORS[FIRST_INTERRUPT + INTERRUPTS] = {
+    [0] = {.stack = stack_high},
+    [1] = {.handler = reset},
+    [2] = {.handler = nothing}, /* NMI */
+    [3] = {.handler = fault},   /* hard fault */
+    [4] = {.handler = fault},   /* memory */
+    [5] = {.handler = fault},   /* bus */
+    [6] = {.handler = fault},   /* usage */
+    [11] = {.handler = fault},  /* SVC */
+    [12] = {.handler = fault},  /* debug */
+    [14] = {.handler = fault},  /* PendSV */
+    [15] = {.handler = systick_interrupt},
+    [FIRST_INTERRUPT] = {.handler = uart_received_interrupt},
 };
 
 static void copy(uint32_t *to, const uint32_t *end, const uint32_t *from)

@@ -35,6 +35,14 @@ void sim_world_start(struct sim_world *world, const struct sim_world_config *con
     }
 }
 
+void sim_world_press(struct sim_world *world, enum sim_press press)
+{
+    struct sim_finger *finger = &world->finger;
+    world->config.finger.press = press;
+    sim_finger_start(finger, &world->config.finger, finger->random);
+    finger->segment.to_mm = world->position_mm;
+}
+
 static bool has_finger(const struct sim_world *world)
 {
     return world->config.finger.press != SIM_PRESS_NONE;
@@ -65,7 +73,7 @@ static void substep(struct sim_world *world, double motor_N, double step_s)
     }
     if (config->has_material) {
         const double resists_N = sim_material_force_N(&world->material, world->position_mm);
-        world->contact_N += resists_N;
+        world->contact_N -= resists_N;
         force_N -= resists_N;
     }
     const double kick = step_s / mass_kg; /* s/kg; m/s for a N */
@@ -87,7 +95,7 @@ void sim_world_tick(struct sim_world *world, double motor_N)
     }
     if (world->config.has_material) {
         /* The reading belongs to the tick's own sample, so before the past moves on. */
-        world->contact_N = sim_material_force_N(&world->material, world->position_mm);
+        world->contact_N = -sim_material_force_N(&world->material, world->position_mm);
         sim_material_tick(&world->material, world->position_mm);
     }
 }

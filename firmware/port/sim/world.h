@@ -40,12 +40,15 @@ struct sim_world {
     struct sim_material material;
     double position_mm;
     double velocity_mm_per_s;
-    double contact_N; /* between handle and what touches it, positive where they press on each other */
+    double contact_N; /* what touches the handle pushes it inwards by this */
 };
 
 struct sim_world_config sim_world_defaults(void);
 
 void sim_world_start(struct sim_world *world, const struct sim_world_config *config);
+
+/* Another finger, which takes hold of the handle where it is. */
+void sim_world_press(struct sim_world *world, enum sim_press press);
 
 /* One tick with the motor's force held. */
 void sim_world_tick(struct sim_world *world, double motor_N);
