@@ -1,8 +1,8 @@
 """The device's C programs for the tests: built once, started as child processes, spoken to in raw bytes.
 
-Tests that count ticks run the host port in lockstep: it ticks when told to through its stdin, so that no test depends on
-the clock of the machine. Bytes written to a terminal may reach the other side later than bytes written to a pipe; so
-every step ends with an answer.
+Tests that count ticks run the host port in lockstep: it ticks when told to through its stdin, so that no test depends
+on the clock of the machine. Bytes written to a terminal may reach the other side later than bytes written to a pipe;
+so every step ends with an answer.
 """
 
 import fcntl
@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from device_wire import Answer, Type, encode, set_crc, set_params, split
+from device_wire import Answer, Type, decode, encode, set_crc, set_params
 
-__all__ = ["FIRMWARE", "SCHEMA", "FOAM", "Port", "State", "Status", "Talk", "compilers", "image", "program"]
+__all__ = ["FIRMWARE", "FOAM", "SCHEMA", "Port", "State", "Status", "Talk", "compilers", "image", "program"]
 
 ROOT = Path(__file__).parents[1]
 FIRMWARE = ROOT / "firmware"
@@ -106,6 +106,7 @@ class Talk:
         self.file = file
         self.seq = 0
         self.rest = b""
+        self.joined_late = False
         self.unasked: list[Answer] = []
         self.boot_id = 0
 
@@ -129,8 +130,11 @@ class Talk:
         """What has come, after at most `patience` s."""
         if not select.select([self.file], [], [], patience)[0]:
             return []
-        answers, self.rest = split(self.rest + os.read(self.file, 65536))
-        return answers
+        *frames, self.rest = (self.rest + os.read(self.file, 65536)).split(b"\0")
+        if frames and self.joined_late:
+            del frames[0]  # begun before this host listened, or empty
+            self.joined_late = False
+        return [decode(frame) for frame in frames if frame]
 
     def expect_ack(self, type: int, payload: bytes = b"") -> int:
         """Sends a request that must be acknowledged; the CRC in the ACK."""
@@ -185,8 +189,8 @@ class Port(Talk):
     def reopen(self) -> None:
         """Another host on the same line."""
         os.close(self.file)
-        self.file, self.rest = self._open(), b""
-        self.send(b"\0")
+        self.file, self.rest, self.joined_late = self._open(), b"", True
+        self.send(b"\0" + encode(Type.GET_STATUS))  # the first frame may be half of one, and is dropped
 
     def command(self, text: str) -> list[str]:
         """A line for the port's stdin, and the words of its answer."""

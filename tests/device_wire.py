@@ -1,10 +1,10 @@
-"""The device's frames in raw bytes, written from PROTOCOL.md alone: an oracle beside `hilbo.protocol` and the C core."""
+"""The device's frames in raw bytes, written from PROTOCOL.md alone: an oracle beside hilbo and the C core."""
 
 import struct
 import zlib
 from typing import NamedTuple
 
-__all__ = ["MOST_ENCODED", "Answer", "Type", "decode", "encode", "set_crc", "set_params", "set_states", "split"]
+__all__ = ["MOST_ENCODED", "Answer", "Type", "decode", "encode", "set_crc", "set_params", "set_states"]
 
 MOST_ENCODED = 71  # bytes of a frame before its 0x00
 
@@ -43,12 +43,6 @@ def decode(encoded: bytes) -> Answer:
     if at != len(encoded) or len(body) < 6 or struct.unpack("<I", body[-4:])[0] != zlib.crc32(body[:-4]):
         raise ValueError(f"no frame: {encoded.hex()}")
     return Answer(body[0], body[1], body[2:-4])
-
-
-def split(received: bytes) -> tuple[list[Answer], bytes]:
-    """The whole frames in what has come, and the rest."""
-    *frames, rest = received.split(b"\0")
-    return [decode(frame) for frame in frames if frame], rest
 
 
 def set_params(set_id, K0, K1, B1, alpha, *, memory=0, length=101, rate=1000, limit=20.0) -> bytes:
