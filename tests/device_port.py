@@ -120,10 +120,11 @@ class Talk:
         self.send(encode(type, payload, self.seq))
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            for answer in self.listen():
-                if answer.seq == self.seq and answer.type not in (Type.NOTICE, Type.TELEMETRY):
-                    return answer
-                self.unasked.append(answer)
+            answers = self.listen()
+            mine = [a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY)]
+            self.unasked += [a for a in answers if a not in mine]
+            if mine:
+                return mine[0]
         raise AssertionError(f"no answer to request {type:#x}")
 
     def listen(self, patience: float = 1.0) -> list[Answer]:
