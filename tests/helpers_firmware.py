@@ -118,6 +118,7 @@ def build(core: Path = CORE, extra: tuple[str, ...] = (), drivers: tuple[str, ..
     """Shared library (or, with a driver that has a main, a program) of these sources, from the cache if it is there."""
     sources = [*sorted(core.glob("*.c")), *(FIRMWARE / "tests" / name for name in drivers)]
     program = "shim.c" not in drivers
+    extra = (*extra, *os.environ.get("HILBO_FIRMWARE_FLAGS", "").split())
     command = [compiler(), *STRICT, *extra, *([] if program else ["-shared", "-fPIC"]), f"-I{core}"]
     texts = [path.read_bytes() for path in [*sources, *sorted(core.glob("*.h")), FIRMWARE / "tests" / "shim.h"]]
     key = hashlib.sha256(b"\0".join([" ".join(command).encode(), *texts])).hexdigest()[:16]
