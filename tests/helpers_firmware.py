@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 __all__ = [
-    "CONFIG", "CORE", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES", "TYPES", "Device", "build", "cobs", "compiler",
+    "CAUSES", "CONFIG", "CORE", "DOCUMENT", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES", "TYPES", "Device", "build", "cobs", "compiler",
     "decode", "frame", "pack", "schema", "unpack",
 ]  # fmt: skip
 
