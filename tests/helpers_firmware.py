@@ -23,7 +23,7 @@ __all__ = [
 ]  # fmt: skip
 
 FIRMWARE = Path(__file__).parents[1] / "firmware"
-CORE = FIRMWARE / "core"
+CORE = Path(os.environ.get("HILBO_FIRMWARE_CORE", FIRMWARE / "core"))
 CACHE = Path(__file__).parents[1] / ".pytest_cache" / "firmware"
 STRICT = (
     "-std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wsign-conversion -Wdouble-promotion"
