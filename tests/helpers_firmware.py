@@ -18,12 +18,12 @@ import numpy as np
 import pytest
 
 __all__ = [
-    "CONFIG", "CORE", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES", "TYPES", "Device", "build", "cobs", "compiler",
+    "CAUSES", "CONFIG", "CORE", "DOCUMENT", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES", "TYPES", "Device", "build", "cobs", "compiler",
     "decode", "frame", "pack", "schema", "unpack",
 ]  # fmt: skip
 
 FIRMWARE = Path(__file__).parents[1] / "firmware"
-CORE = FIRMWARE / "core"
+CORE = Path(os.environ.get("HILBO_FIRMWARE_CORE", FIRMWARE / "core"))
 CACHE = Path(__file__).parents[1] / ".pytest_cache" / "firmware"
 STRICT = (
     "-std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wsign-conversion -Wdouble-promotion"

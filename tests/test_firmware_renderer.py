@@ -13,6 +13,7 @@ from scipy.stats import qmc
 from helpers_firmware import CORE, build, library
 from hilbo import viscoelastic
 from hilbo.exponentials import exponentials
+from test_firmware_protocol import EXPONENTIALS
 
 STEP = np.float32(0.0127)
 SHORT_BOUND, FULL_BOUND = 1e-4, 1e-4  # of the largest force
@@ -126,3 +127,7 @@ def test_every_length_of_short_memory(N):
 @pytest.mark.parametrize("states", [8, 10, 12])
 def test_the_exponentials_of_the_host_are_accepted(alpha, states):
     render(library(build()), np.float32([0.44, 1.0, 3.0, alpha]), np.zeros(3, np.float32), states_of(np.float32(alpha), states))
+
+
+def test_the_exponentials_of_the_protocol_tests_are_the_hosts():
+    np.testing.assert_allclose(np.transpose(EXPONENTIALS), np.stack(states_of(np.float32(0.3), 10)), rtol=1e-6)
