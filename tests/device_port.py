@@ -117,20 +117,24 @@ class Talk:
     def request(self, type: int, payload: bytes = b"") -> Answer:
         """The answer with this request's seq; notices, telemetry and older answers are kept in `unasked`."""
         self.seq = (self.seq + 1) % 256
-        self.send(encode(type, payload, self.seq))
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            answers = self.listen()
-            mine = [a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY)]
-            self.unasked += [a for a in answers if a not in mine]
-            if mine:
-                return mine[0]
+            self.send(encode(type, payload, self.seq))  # again, too, where a full line has swallowed the answer
+            while answers := self.listen():
+                mine = [a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY)]
+                self.unasked += [a for a in answers if a not in mine]
+                if mine:
+                    return mine[0]
         raise AssertionError(f"no answer to request {type:#x}")
 
     def listen(self, patience: float = 1.0) -> list[Answer]:
-        """What has come, after at most `patience` s."""
-        if not select.select([self.file], [], [], patience)[0]:
-            return []
+        """The next frames that come, within about `patience` s; none if the line is silent."""
+        found: list[Answer] = []
+        while not found and select.select([self.file], [], [], patience)[0]:
+            found = self._read()
+        return found
+
+    def _read(self) -> list[Answer]:
         *frames, self.rest = (self.rest + os.read(self.file, 65536)).split(b"\0")
         if frames and self.joined_late:
             del frames[0]  # begun before this host listened, or empty

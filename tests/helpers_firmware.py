@@ -53,7 +53,9 @@ def _parse(schema: str) -> tuple[dict[str, int], dict[str, tuple[list, list]]]:
 
 TYPES, FIELDS = _parse(schema())
 NAMES = {number: name for name, number in TYPES.items()}
-REASONS = dict(enumerate(re.findall(r"^\| \d+ \| ([A-Z_0-9]+) \|", DOCUMENT.split("| NACK reason |")[1], re.M), start=1))
+REASONS = dict(
+    enumerate(re.findall(r"^\| \d+ \| ([A-Z_0-9]+) \|", DOCUMENT.split("| NACK reason |")[1], re.M), start=1)
+)
 STATES = ("STOPPED", "RUNNING", "STOPPING", "DRIVING", "HOLD", "ESTOP")
 CAUSES = ("NONE", "WATCHDOG", "INPUT", "VELOCITY", "OVERRUN", "MODEL", "ENERGY", "ESTOP", "BOOT")
 FLAGS = ("contact", "held", "saturated", "slewed", "controlled", "switching", "hold", "estop", "running", "driving")

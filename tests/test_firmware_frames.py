@@ -145,6 +145,19 @@ def test_the_same_under_sanitizers(tmp_path):
         "HILBO_FIRMWARE_FLAGS": " ".join(SANITIZE), "HOME": str(tmp_path),
     }  # fmt: skip
     names = [str(Path(__file__).parent / name) for name in SANITIZED]
-    command = [sys.executable, "-m", "pytest", "-q", "-s", "-n", "0", "-m", "not deep", "-p", "no:cacheprovider", *names]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-s",
+        "-n",
+        "0",
+        "-m",
+        "not deep",
+        "-p",
+        "no:cacheprovider",
+        *names,
+    ]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]

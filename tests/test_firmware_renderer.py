@@ -126,7 +126,12 @@ def test_every_length_of_short_memory(N):
 @pytest.mark.parametrize("alpha", [0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99])
 @pytest.mark.parametrize("states", [8, 10, 12])
 def test_the_exponentials_of_the_host_are_accepted(alpha, states):
-    render(library(build()), np.float32([0.44, 1.0, 3.0, alpha]), np.zeros(3, np.float32), states_of(np.float32(alpha), states))
+    render(
+        library(build()),
+        np.float32([0.44, 1.0, 3.0, alpha]),
+        np.zeros(3, np.float32),
+        states_of(np.float32(alpha), states),
+    )
 
 
 def test_the_exponentials_of_the_protocol_tests_are_the_hosts():

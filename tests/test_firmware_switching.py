@@ -22,7 +22,9 @@ def passive_sets(count: int) -> np.ndarray:
     B1, alpha = (jnp.asarray(rng.uniform(low, high, 4000)) for low, high in ((0.5, 30), (0.05, 0.8)))
     limit = np.asarray(passivity.largest_K1(B1, alpha, 0.949))
     K1 = np.minimum(limit, 32) * rng.uniform(0.25, 1, 4000)
-    rows = np.column_stack([np.asarray(viscoelastic.K0_from_effective_stiffness(jnp.asarray(K1), B1, alpha)), K1, B1, alpha])
+    rows = np.column_stack(
+        [np.asarray(viscoelastic.K0_from_effective_stiffness(jnp.asarray(K1), B1, alpha)), K1, B1, alpha]
+    )
     return rows[(K1 >= 1) & (limit > 1)][:count].astype(np.float32)
 
 
@@ -79,7 +81,7 @@ def test_all_pairs_of_passive_sets_on_four_motions(count):
         for old, new in itertools.permutations(range(count), 2):
             forces, flags, flip = switch(lib, counts, sets[old], sets[new])
             own, other = first[old, number], np.r_[np.zeros(STAGED), late[new, number]]
-            np.testing.assert_allclose(forces[:flip + 1], own[: flip + 1], rtol=0, atol=largest)
+            np.testing.assert_allclose(forces[: flip + 1], own[: flip + 1], rtol=0, atol=largest)
             steps = np.maximum(np.abs(np.diff(own)), np.abs(np.diff(other)))[flip - 1 :]
             assert np.all(np.abs(np.diff(forces[flip - 1 :])) <= steps + SLEW / 1000 + largest)
             fading = np.flatnonzero(flags & 32)
@@ -91,7 +93,9 @@ def test_all_pairs_of_passive_sets_on_four_motions(count):
             gone.setdefault(name, []).append((fading.size, jump))
     for name, found in gone.items():
         ticks, jumps = np.array(found).T
-        print(f"{name}: largest difference {jumps.max():.2f} N, gone after {ticks.max():.0f} ticks (median {np.median(ticks):.0f})")
+        print(
+            f"{name}: largest difference {jumps.max():.2f} N, gone after {ticks.max():.0f} ticks (median {np.median(ticks):.0f})"
+        )
 
 
 def test_out_of_contact_a_set_is_in_force_at_once_and_its_history_clear():
@@ -123,5 +127,7 @@ def test_without_the_offset_the_force_would_jump():
     counts, (old, new) = motions()["2 Hz sine"], passive_sets(2)
     forces, _, flip = switch(library(build()), counts, old, new)
     x = np.maximum(counts, 0) * STEP.astype(float)
-    first, late = (np.asarray(part)[:, 0] for part in alone(jnp.asarray(np.stack([old, new]), float), jnp.asarray(x[None])))
+    first, late = (
+        np.asarray(part)[:, 0] for part in alone(jnp.asarray(np.stack([old, new]), float), jnp.asarray(x[None]))
+    )
     assert abs(late[1, flip - STAGED] - first[0, flip - 1]) > 5 * abs(forces[flip] - forces[flip - 1])

@@ -143,7 +143,7 @@ def test_a_host_may_go_and_another_come_while_telemetry_flows():
     with Port("--finger", "hold") as port:
         port.run()
         port.expect_ack(Type.STREAM, bytes([1, 0]))
-        port.tick(2000)  # nobody reads: what finds no room is lost, whole frames at a time
+        port.tick(2000)  # nobody reads
         port.reopen()
         port.hello()
         port.unasked.clear()  # what still waited in the device came before its answer
@@ -154,7 +154,21 @@ def test_a_host_may_go_and_another_come_while_telemetry_flows():
         port.tick(70)
         heads = [struct.unpack_from("<IBBH", a.payload) for a in wait_for(port, Type.TELEMETRY, 10)]
         assert [tick for tick, *_ in heads] == [heads[0][0] + 7 * i for i in range(10)]
-        assert {lost for *_, lost in heads} == {0}
+        assert len({lost for *_, lost in heads}) == 1
+
+
+def test_what_the_line_does_not_take_is_lost_in_whole_frames_and_counted():
+    with Port("--finger", "hold") as port:
+        port.hello()
+        port.expect_ack(Type.STREAM, bytes([1, 1]))
+        port.tick(5000)  # nobody reads, and a terminal holds some thousand bytes
+        port.status()
+        port.tick(100)
+        port.status()
+        heads = [struct.unpack_from("<IBBH", a.payload) for a in port.unasked if a.type == Type.TELEMETRY]
+        ticks, lost = np.array([head[0] for head in heads]), np.array([head[3] for head in heads])
+        assert lost[-1] > 1000 and ticks[-1] > 5000
+        np.testing.assert_array_equal(np.diff(ticks), 4 + np.diff(lost))
 
 
 def wait_for(port: Port, type: int, count: int):
