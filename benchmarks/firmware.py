@@ -108,6 +108,7 @@ def scenes_recording() -> bytes:
     recording.section("contact, both: a set staged and telemetry")
     recording.ticks(PRESS[2000:2200])
     recording.section("")
+    recording.send(Type.ABORT)
     recording.send(Type.STREAM, bytes([0, 0]))
     recording.ticks(PRESS[49::-1])
     recording.section("no contact, but still remembered")
