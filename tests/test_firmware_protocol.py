@@ -6,7 +6,6 @@ import zlib
 
 import numpy as np
 import pytest
-
 from helpers_firmware import CAUSES, CONFIG, DOCUMENT, TYPES, Device, build, cobs, frame, library, pack, parameters
 
 SET = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
@@ -15,9 +14,15 @@ REQUESTS = [name for name, number in TYPES.items() if number < 0x40]
 
 
 EXPONENTIALS = [
-    (0.16150905, 0.9044945), (0.19177684, 0.52692366), (0.16125424, 0.23115093),
-    (0.12465648, 0.0905768), (0.09473704, 0.033717748), (0.07124848, 0.012141097),
-    (0.05358717, 0.0042446544), (0.041970227, 0.0014005903), (0.038842943, 0.0003679924),
+    (0.16150905, 0.9044945),
+    (0.19177684, 0.52692366),
+    (0.16125424, 0.23115093),
+    (0.12465648, 0.0905768),
+    (0.09473704, 0.033717748),
+    (0.07124848, 0.012141097),
+    (0.05358717, 0.0042446544),
+    (0.041970227, 0.0014005903),
+    (0.038842943, 0.0003679924),
     (0.06041753, 2.3818455e-05),
 ]
 """Weight and loss of the host's ten exponentials for alpha = 0.3 (another test makes them anew)."""
@@ -34,10 +39,14 @@ def device():
 
 # Frames
 
+STRETCHED = bytearray(frame("ECHO", 1, b"a"))
+STRETCHED[0] += 1  # no zero in it: the first code reaches to the end, and now beyond
+
 
 @pytest.mark.parametrize(
     "data",
     [
+        bytes(STRETCHED),
         b"\x05\x01\x02\0",  # no COBS
         cobs(b"\x0a\x01abc") + b"\0",  # short
         cobs(b"\x0a\x01" + struct.pack("<I", zlib.crc32(b"\x0a\x01") ^ 1)) + b"\0",  # wrong checksum
@@ -208,6 +217,7 @@ def first_seven(rows, **changed):
         ({}, {3: (float("nan"), 0.01)}),
         ({}, {3: (0.1, float("nan"))}),
         ({}, {9: (0.3, 1e-4)}),
+        ({}, {0: EXPONENTIALS[1], 1: EXPONENTIALS[0]}),
     ],
     ids=str,
 )
@@ -314,7 +324,7 @@ def test_start(device):
 def test_states_in_which_requests_are_refused(device):
     staged = device.go(SET)
     drive = pack("DRIVE", offset=1.0, duration_ticks=100, boot_id=7)
-    kind, message = device.ask("DRIVE", drive)
+    _, message = device.ask("DRIVE", drive)
     assert (message["reason"], message["value"]) == ("STATE", 1)
     assert device.refusal("CLEAR", boot_id=7) == "STATE"
     device.must("STOP")
@@ -457,7 +467,7 @@ def test_the_table_of_line_rates():
         for divisor, rate in zip((1, 2, 4, 10, 20), rates.replace(",", "").split(" / "), strict=True):
             asked = {"divisor": divisor, "fields": int(fields)}
             Device(line_rate_baud=int(rate)).must("STREAM", **asked)
-            kind, message = Device(line_rate_baud=int(rate) - 1).ask("STREAM", **asked)
+            _, message = Device(line_rate_baud=int(rate) - 1).ask("STREAM", **asked)
             assert (message["reason"], message["limit"]) == ("LINE_TOO_SLOW", divisor + 1)
 
 

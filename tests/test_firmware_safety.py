@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from helpers_firmware import CAUSES, Device, frame, pack, parameters
 
 SET = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
@@ -48,7 +47,7 @@ def test_silence_of_the_host(pressed):
 def test_hold_is_latched_and_cleared_only_at_zero_force(pressed):
     pressed.beat()
     pressed.run([300] * 255, beating=False)
-    kind, message = pressed.ask("CLEAR", boot_id=7)
+    _, message = pressed.ask("CLEAR", boot_id=7)
     assert (message["reason"], message["ticks"]) == ("BUSY", HOLD - 6)
     pressed.beat()
     assert not np.any(pressed.run([300] * 100)[0][HOLD:]) and pressed.state == "HOLD"

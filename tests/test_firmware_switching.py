@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from helpers_firmware import CONFIG, Device, build, library
+
 from hilbo import passivity, viscoelastic
 
 STAGED, LENGTH = 1500, 4000
@@ -22,7 +22,8 @@ def passive_sets(count: int) -> np.ndarray:
     B1, alpha = (jnp.asarray(rng.uniform(low, high, 4000)) for low, high in ((0.5, 30), (0.05, 0.8)))
     limit = np.asarray(passivity.largest_K1(B1, alpha, 0.949))
     K1 = np.minimum(limit, 32) * rng.uniform(0.25, 1, 4000)
-    rows = np.column_stack([np.asarray(viscoelastic.K0_from_effective_stiffness(jnp.asarray(K1), B1, alpha)), K1, B1, alpha])
+    K0 = np.asarray(viscoelastic.K0_from_effective_stiffness(jnp.asarray(K1), B1, alpha))
+    rows = np.column_stack([K0, K1, B1, alpha])
     return rows[(K1 >= 1) & (limit > 1)][:count].astype(np.float32)
 
 
@@ -70,7 +71,7 @@ def switch(lib, counts, old, new) -> tuple[np.ndarray, np.ndarray, int]:
 
 @pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.deep)])
 def test_all_pairs_of_passive_sets_on_four_motions(count):
-    """Step per tick at most the larger of the two sets' own plus the slew limit; then the new set, to 1e-4 of its force."""
+    """Step per tick at most the larger of the two sets' own plus the slew limit; then the new set, to 1e-4."""
     lib, sets, gone = library(build()), passive_sets(count), {}
     x = np.stack([np.maximum(counts, 0) for counts in motions().values()]) * STEP.astype(float)
     first, late = (np.asarray(part) for part in alone(jnp.asarray(sets, float), jnp.asarray(x)))
@@ -79,7 +80,7 @@ def test_all_pairs_of_passive_sets_on_four_motions(count):
         for old, new in itertools.permutations(range(count), 2):
             forces, flags, flip = switch(lib, counts, sets[old], sets[new])
             own, other = first[old, number], np.r_[np.zeros(STAGED), late[new, number]]
-            np.testing.assert_allclose(forces[:flip + 1], own[: flip + 1], rtol=0, atol=largest)
+            np.testing.assert_allclose(forces[: flip + 1], own[: flip + 1], rtol=0, atol=largest)
             steps = np.maximum(np.abs(np.diff(own)), np.abs(np.diff(other)))[flip - 1 :]
             assert np.all(np.abs(np.diff(forces[flip - 1 :])) <= steps + SLEW / 1000 + largest)
             fading = np.flatnonzero(flags & 32)
@@ -91,7 +92,8 @@ def test_all_pairs_of_passive_sets_on_four_motions(count):
             gone.setdefault(name, []).append((fading.size, jump))
     for name, found in gone.items():
         ticks, jumps = np.array(found).T
-        print(f"{name}: largest difference {jumps.max():.2f} N, gone after {ticks.max():.0f} ticks (median {np.median(ticks):.0f})")
+        late = f"gone after {ticks.max():.0f} ticks, median {np.median(ticks):.0f}"
+        print(f"{name}: differences up to {jumps.max():.2f} N, {late}")
 
 
 def test_out_of_contact_a_set_is_in_force_at_once_and_its_history_clear():
@@ -123,5 +125,6 @@ def test_without_the_offset_the_force_would_jump():
     counts, (old, new) = motions()["2 Hz sine"], passive_sets(2)
     forces, _, flip = switch(library(build()), counts, old, new)
     x = np.maximum(counts, 0) * STEP.astype(float)
-    first, late = (np.asarray(part)[:, 0] for part in alone(jnp.asarray(np.stack([old, new]), float), jnp.asarray(x[None])))
+    sets = jnp.asarray(np.stack([old, new]), float)
+    first, late = (np.asarray(part)[:, 0] for part in alone(sets, jnp.asarray(x[None])))
     assert abs(late[1, flip - STAGED] - first[0, flip - 1]) > 5 * abs(forces[flip] - forces[flip - 1])
