@@ -11,7 +11,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from device_port import FOAM, PATIENCE, SCHEMA, Port, State, compilers, program
+from device_port import COMPILERS, FOAM, PATIENCE, SCHEMA, Port, State, program
 from device_wire import Type, encode, set_crc, set_params, set_states
 
 from hilbo import passivity, viscoelastic
@@ -23,7 +23,7 @@ CAUSE_WATCHDOG, CAUSE_INPUT, CAUSE_OVERRUN = 1, 2, 4
 NACK_NO_HELLO, NACK_BOOT_ID = 3, 8
 
 
-@pytest.mark.parametrize("compiler", compilers())
+@pytest.mark.parametrize("compiler", COMPILERS)
 def test_a_conversation(compiler):
     with Port("--boot-id", "77", "--finger", "hold", compiler=compiler) as port:
         version, rate, schema, _, boot_id, line, damping = struct.unpack_from("<HHIIIIf", port.hello().payload)
