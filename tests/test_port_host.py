@@ -1,6 +1,7 @@
 """The host port: the C core with a simulated finger behind a pseudo-terminal, in raw bytes and in device ticks."""
 
 import os
+import shutil
 import signal
 import struct
 import subprocess
@@ -11,7 +12,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from device_port import COMPILERS, FOAM, PATIENCE, SCHEMA, Port, State, program
+from device_port import COMPILERS, FIRMWARE, FOAM, PATIENCE, SCHEMA, Port, State, program
 from device_wire import Type, encode, set_crc, set_params, set_states
 
 from hilbo import passivity, viscoelastic
@@ -357,3 +358,21 @@ def test_a_press_that_a_safeguard_stops_is_seen():
     assert press(sets, 2000)["nacks"] >= 1
     none_of_it = press([("short", list(FOAM))], 30)
     assert none_of_it["state"] == State.RUNNING and not none_of_it["contact"]
+
+
+@pytest.mark.deep
+def test_everything_builds_without_a_word_and_is_clean(tmp_path):
+    make = ["make", "--no-print-directory", "-C", FIRMWARE, f"BUILD={tmp_path}"]
+    if not shutil.which("make"):
+        pytest.skip("the device's programs need make (Debian: make)")
+    said = subprocess.run([*make, "-j2"], capture_output=True, text=True)
+    assert said.returncode == 0 and said.stderr == ""
+    for folder in (*filter(shutil.which, COMPILERS), *(["m4", "m7"] if shutil.which("arm-none-eabi-gcc") else [])):
+        names = (
+            ["device.elf", "replay.elf"] if folder.startswith("m") else ["hilbo-device", "hilbo-replay", "hilbo-press"]
+        )
+        assert all((tmp_path / folder / name).exists() for name in names)
+    if not shutil.which("cppcheck"):
+        pytest.skip("the static analysis needs cppcheck (Debian: cppcheck)")
+    check = subprocess.run([*make, "check"], capture_output=True, text=True)
+    assert check.returncode == 0, check.stderr
