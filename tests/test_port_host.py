@@ -180,29 +180,31 @@ def wait_for(port: Port, type: int, count: int):
     return [a for a in port.unasked if a.type == type]
 
 
-def test_a_restarted_device_knows_nothing_and_obeys_no_old_name():
+@pytest.mark.parametrize("obeyed", range(5))
+def test_a_restarted_device_knows_nothing_and_obeys_no_old_name(obeyed):
     payload = set_params(3, *FOAM)
-    crc = set_crc(payload)
-    named = struct.pack("<HHII", 3, 0, crc, 0x55)
-    steps = [(Type.HELLO, struct.pack("<HHI", 1, 0, SCHEMA)), (Type.SET_PARAMS, payload), (Type.COMMIT, named)]
-    steps += [(Type.START, named)]
-    for before in range(1, len(steps) + 1):
-        with Port("--boot-id", "0x55", "--finger", "rest") as port:
-            port.boot_id = 0x55
-            for number, (type, body) in enumerate(steps):
-                if number == before:
-                    (_, new_id) = port.command("restart")
-                answer = port.request(type, body)
-                assert (answer.type in (Type.ACK, Type.HELLO_REPLY)) == (number < before), (before, number)
-                port.heartbeat()
-                assert port.tick(20) == 0
-            if before < len(steps):
-                assert answer.payload[1] == NACK_NO_HELLO
-                port.hello()
-                assert port.boot_id == int(new_id) != 0x55
-                assert port.request(*steps[-1]).payload[1] == NACK_BOOT_ID
-                status = port.status()
-                assert (status.state, status.active_id) == (State.STOPPED, 0)
+    named = struct.pack("<HHII", 3, 0, set_crc(payload), 0x55)
+    steps = [(Type.HELLO, struct.pack("<HHI", 1, 0, SCHEMA)), (Type.SET_PARAMS, payload)]
+    steps += [(Type.COMMIT, named), (Type.START, named)]
+    with Port("--boot-id", "0x55", "--finger", "hold") as port:
+        port.boot_id = 0x55
+        port.live(800)  # the finger presses, so that force would be felt
+        force = 0.0
+        for type, body in steps[:obeyed]:
+            assert port.request(type, body).type in (Type.ACK, Type.HELLO_REPLY)
+            force = port.live(300)
+        assert (force > 0.5) == (obeyed == 4) and (force == 0) == (obeyed < 4)
+        _, new_id = port.command("restart")
+        assert port.status().boot_id == int(new_id) != 0x55
+        for type, body in (*steps[max(obeyed, 1) :], steps[-1]):
+            assert port.request(type, body).payload[1] == NACK_NO_HELLO
+            assert port.live(300) == 0
+        port.hello()
+        for type, body in steps[2:]:
+            assert port.request(type, body).payload[1] == NACK_BOOT_ID
+            assert port.live(300) == 0
+        status = port.status()
+        assert (status.state, status.active_id, status.staged_id) == (State.STOPPED, 0, 0)
 
 
 def test_faults_are_those_of_the_protocol():
