@@ -89,7 +89,7 @@ FAULTS = [
           "if (!hb_is_in(device, HB_STOPPED))", "protocol"),
     Fault("CLEAR during the ramp", "hb_motion.c", "hb_is_in(device, HB_HOLDING) && !hb_ramp_has_ended",
           "hb_is_in(device, HB_STOPPED) && !hb_ramp_has_ended", "safety"),
-    Fault("any seq is a repetition", "hb_requests.c", "frame->seq != device->answered_seq || ", "", "protocol"),
+    Fault("the same seq is a repetition", "hb_requests.c", " || frame->crc != device->answered_crc", "", "protocol"),
     Fault("repetitions carried out", "hb_requests.c", "device->answered = acts_once(frame->type);",
           "device->answered = false;", "protocol"),
     Fault("anybody's heartbeat", "hb_requests.c", " && hb_unpack_boot_id(frame->payload) == device->boot_id) {", ") {",
