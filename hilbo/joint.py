@@ -6,9 +6,9 @@ Pointwise, the committee knows a mean and a variance at each point; where the op
 
 S_j the posterior covariance of person j at all m points and K the prior's. With K = R R' everything is said of v,
 f = R v, whose prior is standard normal: B_j = R^-1 K(x, x_j), person j's mean of v is B_j a_j and its covariance
-I - B_j V_j' V_j B_j'. With G_j = V_j B_j' the person adds the precision G_j' (I - G_j G_j')^-1 G_j, of rank n_j and never
-a difference. Directions of K below its rounding (eps m times the largest eigenvalue) are left out: they hold less than
-sqrt(eps m) of the prior's standard deviation at any point.
+I - B_j V_j' V_j B_j'. With G_j = V_j B_j' the person adds the precision G_j' (I - G_j G_j')^-1 G_j, of rank n_j and
+never a difference. Directions of K below its rounding (eps m times the largest eigenvalue) are left out: they hold
+less than sqrt(eps m) of the prior's standard deviation at any point.
 
 At one point this is `bcm.combine`; at several it is not the same map, because a committee of vectors trusts an expert
 in the directions that the expert knows. Reference: Tresp (2000), Neural Computation 12:2719, section 3.
