@@ -55,7 +55,7 @@ MATHS = {
     "search_space": {"viscoelastic", "passivity", "space_filling"},
     "session": {"config", "ordinal_gp", "acquisition", "search_space"},
     "simulate": {"session"},
-    "validation": {"study"},
+    "validation": {"study", "config", "acquisition"},
 }
 # What each module may import of hilbo, and with it what that one may import. Modules to come have their place already.
 MAY_IMPORT = MATHS | {
