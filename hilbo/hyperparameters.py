@@ -175,13 +175,13 @@ def _coordinates(gp: OrdinalGP, learn: Sequence[str]) -> Coordinates:
 
 def _model(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
     """The model at these coordinates; what they do not mention is as in `gp`."""
-    positive = {k: jnp.exp(coordinates[k]) for k in ("theta", "variance", "noise") if k in coordinates}
-    kernel = RBF(positive.get("theta", gp.kernel.theta), positive.get("variance", gp.kernel.variance))
+    held = {"theta": gp.kernel.theta, "variance": gp.kernel.variance, "noise": gp.likelihood.noise}
+    positive = held | {k: jnp.exp(coordinates[k]) for k in held if k in coordinates}
     thresholds = gp.likelihood.thresholds
     if "first" in coordinates:
         steps = jnp.concatenate([coordinates["first"][None], jnp.exp(coordinates["gaps"])])
         thresholds = jnp.cumsum(steps)
-    return OrdinalGP(kernel, OrdinalProbit(thresholds, positive.get("noise", gp.likelihood.noise)))
+    return OrdinalGP(RBF(positive["theta"], positive["variance"]), OrdinalProbit(thresholds, positive["noise"]))
 
 
 def _spread(begin: Coordinates, starts: int) -> Coordinates:

@@ -11,6 +11,7 @@ Reference: paper, section IV.
 """
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -41,7 +42,8 @@ class InferenceError(RuntimeError):
 class OrdinalGP(eqx.Module):
     """Zero-mean Gaussian process prior on the latent realism f and an ordinal likelihood of the answers."""
 
-    kernel: RBF
+    kernel: Any
+    """A `Kernel`: the RBF, or one of yours; only hyperparameters are learnt for the RBF alone."""
     likelihood: OrdinalProbit
 
 

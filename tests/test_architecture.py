@@ -37,7 +37,10 @@ MATHS = {
     "materials": {"fosls"},
     "switching": {"fosls"},
     "viscoelastic": {"fosls", "continuous", "materials", "switching"},
+    "aggregation": {"bcm"},
     "ordinal_gp": {"kernels", "likelihoods", "laplace", "ep", "exact"},
+    "hierarchical": {"kernels", "ordinal_gp"},
+    "joint": {"kernels", "ordinal_gp"},
     "hyperparameters": {"ordinal_gp", "newton"},
     "passivity_certificate": {"viscoelastic"},
     "passivity": {"viscoelastic", "passivity_certificate"},
@@ -52,7 +55,7 @@ MATHS = {
     "search_space": {"viscoelastic", "passivity", "space_filling"},
     "session": {"config", "ordinal_gp", "acquisition", "search_space"},
     "simulate": {"session"},
-    "validation": {"study"},
+    "validation": {"study", "config", "acquisition"},
 }
 # What each module may import of hilbo, and with it what that one may import. Modules to come have their place already.
 MAY_IMPORT = MATHS | {

@@ -1,0 +1,138 @@
+"""The hierarchical model: people share a function and differ by functions of their own.
+
+    f_j = g + h_j,   cov(g) = p k,   cov(h_j) = (1 - p) k,   so   cov(f_i(x), f_j(y)) = k(x, y) (p + (1 - p) [i = j])
+
+p, the share that people have in common, is learnt by evidence: p = 1 says that all people are one (the pooled model,
+and the committee machine's assumption), p = 0 that nothing is learnt about one person from another. The model is an
+ordinal GP like any other, with the person's number as one more coordinate of each point, so that fit, evidence and
+certificate are those of `ordinal_gp`. A person nobody has met has covariance p k with everybody: what is predicted at
+a number of its own is the prediction for a new person; the variance of g is (1 - p) k less.
+
+The pooled fit costs the cube of the number of answers. At the committee's cost, point by point from everybody's own
+posterior, stands `aggregation.aggregate("hierarchical", ...)`, with the p learnt here.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from hilbo.errors import InputError
+from hilbo.kernels import Kernel
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+
+__all__ = ["NEWCOMER", "PersonKernel", "Share", "fit_people", "learn_share", "of_people", "population"]
+
+NEWCOMER = -1.0
+"""The number of a person who has given no answers."""
+
+_NODES = 33  # of the log evidence's Chebyshev interpolation in p
+_FINE = 2001
+
+
+class PersonKernel(eqx.Module):
+    """Covariance of people's functions at points (x, person): `kernel` within a person, `share` of it between two."""
+
+    kernel: Kernel
+    share: Float[Array, ""]
+
+    def __init__(self, kernel: Kernel, share: ArrayLike):
+        self.kernel = kernel
+        self.share = jnp.asarray(share, jnp.result_type(float) if isinstance(share, float | int) else None)
+
+    def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
+        """Covariance of the function of person x[-1] at x[:-1] and of that of person y[-1] at y[:-1]."""
+        same = x[-1] == y[-1]
+        return self.kernel(x[:-1], y[:-1]) * jnp.where(same, jnp.ones_like(x[0]), self.share.astype(x.dtype))
+
+    def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+        """The prior variance of one person's function."""
+        return self.kernel.diagonal(x[:-1])
+
+
+class Share(eqx.Module):
+    """What the answers say of the share p; p has a uniform prior on [0, 1]."""
+
+    shares: Float[Array, " k"]
+    """Grid over [0, 1]."""
+    log_evidence: Float[Array, " k"]
+    """Of the answers, on that grid."""
+    best: Float[Array, ""]
+    """Where the evidence is largest."""
+    mean: Float[Array, ""]
+    interval: Float[Array, "2"]
+    """Central 95 % of the posterior of p."""
+    interpolation_error: Float[Array, ""]
+    """Estimate, of the log evidence between the nodes: its last Chebyshev coefficients."""
+    converged: Array
+    """Every fit held its certificate."""
+
+    @property
+    def against_one(self) -> Float[Array, ""]:
+        """Log Bayes factor of the hierarchical model, p unknown, against people who do not differ, p = 1."""
+        width = self.shares[1] - self.shares[0]
+        top = jnp.max(self.log_evidence)
+        return top + jnp.log(jnp.trapezoid(jnp.exp(self.log_evidence - top), dx=width)) - self.log_evidence[-1]
+
+
+def of_people(trials: Trials) -> Trials:
+    """One record (sum of answers) from stacked trials (M, n): each point with its person's number, from 0."""
+    mask = np.asarray(trials.mask)
+    if not mask.any():
+        raise InputError("hierarchical: nobody gave an answer; at least one person's answers are needed.")
+    person = np.broadcast_to(np.arange(len(mask))[:, None], mask.shape)[mask].astype(np.asarray(trials.x).dtype)
+    return Trials.from_arrays(
+        np.concatenate([np.asarray(trials.x)[mask], person[:, None]], axis=1), np.asarray(trials.q)[mask]
+    )
+
+
+def fit_people(
+    gp: OrdinalGP, trials: Trials, share: ArrayLike, *, inference: str = "laplace", throw: bool = True
+) -> Posterior:
+    """Posterior of everybody's functions, from `of_people(...)`. Predict at points (x, person): an index from 0, or
+    `NEWCOMER`. Differentiable in `share`."""
+    model = OrdinalGP(PersonKernel(gp.kernel, share), gp.likelihood)
+    return fit(model, trials, inference=inference, throw=throw)
+
+
+def population(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) of the shared function g, from a posterior of `fit_people`."""
+    points = jnp.concatenate([x, jnp.full((x.shape[0], 1), NEWCOMER, x.dtype)], axis=1)
+    mean, explained = posterior.predict_explained(points)
+    kernel = posterior.gp.kernel
+    return mean, kernel.share.astype(x.dtype) * jax.vmap(kernel.diagonal)(points) - explained
+
+
+def learn_share(gp: OrdinalGP, trials: Trials, *, inference: str = "laplace") -> Share:
+    """The posterior of the share p, from `of_people(...)`; `gp` is one person's model.
+
+    The log evidence is computed at 33 Chebyshev points of [0, 1] and interpolated: it is smooth in p, and so the whole
+    curve, its maximum and its intervals come at a fixed cost.
+    """
+    nodes = -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
+    evidence, converged = _evidences(gp, trials, jnp.asarray((1 + nodes) / 2, trials.x.dtype), inference)
+    coefficients = np.polynomial.chebyshev.chebfit(nodes, np.asarray(evidence, float), _NODES - 1)
+    grid = np.linspace(0.0, 1.0, _FINE)
+    curve = np.polynomial.chebyshev.chebval(2 * grid - 1, coefficients)
+    weight = np.exp(curve - curve.max())
+    area = np.concatenate([[0.0], np.cumsum((weight[1:] + weight[:-1]) / 2)])
+    return Share(
+        shares=jnp.asarray(grid),
+        log_evidence=jnp.asarray(curve),
+        best=jnp.asarray(grid[curve.argmax()]),
+        mean=jnp.asarray(np.trapezoid(weight * grid) / np.trapezoid(weight)),
+        interval=jnp.asarray(np.interp([0.025, 0.975], area / area[-1], grid)),
+        interpolation_error=jnp.asarray(np.abs(coefficients[-2:]).sum()),
+        converged=jnp.all(converged),
+    )
+
+
+@eqx.filter_jit
+def _evidences(gp, trials, shares, inference):
+    def one(share):
+        posterior = fit_people(gp, trials, share, inference=inference, throw=False)
+        return posterior.log_evidence, posterior.certificate.converged
+
+    return jax.lax.map(one, shares)
