@@ -50,7 +50,7 @@ FAULTS = [
           "if ((crc | 1U) != (hb_crc32(0U, body, size) | 1U))", "protocol"),
     Fault("too long for ever", "hb_frame.c", "    receiver->overlong = false;\n", "", "protocol"),
     Fault("bytes after an overlong frame kept", "hb_frame.c", "    receiver->size = 0U;\n", "", "frames"),
-    Fault("frames that end early taken for COBS", "hb_frame.c", "mark == size ? size - 1U : 0U", "size - 1U", "frames"),
+    Fault("frames that end early taken for COBS", "hb_frame.c", "mark == size ? size - 1U : 0U", "size - 1U", "protocol"),
     Fault("big-endian", "hb_messages.c",
           "(uint8_t)(value & 255U));\n    return put_u8(payload, at, (uint8_t)(value >> 8));",
           "(uint8_t)(value >> 8));\n    return put_u8(payload, at, (uint8_t)(value & 255U));", "frames"),
