@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float, Real
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
 from hilbo.exponentials import STATES
+from hilbo.lattice import Lattice
 from hilbo.memory import Memory, span, sums
 from hilbo.space_filling import latin_chunks, sobol_chunks, take, wall_chunks
 
@@ -254,6 +255,21 @@ class SearchSpace(eqx.Module):
         """
         return _take(self, n, latin_chunks(self.dim, n, seed))
 
+    def lattice(self, nodes: int) -> Lattice:
+        """A tensor grid of the unit cube in columns along K1 (without mechanics along the first parameter), with the
+        ends of the columns of the feasible set."""
+        even = np.linspace(0.0, 1.0, nodes)
+        if self.mechanics is None:
+            columns = nodes ** (self.dim - 1)
+            none = jnp.zeros((0, columns))
+            return Lattice(jnp.asarray(even), jnp.ones((nodes, columns), bool), none, none > 0, 0, self.dim)
+        along = self._index("K1")
+        others = np.stack(np.meshgrid(*[even] * (self.dim - 1), indexing="ij"), axis=-1).reshape(-1, self.dim - 1)
+        low, high = (np.asarray(end) for end in _column(self, np.insert(others, along, 0.0, axis=1)))
+        inside = (low <= even[:, None]) & (even[:, None] <= high) & (high > low)
+        ends = np.stack([low, high] if self.mechanics.effective_damping else [high])
+        return Lattice(*map(jnp.asarray, (even, inside, ends, np.broadcast_to(high > low, ends.shape))), along, self.dim)
+
     def _index(self, name):
         return self.names.index(name)
 
@@ -315,7 +331,8 @@ def _column_table(space):
     """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
     x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
     x[..., space._index("B1")], x[..., space._index("alpha")] = _ROWS[:, None], _COLUMNS
-    node = np.asarray(_width(space, x), float)
+    low, high = _column(space, x)
+    node = np.asarray(high - low, float)
     mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
     volume = mean * np.diff(_ROWS)[:, None] * np.diff(_COLUMNS)
     within = np.pad(np.cumsum(volume, axis=1), ((0, 0), (1, 0)))
@@ -340,10 +357,13 @@ def _rosenblatt(space, uniform):
 
 
 @eqx.filter_jit
-def _width(space, x):
+def _column(space, x):
+    """Both ends of the column of each point, in x_K1."""
     if space.mechanics.effective_damping is None:
-        return space._limit(space.mechanics, x)
-    return space._interval(space.mechanics, x)[1]
+        high = space._limit(space.mechanics, x)
+        return jnp.zeros_like(high), high
+    low, width = space._interval(space.mechanics, x)
+    return low, low + width
 
 
 @eqx.filter_jit

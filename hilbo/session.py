@@ -22,6 +22,7 @@ from hilbo import acquisition
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.kernels import gram
+from hilbo.lattice import Lattice, nodes_for, screen
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.search_space import SearchSpace
 
@@ -38,14 +39,20 @@ __all__ = [
 
 CANDIDATES = 4096
 """Points inside the feasible set among which a function is maximised before polishing; a quarter more on its walls."""
+_STARTS = 3  # of the polishing
 _JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
 
 
 class Design(eqx.Module):
-    """What a seed decides in advance: where the first trials are, and the candidates of the others."""
+    """What a seed decides in advance: where the first trials are, and among which points the others are searched.
+
+    The latter are a lattice in two or three dimensions, whose nodes are products and cost a hundredth of other points;
+    else, and for Thompson's draws, `candidates`.
+    """
 
     initial: Float[Array, "s d"]
-    candidates: Float[Array, "m d"]
+    candidates: Float[Array, "m d"] | None
+    lattice: Lattice | None
     key: PRNGKeyArray
 
 
@@ -56,10 +63,13 @@ def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Flo
 
 
 def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
-    """The seeded part of a session: space-filling points (s, d) and candidates (m, d), in the unit cube."""
+    """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
+    space, nodes = study.space, nodes_for(float(jnp.max(study.gp.kernel.theta)))
+    on_lattice = space.dim in (2, 3) and study.selection.acquisition != "thompson"
     return Design(
-        jnp.asarray(study.space.latin_hypercube(study.selection.space_filling, seed)),
-        search_points(study.space, seed, count),
+        jnp.asarray(space.latin_hypercube(study.selection.space_filling, seed)),
+        None if on_lattice else search_points(space, seed, count),
+        space.lattice(nodes) if on_lattice else None,
         jax.random.key(seed),
     )
 
@@ -69,27 +79,31 @@ def next_point(study: Study, plan: Design, trials: Trials, trial: Int[Array, ""]
     posterior = fit(study.gp, trials, inference=study.inference, throw=False)
     if study.selection.acquisition == "thompson":
         return _thompson_point(posterior, plan, trial)
-    score = _score(study, posterior)
+    distance = study.selection.minimum_distance
+    allowed = (lambda x: _far_from(trials, x, distance)) if distance else None
+    return _highest(study, plan, posterior, _score(study, posterior), allowed).x
+
+
+def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
+    """Where a score is largest in the feasible set; screened in float32."""
 
     def score_at(x):
         mean, variance = posterior.predict(x[None, :])
         return score(mean[0], variance[0])
 
-    distance = study.selection.minimum_distance
-    feasible = study.space.feasible
-    return acquisition.maximise(
-        score(*posterior.astype(jnp.float32).predict(plan.candidates.astype(jnp.float32))),
-        plan.candidates,
-        score_at,
-        from_box=study.space.from_box,
-        to_box=study.space.to_box,
-        feasible=feasible,
-        allowed=(lambda x: _far_from(trials, x, distance)) if distance else None,
-    ).x
+    space = {"from_box": study.space.from_box, "to_box": study.space.to_box, "feasible": study.space.feasible}
+    short = posterior.astype(jnp.float32)
+    if plan.lattice is None:
+        values = score(*short.predict(plan.candidates.astype(jnp.float32)))
+        return acquisition.maximise(values, plan.candidates, score_at, **space, allowed=allowed)
+    values, points = screen(short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor,
+                            plan.lattice, score, allowed)
+    rows = acquisition.spread(values, points, _STARTS)
+    return acquisition.climb(points[rows], values[rows] > -jnp.inf, score_at, **space, allowed=allowed)
 
 
 def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
-    """Where the posterior mean is largest in the feasible set: the session's optimum (paper, algorithm 1)."""
+    """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
     return acquisition.maximise(
         posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
         candidates,
@@ -221,13 +235,13 @@ class Session(eqx.Module):
 
     def best(self) -> dict[str, float]:
         """The rendering with the largest posterior mean: parameter -> value in physical units."""
-        physical = _best_physical(self.study, self.posterior(), self.plan.candidates)
+        physical = _best_physical(self.study, self.plan, self.posterior())
         return dict(zip(self.study.space.names, np.asarray(physical).tolist(), strict=True))
 
 
 @eqx.filter_jit
-def _best_physical(study, posterior, candidates):
-    return study.space.to_physical(best_point(study, posterior, candidates).x)
+def _best_physical(study, plan, posterior):
+    return study.space.to_physical(_highest(study, plan, posterior, acquisition.Mean()).x)
 
 
 def _propose(study, plan, points, answers):
