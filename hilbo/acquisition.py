@@ -168,17 +168,33 @@ def climb(
 ) -> Choice:
     """The best of the usable starts and of where Newton's method leads from them; arguments as in [`maximise`][].
 
+    The search goes through the unit cube itself. Only where that ends outside the feasible set does another follow in
+    the optimiser's coordinates, from the wall beside that end or from the start, whichever is better: there walls are
+    flat, but the function inside is bent wherever the wall is.
     One start after the other: each stops when it is done, where a batch would wait for its slowest.
     """
+
+    def may_end(x):
+        return feasible(x) & (True if allowed is None else allowed(x))
+
+    def along_the_wall(x, outside):
+        aside = from_box(jnp.clip(to_box(outside), 0.0, 1.0))
+        begin = jnp.where(score(aside) > score(x), aside, x)
+        w, value = _polish(lambda w: score(from_box(w)), to_box(begin), steps)
+        end = from_box(w)
+        return end, jnp.where(may_end(end), value, -jnp.inf)
 
     def one(_, start):
         x, may = start
         begun = jnp.where(may, score(x), -jnp.inf)
         if steps == 0:
             return None, (x, begun, begun)
-        end, value = _polish(score, from_box, to_box, steps, x)
-        reached = may & feasible(end) & (True if allowed is None else allowed(end)) & (value > begun)
-        return None, (jnp.where(reached, end, x), jnp.where(reached, value, begun), begun)
+        straight, height = _polish(score, x, steps)
+        end, value = jax.lax.cond(
+            may_end(straight), lambda: (straight, height), lambda: along_the_wall(x, straight)
+        )
+        risen = may & (value > begun)
+        return None, (jnp.where(risen, end, x), jnp.where(risen, value, begun), begun)
 
     _, (ends, values, begun) = jax.lax.scan(one, None, (starts, usable))
     best, first = jnp.argmax(values), jnp.argmax(begun)
@@ -196,19 +212,17 @@ def spread(values: Float[Array, " m"], candidates: Float[Array, "m d"], count: i
     return jax.lax.scan(pick, values, None, length=count)[1]
 
 
-def _polish(score, from_box, to_box, steps, x):
-    """Newton's method from `x` within the optimiser's cube: where it ends, and the score there."""
-    begin = to_box(x)
-    bounds = {"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)}
+def _polish(score, begin, steps):
+    """Newton's method within the unit cube from `begin`: where it ends, and the score there."""
     solution = optx.minimise(
-        lambda w, _: -score(from_box(w)),
+        lambda w, _: -score(w),
         TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION),
         begin,
-        options=bounds,
+        options={"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)},
         max_steps=steps,
         throw=False,
     )
-    return from_box(solution.value), -solution.state.here.value
+    return solution.value, -solution.state.here.value
 
 
 def thompson(

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from hilbo.kernels import RBF
+from hilbo.kernels import RBF, gram
 
 __all__ = ["Lattice", "OptimisticScore", "nodes_for", "screen"]
 
@@ -45,12 +45,14 @@ class Lattice(eqx.Module):
 
     `nodes` (g,); `inside` (g, c): which nodes of the c columns are feasible; `ends` (e, c): where columns end between
     nodes, and `present` (e, c) whether they do. Columns run over the other coordinates, the last one fastest.
+    `extra` (p, d): feasible points of any place, where columns are too far apart.
     """
 
     nodes: Float[Array, " g"]
     inside: Bool[Array, "g c"]
     ends: Float[Array, "e c"]
     present: Bool[Array, "e c"]
+    extra: Float[Array, "p d"]
     along: int = eqx.field(static=True)
     dim: int = eqx.field(static=True)
 
@@ -81,8 +83,9 @@ def screen(
     lattice: Lattice,
     score: OptimisticScore,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
-) -> tuple[Float[Array, " c"], Float[Array, "c d"]]:
-    """The best value of each column (c,) and where it is (c, d); -inf for columns that cannot hold the maximum.
+) -> tuple[Float[Array, " s"], Float[Array, "s d"]]:
+    """The best value of each column and those of the extra points (c + p,), and where they are (c + p, d); -inf for
+    columns that cannot hold the maximum.
 
     **Arguments:** the `kernel`, asked points `x` (n, d), `weights` and `factor` of a posterior; `allowed`: which
     points may be chosen at all, e.g. none too near to earlier ones.
@@ -98,17 +101,19 @@ def screen(
     slack = _SLACK * jnp.finfo(mean.dtype).eps * jnp.sum(jnp.abs(weights)) * prior
     bounds = jnp.max(jnp.where(usable, score.optimistic(mean + slack, prior), -jnp.inf), axis=0)
     product = jnp.concatenate([factor, weights[None, :]])
-    batch = min(_BATCH, bounds.shape[0])
+
+    def value_of(cross):
+        both = product @ cross
+        left = prior - jnp.sum(both[:-1] ** 2, axis=0)
+        # Rounding may leave less than nothing of a variance, and these numbers only rank.
+        return score(both[-1], jnp.where(left > 0, left, 0.0))
 
     def evaluate(state):
         bounds, best, row = state
         _, chosen = jax.lax.top_k(bounds, batch)
         u = across[:, chosen]
         cross = jnp.concatenate([down[:, :, None] * u[:, None, :], ends[:, :, chosen] * u[:, None, :]], axis=1)
-        both = product @ cross.reshape(cross.shape[0], -1)
-        left = prior - jnp.sum(both[:-1] ** 2, axis=0)
-        # Rounding may leave less than nothing of a variance, and these numbers only rank.
-        value = score(both[-1], jnp.where(left > 0, left, 0.0)).reshape(-1, batch)
+        value = value_of(cross.reshape(x.shape[0], -1)).reshape(-1, batch)
         value = jnp.where(usable[:, chosen] & (value > -jnp.inf), value, -jnp.inf)
         return (
             bounds.at[chosen].set(-jnp.inf),
@@ -116,10 +121,19 @@ def screen(
             row.at[chosen].set(jnp.argmax(value, axis=0)),
         )
 
+    others = value_of(gram(kernel, x, lattice.extra.astype(x.dtype)))
+    others = jnp.where(others > -jnp.inf, others, -jnp.inf)
+    if allowed is not None:
+        others = jnp.where(jax.vmap(allowed)(lattice.extra), others, -jnp.inf)
+    highest = jnp.max(others, initial=-jnp.inf)
+    batch = min(_BATCH, bounds.shape[0])
     nothing = jnp.full_like(bounds, -jnp.inf)
     first = evaluate((bounds, nothing, jnp.zeros(bounds.shape, jnp.int32)))
-    _, best, row = jax.lax.while_loop(lambda s: jnp.max(s[0]) > jnp.max(s[1]), evaluate, first)
-    return best, lattice.points(row, jnp.arange(bounds.shape[0]))
+    _, best, row = jax.lax.while_loop(
+        lambda state: jnp.max(state[0]) > jnp.maximum(jnp.max(state[1]), highest), evaluate, first
+    )
+    at_best = lattice.points(row, jnp.arange(bounds.shape[0]))
+    return jnp.concatenate([best, others]), jnp.concatenate([at_best, lattice.extra])
 
 
 def _factors(kernel, x, lattice):

@@ -262,13 +262,15 @@ class SearchSpace(eqx.Module):
         if self.mechanics is None:
             columns = nodes ** (self.dim - 1)
             none = jnp.zeros((0, columns))
-            return Lattice(jnp.asarray(even), jnp.ones((nodes, columns), bool), none, none > 0, 0, self.dim)
+            inside, extra = jnp.ones((nodes, columns), bool), jnp.zeros((0, self.dim))
+            return Lattice(jnp.asarray(even), inside, none, none > 0, extra, 0, self.dim)
         along = self._index("K1")
         others = np.stack(np.meshgrid(*[even] * (self.dim - 1), indexing="ij"), axis=-1).reshape(-1, self.dim - 1)
         low, high = (np.asarray(end) for end in _column(self, np.insert(others, along, 0.0, axis=1)))
         inside = (low <= even[:, None]) & (even[:, None] <= high) & (high > low)
         ends = np.stack([low, high] if self.mechanics.effective_damping else [high])
-        return Lattice(*map(jnp.asarray, (even, inside, ends, np.broadcast_to(high > low, ends.shape))), along, self.dim)
+        present = np.broadcast_to(high > low, ends.shape)
+        return Lattice(*map(jnp.asarray, (even, inside, ends, present, _steep_wall(self, even))), along, self.dim)
 
     def _index(self, name):
         return self.names.index(name)
@@ -327,18 +329,48 @@ def _minimum_damping(m, physical):
 
 
 @functools.lru_cache(maxsize=16)
-def _column_table(space):
-    """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
+def _ends(space):
+    """Both ends of the columns over the rows of B1 and the columns of α."""
     x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
     x[..., space._index("B1")], x[..., space._index("alpha")] = _ROWS[:, None], _COLUMNS
-    low, high = _column(space, x)
-    node = np.asarray(high - low, float)
+    return tuple(np.asarray(end, float) for end in _column(space, x))
+
+
+@functools.lru_cache(maxsize=16)
+def _column_table(space):
+    """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
+    low, high = _ends(space)
+    node = high - low
     mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
     volume = mean * np.diff(_ROWS)[:, None] * np.diff(_COLUMNS)
     within = np.pad(np.cumsum(volume, axis=1), ((0, 0), (1, 0)))
     total = within[:, -1:]
     within = np.where(total > 0, within, _COLUMNS) / np.where(total > 0, total, 1)
     return np.pad(np.cumsum(total), (1, 0)), within
+
+
+def _steep_wall(space, levels):
+    """Points of the wall at these x_K1, on lines of constant B1 and of constant α: where the wall is steep, columns
+    meet it too rarely. (p, 3), for a space of K1, B1 and α alone."""
+    heights, found = _ends(space)[1], []
+    K1, B1, alpha = (space._index(name) for name in ("K1", "B1", "alpha"))
+    for table, lines, positions, fixed, free in (
+        (heights.T, _COLUMNS, _ROWS, alpha, B1),
+        (heights, _ROWS, _COLUMNS, B1, alpha),
+    ):
+        at = np.abs(lines[:, None] - levels[None, :]).argmin(axis=0)
+        above = table[at][:, :, None] >= levels[None, None, 1:]
+        line, before, level = np.nonzero(above[:, 1:] != above[:, :-1])
+        left, right = table[at][line, before], table[at][line, before + 1]
+        share = (levels[level + 1] - left) / (right - left)
+        points = np.empty((len(line), 3))
+        points[:, fixed] = lines[at][line]
+        points[:, free] = positions[before] + share * (positions[before + 1] - positions[before])
+        found.append(points)
+    points = np.concatenate(found)
+    points[:, K1] = 1.0
+    x, feasible = (np.asarray(part) for part in _from_box(space, points))
+    return x[feasible]
 
 
 def _rosenblatt(space, uniform):
