@@ -82,8 +82,8 @@ def report(values, count):
     lines = [
         "# What sessions choose",
         "",
-        f"Made by `python benchmarks/choice.py --states {count} --write`: {count} random states of simulated sessions of",
-        "the preset `paper` (after 5 to 24 answers); differences of UCB, whose scale is the prior's sd, 1.",
+        f"Made by `python benchmarks/choice.py --states {count} --write`: {count} random states of simulated sessions",
+        "of the preset `paper` (after 5 to 24 answers); differences of UCB, whose scale is the prior's sd, 1.",
         "",
         "| the session's choice against | states where lower by more than 1e-6 | lower by at most |"
         " higher on average | higher by at most |",
@@ -92,9 +92,8 @@ def report(values, count):
     names = ("the best of 20,000 points", "the same, polished", "the best known point")
     for name, other in zip(names, values[:, 1:].T, strict=True):
         gain = own - other
-        lines.append(
-            f"| {name} | {np.sum(gain < -TOLERANCE)} | {max(-gain.min(), 0):.1e} | {gain.mean():.1e} | {gain.max():.1e} |"
-        )
+        lower, least = np.sum(gain < -TOLERANCE), max(-gain.min(), 0)
+        lines.append(f"| {name} | {lower} | {least:.1e} | {gain.mean():.1e} | {gain.max():.1e} |")
     return "\n".join(lines) + "\n"
 
 

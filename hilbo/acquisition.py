@@ -190,9 +190,9 @@ def climb(
         if steps == 0:
             return None, (x, begun, begun)
         straight, height = _polish(score, x, steps)
-        end, value = jax.lax.cond(
-            may_end(straight), lambda: (straight, height), lambda: along_the_wall(x, straight)
-        )
+        w = to_box(straight)
+        inside = jnp.all((w >= 0.0) & (w <= 1.0)) & may_end(straight)
+        end, value = jax.lax.cond(inside, lambda: (straight, height), lambda: along_the_wall(x, straight))
         risen = may & (value > begun)
         return None, (jnp.where(risen, end, x), jnp.where(risen, value, begun), begun)
 

@@ -13,7 +13,7 @@ The maximum over the lattice is the same as if every variance had been computed,
 
 import math
 from collections.abc import Callable
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.kernels import RBF, gram
 
-__all__ = ["Lattice", "OptimisticScore", "nodes_for", "screen"]
+__all__ = ["Lattice", "OptimisticScore", "nodes_for", "screen", "screen_points"]
 
 _BATCH = 48  # columns
 _PER_LENGTH = 3.0  # nodes per length scale,
@@ -30,6 +30,7 @@ _FEWEST, _MOST = 12, 32  # and per coordinate
 _SLACK = 16.0  # rounding errors of a mean, in units of eps times the sum of its terms' sizes
 
 
+@runtime_checkable
 class OptimisticScore(Protocol):
     """A score of means and variances that can bound itself."""
 
@@ -100,13 +101,7 @@ def screen(
     mean = jnp.concatenate([(weights[:, None] * down).T @ across, (weights @ at_ends).reshape(-1, across.shape[1])])
     slack = _SLACK * jnp.finfo(mean.dtype).eps * jnp.sum(jnp.abs(weights)) * prior
     bounds = jnp.max(jnp.where(usable, score.optimistic(mean + slack, prior), -jnp.inf), axis=0)
-    product = jnp.concatenate([factor, weights[None, :]])
-
-    def value_of(cross):
-        both = product @ cross
-        left = prior - jnp.sum(both[:-1] ** 2, axis=0)
-        # Rounding may leave less than nothing of a variance, and these numbers only rank.
-        return score(both[-1], jnp.where(left > 0, left, 0.0))
+    value_of = _Values(prior, jnp.concatenate([factor, weights[None, :]]), score)
 
     def evaluate(state):
         bounds, best, row = state
@@ -114,15 +109,14 @@ def screen(
         u = across[:, chosen]
         cross = jnp.concatenate([down[:, :, None] * u[:, None, :], ends[:, :, chosen] * u[:, None, :]], axis=1)
         value = value_of(cross.reshape(x.shape[0], -1)).reshape(-1, batch)
-        value = jnp.where(usable[:, chosen] & (value > -jnp.inf), value, -jnp.inf)
+        value = jnp.where(usable[:, chosen], value, -jnp.inf)
         return (
             bounds.at[chosen].set(-jnp.inf),
             best.at[chosen].set(jnp.max(value, axis=0)),
-            row.at[chosen].set(jnp.argmax(value, axis=0)),
+            row.at[chosen].set(jnp.argmax(value, axis=0).astype(row.dtype)),
         )
 
     others = value_of(gram(kernel, x, lattice.extra.astype(x.dtype)))
-    others = jnp.where(others > -jnp.inf, others, -jnp.inf)
     if allowed is not None:
         others = jnp.where(jax.vmap(allowed)(lattice.extra), others, -jnp.inf)
     highest = jnp.max(others, initial=-jnp.inf)
@@ -134,6 +128,47 @@ def screen(
     )
     at_best = lattice.points(row, jnp.arange(bounds.shape[0]))
     return jnp.concatenate([best, others]), jnp.concatenate([at_best, lattice.extra])
+
+
+def screen_points(
+    kernel: RBF,
+    x: Float[Array, "n d"],
+    weights: Float[Array, " n"],
+    factor: Float[Array, "n n"],
+    points: Float[Array, "m d"],
+    score: OptimisticScore,
+    batch: int = 512,
+) -> Float[Array, " m"]:
+    """Values (m,) of a score at any points, -inf at those that cannot hold the maximum and got no variance."""
+    prior = kernel.diagonal(x[0])
+    mean = gram(kernel, points, x) @ weights
+    slack = _SLACK * jnp.finfo(mean.dtype).eps * jnp.sum(jnp.abs(weights)) * prior
+    value_of = _Values(prior, jnp.concatenate([factor, weights[None, :]]), score)
+
+    def evaluate(state):
+        bounds, values = state
+        _, chosen = jax.lax.top_k(bounds, min(batch, bounds.shape[0]))
+        found = value_of(gram(kernel, x, points[chosen]))
+        # A point that comes twice, because all bounds are used up, keeps its value.
+        return bounds.at[chosen].set(-jnp.inf), values.at[chosen].set(found)
+
+    first = evaluate((score.optimistic(mean + slack, prior), jnp.full_like(mean, -jnp.inf)))
+    return jax.lax.while_loop(lambda state: jnp.max(state[0]) > jnp.max(state[1]), evaluate, first)[1]
+
+
+class _Values(eqx.Module):
+    """A score where the prior covariances with the asked points are the columns of `cross`."""
+
+    prior: Float[Array, ""]
+    product: Float[Array, "r n"]
+    score: OptimisticScore
+
+    def __call__(self, cross):
+        both = self.product @ jax.lax.optimization_barrier(cross)
+        left = self.prior - jnp.sum(both[:-1] ** 2, axis=0)
+        # Rounding may leave less than nothing of a variance, and these numbers only rank; what is none ranks last.
+        value = self.score(both[-1], jnp.where(left > 0, left, 0.0))
+        return jnp.where(value > -jnp.inf, value, -jnp.inf)
 
 
 def _factors(kernel, x, lattice):

@@ -31,11 +31,10 @@ from jaxtyping import Array, Bool, Float, Real
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
 from hilbo.exponentials import STATES
-from hilbo.lattice import Lattice
 from hilbo.memory import Memory, span, sums
 from hilbo.space_filling import latin_chunks, sobol_chunks, take, wall_chunks
 
-__all__ = ["SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace"]
+__all__ = ["COLUMNS", "ROWS", "SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace", "column_ends", "column_table"]
 
 SEARCH_MARGIN = 1e-3
 """The search uses the damping b·(1 - SEARCH_MARGIN)."""
@@ -43,8 +42,8 @@ SEARCH_MARGIN = 1e-3
 # Cells of the table of column widths. At small B1 the width falls from all to little within 1/1000 of the range, so
 # the rows crowd there: with even rows the share of the first one alone would be off by a sixth.
 _CELLS = 256
-_ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
-_COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
+ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
+COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
 # The map puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse them.
 _ROUNDING = 64
 
@@ -255,23 +254,6 @@ class SearchSpace(eqx.Module):
         """
         return _take(self, n, latin_chunks(self.dim, n, seed))
 
-    def lattice(self, nodes: int) -> Lattice:
-        """A tensor grid of the unit cube in columns along K1 (without mechanics along the first parameter), with the
-        ends of the columns of the feasible set."""
-        even = np.linspace(0.0, 1.0, nodes)
-        if self.mechanics is None:
-            columns = nodes ** (self.dim - 1)
-            none = jnp.zeros((0, columns))
-            inside, extra = jnp.ones((nodes, columns), bool), jnp.zeros((0, self.dim))
-            return Lattice(jnp.asarray(even), inside, none, none > 0, extra, 0, self.dim)
-        along = self._index("K1")
-        others = np.stack(np.meshgrid(*[even] * (self.dim - 1), indexing="ij"), axis=-1).reshape(-1, self.dim - 1)
-        low, high = (np.asarray(end) for end in _column(self, np.insert(others, along, 0.0, axis=1)))
-        inside = (low <= even[:, None]) & (even[:, None] <= high) & (high > low)
-        ends = np.stack([low, high] if self.mechanics.effective_damping else [high])
-        present = np.broadcast_to(high > low, ends.shape)
-        return Lattice(*map(jnp.asarray, (even, inside, ends, present, _steep_wall(self, even))), along, self.dim)
-
     def _index(self, name):
         return self.names.index(name)
 
@@ -329,48 +311,24 @@ def _minimum_damping(m, physical):
 
 
 @functools.lru_cache(maxsize=16)
-def _ends(space):
-    """Both ends of the columns over the rows of B1 and the columns of α."""
+def column_table(space):
+    """Both ends of the columns, (B1, α), on a grid: at the x_B1 `ROWS` and the x_alpha `COLUMNS`."""
     x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
-    x[..., space._index("B1")], x[..., space._index("alpha")] = _ROWS[:, None], _COLUMNS
-    return tuple(np.asarray(end, float) for end in _column(space, x))
+    x[..., space._index("B1")], x[..., space._index("alpha")] = ROWS[:, None], COLUMNS
+    return tuple(np.asarray(end, float) for end in column_ends(space, x))
 
 
 @functools.lru_cache(maxsize=16)
 def _column_table(space):
     """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
-    low, high = _ends(space)
+    low, high = column_table(space)
     node = high - low
     mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
-    volume = mean * np.diff(_ROWS)[:, None] * np.diff(_COLUMNS)
+    volume = mean * np.diff(ROWS)[:, None] * np.diff(COLUMNS)
     within = np.pad(np.cumsum(volume, axis=1), ((0, 0), (1, 0)))
     total = within[:, -1:]
-    within = np.where(total > 0, within, _COLUMNS) / np.where(total > 0, total, 1)
+    within = np.where(total > 0, within, COLUMNS) / np.where(total > 0, total, 1)
     return np.pad(np.cumsum(total), (1, 0)), within
-
-
-def _steep_wall(space, levels):
-    """Points of the wall at these x_K1, on lines of constant B1 and of constant α: where the wall is steep, columns
-    meet it too rarely. (p, 3), for a space of K1, B1 and α alone."""
-    heights, found = _ends(space)[1], []
-    K1, B1, alpha = (space._index(name) for name in ("K1", "B1", "alpha"))
-    for table, lines, positions, fixed, free in (
-        (heights.T, _COLUMNS, _ROWS, alpha, B1),
-        (heights, _ROWS, _COLUMNS, B1, alpha),
-    ):
-        at = np.abs(lines[:, None] - levels[None, :]).argmin(axis=0)
-        above = table[at][:, :, None] >= levels[None, None, 1:]
-        line, before, level = np.nonzero(above[:, 1:] != above[:, :-1])
-        left, right = table[at][line, before], table[at][line, before + 1]
-        share = (levels[level + 1] - left) / (right - left)
-        points = np.empty((len(line), 3))
-        points[:, fixed] = lines[at][line]
-        points[:, free] = positions[before] + share * (positions[before + 1] - positions[before])
-        found.append(points)
-    points = np.concatenate(found)
-    points[:, K1] = 1.0
-    x, feasible = (np.asarray(part) for part in _from_box(space, points))
-    return x[feasible]
 
 
 def _rosenblatt(space, uniform):
@@ -380,17 +338,17 @@ def _rosenblatt(space, uniform):
     rows, within = _column_table(space)
     B1, alpha = space._index("B1"), space._index("alpha")
     w = uniform.copy()
-    w[:, B1] = np.interp(uniform[:, B1] * rows[-1], rows, _ROWS)
-    row = np.searchsorted(_ROWS[1:-1], w[:, B1], side="right")
+    w[:, B1] = np.interp(uniform[:, B1] * rows[-1], rows, ROWS)
+    row = np.searchsorted(ROWS[1:-1], w[:, B1], side="right")
     # All rows at once: row r of the table climbs from r to r + 1.
     climbing = (within + np.arange(_CELLS)[:, None]).ravel()
-    w[:, alpha] = np.interp(row + uniform[:, alpha], climbing, np.tile(_COLUMNS, _CELLS))
+    w[:, alpha] = np.interp(row + uniform[:, alpha], climbing, np.tile(COLUMNS, _CELLS))
     return w
 
 
 @eqx.filter_jit
-def _column(space, x):
-    """Both ends of the column of each point, in x_K1."""
+def column_ends(space, x):
+    """Both ends (...,) of the column of each point (..., d) of the unit cube, in x_K1; equal where none is feasible."""
     if space.mechanics.effective_damping is None:
         high = space._limit(space.mechanics, x)
         return jnp.zeros_like(high), high
