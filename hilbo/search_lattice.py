@@ -5,6 +5,8 @@ Where the wall is steep, columns meet it too rarely. There the points are those 
 and along alpha: found in a table of the wall by interpolation, then put exactly on the wall.
 """
 
+import functools
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -15,6 +17,7 @@ from hilbo.space_filling import crossings
 __all__ = ["lattice_of"]
 
 
+@functools.lru_cache(maxsize=16)
 def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
     """The lattice of a space, `nodes` per coordinate; without mechanics its columns run along the first parameter."""
     even, dim = np.linspace(0.0, 1.0, nodes), space.dim
