@@ -1,43 +1,65 @@
 """Run time against the textbook NumPy form (benchmarks/reference_numpy.py), as ratios within one run.
 
     python benchmarks/run.py            one core, one BLAS thread, for both
-    python benchmarks/run.py --cores 2  the process may use two cores; NumPy keeps one BLAS thread
+    python benchmarks/run.py --cores 2  both may use two cores
+    python benchmarks/run.py --write    both of these, and what limits them, into docs/benchmarks.md
 
-The two take turns, round by round; a row is the median over the rounds and the ratio of medians. Writes
-docs/benchmarks.md with --write.
+The two take turns, round by round, hilbo once with Laplace and once with expectation propagation; a row is the median
+over the rounds and the ratio of medians. The live step is repeated many times, for its 99th percentile.
 """
 
 import argparse
+import json
 import os
 import platform
 import subprocess
 import sys
-import tempfile
 import time
+from functools import partial
 from pathlib import Path
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).parents[1]
-sys.path.insert(0, str(ROOT / "benchmarks"))
+sys.path[:0] = [str(ROOT / "benchmarks"), str(ROOT)]
+ASKED = {"live step": 6, "session": 6, "cohort": 5, "pooled": 1.5, "hyperparameters": 10}
+NAMES = {
+    "live step": "live step: 24 answers to the next point, `Session`'s own step; NumPy: best of 20,000 points",
+    "session": "25-trial session, `Session.start` to the last `tell`; NumPy: 5 given points, 20 such steps",
+    "cohort": "24 people x 25 trials fitted, merged (BCM) at 20,000 points; screening in float32",
+    "cohort, float64": "the same in float64",
+    "pooled": "one GP on 600 answers, and the best of 20,000 points",
+    "pooled, all": "the same with mean and sd at all 20,000 points, float64",
+    "hyperparameters": "hyperparameters (theta, noise) of 24 people by evidence, 4 starts each",
+}
 
 
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--cores", type=int, default=1)
     options.add_argument("--rounds", type=int, default=15)
+    options.add_argument("--json", action="store_true")
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    available = sorted(os.sched_getaffinity(0))
-    os.sched_setaffinity(0, available[-chosen.cores :])
-    if chosen.cores == 1:
-        os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false " + os.environ.get("XLA_FLAGS", "")
-    rows = [timed(name, ours, theirs, chosen.rounds) for name, ours, theirs in tasks()]
-    os.sched_setaffinity(0, available)
-    text = table(rows, cold_start(), chosen)
-    print(text)
     if chosen.write:
-        (ROOT / "docs" / "benchmarks.md").write_text(text)
+        runs = [measured_elsewhere(cores, chosen.rounds) for cores in (1, 2)]
+        (ROOT / "docs" / "benchmarks.md").write_text(document(runs, chosen.rounds))
+        return
+    limit_cores(chosen.cores)
+    found = measure(chosen.rounds)
+    print(json.dumps(found) if chosen.json else table(found))
+
+
+def limit_cores(cores):
+    """Before NumPy and JAX are imported."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[name] = str(cores)
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-cores:])
+    if cores == 1:
+        os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false " + os.environ.get("XLA_FLAGS", "")
+
+
+def measured_elsewhere(cores, rounds):
+    command = [sys.executable, "-W", "ignore", __file__, "--json", "--cores", str(cores), "--rounds", str(rounds)]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
 
 def data():
@@ -68,93 +90,95 @@ def data():
 
 
 def tasks():
-    import functools
+    """Name -> hilbo by inference, NumPy, how many more repeats."""
+    import numpy as np
+    import reference_numpy as textbook
 
+    study, candidates, answer, people, _, trials = data()
+    ours = {
+        inference: hilbo_tasks(with_inference(study, inference), candidates, answer, people, trials)
+        for inference in ("laplace", "ep")
+    }
+    x, q = (np.concatenate(part) for part in zip(*people, strict=True))
+    given, starts = candidates[:5], np.array([(30.0, 0.5), (120.0, 0.25), (7.5, 1.0), (480.0, 0.125)])
+    theirs = {
+        "live step": lambda: textbook.ucb_choice(
+            *textbook.predict(textbook.fit(people[0][0][:24], people[0][1][:24]), candidates)
+        ),
+        "session": lambda: textbook.session_25(given, candidates, answer),
+        "cohort": lambda: textbook.study_24x25_bcm(people, candidates),
+        "cohort, float64": lambda: textbook.study_24x25_bcm(people, candidates),
+        "pooled": lambda: textbook.ucb_choice(*textbook.predict(textbook.fit(x, q), candidates)),
+        "pooled, all": lambda: textbook.predict(textbook.fit(x, q), candidates),
+        "hyperparameters": lambda: [textbook.optimise_hyperparameters(*person, starts) for person in people],
+    }
+    return {name: ([ours[i][name] for i in ours], theirs[name]) for name in theirs}
+
+
+def with_inference(study, inference):
+    return type(study).from_dict(edited(study, inference))
+
+
+def edited(study, inference):
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["gp"]["inference"] = inference
+    return raw
+
+
+def hilbo_tasks(study, candidates, answer, people, trials):
     import equinox as eqx
     import jax
     import jax.numpy as jnp
     import numpy as np
-    import reference_numpy as textbook
 
-    from hilbo import session as session_module
+    from hilbo.acquisition import UCB
     from hilbo.hyperparameters import maximise_evidence
+    from hilbo.lattice import screen_points
     from hilbo.ordinal_gp import Trials, fit
+    from hilbo.session import Session
     from hilbo.study import fit_cohort, population
 
-    study, candidates, answer, people, one, trials = data()
     points = jnp.asarray(candidates)
-
     short = points.astype(jnp.float32)
+    low, width = (
+        np.array(part) for part in zip(*((p.low, p.high - p.low) for p in study.space.parameters), strict=True)
+    )
+    given = np.asarray(study.space.to_physical(people[0][0][:24]))
+    begun = Session.start(study)
+    pooled = Trials.from_arrays(*(np.concatenate(part) for part in zip(*people, strict=True)), 600)
+    cohort = Cohort(trials)
+    merge = jax.jit(lambda posteriors, points: population(posteriors.astype(points.dtype), points))
+    learn = eqx.filter_jit(
+        jax.vmap(lambda gp, one: maximise_evidence(gp, one, starts=4, inference=study.inference), in_axes=(None, 0))
+    )
+
+    def session():
+        state = Session.start(study)
+        for trial in range(25):
+            unit = (np.array(list(state.ask().values())) - low) / width
+            state = state.tell(study.responses[answer(unit, trial)])
+        return state.answers
 
     @jax.jit
-    def step(gp, data, points):
-        posterior = fit(gp, data, throw=False).astype(points.dtype)
-        mean, variance = posterior.predict(points)
-        return jnp.argmax(mean + 0.7 * jnp.sqrt(variance))
+    def choice(gp, data, points):
+        posterior = fit(gp, data, inference=study.inference, throw=False).astype(points.dtype)
+        latent = posterior.latent
+        return jnp.argmax(screen_points(gp.kernel, posterior.trials.x, latent.weights, latent.factor, points, UCB(0.7)))
 
-    def live_numpy():
-        posterior = textbook.fit(*people[0])
-        return textbook.ucb_choice(*textbook.predict(posterior, candidates))
+    @jax.jit
+    def everywhere(gp, data, points):
+        mean, variance = fit(gp, data, inference=study.inference, throw=False).predict(points)
+        return mean, jnp.sqrt(variance)
 
-    def session(screened):
-        data = Trials.empty(25, 3)
-        for trial in range(25):
-            row = trial if trial < 5 else int(step(study.gp, data, screened))
-            data = append(data, candidates[row], answer(candidates[row], trial))
-        return data.q
-
-    def own_session():
-        data = Trials.empty(25, 3)
-        for trial in range(25):
-            point = candidates[trial] if trial < 5 else own(data)
-            data = append(data, point, answer(np.asarray(point), trial))
-        return data.q
-
-    append = jax.jit(lambda data, x, q: data.append(x, q))
-    plan = session_module.design(study, 0)
-    own = jax.jit(lambda data: session_module.next_point(study, plan, data, 24))  # UCB does not look at the trial
-    starts = [(30.0, 0.5), (120.0, 0.25), (7.5, 1.0), (480.0, 0.125)]
-    learn = eqx.filter_jit(functools.partial(maximise_evidence, learn=("theta", "noise"), starts=4))
-    merge = jax.jit(lambda posteriors, points: population(posteriors.astype(points.dtype), points))
-    live, whole = (
-        "fit n = 25, mean and sd at 20,000 candidates, choice",
-        "24 people x 25 trials, fitted and merged (BCM)",
-    )
-    given = candidates[:5]
-    tasks = []
-    for kind, where in (("float64", points), ("float32 screening", short)):
-        tasks += [
-            (f"live step: {live}; {kind}", functools.partial(step, study.gp, one, where), live_numpy),
-            (
-                f"25-trial session: 5 given points, 20 such steps; {kind}",
-                functools.partial(session, where),
-                lambda: textbook.session_25(given, candidates, answer),
-            ),
-            (
-                f"{whole} at 20,000 points; {kind}",
-                lambda where=where: merge(fit_cohort(study, Cohort(trials)), where),
-                lambda: textbook.study_24x25_bcm(people, candidates),
-            ),
-        ]
-    as_sessions = "as sessions do it: 5,120 points, the best polished"
-    return [
-        *tasks,
-        (
-            f"live step {as_sessions}, against the best of 20,000",
-            lambda: own(one),
-            live_numpy,
-        ),
-        (
-            f"25-trial session {as_sessions}, against the best of 20,000",
-            own_session,
-            lambda: textbook.session_25(given, candidates, answer),
-        ),
-        (
-            "hyperparameters (theta, noise) of one person by evidence, 4 starts",
-            lambda: learn(study.gp, one).log_evidence,
-            lambda: textbook.optimise_hyperparameters(*people[0], np.array(starts)),
-        ),
-    ]
+    return {
+        "live step": lambda: begun.step(given, people[0][1][:24]),
+        "session": session,
+        "cohort": lambda: merge(fit_cohort(study, cohort), short),
+        "cohort, float64": lambda: merge(fit_cohort(study, cohort), points),
+        "pooled": lambda: choice(study.gp, pooled, short),
+        "pooled, all": lambda: everywhere(study.gp, pooled, points),
+        "hyperparameters": lambda: learn(study.gp, trials).log_evidence,
+    }
 
 
 class Cohort:
@@ -164,78 +188,126 @@ class Cohort:
         self.trials = trials
 
 
-def timed(name, ours, theirs, rounds):
+def once(function):
     import jax
 
-    def once(function):
-        start = time.perf_counter()
-        jax.block_until_ready(function())
-        return time.perf_counter() - start
-
-    both = [f for f in (ours, theirs) if f]
-    for function in both:
-        once(function)
-        once(function)
-    times = [[once(function) for function in both] for _ in range(rounds)]
-    medians = [sorted(column)[rounds // 2] for column in zip(*times, strict=True)]
-    return name, *medians
+    start = time.perf_counter()
+    jax.block_until_ready(function())
+    return time.perf_counter() - start
 
 
-def cold_start():
-    """Seconds of whole processes: what a user waits for."""
-    first = (
-        "import jax; jax.config.update('jax_enable_x64', True)\n"
-        "from hilbo import Session, Study\n"
-        f"s = Session.start(Study.load({str(ROOT / 'hilbo/data/paper.toml')!r}))\n"
-        "for _ in range(5): s = s.tell('different')\n"
-        "print(s.ask())"
-    )
-    rows = []
-    with tempfile.TemporaryDirectory() as cache:
-        env = os.environ | {
-            "JAX_COMPILATION_CACHE_DIR": cache,
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-            "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+def measure(rounds):
+    import numpy as np
+
+    found = {"tasks": {}, "floors": floors(rounds)}
+    for name, (ours, theirs) in tasks().items():
+        for function in (*ours, theirs):
+            once(function)
+        count = 40 * rounds if name == "live step" else max(rounds // 5, 3) if name == "hyperparameters" else rounds
+        times = np.array([[once(function) for function in (*ours, theirs)] for _ in range(count)])
+        found["tasks"][name] = {
+            "median": np.median(times, axis=0).tolist(),
+            "p99": np.quantile(times, 0.99, axis=0).tolist(),
         }
-        for name, code in (
-            ("`import jax`", "import jax"),
-            ("`import hilbo`", "import hilbo"),
-            ("first chosen point of a session, empty compilation cache", first),
-            ("the same, warm cache", first),
+        print(name, found["tasks"][name], file=sys.stderr)
+    return found
+
+
+def floors(rounds):
+    """Seconds per operation of this machine through XLA: exponentials, products, a dispatch."""
+    import jax
+    import jax.numpy as jnp
+
+    jax.config.update("jax_enable_x64", True)
+    numbers = {}
+    for kind in ("float32", "float64"):
+        pairs = -jnp.linspace(0.0, 20.0, 25 * 5000, dtype=kind).reshape(25, 5000)
+        thin, square = jnp.ones((26, 25), kind), jnp.ones((600, 600), kind)
+        wide = jnp.ones((600, 2000), kind)
+        exp, product = jax.jit(jnp.exp), jax.jit(jnp.matmul)
+        for name, call, operations in (
+            ("exp", partial(exp, pairs), pairs.size),
+            ("product 26 x 25 x 5,000", partial(product, thin, pairs), 26 * 25 * 5000),
+            ("product 600 x 600 x 2,000", partial(product, square, wide), 600 * 600 * 2000),
         ):
-            start = time.perf_counter()
-            subprocess.run([sys.executable, "-W", "ignore", "-c", code], env=env, check=True, capture_output=True)
-            rows.append((name, time.perf_counter() - start))
-    return rows
+            once(call)
+            numbers[f"{name}, {kind}"] = min(once(call) for _ in range(4 * rounds)) / operations
+    nothing = jax.jit(lambda a: a + 1)
+    one = jnp.ones(())
+    once(lambda: nothing(one))
+    numbers["dispatch"] = min(once(lambda: nothing(one)) for _ in range(40 * rounds))
+    return numbers
 
 
-def table(rows, cold, chosen):
+def table(found):
+    lines = [
+        "| task | NumPy (ms) | hilbo, Laplace (ms) | ratio (asked) | hilbo, EP (ms) | EP / Laplace |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for key, times in found["tasks"].items():
+        laplace, ep, numpy = (1e3 * t for t in times["median"])
+        asked = f" ({ASKED[key]})" if key in ASKED else ""
+        ratio = f"{numpy / laplace:.1f} x{asked}"
+        lines.append(f"| {NAMES[key]} | {numpy:.2f} | {laplace:.2f} | {ratio} | {ep:.2f} | {ep / laplace:.2f} |")
+    p99 = [1e3 * t for t in found["tasks"]["live step"]["p99"]]
+    lines += [
+        "",
+        f"99th percentile of the live step: Laplace {p99[0]:.2f} ms, EP {p99[1]:.2f} ms, NumPy {p99[2]:.2f} ms.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def document(runs, rounds):
     import jax
 
-    cores = f"{chosen.cores} core{'s' if chosen.cores > 1 else ''}"
     lines = [
         "# Run time",
         "",
-        "Made by `python benchmarks/run.py --write` (`make bench` prints it). Ratios against the textbook NumPy form,",
-        f"benchmarks/reference_numpy.py in the same run, {cores}, one BLAS thread, float64, medians of {chosen.rounds}",
-        f"rounds in turn; {platform.machine()}, Python {platform.python_version()}, jax {jax.__version__}.",
+        "Made by `python benchmarks/run.py --write` (`make bench` prints the first table). hilbo and the textbook NumPy",
+        "form, benchmarks/reference_numpy.py, take turns in one run; medians of",
+        f"{rounds} rounds ({40 * rounds} of the live step); {platform.machine()}, Python {platform.python_version()},",
+        f"jax {jax.__version__}. What the chosen points are worth: [choice.md](choice.md). Cold start:",
+        "[cold_start.md](cold_start.md). What is skipped: [skipping.md](skipping.md).",
         "",
-        "| task | NumPy (ms) | hilbo (ms) | ratio |",
-        "|---|---:|---:|---:|",
+        "## One core, one BLAS thread",
+        "",
+        table(runs[0]),
+        "## Two cores, two BLAS threads",
+        "",
+        table(runs[1]),
+        "## What this machine needs for the operations alone",
+        "",
+        "Nanoseconds per exponential, and per multiplication with addition; by XLA on one core (two).",
+        "",
+        "| operation | float32 | float64 |",
+        "|---|---:|---:|",
     ]
-    lines += [f"| {name} | {1e3 * b:.2f} | {1e3 * a:.2f} | {b / a:.1f} x |" for name, a, b in rows]
-    lines += [
-        "",
-        "What sessions choose has a UCB 0.005 higher than the best of 20,000 points on average, and lower in 3 of 480",
-        "states (by 0.006 at most), counted over the preset's simulated sessions.",
-        "",
-        "Whole processes, cold start:",
-        "",
-        "| process | seconds |",
-        "|---|---:|",
+    for name in ("exp", "product 26 x 25 x 5,000", "product 600 x 600 x 2,000"):
+        cells = [
+            f"{1e9 * runs[0]['floors'][f'{name}, {kind}']:.3f} ({1e9 * runs[1]['floors'][f'{name}, {kind}']:.3f})"
+            for kind in ("float32", "float64")
+        ]
+        lines.append(f"| {name} | {cells[0]} | {cells[1]} |")
+    return "\n".join(lines) + "\n" + floor_text(runs[0])
+
+
+def floor_text(run):
+    """What the operations that cannot be skipped take, beside what the tasks take."""
+    cost, tasks = run["floors"], run["tasks"]
+    cohort = {
+        kind: 1e3 * 24 * 20_000 * (25 * cost[f"exp, {kind}"] + 26 * 25 * cost[f"product 26 x 25 x 5,000, {kind}"])
+        for kind in ("float32", "float64")
+    }
+    pooled = 1e3 * 20_000 * 600 * (cost["exp, float64"] + 601 * cost["product 600 x 600 x 2,000, float64"])
+    rows = [
+        ("cohort", "24 x 20,000 x (25 exponentials, 26 x 25 products), float32", cohort["float32"]),
+        ("cohort, float64", "the same, float64", cohort["float64"]),
+        ("pooled, all", "20,000 x 600 x (1 exponential, 601 products), float64", pooled),
     ]
-    lines += [f"| {name} | {seconds:.1f} |" for name, seconds in cold]
-    return "\n".join(lines) + "\n"
+    lines = ["", "| task | operations that every point needs | floor (ms) | hilbo (ms) |", "|---|---|---:|---:|"]
+    lines += [f"| {key} | {what} | {floor:.1f} | {1e3 * tasks[key]['median'][0]:.1f} |" for key, what, floor in rows]
+    dispatch = 1e6 * cost["dispatch"]
+    return "\n".join([*lines, "", f"A call of a compiled function that does nothing takes {dispatch:.1f} us."]) + "\n"
 
 
 if __name__ == "__main__":

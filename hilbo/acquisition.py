@@ -13,7 +13,6 @@ Log expected improvement after Ament et al. (2023), arXiv:2310.20708: without th
 an improvement is unlikely.
 """
 
-import functools
 from collections.abc import Callable
 
 import equinox as eqx
@@ -26,7 +25,7 @@ from hilbo.linalg import eigh
 from hilbo.newton import TrustRegionNewton
 from hilbo.normal import HALF_LOG_2PI, excess_hazard
 
-__all__ = ["UCB", "Choice", "LogEI", "Mean", "Score", "TopCategory", "maximise", "thompson"]
+__all__ = ["UCB", "Choice", "LogEI", "Mean", "Score", "TopCategory", "climb", "maximise", "spread", "thompson"]
 
 Score = Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
 """Posterior mean and variance at a point -> how much we want to ask there."""
@@ -43,6 +42,10 @@ class UCB(eqx.Module):
     def __call__(self, mean, variance):
         return mean + self.weight.astype(mean.dtype) * jnp.sqrt(variance)
 
+    def optimistic(self, mean, prior):
+        """With all of the prior's variance left; `weight` is not negative."""
+        return self(mean, prior)
+
 
 class LogEI(eqx.Module):
     """Logarithm of the expected improvement over `best`, usually the largest posterior mean among the asked points."""
@@ -52,6 +55,10 @@ class LogEI(eqx.Module):
     def __call__(self, mean, variance):
         sd = jnp.sqrt(variance)
         return jnp.log(sd) + _log_improvement((mean - self.best.astype(mean.dtype)) / sd)
+
+    def optimistic(self, mean, prior):
+        """With all of the prior's variance left: more spread means more improvement."""
+        return self(mean, prior)
 
 
 class TopCategory(eqx.Module):
@@ -64,12 +71,21 @@ class TopCategory(eqx.Module):
         spread = jnp.sqrt(self.noise.astype(mean.dtype) ** 2 + variance)
         return jax.scipy.special.log_ndtr((mean - self.threshold.astype(mean.dtype)) / spread)
 
+    def optimistic(self, mean, prior):
+        """Certain where the mean is above the threshold, as uncertain as the prior below it."""
+        return self(mean, jnp.where(mean > self.threshold.astype(mean.dtype), 0.0, prior))
+
 
 class Mean(eqx.Module):
     """The posterior mean itself: pure exploitation, and what the final optimum maximises."""
 
     def __call__(self, mean, variance):
         del variance
+        return mean
+
+    def optimistic(self, mean, prior):
+        """The mean."""
+        del prior
         return mean
 
 
@@ -125,27 +141,67 @@ def maximise(
     """
     if allowed is not None:
         values = jnp.where(jax.vmap(allowed)(candidates), values, -jnp.inf)
-    rows = _spread(values, candidates, max(starts, 1))
-    begun = jnp.where(values[rows] > -jnp.inf, jax.vmap(score)(candidates[rows]), -jnp.inf)
-    first = jnp.argmax(begun)
-    best = Choice(candidates[rows[first]], begun[first], rows[first], begun[first])
-    if starts == 0:
-        return best
-    # One after the other: each stops when it is done, where a batch would wait for its slowest.
-    polished = jax.lax.map(functools.partial(_polish, score, from_box, to_box, steps), candidates[rows])
-    usable = jax.vmap(lambda x: feasible(x) & (True if allowed is None else allowed(x)))(polished)
-    reached = jnp.where(usable, jax.vmap(score)(polished), -jnp.inf)
-    top = jnp.argmax(reached)
-    better = reached[top] > best.value
-    return Choice(
-        jnp.where(better, polished[top], best.x),
-        jnp.where(better, reached[top], best.value),
-        best.candidate,
-        best.candidate_value,
+    rows = spread(values, candidates, max(starts, 1))
+    found = climb(
+        candidates[rows],
+        values[rows] > -jnp.inf,
+        score,
+        from_box=from_box,
+        to_box=to_box,
+        feasible=feasible,
+        allowed=allowed,
+        steps=steps if starts else 0,
     )
+    return eqx.tree_at(lambda c: c.candidate, found, rows[found.candidate])
 
 
-def _spread(values, candidates, count, apart=0.1):
+def climb(
+    starts: Float[Array, "s d"],
+    usable: Bool[Array, " s"],
+    score: Callable[[Float[Array, " d"]], Float[Array, ""]],
+    *,
+    from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
+    to_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
+    feasible: Callable[[Float[Array, " d"]], Bool[Array, ""]],
+    allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
+    steps: int = 50,
+) -> Choice:
+    """The best of the usable starts and of where Newton's method leads from them; arguments as in [`maximise`][].
+
+    The search goes through the unit cube itself. Only where that ends outside the feasible set does another follow in
+    the optimiser's coordinates, from the wall beside that end or from the start, whichever is better: there walls are
+    flat, but the function inside is bent wherever the wall is.
+    One start after the other: each stops when it is done, where a batch would wait for its slowest.
+    """
+
+    def may_end(x):
+        return feasible(x) & (True if allowed is None else allowed(x))
+
+    def along_the_wall(x, outside):
+        aside = from_box(jnp.clip(to_box(outside), 0.0, 1.0))
+        begin = jnp.where(score(aside) > score(x), aside, x)
+        w, value = _polish(lambda w: score(from_box(w)), to_box(begin), steps)
+        end = from_box(w)
+        return end, jnp.where(may_end(end), value, -jnp.inf)
+
+    def one(_, start):
+        x, may = start
+        begun = jnp.where(may, score(x), -jnp.inf)
+        if steps == 0:
+            return None, (x, begun, begun)
+        straight, height = _polish(score, x, steps)
+        w = to_box(straight)
+        inside = jnp.all((w >= 0.0) & (w <= 1.0)) & may_end(straight)
+        end, value = jax.lax.cond(inside, lambda: (straight, height), lambda: along_the_wall(x, straight))
+        risen = may & (value > begun)
+        return None, (jnp.where(risen, end, x), jnp.where(risen, value, begun), begun)
+
+    _, (ends, values, begun) = jax.lax.scan(one, None, (starts, usable))
+    best, first = jnp.argmax(values), jnp.argmax(begun)
+    return Choice(ends[best], values[best], first, begun[first])
+
+
+def spread(values: Float[Array, " m"], candidates: Float[Array, "m d"], count: int, apart: float = 0.1):
     """Rows of good candidates from different places: the best, the best further than `apart` from it, and so on."""
 
     def pick(remaining, _):
@@ -156,19 +212,17 @@ def _spread(values, candidates, count, apart=0.1):
     return jax.lax.scan(pick, values, None, length=count)[1]
 
 
-def _polish(score, from_box, to_box, steps, x):
-    """Newton's method from `x` within the optimiser's cube."""
-    begin = to_box(x)
-    bounds = {"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)}
+def _polish(score, begin, steps):
+    """Newton's method within the unit cube from `begin`: where it ends, and the score there."""
     solution = optx.minimise(
-        lambda w, _: -score(from_box(w)),
+        lambda w, _: -score(w),
         TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION),
         begin,
-        options=bounds,
+        options={"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)},
         max_steps=steps,
         throw=False,
     )
-    return from_box(solution.value)
+    return solution.value, -solution.state.here.value
 
 
 def thompson(

@@ -16,6 +16,7 @@ __all__ = [
     "Certificate",
     "GaussianPosterior",
     "factor",
+    "factorise",
     "inverse_and_log_determinant",
     "mean_and_explained",
     "square_root",
@@ -99,7 +100,10 @@ def square_root(covariance: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], F
     return root, jnp.max(jnp.abs(root @ root.T - covariance))
 
 
-def _factorise(covariance, curvature):
+def factorise(
+    covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, "n n"]]:
+    """W^(1/2) as a vector, B = I + W^(1/2) K W^(1/2), and its Cholesky factor L."""
     root = jnp.sqrt(curvature)
     matrix = jnp.eye(root.shape[0], dtype=root.dtype) + root[:, None] * covariance * root[None, :]
     return root, matrix, cholesky(matrix)
@@ -109,7 +113,7 @@ def factor(
     covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
     """V = L^-1 W^(1/2) with B = L L', so V'V = C; and a bound on B's condition, as B has no eigenvalue below 1."""
-    root, matrix, lower = _factorise(covariance, curvature)
+    root, matrix, lower = factorise(covariance, curvature)
     return solve_lower(lower, jnp.diag(root)), jnp.linalg.norm(matrix)
 
 
@@ -118,7 +122,7 @@ def inverse_and_log_determinant(
     covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
     """C, and log|B| = log|I + K W|."""
-    root, _, lower = _factorise(covariance, curvature)
+    root, _, lower = factorise(covariance, curvature)
     factor = solve_lower(lower, jnp.diag(root))
     return factor.T @ factor, 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
 

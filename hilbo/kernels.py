@@ -55,6 +55,11 @@ class RBF(eqx.Module):
         exponent = sum((theta[i] * (x[i] - y[i]) ** 2 for i in range(1, x.shape[0])), theta[0] * (x[0] - y[0]) ** 2)
         return self.variance.astype(x.dtype) * jnp.exp(-exponent)
 
+    def along(self, axis: int, x: Float[Array, " n"], y: Float[Array, " m"]) -> Float[Array, "n m"]:
+        """The factor (n, m) that one coordinate contributes: the kernel is the product of these and the variance."""
+        theta = self.theta[axis] if self.theta.ndim else self.theta
+        return jnp.exp(-theta.astype(x.dtype) * (x[:, None] - y[None, :]) ** 2)
+
     def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
         """The prior variance, the same everywhere."""
         return self.variance.astype(x.dtype)

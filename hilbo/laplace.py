@@ -7,7 +7,10 @@ K is the prior covariance of the eta's, of whatever rank (the same stimulus aske
 * Coordinates. eta = R v with v ~ N(0, I) and R the symmetric-eigenvector root of K, so K is never inverted and needs
   no jitter. The Newton matrix I + R'WR has no eigenvalue below 1, and the objective is strongly concave with modulus
   1: the residual |R' grad l - v| *bounds* the distance to the mode, in units of the prior's standard deviations.
-* The steps are damped by Armijo's rule (`_DampedNewton`, an optimistix root finder), so every start converges.
+* The search begins with full Newton steps on the weights a, eta = K a (R & W, algorithm 3.1), which need no R: there
+  v = R'a and the same residual is sqrt(r'Kr), r = grad l - a. Where they do not end below the tolerance, because the
+  answers conflict at little noise, say, the search begins anew in v, where every start converges: the steps are damped
+  by Armijo's rule (`_DampedNewton`, an optimistix root finder).
 * Derivatives of any order come from the stationarity eta = K grad l(eta) by the implicit function theorem, and from
   C = (K + 1/W)^-1 written so that W = 0 is no special case. R, whose derivative may not exist, has no part in them.
 
@@ -16,20 +19,31 @@ References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1; paper, section 
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from hilbo.gaussian import Certificate, GaussianPosterior, factor, inverse_and_log_determinant, square_root
+from hilbo.gaussian import (
+    Certificate,
+    GaussianPosterior,
+    factor,
+    factorise,
+    inverse_and_log_determinant,
+    square_root,
+)
 from hilbo.linalg import cholesky, solve_lower, solve_lower_transposed
 
 __all__ = ["Pointwise", "Terms", "laplace"]
 
 Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 """Log-likelihood terms l_i(eta_i), their slopes l_i' and curvatures -l_i'' >= 0; [`Pointwise`][] derives the latter."""
+
+
+_PLAIN_STEPS = 20
 
 
 class Pointwise(eqx.Module):
@@ -92,9 +106,81 @@ def laplace(
 # --- the mode
 
 
-@eqx.filter_custom_jvp
-def _find_mode(terms, covariance, start, max_steps):
+class _Mode(NamedTuple):
     """The mode, its residual and the tolerance that was to be met, steps taken, and what the square root dropped."""
+
+    eta: Float[Array, " n"]
+    residual: Float[Array, ""]
+    tolerance: Float[Array, ""]
+    steps: Int[Array, ""]
+    changed: Float[Array, ""]
+
+
+@eqx.filter_custom_jvp
+def _find_mode(terms, covariance, start, max_steps) -> _Mode:
+    """Under `vmap` one matrix after the other on CPUs, each stopping when it is done; elsewhere all at once in v."""
+    arrays, rest = eqx.partition(terms, eqx.is_array)
+
+    def safe(arrays, covariance, start):
+        return _whitened_mode(eqx.combine(arrays, rest), covariance, start, max_steps)
+
+    def quick(arrays, covariance, start):
+        found = _plain_mode(eqx.combine(arrays, rest), covariance, start, min(max_steps, _PLAIN_STEPS))
+        done = found.residual <= found.tolerance
+        return jax.lax.cond(done, lambda *_: found, safe, arrays, covariance, start)
+
+    mapped = jax.custom_batching.custom_vmap(quick)
+
+    @mapped.def_vmap
+    def rule(size, in_batched, *args):
+        whole = jax.tree.map(lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape)), args, tuple(in_batched))
+        found = jax.lax.platform_dependent(
+            *whole, cpu=lambda *stacked: jax.lax.map(lambda row: mapped(*row), stacked), default=jax.vmap(safe)
+        )
+        return found, jax.tree.map(lambda _: True, found)
+
+    return mapped(arrays, covariance, start)
+
+
+class _PlainState(NamedTuple):
+    weights: Float[Array, " n"]  # a, with eta = K a
+    following: Float[Array, " n"]  # the weights after a full step
+    eta: Float[Array, " n"]
+    objective: Float[Array, ""]
+    residual: Float[Array, ""]
+    steps: Int[Array, ""]
+    risen: Bool[Array, ""]
+
+
+def _plain_mode(terms, covariance, start, max_steps) -> _Mode:
+    """Full Newton steps on the weights, as long as the log posterior rises."""
+    epsilon = jnp.finfo(start.dtype).eps
+    tolerance = jnp.asarray(epsilon ** (2 / 3), start.dtype)
+
+    def at(weights, steps, before):
+        eta = covariance @ weights
+        values, slope, curvature = terms(eta)
+        root, _, lower = factorise(covariance, curvature)
+        target = curvature * eta + slope
+        half = solve_lower(lower, (root * (covariance @ target))[:, None])
+        following = target - root * solve_lower_transposed(lower, half)[:, 0]
+        off = slope - weights
+        # |off| |K off| >= off' K off, and unlike it cannot be rounded to less than 0.
+        residual = jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(covariance @ off))
+        objective = jnp.sum(values) - 0.5 * weights @ eta
+        slack = 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + jnp.abs(weights @ eta))
+        return _PlainState(weights, following, eta, objective, residual, steps, objective >= before - slack)
+
+    last = jax.lax.while_loop(
+        lambda state: state.risen & (state.residual > tolerance) & (state.steps < max_steps),
+        lambda state: at(state.following, state.steps + 1, state.objective),
+        at(start, jnp.asarray(1), jnp.asarray(-jnp.inf, start.dtype)),
+    )
+    return _Mode(last.eta, last.residual, tolerance, last.steps, jnp.zeros_like(tolerance))
+
+
+def _whitened_mode(terms, covariance, start, max_steps) -> _Mode:
+    """Damped Newton steps in v."""
     root, changed = square_root(covariance)
     solution = optx.root_find(
         _stationarity,
@@ -106,7 +192,8 @@ def _find_mode(terms, covariance, start, max_steps):
         throw=False,
     )
     state = solution.state
-    return solution.value, state.residual, state.tolerance, jnp.asarray(solution.stats["num_steps"]), changed
+    steps = jnp.asarray(solution.stats["num_steps"])
+    return _Mode(solution.value, state.residual, state.tolerance, steps, changed)
 
 
 @_find_mode.def_jvp
@@ -114,7 +201,7 @@ def _find_mode_jvp(primals, tangents):
     """eta = K grad l(eta), hence (I + K W) d eta = d(K grad l) at fixed eta, and (I + K W)^-1 = I - K C."""
     terms, covariance, _, _ = primals
     found = _find_mode(*primals)
-    mode = found[0]
+    mode = found.eta
 
     def image(terms, matrix):
         _, slope, curvature = terms(mode)
@@ -122,7 +209,7 @@ def _find_mode_jvp(primals, tangents):
 
     (_, curvature), (moved, _) = eqx.filter_jvp(image, (terms, covariance), tangents[:2])
     inverse, _ = inverse_and_log_determinant(covariance, curvature)
-    return found, (moved - covariance @ (inverse @ moved), None, None, None, None)
+    return found, _Mode(moved - covariance @ (inverse @ moved), None, None, None, None)
 
 
 def _stationarity(eta, args):

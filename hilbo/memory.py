@@ -101,29 +101,40 @@ def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"
 @partial(jax.jit, static_argnames="N")
 def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
     """C(1), C(-1), their difference and the first moment of one order α, without cancellation."""
-    return _gl_sums_derivative(jnp.asarray(alpha, jnp.result_type(1.0, alpha)), N, 0)
+    return _gl_sums_jet(jnp.asarray(alpha, jnp.result_type(1.0, alpha)), N, 0)[0]
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
-def _gl_sums_derivative(alpha, N, order):
-    """The derivative of the sums by α of that order: d/dα is taken once, however many directions α moves in.
+def _gl_sums_jet(alpha, N, order):
+    """The sums and their derivatives by α up to that order, in one loop, however many directions α moves in.
 
-    Without this rule a Hessian carries every direction through the N additions, at ten times the time.
+    Without this rule a Hessian carries every direction through the N additions, at ten times the time; and the rule
+    below asks for one longer jet in place of one loop for each order.
     """
-    function = partial(_gl_sums, N=N)
+    jet = _first_of_jet(partial(_gl_sums, N=N))
     for _ in range(order):
-        function = _derivative(function)
-    return function(alpha)
+        jet = _longer(jet)
+    return jet(alpha)
 
 
-@_gl_sums_derivative.defjvp
-def _gl_sums_derivative_jvp(N, order, primals, tangents):
-    slope = _gl_sums_derivative(*primals, N, order + 1)
-    return _gl_sums_derivative(*primals, N, order), jax.tree.map(lambda part: part * tangents[0], slope)
+@_gl_sums_jet.defjvp
+def _gl_sums_jet_jvp(N, order, primals, tangents):
+    longer = _gl_sums_jet(*primals, N, order + 1)
+    return longer[:-1], jax.tree.map(lambda part: part * tangents[0], longer[1:])
 
 
-def _derivative(function):
-    return lambda alpha: jax.jvp(function, (alpha,), (jnp.ones_like(alpha),))[1]
+def _first_of_jet(function):
+    return lambda alpha: (function(alpha),)
+
+
+def _longer(jet):
+    """The jet with one derivative more."""
+
+    def extended(alpha):
+        values, slopes = jax.jvp(jet, (alpha,), (jnp.ones_like(alpha),))
+        return (*values, slopes[-1])
+
+    return extended
 
 
 def _gl_sums(alpha, N):

@@ -32,6 +32,7 @@ from hilbo.likelihoods import OrdinalProbit
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
 
 _SOUGHT = {"laplace": "Laplace mode", "ep": "fixed point of expectation propagation", "exact": "exact posterior"}
+_CACHED, _PARTS = 2**16, 8  # covariances held at a time when many points are predicted, in at most so many parts
 _BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
 
 
@@ -238,9 +239,21 @@ def _predict(posterior, x):
 
 @jax.jit
 def _mean_and_explained(posterior, x):
-    latent = posterior.latent
-    cross = gram(posterior.gp.kernel, posterior.trials.x, x)
-    return mean_and_explained(latent.weights, latent.factor, latent.inverse, cross)
+    latent, count = posterior.latent, x.shape[0]
+    # Many points go in parts whose covariances stay in a core's cache; no scan, which would drop derivative rules. Each
+    # coordinate lies in one piece, for loops over points that take several at a time.
+    x = jax.lax.optimization_barrier(x.T).T
+    size = max(_CACHED // max(posterior.trials.capacity, 1), -(-count // _PARTS), 1)
+    parts = [
+        mean_and_explained(
+            latent.weights,
+            latent.factor,
+            latent.inverse,
+            gram(posterior.gp.kernel, posterior.trials.x, x[begin : begin + size]),
+        )
+        for begin in range(0, max(count, 1), size)
+    ]
+    return parts[0] if len(parts) == 1 else jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *parts)
 
 
 def fit(

@@ -34,7 +34,7 @@ from hilbo.exponentials import STATES
 from hilbo.memory import Memory, span, sums
 from hilbo.space_filling import latin_chunks, sobol_chunks, take, wall_chunks
 
-__all__ = ["SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace"]
+__all__ = ["COLUMNS", "ROWS", "SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace", "column_ends", "column_table"]
 
 SEARCH_MARGIN = 1e-3
 """The search uses the damping b·(1 - SEARCH_MARGIN)."""
@@ -42,8 +42,8 @@ SEARCH_MARGIN = 1e-3
 # Cells of the table of column widths. At small B1 the width falls from all to little within 1/1000 of the range, so
 # the rows crowd there: with even rows the share of the first one alone would be off by a sixth.
 _CELLS = 256
-_ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
-_COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
+ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
+COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
 # The map puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse them.
 _ROUNDING = 64
 
@@ -311,16 +311,23 @@ def _minimum_damping(m, physical):
 
 
 @functools.lru_cache(maxsize=16)
+def column_table(space):
+    """Both ends of the columns, (B1, α), on a grid: at the x_B1 `ROWS` and the x_alpha `COLUMNS`."""
+    x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
+    x[..., space._index("B1")], x[..., space._index("alpha")] = ROWS[:, None], COLUMNS
+    return tuple(np.asarray(end, float) for end in column_ends(space, x))
+
+
+@functools.lru_cache(maxsize=16)
 def _column_table(space):
     """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
-    x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
-    x[..., space._index("B1")], x[..., space._index("alpha")] = _ROWS[:, None], _COLUMNS
-    node = np.asarray(_width(space, x), float)
+    low, high = column_table(space)
+    node = high - low
     mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
-    volume = mean * np.diff(_ROWS)[:, None] * np.diff(_COLUMNS)
+    volume = mean * np.diff(ROWS)[:, None] * np.diff(COLUMNS)
     within = np.pad(np.cumsum(volume, axis=1), ((0, 0), (1, 0)))
     total = within[:, -1:]
-    within = np.where(total > 0, within, _COLUMNS) / np.where(total > 0, total, 1)
+    within = np.where(total > 0, within, COLUMNS) / np.where(total > 0, total, 1)
     return np.pad(np.cumsum(total), (1, 0)), within
 
 
@@ -331,19 +338,22 @@ def _rosenblatt(space, uniform):
     rows, within = _column_table(space)
     B1, alpha = space._index("B1"), space._index("alpha")
     w = uniform.copy()
-    w[:, B1] = np.interp(uniform[:, B1] * rows[-1], rows, _ROWS)
-    row = np.searchsorted(_ROWS[1:-1], w[:, B1], side="right")
+    w[:, B1] = np.interp(uniform[:, B1] * rows[-1], rows, ROWS)
+    row = np.searchsorted(ROWS[1:-1], w[:, B1], side="right")
     # All rows at once: row r of the table climbs from r to r + 1.
     climbing = (within + np.arange(_CELLS)[:, None]).ravel()
-    w[:, alpha] = np.interp(row + uniform[:, alpha], climbing, np.tile(_COLUMNS, _CELLS))
+    w[:, alpha] = np.interp(row + uniform[:, alpha], climbing, np.tile(COLUMNS, _CELLS))
     return w
 
 
 @eqx.filter_jit
-def _width(space, x):
+def column_ends(space, x):
+    """Both ends (...,) of the column of each point (..., d) of the unit cube, in x_K1; equal where none is feasible."""
     if space.mechanics.effective_damping is None:
-        return space._limit(space.mechanics, x)
-    return space._interval(space.mechanics, x)[1]
+        high = space._limit(space.mechanics, x)
+        return jnp.zeros_like(high), high
+    low, width = space._interval(space.mechanics, x)
+    return low, low + width
 
 
 @eqx.filter_jit

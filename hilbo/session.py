@@ -10,6 +10,7 @@ answers so far and the seed: fits start cold, from the physical values that a ta
 log, of a table, on another day) gives the same points bit for bit.
 """
 
+import functools
 from collections.abc import Iterable, Mapping
 
 import equinox as eqx
@@ -22,7 +23,9 @@ from hilbo import acquisition
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.kernels import gram
+from hilbo.lattice import Lattice, nodes_for, screen, screen_points
 from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.search_lattice import lattice_of
 from hilbo.search_space import SearchSpace
 
 __all__ = [
@@ -38,14 +41,20 @@ __all__ = [
 
 CANDIDATES = 4096
 """Points inside the feasible set among which a function is maximised before polishing; a quarter more on its walls."""
+_BEST, _STARTS = 256, 3  # screened points among which the starts of the polishing are sought, and starts
 _JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
 
 
 class Design(eqx.Module):
-    """What a seed decides in advance: where the first trials are, and the candidates of the others."""
+    """What a seed decides in advance: where the first trials are, and among which points the others are searched.
+
+    The latter are a lattice in two or three dimensions, whose nodes are products and cost a hundredth of other points;
+    else, and for Thompson's draws, `candidates`.
+    """
 
     initial: Float[Array, "s d"]
-    candidates: Float[Array, "m d"]
+    candidates: Float[Array, "m d"] | None
+    lattice: Lattice | None
     key: PRNGKeyArray
 
 
@@ -56,10 +65,13 @@ def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Flo
 
 
 def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
-    """The seeded part of a session: space-filling points (s, d) and candidates (m, d), in the unit cube."""
+    """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
+    space, nodes = study.space, nodes_for(float(jnp.max(study.gp.kernel.theta)))
+    on_lattice = space.dim in (2, 3) and study.selection.acquisition != "thompson"
     return Design(
-        jnp.asarray(study.space.latin_hypercube(study.selection.space_filling, seed)),
-        search_points(study.space, seed, count),
+        jnp.asarray(space.latin_hypercube(study.selection.space_filling, seed)),
+        None if on_lattice else search_points(space, seed, count),
+        lattice_of(space, nodes) if on_lattice else None,
         jax.random.key(seed),
     )
 
@@ -69,27 +81,36 @@ def next_point(study: Study, plan: Design, trials: Trials, trial: Int[Array, ""]
     posterior = fit(study.gp, trials, inference=study.inference, throw=False)
     if study.selection.acquisition == "thompson":
         return _thompson_point(posterior, plan, trial)
-    score = _score(study, posterior)
+    distance = study.selection.minimum_distance
+    allowed = (lambda x: _far_from(trials, x, distance)) if distance else None
+    return _highest(study, plan, posterior, _score(study, posterior), allowed).x
+
+
+def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
+    """Where a score is largest in the feasible set; screened in float32."""
 
     def score_at(x):
         mean, variance = posterior.predict(x[None, :])
         return score(mean[0], variance[0])
 
-    distance = study.selection.minimum_distance
-    feasible = study.space.feasible
-    return acquisition.maximise(
-        score(*posterior.astype(jnp.float32).predict(plan.candidates.astype(jnp.float32))),
-        plan.candidates,
-        score_at,
-        from_box=study.space.from_box,
-        to_box=study.space.to_box,
-        feasible=feasible,
-        allowed=(lambda x: _far_from(trials, x, distance)) if distance else None,
-    ).x
+    space = {"from_box": study.space.from_box, "to_box": study.space.to_box, "feasible": study.space.feasible}
+    short = posterior.astype(jnp.float32)
+    known = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
+    if plan.lattice is None:
+        points = plan.candidates
+        if allowed is None:
+            values = screen_points(*known, points.astype(jnp.float32), score)
+        else:  # which may rule out all points that were not skipped
+            values = score(*short.predict(points.astype(jnp.float32)))
+        return acquisition.maximise(values, points, score_at, **space, allowed=allowed)
+    values, points = screen(*known, plan.lattice, score, allowed)
+    values, best = jax.lax.top_k(values, min(_BEST, values.shape[0]))
+    rows = best[acquisition.spread(values, points[best], _STARTS)]
+    return acquisition.climb(points[rows], values[rows] > -jnp.inf, score_at, **space, allowed=allowed)
 
 
 def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
-    """Where the posterior mean is largest in the feasible set: the session's optimum (paper, algorithm 1)."""
+    """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
     return acquisition.maximise(
         posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
         candidates,
@@ -132,11 +153,15 @@ def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capac
 
     Rows beyond n are put in the middle of the box before the change of coordinates, so that it compiles once.
     """
-    padded = np.tile([(p.low + p.high) / 2 for p in study.space.parameters], (capacity, 1))
-    padded[: len(points)] = points
-    categories = np.zeros(capacity, np.int32)
-    categories[: len(answers)] = answers
+    middle = np.array([(p.low + p.high) / 2 for p in study.space.parameters])
+    padded, categories = _padded(points, answers, capacity, middle)
     return Trials(_to_unit(study.space, padded), jnp.asarray(categories), jnp.arange(capacity) < len(points))
+
+
+def _padded(points, answers, capacity, middle):
+    padded, categories = np.tile(middle, (capacity, 1)), np.zeros(capacity, np.int32)
+    padded[: len(points)], categories[: len(answers)] = points, answers
+    return padded, categories
 
 
 @eqx.filter_jit
@@ -149,9 +174,42 @@ def _to_physical(space, unit):
     return space.to_physical(unit)
 
 
-@eqx.filter_jit
-def _next_physical(study, plan, trials, trial):
-    return study.space.to_physical(next_point(study, plan, trials, trial))
+class _Step:
+    """What is compiled once for a study and a design: from answers to the next point, in physical units.
+
+    Everything but the answers is bound, so that a call costs no look at the study.
+    """
+
+    def __init__(self, study, plan):
+        arrays, fixed = eqx.partition((study, plan), eqx.is_array)
+        leaves, structure = jax.tree.flatten(fixed)
+        self.arrays, self.compiled = arrays, _compiled(structure, tuple(leaves))
+        self.initial = np.asarray(_to_physical(study.space, plan.initial))
+        self.capacity = study.selection.trials
+        self.middle = np.array([(p.low + p.high) / 2 for p in study.space.parameters])
+
+    def __call__(self, points, answers):
+        """The next point, as numbers that survive a round trip through text; None when all trials are answered."""
+        count = len(answers)
+        if count >= self.capacity:
+            return None
+        if count < len(self.initial):
+            return self.initial[count]
+        padded, categories = _padded(points, answers, self.capacity, self.middle)
+        return np.asarray(self.compiled(self.arrays, padded, categories, np.int32(count)))
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(structure, leaves):
+    fixed = jax.tree.unflatten(structure, leaves)
+
+    @jax.jit
+    def step(arrays, points, answers, count):
+        study, plan = eqx.combine(arrays, fixed)
+        trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)
+        return study.space.to_physical(next_point(study, plan, trials, count))
+
+    return step
 
 
 class Session(eqx.Module):
@@ -167,13 +225,15 @@ class Session(eqx.Module):
     answers: np.ndarray
     proposal: np.ndarray | None
     seed: int = eqx.field(static=True)
+    step: _Step = eqx.field(static=True, repr=False)
 
     @classmethod
     def start(cls, study: Study, seed: int = 0) -> "Session":
         """A session without answers. The seed decides the space-filling trials and the candidates."""
         plan = design(study, seed)
-        nothing = np.zeros((0, study.space.dim))
-        return cls(study, plan, nothing, np.zeros(0, int), _propose(study, plan, nothing, np.zeros(0, int)), seed)
+        step = _Step(study, plan)
+        points, answers = np.zeros((0, study.space.dim)), np.zeros(0, int)
+        return cls(study, plan, points, answers, step(points, answers), seed, step)
 
     @classmethod
     def replay(cls, study: Study, responses: Iterable[str], seed: int = 0) -> "Session":
@@ -206,14 +266,15 @@ class Session(eqx.Module):
 
         `at`: the point that was really presented, if it was not the asked one.
         """
-        if response not in self.study.responses:
-            raise InputError(f'Session: "{response}" is no answer of this study; give one of {self.study.responses}.')
-        shown = self.ask() if at is None else at
-        point = np.array([[shown[name] for name in self.study.space.names]])
-        points = np.concatenate([self.points, point])
-        answers = np.append(self.answers, self.study.responses.index(response))
-        proposal = _propose(self.study, self.plan, points, answers)
-        return Session(self.study, self.plan, points, answers, proposal, self.seed)
+        study, responses = self.study, self.study.responses
+        if response not in responses:
+            raise InputError(f'Session: "{response}" is no answer of this study; give one of {responses}.')
+        if self.proposal is None:
+            self.ask()  # says that nothing is left to ask
+        shown = self.proposal if at is None else np.array([at[name] for name in study.space.names])
+        points = np.concatenate([self.points, shown[None, :]])
+        answers = np.append(self.answers, responses.index(response))
+        return Session(study, self.plan, points, answers, self.step(points, answers), self.seed, self.step)
 
     def posterior(self) -> Posterior:
         """The participant's posterior after the answers so far."""
@@ -221,21 +282,10 @@ class Session(eqx.Module):
 
     def best(self) -> dict[str, float]:
         """The rendering with the largest posterior mean: parameter -> value in physical units."""
-        physical = _best_physical(self.study, self.posterior(), self.plan.candidates)
+        physical = _best_physical(self.study, self.plan, self.posterior())
         return dict(zip(self.study.space.names, np.asarray(physical).tolist(), strict=True))
 
 
 @eqx.filter_jit
-def _best_physical(study, posterior, candidates):
-    return study.space.to_physical(best_point(study, posterior, candidates).x)
-
-
-def _propose(study, plan, points, answers):
-    """The next point in physical units, as numbers that survive a round trip through text."""
-    count = len(answers)
-    if count >= study.selection.trials:
-        return None
-    if count < len(plan.initial):
-        return np.asarray(_to_physical(study.space, plan.initial))[count]
-    trials = physical_trials(study, points, answers, study.selection.trials)
-    return np.asarray(_next_physical(study, plan, trials, jnp.asarray(count)))
+def _best_physical(study, plan, posterior):
+    return study.space.to_physical(_highest(study, plan, posterior, acquisition.Mean()).x)

@@ -7,9 +7,9 @@ that grows away from the data has its maximum there, and no number of points ins
 from collections.abc import Callable, Iterator
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-__all__ = ["latin_chunks", "sobol_chunks", "take", "wall_chunks"]
+__all__ = ["crossings", "latin_chunks", "sobol_chunks", "take", "wall_chunks"]
 
 Chunks = Iterator[Float[np.ndarray, "n d"]]
 
@@ -59,6 +59,17 @@ def wall_chunks(dim: int, count: int, seed: int) -> Chunks:
     for size in _sizes(max(count, 1)):
         held = np.argsort(rng.random((size, dim)), axis=1) < rng.choice(len(shares), size, p=shares)[:, None] + 1
         yield np.where(held, rng.integers(0, 2, (size, dim)), np.nan)
+
+
+def crossings(
+    table: Float[np.ndarray, "l p"], positions: Float[np.ndarray, " p"], levels: Float[np.ndarray, " v"]
+) -> tuple[Int[np.ndarray, " c"], Float[np.ndarray, " c"]]:
+    """Where a function, tabulated along each of l lines, crosses levels: the line, and the interpolated position."""
+    above = table[:, :, None] >= levels[None, None, :]
+    line, before, level = np.nonzero(above[:, 1:] != above[:, :-1])
+    left, right = table[line, before], table[line, before + 1]
+    share = (levels[level] - left) / (right - left)
+    return line, positions[before] + share * (positions[before + 1] - positions[before])
 
 
 def _sizes(size: int) -> Iterator[int]:

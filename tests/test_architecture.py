@@ -28,6 +28,7 @@ MATHS = {
     "exact": {"tilting", "sobol"},
     "bcm": set(),
     "acquisition": {"newton"},
+    "lattice": {"kernels"},
     "mittag_leffler": set(),
     "exponentials": set(),
     "memory": {"exponentials"},
@@ -53,7 +54,8 @@ MATHS = {
     "characterise": {"intervals", "memory_selection", "moduli", "passivity"},
     "space_filling": set(),
     "search_space": {"viscoelastic", "passivity", "space_filling"},
-    "session": {"config", "ordinal_gp", "acquisition", "search_space"},
+    "search_lattice": {"lattice", "search_space", "space_filling"},
+    "session": {"config", "ordinal_gp", "acquisition", "lattice", "search_lattice"},
     "simulate": {"session"},
     "validation": {"study", "config", "acquisition"},
 }

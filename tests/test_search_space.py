@@ -175,7 +175,11 @@ def test_wall_points_lie_on_every_wall_of_the_feasible_set(space):
     w = np.asarray(space.to_box(x))
     at_end = np.minimum(np.abs(w), np.abs(1 - w)) < 1e-9
     assert np.all(at_end.any(axis=1))
-    assert 0.05 < np.mean(at_end.sum(axis=1) > 1) < 0.5  # some on edges
+    edges = np.mean(at_end.sum(axis=1) > 1)
+    if space.mechanics is None or space.mechanics.effective_damping is None:
+        assert 0.25 < edges < 0.4  # three in ten are made on edges, and a few more end there
+    else:
+        assert 0.05 < edges < 0.5  # edges whose columns hold nothing feasible drop out
     for column in range(space.dim):
         for end in (0, 1):
             held = np.random.default_rng(column).random((1000, space.dim))
