@@ -124,7 +124,7 @@ def test_one_material_is_chosen(tmp_path):
     text = "material," + HEADER + "foam,A,1,close,1,2\ngel,A,1,different,1,2\n"
     assert read_trials(written(tmp_path, text), study(), "gel")["category"].tolist() == [0]
     assert "2 materials (foam, gel); choose" in refusal(tmp_path, text)
-    assert 'no answers to material "silk"; it has foam, gel' in refusal(tmp_path, text, material="silk")
+    assert 'holds no material "silk"; it has foam, gel' in refusal(tmp_path, text, material="silk")
     assert 'column "material" is missing' in refusal(tmp_path, HEADER + "A,1,close,1,2\n", material="gel")
 
 
