@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hilbo.batch import Jets, Population, Say, Sums, jets, population_of, refit
+from hilbo.batch import Jets, Population, Say, Sums, jets, population_of, refit, sums
 from hilbo.config import Study
 from hilbo.distributed import Crew
 from hilbo.newton import TrustRegionNewton
@@ -35,11 +35,17 @@ class Merged(eqx.Module):
 
     cohort: Cohort
     population: Population
-    certificate: dict[str, np.ndarray]
+    certificates: dict[str, np.ndarray]
     optimum: Optimum
     individuals: Optimum | None
     """Stacked; None if they were not asked for."""
     alternatives: dict[str, Optimum]
+
+    def surface(self, x: Float[np.ndarray, "m d"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Mean and variance (m,) of the population map at points of the unit cube: a pass of the whole crew."""
+        study = self.population.study
+        prior = np.asarray(jax.vmap(study.gp.kernel.diagonal)(jnp.asarray(x)))
+        return sums(self.population, x, "participants asked for the map").merge(prior, self.population.people)
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"] | None:

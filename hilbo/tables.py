@@ -61,10 +61,12 @@ def read_trials(
 
 def _checked(text, study, source, others, known):
     """A piece with its numbers as numbers and its texts as one object each, and `_fitted`: which rows count."""
-    needed = {"participant", "trial", "response", *study.space.names, *_KEY}
+    numeric = {"trial", *study.space.names}
     table = pd.DataFrame(index=text.index)
     for column in text.columns:
-        if others or column in needed - {"response"}:
+        if column in numeric:
+            table[column] = np.nan  # its place among the columns
+        elif others or column in _KEY:
             table[column] = [known.setdefault(cell, cell) for cell in text[column]]
     whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
     table["trial"] = whole.astype(int)
@@ -128,8 +130,15 @@ def _parquet_pieces(path):
 
 
 def _as_text(frame, begin):
-    frame = frame.map(lambda v: "" if v is None or v is pd.NA else repr(float(v)) if isinstance(v, float) else str(v))
-    return frame.set_axis(np.arange(begin, begin + len(frame)))
+    columns = {i: _column_as_text(frame.iloc[:, i]) for i in range(frame.shape[1])}  # a name may stand there twice
+    index = np.arange(begin, begin + len(frame))
+    return pd.DataFrame(columns, index=index, dtype=object).set_axis(frame.columns, axis=1)
+
+
+def _column_as_text(column):
+    if column.dtype.kind == "f":
+        return [repr(v) for v in column.tolist()]
+    return ["" if v is None or v is pd.NA else repr(v) if isinstance(v, float) else str(v) for v in column.tolist()]
 
 
 def _csv_pieces(path, source, needs):
@@ -158,7 +167,7 @@ def _csv_pieces(path, source, needs):
 
 def _piece(rows, lines, header, pieces):
     skip = 0 if pieces else 1  # the first row of the first piece is the header
-    return pd.DataFrame(rows[skip:], index=lines[skip:], columns=header, dtype=str)
+    return pd.DataFrame(rows[skip:], index=lines[skip:], columns=header, dtype=object)
 
 
 def place(source: str, row: object = None) -> str:
@@ -180,16 +189,22 @@ def _check_columns(text, study, source):
 def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> pd.Series:
     """A column as float64, each cell correctly rounded; `valid` says which values may be, `words` which those are."""
 
-    def number(cell):
-        try:
-            return np.nan if "_" in cell else float(cell)  # Python reads 1_5 as 15
-        except ValueError:
-            return np.nan
-
-    values = pd.Series([number(cell) for cell in text[column]], text.index, dtype=float)
+    cells = text[column].tolist()
+    try:
+        found = [] if "_" in "".join(cells) else [float(cell) for cell in cells]
+    except ValueError:
+        found = []
+    values = pd.Series(found if len(found) == len(cells) else [_number(c) for c in cells], text.index, dtype=float)
     wrong = ~(np.isfinite(values) & valid(values))
     refuse(wrong, source, lambda row: f'{column} is "{text.at[row, column]}"; it must be {words}.')
     return values
+
+
+def _number(cell):
+    try:
+        return np.nan if "_" in cell else float(cell)  # Python reads 1_5 as 15
+    except ValueError:
+        return np.nan
 
 
 def _parameter(text, parameter, source):
