@@ -122,7 +122,9 @@ def block_size(people: int, platform: str = "cpu") -> int:
 def refit(population: Population, points: Float[np.ndarray, "m d"], individuals: bool = False) -> Fitted:
     """Fit everybody and add up what they say at points (m, d); `individuals`: and find everybody's own optimum, the
     points being its candidates."""
-    found, people = _pass(population, "individuals" if individuals else "first", points, "participants fitted")
+    words = "participants fitted, each with an optimum of their own (--no-individuals leaves these out)"
+    words = words if individuals else "participants fitted"
+    found, people = _pass(population, "individuals" if individuals else "first", points, words)
     fitted = eqx.tree_at(lambda p: p.weights, population, people["weights"], is_leaf=lambda leaf: leaf is None)
     optima = Optimum(*people["optima"]) if individuals else None
     return Fitted(fitted, found, people["certificate"], optima)

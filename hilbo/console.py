@@ -88,7 +88,7 @@ def _check_free(out: Path, force: bool) -> None:
 
 
 class Say(Protocol):
-    """Told what is being done and, where that goes by participants, how many of them are done."""
+    """Told what is being done and, where that is counted, how many are done already, and of how many."""
 
     def __call__(self, text: str, done: int | None = None, people: int | None = None) -> None: ...
 
@@ -123,15 +123,16 @@ class _Pace:
 
     def line(self, text: str, done: int | None, people: int | None, now: float) -> tuple[str, bool]:
         """The line, and whether it is news where there is no line that changes."""
-        if done is None or people is None:
+        if done is None:
             self.text = text
             return text, True
         if text != self.text or done < self.done:  # the first report has the compilation in it, and tells no pace
             again = text == self.text
             self.text, self.first, self.told = text, (done, now), self.told if again else -math.inf
         self.done = done
-        line, (begin, since) = f"{done:,} of {people:,} {text}", self.first
-        if done < people and done > begin:
+        begin, since = self.first
+        line = f"{done:,} {text}" if people is None else f"{done:,} of {people:,} {text}"
+        if people is not None and begin < done < people:
             left = round((now - since) / (done - begin) * (people - done))
             line += f", {left // 60}:{left % 60:02d} left"
         if now - self.told < _EVERY:

@@ -165,9 +165,11 @@ def _leave(sentence, rank, count, code, wait=True):
     os._exit(code)
 
 
-def digest(*parts) -> str:
-    """A short text that differs where the parts (arrays, texts, numbers) do."""
+def digest(*parts: PyTree) -> str:
+    """A short text that differs where the parts do: records of arrays, texts, numbers."""
     found = hashlib.sha256()
-    for part in parts:
-        found.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+    for leaf in jax.tree.leaves(parts):
+        is_array = isinstance(leaf, jax.Array | np.ndarray)
+        found.update(np.ascontiguousarray(leaf).tobytes() if is_array else repr(leaf).encode())
+    found.update(repr(jax.tree.structure(parts)).encode())  # with what records hold besides arrays
     return found.hexdigest()

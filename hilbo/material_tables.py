@@ -120,8 +120,8 @@ def _columns(text, source):
     measured, derived = {"position", "force"} & set(columns), {"modulus", "compliance"} & set(columns)
     if "time" not in columns or not (len(measured) == 2 or (derived and not measured)):
         raise InputError(
-            f"{place(source)}a material table has time, position and force, or time and modulus or compliance, each with"
-            f" its unit as in time_s; found {', '.join(columns) or 'none of them'}."
+            f"{place(source)}a material table has time, position and force, or time and modulus or compliance, each"
+            f" with its unit as in time_s; found {', '.join(columns) or 'none of them'}."
         )
     return columns, units
 

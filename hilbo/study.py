@@ -61,13 +61,19 @@ class Cohort(eqx.Module):
 
     def of(self, names: Sequence[str]) -> "Cohort":
         """Only these participants."""
-        unknown = [name for name in names if name not in self.names]
+        known = set(self.names)
+        unknown = [name for name in names if name not in known]
         if unknown:
             raise InputError(
                 f'participant "{unknown[0]}" is not in the table, which has {len(self.names)} participants.'
             )
-        rows = np.array([self.names.index(name) for name in names])
-        return Cohort(jax.tree.map(lambda leaf: leaf[rows], self.trials), self.physical[rows], tuple(names))
+        places = {name: row for row, name in enumerate(self.names)}
+        return self.rows(np.array([places[name] for name in names]))
+
+    def rows(self, rows: Int[np.ndarray, " k"]) -> "Cohort":
+        """Only the participants in these places."""
+        names = tuple(self.names[row] for row in rows)
+        return Cohort(jax.tree.map(lambda leaf: leaf[rows], self.trials), self.physical[rows], names)
 
     def counts(self) -> Int[np.ndarray, " M"]:
         """Answers of each participant."""
