@@ -126,7 +126,7 @@ def refit(population: Population, points: Float[np.ndarray, "m d"], individuals:
     words = words if individuals else "participants fitted"
     found, people = _pass(population, "individuals" if individuals else "first", points, words)
     fitted = eqx.tree_at(lambda p: p.weights, population, people["weights"], is_leaf=lambda leaf: leaf is None)
-    optima = Optimum(*people["optima"]) if individuals else None
+    optima = Optimum(*map(jnp.asarray, people["optima"])) if individuals else None
     return Fitted(fitted, found, people["certificate"], optima)
 
 

@@ -15,7 +15,6 @@ import pandas as pd
 from jaxtyping import Float
 
 from hilbo.config import Study
-from hilbo.study import Optimum
 
 __all__ = ["People", "as_json", "json_lines", "parameter_sets", "people_of", "quoted"]
 
@@ -29,7 +28,7 @@ class People(NamedTuple):
     trials: np.ndarray
     certificate: dict[str, np.ndarray]
     labels: tuple[str, ...]
-    optima: Optimum | None
+    optima: dict[str, np.ndarray] | None
     sets: dict[str, np.ndarray] | None
     margins: np.ndarray | None
 
@@ -46,12 +45,12 @@ class People(NamedTuple):
     def _optimum(self, j):
         if self.optima is None or self.sets is None:
             return None
-        chances = np.asarray(self.optima.class_probabilities)[j].tolist()
+        chances = self.optima["class_probabilities"][j].tolist()
         return {
             "parameters": {name: float(values[j]) for name, values in self.sets.items()},
-            "unit": np.asarray(self.optima.x)[j].tolist(),
-            "mean": float(np.asarray(self.optima.mean)[j]),
-            "sd": float(np.asarray(self.optima.sd)[j]),
+            "unit": self.optima["x"][j].tolist(),
+            "mean": float(self.optima["mean"][j]),
+            "sd": float(self.optima["sd"][j]),
             "class_probabilities": dict(zip(self.labels, chances, strict=True)),
             "passivity_margin": None if self.margins is None else float(self.margins[j]),
         }
@@ -68,12 +67,8 @@ def people_of(study: Study, aggregate: Any) -> People:
     found = aggregate.individuals
     sets, margins = (None, None) if found is None else parameter_sets(study, np.asarray(found.x))
     cohort = aggregate.cohort
-    host = (
-        None
-        if found is None
-        else Optimum(*(np.asarray(part) for part in (found.x, found.mean, found.sd, found.class_probabilities)))
-    )
-    return People(cohort.names, cohort.counts(), aggregate.certificates, study.responses, host, sets, margins)
+    optima = None if found is None else {name: np.asarray(getattr(found, name)) for name in found.__dataclass_fields__}
+    return People(cohort.names, cohort.counts(), aggregate.certificates, study.responses, optima, sets, margins)
 
 
 def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str, np.ndarray], np.ndarray | None]:

@@ -175,5 +175,6 @@ def test_a_failed_certificate_is_said_in_one_sentence():
         " see the certificates in result.json."
     ]
     from hilbo.page import results_page
+    from hilbo.report_people import people_of
 
-    assert content["warnings"][0] in results_page(study, content, [])
+    assert content["warnings"][0] in results_page(study, content, [], people_of(study, failed))
