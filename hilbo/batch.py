@@ -24,9 +24,9 @@ from jaxtyping import Array, Float
 
 from hilbo.config import Inference, Study
 from hilbo.distributed import AXIS, Crew
-from hilbo.gaussian import GaussianPosterior, factor
-from hilbo.kernels import gram
-from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.gaussian import factor, mean_and_explained
+from hilbo.kernels import RBF, gram
+from hilbo.ordinal_gp import Trials, fit
 from hilbo.study import Cohort, Optimum, Rule, individual_optima
 
 __all__ = ["Fitted", "Jets", "Population", "Say", "Sums", "block_size", "jets", "population_of", "refit", "sums"]
@@ -52,7 +52,7 @@ class Sums(NamedTuple):
     means: Float[Array, "..."] | np.ndarray
     explained: Float[Array, "..."] | np.ndarray
 
-    def merge(self, prior, people: int, rule: Rule = "bcm"):
+    def merge(self, prior, people, rule: Rule = "bcm"):
         """Mean and variance of the map of so many people with the prior variance `prior`, by the committee or by a
         plain average of the latent functions."""
         if rule == "average":
@@ -192,12 +192,12 @@ def _round(study, points, blocks, task, inference, crew):
 
 
 def _block(study, points, trials, weights, task, inference, platform):
-    posteriors = _each(lambda person: _posterior(study, inference, *person), (trials, weights), platform)
-    if task == "jets":
-        return _added(lambda posterior: _jets_of(posterior, points), posteriors, platform), {}
-    total = _added(lambda posterior: _sums_of(posterior, points), posteriors, platform)
-    if task == "sums":
-        return total, {}
+    if task in ("sums", "jets"):
+        say = _sums_of if task == "sums" else _jets_of
+        experts = _each(lambda person: _expert(study, inference, *person), (trials, weights), platform)
+        return _added(lambda expert: say(expert, points), experts, platform), {}
+    posteriors = _each(lambda person: fit(study.gp, person, inference=inference, throw=False), trials, platform)
+    total = _added(lambda posterior: _sums_of(_of(posterior), points), posteriors, platform)
     kept = {"weights": posteriors.latent.weights, "certificate": _fields(posteriors.certificate)}
     if task == "individuals":
         optima = individual_optima(study, posteriors, points)
@@ -205,20 +205,34 @@ def _block(study, points, trials, weights, task, inference, platform):
     return total, kept
 
 
+class _Expert(eqx.Module):
+    """What it takes of a posterior to predict."""
+
+    kernel: RBF
+    x: Float[Array, "n d"]
+    weights: Float[Array, " n"]
+    factor: Float[Array, "n n"]
+    inverse: Float[Array, "n n"]
+
+
+def _of(posterior):
+    latent = posterior.latent
+    return _Expert(posterior.gp.kernel, posterior.trials.x, latent.weights, latent.factor, latent.inverse)
+
+
+def _expert(study, inference, trials, weights):
+    """One person's: Laplace's from the weights of the fit, else by another fit."""
+    if weights is None or inference != "laplace":
+        return _of(fit(study.gp, trials, inference=inference, throw=False))
+    kernel = study.gp.kernel
+    covariance = gram(kernel, trials.x, trials.x)
+    curvature = jax.vmap(study.gp.likelihood.expand)(covariance @ weights, trials.q)[2]
+    root, _ = factor(covariance, jnp.where(trials.mask, curvature, jnp.zeros_like(curvature)))
+    return _Expert(kernel, trials.x, weights, root, root.T @ root)
+
+
 def _fields(record):
     return {name: getattr(record, name) for name in record.__dataclass_fields__}
-
-
-def _posterior(study, inference, trials, weights):
-    """One person's posterior: fitted, or from the weights of the fit."""
-    if weights is None or inference != "laplace":
-        return fit(study.gp, trials, inference=inference, throw=False)
-    covariance = gram(study.gp.kernel, trials.x, trials.x)
-    mode = covariance @ weights
-    curvature = jax.vmap(study.gp.likelihood.expand)(mode, trials.q)[2]
-    root, _ = factor(covariance, jnp.where(trials.mask, curvature, 0.0))
-    unused = jnp.zeros_like(mode[0])
-    return Posterior(study.gp, trials, GaussianPosterior(mode, weights, root, root.T @ root, unused, None))  # type: ignore[arg-type]
 
 
 def _each(function, people, platform):
@@ -242,16 +256,17 @@ def _added(function, people, platform):
     return jax.lax.scan(lambda total, group: (jax.tree.map(jnp.add, total, of_group(group)), None), nothing, groups)[0]
 
 
-def _sums_of(posterior, points):
-    means, explained = posterior.predict_explained(points)
-    prior = jax.vmap(posterior.gp.kernel.diagonal)(points)
+def _sums_of(expert, points):
+    cross = gram(expert.kernel, expert.x, points)
+    means, explained = mean_and_explained(expert.weights, expert.factor, expert.inverse, cross)
+    prior = jax.vmap(expert.kernel.diagonal)(points)
     remaining = prior - explained
     return Sums(explained / (prior * remaining), means / remaining, means, explained)
 
 
-def _jets_of(posterior, points):
+def _jets_of(expert, points):
     def at(x):
-        return jax.tree.map(lambda leaf: leaf[0], _sums_of(posterior, x[None, :]))
+        return jax.tree.map(lambda leaf: leaf[0], _sums_of(expert, x[None, :]))
 
     slope = jax.jacrev(at)
     return jax.vmap(lambda x: Jets(at(x), slope(x), jax.jacfwd(slope)(x)))(points)

@@ -150,7 +150,7 @@ def optimum_near(
     for _ in range(_STEPS):
         at = _ahead(study, w, state)
         there = jets(population, np.asarray(at), words)
-        w, state, finished, last = _advance(study, w, state, there, at, plain, float(population.people))
+        w, state, finished, last = _advance(study, w, state, there, at, plain, jnp.asarray(float(population.people)))
         if bool(jnp.all(finished | (jnp.max(jnp.abs(state.move), axis=1) <= tolerance))):
             break
     x, mean, variance = last if tolerance else state.here.aux

@@ -30,8 +30,8 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
     return sheet.render(
         title=f"{study.name}: the population's optimum",
         lead=f"{count:,} participants gave {answers:,} answers ({', '.join(study.responses)}). Each person's"
-        " answers were turned into a map of perceived realism; the maps were merged, and this is where the merged map is"
-        " highest.",
+        " answers were turned into a map of perceived realism; the maps were merged, and this is where the merged map"
+        " is highest.",
         warnings=content["warnings"],
         study_rows=_study_rows(study),
         optimum=[(_head(study, name), _number(value)) for name, value in best["parameters"].items()],

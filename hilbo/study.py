@@ -137,7 +137,7 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     held = np.arange(capacity)[None, :] < counts[:, None]
     middle = [(p.low + p.high) / 2 for p in study.space.parameters]
     x = _to_unit(study.space, np.where(held[..., None], physical, middle))
-    return Cohort(jax.vmap(Trials)(x, answers, held), physical, tuple(names))
+    return Cohort(jax.vmap(Trials)(x, jnp.asarray(answers), jnp.asarray(held)), physical, tuple(names))
 
 
 @eqx.filter_jit
