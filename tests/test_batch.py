@@ -2,6 +2,7 @@
 
 import functools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ import pandas as pd
 import pytest
 
 from hilbo import distributed
-from hilbo.batch import Sums, block_size, jets, population_of, refit, sums
+from hilbo.batch import Sums, _block, block_size, jets, population_of, refit, sums
 from hilbo.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.config import Study
 from hilbo.session import search_points
@@ -155,6 +156,22 @@ def test_other_inferences_are_fitted_again(inference):
     np.testing.assert_allclose(found.sums.merge(1.3, PEOPLE)[0], expected[0], atol=1e-9)
     again = sums(found.population, candidates())
     np.testing.assert_allclose(again.weighted, found.sums.weighted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("task", ["individuals", "jets"])
+def test_a_block_made_at_once_is_one_made_person_by_person(task):
+    """As GPUs make it, and as CPUs do; the first ones keep people together in groups."""
+    trials = jax.tree.map(lambda leaf: jnp.asarray(leaf[:32]), fitted().population.trials)
+    weights = None if task == "individuals" else jnp.asarray(fitted().population.weights[:32])
+    points = jnp.asarray(candidates()[:40])
+    found = [
+        eqx.filter_jit(_block)(STUDY, points, trials, weights, task, "laplace", platform) for platform in ("cpu", "gpu")
+    ]
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9), *[total for total, _ in found])
+    if task == "individuals":
+        np.testing.assert_allclose(found[1][1]["weights"], found[0][1]["weights"], atol=1e-10)
+        np.testing.assert_allclose(found[1][1]["optima"][0], found[0][1]["optima"][0], atol=1e-7)
 
 
 @pytest.mark.parametrize(("people", "platform", "size"), [(1, "cpu", 1), (24, "cpu", 2), (100_000, "cpu", 256)])
