@@ -13,7 +13,7 @@ not depend on how many there are. A block is padded with people without answers,
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -44,15 +44,16 @@ def _silent(words: str, done: int, people: int) -> None:
 class Sums(NamedTuple):
     """Sums over people at points (m,), or derivatives of those sums with further axes.
 
-    `added` precision and precision-`weighted` means (as in `bcm.Evidence`), plain `means`, `explained` variances.
+    `added` precision and precision-`weighted` means (as in `bcm.Evidence`), plain `means`, `explained` variances;
+    arrays of JAX or NumPy.
     """
 
-    added: Float[Array, "..."] | np.ndarray
-    weighted: Float[Array, "..."] | np.ndarray
-    means: Float[Array, "..."] | np.ndarray
-    explained: Float[Array, "..."] | np.ndarray
+    added: Any
+    weighted: Any
+    means: Any
+    explained: Any
 
-    def merge(self, prior, people, rule: Rule = "bcm"):
+    def merge(self, prior, people, rule: Rule = "bcm") -> tuple[Any, Any]:
         """Mean and variance of the map of so many people with the prior variance `prior`, by the committee or by a
         plain average of the latent functions."""
         if rule == "average":
@@ -88,7 +89,7 @@ class Population(eqx.Module):
 
     def every(self, count: int) -> "Population":
         """About `count` of the people, evenly chosen, and nobody watching."""
-        rows = np.unique(np.linspace(0, self.people - 1, min(count, self.people)).round().astype(int))
+        rows = np.unique(np.linspace(0, self.people - 1, min(max(count, 1), self.people)).round().astype(int))
         trials = jax.tree.map(lambda leaf: leaf[rows], self.trials)
         weights = None if self.weights is None else self.weights[rows]
         return dataclasses.replace(self, trials=trials, weights=weights, say=_silent)
@@ -145,7 +146,7 @@ def jets(population: Population, points: Float[np.ndarray, "s d"], words: str = 
 _Task = Literal["first", "individuals", "sums", "jets"]
 
 
-def _pass(population, task: _Task, points, words):
+def _pass(population, task: _Task, points, words) -> Any:
     """Block sums added in the order of the blocks, and what is kept of everybody in the order of people."""
     crew, people, size = population.crew, population.people, population.block
     total, kept = None, []

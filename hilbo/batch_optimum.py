@@ -26,7 +26,8 @@ __all__ = ["Merged", "aggregate_population", "optima_from", "optimum_near"]
 _STEPS = 60
 _STATIONARY, _RESOLUTION = 1e-8, 1e-6  # as a session's optimum: gradient, and radius at a kink of the passive set
 _STARTS, _APART = 3, 0.1
-_PILOT, _PILOT_SHARE = 1000, 20  # people asked first by another inference: so many, or this part of all
+_PILOT, _PILOT_SHARE = 1000, 20  # people asked first by another inference: so many, or this part of all,
+_FEWEST = 50  # and nobody if that is too few
 _SETTLED = 0.003  # of the search ranges: a Newton step of this size leaves an error of its square over a lengthscale
 
 
@@ -116,17 +117,17 @@ def _spread(values, candidates):
 
 def _by_other_inference(population, best):
     """The optimum nearby under the other inference."""
-    study = population.study
-    pilot = population.every(max(1, min(_PILOT, population.people // _PILOT_SHARE)))
+    study, at = population.study, np.asarray(best.x)[None, :]
     other = other_inference(study)
-    at = np.asarray(best.x)[None, :]
-    (own,), (moved,) = (optimum_near(p, at, ("bcm",)) for p in (pilot, pilot.by(other)))
-    box = study.space.to_box
-    begin = jnp.clip(box(best.x) + box(moved.x) - box(own.x), 0.0, 1.0)
-    start = np.asarray(study.space.from_box(begin))[None, :]
+    pilot = population.every(min(_PILOT, population.people // _PILOT_SHARE))
+    if pilot.people >= _FEWEST:
+        (own,), (moved,) = (optimum_near(p, at, ("bcm",)) for p in (pilot, pilot.by(other)))
+        box = study.space.to_box
+        begin = jnp.clip(box(best.x) + box(moved.x) - box(own.x), 0.0, 1.0)
+        at = np.asarray(study.space.from_box(begin))[None, :]
     name = {"ep": "expectation propagation", "laplace": "Laplace"}[other]
     words = f"participants fitted by {name} for comparison"
-    return optimum_near(population.by(other), start, ("bcm",), tolerance=_SETTLED, words=words)[0]
+    return optimum_near(population.by(other), at, ("bcm",), tolerance=_SETTLED, words=words)[0]
 
 
 def optimum_near(
@@ -160,13 +161,18 @@ def optimum_near(
 _SOLVER = TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION)
 
 
+def _nowhere(w, _):
+    """The solver does not look at its function before the first step."""
+    raise NotImplementedError
+
+
 @eqx.filter_jit
 def _begin(study, starts):
     def one(x):
         w = study.space.to_box(x)
         number = jax.ShapeDtypeStruct((), w.dtype)
         aux = (jax.ShapeDtypeStruct(w.shape, w.dtype), number, number)
-        return w, _SOLVER.init(None, w, None, {}, None, aux, frozenset())
+        return w, _SOLVER.init(_nowhere, w, None, {}, number, aux, frozenset())
 
     return jax.vmap(one)(jnp.asarray(starts))
 

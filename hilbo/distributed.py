@@ -28,6 +28,7 @@ __all__ = ["AXIS", "Crew", "alone", "crew", "digest"]
 
 AXIS = "people"
 _MEETING, _HEARTBEAT = 120, 60  # s to find each other, and after which a silent process counts as dead
+_WRITING = 3600  # s that the others wait at the end for the one that writes; a dead one is missed by then
 
 
 class AgreedError(InputError):
@@ -143,7 +144,7 @@ def _meet(coordinator, processes, process):
             process,
             initialization_timeout=_MEETING,
             heartbeat_timeout_seconds=_HEARTBEAT,
-            shutdown_timeout_seconds=_HEARTBEAT,
+            shutdown_timeout_seconds=_WRITING,
         )
     except ValueError as error:  # neither given nor found
         raise InputError(

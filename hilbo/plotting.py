@@ -217,9 +217,9 @@ def _slice(study, posteriors, optimum, third):
     return np.where(np.asarray(study.space.feasible(flat)), mean, np.nan).reshape(_CELLS, _CELLS)
 
 
-def _map(posteriors, x):
+def _map(posteriors, x) -> tuple[ArrayLike, ArrayLike]:
     """Mean and variance of a population's map, or of a function that gives them."""
-    return posteriors(x) if callable(posteriors) else population(posteriors, x)
+    return population(posteriors, x) if isinstance(posteriors, Posterior) else posteriors(x)
 
 
 def _curve(study, posteriors):

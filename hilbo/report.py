@@ -122,7 +122,7 @@ def result(
     other = other_inference(study)
     if other in aggregate.alternatives:
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
-    failed = [people.names[j] for j in np.flatnonzero(~people.certificate["converged"])]
+    failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
     content["warnings"] = [_not_converged(failed)] if failed else []
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
