@@ -122,7 +122,7 @@ def together(folder, out, count, codes=None, trials=None):
         for rank in range(count)
     ]
     try:
-        return [(process.communicate(timeout=300)[1], process.returncode) for process in crew]
+        return [(process.communicate(timeout=900)[1], process.returncode) for process in crew]
     finally:
         for process in crew:
             process.kill()
@@ -149,7 +149,7 @@ def assert_same(one, other):
 @pytest.mark.deep
 def test_two_and_four_processes_and_four_devices_give_the_map_of_one(folder):
     process = start(folder, "one", "--devices", 1, "--individuals", "--distributed", flags="")
-    assert process.communicate(timeout=300) and process.returncode == 2  # nobody to be distributed with
+    assert process.communicate(timeout=900) and process.returncode == 2  # nobody to be distributed with
     assert together(folder, "one", 1)[0][1] == 0
     expected = result(folder, "one")
     for count in (2, 4):
@@ -158,7 +158,7 @@ def test_two_and_four_processes_and_four_devices_give_the_map_of_one(folder):
         assert_same(expected, result(folder, f"p{count}"))
         assert "report.html" in ended[0][0] and "report.html" not in ended[1][0]  # one process writes and reports
     process = start(folder, "d4", flags="--xla_force_host_platform_device_count=4")
-    words = process.communicate(timeout=300)[1]
+    words = process.communicate(timeout=900)[1]
     assert process.returncode == 0, words
     assert_same(expected, result(folder, "d4"))
 
