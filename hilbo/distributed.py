@@ -158,12 +158,12 @@ def _meet(coordinator, processes, process):
 
 def _leave(sentence, rank, count, code, wait=True):
     """Say why, and end this process; an error that only this one knows of ends it without the others' leave."""
-    print(f"hilbo: process {rank} of {count}: {sentence}", file=sys.stderr, flush=True)
-    sys.stdout.flush()
-    if wait:
-        with contextlib.suppress(RuntimeError):
+    try:
+        print(f"hilbo: process {rank} of {count}: {sentence}", file=sys.stderr, flush=True)
+        if wait:
             jax.distributed.shutdown()
-    os._exit(code)
+    finally:
+        os._exit(code)
 
 
 def digest(*parts: PyTree) -> str:
