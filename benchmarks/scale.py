@@ -39,7 +39,8 @@ def main():
     if chosen.run:
         print(json.dumps(globals()[f"run_{chosen.device}"](**json.loads(chosen.run))))
         return
-    os.environ["JAX_PLATFORMS"] = "cpu" if chosen.device == "cpu" else "cuda,cpu"
+    if chosen.device == "cpu":
+        os.environ["JAX_PLATFORMS"] = "cpu"
     text = cpu_report(chosen) if chosen.device == "cpu" else gpu_report(chosen)
     print(text)
     page = ROOT / "docs" / "scale.md"
