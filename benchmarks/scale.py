@@ -273,7 +273,7 @@ are), in several processes (`--distributed`), and with `--no-individuals`, which
 
 * Read: the table is checked piece by piece; 60 bytes of each answer stay in memory.
 * Refit and merge: a fit takes about half of the time, the map the rest. Posteriors live in blocks of at most 256 people
-  on each device; n weights of each person stay.
+  on each device; the mode of each person stays, n numbers.
 * Optimum: passes over everybody for value, gradient and Hessian of the map, one for each Newton step.
 * Own optima: a search for each person, several times the rest together.
 

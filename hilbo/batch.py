@@ -2,9 +2,8 @@
 
 The committee machine (`hilbo.bcm`) needs two sums over people, of the precision each adds to the prior and of their
 precision-weighted means. They are made block by block: a device fits the people of its block, adds up what they say at
-the asked points, and forgets their posteriors. What stays of a person are the answers and the weights `a` of the
-posterior mean (n numbers), from which Laplace's posterior is made again without a search, f = K a and W at f; another
-inference is fitted again.
+the asked points, and forgets their posteriors. What stays of a person are the answers and Laplace's mode (n numbers),
+from which the posterior is made again without a search: slopes and curvatures there. Another inference is fitted again.
 
 Blocks depend on the number of people alone and are added in their order, whichever device made them, so that results do
 not depend on how many there are. A block is padded with people without answers, who add exactly 0.
@@ -75,8 +74,8 @@ class Population(eqx.Module):
 
     study: Study
     trials: Trials
-    weights: np.ndarray | None
-    """(M, n) of the posterior means, once everybody has been fitted."""
+    modes: np.ndarray | None
+    """(M, n) of everybody's latent values, once they have been fitted by Laplace's method."""
     crew: Crew = eqx.field(static=True)
     block: int = eqx.field(static=True)
     inference: Inference = eqx.field(static=True)
@@ -91,12 +90,12 @@ class Population(eqx.Module):
         """About `count` of the people, evenly chosen, and nobody watching."""
         rows = np.unique(np.linspace(0, self.people - 1, min(max(count, 1), self.people)).round().astype(int))
         trials = jax.tree.map(lambda leaf: leaf[rows], self.trials)
-        weights = None if self.weights is None else self.weights[rows]
-        return dataclasses.replace(self, trials=trials, weights=weights, say=_silent)
+        modes = None if self.modes is None else self.modes[rows]
+        return dataclasses.replace(self, trials=trials, modes=modes, say=_silent)
 
     def by(self, inference: Inference) -> "Population":
         """The same people's answers for another inference."""
-        return dataclasses.replace(self, weights=None, inference=inference)
+        return dataclasses.replace(self, modes=None, inference=inference)
 
 
 class Fitted(NamedTuple):
@@ -126,7 +125,7 @@ def refit(population: Population, points: Float[np.ndarray, "m d"], individuals:
     words = "participants fitted, each with an optimum of their own (--no-individuals leaves these out)"
     words = words if individuals else "participants fitted"
     found, people = _pass(population, "individuals" if individuals else "first", points, words)
-    fitted = eqx.tree_at(lambda p: p.weights, population, people["weights"], is_leaf=lambda leaf: leaf is None)
+    fitted = dataclasses.replace(population, modes=people.get("modes"))
     optima = Optimum(*map(jnp.asarray, people["optima"])) if individuals else None
     return Fitted(fitted, found, people["certificate"], optima)
 
@@ -165,7 +164,7 @@ def _pass(population, task: _Task, points, words) -> Any:
 
 
 def _padded(population, rows, size):
-    """Trials and weights of some rows as (devices, size, ...), filled up with people who gave no answer."""
+    """Trials and modes of some rows as (devices, size, ...), filled up with people who gave no answer."""
     devices = population.crew.devices
 
     def block(leaf):
@@ -173,7 +172,7 @@ def _padded(population, rows, size):
         filled[: rows.stop - rows.start] = leaf[rows]
         return filled.reshape(devices, size, *leaf.shape[1:])
 
-    return jax.tree.map(block, (population.trials, population.weights))
+    return jax.tree.map(block, (population.trials, population.modes))
 
 
 @eqx.filter_jit
@@ -181,8 +180,8 @@ def _round(study, points, blocks, task, inference, crew):
     """A block on each device; everything comes back to everybody."""
 
     def on_device(study, points, blocks):
-        trials, weights = jax.tree.map(lambda leaf: leaf[0], blocks)
-        out = _block(study, points, trials, weights, task, inference, crew.platform)
+        trials, modes = jax.tree.map(lambda leaf: leaf[0], blocks)
+        out = _block(study, points, trials, modes, task, inference, crew.platform)
         return jax.tree.map(lambda leaf: leaf[None], out)
 
     dealt, copied = PartitionSpec(AXIS), PartitionSpec()
@@ -192,14 +191,16 @@ def _round(study, points, blocks, task, inference, crew):
     return jax.lax.with_sharding_constraint(spread(study, points, blocks), crew.everywhere)
 
 
-def _block(study, points, trials, weights, task, inference, platform):
+def _block(study, points, trials, modes, task, inference, platform):
     if task in ("sums", "jets"):
         say = _sums_of if task == "sums" else _jets_of
-        experts = _each(lambda person: _expert(study, inference, *person), (trials, weights), platform)
+        experts = _each(lambda person: _expert(study, inference, *person), (trials, modes), platform)
         return _added(lambda expert: say(expert, points), experts, platform), {}
     posteriors = _each(lambda person: fit(study.gp, person, inference=inference, throw=False), trials, platform)
     total = _added(lambda posterior: _sums_of(_of(posterior), points), posteriors, platform)
-    kept = {"weights": posteriors.latent.weights, "certificate": _fields(posteriors.certificate)}
+    kept = {"certificate": _fields(posteriors.certificate)}
+    if inference == "laplace":
+        kept["modes"] = posteriors.latent.mode
     if task == "individuals":
         optima = individual_optima(study, posteriors, points)
         kept["optima"] = (optima.x, optima.mean, optima.sd, optima.class_probabilities)
@@ -221,14 +222,14 @@ def _of(posterior):
     return _Expert(posterior.gp.kernel, posterior.trials.x, latent.weights, latent.factor, latent.inverse)
 
 
-def _expert(study, inference, trials, weights):
-    """One person's: Laplace's from the weights of the fit, else by another fit."""
-    if weights is None or inference != "laplace":
+def _expert(study, inference, trials, mode):
+    """One person's: Laplace's from the mode, the same numbers as the fit's; else by another fit."""
+    if mode is None or inference != "laplace":
         return _of(fit(study.gp, trials, inference=inference, throw=False))
     kernel = study.gp.kernel
-    covariance = gram(kernel, trials.x, trials.x)
-    curvature = jax.vmap(study.gp.likelihood.expand)(covariance @ weights, trials.q)[2]
-    root, _ = factor(covariance, jnp.where(trials.mask, curvature, jnp.zeros_like(curvature)))
+    _, slope, curvature = jax.vmap(study.gp.likelihood.expand)(mode, trials.q)
+    weights, curvature = (jnp.where(trials.mask, part, jnp.zeros_like(part)) for part in (slope, curvature))
+    root, _ = factor(gram(kernel, trials.x, trials.x), curvature)
     return _Expert(kernel, trials.x, weights, root, root.T @ root)
 
 
