@@ -5,6 +5,7 @@ with `--json` to stdout, progress to stderr (`console`). Exit code 0: done, 1: f
 in one sentence.
 """
 
+import contextlib
 import shutil
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +24,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="From people's ordinal answers to a population optimum, for haptic rendering of viscoelastic material.",
 )
+
+_LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
 Table = Annotated[Path, typer.Argument(help="Trial table (CSV or Parquet).", show_default=False)]
@@ -47,16 +50,41 @@ def aggregate(
     material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
     participants: Annotated[str | None, typer.Option(help="Only these, separated by commas.")] = None,
     first: Annotated[int | None, typer.Option(min=1, help="Only everybody's first so many trials.")] = None,
+    individuals: Annotated[bool, typer.Option(help="Seek everybody's own optimum: most of the work.")] = True,
+    devices: Annotated[int | None, typer.Option(min=1, help="Deal people to so many cores of the CPU.")] = None,
+    distributed: Annotated[
+        bool, typer.Option("--distributed", help="One of several processes: under srun, mpirun, or as the next three.")
+    ] = False,
+    coordinator: Annotated[
+        str | None, typer.Option(envvar="JAX_COORDINATOR_ADDRESS", help="HOST:PORT of process 0.")
+    ] = None,
+    processes: Annotated[
+        int | None, typer.Option(min=1, envvar="JAX_NUM_PROCESSES", help="How many processes there are.")
+    ] = None,
+    process_id: Annotated[
+        int | None, typer.Option(min=0, envvar="JAX_PROCESS_ID", help="Which one this is, from 0.")
+    ] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Merge people's answers into one population map and find its optimum."""
-    with results(out, force) as folder, progress() as say:
-        chosen, cohort = _read(trials, study, material, say)
-        cohort = cohort.of(participants.split(",")) if participants else cohort
-        cohort = cohort.first(first) if first else cohort
-        content = _aggregate(chosen, cohort, folder, seed, say)
-    finish(content, out, as_json)
+    start(devices)
+    from hilbo.distributed import crew, digest
+
+    with crew(distributed, coordinator, processes, process_id) as team, contextlib.ExitStack() as held:
+        say = held.enter_context(progress(quiet=not team.writes))
+        with team.agreement() as agree:
+            folder = held.enter_context(results(out, force)) if team.writes else None
+            chosen, cohort = _read(trials, study, material, say)
+            cohort = cohort.of(participants.split(",")) if participants else cohort
+            cohort = cohort.first(first) if first else cohort
+            agree(digest(chosen.content, seed, individuals, cohort))
+        if team.devices == 1 and len(cohort.names) <= _LARGE and individuals:
+            content = _aggregate(chosen, cohort, folder, seed, say)
+        else:
+            content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say)
+    if team.writes:
+        finish(content, out, as_json)
 
 
 @app.command()
@@ -132,7 +160,8 @@ def _read(trials, study, material, say):
 
     chosen = Study.load(study)
     chosen = chosen.material(material) if material and chosen.materials else chosen
-    return chosen, cohort_of(read_trials(trials, chosen, material), chosen)
+    table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
+    return chosen, cohort_of(table, chosen)
 
 
 def _aggregate(study, cohort, folder, seed, say, truth=None) -> dict[str, Any]:
@@ -142,6 +171,16 @@ def _aggregate(study, cohort, folder, seed, say, truth=None) -> dict[str, Any]:
     say(f"fitting {len(cohort.names)} participants ({study.name})")
     found = aggregate_cohort(study, cohort, seed)
     return report.write_results(study, found, folder, seed, truth, say)
+
+
+def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -> dict[str, Any]:
+    """As `_aggregate` for a large cohort or several devices: by the whole crew, of which one process writes."""
+    from hilbo.batch_optimum import aggregate_population
+    from hilbo.report_population import population_map, write_population
+
+    merged = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
+    grid = population_map(study, merged)
+    return {} if folder is None else write_population(study, merged, grid, folder, seed, say)
 
 
 def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:

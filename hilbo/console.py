@@ -5,20 +5,21 @@ and nothing is overwritten without `--force`. Progress goes to stderr, results w
 """
 
 import contextlib
+import math
 import os
 import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, NoReturn, Protocol
 
 import typer
 
 from hilbo.errors import InputError
 
-__all__ = ["PARTS", "Force", "Json", "Out", "Seed", "fail", "finish", "progress", "results", "start"]
+__all__ = ["PARTS", "Force", "Json", "Out", "Say", "Seed", "fail", "finish", "progress", "results", "start"]
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
 Seed = Annotated[int, typer.Option("--seed", help="Decides candidates, and in simulations everything random.")]
@@ -28,6 +29,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.
 # What the commands write: a folder with anything else in it is never replaced.
 _FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
 _MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
+_EVERY = 10.0  # s
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
 _WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
@@ -35,11 +37,16 @@ _WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml
 }
 
 
-def start() -> None:
-    """Float64, and compiled functions kept in the user's cache folder from one command to the next."""
+def start(devices: int | None = None) -> None:
+    """Float64, and compiled functions kept in the user's cache folder from one command to the next.
+
+    `devices`: as how many devices the CPU is to count.
+    """
     import jax
 
     jax.config.update("jax_enable_x64", True)
+    if devices is not None:
+        jax.config.update("jax_num_cpu_devices", devices)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
         jax.config.update("jax_compilation_cache_dir", str(Path(home) / "hilbo" / "jax"))
@@ -80,35 +87,72 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
 
 
+class Say(Protocol):
+    """Told what is being done and, where that is counted, how many are done already, and of how many."""
+
+    def __call__(self, text: str, done: int | None = None, people: int | None = None) -> None: ...
+
+
 @contextlib.contextmanager
-def progress() -> Iterator[Callable[[str], None]]:
-    """Says on stderr what is being done: in one changing line on a terminal, else in a line for each thing."""
+def progress(quiet: bool = False) -> Iterator[Say]:
+    """Says on stderr what is being done: in one changing line on a terminal, else in a line for each thing, or every
+    ten seconds for one that takes longer. `quiet`: says nothing, for the processes whose results are not written."""
     from rich.console import Console
 
     console, begun = Console(stderr=True, highlight=False, markup=False, soft_wrap=True), time.perf_counter()
+    console.quiet = quiet
     with console.status("starting") as status:
+        pace = _Pace()
 
-        def say(text: str) -> None:
+        def say(text: str, done: int | None = None, people: int | None = None) -> None:
+            line, new = pace.line(text, done, people, time.perf_counter())
             if console.is_terminal:
-                status.update(text)
-            else:
-                console.print(text)
+                status.update(line)
+            elif new:
+                console.print(line)
 
         yield say
     console.print(f"done in {time.perf_counter() - begun:.1f} s")
 
 
-def finish(content, out, as_json):
-    from hilbo.report import as_json as text
+class _Pace:
+    """The words for work that goes by participants: how many are done, and how long the others will take."""
 
+    def __init__(self) -> None:
+        self.text, self.done, self.first, self.told = "", 0, (0, 0.0), -math.inf
+
+    def line(self, text: str, done: int | None, people: int | None, now: float) -> tuple[str, bool]:
+        """The line, and whether it is news where there is no line that changes."""
+        if done is None:
+            self.text = text
+            return text, True
+        if text != self.text or done < self.done:  # the first report has the compilation in it, and tells no pace
+            again = text == self.text
+            self.text, self.first, self.told = text, (done, now), self.told if again else -math.inf
+        self.done = done
+        begin, since = self.first
+        line = f"{done:,} {text}" if people is None else f"{done:,} of {people:,} {text}"
+        if people is not None and begin < done < people:
+            left = round((now - since) / (done - begin) * (people - done))
+            line += f", {left // 60}:{left % 60:02d} left"
+        if now - self.told < _EVERY:
+            return line, False
+        self.told = now
+        return line, True
+
+
+def finish(content: dict[str, Any], out: Path, as_json: bool) -> None:
+    """The last words of a command: warnings, then result.json or the way to the report."""
     for warning in content.get("warnings", []):
         print(f"hilbo: {warning}", file=sys.stderr)
     if as_json:
-        print(text(content), end="")
+        with (out / "result.json").open(encoding="utf-8") as file:
+            shutil.copyfileobj(file, sys.stdout)
     else:
         print(f"{out / 'report.html'}", file=sys.stderr)
 
 
-def fail(sentence: str, code: int) -> None:
+def fail(sentence: str, code: int) -> NoReturn:
+    """One sentence on stderr, and the end."""
     print(f"hilbo: {sentence}", file=sys.stderr)
     sys.exit(code)

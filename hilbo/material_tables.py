@@ -17,7 +17,7 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.identification import Test
-from hilbo.tables import numbers, read_cells, refuse
+from hilbo.tables import numbers, of_material, place, read_cells, refuse
 
 __all__ = ["Material", "read_material"]
 
@@ -70,7 +70,7 @@ def read_material(
     columns, units = _columns(text, source)
     if text.empty:
         raise InputError(f"{source}: has no rows; a material table needs the samples of at least one test.")
-    text = _of_material(text, material, source)
+    text = of_material(text, material, source)
     values = pd.DataFrame(
         {
             q: numbers(text, c, source, "a finite number", lambda v: v == v) * _UNITS[q][units[q]]
@@ -89,7 +89,9 @@ def read_material(
     ]
     lengths = {units[q] in _OF_LENGTH for q in columns if q in ("modulus", "compliance")}
     if len(lengths) > 1:
-        raise InputError(f"{source}:1: has a modulus and a compliance that belong to different units; use one system.")
+        raise InputError(
+            f"{place(source)}has a modulus and a compliance that belong to different units; use one system."
+        )
     return Material(tuple(tests), "N/mm" if lengths in (set(), {True}) else "Pa", tuple(notes))
 
 
@@ -107,17 +109,19 @@ def _columns(text, source):
             known = ", ".join(_UNITS[quantity])
             says = f'has the unit "{unit}"' if unit else "has no unit"
             example = f"{match[1]} ({next(iter(_UNITS[quantity]))})"
-            raise InputError(f'{source}:1: column "{column}" {says}; write it like "{example}", with one of {known}.')
+            raise InputError(
+                f'{place(source)}column "{column}" {says}; write it like "{example}", with one of {known}.'
+            )
         if quantity in columns:
             raise InputError(
-                f'{source}:1: columns "{columns[quantity]}" and "{column}" both are a {quantity}; keep one.'
+                f'{place(source)}columns "{columns[quantity]}" and "{column}" both are a {quantity}; keep one.'
             )
         columns[quantity], units[quantity] = column, unit
     measured, derived = {"position", "force"} & set(columns), {"modulus", "compliance"} & set(columns)
     if "time" not in columns or not (len(measured) == 2 or (derived and not measured)):
         raise InputError(
-            f"{source}:1: a material table has time, position and force, or time and modulus or compliance, each with"
-            f" its unit as in time_s; found {', '.join(columns) or 'none of them'}."
+            f"{place(source)}a material table has time, position and force, or time and modulus or compliance, each"
+            f" with its unit as in time_s; found {', '.join(columns) or 'none of them'}."
         )
     return columns, units
 
@@ -127,11 +131,11 @@ def _kinds(text, columns, source):
     if "position" not in columns:
         both = {"modulus", "compliance"} <= set(columns)
         if both:
-            raise InputError(f"{source}:1: has a modulus and a compliance in one row; put them into two tables.")
+            raise InputError(f"{place(source)}has a modulus and a compliance in one row; put them into two tables.")
         return pd.Series("modulus" if "modulus" in columns else "compliance", text.index)
     if "test" not in text:
         raise InputError(
-            f'{source}:1: column "test" is missing; write relaxation (position applied) or creep (force applied).'
+            f'{place(source)}column "test" is missing; write relaxation (position applied) or creep (force applied).'
         )
     kinds = text["test"].str.strip().str.lower()
     refuse(
@@ -140,19 +144,6 @@ def _kinds(text, columns, source):
         lambda row: f'test is "{text.at[row, "test"]}"; it must be relaxation or creep.',
     )
     return kinds
-
-
-def _of_material(text, material, source):
-    if "material" not in text:
-        if material is not None:
-            raise InputError(f'{source}:1: column "material" is missing; without it no material can be chosen.')
-        return text
-    found = list(text["material"].unique())
-    if material is None and len(found) > 1:
-        raise InputError(f"{source}: holds {len(found)} materials ({', '.join(found)}); choose one with --material.")
-    if material is not None and material not in found:
-        raise InputError(f'{source}: holds no material "{material}"; it has {", ".join(found)}.')
-    return text if material is None else text[text["material"] == material]
 
 
 def _test(kind, values, repeats, source, begin, longest, notes):

@@ -76,7 +76,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         there = _expand(lambda at: fn(restore(at), args), ahead)
         achieved = state.here.value - there.value
         taken = achieved > _ENOUGH * state.promised  # never if it is not a number
-        good = jnp.isfinite(achieved) & (achieved > _GOOD * state.promised)
+        good = taken & jnp.isfinite(achieved) & (achieved > _GOOD * state.promised)
         radius = state.radius * jnp.where(good, 2.0, jnp.where(taken, 1.0, 0.25))
         here = jax.tree.map(lambda new, old: jnp.where(taken, new, old), there, state.here)
         flat = jnp.where(taken, ahead, flat)

@@ -1,10 +1,12 @@
 """Results as self-contained HTML pages: the words and tables around the numbers of result.json."""
 
+from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from hilbo.config import Study
+from hilbo.report_people import People
 
 _RULES = {
     "ucb": "by the upper confidence bound",
@@ -14,19 +16,22 @@ _RULES = {
     "mean": "by the posterior mean",
 }
 
+_SHOWN = 200  # participants in the page's table
+
 __all__ = ["results_page", "robustness_page", "template"]
 
 
-def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str, str]]) -> str:
+def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str, str]], people: People) -> str:
     """The page of an aggregation; `pictures` have png (base64), title, caption and alt."""
     sheet = template("report.html")
     best, gp = content["optimum"], study.gp
-    people, answers = len(content["participants"]), sum(p["trials"] for p in content["participants"])
-    worst = max(p["certificate"]["residual"] for p in content["participants"])
+    count, answers = len(people.names), int(people.trials.sum())
+    worst = float(people.certificate["residual"].max())
     return sheet.render(
         title=f"{study.name}: the population's optimum",
-        lead=f"{people} participants gave {answers} answers ({', '.join(study.responses)}). Each person's answers were"
-        " turned into a map of perceived realism; the maps were merged, and this is where the merged map is highest.",
+        lead=f"{count:,} participants gave {answers:,} answers ({', '.join(study.responses)}). Each person's"
+        " answers were turned into a map of perceived realism; the maps were merged, and this is where the merged map"
+        " is highest.",
         warnings=content["warnings"],
         study_rows=_study_rows(study),
         optimum=[(_head(study, name), _number(value)) for name, value in best["parameters"].items()],
@@ -36,16 +41,8 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
         **_comparison(study, content),
         figures=pictures,
         people_head=["participant", "trials", *(_head(study, n) for n in best["parameters"]), "f", "sd"],
-        people=[
-            [
-                p["participant"],
-                p["trials"],
-                *(_number(v) for v in p["optimum"]["parameters"].values()),
-                f"{p['optimum']['mean']:.2f}",
-                f"{p['optimum']['sd']:.2f}",
-            ]
-            for p in content["participants"]
-        ],
+        people=[] if people.sets is None else [_person(entry) for entry in islice(people.entries(), _SHOWN)],
+        people_words=_people_words(people),
         variance=f"{float(gp.kernel.variance):g}",
         theta=", ".join(f"{t:g}" for t in np.atleast_1d(np.asarray(gp.kernel.theta))),
         noise=f"{float(gp.likelihood.noise):g}",
@@ -53,11 +50,26 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
         search=_search_words(study),
         method=_METHODS[study.inference],
         certificate=_CERTIFICATES[study.inference].format(worst=f"{worst:.1e}"),
-        other=_other_words(content),
+        other=_other_words(study, content),
         study_hash=content["study"],
         seed=content["seed"],
         versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
     )
+
+
+def _person(entry):
+    best = entry["optimum"]
+    values = (_number(v) for v in best["parameters"].values())
+    return [entry["participant"], entry["trials"], *values, f"{best['mean']:.2f}", f"{best['sd']:.2f}"]
+
+
+def _people_words(people):
+    """What the table of participants leaves out."""
+    if people.sets is None:
+        return "Their own optima were not sought; result.json has their certificates."
+    if len(people.names) > _SHOWN:
+        return f"The first {_SHOWN} of {len(people.names):,}; all are in result.json and optima.csv."
+    return ""
 
 
 def _head(study, name):
@@ -113,13 +125,18 @@ _CERTIFICATES = {
 }
 
 
-def _other_words(content):
+def _other_words(study, content):
     """By how much the optimum would move with another inference; nothing if it was not computed."""
     other = content.get("other_inference")
     if other is None:
         return ""
     name = {"ep": "expectation propagation", "laplace": "Laplace's approximation"}[other["inference"]]
-    return f"With {name} instead, the optimum would move by {100 * other['nrmse']:.1f} % of the search ranges (NRMSE)."
+    ways = [
+        f"{_head(study, parameter)} by {way['by']:+.3g} ({way['percent']:+.1f} % of its range)"
+        for parameter, way in other["moved"].items()
+    ]
+    whole = f"the optimum would move by {100 * other['nrmse']:.1f} % of the search ranges (NRMSE)"
+    return f"With {name} instead, {whole}: {', '.join(ways)}."
 
 
 def _passivity_words(margin):
@@ -148,7 +165,8 @@ def _comparison(study, content):
     words = {"average": "plain average of the latent functions", "pooled": "one model of all answers"}
     words |= {"ep": "population map, expectation propagation", "laplace": "population map, Laplace"}
     claims |= {words[name]: (name, found) for name, found in content["alternatives"].items()}
-    claims["mean of the individual optima"] = ("mean_of_optima", content["mean_of_optima"])
+    if content["mean_of_optima"] is not None:
+        claims["mean of the individual optima"] = ("mean_of_optima", content["mean_of_optima"])
     rows = []
     for words_, (name, found) in claims.items():
         row = [words_, *(_number(v) for v in found["parameters"].values())]
@@ -177,21 +195,42 @@ def _comparison(study, content):
 
 def robustness_page(study: Study, content: dict[str, Any], pictures: list[dict[str, str]]) -> str:
     """One self-contained page of the robustness check."""
-    learned = content["learned"]
+    learned, versions = content["learned"], content["versions"]
+    whose = "one set for all" if learned["shared"] else "each person's own"
     return template("robustness.html").render(
-        study=study,
-        content=content,
-        flagged=[p["participant"] for p in content["participants"] if p["flagged"]],
+        title=f"{study.name}: robustness to the hyperparameters",
+        lead="The optima were found twice: under the study's fixed hyperparameters, and under those by maximum evidence"
+        f" with weak priors ({whose}; learnt: {', '.join(learned['parameters'])}). The population optimum moved by"
+        f" {100 * content['nrmse']:.1f} % of the search ranges (NRMSE),"
+        f" {'which is 3 % or more: it is not robust' if content['flagged'] else 'less than 3 %: it is robust'}.",
+        warnings=content["warnings"],
+        flagged=_flagged_words([p["participant"] for p in content["participants"] if p["flagged"]]),
         figures=pictures,
-        head=[_head(study, name) for name in content["fixed"]["parameters"]],
+        head=["", *(_head(study, name) for name in content["fixed"]["parameters"]), "f"],
         optima=[
-            (label, [_number(v) for v in content[key]["parameters"].values()], content[key])
-            for label, key in (("fixed", "fixed"), ("by evidence", "optimised"))
+            [label, *(_number(v) for v in found["parameters"].values()), f"{found['mean']:.2f} ± {found['sd']:.2f}"]
+            for label, found in (("fixed", content["fixed"]), ("by evidence", content["optimised"]))
         ],
-        learned=[(name, _numbers(learned[name])) for name in ("theta", "noise", "thresholds")],
-        sensitivity_head=[_head(study, name) for name in study.space.names],
-        sensitivity=list(_sensitivity_rows(content["sensitivity"])),
+        learned="; ".join(f"{name} {_numbers(learned[name])}" for name in ("theta", "noise", "thresholds"))
+        if learned["shared"]
+        else "",
+        sensitivity_head=["", *(_head(study, name) for name in study.space.names)],
+        sensitivity=[[name, *values] for name, values in _sensitivity_rows(content["sensitivity"])],
+        people=[[p["participant"], f"{100 * p['nrmse']:.1f} %", _remark(p)] for p in content["participants"]],
+        versions=", ".join(f"{k} {v}" for k, v in versions.items()),
     )
+
+
+def _flagged_words(names):
+    if not names:
+        return "No individual optimum moved by 3 % or more."
+    return f"Individual optima that moved by 3 % or more: {', '.join(names)}."
+
+
+def _remark(person):
+    remarks = {"flagged": person["flagged"], "no maximum in reach": person["runaway"]}
+    remarks["search not converged"] = not person["converged"]
+    return ", ".join(words for words, holds in remarks.items() if holds)
 
 
 _COORDINATES = {"theta": "ln theta", "noise": "ln noise", "first": "lowest threshold", "gaps": "ln gap"}

@@ -57,6 +57,7 @@ def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohor
 
     The first two parameters span the slices; there is one at the optimum's value of the third, and one on either side.
     Further parameters stay at the optimum. With one parameter, the map is a curve with its standard deviation.
+    `posteriors`: everybody's, or a function that gives the map's mean and variance at points (m, d).
     """
     if study.space.dim == 1:
         return _map_curve(study, posteriors, optimum, cohort)
@@ -212,14 +213,19 @@ def _slice(study, posteriors, optimum, third):
     if third is not None:
         x[..., 2] = third
     flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
-    mean = np.asarray(population(posteriors, flat)[0])
+    mean = np.asarray(_map(posteriors, flat)[0])
     return np.where(np.asarray(study.space.feasible(flat)), mean, np.nan).reshape(_CELLS, _CELLS)
+
+
+def _map(posteriors, x) -> tuple[ArrayLike, ArrayLike]:
+    """Mean and variance of a population's map, or of a function that gives them."""
+    return population(posteriors, x) if isinstance(posteriors, Posterior) else posteriors(x)
 
 
 def _curve(study, posteriors):
     """Physical values, mean and standard deviation of a map of one parameter."""
     side = jnp.linspace(0.0, 1.0, _CELLS)
-    mean, variance = population(posteriors, side[:, None])
+    mean, variance = _map(posteriors, side[:, None])
     return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
 
 

@@ -8,9 +8,8 @@ import base64
 import importlib.metadata
 import io
 import json
-import math
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +21,20 @@ import xarray as xr
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from hilbo.batch_optimum import Merged
 from hilbo.config import Study
-from hilbo.ordinal_gp import Posterior
 from hilbo.page import results_page
-from hilbo.study import Aggregate, Optimum, nrmse, other_inference, population, progress
+from hilbo.report_people import People, as_json, people_of
+from hilbo.study import Aggregate, Optimum, nrmse, other_inference, progress
 
 __all__ = [
+    "MAP_CELLS",
     "K0_range",
     "as_json",
     "map_dataset",
     "misses",
+    "moved",
+    "optima_table",
     "optimum_content",
     "result",
     "save_figures",
@@ -40,7 +43,8 @@ __all__ = [
     "write_results",
 ]
 
-_MAP_CELLS = 41
+MAP_CELLS = 41
+"""Points of the map's grid along each parameter."""
 
 
 def set_of(study: Study, x: ArrayLike) -> dict[str, float]:
@@ -65,19 +69,6 @@ def K0_range(study: Study) -> float:
     ends = {p.name: p.low if p.name == "alpha" else p.high for p in study.space.parameters}
     assert study.space.mechanics is not None
     return study.space.mechanics.K_eff - float(study.space.derived(ends)["K0"])
-
-
-def as_json(content: dict[str, Any]) -> str:
-    """The text of result.json; a number that is not finite (after a failed fit) is null."""
-
-    def clean(value):
-        if isinstance(value, dict):
-            return {key: clean(v) for key, v in value.items()}
-        if isinstance(value, list):
-            return [clean(v) for v in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    return json.dumps(clean(content), indent=2, allow_nan=False) + "\n"
 
 
 def misses(
@@ -106,30 +97,22 @@ def versions() -> dict[str, str]:
 
 
 def result(
-    study: Study, aggregate: Aggregate, seed: int, truth: Float[np.ndarray, " d"] | None = None
+    study: Study,
+    aggregate: Aggregate | Merged,
+    seed: int,
+    truth: Float[np.ndarray, " d"] | None = None,
+    people: People | None = None,
 ) -> dict[str, Any]:
     """The content of result.json."""
-    certificate = aggregate.posteriors.certificate
-    people = []
-    for j, name in enumerate(aggregate.cohort.names):
-        fields = {key: np.asarray(getattr(certificate, key))[j].item() for key in certificate.__dataclass_fields__}
-        trials = int(aggregate.cohort.counts()[j])
-        people.append(
-            {
-                "participant": name,
-                "trials": trials,
-                "optimum": optimum_content(study, jax.tree.map(lambda leaf, j=j: leaf[j], aggregate.individuals)),
-                "certificate": fields,
-            }
-        )
+    people = people_of(study, aggregate) if people is None else people
+    best, mean = aggregate.optimum, aggregate.mean_of_optima
     content = {
-        "optimum": optimum_content(study, aggregate.optimum),
-        "participants": people,
+        "optimum": optimum_content(study, best),
+        "participants": people if isinstance(aggregate, Merged) else list(people.entries()),
         "alternatives": {name: optimum_content(study, found) for name, found in aggregate.alternatives.items()},
-        "mean_of_optima": {
-            "parameters": set_of(study, aggregate.mean_of_optima),
-            "passivity_margin": margin_of(study, aggregate.mean_of_optima),
-        },
+        "mean_of_optima": None
+        if mean is None
+        else {"parameters": set_of(study, mean), "passivity_margin": margin_of(study, mean)},
         "rule": study.rule,
         "inference": study.inference,
         "study": study.hash,
@@ -138,19 +121,30 @@ def result(
     }
     other = other_inference(study)
     if other in aggregate.alternatives:
-        moved = nrmse(aggregate.alternatives[other].x, aggregate.optimum.x)
-        content["other_inference"] = {"inference": other, "nrmse": float(moved)}
-    failed = [person["participant"] for person in people if not person["certificate"]["converged"]]
+        content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
+    failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
     content["warnings"] = [_not_converged(failed)] if failed else []
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content
 
 
+def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> dict[str, Any]:
+    """How far one optimum is from another: NRMSE, and each parameter's way in its unit and in % of its range."""
+    there, here = set_of(study, x), set_of(study, start)
+    percent = 100 * (np.asarray(x) - np.asarray(start))
+    share = dict(zip(study.space.names, percent.tolist(), strict=True))
+    if "K0" in there:
+        share = {"K0": 100 * (there["K0"] - here["K0"]) / K0_range(study)} | share
+    ways = {name: {"by": there[name] - here[name], "percent": share[name]} for name in there}
+    return {"nrmse": float(nrmse(x, start)), "moved": ways}
+
+
 def _not_converged(names):
     one = len(names) == 1
+    shown = names if len(names) <= 10 else [*names[:10], f"{len(names) - 10:,} others"]
     return (
-        f"The {'fit' if one else 'fits'} of {', '.join(names)} did not reach {'its' if one else 'their'} tolerance, so"
+        f"The {'fit' if one else 'fits'} of {', '.join(shown)} did not reach {'its' if one else 'their'} tolerance, so"
         " that the results may be off by more than rounding; see the certificates in result.json."
     )
 
@@ -200,18 +194,19 @@ def write_results(
     say=lambda text: None,
 ) -> dict[str, Any]:
     """Write the results folder; returns the content of result.json. `say` is told what is being done."""
-    content = result(study, aggregate, seed, truth)
+    people = people_of(study, aggregate)
+    content = result(study, aggregate, seed, truth, people)
     (folder / "result.json").write_text(as_json(content))
-    _optima_table(content).to_csv(folder / "optima.csv", index=False)
+    optima_table(content, people).to_csv(folder / "optima.csv", index=False)
     say("the population map on a grid")
-    data = map_dataset(study, aggregate.posteriors, aggregate.optimum.x)
+    data = map_dataset(study, aggregate.surface, aggregate.optimum.x)
     data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     data.to_netcdf(folder / "map.nc", engine="h5netcdf")
     say("progress of the optimum over trials")
     figures = _figures(study, aggregate, seed, truth)
     say("figures and report")
     pictures = save_figures(figures, folder)
-    (folder / "report.html").write_text(results_page(study, content, pictures), encoding="utf-8")
+    (folder / "report.html").write_text(results_page(study, content, pictures, people), encoding="utf-8")
     return content
 
 
@@ -228,24 +223,26 @@ def save_figures(figures: Mapping[str, tuple[Any, str, str]], folder: Path) -> l
     return pictures
 
 
-def _optima_table(content):
+def optima_table(content: dict[str, Any], people: People) -> pd.DataFrame:
+    """What optima.csv holds: the population's, the alternatives' and everybody's own."""
     rows = [{"source": "aggregate"} | content["optimum"]["parameters"]]
     rows += [{"source": name} | found["parameters"] for name, found in content["alternatives"].items()]
-    rows += [{"source": f"individual:{p['participant']}"} | p["optimum"]["parameters"] for p in content["participants"]]
-    return pd.DataFrame(rows)
+    return pd.concat([pd.DataFrame(rows), people.table()])
 
 
-def map_dataset(study: Study, posteriors: Posterior, at: Float[Array, " d"]) -> xr.Dataset:
+def map_dataset(
+    study: Study, surface: Callable[..., Any], at: Float[Array, " d"], cells: int = MAP_CELLS
+) -> xr.Dataset:
     """The population map on a grid of all dimensions, or of the first two where there are more than three (then
-    through the point `at` of the unit cube)."""
+    through the point `at` of the unit cube). `surface`: points (m, d) -> mean and variance, (m,) each."""
     parameters = study.space.parameters
     shown = parameters if len(parameters) <= 3 else parameters[:2]
-    side = np.linspace(0.0, 1.0, _MAP_CELLS)
-    x = np.tile(np.asarray(at), (*(_MAP_CELLS,) * len(shown), 1))
+    side = np.linspace(0.0, 1.0, cells)
+    x = np.tile(np.asarray(at), (*(cells,) * len(shown), 1))
     for i, grid in enumerate(np.meshgrid(*(side,) * len(shown), indexing="ij")):
         x[..., i] = grid
-    flat = jnp.asarray(x.reshape(-1, len(parameters)))
-    mean, variance = population(posteriors, flat)
+    flat = x.reshape(-1, len(parameters))
+    mean, variance = surface(flat)
     names = [p.name for p in shown]
     shape = x.shape[:-1]
     return xr.Dataset(

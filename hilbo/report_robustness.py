@@ -1,8 +1,10 @@
 """Results of the robustness check: result.json, both population maps, figures, and a page that explains itself."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
@@ -10,7 +12,7 @@ from hilbo.config import Study
 from hilbo.page import robustness_page
 from hilbo.report import as_json, map_dataset, optimum_content, save_figures, versions
 from hilbo.robustness import LIMIT, Robustness
-from hilbo.study import Cohort
+from hilbo.study import Cohort, population
 
 __all__ = ["robustness_result", "write_robustness"]
 
@@ -22,12 +24,19 @@ def write_robustness(study: Study, cohort: Cohort, found: Robustness, folder: Pa
     """Write the folder of `hilbo robustness`; returns the content of result.json."""
     content = robustness_result(study, cohort, found, seed)
     (folder / "result.json").write_text(as_json(content))
-    maps = [map_dataset(study, posteriors, found.fixed.x) for posteriors in (found.posteriors, found.posteriors_learnt)]
+    maps = [
+        map_dataset(study, partial(_surface, posteriors), found.fixed.x)
+        for posteriors in (found.posteriors, found.posteriors_learnt)
+    ]
     both = xr.concat(maps, xr.DataArray(["fixed", "by evidence"], dims="hyperparameters", name="hyperparameters"))
     both.to_netcdf(folder / "map.nc", engine="h5netcdf")
     pictures = save_figures(_figures(study, cohort, found), folder)
     (folder / "report.html").write_text(robustness_page(study, content, pictures), encoding="utf-8")
     return content
+
+
+def _surface(posteriors, x):
+    return population(posteriors, jnp.asarray(x))
 
 
 def _figures(study, cohort, found):

@@ -16,13 +16,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from hilbo import acquisition, bcm
 from hilbo.config import Inference, Study
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
-from hilbo.session import best_point, physical_trials, search_points
+from hilbo.session import best_point, search_points
 
 __all__ = [
     "Aggregate",
@@ -60,13 +61,19 @@ class Cohort(eqx.Module):
 
     def of(self, names: Sequence[str]) -> "Cohort":
         """Only these participants."""
-        unknown = [name for name in names if name not in self.names]
+        known = set(self.names)
+        unknown = [name for name in names if name not in known]
         if unknown:
             raise InputError(
                 f'participant "{unknown[0]}" is not in the table, which has {len(self.names)} participants.'
             )
-        rows = np.array([self.names.index(name) for name in names])
-        return Cohort(jax.tree.map(lambda leaf: leaf[rows], self.trials), self.physical[rows], tuple(names))
+        places = {name: row for row, name in enumerate(self.names)}
+        return self.rows(np.array([places[name] for name in names]))
+
+    def rows(self, rows: Int[np.ndarray, " k"]) -> "Cohort":
+        """Only the participants in these places."""
+        names = tuple(self.names[row] for row in rows)
+        return Cohort(jax.tree.map(lambda leaf: leaf[rows], self.trials), self.physical[rows], names)
 
     def counts(self) -> Int[np.ndarray, " M"]:
         """Answers of each participant."""
@@ -94,6 +101,16 @@ class Aggregate(eqx.Module):
     population map by another inference: "ep", or "laplace" where the study itself says "ep"."""
 
     @property
+    def certificates(self) -> dict[str, np.ndarray]:
+        """Everybody's certificate, (M,) for each of its figures."""
+        found = self.posteriors.certificate
+        return {name: np.asarray(getattr(found, name)) for name in found.__dataclass_fields__}
+
+    def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of the population map at points of the unit cube."""
+        return population(self.posteriors, jnp.asarray(x))
+
+    @property
     def mean_of_optima(self) -> Float[Array, " d"]:
         """Plain average of the individuals' optima in the unit cube: what the paper compares the map with."""
         return jnp.mean(self.individuals.x, axis=0)
@@ -104,17 +121,29 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
 
     `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
     """
-    groups = dict(list(table.groupby("participant", sort=False)))
-    longest = max(len(group) for group in groups.values())
+    person, names = pd.factorize(table["participant"])
+    counts = np.bincount(person)
+    longest = int(counts.max())
     capacity = max(longest, study.selection.trials) if capacity is None else capacity
-    columns = list(study.space.names)
-    padded = [
-        physical_trials(study, g[columns].to_numpy(float), g["category"].to_numpy(), capacity) for g in groups.values()
-    ]
-    physical = np.full((len(groups), capacity, len(columns)), np.nan)
-    for row, group in zip(physical, groups.values(), strict=True):
-        row[: len(group)] = group[columns].to_numpy(float)
-    return Cohort(jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded), physical, tuple(groups))
+    if capacity < longest:
+        raise InputError(f"cohort_of: capacity is {capacity}, but {longest} answers of a participant need as many.")
+    order = np.argsort(person, kind="stable")
+    rank = np.arange(len(person)) - np.repeat(np.cumsum(counts) - counts, counts)
+    rows = person[order], rank
+    physical = np.full((len(counts), capacity, study.space.dim), np.nan)
+    physical[rows] = table[list(study.space.names)].to_numpy(float)[order]
+    answers = np.zeros((len(counts), capacity), np.int32)
+    answers[rows] = table["category"].to_numpy()[order]
+    held = np.arange(capacity)[None, :] < counts[:, None]
+    middle = [(p.low + p.high) / 2 for p in study.space.parameters]
+    x = _to_unit(study.space, np.where(held[..., None], physical, middle))
+    return Cohort(jax.vmap(Trials)(x, jnp.asarray(answers), jnp.asarray(held)), physical, tuple(names))
+
+
+@eqx.filter_jit
+def _to_unit(space, physical):
+    """Person by person, as `session.physical_trials` does for one: the same bits."""
+    return jax.lax.map(space.to_unit, jnp.asarray(physical))
 
 
 def fit_cohort(
@@ -178,7 +207,8 @@ def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Arr
         probabilities = posterior.gp.likelihood.class_probabilities(mean[0], variance[0])
         return Optimum(x, mean[0], jnp.sqrt(variance[0]), probabilities)
 
-    return jax.lax.map(one, posteriors, batch_size=32)
+    # On a CPU one after the other: each search stops when it is done, where a batch waits for its slowest.
+    return jax.lax.map(one, posteriors, batch_size=None if jax.default_backend() == "cpu" else 256)
 
 
 def other_inference(study: Study) -> Inference:

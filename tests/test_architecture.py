@@ -66,17 +66,22 @@ MAY_IMPORT = MATHS | {
     "config": {"search_space", "ordinal_gp"},
     "tables": {"config"},
     "material_tables": {"tables", "identification"},
-    "console": {"report"},
+    "console": set(),
     "cli_material": {"console", "characterise", "material_tables", "report_material"},
     "event_log": {"session"},
     "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm"},
+    "distributed": set(),
+    "batch": {"study", "distributed", "gaussian", "kernels"},
+    "batch_optimum": {"batch", "newton"},
     "robustness": {"study", "hyperparameters"},
     "plotting": set(MATHS) | {"study"},
     "plotting_mechanics": {"plotting", "characterise"},
-    "page": {"config"},
+    "report_people": {"study"},
+    "page": {"config", "report_people"},
     "hardware_bridge": {"protocol"},
 }
 MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material"}
+MAY_IMPORT["report_population"] = {"report", "report_people", "page", "batch_optimum"}
 MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)

@@ -75,3 +75,28 @@ def test_every_lane_of_a_batch_ends():
     ends = solve(starts)
     np.testing.assert_allclose(ends[:2], 1.0, atol=1e-5)
     assert not np.isfinite(ends[2]).all()
+
+
+def ridge(y, form):
+    centre, matrix = form
+    return -jnp.exp(-(y - centre) @ matrix @ (y - centre))
+
+
+@jax.jit
+def climbed(start, centre, matrix):
+    box = {"lower": jnp.zeros(2), "upper": jnp.ones(2)}
+    solver = TrustRegionNewton(atol=1e-9)
+    solution = optx.minimise(ridge, solver, start, (centre, matrix), options=box, max_steps=60, throw=False)
+    return solution.result == optx.RESULTS.successful, solution.state.radius
+
+
+@pytest.mark.parametrize("seed", [10, 27, 55, 67, 75, 84])
+def test_a_step_that_a_wall_turns_uphill_is_refused_and_shortened(seed):
+    """A narrow ridge across a wall: cut off there, Newton's step would rise by its own model, which trusted itself."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, np.pi)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    matrix = turn @ np.diag([rng.uniform(1, 5), rng.uniform(20, 300)]) @ turn.T
+    centre, start = rng.uniform(-0.3, 1.3, 2), rng.uniform(size=2)
+    found, radius = climbed(jnp.asarray(start), jnp.asarray(centre), jnp.asarray(matrix))
+    assert bool(found) and float(radius) < 1e6

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from hilbo import report
+from hilbo import report, report_people
 from hilbo.config import Study
 from hilbo.study import aggregate_cohort, cohort_of, population
 
@@ -175,5 +175,35 @@ def test_a_failed_certificate_is_said_in_one_sentence():
         " see the certificates in result.json."
     ]
     from hilbo.page import results_page
+    from hilbo.report_people import people_of
 
-    assert content["warnings"][0] in results_page(study, content, [])
+    assert content["warnings"][0] in results_page(study, content, [], people_of(study, failed))
+
+
+def test_many_participants_are_written_as_few():
+    names, x = [f"P{i}" for i in range(5)], np.random.default_rng(0).uniform(size=(5, 3)) * [1, 1, 0.1]
+    sets, margins = report_people.parameter_sets(PAPER, x)
+    for j in range(5):
+        one = report.set_of(PAPER, x[j])
+        assert {name: values[j] for name, values in sets.items()} == pytest.approx(one, rel=1e-12)
+        assert list(sets) == list(one)
+        assert margins[j] == pytest.approx(report.margin_of(PAPER, x[j]), rel=1e-12)
+    optima = {"x": x, "mean": x[:, 0], "sd": x[:, 1], "class_probabilities": x}
+    certificate = {"residual": np.array([1.0, np.nan, 0, 0, 0]), "converged": np.ones(5, bool)}
+    people = report_people.People(names, np.arange(5), certificate, PAPER.responses, optima, sets, margins)
+    content = {"rule": "bcm", "participants": people, "alternatives": {"a": {}}}
+    text = report.as_json(content)
+    listed = report.as_json(content | {"participants": list(people.entries())})
+    assert json.loads(text) == json.loads(listed)
+    assert json.loads(text)["participants"][1]["certificate"] == {"residual": None, "converged": True}
+    without = report_people.People(names, np.arange(5), certificate, PAPER.responses, None, None, None)
+    assert next(without.entries())["optimum"] is None and without.table().empty
+
+
+def test_a_way_is_said_in_units_and_percent():
+    found = report.moved(PAPER, jnp.asarray(unit(AGGREGATE)), jnp.asarray(unit(SYSTEM_IDENTIFICATION)))
+    assert list(found["moved"]) == ["K0", "K1", "B1", "alpha"]
+    assert found["moved"]["B1"]["by"] == pytest.approx(7.88 - 5.89)
+    percents = [way["percent"] for way in found["moved"].values()]
+    np.testing.assert_allclose(np.abs(percents), (1.8, 0.4, 6.2, 2.8), atol=0.06)
+    assert found["nrmse"] == pytest.approx(0.0393, abs=5e-4)

@@ -1,6 +1,7 @@
 """Trial tables, cohorts, and aggregation of prefixes and subsets, against one person at a time."""
 
 import dataclasses
+import tomllib
 from pathlib import Path
 
 import jax
@@ -13,6 +14,7 @@ from hilbo import bcm
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials, fit
+from hilbo.session import physical_trials
 from hilbo.study import aggregate_cohort, cohort_of, fit_cohort, nrmse, population, progress
 from hilbo.tables import read_trials, write_trials
 
@@ -156,3 +158,20 @@ def test_a_study_may_ask_for_another_inference(cohort, inference):
 
 def test_nrmse_is_the_root_mean_square():
     assert float(nrmse(jnp.array([0.1, 0.5, 0.4]), jnp.array([0.1, 0.2, 0.8]))) == pytest.approx(np.sqrt(0.25 / 3))
+
+
+def test_a_cohort_has_the_bits_of_its_sessions():
+    """What a person's own session makes of the physical values, on linear and logarithmic scales."""
+    content = tomllib.loads(Path("hilbo/data/paper.toml").read_text())
+    content["parameters"]["B1"]["scale"] = "log"
+    for study in (STUDY, Study.from_dict(content)):
+        frame = table(people=5, trials=7)
+        frame["category"] = np.arange(35) % 3
+        cohort = cohort_of(frame.sample(frac=1, random_state=0).sort_values("trial", kind="stable"), study)
+        for j, name in enumerate(cohort.names):
+            rows = frame[frame["participant"] == name]
+            points = rows[list(study.space.names)].to_numpy()
+            alone = physical_trials(study, points, rows["category"].to_numpy(), 25)
+            one = jax.tree.map(lambda leaf, j=j: leaf[j], cohort.trials)
+            jax.tree.map(np.testing.assert_array_equal, one, alone)
+            np.testing.assert_array_equal(cohort.physical[j, :7], points)

@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hilbo import tables
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.tables import read_trials, write_trials
@@ -124,7 +125,7 @@ def test_one_material_is_chosen(tmp_path):
     text = "material," + HEADER + "foam,A,1,close,1,2\ngel,A,1,different,1,2\n"
     assert read_trials(written(tmp_path, text), study(), "gel")["category"].tolist() == [0]
     assert "2 materials (foam, gel); choose" in refusal(tmp_path, text)
-    assert 'no answers to material "silk"; it has foam, gel' in refusal(tmp_path, text, material="silk")
+    assert 'holds no material "silk"; it has foam, gel' in refusal(tmp_path, text, material="silk")
     assert 'column "material" is missing' in refusal(tmp_path, HEADER + "A,1,close,1,2\n", material="gel")
 
 
@@ -219,3 +220,50 @@ def test_what_cannot_be_read_is_refused(tmp_path):
     (tmp_path / "latin.csv").write_bytes(HEADER.encode() + "Zoë,1,close,1,2\n".encode("latin-1"))
     with pytest.raises(InputError, match=r"latin\.csv: is not a table"):
         read_trials(tmp_path / "latin.csv", study())
+
+
+def many(count):
+    return "".join(f"P{i // 5},{i % 5 + 1},close,1,{2 + i % 7}\n" for i in range(count))
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_pieces_make_the_same_table(tmp_path, monkeypatch, name):
+    path = written(tmp_path, HEADER + many(53), name)
+    if name.endswith("parquet"):
+        pd.read_csv(written(tmp_path, HEADER + many(53))).to_parquet(path)
+    whole, told = read_trials(path, study()), []
+    monkeypatch.setattr(tables, "_PIECE", 10)
+    pd.testing.assert_frame_equal(read_trials(path, study(), say=told.append), whole)
+    assert told[-1] == 53 and told == sorted(told) and len(told) > 4
+
+
+def test_a_damaged_row_far_down_is_found_with_its_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "_PIECE", 10)
+    text = HEADER + many(53)
+    assert 't.csv:41: response is "near"' in refusal(tmp_path, text.replace("P7,5,close", "P7,5,near"))
+    assert "t.csv:41: has 4 cells" in refusal(tmp_path, text.replace("P7,5,close,1", "P7,5,close"))
+    again = refusal(tmp_path, text.replace("P9,1,", "P0,2,"))  # two pieces apart
+    assert "t.csv:47: participant P0, trial 2 stands in line 3 already" in again
+
+
+def test_other_columns_may_be_left_out(tmp_path):
+    table = read_trials(written(tmp_path, "note," + HEADER + "007,A,1,close,1,2\n"), study(), others=False)
+    assert set(table.columns) == {"participant", "trial", "gain", "delay", "category"}
+
+
+def test_a_parquet_file_has_rows_and_no_lines(tmp_path):
+    good = pd.read_csv(written(tmp_path, HEADER + many(20)))
+
+    def refused(frame):
+        frame.to_parquet(tmp_path / "t.parquet")
+        with pytest.raises(InputError) as error:
+            read_trials(tmp_path / "t.parquet", study())
+        return str(error.value)
+
+    assert 't.parquet: row 7: gain is "9.0"; it must be' in refused(good.assign(gain=[1.0] * 6 + [9.0] * 14))
+    twice = refused(pd.concat([good, good.iloc[[3]]]))
+    assert "t.parquet: row 21: participant P0, trial 4 stands in row 4 already" in twice
+    assert 't.parquet: column "gain" is missing' in refused(good.drop(columns="gain"))
+    mixed = good.astype({"gain": object})
+    mixed.loc[2, "gain"] = None
+    assert 't.parquet: row 3: gain is ""' in refused(mixed).replace('"nan"', '""')

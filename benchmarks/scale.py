@@ -1,0 +1,295 @@
+"""Populations of 100 to 100,000 people refitted and merged: time per participant, memory, and agreement of processes.
+
+    python benchmarks/scale.py                     the figures, on this machine's CPU
+    python benchmarks/scale.py --write             and docs/scale.md from them
+    python benchmarks/scale.py --device gpu        participants and map points per second where JAX finds a GPU
+    python benchmarks/scale.py --people 100 1000   other sizes
+
+Every size runs in a process of its own, so that the peak of memory (largest resident set) is its own. The map is merged
+at 2,000 points. A first pass over a few people compiles and is not in the times, which are said beside it.
+"""
+
+import argparse
+import json
+import os
+import platform
+import resource
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+POINTS, TRIALS = 2000, 25
+HEAD = (
+    "| participants | read, µs each | refit + merge, µs each | and optimum, µs each | own optima, µs each | peak MB |"
+)
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--people", type=int, nargs="+", default=[100, 1000, 10_000, 100_000])
+    options.add_argument("--device", choices=["cpu", "gpu"], default="cpu")
+    options.add_argument("--processes", type=int, nargs="+", default=[1, 2, 4], help="that are to give one map")
+    options.add_argument("--agree", type=int, default=1000, help="participants of that map")
+    options.add_argument("--write", action="store_true")
+    options.add_argument("--run", help=argparse.SUPPRESS)
+    chosen = options.parse_args()
+    if chosen.run:
+        print(json.dumps(globals()[f"run_{chosen.device}"](**json.loads(chosen.run))))
+        return
+    if chosen.device == "cpu":
+        os.environ["JAX_PLATFORMS"] = "cpu"
+    text = cpu_report(chosen) if chosen.device == "cpu" else gpu_report(chosen)
+    print(text)
+    page = ROOT / "docs" / "scale.md"
+    if chosen.write:
+        keep = page.read_text() if page.exists() else INTRODUCTION
+        mark = f"<!-- {chosen.device} -->"
+        parts = {m: keep.partition(m)[2].partition("<!--")[0] for m in ("<!-- cpu -->", "<!-- gpu -->") if m in keep}
+        parts[mark] = f"\n{text}\n"
+        page.write_text(keep.partition("<!--")[0] + "".join(m + parts[m] for m in sorted(parts)))
+
+
+def cpu_report(chosen):
+    rows = [measured("cpu", people=people) for people in chosen.people]
+    lines = [HEAD, "|--:|--:|--:|--:|--:|--:|"]
+    for row in rows:
+        cells = [f"{row['people']:,}", *(f"{row[name]:.0f}" for name in ("read", "merge", "optimum", "own", "peak"))]
+        lines.append(f"| {' | '.join(cells)} |")
+    lines += [
+        "",
+        f"Compiling, or reading it from the cache, took {rows[0]['compiled']:.0f} s besides. {machine()}.",
+        "",
+        *agreement(chosen),
+    ]
+    return "\n".join(lines)
+
+
+def gpu_report(chosen):
+    rows = [measured("gpu", people=people) for people in chosen.people]
+    lines = ["| participants | participants/s | map points/s | peak GPU MB |", "|--:|--:|--:|--:|"]
+    lines += [f"| {r['people']:,} | {r['rate']:,.0f} | {r['points']:,.0f} | {r['peak']:.0f} |" for r in rows]
+    return "\n".join(
+        [*lines, "", f"On {rows[0]['device']}, float64; a map point is one participant's say at one point."]
+    )
+
+
+def agreement(chosen):
+    """Lines on how far the maps of several processes are from that of one."""
+    import numpy as np
+
+    maps, lines = (
+        {},
+        [f"| processes, {chosen.agree:,} participants | largest difference of the map, of its scale | s |"],
+    )
+    lines.append("|--:|--:|--:|")
+    for count in chosen.processes:
+        found = distributed(chosen.agree, count)
+        maps[count] = np.array(found["map"])
+        first = maps[chosen.processes[0]]
+        apart = np.abs(maps[count] - first).max() / np.abs(first).max()
+        lines.append(f"| {count} | {apart:.1e} | {found['seconds']:.1f} |")
+    return lines
+
+
+def measured(device, **settings):
+    command = [sys.executable, __file__, "--device", device, "--run", json.dumps(settings)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def distributed(people, count):
+    """What process 0 of `count` found."""
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    settings = [{"people": people, "agree": [f"localhost:{port}", count, rank]} for rank in range(count)]
+    command = [sys.executable, __file__, "--device", "cpu", "--run"]
+    crew = [subprocess.Popen([*command, json.dumps(s)], stdout=subprocess.PIPE, text=True) for s in settings]
+    said = [process.communicate()[0] for process in crew]
+    return json.loads(said[0].splitlines()[-1])
+
+
+def cohort_of_people(study, people):
+    """People whose favourite renderings scatter around one, with answers to random renderings."""
+    import numpy as np
+    import pandas as pd
+
+    rng = np.random.default_rng(0)
+    candidates = study.space.candidates(8192, 0)
+    x = candidates[rng.integers(0, len(candidates), people * TRIALS)]
+    favourite = np.repeat(np.array([0.15, 0.18, 0.2]) + 0.1 * rng.normal(size=(people, 3)), TRIALS, axis=0)
+    felt = np.linalg.norm((x - favourite) / np.array([0.24, 0.36, 0.09]), axis=1) + 0.9 * rng.normal(size=len(x))
+    table = pd.DataFrame(np.asarray(study.space.to_physical(x.astype(float))), columns=list(study.space.names))
+    table.insert(0, "response", np.array(study.responses)[(felt < 2.6).astype(int) + (felt < 1.8)])
+    table.insert(0, "trial", np.tile(np.arange(1, TRIALS + 1), people))
+    table.insert(0, "participant", np.repeat([f"P{i:06d}" for i in range(people)], TRIALS))
+    return table
+
+
+def run_cpu(people, agree=None):
+    """One size in this process, or one process's part of an agreement."""
+    from hilbo.console import start
+
+    start()
+    from hilbo.distributed import crew
+
+    with crew(agree is not None, *(agree or ())) as team:
+        return agreed(team, people) if agree else sized(team, people)
+
+
+def agreed(team, people):
+    import numpy as np
+
+    from hilbo import batch
+    from hilbo.config import Study
+    from hilbo.study import cohort_of
+
+    study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
+    table = cohort_of_people(study, people)
+    table["category"] = table["response"].map({label: i for i, label in enumerate(study.responses)})
+    population, points = batch.population_of(study, cohort_of(table, study), team), study.space.candidates(POINTS, 0)
+    batch.refit(population, points)
+    begun = time.perf_counter()
+    mean, variance = batch.refit(population, points).sums.merge(float(study.gp.kernel.variance), people)
+    return {"map": np.concatenate([mean, variance]).tolist(), "seconds": time.perf_counter() - begun}
+
+
+def sized(team, people):
+    import tempfile
+
+    import numpy as np
+
+    from hilbo import batch
+    from hilbo.batch_optimum import optima_from
+    from hilbo.config import Study
+    from hilbo.study import cohort_of
+    from hilbo.tables import read_trials
+
+    study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
+    points = study.space.candidates(POINTS, 0)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "trials.csv"
+        making = [sys.executable, "-c", MAKE.format(root=str(ROOT), people=people, path=str(path))]
+        subprocess.run(making, check=True)  # in a process of its own: this one's memory is measured
+        begun = time.perf_counter()
+        cohort = cohort_of(read_trials(path, study, others=False), study)
+        read = time.perf_counter() - begun
+    population = batch.population_of(study, cohort, team)
+    few = population.every(2 * population.block)
+    begun = time.perf_counter()
+    fitted = batch.refit(few, points)
+    optima_from(fitted.population, points, fitted.sums)
+    compiled = time.perf_counter() - begun
+
+    begun = time.perf_counter()
+    fitted = batch.refit(population, points)
+    merge = time.perf_counter() - begun
+    begun = time.perf_counter()
+    optima_from(fitted.population, points, fitted.sums)
+    optimum = time.perf_counter() - begun
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+    some = population.every(min(people, 1000))
+    batch.refit(few, points, individuals=True)
+    begun = time.perf_counter()
+    batch.refit(some, points, individuals=True)
+    own = (time.perf_counter() - begun) / some.people - merge / people
+    assert np.all(fitted.certificate["converged"])
+    micro = 1e6 / people
+    return {
+        "people": people,
+        "read": read * micro,
+        "merge": merge * micro,
+        "optimum": optimum * micro,
+        "own": own * 1e6,
+        "peak": peak,
+        "compiled": compiled,
+    }
+
+
+MAKE = """
+import sys
+sys.path[:0] = ["{root}", "{root}/benchmarks"]
+import jax; jax.config.update("jax_enable_x64", True)
+import scale
+from hilbo.config import Study
+from hilbo.tables import write_trials
+write_trials(scale.cohort_of_people(Study.load("{root}/hilbo/data/paper.toml"), {people}), "{path}")
+"""
+
+
+def run_gpu(people):
+    """Refit and merge on the GPU: no line here says that it is one, but for its memory."""
+    import jax
+
+    from hilbo.console import start
+
+    start()
+    from hilbo import batch, distributed
+    from hilbo.config import Study
+    from hilbo.study import cohort_of
+
+    device = jax.devices()[0]
+    if device.platform == "cpu":
+        sys.exit("JAX finds no GPU: install a build of it for one, jax[cuda12] or jax[rocm], and see jax.devices().")
+    study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
+    table = cohort_of_people(study, people)
+    table["category"] = table["response"].map({label: i for i, label in enumerate(study.responses)})
+    population, points = (
+        batch.population_of(study, cohort_of(table, study), distributed.alone()),
+        study.space.candidates(POINTS, 0),
+    )
+    fitted = batch.refit(population.every(2 * population.block), points)
+    batch.sums(fitted.population, points)
+    begun = time.perf_counter()
+    fitted = batch.refit(population, points)
+    whole = time.perf_counter() - begun
+    begun = time.perf_counter()
+    batch.sums(fitted.population, points)
+    again = time.perf_counter() - begun
+    peak = (device.memory_stats() or {}).get("peak_bytes_in_use", 0) / 1e6
+    return {
+        "people": people,
+        "rate": people / whole,
+        "points": people * POINTS / again,
+        "peak": peak,
+        "device": device.device_kind,
+    }
+
+
+def machine():
+    return f"{len(os.sched_getaffinity(0))} cores ({platform.machine()}), Python {platform.python_version()}"
+
+
+INTRODUCTION = f"""# Scale
+
+How many participants can be refitted and merged, how long it takes and how much memory, measured by
+`python benchmarks/scale.py --write`: {TRIALS} answers each, the map at {POINTS:,} points, the paper's study, float64.
+
+`hilbo aggregate` works like this above 1,000 participants, on several devices (`--devices 4`, or all the GPUs there
+are), in several processes (`--distributed`), and with `--no-individuals`, which leaves out everybody's own optimum.
+
+* Read: the table is checked piece by piece; 60 bytes of each answer stay in memory.
+* Refit and merge: a fit takes about half of the time, the map the rest. Posteriors live in blocks of at most 256 people
+  on each device; the mode of each person stays, n numbers.
+* Optimum: passes over everybody for value, gradient and Hessian of the map, one for each Newton step.
+* Own optima: a search for each person, several times the rest together.
+
+Several processes are started by Slurm (`srun hilbo aggregate … --distributed`), Open MPI (`mpirun hilbo aggregate …
+--distributed`), or by hand, here two on one machine:
+
+    export JAX_COORDINATOR_ADDRESS=localhost:9000 JAX_NUM_PROCESSES=2    # or --coordinator and --processes
+    hilbo aggregate trials.csv --study study.toml --out results --distributed --process-id 0 &
+    hilbo aggregate trials.csv --study study.toml --out results --distributed --process-id 1
+
+Each reads the table, and the first one writes. Blocks depend on the number of people alone and are added in their
+order, whichever process made them. If one process meets bad input, all end with one sentence and exit code 2; if one
+dies, the others end with an error within a minute or two.
+
+"""
+
+
+if __name__ == "__main__":
+    main()

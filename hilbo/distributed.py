@@ -1,0 +1,176 @@
+"""Several devices and several processes: who takes part, how work is dealt out, and how a failure ends all of them.
+
+A `Crew` is the devices of all processes in one line. Work is dealt in rounds, one block for each device; every process
+feeds its own devices, and what they return is copied to all processes (JAX's sharding over the whole line), so that
+each of them can go on with the same numbers. Processes find each other by `jax.distributed`: under Slurm and Open MPI
+by themselves, elsewhere by the address of process 0. On CPUs they talk by gloo.
+
+Nobody waits for ever: bad input is exchanged before work begins, so that all stop with a sentence; a process that dies
+later breaks the next exchange, or is missed by JAX's heartbeats, and the others end with an error.
+"""
+
+import contextlib
+import hashlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
+
+from hilbo.errors import InputError
+
+__all__ = ["AXIS", "Crew", "alone", "crew", "digest"]
+
+AXIS = "people"
+_MEETING, _HEARTBEAT = 120, 60  # s to find each other, and after which a silent process counts as dead
+_WRITING = 3600  # s that the others wait at the end for the one that writes; a dead one is missed by then
+
+
+class AgreedError(InputError):
+    """Bad input of which all processes know, so that all of them stop in order."""
+
+
+class Crew(NamedTuple):
+    """The devices of all processes, and which process this is."""
+
+    mesh: Mesh
+    rank: int
+    count: int
+
+    @property
+    def writes(self) -> bool:
+        """Whether this process writes the results and reports progress: the first one does."""
+        return self.rank == 0
+
+    @property
+    def devices(self) -> int:
+        """Devices of all processes."""
+        return self.mesh.devices.size
+
+    @property
+    def platform(self) -> str:
+        """ "cpu", "gpu", ...; the devices are all of a kind."""
+        return self.mesh.devices.flat[0].platform
+
+    @property
+    def everywhere(self) -> NamedSharding:
+        """Of arrays that each device holds a copy of."""
+        return NamedSharding(self.mesh, PartitionSpec())
+
+    def deal(self, blocks: PyTree) -> PyTree:
+        """Arrays on the host with a leading axis of `devices`, as arrays of which each device holds one row."""
+        dealt = NamedSharding(self.mesh, PartitionSpec(AXIS))
+
+        def place(rows):
+            return jax.make_array_from_callback(rows.shape, dealt, lambda index: rows[index])
+
+        return jax.tree.map(place, blocks)
+
+    @contextlib.contextmanager
+    def agreement(self) -> Iterator[Callable[[str], None]]:
+        """Work on the input that all processes must do alike; gives a function that takes a digest of what was read.
+
+        If it is an `InputError` in any process, or the digests differ, there is one in all of them.
+        """
+        read = []
+        try:
+            yield read.append
+        except InputError as error:
+            self._exchange("")
+            raise AgreedError(str(error)) from error
+        marks = self._exchange("".join(read) or "nothing")
+        failed = [str(rank) for rank, mark in enumerate(marks) if not mark.any()]
+        if failed:
+            raise AgreedError(f"process {failed[0]} of {self.count} refused its input; its own message says why.")
+        if any((mark != marks[0]).any() for mark in marks):
+            raise AgreedError(
+                f"the {self.count} processes read different data or were given different options; start all with the"
+                " same command on the same files."
+            )
+
+    def _exchange(self, text):
+        """A mark of everybody's text, (count, 8); 0 for an empty one."""
+        mark = np.frombuffer(hashlib.sha256(text.encode()).digest()[:8], np.uint8) if text else np.zeros(8, np.uint8)
+        if self.count == 1:
+            return mark[None]
+        return np.asarray(multihost_utils.process_allgather(mark)).reshape(self.count, 8)
+
+
+def alone() -> Crew:
+    """This process with all its devices."""
+    return Crew(Mesh(np.array(jax.devices()), (AXIS,)), 0, 1)
+
+
+@contextlib.contextmanager
+def crew(
+    distributed: bool, coordinator: str | None = None, processes: int | None = None, process: int | None = None
+) -> Iterator[Crew]:
+    """The crew for a block of work; one process unless `distributed`. To be entered before JAX computes anything.
+
+    What ends the block with an error ends the process at once, without waiting for others that wait for it.
+    """
+    if not distributed:
+        if (coordinator, processes, process) != (None, None, None):
+            raise InputError("--coordinator, --processes and --process-id need --distributed.")
+        yield alone()
+        return
+    _meet(coordinator, processes, process)
+    rank, count = jax.process_index(), jax.process_count()
+    try:
+        yield Crew(Mesh(np.array(jax.devices()), (AXIS,)), rank, count)
+    except AgreedError as error:
+        _leave(str(error), rank, count, 2)
+    except BaseException as error:
+        _leave(f"{type(error).__name__}: {error}", rank, count, 1, wait=False)
+        raise
+    jax.distributed.shutdown()
+
+
+def _meet(coordinator, processes, process):
+    if processes is not None and process is not None and not 0 <= process < processes:
+        raise InputError(f"--process-id is {process}; it must be from 0 to {processes - 1}, another for each process.")
+    if coordinator is not None and not (coordinator.rpartition(":")[0] and coordinator.rpartition(":")[2].isdigit()):
+        raise InputError(f'--coordinator is "{coordinator}"; it must be HOST:PORT, the address of process 0.')
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    try:
+        jax.distributed.initialize(
+            coordinator,
+            processes,
+            process,
+            initialization_timeout=_MEETING,
+            heartbeat_timeout_seconds=_HEARTBEAT,
+            shutdown_timeout_seconds=_WRITING,
+        )
+    except ValueError as error:  # neither given nor found
+        raise InputError(
+            "--distributed: no coordinator is known; start hilbo with Slurm's srun or Open MPI's mpirun, or give each"
+            " process --coordinator HOST:PORT, --processes COUNT and --process-id 0, 1, ..."
+        ) from error
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise InputError(f"--distributed: the processes did not meet within {_MEETING} s ({reason}).") from error
+
+
+def _leave(sentence, rank, count, code, wait=True):
+    """Say why, and end this process; an error that only this one knows of ends it without the others' leave."""
+    try:
+        print(f"hilbo: process {rank} of {count}: {sentence}", file=sys.stderr, flush=True)
+        if wait:
+            jax.distributed.shutdown()
+    finally:
+        os._exit(code)
+
+
+def digest(*parts: PyTree) -> str:
+    """A short text that differs where the parts do: records of arrays, texts, numbers."""
+    found = hashlib.sha256()
+    for leaf in jax.tree.leaves(parts):
+        is_array = isinstance(leaf, jax.Array | np.ndarray)
+        found.update(np.ascontiguousarray(leaf).tobytes() if is_array else repr(leaf).encode())
+    found.update(repr(jax.tree.structure(parts)).encode())  # with what records hold besides arrays
+    return found.hexdigest()
