@@ -2,14 +2,12 @@
 against it."""
 
 from functools import cache
-from importlib.resources import files
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
-from datasets import SMALL, Dataset, near_separable, noisy, repeated, repeated_19, separated
+from datasets import SIX, near_separable, noisy, repeated, repeated_19, separated
 from helpers import answers, assert_traces_once, model
 from reference_exact import genz, quadrature, slice_sampled
 
@@ -21,20 +19,6 @@ from hilbo.sobol import scrambled_sobol
 from hilbo.tilting import ordered_box, tilting
 
 CAPACITY = 25
-
-
-def rated() -> Dataset:
-    """A real person's ratings of 20 videos, in five categories."""
-    table = pd.read_csv(str(files("hilbo") / "data" / "video_quality.csv"))
-    own = table[table.participant == "V09"].iloc[:20]
-    x = np.stack([np.log(own.bitrate_kbps / 375) / np.log(20000 / 375), own.height_px / 1080], axis=1)
-    thresholds = (-1.0, -0.3, 0.3, 1.0)
-    return Dataset(
-        "rated", x, own.response.to_numpy() - 1, 4.0, 1.0, thresholds, 0.5, np.random.default_rng(1).random((5, 2))
-    )
-
-
-SETS = (*SMALL, rated)
 
 
 @cache
@@ -50,7 +34,7 @@ def errors_apart(found, expected, *errors):
 # --- right, within the stated errors
 
 
-@pytest.mark.parametrize("make", SETS)
+@pytest.mark.parametrize("make", SIX)
 def test_against_two_other_methods(make):
     """The latent function by elliptical slice sampling, the evidence by SciPy: within three standard errors."""
     data, posterior = make(), fitted(make)
