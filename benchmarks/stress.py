@@ -208,9 +208,9 @@ Made by `python benchmarks/stress.py --write`; `tests/test_stress.py` holds a pa
 Noise 1e-4 to 10, theta 1e-3 to 1e5, prior variance 1e-6 to 1e6, gaps between thresholds 1e-4 to 1e2, 2 to 10
 categories, 0 to 600 answers, 1 to 20 dimensions: a Latin hypercube. Answers independent of x, sensible, of one
 category, conflicting on five points, all on one point, on a line; predictions at asked points and elsewhere. "Hold":
-the certificate holds. "Wrong": it does, but a number is not finite, a variance is outside 0 and the prior's, or a reference
-disagrees (Laplace: the same approximation to 25 digits; the others: quadrature of the exact posterior where all
-points are equal or unconnected). "Worst" errors are over the fits that hold; those of EP are the method's own.
+the certificate holds. "Wrong": it does, but a number is not finite, a variance is outside 0 and the prior's, or a
+reference disagrees (Laplace: the same approximation to 25 digits; the others: quadrature of the exact posterior where
+all points are equal or unconnected). "Worst" errors are over the fits that hold; those of EP are the method's own.
 
 {table}
 
@@ -226,8 +226,8 @@ each other ask for more digits than there are.
 ## Committees
 
 1 to 10,000 experts who explain from 1e-12 to all but 1e-4 of the prior variance (1e-6, 1, 1e6), against 50 digits.
-Relative to the variance, and to the sum of the sizes of the mean's terms; in float32 the variances handed over are those
-that float32 can hold (with `combine_explained` nothing is lost there).
+Relative to the variance, and to the sum of the sizes of the mean's terms; in float32 the variances handed over are
+those that float32 can hold (with `combine_explained` nothing is lost there).
 
 {committees}
 """
