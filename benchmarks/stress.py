@@ -120,6 +120,9 @@ def run(quick: bool) -> dict:
             truth = of_laplace if inference == "laplace" else of_posterior
             start = time.perf_counter()
             found = [fit_case(c, size, inference, np.dtype(dtype).type, t) for c, t in zip(cases, truth, strict=True)]
+            for outcome in found:
+                if outcome.wrong or (dtype == "float64" and not outcome.converged):
+                    print(f"  {outcome.wrong or 'said no'}: {outcome.case.name}", file=sys.stderr)
             before, seconds = results[inference, dtype]
             results[inference, dtype] = before + found, seconds + time.perf_counter() - start
             print(f"{size} {inference} {dtype}: {time.perf_counter() - start:.0f} s", file=sys.stderr)

@@ -81,15 +81,18 @@ def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
     prior_variance = jnp.diagonal(fixed[0])
     largest = jnp.max(prior_variance)
     explained = jnp.sum((root @ fixed[0]) ** 2, axis=0)
+    smallest = jnp.min(jnp.where(fixed[1] > 0, prior_variance - explained, largest))
+    resolution = jnp.finfo(mean.dtype).eps * largest * mean.shape[0] ** 0.5
+    resolved = smallest >= resolution
     certificate = Certificate(
         residual=found.residual,
         tolerance=found.tolerance,
         iterations=found.iterations,
         jitter=found.changed / largest,
         condition=condition,
-        smallest_variance=jnp.min(jnp.where(fixed[1] > 0, prior_variance - explained, largest)),
-        variance_resolution=jnp.finfo(mean.dtype).eps * largest * mean.shape[0] ** 0.5,
-        converged=(found.residual <= found.tolerance) & jnp.isfinite(log_evidence),
+        smallest_variance=smallest,
+        variance_resolution=resolution,
+        converged=(found.residual <= found.tolerance) & jnp.isfinite(log_evidence) & resolved,
     )
     return GaussianPosterior(covariance @ slope, slope, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 
@@ -104,6 +107,8 @@ class _Found(eqx.Module):
     tolerance: Float[Array, ""]
     iterations: Int[Array, ""]
     changed: Float[Array, ""]
+    root: Float[Array, "n n"]
+    """R with R R' = K."""
 
 
 class _Search(eqx.Module):
@@ -132,7 +137,7 @@ def fixed_point(terms, covariance, start, max_steps):
         return (search.steps < max_steps) & ~(search.residual <= search.tolerance) & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
-    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, changed)
+    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, changed, root)
 
 
 def _begin(terms, covariance, root, start):
@@ -254,11 +259,24 @@ def coupling(sites, posterior, variance):
     return follow, spread, matrix
 
 
-def settled(covariance, sites, variance):
-    """At the fixed point, written so that it can be differentiated: S and its kin, and I - K C = I - S T."""
-    inverse, _ = inverse_and_log_determinant(covariance, sites.precision)
-    transfer = jnp.eye(variance.shape[0], dtype=variance.dtype) - covariance @ inverse
-    joint = transfer @ covariance
+@jax.custom_jvp
+def _joint(covariance, precision, root):
+    """S from the root R of K, without the difference K - K C K; its derivative needs none of R's."""
+    del covariance
+    return _posterior_of(root, precision).covariance
+
+
+@_joint.defjvp
+def _joint_jvp(primals, tangents):
+    joint = _joint(*primals)
+    transfer = jnp.eye(joint.shape[0], dtype=joint.dtype) - joint * primals[1][None, :]
+    return joint, transfer @ tangents[0] @ transfer.T - (joint * tangents[1][None, :]) @ joint
+
+
+def settled(covariance, sites, variance, root):
+    """At the fixed point, written so that it can be differentiated: S and its kin, and I - S T."""
+    joint = _joint(covariance, sites.precision, root)
+    transfer = jnp.eye(variance.shape[0], dtype=variance.dtype) - joint * sites.precision[None, :]
     return _Posterior(joint, jnp.diagonal(joint), 1.0 / (1.0 + variance * sites.precision)), transfer
 
 
@@ -290,7 +308,7 @@ def _fixed_point_jvp(primals, tangents):
     terms, covariance, _, _ = primals
     mean, variance, found = fixed_point(*primals)
     sites = sites_of(terms, mean, variance)
-    posterior, transfer = settled(covariance, sites, variance)
+    posterior, transfer = settled(covariance, sites, variance, found.root)
     joint, ratio = posterior.covariance, 1.0 / posterior.left
     follow, spread, matrix = coupling(sites, posterior, variance)
 

@@ -309,6 +309,12 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
                 f"fit: an answer has category {highest}, but the likelihood has {categories - 1} thresholds and so the"
                 f" categories 0 to {categories - 1}; check the answers or the thresholds."
             )
+        if bool(certificate.residual <= certificate.tolerance):
+            raise InferenceError(
+                f"the {sought} was found (residual {float(certificate.residual):.3g}), but the answers leave a variance"
+                " too small a part of the prior's for this precision to tell; use a larger noise, float64, or"
+                " throw=False to look at the certificate."
+            )
         raise InferenceError(
             f"the {sought} was not found: its residual is {float(certificate.residual):.3g} after"
             f" {int(certificate.iterations)} steps and should be at most {float(certificate.tolerance):.3g}; use a"

@@ -88,7 +88,8 @@ def _one_stimulus(q, case):
 
     sd = np.sqrt(case.variance)
     edges = np.array(case.thresholds)
-    low, high = min(-12 * sd, edges[0] - 12 * case.noise), max(12 * sd, edges[-1] + 12 * case.noise)
+    reach = 12 * (sd + case.noise)
+    low, high = min(0.0, edges[0]) - reach, max(0.0, edges[-1]) + reach
     for _ in range(60):
         f = np.linspace(low, high, 801)
         values = log_joint(f)

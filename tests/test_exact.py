@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from datasets import SIX, near_separable, noisy, repeated, repeated_19, separated
+from datasets import SIX, Dataset, near_separable, noisy, repeated, repeated_19, separated
 from helpers import answers, assert_traces_once, model
 from reference_exact import genz, quadrature, slice_sampled
+from stress_cases import reference as one_variable
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, bcm, fit, ordinal_gp
 from hilbo.errors import InputError
@@ -133,6 +134,22 @@ def test_no_weight_exceeds_the_bound(make):
     assert jnp.max(latent.shares) * latent.shares.size * total <= 1 + 1e-9
     assert 0 < total <= 1 and np.all(relative >= 0)
     np.testing.assert_allclose(jnp.sum(latent.shares), 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("noise", [0.5, 0.01])
+def test_conflicting_repeats_under_a_wide_prior(noise):
+    """Ten answers at one point, lowest and highest in turn, a prior sd of 100: against quadrature in one variable."""
+    x, q = np.full((10, 3), 0.4), np.tile([0, 2], 5)
+    case = Dataset("conflicting", x, q, 1.0, 1e4, (-0.5, 0.5), noise, x[:1])
+    posterior = fit(model(case), answers(case), inference="exact")
+    evidence, mean, variance = one_variable(case)
+    certificate = posterior.certificate
+    assert certificate.iterations < 40
+    np.testing.assert_allclose(posterior.log_evidence, evidence, rtol=1e-8, atol=4 * certificate.log_evidence_error)
+    found = posterior.predict(jnp.asarray(x[:1]))
+    errors = posterior.standard_errors(jnp.asarray(x[:1]))
+    np.testing.assert_allclose(found[0], mean[:1], atol=4 * errors[0][0] + 1e-9)
+    np.testing.assert_allclose(found[1], variance[:1], rtol=1e-3, atol=4 * errors[1][0] + 1e-11)
 
 
 def test_draws_have_the_moments_of_the_posterior():
