@@ -14,6 +14,7 @@ _names, __dir__, __all__ = lazy_loader.attach(
         "bcm",
         "config",
         "ep",
+        "ep_corrected",
         "errors",
         "exact",
         "hyperparameters",
@@ -44,6 +45,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors; a test compar
     from hilbo import bcm as bcm
     from hilbo import config as config
     from hilbo import ep as ep
+    from hilbo import ep_corrected as ep_corrected
     from hilbo import errors as errors
     from hilbo import exact as exact
     from hilbo import hyperparameters as hyperparameters

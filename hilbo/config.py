@@ -68,7 +68,7 @@ class _RendererTable(_Table, frozen=True):
     effective_damping: Annotated[tuple[float, float] | None, _text("a list of two numbers", "[10, 80]")] = None
 
 
-Inference = Literal["laplace", "ep", "exact"]
+Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
 
 
 class _GPTable(_Table, frozen=True):
@@ -79,7 +79,7 @@ class _GPTable(_Table, frozen=True):
     variance: Annotated[_Positive, msgspec.Meta(examples=["1.0"])]
     thresholds: Annotated[tuple[float, ...], _text("a list of rising numbers", "[-0.5, 0.5]")]
     noise: Annotated[_Positive, msgspec.Meta(examples=["0.5"])]
-    inference: Annotated[Inference, _text('"laplace", "ep" or "exact"', '"laplace"')] = "laplace"
+    inference: Annotated[Inference, _text('"laplace", "ep", "ep_corrected" or "exact"', '"laplace"')] = "laplace"
 
 
 Acquisition = Literal["ucb", "log_ei", "thompson", "top_category", "mean"]

@@ -37,7 +37,7 @@ from jaxtyping import Array, Float, Int
 from hilbo.gaussian import Certificate, GaussianPosterior, factor, inverse_and_log_determinant, square_root
 from hilbo.linalg import cholesky, one_at_a_time, solve_lower
 
-__all__ = ["Tilted", "ep"]
+__all__ = ["Tilted", "coupling", "ep", "fixed_point", "gaussian", "inverse_of", "settled", "sites_of"]
 
 Tilted = Callable[
     [Float[Array, " n"], Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
@@ -68,7 +68,11 @@ def ep(
     `certificate.converged`. In the certificate, `residual` is the largest mismatch of a mean, in prior standard
     deviations, or of a log variance, whichever is the worse beside its tolerance.
     """
-    mean, variance, found = _fixed_point(terms, covariance, start, max_steps)
+    return gaussian(terms, covariance, *fixed_point(terms, covariance, start, max_steps))
+
+
+def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
+    """The posterior that belongs to the cavities `fixed_point` ended at."""
     _, slope, precision = terms(mean, variance)
     inverse, _ = inverse_and_log_determinant(covariance, precision)
     log_evidence = _log_evidence(terms, covariance, mean, variance)
@@ -77,15 +81,18 @@ def ep(
     prior_variance = jnp.diagonal(fixed[0])
     largest = jnp.max(prior_variance)
     explained = jnp.sum((root @ fixed[0]) ** 2, axis=0)
+    smallest = jnp.min(jnp.where(fixed[1] > 0, prior_variance - explained, largest))
+    resolution = jnp.finfo(mean.dtype).eps * largest * mean.shape[0] ** 0.5
+    resolved = smallest >= resolution
     certificate = Certificate(
         residual=found.residual,
         tolerance=found.tolerance,
         iterations=found.iterations,
         jitter=found.changed / largest,
         condition=condition,
-        smallest_variance=jnp.min(jnp.where(fixed[1] > 0, prior_variance - explained, largest)),
-        variance_resolution=jnp.finfo(mean.dtype).eps * largest * mean.shape[0] ** 0.5,
-        converged=(found.residual <= found.tolerance) & jnp.isfinite(log_evidence),
+        smallest_variance=smallest,
+        variance_resolution=resolution,
+        converged=(found.residual <= found.tolerance) & jnp.isfinite(log_evidence) & resolved,
     )
     return GaussianPosterior(covariance @ slope, slope, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 
@@ -100,6 +107,8 @@ class _Found(eqx.Module):
     tolerance: Float[Array, ""]
     iterations: Int[Array, ""]
     changed: Float[Array, ""]
+    root: Float[Array, "n n"]
+    """R with R R' = K."""
 
 
 class _Search(eqx.Module):
@@ -114,7 +123,7 @@ class _Search(eqx.Module):
 
 
 @eqx.filter_custom_jvp
-def _fixed_point(terms, covariance, start, max_steps):
+def fixed_point(terms, covariance, start, max_steps):
     """Cavity means and variances, and how they were found."""
     root, changed = square_root(covariance)
     largest = jnp.asarray(jnp.inf, covariance.dtype)
@@ -128,7 +137,7 @@ def _fixed_point(terms, covariance, start, max_steps):
         return (search.steps < max_steps) & ~(search.residual <= search.tolerance) & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
-    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, changed)
+    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, changed, root)
 
 
 def _begin(terms, covariance, root, start):
@@ -138,7 +147,7 @@ def _begin(terms, covariance, root, start):
         return jnp.zeros_like(prior), prior
     mean = covariance @ start
     _, _, precision = terms(mean, jnp.zeros_like(mean))
-    posterior = _posterior(root, precision)
+    posterior = _posterior_of(root, precision)
     variance = posterior.variance / posterior.left
     return mean - variance * start, variance
 
@@ -153,7 +162,7 @@ class _Sites(eqx.Module):
     precision_v: Float[Array, " n"]
 
 
-def _sites(terms, mean, variance):
+def sites_of(terms, mean, variance):
     (_, slope, precision), push = jax.linearize(terms, mean, variance)
     ones, zeros = jnp.ones_like(mean), jnp.zeros_like(mean)  # the terms are independent: one tangent serves them all
     _, _, precision_m = push(ones, zeros)
@@ -167,7 +176,7 @@ class _Posterior(eqx.Module):
     left: Float[Array, " n"]  # 1 - t s: the share of the variance that is left when the site joins its cavity
 
 
-def _posterior(root, precision):
+def _posterior_of(root, precision):
     """S = G'G with L G = R', LL' = I + R'TR: a sum of squares, no inverse of K or T."""
     matrix = jnp.eye(root.shape[0], dtype=root.dtype) + (root.T * precision[None, :]) @ root
     half = solve_lower(cholesky(matrix), root.T)
@@ -178,8 +187,8 @@ def _posterior(root, precision):
 def _advance(terms, covariance, root, search):
     """Evaluate the mismatch of the cavities and move them, by Newton's step or a damped update."""
     m, v = search.mean, search.variance
-    sites = _sites(terms, m, v)
-    posterior = _posterior(root, sites.precision)
+    sites = sites_of(terms, m, v)
+    posterior = _posterior_of(root, sites.precision)
     tilted = m + v * sites.slope
     natural = sites.slope + sites.precision * tilted
     matched = posterior.covariance @ natural
@@ -230,13 +239,13 @@ def _newton_step(sites, posterior, variance, apart, wider):
 
     dm = W dv + (1 + v t) apart,      J dv = wider - Q (dt/dm (1 + v t) apart).
     """
-    follow, spread, matrix = _coupling(sites, posterior, variance)
+    follow, spread, matrix = coupling(sites, posterior, variance)
     free = (1.0 + variance * sites.precision) * apart
     dv = _solve(matrix, wider - spread @ (sites.precision_m * free))
     return free + follow @ dv, dv
 
 
-def _coupling(sites, posterior, variance):
+def coupling(sites, posterior, variance):
     """W: how the means follow the cavity variances; Q: how these follow the precisions; J = I + Q (dt/dv + dt/dm W).
 
     The means' equation has the inverse diag(1 + v t) (I - S T); dv_i = -(s_i / left_i s_i)^2 sum_{j != i} S_ij^2 dt_j.
@@ -250,6 +259,27 @@ def _coupling(sites, posterior, variance):
     return follow, spread, matrix
 
 
+@jax.custom_jvp
+def _joint(covariance, precision, root):
+    """S from the root R of K, without the difference K - K C K; its derivative needs none of R's."""
+    del covariance
+    return _posterior_of(root, precision).covariance
+
+
+@_joint.defjvp
+def _joint_jvp(primals, tangents):
+    joint = _joint(*primals)
+    transfer = jnp.eye(joint.shape[0], dtype=joint.dtype) - joint * primals[1][None, :]
+    return joint, transfer @ tangents[0] @ transfer.T - (joint * tangents[1][None, :]) @ joint
+
+
+def settled(covariance, sites, variance, root):
+    """At the fixed point, written so that it can be differentiated: S and its kin, and I - S T."""
+    joint = _joint(covariance, sites.precision, root)
+    transfer = jnp.eye(variance.shape[0], dtype=variance.dtype) - joint * sites.precision[None, :]
+    return _Posterior(joint, jnp.diagonal(joint), 1.0 / (1.0 + variance * sites.precision)), transfer
+
+
 @one_at_a_time
 def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
     return jnp.linalg.solve(matrix, right)
@@ -257,17 +287,17 @@ def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Arra
 
 @jax.custom_jvp
 @one_at_a_time
-def _inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return jnp.linalg.inv(matrix)
 
 
-@_inverse.defjvp
-def _inverse_jvp(primals, tangents):
-    inverse = _inverse(*primals)
+@inverse_of.defjvp
+def _inverse_of_jvp(primals, tangents):
+    inverse = inverse_of(*primals)
     return inverse, -inverse @ tangents[0] @ inverse
 
 
-@_fixed_point.def_jvp
+@fixed_point.def_jvp
 def _fixed_point_jvp(primals, tangents):
     """Both conditions differentiated: with P = I - K C = I - S T,
 
@@ -276,14 +306,11 @@ def _fixed_point_jvp(primals, tangents):
     where da and dt are the changes of slopes and precisions at fixed cavities.
     """
     terms, covariance, _, _ = primals
-    mean, variance, found = _fixed_point(*primals)
-    sites = _sites(terms, mean, variance)
-    inverse, _ = inverse_and_log_determinant(covariance, sites.precision)
-    transfer = jnp.eye(mean.shape[0], dtype=mean.dtype) - covariance @ inverse
-    joint = transfer @ covariance
-    ratio = 1.0 + variance * sites.precision
-    posterior = _Posterior(joint, jnp.diagonal(joint), 1.0 / ratio)
-    follow, spread, matrix = _coupling(sites, posterior, variance)
+    mean, variance, found = fixed_point(*primals)
+    sites = sites_of(terms, mean, variance)
+    posterior, transfer = settled(covariance, sites, variance, found.root)
+    joint, ratio = posterior.covariance, 1.0 / posterior.left
+    follow, spread, matrix = coupling(sites, posterior, variance)
 
     def changes(terms, covariance):
         _, slope, precision = terms(mean, variance)
@@ -294,7 +321,7 @@ def _fixed_point_jvp(primals, tangents):
     # What does not depend on the side that moves has no tangent at all.
     moved, d_precision, widened = (jnp.zeros_like(a) if t is None else t for a, t in zip(at, tangent, strict=True))
     free = ratio * moved
-    dv = _inverse(matrix) @ (widened * ratio**2 - spread @ (sites.precision_m * free + d_precision))
+    dv = inverse_of(matrix) @ (widened * ratio**2 - spread @ (sites.precision_m * free + d_precision))
     return (mean, variance, found), (free + follow @ dv, dv, jax.tree.map(lambda _: None, found))
 
 

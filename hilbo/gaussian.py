@@ -41,7 +41,7 @@ class Certificate(eqx.Module):
     variance_resolution: Float[Array, ""]
     """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
     converged: Bool[Array, ""]
-    """residual <= tolerance."""
+    """residual <= tolerance, a finite log evidence, and no variance below its resolution."""
 
 
 class GaussianPosterior(eqx.Module):

@@ -71,7 +71,7 @@ def maximise_evidence(
     - `gp`: starting values, and the values of what is not learnt.
     - `learn`: which of "theta", "variance", "noise", "thresholds". A `theta` of shape (d,) is learnt per dimension.
     - `weak_priors`: add the log prior above.
-    - `inference`: whose evidence, "laplace" or "ep"; "exact" has no derivatives.
+    - `inference`: whose evidence, "laplace", "ep" or "ep_corrected"; "exact" has no derivatives.
     - `starts`: the search begins at the model's values with theta and noise scaled by powers of 2; the best end wins.
     """
     return _maximise(

@@ -90,15 +90,17 @@ def laplace(
     prior_variance = jnp.diagonal(fixed[0])
     largest = jnp.max(prior_variance)
     variance = prior_variance - jnp.sum((root @ fixed[0]) ** 2, axis=0)
+    smallest = jnp.min(jnp.where(fixed[1] > 0, variance, largest))
+    resolution = jnp.finfo(mode.dtype).eps * largest * mode.shape[0] ** 0.5
     certificate = Certificate(
         residual=residual,
         tolerance=tolerance,
         iterations=iterations,
         jitter=changed / largest,
         condition=condition,
-        smallest_variance=jnp.min(jnp.where(fixed[1] > 0, variance, largest)),
-        variance_resolution=jnp.finfo(mode.dtype).eps * largest * mode.shape[0] ** 0.5,
-        converged=(residual <= tolerance) & jnp.isfinite(log_evidence),
+        smallest_variance=smallest,
+        variance_resolution=resolution,
+        converged=(residual <= tolerance) & jnp.isfinite(log_evidence) & (smallest >= resolution),
     )
     return GaussianPosterior(mode, gradient, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 

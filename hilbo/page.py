@@ -113,6 +113,7 @@ def _memory(mechanics):
 _METHODS = {
     "laplace": "a Gaussian at its mode (Laplace)",
     "ep": "a Gaussian with the moments of expectation propagation",
+    "ep_corrected": "a Gaussian with the moments of expectation propagation, corrected to second order",
     "exact": "sampled exactly (minimax tilting) and enters with its mean and variance",
 }
 _CERTIFICATES = {
@@ -120,6 +121,8 @@ _CERTIFICATES = {
     " deviations (which bounds its distance from the exact mode).",
     "ep": "Certificates: the moments of every fit agree to {worst} (means in prior standard deviations, or logarithms"
     " of variances).",
+    "ep_corrected": "Certificates: the moments of every fit agreed to {worst} (means in prior standard deviations, or"
+    " logarithms of variances) before they were corrected.",
     "exact": "Certificates: the largest standard error of a latent mean (in prior standard deviations) or of a log"
     " evidence is {worst}.",
 }

@@ -69,14 +69,18 @@ def ordered_box(covariance, lower, upper, noise, answered):
 def _intervals(mean, lower, upper, answered):
     """`confined_normal` of every variable; where there is no answer there is no interval, and all is 0."""
     lower = jnp.where(answered, lower, 0.0)
-    parts = jax.vmap(confined_normal)(mean, lower, jnp.where(answered, upper, jnp.inf))
+    parts = jnp.vectorize(confined_normal, signature="(),(),()->(),(),()")(
+        mean, lower, jnp.where(answered, upper, jnp.inf)
+    )
     return tuple(jnp.where(answered, part, 0.0) for part in parts)
 
 
 class _Saddle(eqx.Module):
     x: Float[Array, " n"]
     mu: Float[Array, " n"]
-    step: tuple[Float[Array, " n"], Float[Array, " n"]]
+    gradient: Float[Array, " 2*n"]  # in x and in mu
+    matrix: Float[Array, "2*n 2*n"]  # its derivative
+    step: Float[Array, " 2*n"]
     scale: Float[Array, ""]
     size: Float[Array, ""]  # of the gradient
     psi: Float[Array, ""]
@@ -84,18 +88,22 @@ class _Saddle(eqx.Module):
 
 
 def tilting(box, max_steps=100):
-    """The saddle point of psi by Newton's method: along its direction the gradient's length falls."""
-    zero = jnp.zeros_like(box.lower)
-    infinite = jnp.full((), jnp.inf, zero.dtype)
-    begin = _Saddle(zero, zero, (zero, zero), jnp.ones_like(infinite), infinite, infinite, jnp.zeros((), jnp.int32))
-    small = jnp.finfo(zero.dtype).eps ** 0.5
+    """The saddle point of psi by Newton's method.
+
+    A step is shortened until the simplified step that would follow, by the same matrix, is the shorter one: a test that
+    does not depend on the units of x and mu, which conflicting repeats stretch by sd / noise (Deuflhard 2011, 3.3).
+    """
+    n = box.lower.shape[0]
+    begin = _saddle(box, _expected(box), jnp.zeros_like(box.lower))
+    small = jnp.finfo(box.lower.dtype).eps ** 0.5
 
     def unfinished(state):
         return (state.count < max_steps) & (state.size > small) & (state.scale > 1e-8)
 
     def advance(state):
-        trial = _saddle(box, *(at + state.scale * by for at, by in zip((state.x, state.mu), state.step, strict=True)))
-        better = trial.size <= (1.0 - 1e-4 * state.scale) * state.size
+        trial = _saddle(box, state.x + state.scale * state.step[:n], state.mu + state.scale * state.step[n:])
+        following = jnp.linalg.norm(_solve(state.matrix, trial.gradient))
+        better = following <= (1.0 - 0.25 * state.scale) * jnp.linalg.norm(state.step)
         refused = eqx.tree_at(lambda s: s.scale, state, 0.5 * state.scale)
         taken = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, refused)
         return eqx.tree_at(lambda s: s.count, taken, state.count + 1)
@@ -104,18 +112,30 @@ def tilting(box, max_steps=100):
     return Tilt(end.mu, end.psi, end.size, end.count)
 
 
+def _expected(box):
+    """x, each at its expected value given those before it, without tilting: inside the box, and psi flat in mu."""
+
+    def one(x, k):
+        shift = box.below[k] @ x
+        value = _intervals(shift, box.lower[k], box.upper[k], box.answered[k])[1]
+        return x.at[k].set(value), None
+
+    return jax.lax.scan(one, jnp.zeros_like(box.lower), jnp.arange(box.lower.shape[0]))[0]
+
+
 def _saddle(box, x, mu):
-    """psi, the length of its gradient and Newton's direction at a point; a and b are its gradients in x and in mu."""
+    """psi, its gradient, in x and in mu, and Newton's step at a point."""
     shift = box.below @ x + mu
     log_mass, mean, curvature = _intervals(shift, box.lower, box.upper, box.answered)
     a, b = box.below.T @ mean - mu, mu - x + mean
     eye = jnp.eye(x.shape[0], dtype=x.dtype)
     bent = curvature[:, None] * box.below
     matrix = jnp.block([[-box.below.T @ bent, -eye - bent.T], [-eye - bent, jnp.diag(1.0 - curvature)]])
-    step = -_solve(matrix, jnp.concatenate([a, b]))
+    gradient = jnp.concatenate([a, b])
+    step = -_solve(matrix, gradient)
     psi = jnp.sum(0.5 * mu**2 - mu * x + log_mass)
-    size = jnp.sqrt(a @ a + b @ b)
-    return _Saddle(x, mu, (step[: len(x)], step[len(x) :]), jnp.ones_like(psi), size, psi, jnp.zeros((), jnp.int32))
+    size = jnp.linalg.norm(gradient)
+    return _Saddle(x, mu, gradient, matrix, step, jnp.ones_like(psi), size, psi, jnp.zeros((), jnp.int32))
 
 
 @one_at_a_time

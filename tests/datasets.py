@@ -6,12 +6,25 @@ Pure NumPy; every call gives the same bits. x lies in the unit cube, q counts fr
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-__all__ = ["SMALL", "Dataset", "hostile_cases", "near_separable", "noisy", "repeated", "repeated_19", "separated"]
+__all__ = [
+    "SIX",
+    "SMALL",
+    "Dataset",
+    "hostile_cases",
+    "near_separable",
+    "noisy",
+    "rated",
+    "repeated",
+    "repeated_19",
+    "separated",
+]
 
+RATINGS = Path(__file__).parents[1] / "hilbo" / "data" / "video_quality.csv"
 PEAK = np.array([0.35, 0.6, 0.4])
 
 
@@ -91,7 +104,18 @@ def repeated_19() -> Dataset:
     return Dataset("repeated_19", x[order], q[order], 30.0, 1.0, (-0.5, 0.5), 0.5, _x_new(rng, x))
 
 
+def rated() -> Dataset:
+    """A real person's ratings of 20 videos, in five categories."""
+    table = np.genfromtxt(RATINGS, delimiter=",", names=True, dtype=None, encoding="utf-8")
+    own = table[table["participant"] == "V09"][:20]
+    x = np.stack([np.log(own["bitrate_kbps"] / 375) / np.log(20000 / 375), own["height_px"] / 1080], axis=1)
+    thresholds = (-1.0, -0.3, 0.3, 1.0)
+    x_new = np.random.default_rng(1).random((5, 2))
+    return Dataset("rated", x, own["response"] - 1, 4.0, 1.0, thresholds, 0.5, x_new)
+
+
 SMALL: tuple[Callable[[], Dataset], ...] = (separated, noisy, near_separable, repeated, repeated_19)
+SIX = (*SMALL, rated)
 
 NOISES = (1e-3, 1e-2, 0.1, 0.5, 10.0)
 THETAS = (1e-2, 1.0, 30.0, 1e4)

@@ -1,4 +1,5 @@
-"""Tools that tests share: derivatives against finite differences, and how often a function is compiled."""
+"""Tools that tests share: derivatives against finite differences, how often a function is compiled, and fits of the
+data sets with what is wrong about them."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -7,8 +8,12 @@ from contextlib import contextmanager
 import jax
 import jax.numpy as jnp
 import numpy as np
+from datasets import Dataset
 
-__all__ = ["assert_traces_once", "check_grad"]
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo.ordinal_gp import InferenceError
+
+__all__ = ["answers", "assert_traces_once", "check_grad", "complaint", "model"]
 
 
 def check_grad(fn: Callable, *args, rtol: float = 1e-6, atol: float = 0.0) -> None:
@@ -72,3 +77,40 @@ def assert_traces_once(*functions: Callable) -> Iterator[None]:
     for name in (function.__name__ for function in functions):
         counts = (_traced[name] - traced[name], _compiled[name] - compiled[name])
         assert counts == (1, 1), f"{name}: traced {counts[0]} times and compiled {counts[1]} times, not once"
+
+
+def model(data: Dataset, dtype: type = np.float64) -> OrdinalGP:
+    """The model with the hyperparameters of a data set."""
+    likelihood = OrdinalProbit(np.asarray(data.thresholds, dtype), dtype(data.noise))
+    return OrdinalGP(RBF(np.asarray(data.theta, dtype), dtype(data.variance)), likelihood)
+
+
+def answers(data: Dataset, capacity: int = 25, dtype: type = np.float64) -> Trials:
+    """Its answers, padded."""
+    return Trials.from_arrays(data.x.astype(dtype), data.q, capacity)
+
+
+def complaint(case: Dataset, dtype: type, inference: str = "laplace") -> str:
+    """What is wrong with a fit of the case; nothing if it converged to sense, or failed and said so in float32."""
+    gp, trials = model(case, dtype), answers(case, 25 if len(case.q) <= 25 else 200, dtype)
+    posterior = fit(gp, trials, inference=inference, throw=False)
+    certificate = posterior.certificate
+    if not certificate.converged:
+        try:
+            fit(gp, trials, inference=inference)
+        except InferenceError as error:
+            wrong = "" if f"{float(certificate.residual):.3g}" in str(error) else f"a message without figures: {error}"
+        else:
+            wrong = "not converged, and not raised"
+        return wrong or ("not converged in float64" if dtype is np.float64 else "")
+    mean, variance = map(np.asarray, posterior.predict(jnp.asarray(case.x_new.astype(dtype))))
+    slack = 10 * float(certificate.variance_resolution)
+    checks = {
+        "a value that is not finite": all(np.all(np.isfinite(v)) for v in (mean, variance, posterior.log_evidence)),
+        "a variance outside 0 and the prior": np.all((variance >= -slack) & (variance <= case.variance * (1 + 1e-6))),
+        "a positive log evidence": posterior.log_evidence <= slack,
+        "a residual above its tolerance": certificate.residual <= certificate.tolerance,
+        "a residual that bounds nothing": certificate.residual <= np.finfo(dtype).eps ** 0.25,
+        "jitter": certificate.jitter <= (1e-13 if dtype is np.float64 else 2e-4),
+    }
+    return ", ".join(name for name, good in checks.items() if not good)

@@ -171,7 +171,7 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
         "[0.5]",
         "28: gp.thresholds has 1 numbers, it must have one fewer than the 3 responses.",
     ),
-    ('inference = "laplace"', 'inference = "vb"', '30: gp.inference is "vb", it must be "laplace", "ep" or "exact"; '),
+    ('inference = "laplace"', 'inference = "vb"', '30: gp.inference is "vb", it must be "laplace", "ep", "ep_correct'),
     ('"similar", ', '"close", ', '4: study.responses is ["different", "close", "close"], it must not have one label '),
     ('["different", "similar", "close"]', '["close"]', '4: study.responses is ["close"], it must be a list of two '),
     ('"memory foam"', '""', '3: study.name is "", it must be a text; write for example name = "memory foam".'),

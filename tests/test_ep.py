@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from datasets import SMALL, hostile_cases, near_separable, noisy, repeated, repeated_19, separated
-from helpers import assert_traces_once
+from helpers import answers, assert_traces_once, complaint, model
 from jaxtyping import Array
 from reference_ep import textbook_ep, tilted_moments
 
@@ -16,19 +16,8 @@ from hilbo.gaussian import mean_and_explained
 from hilbo.kernels import gram
 from hilbo.ordinal_gp import InferenceError
 
-CAPACITY = 25
 
-
-def model(data, dtype=np.float64) -> OrdinalGP:
-    likelihood = OrdinalProbit(np.asarray(data.thresholds, dtype), dtype(data.noise))
-    return OrdinalGP(RBF(np.asarray(data.theta, dtype), dtype(data.variance)), likelihood)
-
-
-def answers(data, capacity=CAPACITY, dtype=np.float64) -> Trials:
-    return Trials.from_arrays(data.x.astype(dtype), data.q, capacity)
-
-
-def by_ep(data, capacity=CAPACITY, **options):
+def by_ep(data, capacity=25, **options):
     return fit(model(data), answers(data, capacity), inference="ep", **options)
 
 
@@ -55,10 +44,10 @@ def test_against_the_textbook(make):
 @pytest.mark.parametrize("noise", [0.05, 0.5, 3.0])
 def test_one_answer_is_exact(category, noise):
     likelihood = OrdinalProbit((-0.5, 0.7), noise)
-    trials = Trials.from_arrays(np.array([[0.3]]), np.array([category]), CAPACITY)
+    trials = Trials.from_arrays(np.array([[0.3]]), np.array([category]), 25)
     posterior = fit(OrdinalGP(RBF(5.0, 1.7), likelihood), trials, inference="ep")
     edges = (-np.inf, -0.5, 0.7, np.inf)
-    log_z, mean, variance = tilted_moments(0.0, 1.7, edges[category], edges[category + 1], noise)
+    log_z, mean, variance, _ = tilted_moments(0.0, 1.7, edges[category], edges[category + 1], noise)
     np.testing.assert_allclose(posterior.log_evidence, log_z, rtol=1e-10)
     np.testing.assert_allclose(posterior.predict(trials.x[:1]), [[mean], [variance]], rtol=0, atol=1e-10)
     blurred = OrdinalProbit((-0.5, 0.7), np.sqrt(noise**2 + 1.7))
@@ -193,7 +182,7 @@ def test_a_batch_equals_a_loop():
 
 def test_no_answers_give_exactly_the_prior():
     gp, x = OrdinalGP(RBF(3.0, 1.7), model(separated()).likelihood), jnp.asarray(separated().x_new)
-    posterior = fit(gp, Trials.empty(CAPACITY, 3), inference="ep")
+    posterior = fit(gp, Trials.empty(25, 3), inference="ep")
     mean, variance = posterior.predict(x)
     assert posterior.log_evidence == 0.0
     np.testing.assert_array_equal(mean, np.zeros(len(x)))
@@ -220,7 +209,7 @@ def test_a_warm_start_changes_the_steps_and_not_the_result(make):
         assert_same(by_ep(data, start=start), cold, rtol=1e-10)
     warm = by_ep(data, start=cold.latent.weights)
     assert warm.certificate.iterations < cold.certificate.iterations
-    wild = 1e3 * jnp.asarray(np.random.default_rng(8).standard_normal(CAPACITY))
+    wild = 1e3 * jnp.asarray(np.random.default_rng(8).standard_normal(25))
     assert_same(by_ep(data, start=jnp.where(cold.trials.mask, wild, 0.0)), cold, rtol=1e-10)
 
 
@@ -242,35 +231,15 @@ def test_float32_against_float64(make):
 HOSTILE = [case for case in hostile_cases() if len(case.q) <= 25]
 
 
-def complaint(case, dtype=np.float64) -> str:
-    posterior = fit(model(case, dtype), answers(case, dtype=dtype), inference="ep", throw=False)
-    certificate = posterior.certificate
-    if not certificate.converged:
-        return "not converged" if dtype is np.float64 else ""
-    mean, variance = map(np.asarray, posterior.predict(jnp.asarray(case.x_new.astype(dtype))))
-    slack = 10 * float(certificate.variance_resolution)
-    checks = {
-        "a value that is not finite": all(np.all(np.isfinite(v)) for v in (mean, variance, posterior.log_evidence)),
-        "a variance outside 0 and the prior": np.all((variance >= -slack) & (variance <= case.variance * (1 + 1e-6))),
-        "a positive log evidence": posterior.log_evidence <= slack,
-        "a residual above its tolerance": certificate.residual <= certificate.tolerance,
-    }
-    return ", ".join(name for name, good in checks.items() if not good)
-
-
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_a_part_of_the_hostile_grid(dtype):
-    assert [(case.name, wrong) for case in HOSTILE[::4] if (wrong := complaint(case, dtype))] == []
+    assert [(case.name, wrong) for case in HOSTILE[::4] if (wrong := complaint(case, dtype, "ep"))] == []
 
 
 @pytest.mark.deep
 def test_the_whole_hostile_grid():
-    cases = [case for case in hostile_cases() if len(case.q) == 200]
-    assert [(case.name, wrong) for case in HOSTILE if (wrong := complaint(case))] == []
-    for case in cases:
-        posterior = fit(model(case), answers(case, 200), inference="ep", throw=False)
-        assert posterior.certificate.converged, case.name
-        assert np.isfinite(posterior.log_evidence), case.name
+    for case in hostile_cases():
+        assert (case.name, complaint(case, np.float64, "ep")) == (case.name, "")
 
 
 @pytest.mark.parametrize("noise", [1e-3, 1e-4])
@@ -278,7 +247,7 @@ def test_conflicting_repeats_at_tiny_noise(noise):
     """Ten answers on one stimulus, half lowest, half highest: the posterior is a normal around the middle."""
     x, q = np.full((10, 3), 0.4), np.tile([0, 2], 5)
     gp = OrdinalGP(RBF(30.0, 1.0), OrdinalProbit((-0.5, 0.5), noise))
-    posterior = fit(gp, Trials.from_arrays(x, q, CAPACITY), inference="ep")
+    posterior = fit(gp, Trials.from_arrays(x, q, 25), inference="ep")
     mean, variance = posterior.predict(jnp.asarray(x[:1]))
     # -log p(f) = 5 (1 + 1/4 + f^2 ...) / noise^2: both edges are half a unit away, ten curvatures 1 / noise^2
     rounding = 1e-16 * np.sum(np.abs(posterior.latent.weights))

@@ -2,16 +2,15 @@
 against it."""
 
 from functools import cache
-from importlib.resources import files
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pandas as pd
 import pytest
-from datasets import SMALL, Dataset, near_separable, noisy, repeated, repeated_19, separated
-from helpers import assert_traces_once
+from datasets import SIX, Dataset, near_separable, noisy, repeated, repeated_19, separated
+from helpers import answers, assert_traces_once, model
 from reference_exact import genz, quadrature, slice_sampled
+from stress_cases import reference as one_variable
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, bcm, fit, ordinal_gp
 from hilbo.errors import InputError
@@ -21,28 +20,6 @@ from hilbo.sobol import scrambled_sobol
 from hilbo.tilting import ordered_box, tilting
 
 CAPACITY = 25
-
-
-def rated() -> Dataset:
-    """A real person's ratings of 20 videos, in five categories."""
-    table = pd.read_csv(str(files("hilbo") / "data" / "video_quality.csv"))
-    own = table[table.participant == "V09"].iloc[:20]
-    x = np.stack([np.log(own.bitrate_kbps / 375) / np.log(20000 / 375), own.height_px / 1080], axis=1)
-    thresholds = (-1.0, -0.3, 0.3, 1.0)
-    return Dataset(
-        "rated", x, own.response.to_numpy() - 1, 4.0, 1.0, thresholds, 0.5, np.random.default_rng(1).random((5, 2))
-    )
-
-
-SETS = (*SMALL, rated)
-
-
-def model(data) -> OrdinalGP:
-    return OrdinalGP(RBF(data.theta, data.variance), OrdinalProbit(data.thresholds, data.noise))
-
-
-def answers(data, capacity=CAPACITY) -> Trials:
-    return Trials.from_arrays(data.x, data.q, capacity)
 
 
 @cache
@@ -58,7 +35,7 @@ def errors_apart(found, expected, *errors):
 # --- right, within the stated errors
 
 
-@pytest.mark.parametrize("make", SETS)
+@pytest.mark.parametrize("make", SIX)
 def test_against_two_other_methods(make):
     """The latent function by elliptical slice sampling, the evidence by SciPy: within three standard errors."""
     data, posterior = make(), fitted(make)
@@ -80,7 +57,7 @@ def test_against_quadrature(make):
     assert errors_apart(posterior.log_evidence, evidence, posterior.certificate.log_evidence_error) < 3
     found = (*posterior.predict(x), posterior.class_probabilities(x))
     for value, target, error in zip(found, expected, posterior.standard_errors(x), strict=True):
-        assert np.max(errors_apart(value, target, error)) < 3.5
+        assert np.max(errors_apart(value, target, error)) < 3
         assert np.max(error) < 1e-3
 
 
@@ -123,7 +100,7 @@ def test_one_answer_by_hand():
         by_ep = fit(gp, trials, inference="ep")
         found, errors = posterior.predict(trials.x[:1]), posterior.standard_errors(trials.x[:1])
         for value, expected, error in zip(found, by_ep.predict(trials.x[:1]), errors, strict=False):
-            assert errors_apart(value, expected, error) < 3.5 and error < 1e-3
+            assert errors_apart(value, expected, error) < 3 and error < 1e-3
 
 
 # --- what the approximations miss (docs/inference.md has the table)
@@ -159,13 +136,29 @@ def test_no_weight_exceeds_the_bound(make):
     np.testing.assert_allclose(jnp.sum(latent.shares), 1.0, rtol=1e-12)
 
 
+@pytest.mark.parametrize("noise", [0.5, 0.01])
+def test_conflicting_repeats_under_a_wide_prior(noise):
+    """Ten answers at one point, lowest and highest in turn, a prior sd of 100: against quadrature in one variable."""
+    x, q = np.full((10, 3), 0.4), np.tile([0, 2], 5)
+    case = Dataset("conflicting", x, q, 1.0, 1e4, (-0.5, 0.5), noise, x[:1])
+    posterior = fit(model(case), answers(case), inference="exact")
+    evidence, mean, variance = one_variable(case)
+    certificate = posterior.certificate
+    assert certificate.iterations < 40
+    np.testing.assert_allclose(posterior.log_evidence, evidence, rtol=1e-8, atol=4 * certificate.log_evidence_error)
+    found = posterior.predict(jnp.asarray(x[:1]))
+    errors = posterior.standard_errors(jnp.asarray(x[:1]))
+    np.testing.assert_allclose(found[0], mean[:1], atol=4 * errors[0][0] + 1e-9)
+    np.testing.assert_allclose(found[1], variance[:1], rtol=1e-3, atol=4 * errors[1][0] + 1e-11)
+
+
 def test_draws_have_the_moments_of_the_posterior():
     data, posterior = near_separable(), fitted(near_separable)
     x = jnp.asarray(data.x_new)
     draws = posterior.draw(jax.random.key(3), x, 20_000)
     mean, variance = posterior.predict(x)
     assert draws.shape == (20_000, len(x)) and np.all(np.isfinite(draws))
-    assert np.max(errors_apart(np.mean(draws, axis=0), mean, np.std(draws, axis=0) / np.sqrt(20_000))) < 3.5
+    assert np.max(errors_apart(np.mean(draws, axis=0), mean, np.std(draws, axis=0) / np.sqrt(20_000))) < 3
     np.testing.assert_allclose(np.var(draws, axis=0), variance, rtol=0.05)
     # asked twice at one point, a draw gives one value: it is a function
     twice = posterior.draw(jax.random.key(3), jnp.stack([x[1], x[1]]), 50)

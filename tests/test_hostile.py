@@ -1,7 +1,7 @@
 """Hyperparameters and answers that nobody should choose: every fit converges, or says that it did not.
 
 Noise 1e-3 to 10, theta 1e-2 to 1e4, variance 1e-3 to 1e4; one category only, conflicting repeats, answers independent
-of x; 0, 1, 25 and 200 of them. The table of the whole grid is docs/hostile.md, made by benchmarks/hostile.py.
+of x; 0, 1, 25 and 200 of them. Wider ranges and the other inferences: tests/test_stress.py, docs/stress.md.
 """
 
 from itertools import product
@@ -10,46 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from datasets import hostile_cases
+from helpers import answers, complaint, model
 from reference_laplace import mpmath_laplace
 
-from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
-from hilbo.ordinal_gp import InferenceError
+from hilbo import fit
 
 CASES = list(hostile_cases())
 WITH_25 = [case for case in CASES if len(case.q) == 25]
 NASTIEST = [case for case in WITH_25 if case.noise == 1e-3 and case.theta == 1e-2 and case.variance == 1e4]
-
-
-def fitted(case, dtype=np.float64, throw=False):
-    likelihood = OrdinalProbit(np.asarray(case.thresholds, dtype), dtype(case.noise))
-    gp = OrdinalGP(RBF(dtype(case.theta), dtype(case.variance)), likelihood)
-    capacity = 25 if len(case.q) <= 25 else 200
-    return fit(gp, Trials.from_arrays(case.x.astype(dtype), case.q, capacity), throw=throw)
-
-
-def complaint(case, dtype) -> str:
-    """What is wrong with a fit of the case; nothing if it converged to sense, or failed and said so."""
-    posterior = fitted(case, dtype)
-    certificate = posterior.certificate
-    if not certificate.converged:
-        try:
-            fitted(case, dtype, throw=True)
-        except InferenceError as error:
-            wrong = "" if f"{float(certificate.residual):.3g}" in str(error) else f"a message without figures: {error}"
-        else:
-            wrong = "not converged, and not raised"
-        return wrong or ("not converged in float64" if dtype is np.float64 else "")
-    mean, variance = map(np.asarray, posterior.predict(jnp.asarray(case.x_new.astype(dtype))))
-    slack = 10 * float(certificate.variance_resolution)
-    checks = {
-        "a value that is not finite": all(np.all(np.isfinite(v)) for v in (mean, variance, posterior.log_evidence)),
-        "a variance outside 0 and the prior": np.all((variance >= -slack) & (variance <= case.variance * (1 + 1e-6))),
-        "a positive log evidence": posterior.log_evidence <= slack,
-        "a residual above its tolerance": certificate.residual <= certificate.tolerance,
-        "a residual that bounds nothing": certificate.residual <= np.finfo(dtype).eps ** 0.25,
-        "jitter": certificate.jitter <= (1e-13 if dtype is np.float64 else 2e-4),
-    }
-    return ", ".join(name for name, good in checks.items() if not good)
 
 
 def complaints(cases, dtype) -> list[str]:
@@ -72,7 +40,7 @@ def test_the_whole_grid(dtype):
 def check_against_digits(case):
     """|mean error| <= sqrt(k**) (residual + distance to the mode) <= 2 sqrt(k**) residual, and rounding."""
     exact = mpmath_laplace(*case.problem(), digits=25)
-    posterior = fitted(case)
+    posterior = fit(model(case), answers(case), throw=False)
     assert posterior.certificate.converged, case.name
     mean, variance = posterior.predict(jnp.asarray(case.x_new))
     weight = float(jnp.sum(jnp.abs(posterior.latent.weights)))
