@@ -25,7 +25,8 @@ __all__ = ["Design", "design", "fit", "information", "log_likelihood", "scores"]
 
 _STEPS, _HALVINGS = 200, 60
 _LONGEST = 10.0  # change of an edge in one step
-_CLOSE = 1e-14  # squared Newton step in standard errors: the step that follows it is below rounding
+_NEAR = 1e-6  # squared Newton step in standard errors: below it, rounding of the likelihood may hide the rise
+_CLOSE = 1e-14  # the same: the step that follows it is below rounding
 
 
 class Design(eqx.Module):
@@ -121,15 +122,19 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"
     `start` must have its edges in order, and a maximum must exist (`hilbo.separation`) and be unique. Raises
     `RuntimeError` if it is not reached, which under these conditions has not been seen.
     """
-    theta, value = start, log_likelihood(model, start)
+    theta = start
     for _ in range(_STEPS):
         gradient = scores(model, theta).sum(axis=0)
         # Far from the maximum the information may be singular to rounding: hence no plain solve.
         step = np.linalg.lstsq(information(model, theta).sum(axis=0), gradient, rcond=None)[0]
-        if gradient @ step <= _CLOSE:
+        promised = gradient @ step
+        if promised <= _CLOSE:
             return theta + step
-        step = step * min(1.0, _LONGEST / max(np.abs(rows @ step).max() for rows in (model.upper, model.lower)))
-        theta, value, moved = _climb(model, theta, value, step, gradient @ step)
+        if promised <= _NEAR:
+            theta = theta + step
+            continue
+        share = min(1.0, _LONGEST / max(np.abs(rows @ step).max() for rows in (model.upper, model.lower)))
+        theta, moved = _climb(model, theta, share * step, share * promised)
         if not moved:
             break
     raise RuntimeError(
@@ -137,10 +142,10 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Float[np.ndarray, " k"
     )
 
 
-def _climb(model, theta, value, step, promised):
+def _climb(model, theta, step, promised):
+    value = log_likelihood(model, theta)
     for halving in range(_HALVINGS):
         share = 0.5**halving
-        found = log_likelihood(model, theta + share * step)
-        if found >= value + 1e-4 * share * promised:
-            return theta + share * step, found, True
-    return theta, value, False
+        if log_likelihood(model, theta + share * step) >= value + 1e-4 * share * promised:
+            return theta + share * step, True
+    return theta, False

@@ -31,6 +31,9 @@ __all__ = ["FEW_CLUSTERS", "Clusters", "Errors", "Regression", "regress"]
 Clusters = Mapping[str, Any] | pd.DataFrame  # a column for each way, n entries each
 FEW_CLUSTERS = 12
 _NO_SPREAD = 1e-8  # of the iid error: clusters that agree to rounding
+_NOTHING_LEFT = (
+    "nothing is left to estimate an error from (clusters agree exactly, or the two-way variance is negative)"
+)
 
 
 class Regression(eqx.Module):
@@ -84,30 +87,31 @@ def regress(
     labels = _labels(clusters, n)
     _check_independent(model, names, nuisance)
     found = separation(model)
-    warnings = [] if not found.infinite.any() else [_separated(names, found, nuisance)]
+    warnings = [_separated(names, found, nuisance)] if found.infinite.any() else []
     rows, covariances, log_likelihood = [], {}, 0.0
     if not found.certain.all():
         rest, keep, begin = decisive(model, start, found.certain)
         theta = ordered_logit.fit(rest, begin)
         log_likelihood = ordered_logit.log_likelihood(rest, theta)
-        kept = {name: codes[~found.certain] for name, codes in labels.items()}
-        kinds, said = _kinds(rest, theta, kept)
-        warnings += said
-        finite = np.flatnonzero(~found.infinite[keep])
-        shown = [np.array(names)[keep][j] for j in finite]
-        warnings += _below_iid(kinds, finite, shown)
-        for kind in kinds:
-            covariances[kind.name] = pd.DataFrame(kind.covariance.matrix[np.ix_(finite, finite)], shown, shown)
-            rows += [_wald(name, theta[j], j, kind, kinds[0], level) for j, name in zip(finite, shown, strict=True)]
+        kinds, said = _kinds(rest, theta, {name: codes[~found.certain] for name, codes in labels.items()})
+        finite = {j: names[i] for j, i in enumerate(np.flatnonzero(keep)) if not found.infinite[i]}
+        warnings += [*said, *_below_iid(kinds, finite)]
+        covariances = {kind.name: _covariance(kind, finite) for kind in kinds}
+        rows += [_wald(term, theta[j], j, kind, kinds[0], level) for j, term in finite.items() for kind in kinds]
         if bootstrap:
-            tested = [j for j in finite if np.flatnonzero(keep)[j] < len(names) - nuisance]
-            rows += _bootstrapped(rest, theta, kinds, {j: np.array(names)[keep][j] for j in tested}, level, seed)
+            tested = {j: term for j, term in finite.items() if term in names[: len(names) - nuisance]}
+            rows += _bootstrapped(rest, theta, kinds, tested, level, seed)
     rows += [
         _profiled(model, j, names[j], start, found, level, j >= len(names) - nuisance)
-        for j in np.flatnonzero(found.infinite)
+        for j in np.flatnonzero(found.infinite).tolist()
     ]
     counts = {name: len(np.unique(codes)) for name, codes in labels.items()}
     return Regression(_tidy(rows, names, nuisance), covariances, log_likelihood, n, counts, tuple(warnings))
+
+
+def _covariance(kind, terms):
+    shown = list(terms.values())
+    return pd.DataFrame(kind.covariance.matrix[np.ix_(list(terms), list(terms))], shown, shown)
 
 
 def _labels(clusters, n):
@@ -160,14 +164,14 @@ def _kinds(model, theta, labels):
     return kinds, warnings
 
 
-def _below_iid(kinds, finite, names):
+def _below_iid(kinds, terms):
     """A sentence for each kind of clustered error that is below the iid one in some coefficient."""
     reference, said = np.sqrt(np.diag(kinds[0].covariance.matrix)), []
     for kind in kinds[1:]:
         errors = np.sqrt(np.diag(kind.covariance.matrix))
         below = [
             f"{name} ({errors[j]:.3g} against {reference[j]:.3g})"
-            for j, name in zip(finite, names, strict=True)
+            for j, name in terms.items()
             if errors[j] < reference[j]
         ]
         if below:
@@ -182,7 +186,7 @@ def _wald(term, estimate, j, kind, reference, level):
     error, least = (float(np.sqrt(c.matrix[j, j])) for c in (kind.covariance, reference.covariance))
     dof = kind.covariance.degrees_of_freedom
     if error <= _NO_SPREAD * least:
-        assumes = f"{kind.assumes}; all clusters agree exactly, which leaves nothing to estimate an error from"
+        assumes = f"{kind.assumes}; {_NOTHING_LEFT}"
         return _row(term, estimate, kind.name, assumes, dof=dof)
     reach = float(stats.t.ppf((1 + level) / 2, dof)) * error
     p_value = float(2 * stats.t.sf(abs(estimate) / error, dof))
@@ -209,6 +213,7 @@ def _bootstrapped(model, theta, kinds, tested, level, seed):
         for j, term in tested.items():
             name = kind.name.replace("clustered", "wild bootstrap")
             if errors[j] <= _NO_SPREAD * least[j]:
+                rows.append(_row(term, theta[j], name, f"{kind.assumes}; {_NOTHING_LEFT}"))
                 continue
             low, high = wild_bootstrap.interval(test, j, level)
             p_value = wild_bootstrap.p_value(test, j, 0.0)
