@@ -4,8 +4,9 @@
 
 Classes: a logistic variable with the set's level, a participant's effect and a participant's effect on the set; 12
 comparisons each. Preferences: effects of participants and of 24 individual sets, each pair of them shown twice. The
-truth is what endless participants would give: the logit of the mean probability, or the ordered logit that is nearest to the mean
-probabilities, by Gauss-Hermite quadrature. --write puts the table into docs/statistics.md; 20 minutes.
+truth is what endless participants would give: the logit of the mean probability, or the ordered logit that is nearest
+to the mean probabilities, by Gauss-Hermite quadrature. --alike adds participants without effects of their own. --write
+puts the table into docs/statistics.md; five minutes.
 """
 
 import argparse
@@ -21,14 +22,18 @@ from scipy.special import expit, logit
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
+from hilbo.cluster_robust import ways  # noqa: E402
+from hilbo.ordered_logit import design  # noqa: E402
 from hilbo.preferences import rate  # noqa: E402
 from hilbo.statistics import binary_logit, ordered_logit  # noqa: E402
+from hilbo.wild_bootstrap import p_value, wild  # noqa: E402
 
 # Levels of best, mid, worst, and edges between close, similar, different: with these effects, shares like the paper's.
 LEVELS, EDGES = np.array([-4.8, 0.0, 3.4]), np.array([-2.0, 2.1])
 PERSON, PERSON_SET = 0.8, 0.6  # sd in logits
 JUDGE, SET, EFFECT = 0.6, 0.4, 1.05  # table IV: sd of participants and of sets, and the preference
 SHOWN, SETS, TWICE = 8, 24, 2
+WIDTHS = 100  # studies whose bootstrap intervals are found; of the others only whether they hold the truth
 NODES, WEIGHTS = hermegauss(60)
 WEIGHTS = WEIGHTS / WEIGHTS.sum()
 START, END = "<!-- coverage -->", "<!-- end of coverage -->"
@@ -72,43 +77,63 @@ def preferences(rng, participants, scale):
     return won.ravel(), pd.DataFrame({"participant": who.ravel(), "set": which.ravel()})
 
 
-def study(rng, participants, scale, truths):
-    """Every interval of one study: table, term, errors, whether it holds the truth, its width."""
+def study(rng, participants, scale, truths, widths):
+    """Every interval of one study: table, term, errors, whether it holds the truth, its width, whether separated."""
     category, shown, people = classes(rng, participants, scale)
     best, worst = (shown == 0).astype(float), (shown == 2).astype(float)
     won, pairs = preferences(rng, participants, scale)
+    one = np.ones(len(category))
+    designs = {
+        "II": (design((category == 0).astype(int), np.column_stack([one, best]), np.zeros((1, 0))), people),
+        "III": (design(category, np.column_stack([best, worst]), np.eye(2)), people),
+        "IV": (design(won.astype(int), np.ones((len(won), 1)), np.zeros((1, 0))), pairs),
+    }
     fits = {
-        "II": binary_logit(category == 0, {"Best": best}, people).table,
-        "III": ordered_logit(category, {"Best": best, "Worst": worst}, people).table,
-        "IV": binary_logit(won, None, pairs).table.assign(term="Aggregate-Best"),
-        "rate": rate(won, pairs, bootstrap=False).query("errors in ('Wilson', 'exact')").assign(term="rate"),
+        "II": lambda wild: binary_logit(category == 0, {"Best": best}, people, bootstrap=wild),
+        "III": lambda wild: ordered_logit(category, {"Best": best, "Worst": worst}, people, bootstrap=wild),
+        "IV": lambda wild: binary_logit(won, None, pairs, bootstrap=wild, intercept="Aggregate-Best"),
     }
     rows = []
-    for name, table in fits.items():
-        table = answered(table[table["term"].isin(truths[name])])
-        rows += [table.assign(table=name), larger(table).assign(table=name)]
-    found = pd.concat(rows)
-    truth = np.array([truths[name][term] for name, term in zip(found["table"], found["term"], strict=True)])
-    found["held"] = (found["low"].to_numpy() <= truth) & (truth <= found["high"].to_numpy())
-    found["width"] = found["high"] - found["low"]
-    return found[["table", "term", "errors", "held", "width", "separated"]]
+    for name, fit in fits.items():
+        table = fit(widths).table
+        separated = (table["errors"] == "profile likelihood").any()
+        table = fit(True).table if separated and not widths else table
+        rows += intervals(name, table, truths[name])
+        if not widths and not separated:
+            rows += bootstrapped(name, *designs[name], table, truths[name])
+    shares = rate(won, pairs, bootstrap=False).query("errors in ('Wilson', 'exact')").assign(term="rate")
+    return rows + intervals("rate", shares, truths["rate"])
 
 
-def answered(table):
-    """The interval of a separated coefficient stands in for every kind of error that the others have."""
-    gone = table["errors"] == "profile likelihood"
-    kinds = table.loc[~gone, "errors"].unique()
-    copies = [table[gone].assign(errors=kind, separated=True) for kind in kinds]
-    return pd.concat([table[~gone].assign(separated=False), *copies])
+def intervals(name, table, truths):
+    """The rows of a table, a separated coefficient's under every kind of error, and the largest of the plain ones."""
+    plain = table["errors"] != "profile likelihood"
+    kinds, rows = list(table.loc[plain, "errors"].unique()), []
+    for term, truth in truths.items():
+        mine = table[table["term"] == term].set_index("errors")
+        separated = "profile likelihood" in mine.index
+        found = {kind: mine.loc["profile likelihood" if separated else kind, ["low", "high"]] for kind in kinds}
+        sure = {kind: ends for kind, ends in found.items() if kind == "iid" or kind.startswith("clustered")}
+        if sure:
+            found["the largest of iid and clustered"] = max(sure.values(), key=lambda ends: np.nan_to_num(np.ptp(ends)))
+        for kind, (low, high) in found.items():
+            rows.append((name, term, kind, bool(low <= truth <= high), high - low, separated))
+    return rows
 
 
-def larger(table):
-    """The widest of the iid and the clustered intervals of each term."""
-    plain = table[(table["errors"] == "iid") | table["errors"].str.startswith("clustered")]
-    if plain.empty:
-        return plain
-    widths = (plain["high"] - plain["low"]).groupby(plain["term"])
-    return plain.loc[widths.idxmax()].assign(errors="the largest of iid and clustered")
+def bootstrapped(name, model, clusters, table, truths):
+    """Whether the wild intervals hold the truth, which is whether the truth is not rejected."""
+    rows, terms = [], list(table["term"].unique())
+    theta = table.drop_duplicates("term")["estimate"].to_numpy()
+    for kind in [kind for kind in table["errors"].unique() if kind.startswith("clustered")]:
+        errors = table.loc[table["errors"] == kind, "std_error"].to_numpy()
+        labels = [clusters[way] for way in kind.removeprefix("clustered by ").split(" and ")]
+        test = wild(model, theta, errors, ways(*labels))
+        for term, truth in truths.items():
+            j = terms.index(term)
+            held = bool(np.isfinite(errors[j])) and p_value(test, j, float(truth)) > 0.05
+            rows.append((name, term, kind.replace("clustered", "wild bootstrap"), held, np.nan, False))
+    return rows
 
 
 def truths_of(scale):
@@ -124,13 +149,14 @@ def truths_of(scale):
 def measure(participants, scale, studies):
     truths, begin, blocks = truths_of(scale), time.perf_counter(), []
     for index in range(studies):
-        blocks.append(study(np.random.default_rng([participants, int(10 * scale), index]), participants, scale, truths))
+        rng = np.random.default_rng([participants, int(10 * scale), index])
+        blocks += study(rng, participants, scale, truths, index < WIDTHS)
         if index % 100 == 99:
             print(
                 f"{participants} participants, effects x {scale}: {index + 1}, {time.perf_counter() - begin:.0f} s",
                 file=sys.stderr,
             )
-    found = pd.concat(blocks)
+    found = pd.DataFrame(blocks, columns=["table", "term", "errors", "held", "width", "separated"])
     return found.groupby(["table", "term", "errors"], sort=False).agg(
         held=("held", "mean"), separated=("separated", "sum"), width=("width", "median")
     )
@@ -139,8 +165,9 @@ def measure(participants, scale, studies):
 def page(results, studies):
     heads = [f"{count} people{', alike' if scale == 0 else ''}" for count, scale in results]
     lines = [
-        f"Made by `python benchmarks/coverage_statistics.py --write`: {studies} studies a column; the share of 95 % intervals",
-        f"that held the truth, in %, in brackets how many were one-sided (separated), and the median width. The share's own standard error is {100 * np.sqrt(0.05 * 0.95 / studies):.1f} %.",
+        f"Made by `python benchmarks/coverage_statistics.py --alike --write`: {studies} studies a column. A cell is",
+        "the share of 95 % intervals that held the truth, in %; in brackets, how many were one-sided (separation);",
+        f"the median width. The share's own standard error is {100 * np.sqrt(0.05 * 0.95 / studies):.1f} %.",
         "",
         "| table | coefficient | errors | " + " | ".join(heads) + " |",
         "|---|---|---|" + "---|" * len(heads),
@@ -170,9 +197,14 @@ def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--studies", type=int, default=1000)
     options.add_argument("--clusters", type=int, nargs="*", default=[8, 24])
+    options.add_argument("--alike", action="store_true")
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    results = {(n, scale): measure(n, scale, chosen.studies) for scale in (1.0, 0.0) for n in chosen.clusters}
+    results = {
+        (n, scale): measure(n, scale, chosen.studies)
+        for scale in ((1.0, 0.0) if chosen.alike else (1.0,))
+        for n in chosen.clusters
+    }
     text = page(results, chosen.studies)
     print(text)
     if chosen.write:

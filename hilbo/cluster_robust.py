@@ -11,6 +11,7 @@ The wild bootstrap (`hilbo.wild_bootstrap`) uses the same sums, cell by cell.
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -18,10 +19,10 @@ from jaxtyping import Float, Int
 
 __all__ = ["Covariance", "Ways", "iid", "sandwich", "ways"]
 
-_ROUNDING = 1e-12  # of the largest eigenvalue
+_ROUNDING = 1e-12
 
 
-class Ways(eqx.Module):
+class Ways(NamedTuple):
     """One or two ways in which n answers fall into clusters.
 
     `cells` numbers the cells in which the ways cross, (n,); `of_cell` (w, cells) the cluster of each cell by each way.
@@ -54,7 +55,7 @@ class Ways(eqx.Module):
 
 
 class Covariance(eqx.Module):
-    """A covariance of the estimates; `repaired` is its worst negative eigenvalue over its largest, 0 if none was."""
+    """A covariance of the estimates; `repaired`: its worst negative eigenvalue over the largest of the one-way sum."""
 
     matrix: Float[np.ndarray, "k k"]
     degrees_of_freedom: float
@@ -83,11 +84,11 @@ def sandwich(scores: Float[np.ndarray, "n k"], information: Float[np.ndarray, "n
     n, k = scores.shape
     bread = np.linalg.inv(information.sum(axis=0))
     by_cell = clusters.sums(scores)
-    meat = np.zeros((k, k))
+    added, taken = np.zeros((k, k)), np.zeros((k, k))
     for sign, cluster, count in clusters.terms():
-        total = _sums(by_cell, cluster, count)
-        meat += sign * factor(count, n, k) * total.T @ total
-    matrix, repaired = _repair(bread @ meat @ bread)
+        total = _sums(by_cell, cluster, count) @ bread
+        (added if sign > 0 else taken)[:] += factor(count, n, k) * total.T @ total
+    matrix, repaired = _repair(added, taken)
     return Covariance(matrix, float(clusters.degrees_of_freedom), repaired)
 
 
@@ -97,11 +98,10 @@ def _sums(values, index, count):
     return total
 
 
-def _repair(matrix):
-    matrix = (matrix + matrix.T) / 2
-    values, vectors = np.linalg.eigh(matrix)
-    if values[0] >= -_ROUNDING * values[-1]:
-        return matrix, 0.0
-    kept = np.maximum(values, 0.0)
-    # All of them may be negative: then the two-way formula says nothing at all.
-    return (vectors * kept) @ vectors.T, float(-values[0] / np.abs(values).max())
+def _repair(added, taken):
+    """The difference without its negative eigenvalues, and the worst of these over the largest of `added`."""
+    values, vectors = np.linalg.eigh(added - taken)
+    if values[0] >= 0:
+        return added - taken, 0.0
+    share = -values[0] / np.linalg.eigvalsh(added)[-1]
+    return (vectors * np.maximum(values, 0.0)) @ vectors.T, float(share) if share > _ROUNDING else 0.0

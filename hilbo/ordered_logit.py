@@ -16,7 +16,8 @@ Ordered logit (McCullagh 1980) has u = t_c - x·β, l = t_(c-1) - x·β; binary 
 with ties (Rao & Kupper 1967) have the edges -η and η. A positive coefficient moves answers to higher categories.
 """
 
-import equinox as eqx
+from typing import NamedTuple
+
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.special import expit, log_expit
@@ -29,7 +30,7 @@ _NEAR = 1e-6  # squared Newton step in standard errors: below it, rounding of th
 _CLOSE = 1e-14  # the same: the step that follows it is below rounding
 
 
-class Design(eqx.Module):
+class Design(NamedTuple):
     """The edges of n answers as functions of k parameters; an open side has an infinite offset and a row of zeros."""
 
     upper: Float[np.ndarray, "n k"]

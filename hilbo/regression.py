@@ -90,7 +90,7 @@ def regress(
     warnings = [_separated(names, found, nuisance)] if found.infinite.any() else []
     rows, covariances, log_likelihood = [], {}, 0.0
     if not found.certain.all():
-        rest, keep, begin = decisive(model, start, found.certain)
+        rest, keep, begin = decisive(model, start, found)
         theta = ordered_logit.fit(rest, begin)
         log_likelihood = ordered_logit.log_likelihood(rest, theta)
         kinds, said = _kinds(rest, theta, {name: codes[~found.certain] for name, codes in labels.items()})
@@ -156,7 +156,7 @@ def _kinds(model, theta, labels):
         if covariance.repaired:
             warnings.append(
                 f"The covariance clustered by {both} was indefinite (worst eigenvalue {-covariance.repaired:.1%} of the"
-                " largest) and was repaired; its small errors may be too small."
+                " largest of the one-way terms) and was repaired; its errors may be too small."
             )
     few = min((kind.clusters.degrees_of_freedom + 1 for kind in kinds if kind.clusters is not None), default=99)
     if few <= FEW_CLUSTERS:

@@ -3,8 +3,8 @@
 The log-likelihood of `hilbo.ordered_logit` never falls along a direction δ exactly if no upper edge falls and no lower
 edge rises: U·δ >= 0 and L·δ <= 0 in every answer. If such a direction moves an edge, the answers are separated (a cell
 of 0 or 100 %, or a combination of predictors that is), and the maximum lies at infinity (Albert & Anderson 1984).
-The answers whose edges move along some such direction then have probability 1 in the limit; the others alone decide
-the coefficients that no such direction touches, and the supremum of the likelihood is theirs.
+Edges that move along some such direction are open in the limit; the others alone decide the coefficients that no such
+direction touches, and the supremum of the likelihood is theirs. An answer without an edge left is certain.
 
 Reference: Konis (2007), Computational algorithms for detecting separation (linear programming), D.Phil., Oxford.
 """
@@ -27,39 +27,44 @@ class Separation(eqx.Module):
     """What is not finite.
 
     `falls`, `rises`: whether a coefficient goes to -inf, to inf, along some direction that never lowers the likelihood
-    (both: the answers say nothing of its sign). `certain`: answers whose probability goes to 1.
+    (both: the answers say nothing of its sign). `upper`, `lower`: edges that go to infinity or are there already.
     """
 
     falls: Bool[np.ndarray, " k"]
     rises: Bool[np.ndarray, " k"]
-    certain: Bool[np.ndarray, " n"]
+    upper: Bool[np.ndarray, " n"]
+    lower: Bool[np.ndarray, " n"]
 
     @property
     def infinite(self) -> Bool[np.ndarray, " k"]:
         """Coefficients without a finite estimate."""
         return self.falls | self.rises
 
+    @property
+    def certain(self) -> Bool[np.ndarray, " n"]:
+        """Answers whose probability goes to 1."""
+        return self.upper & self.lower
+
 
 def separation(model: Design) -> Separation:
-    """Find every coefficient without a finite estimate, and the answers that decide nothing else."""
-    rows, owner = _constraints(model)
-    k = model.upper.shape[1]
-    if not len(rows):
-        return Separation(np.zeros(k, bool), np.zeros(k, bool), np.zeros(len(model.upper), bool))
-    distinct, inverse = np.unique(rows, axis=0, return_inverse=True)
-    moves = _largest_support(distinct)
-    certain = np.zeros(len(model.upper), bool)
-    np.logical_or.at(certain, owner, moves[inverse.ravel()])
-    if not moves.any():
-        return Separation(np.zeros(k, bool), np.zeros(k, bool), certain)
-    rises = np.array([_reach(distinct, j, 1) > _TOLERANCE for j in range(k)])
-    falls = np.array([_reach(distinct, j, -1) > _TOLERANCE for j in range(k)])
-    return Separation(falls, rises, certain)
+    """Find every coefficient without a finite estimate, and the edges that go with them."""
+    rows, k = _constraints(model), model.upper.shape[1]
+    upper, lower = np.isinf(model.upper_offset), np.isinf(model.lower_offset)
+    rises, falls = np.zeros(k, bool), np.zeros(k, bool)
+    if k and len(rows):
+        distinct, inverse = np.unique(rows, axis=0, return_inverse=True)
+        moves = _largest_support(distinct)
+        above, below = np.split(moves[inverse.ravel()], [np.sum(~upper)])
+        upper[~upper], lower[~lower] = above, below
+        if moves.any():
+            rises = np.array([_reach(distinct, j, 1) > _TOLERANCE for j in range(k)])
+            falls = np.array([_reach(distinct, j, -1) > _TOLERANCE for j in range(k)])
+    return Separation(falls, rises, upper, lower)
 
 
 def independent(model: Design) -> Bool[np.ndarray, " k"]:
     """Columns that are no combination of those before them, of the edges that are not open."""
-    rows, _ = _constraints(model)
+    rows = _constraints(model)
     keep = np.zeros(model.upper.shape[1], bool)
     rank = 0
     for column in range(len(keep)):
@@ -69,26 +74,31 @@ def independent(model: Design) -> Bool[np.ndarray, " k"]:
     return keep
 
 
-def supremum(model: Design, start: Float[np.ndarray, " k"], certain: Bool[np.ndarray, " n"] | None = None) -> float:
-    """The supremum of the log-likelihood, reached or not; `certain` as `separation` finds it, if that is known."""
-    certain = separation(model).certain if certain is None else certain
-    if certain.all():
+def supremum(model: Design, start: Float[np.ndarray, " k"], found: Separation) -> float:
+    """The supremum of the log-likelihood, reached or not."""
+    if found.certain.all():
         return 0.0
-    rest, _, begin = decisive(model, start, certain)
+    rest, _, begin = decisive(model, start, found)
     theta = ordered_logit.fit(rest, begin) if len(begin) else begin
     return ordered_logit.log_likelihood(rest, theta)
 
 
 def decisive(
-    model: Design, start: Float[np.ndarray, " k"], certain: Bool[np.ndarray, " n"]
+    model: Design, start: Float[np.ndarray, " k"], found: Separation
 ) -> tuple[Design, Bool[np.ndarray, " k"], Float[np.ndarray, " j"]]:
     """The answers that are not certain, with as many coefficients as they decide, which these are, and a start.
 
-    A coefficient that is left out is 0 there: the answers that are left depend on it through the others only.
+    Edges that go to infinity are open. A coefficient that is left out is 0 there: the edges that are left depend on it
+    through the others only.
     """
-    rest = model.rows(~certain)
+    rest = Design(
+        np.where(found.upper[:, None], 0.0, model.upper),
+        np.where(found.lower[:, None], 0.0, model.lower),
+        np.where(found.upper, np.inf, model.upper_offset),
+        np.where(found.lower, -np.inf, model.lower_offset),
+    ).rows(~found.certain)
     keep = independent(rest)
-    rows, _ = _constraints(rest)
+    rows = _constraints(rest)
     begin = np.linalg.lstsq(rows[:, keep], rows @ start, rcond=None)[0]  # the same edges as at `start`
     return rest.columns(keep), keep, begin
 
@@ -104,12 +114,12 @@ def profile(
     if found.falls[column] and found.rises[column]:
         return -np.inf, np.inf, 1.0
     sign = 1.0 if found.rises[column] else -1.0
-    top = supremum(model, start, found.certain)
+    top = supremum(model, start, found)
     others = np.arange(len(start)) != column
-    certain = separation(model.fixed(column, 0.0)).certain  # the same for every value
+    at_a_value = separation(model.fixed(column, 0.0))  # the same for every value
 
     def drop(size):
-        return 2 * (top - supremum(model.fixed(column, sign * size), start[others], certain))
+        return 2 * (top - supremum(model.fixed(column, sign * size), start[others], at_a_value))
 
     quantile = float(chi2.ppf(level, 1))
     high = low = 1.0  # in `size`, along which the drop falls to 0
@@ -123,10 +133,9 @@ def profile(
 
 
 def _constraints(model):
-    """Rows a with a·δ >= 0 for every direction along which nothing is lost, and the answer that each belongs to."""
+    """Rows a with a·δ >= 0 for every direction along which nothing is lost: upper edges, then lower ones."""
     has_upper, has_lower = np.isfinite(model.upper_offset), np.isfinite(model.lower_offset)
-    rows = np.vstack([model.upper[has_upper], -model.lower[has_lower]])
-    return rows, np.concatenate([np.flatnonzero(has_upper), np.flatnonzero(has_lower)])
+    return np.vstack([model.upper[has_upper], -model.lower[has_lower]])
 
 
 def _largest_support(rows):

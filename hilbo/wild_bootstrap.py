@@ -29,9 +29,9 @@ from hilbo.ordered_logit import Design
 
 __all__ = ["Wild", "interval", "p_value", "wild", "wild_weights"]
 
-_DRAWS = 1999
+_DRAWS = 999
 _FEW, _ENUMERATED = 7, 12  # clusters: least for signs, most for all signs
-_FARTHEST = 200.0  # in standard errors: an interval that reaches it is reported as open
+_FARTHEST = 30.0  # in standard errors: an interval that reaches it is reported as open
 
 
 class Wild(eqx.Module):
