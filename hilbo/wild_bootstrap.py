@@ -10,8 +10,8 @@ se being the cluster-robust error of the linearised model, with the same small-s
 (MacKinnon, Nielsen & Webb 2024, arXiv:2406.00650, the restricted "classic" form). p is the share of |t*| that is not
 below |θ̂_j - b|/se(θ̂_j), and the interval holds every b that is not rejected.
 
-With 7 to 12 clusters all signs are used, so that there is no randomness; below, signs are too few for a 5 % test and
-the six weights of Webb (2023) take their place; above, signs are drawn. With two ways the clusters of the smaller
+With 7 to 12 clusters all signs are used, so that there is no randomness; above, signs are drawn. Below, signs are too
+few for a 5 % test and the six weights of Webb (2023) take their place, all of them for up to 5 clusters. With two ways the clusters of the smaller
 way carry the weights and se is the two-way error (MacKinnon, Nielsen & Webb 2021); draws whose two-way
 variance is not positive count as beyond |t|.
 """
@@ -30,7 +30,9 @@ from hilbo.ordered_logit import Design
 __all__ = ["Wild", "interval", "p_value", "wild", "wild_weights"]
 
 _DRAWS = 999
-_FEW, _ENUMERATED = 7, 12  # clusters: least for signs, most for all signs
+_FEW = 7  # clusters: least for signs
+_MOST = 8000  # weights that are all used
+_SINGULAR = 1e-12
 _FARTHEST = 30.0  # in standard errors: an interval that reaches it is reported as open
 
 
@@ -56,9 +58,9 @@ def wild(
 
 def wild_weights(clusters: int, seed: int = 0) -> tuple[Float[np.ndarray, "b g"], bool]:
     """Weights of the clusters, one row per draw, and whether these are all. Rows that differ by their sign are one."""
-    if clusters > _ENUMERATED:
-        return np.random.default_rng(seed).choice([-1.0, 1.0], (_DRAWS, clusters)), False
-    values = (-1.0, 1.0) if clusters >= _FEW else tuple(s * np.sqrt(v) for s in (-1, 1) for v in (0.5, 1.0, 1.5))
+    values = [-1.0, 1.0] if clusters >= _FEW else [s * np.sqrt(v) for s in (-1, 1) for v in (0.5, 1.0, 1.5)]
+    if len(values) ** clusters > _MOST:
+        return np.random.default_rng(seed).choice(values, (_DRAWS, clusters)), False
     positive = [value for value in values if value > 0]
     return np.array(list(itertools.product(positive, *[values] * (clusters - 1)))), True
 
@@ -95,7 +97,7 @@ def _end(excess, estimate, step):
 
 
 def _statistics(test, column, value):
-    """|t*| of every draw under the hypothesis."""
+    """|t*| of every draw under the hypothesis; inf, which rejects nothing, where hardly any information is left."""
     others = np.arange(len(test.estimate)) != column
     theta = test.estimate.copy()
     theta[column] = value
@@ -103,6 +105,8 @@ def _statistics(test, column, value):
         theta[others] = ordered_logit.fit(test.model.fixed(column, value), test.estimate[others])
     scores = test.clusters.sums(ordered_logit.scores(test.model, theta))
     information = test.clusters.sums(ordered_logit.information(test.model, theta))
+    if np.linalg.matrix_rank(information.sum(axis=0), rtol=_SINGULAR) < len(theta):
+        return np.full(len(test.weights), np.inf)
     bread = np.linalg.inv(information.sum(axis=0))
     weighted = test.weights[:, test.clusters.of_cell[np.argmin(test.clusters.counts)]]  # (b, cells)
     delta = weighted @ scores @ bread

@@ -10,7 +10,7 @@ from itertools import combinations, product
 import mpmath
 import numpy as np
 
-__all__ = ["Reference", "counts_to_answers", "extreme_rays"]
+__all__ = ["Reference", "counts_to_answers", "estimates", "extreme_rays"]
 
 mp = mpmath.mp.clone()
 mp.dps = 50
@@ -25,6 +25,11 @@ def counts_to_answers(counts, clusters, rng):
         mine = np.flatnonzero(group == value)
         cluster[mine] = rng.permutation(np.arange(len(mine)) % clusters)
     return category, group, cluster
+
+
+def estimates(regression):
+    """Each term's estimate."""
+    return regression.table.drop_duplicates("term").set_index("term")["estimate"]
 
 
 def sigma(z):
