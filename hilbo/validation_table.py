@@ -55,7 +55,8 @@ def check_validation(
         raise InputError(f"{source}: has no rows; a validation table needs at least one comparison.")
     text = table.copy()
     for column in (*_NEEDED, *(name for name in _OPTIONAL if name in text)):
-        text[column] = ["" if pd.isna(cell) else str(cell).strip() for cell in text[column]]
+        cells = ["" if pd.isna(cell) else str(cell).strip() for cell in text[column]]
+        text[column] = ["" if cell == "nan" else cell for cell in cells]  # a column of nothing, read from Parquet
     out = text.copy()
     whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
     out["trial"] = whole.astype(int)

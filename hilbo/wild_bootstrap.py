@@ -7,13 +7,13 @@ scores, w_g = ±1, and the model linearised at that estimate is fitted to the su
     δ* = H⁻¹ Σ_g w_g s_g,   s*_g = w_g s_g - H_g δ*,   t* = δ*_j / se(s*),
 
 se being the cluster-robust error of the linearised model, with the same small-sample factors as the estimate's own
-(MacKinnon, Nielsen & Webb 2024, arXiv:2406.00650, the restricted "classic" form). p is the share of |t*| that is not
+(after MacKinnon, Nielsen & Webb 2024, arXiv:2406.00650). p is the share of |t*| that is not
 below |θ̂_j - b|/se(θ̂_j), and the interval holds every b that is not rejected.
 
 With 7 to 12 clusters all signs are used, so that there is no randomness; above, signs are drawn. Below, signs are too
-few for a 5 % test and the six weights of Webb (2023) take their place, all of them for up to 5 clusters. With two ways the clusters of the smaller
-way carry the weights and se is the two-way error (MacKinnon, Nielsen & Webb 2021); draws whose two-way
-variance is not positive count as beyond |t|.
+few for a 5 % test and the six weights of Webb (2023) take their place, all of them for up to 5 clusters. With two ways
+the clusters of the smaller way carry the weights and se is the two-way error (MacKinnon, Nielsen & Webb 2021); draws
+whose two-way variance is not positive count as beyond |t|.
 """
 
 import itertools

@@ -33,6 +33,14 @@ def test_a_table_made_in_memory_is_the_same(tmp_path):
     pd.testing.assert_frame_equal(check_validation(again), again)
 
 
+def test_parquet_is_the_same(tmp_path):
+    found = read_validation(write(tmp_path, *GOOD))
+    found.assign(first=float("nan")).to_parquet(tmp_path / "table.parquet")
+    again = read_validation(tmp_path / "table.parquet")
+    assert list(again["first"]) == ["", "", ""]
+    pd.testing.assert_frame_equal(again.drop(columns="first"), found.drop(columns="first").set_axis([1, 2, 3]))
+
+
 def test_a_material_is_chosen(tmp_path):
     path = write(tmp_path, *GOOD, "P1,silicone,1,1,best,mid,a,close,close,a")
     with pytest.raises(InputError, match=r"holds 2 materials \(foam, silicone\); choose one of them"):
