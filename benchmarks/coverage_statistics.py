@@ -1,12 +1,12 @@
 """How often the 95 % intervals of tables II to IV hold the truth, in simulated studies whose participants differ.
 
-    python benchmarks/coverage_statistics.py [--studies 1000] [--clusters 8 24] [--write]
+    python benchmarks/coverage_statistics.py [--studies 1000] [--people 8 24] [--cases differ unequal alike] [--write]
 
 Classes: a logistic variable with the set's level, a participant's effect and a participant's effect on the set; 12
 comparisons each. Preferences: effects of participants and of 24 individual sets, each pair of them shown twice. The
 truth is what endless participants would give: the logit of the mean probability, or the ordered logit that is nearest
-to the mean probabilities, by Gauss-Hermite quadrature. --alike adds participants without effects of their own. --write
-puts the table into docs/statistics.md; five minutes.
+to the mean probabilities, by Gauss-Hermite quadrature. Cases: people differ; they differ and answer unequally often,
+person i of G the first i/G of the plan; they are alike. --write puts the table into docs/statistics.md; ten minutes.
 """
 
 import argparse
@@ -34,14 +34,15 @@ PERSON, PERSON_SET = 0.8, 0.6  # sd in logits
 JUDGE, SET, EFFECT = 0.6, 0.4, 1.05  # table IV: sd of participants and of sets, and the preference
 SHOWN, SETS, TWICE = 8, 24, 2
 WIDTHS = 100  # studies whose bootstrap intervals are found; of the others only whether they hold the truth
+CASES = {"differ": (1.0, False), "unequal": (1.0, True), "alike": (0.0, False)}  # scale of effects; unequal
 NODES, WEIGHTS = hermegauss(60)
 WEIGHTS = WEIGHTS / WEIGHTS.sum()
 START, END = "<!-- coverage -->", "<!-- end of coverage -->"
 
 
-def class_truth():
+def class_truth(scale):
     """Mean class probabilities of each set, and the coefficients of tables II and III that they mean."""
-    sd = np.hypot(PERSON, PERSON_SET)
+    sd = scale * np.hypot(PERSON, PERSON_SET)
     below = expit(EDGES[None, None, :] - LEVELS[:, None, None] - sd * NODES[None, :, None])
     below = np.einsum("n,snc->sc", WEIGHTS, below)
     shares = np.diff(np.hstack([np.zeros((3, 1)), below, np.ones((3, 1))]), axis=1)
@@ -60,28 +61,35 @@ def class_truth():
     return {"Intercept": others, "Best": logit(close[0]) - others}, {"Best": near.x[0], "Worst": near.x[1]}
 
 
-def classes(rng, participants, scale):
+def classes(rng, participants, scale, unequal):
     person = scale * PERSON * rng.standard_normal(participants)[:, None, None]
     both = scale * PERSON_SET * rng.standard_normal((participants, 3))[:, :, None]
     latent = LEVELS[None, :, None] + person + both + rng.logistic(size=(participants, 3, SHOWN))
     who, which, _ = np.indices(latent.shape)
-    category = np.searchsorted(EDGES, latent.ravel())
-    return category, which.ravel(), pd.DataFrame({"participant": who.ravel()})
+    asked = there(who, participants, np.indices(latent.shape)[2], SHOWN, unequal)
+    return np.searchsorted(EDGES, latent[asked]), which[asked], pd.DataFrame({"participant": who[asked]})
 
 
-def preferences(rng, participants, scale):
+def preferences(rng, participants, scale, unequal):
     judge = scale * JUDGE * rng.standard_normal(participants)[:, None, None]
     item = scale * SET * rng.standard_normal(SETS)[None, :, None]
     won = EFFECT + judge + item + rng.logistic(size=(participants, SETS, TWICE)) > 0
     who, which, _ = np.indices(won.shape)
-    return won.ravel(), pd.DataFrame({"participant": who.ravel(), "set": which.ravel()})
+    asked = there(who, participants, which, SETS, unequal)
+    return won[asked], pd.DataFrame({"participant": who[asked], "set": which[asked]})
 
 
-def study(rng, participants, scale, truths, widths):
+def there(who, participants, turn, turns, unequal):
+    """Which answers were given: all, or a person's share of the turns."""
+    return turn * participants < (who + 1) * turns if unequal else np.full(who.shape, True)
+
+
+def study(rng, participants, case, truths, widths):
     """Every interval of one study: table, term, errors, whether it holds the truth, its width, whether separated."""
-    category, shown, people = classes(rng, participants, scale)
+    scale, unequal = CASES[case]
+    category, shown, people = classes(rng, participants, scale, unequal)
     best, worst = (shown == 0).astype(float), (shown == 2).astype(float)
-    won, pairs = preferences(rng, participants, scale)
+    won, pairs = preferences(rng, participants, scale, unequal)
     one = np.ones(len(category))
     designs = {
         "II": (design((category == 0).astype(int), np.column_stack([one, best]), np.zeros((1, 0))), people),
@@ -137,25 +145,19 @@ def bootstrapped(name, model, clusters, table, truths):
 
 
 def truths_of(scale):
-    global PERSON, PERSON_SET
-    kept = PERSON, PERSON_SET
-    PERSON, PERSON_SET = scale * PERSON, scale * PERSON_SET
-    two, three = class_truth()
-    PERSON, PERSON_SET = kept
+    two, three = class_truth(scale)
     mean = WEIGHTS @ expit(EFFECT + scale * np.hypot(JUDGE, SET) * NODES)
     return {"II": two, "III": three, "IV": {"Aggregate-Best": logit(mean)}, "rate": {"rate": mean}}
 
 
-def measure(participants, scale, studies):
+def measure(participants, case, studies):
+    scale = CASES[case][0]
     truths, begin, blocks = truths_of(scale), time.perf_counter(), []
     for index in range(studies):
         rng = np.random.default_rng([participants, int(10 * scale), index])
-        blocks += study(rng, participants, scale, truths, index < WIDTHS)
+        blocks += study(rng, participants, case, truths, index < WIDTHS)
         if index % 100 == 99:
-            print(
-                f"{participants} participants, effects x {scale}: {index + 1}, {time.perf_counter() - begin:.0f} s",
-                file=sys.stderr,
-            )
+            print(f"{participants}, {case}: {index + 1}, {time.perf_counter() - begin:.0f} s", file=sys.stderr)
     found = pd.DataFrame(blocks, columns=["table", "term", "errors", "held", "width", "separated"])
     return found.groupby(["table", "term", "errors"], sort=False).agg(
         held=("held", "mean"), separated=("separated", "sum"), width=("width", "median")
@@ -163,9 +165,9 @@ def measure(participants, scale, studies):
 
 
 def page(results, studies):
-    heads = [f"{count} people{', alike' if scale == 0 else ''}" for count, scale in results]
+    heads = [f"{count}, {case}" for count, case in results]
     lines = [
-        f"Made by `python benchmarks/coverage_statistics.py --alike --write`: {studies} studies a column. A cell is",
+        f"Made by `python benchmarks/coverage_statistics.py --write`: {studies} studies a column. A cell is",
         "the share of 95 % intervals that held the truth, in %; in brackets, how many were one-sided (separation);",
         f"the median width. The share's own standard error is {100 * np.sqrt(0.05 * 0.95 / studies):.1f} %.",
         "",
@@ -196,15 +198,11 @@ def order(name):
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--studies", type=int, default=1000)
-    options.add_argument("--clusters", type=int, nargs="*", default=[8, 24])
-    options.add_argument("--alike", action="store_true")
+    options.add_argument("--people", type=int, nargs="*", default=[8, 24])
+    options.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    results = {
-        (n, scale): measure(n, scale, chosen.studies)
-        for scale in ((1.0, 0.0) if chosen.alike else (1.0,))
-        for n in chosen.clusters
-    }
+    results = {(n, case): measure(n, case, chosen.studies) for case in chosen.cases for n in chosen.people}
     text = page(results, chosen.studies)
     print(text)
     if chosen.write:

@@ -160,7 +160,9 @@ def _kinds(model, theta, labels):
             )
     few = min((kind.clusters.degrees_of_freedom + 1 for kind in kinds if kind.clusters is not None), default=99)
     if few <= FEW_CLUSTERS:
-        warnings.append(f"There are {few} clusters by one way: prefer the wild bootstrap to the clustered errors.")
+        warnings.append(
+            f"There are {few} clusters by one way: report the wider of the clustered and the wild bootstrap interval."
+        )
     return kinds, warnings
 
 
