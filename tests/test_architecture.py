@@ -59,6 +59,12 @@ MATHS = {
     "session": {"config", "ordinal_gp", "acquisition", "lattice", "search_lattice"},
     "simulate": {"session"},
     "validation": {"study", "config", "acquisition"},
+    "ordered_logit": set(),
+    "separation": {"ordered_logit"},
+    "cluster_robust": set(),
+    "wild_bootstrap": {"ordered_logit", "cluster_robust"},
+    "regression": {"separation", "wild_bootstrap"},
+    "statistics": {"regression"},
 }
 # What each module may import of hilbo, and with it what that one may import. Modules to come have their place already.
 MAY_IMPORT = MATHS | {
@@ -67,6 +73,9 @@ MAY_IMPORT = MATHS | {
     "config": {"search_space", "ordinal_gp"},
     "tables": {"config"},
     "material_tables": {"tables", "identification"},
+    "validation_table": {"tables"},
+    "preferences": {"statistics", "validation_table"},
+    "paper_tables": {"preferences"},
     "console": set(),
     "cli_material": {"console", "characterise", "material_tables", "report_material"},
     "event_log": {"session"},

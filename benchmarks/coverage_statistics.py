@@ -1,0 +1,216 @@
+"""How often the 95 % intervals of tables II to IV hold the truth, in simulated studies whose participants differ.
+
+    python benchmarks/coverage_statistics.py [--studies 1000] [--people 8 24] [--cases differ unequal alike] [--write]
+
+Classes: a logistic variable with the set's level, a participant's effect and a participant's effect on the set; 12
+comparisons each. Preferences: effects of participants and of 24 individual sets, each pair of them shown twice. The
+truth is what endless participants would give: the logit of the mean probability, or the ordered logit that is nearest
+to the mean probabilities, by Gauss-Hermite quadrature. Cases: people differ; they differ and answer unequally often,
+person i of G the first i/G of the plan; they are alike. --write puts the table into docs/statistics.md; ten minutes.
+"""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.polynomial.hermite_e import hermegauss
+from scipy.optimize import minimize
+from scipy.special import expit, logit
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+from hilbo.cluster_robust import ways  # noqa: E402
+from hilbo.ordered_logit import design  # noqa: E402
+from hilbo.preferences import rate  # noqa: E402
+from hilbo.statistics import binary_logit, ordered_logit  # noqa: E402
+from hilbo.wild_bootstrap import p_value, wild  # noqa: E402
+
+# Levels of best, mid, worst, and edges between close, similar, different: with these effects, shares like the paper's.
+LEVELS, EDGES = np.array([-4.8, 0.0, 3.4]), np.array([-2.0, 2.1])
+PERSON, PERSON_SET = 0.8, 0.6  # sd in logits
+JUDGE, SET, EFFECT = 0.6, 0.4, 1.05  # table IV: sd of participants and of sets, and the preference
+SHOWN, SETS, TWICE = 8, 24, 2
+WIDTHS = 100  # studies whose bootstrap intervals are found; of the others only whether they hold the truth
+CASES = {"differ": (1.0, False), "unequal": (1.0, True), "alike": (0.0, False)}  # scale of effects; unequal
+NODES, WEIGHTS = hermegauss(60)
+WEIGHTS = WEIGHTS / WEIGHTS.sum()
+START, END = "<!-- coverage -->", "<!-- end of coverage -->"
+
+
+def class_truth(scale):
+    """Mean class probabilities of each set, and the coefficients of tables II and III that they mean."""
+    sd = scale * np.hypot(PERSON, PERSON_SET)
+    below = expit(EDGES[None, None, :] - LEVELS[:, None, None] - sd * NODES[None, :, None])
+    below = np.einsum("n,snc->sc", WEIGHTS, below)
+    shares = np.diff(np.hstack([np.zeros((3, 1)), below, np.ones((3, 1))]), axis=1)
+    close = shares[:, 0]
+    others = logit(close[1:].mean())
+
+    def loss(theta):
+        shift = np.array([theta[0], 0.0, theta[1]])
+        inner = expit(theta[None, 2:] - shift[:, None])
+        found = np.diff(np.hstack([np.zeros((3, 1)), inner, np.ones((3, 1))]), axis=1)
+        return -np.sum(shares * np.log(found))
+
+    near = minimize(
+        loss, [-4.0, 3.0, *EDGES], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 9999}
+    )
+    return {"Intercept": others, "Best": logit(close[0]) - others}, {"Best": near.x[0], "Worst": near.x[1]}
+
+
+def classes(rng, participants, scale, unequal):
+    person = scale * PERSON * rng.standard_normal(participants)[:, None, None]
+    both = scale * PERSON_SET * rng.standard_normal((participants, 3))[:, :, None]
+    latent = LEVELS[None, :, None] + person + both + rng.logistic(size=(participants, 3, SHOWN))
+    who, which, _ = np.indices(latent.shape)
+    asked = there(who, participants, np.indices(latent.shape)[2], SHOWN, unequal)
+    return np.searchsorted(EDGES, latent[asked]), which[asked], pd.DataFrame({"participant": who[asked]})
+
+
+def preferences(rng, participants, scale, unequal):
+    judge = scale * JUDGE * rng.standard_normal(participants)[:, None, None]
+    item = scale * SET * rng.standard_normal(SETS)[None, :, None]
+    won = EFFECT + judge + item + rng.logistic(size=(participants, SETS, TWICE)) > 0
+    who, which, _ = np.indices(won.shape)
+    asked = there(who, participants, which, SETS, unequal)
+    return won[asked], pd.DataFrame({"participant": who[asked], "set": which[asked]})
+
+
+def there(who, participants, turn, turns, unequal):
+    """Which answers were given: all, or a person's share of the turns."""
+    return turn * participants < (who + 1) * turns if unequal else np.full(who.shape, True)
+
+
+def study(rng, participants, case, truths, widths):
+    """Every interval of one study: table, term, errors, whether it holds the truth, its width, whether separated."""
+    scale, unequal = CASES[case]
+    category, shown, people = classes(rng, participants, scale, unequal)
+    best, worst = (shown == 0).astype(float), (shown == 2).astype(float)
+    won, pairs = preferences(rng, participants, scale, unequal)
+    one = np.ones(len(category))
+    designs = {
+        "II": (design((category == 0).astype(int), np.column_stack([one, best]), np.zeros((1, 0))), people),
+        "III": (design(category, np.column_stack([best, worst]), np.eye(2)), people),
+        "IV": (design(won.astype(int), np.ones((len(won), 1)), np.zeros((1, 0))), pairs),
+    }
+    fits = {
+        "II": lambda wild: binary_logit(category == 0, {"Best": best}, people, bootstrap=wild),
+        "III": lambda wild: ordered_logit(category, {"Best": best, "Worst": worst}, people, bootstrap=wild),
+        "IV": lambda wild: binary_logit(won, None, pairs, bootstrap=wild, intercept="Aggregate-Best"),
+    }
+    rows = []
+    for name, fit in fits.items():
+        table = fit(widths).table
+        separated = (table["errors"] == "profile likelihood").any()
+        table = fit(True).table if separated and not widths else table
+        rows += intervals(name, table, truths[name])
+        if not widths and not separated:
+            rows += bootstrapped(name, *designs[name], table, truths[name])
+    shares = rate(won, pairs, bootstrap=False).query("errors in ('Wilson', 'exact')").assign(term="rate")
+    return rows + intervals("rate", shares, truths["rate"])
+
+
+def intervals(name, table, truths):
+    """The rows of a table, a separated coefficient's under every kind of error, and the largest of the plain ones."""
+    plain = table["errors"] != "profile likelihood"
+    kinds, rows = list(table.loc[plain, "errors"].unique()), []
+    for term, truth in truths.items():
+        mine = table[table["term"] == term].set_index("errors")
+        separated = "profile likelihood" in mine.index
+        found = {kind: mine.loc["profile likelihood" if separated else kind, ["low", "high"]] for kind in kinds}
+        sure = {kind: ends for kind, ends in found.items() if kind == "iid" or kind.startswith("clustered")}
+        if sure:
+            found["the largest of iid and clustered"] = max(sure.values(), key=lambda ends: np.nan_to_num(np.ptp(ends)))
+        for kind, (low, high) in found.items():
+            rows.append((name, term, kind, bool(low <= truth <= high), high - low, separated))
+    return rows
+
+
+def bootstrapped(name, model, clusters, table, truths):
+    """Whether the wild intervals hold the truth, which is whether the truth is not rejected."""
+    rows, terms = [], list(table["term"].unique())
+    theta = table.drop_duplicates("term")["estimate"].to_numpy()
+    for kind in [kind for kind in table["errors"].unique() if kind.startswith("clustered")]:
+        errors = table.loc[table["errors"] == kind, "std_error"].to_numpy()
+        labels = [clusters[way] for way in kind.removeprefix("clustered by ").split(" and ")]
+        test = wild(model, theta, errors, ways(*labels))
+        for term, truth in truths.items():
+            j = terms.index(term)
+            held = bool(np.isfinite(errors[j])) and p_value(test, j, float(truth)) > 0.05
+            rows.append((name, term, kind.replace("clustered", "wild bootstrap"), held, np.nan, False))
+    return rows
+
+
+def truths_of(scale):
+    two, three = class_truth(scale)
+    mean = WEIGHTS @ expit(EFFECT + scale * np.hypot(JUDGE, SET) * NODES)
+    return {"II": two, "III": three, "IV": {"Aggregate-Best": logit(mean)}, "rate": {"rate": mean}}
+
+
+def measure(participants, case, studies):
+    scale = CASES[case][0]
+    truths, begin, blocks = truths_of(scale), time.perf_counter(), []
+    for index in range(studies):
+        rng = np.random.default_rng([participants, int(10 * scale), index])
+        blocks += study(rng, participants, case, truths, index < WIDTHS)
+        if index % 100 == 99:
+            print(f"{participants}, {case}: {index + 1}, {time.perf_counter() - begin:.0f} s", file=sys.stderr)
+    found = pd.DataFrame(blocks, columns=["table", "term", "errors", "held", "width", "separated"])
+    return found.groupby(["table", "term", "errors"], sort=False).agg(
+        held=("held", "mean"), separated=("separated", "sum"), width=("width", "median")
+    )
+
+
+def page(results, studies):
+    heads = [f"{count}, {case}" for count, case in results]
+    lines = [
+        f"Made by `python benchmarks/coverage_statistics.py --write`: {studies} studies a column. A cell is",
+        "the share of 95 % intervals that held the truth, in %; in brackets, how many were one-sided (separation);",
+        f"the median width. The share's own standard error is {100 * np.sqrt(0.05 * 0.95 / studies):.1f} %.",
+        "",
+        "| table | coefficient | errors | " + " | ".join(heads) + " |",
+        "|---|---|---|" + "---|" * len(heads),
+    ]
+    index = pd.concat([summary[["held"]] for summary in results.values()], axis=1).index
+    for table, term, errors in sorted(index, key=lambda key: (order(key[0]), key[1], order(key[2]))):
+        cells = []
+        for summary in results.values():
+            if (table, term, errors) not in summary.index:
+                cells.append("")
+                continue
+            row = summary.loc[(table, term, errors)]
+            gone = f" ({int(row['separated'])})" if row["separated"] else ""
+            cells.append(f"{100 * row['held']:.1f}{gone}, {row['width']:.2f}")
+        lines.append(f"| {table} | {term} | {errors} | " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def order(name):
+    for place, begin in enumerate(("II", "III", "IV", "rate", "iid", "clustered", "the largest", "wild", "profile")):
+        if name == begin or (place > 3 and name.startswith(begin)):
+            return place, name
+    return 99, name
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--studies", type=int, default=1000)
+    options.add_argument("--people", type=int, nargs="*", default=[8, 24])
+    options.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
+    options.add_argument("--write", action="store_true")
+    chosen = options.parse_args()
+    results = {(n, case): measure(n, case, chosen.studies) for case in chosen.cases for n in chosen.people}
+    text = page(results, chosen.studies)
+    print(text)
+    if chosen.write:
+        path = ROOT / "docs" / "statistics.md"
+        before, _, rest = path.read_text(encoding="utf-8").partition(START)
+        _, _, after = rest.partition(END)
+        path.write_text(f"{before}{START}\n{text}{END}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
