@@ -1,0 +1,49 @@
+/* The viscoelastic model, one tick at a time: one parameter set with its own history.
+ *
+ *     k = K1 beta/(K1 + beta), g = K1/(K1 + beta), beta = B1 T^-alpha
+ *     F = K0 x + k (x - s),   y = s + g (x - s),   s = what the past of y contributes:
+ *     short memory: sum over N past samples |c_i| y_{n-i}, oldest first;   full memory: sum of p_k m_k, fading means
+ *
+ * float32 in a fixed order: the same bits on every machine with IEEE arithmetic. */
+#ifndef HB_RENDERER_H
+#define HB_RENDERER_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "hb_config.h"
+
+/* What SET_PARAMS says. */
+struct hb_parameters {
+    uint16_t set_id;
+    uint8_t memory;  /* enum hb_memory */
+    uint16_t length; /* N, or number of exponentials */
+    uint16_t tick_rate_Hz;
+    float K0_N_per_mm;
+    float K1_N_per_mm;
+    float B1_N_s_alpha_per_mm;
+    float alpha;
+    float force_limit_N;
+};
+
+/* One bank. All zero is an empty one. */
+struct hb_renderer {
+    struct hb_parameters set;
+    float beta_N_per_mm;
+    float gain;                         /* g */
+    float stiffness_N_per_mm;           /* k */
+    float rest_share;                   /* y of the equilibrium at 1 mm */
+    float minimum_damping_N_s_per_m;    /* of the passive rendering */
+    uint32_t warm_ticks;                /* until a history that starts at an equilibrium is its own */
+    float tap[HB_MAX_TAPS];             /* short: |c_N| ... |c_1| */
+    float history_mm[2U * HB_MAX_TAPS]; /* short: every y twice, N apart, so that the last N always lie in a row */
+    size_t oldest;                      /* short: where that row begins */
+    size_t quiet;                       /* short: how many y in a row have been 0, up to N */
+    float weight[HB_MAX_STATES];        /* full: p_k */
+    float loss[HB_MAX_STATES];          /* full: 1 - lambda_k */
+    float mean_mm[HB_MAX_STATES];       /* full: m_k, */
+    float rest_mm[HB_MAX_STATES];       /* full: and what its last additions lost to rounding */
+};
+
+#endif
