@@ -6,7 +6,7 @@ a test holds that against the file, byte for byte. Names, units and meaning of t
 
 import re
 from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple, dataclass_transform
 
 __all__ = [
     "MESSAGES",
@@ -53,7 +53,10 @@ U16 = Annotated[int, "u16"]
 U32 = Annotated[int, "u32"]
 F32 = Annotated[float, "f32"]
 
-_message = dataclass(frozen=True, slots=True, kw_only=True)
+
+@dataclass_transform(frozen_default=True, kw_only_default=True)
+def _message(kind):
+    return dataclass(frozen=True, slots=True, kw_only=True)(kind)
 
 
 class Exponential(NamedTuple):
