@@ -11,7 +11,7 @@ STAMP := $(VENV)/.hilbo-setup
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-deep lint bench clean
+.PHONY: help setup demo firmware test test-deep lint bench clean
 
 help:  ## show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
@@ -20,6 +20,9 @@ setup: $(STAMP)  ## make .venv with everything that the other targets need
 
 demo: $(STAMP)  ## re-aggregate the shipped data and run the simulated study, into demo-results/
 	$(BIN)/hilbo demo --out demo-results --force
+
+firmware:  ## the C programs of the device, and its Cortex-M images where the cross compiler is
+	$(MAKE) --no-print-directory -C firmware
 
 test: $(STAMP)  ## the tests, without the slow ones
 	$(PYTEST) -m "not deep" $(PYTEST_ARGS)

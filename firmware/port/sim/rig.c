@@ -1,0 +1,84 @@
+#include "rig.h"
+
+#include <math.h>
+
+#ifndef HB_FIRMWARE_HASH
+#define HB_FIRMWARE_HASH 0 /* the build sets it: CRC-32 of the core's sources */
+#endif
+
+struct sim_rig_config sim_rig_defaults(void)
+{
+    return (struct sim_rig_config){
+        .world = sim_world_defaults(),
+        .line_rate_baud = 921600,
+        .has_sensor = true,
+    };
+}
+
+/* The device as its maker would describe it. The servo has the stiffness of a firm hand, critical damping at 0.3 kg
+ * being 0.05 N.s/mm; less than that, since one encoder count a tick is a velocity of 12.7 mm/s. */
+struct hb_config sim_rig_describe(const struct sim_rig_config *config)
+{
+    const struct sim_world_config *world = &config->world;
+    const int capabilities = HB_CAN_DRIVE | HB_IS_SIMULATED | (config->has_sensor ? HB_CAN_SENSE_FORCE : 0);
+    return (struct hb_config){
+        .firmware = HB_FIRMWARE_HASH,
+        .line_rate_baud = config->line_rate_baud,
+        .tick_rate_Hz = (uint16_t)lround(1.0 / world->tick_s),
+        .watchdog_ticks = 250,
+        .hold_ticks = 20,
+        .most_taps = HB_MAX_TAPS,
+        .most_states = HB_MAX_STATES,
+        .capabilities = (uint8_t)capabilities,
+        .damping_N_s_per_m = (float)world->damping_N_s_per_m,
+        .force_limit_N = 20.0F,
+        .position_low_mm = (float)(world->low_mm - 0.1), /* the encoder may round a stop outwards */
+        .position_high_mm = (float)(world->high_mm + 0.1),
+        .encoder_step_mm = (float)world->encoder_step_mm,
+        .slew_limit_N_per_s = 500.0F,
+        .velocity_limit_mm_per_s = 1000.0F,
+        .plausible_step_mm = 2.0F,
+        .K0_N_per_mm = {-64.0F, 64.0F},
+        .K1_N_per_mm = {1e-3F, 64.0F},
+        .B1_N_s_alpha_per_mm = {1e-4F, 64.0F},
+        .alpha = {0.005F, 0.995F},
+        .servo_stiffness_N_per_mm = 2.0F,
+        .servo_damping_N_s_per_mm = 0.03F,
+        .servo_integral_N_per_mm_s = 20.0F,
+        .servo_speed_mm_per_s = 100.0F,
+    };
+}
+
+enum hb_error sim_rig_start(struct sim_rig *rig, const struct sim_rig_config *config, uint32_t boot_id)
+{
+    rig->config = sim_rig_describe(config);
+    rig->bad_ticks = 0;
+    rig->late_ticks = 0;
+    sim_world_start(&rig->world, &config->world);
+    return sim_rig_restart(rig, boot_id);
+}
+
+enum hb_error sim_rig_restart(struct sim_rig *rig, uint32_t boot_id)
+{
+    return hb_init(&rig->device, &rig->config, boot_id);
+}
+
+static bool counted_down(uint32_t *left)
+{
+    const bool any = *left > 0;
+    *left -= any ? 1U : 0U;
+    return any;
+}
+
+float sim_rig_tick(struct sim_rig *rig)
+{
+    const struct hb_input input = {
+        .position_counts = sim_world_counts(&rig->world),
+        .position_valid = !counted_down(&rig->bad_ticks),
+        .overrun = counted_down(&rig->late_ticks),
+        .sensed_N = (rig->config.capabilities & HB_CAN_SENSE_FORCE) != 0 ? (float)sim_world_sensed_N(&rig->world) : NAN,
+    };
+    const float force_N = hb_tick(&rig->device, &input);
+    sim_world_tick(&rig->world, -(double)force_N);
+    return force_N;
+}
