@@ -131,6 +131,13 @@ class Renderer:
         except BaseException:
             self._link.close()
             raise
+        if self._simulator is not None:
+            self._simulator.run(self._keep_up)
+
+    def _keep_up(self) -> None:
+        """Between ticks of a simulated device whose time is ours: a heartbeat, and everything it sent has been read."""
+        self._link.heartbeat()
+        self._link.request(protocol.GetStatus())
 
     def send(
         self,
