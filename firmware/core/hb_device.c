@@ -1,38 +1,172 @@
-/* Stub: the contract compiles and links; what the device does comes next. */
 #include "hb_device.h"
 
-const char *hb_error_sentence(enum hb_error error) { return error == HB_OK ? "Nothing is wrong." : "Something is."; }
-
-enum hb_error hb_config_check(const struct hb_config *config)
-{
-    (void)config;
-    return HB_OK;
-}
+#include "hb_math.h"
+#include "hb_motion.h"
+#include "hb_requests.h"
+#include "hb_staging.h"
 
 enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, uint32_t boot_id)
 {
+    enum hb_error error = hb_config_check(config);
     *device = (struct hb_device){.config = config, .boot_id = boot_id};
-    return HB_OK;
+    if (error == HB_OK) {
+        device->heartbeat_age_ticks = config->watchdog_ticks;
+        hb_enter(device, HB_STOPPED, HB_CAUSE_BOOT);
+    }
+    return error;
 }
 
 size_t hb_receive(struct hb_device *device, const uint8_t *bytes, size_t size)
 {
-    (void)device;
-    (void)bytes;
+    struct hb_frame frame;
+    for (size_t i = 0U; i < size; i += 1U) {
+        if (hb_receiver_push(&device->receiver, bytes[i], &frame)) {
+            hb_handle(device, &frame);
+            return i + 1U;
+        }
+    }
     return size;
 }
 
 size_t hb_transmit(struct hb_device *device, uint8_t *bytes, size_t room)
 {
-    (void)device;
-    (void)bytes;
-    (void)room;
-    return 0;
+    return hb_output_take(&device->output, bytes, room);
+}
+
+/* The difference of two forces, taken back as fast as the slew limit allows beside the model's own movement. */
+static void fade(struct hb_device *device, float before_N)
+{
+    const struct hb_config *config = device->config;
+    float step_N = config->slew_limit_N_per_s / (float)config->tick_rate_Hz;
+    float moved_N = before_N - device->safety.force_N;
+    float along_N = device->offset_N > 0.0F ? -moved_N : moved_N;
+    float room_N = hb_clamp(step_N - along_N, 0.0F, step_N);
+    device->offset_N = hb_towards_zero(device->offset_N, room_N);
+}
+
+/* The command while RUNNING, up to and with the slew limit. */
+static float run(struct hb_device *device, float model_N, float old_N)
+{
+    const struct hb_config *config = device->config;
+    struct hb_safety *safety = &device->safety;
+    float set_limit_N = device->bank[device->active].set.force_limit_N;
+    float limit_N = set_limit_N < config->force_limit_N ? set_limit_N : config->force_limit_N;
+    float force_N = model_N;
+    if (device->starting) {
+        device->offset_N = -model_N;
+    } else if (device->flipped) {
+        device->offset_N = old_N - model_N;
+    }
+    float before_N = hb_clamp(model_N + device->offset_N, 0.0F, limit_N);
+    bool switching = device->offset_N != 0.0F;
+    if (switching) {
+        safety->flags |= (uint16_t)HB_FLAG_SWITCHING;
+        if (!device->starting && !device->flipped) {
+            fade(device, before_N);
+        }
+        force_N = model_N + device->offset_N;
+        force_N = force_N > 0.0F ? force_N : 0.0F;
+    }
+    device->starting = false;
+    if ((config->capabilities & (uint8_t)HB_CAN_CONTROL_PASSIVITY) != 0U) {
+        force_N = hb_control(safety, config, force_N);
+    }
+    force_N = hb_saturate(safety, force_N, limit_N);
+    return hb_slew(safety, config, force_N, switching ? before_N : force_N);
+}
+
+static float drive(struct hb_device *device)
+{
+    float force_N = hb_drive_step(&device->drive, device->config, &device->safety);
+    force_N = hb_saturate(&device->safety, force_N, device->config->force_limit_N);
+    return hb_slew(&device->safety, device->config, force_N, force_N);
+}
+
+static enum hb_cause fault(const struct hb_device *device, bool input_lost, bool overrun, bool finite)
+{
+    if (device->heartbeat_age_ticks >= device->config->watchdog_ticks) {
+        return HB_CAUSE_WATCHDOG;
+    }
+    if (input_lost) {
+        return HB_CAUSE_INPUT;
+    }
+    if (hb_is_too_fast(&device->safety, device->config)) {
+        return HB_CAUSE_VELOCITY;
+    }
+    if (overrun) {
+        return HB_CAUSE_OVERRUN;
+    }
+    return finite ? HB_CAUSE_NONE : HB_CAUSE_MODEL;
+}
+
+/* The command that the state asks for, once a fault has had its say. */
+static float command(struct hb_device *device, float wanted_N, enum hb_cause cause)
+{
+    struct hb_safety *safety = &device->safety;
+    bool moves = hb_is_in(device, HB_RUNNING) || hb_is_in(device, HB_DRIVING);
+    if (moves && cause != HB_CAUSE_NONE) {
+        hb_count_up(&safety->count.holds);
+        hb_ramp_begin(safety);
+        hb_enter(device, HB_HOLDING, cause);
+    } else if (hb_is_in(device, HB_DRIVING) && hb_drive_has_ended(&device->drive)) {
+        hb_ramp_begin(safety);
+        hb_enter(device, HB_STOPPING, HB_CAUSE_NONE);
+    } else if (moves) {
+        return wanted_N;
+    }
+    if (hb_is_in(device, HB_HOLDING)) {
+        return hb_ramp(safety, device->config);
+    }
+    if (hb_is_in(device, HB_STOPPING)) {
+        float force_N = hb_ramp(safety, device->config);
+        if (hb_ramp_has_ended(safety, device->config)) {
+            hb_enter(device, HB_STOPPED, HB_CAUSE_NONE);
+        }
+        return force_N;
+    }
+    return 0.0F;
+}
+
+static uint16_t state_flags(const struct hb_device *device)
+{
+    uint32_t flags = device->safety.flags;
+    flags |= hb_in_contact(&device->safety) ? (uint32_t)HB_FLAG_CONTACT : 0U;
+    flags |= hb_is_in(device, HB_HOLDING) ? (uint32_t)HB_FLAG_HOLD : 0U;
+    flags |= hb_is_in(device, HB_ESTOPPED) ? (uint32_t)HB_FLAG_ESTOP : 0U;
+    flags |= hb_is_in(device, HB_RUNNING) ? (uint32_t)HB_FLAG_RUNNING : 0U;
+    flags |= hb_is_in(device, HB_DRIVING) ? (uint32_t)HB_FLAG_DRIVING : 0U;
+    return (uint16_t)flags;
 }
 
 float hb_tick(struct hb_device *device, const struct hb_input *input)
 {
-    (void)input;
+    const struct hb_config *config = device->config;
+    struct hb_safety *safety = &device->safety;
     device->tick += 1U;
-    return 0.0F;
+    safety->flags = 0U;
+    if (device->heartbeat_age_ticks < config->watchdog_ticks) {
+        device->heartbeat_age_ticks += 1U;
+    }
+    if (input->overrun) {
+        hb_count_up(&safety->count.overruns);
+    }
+    bool input_lost = !hb_check_input(safety, config, input);
+    float old_N = 0.0F;
+    float model_N = hb_render(device, hb_penetration_mm(safety, config), &old_N);
+    bool finite = hb_is_finite(model_N) && hb_is_finite(old_N);
+    model_N = model_N > 0.0F ? model_N : 0.0F;
+    old_N = old_N > 0.0F ? old_N : 0.0F;
+    hb_observe(safety, config);
+    float wanted_N = 0.0F;
+    if (hb_is_in(device, HB_RUNNING)) {
+        wanted_N = run(device, model_N, old_N);
+    } else if (hb_is_in(device, HB_DRIVING)) {
+        wanted_N = drive(device);
+    }
+    device->flipped = false;
+    safety->force_N = command(device, wanted_N, fault(device, input_lost, input->overrun, finite));
+    safety->flags = state_flags(device);
+    struct hb_sample sample = {(int16_t)safety->counts, safety->flags, safety->force_N, input->sensed_N};
+    hb_stream_tick(&device->stream, &device->output, device->tick, &sample);
+    return safety->force_N;
 }

@@ -20,95 +20,33 @@
 #include <stdint.h>
 
 #include "hb_config.h"
+#include "hb_drive.h"
 #include "hb_frame.h"
+#include "hb_line.h"
 #include "hb_messages.h"
 #include "hb_renderer.h"
-
-/* What the port knows at a tick. */
-struct hb_input {
-    int32_t position_counts; /* of the encoder, 0 at the surface, positive into it */
-    bool position_valid;     /* false where the encoder gave no number: counts as bad input */
-    bool overrun;            /* a tick was missed, or the last one took longer than its period */
-    float sensed_N;          /* what pushes the handle towards positive positions; NaN where nothing was read.
-                              * Only passed on to telemetry. */
-};
-
-/* How often each safeguard acted since the start; each stays at 65535. */
-struct hb_counts {
-    uint16_t input_held;
-    uint16_t saturated;
-    uint16_t slewed;
-    uint16_t controlled;
-    uint16_t holds;
-    uint16_t estops;
-    uint16_t overruns;
-};
-
-/* Position, energy and force as the safety chain knows them. */
-struct hb_safety {
-    int32_t counts;       /* the last position that was believed */
-    bool known;           /* there is one */
-    uint16_t bad;         /* bad positions in a row */
-    int32_t step_counts;  /* from the one before to `counts` */
-    int64_t energy;       /* that the hand put in during this touch, in 2^-20 mJ */
-    float force_N;        /* the last command */
-    float ramp_N;         /* the command when HOLD or STOP began */
-    uint16_t ramp_tick;   /* ticks since */
-    uint16_t flags;       /* of the last tick, enum hb_flag */
-    struct hb_counts count;
-};
-
-/* DRIVE as it was asked for, and where it is. Its forces are positive towards positive positions (pressing in): the
- * opposite sign of the command, which telemetry reports. */
-struct hb_drive {
-    uint8_t mode;
-    uint8_t shape;
-    float offset;
-    float amplitude;
-    uint32_t period_ticks;
-    uint32_t duration_ticks;
-    uint32_t tick;
-    float reference_mm;
-    float integral_N;
-};
-
-/* Telemetry that is being collected. */
-struct hb_stream {
-    uint8_t divisor; /* 0 = off */
-    uint8_t fields;
-    uint8_t until;   /* ticks until the next sample */
-    uint8_t samples; /* collected */
-    uint16_t lost;   /* samples, modulo 65536 */
-    size_t size;
-    uint8_t payload[HB_MAX_PAYLOAD];
-};
-
-/* Frames that wait for the line: a ring. */
-struct hb_output {
-    uint8_t bytes[HB_OUTPUT_BYTES];
-    size_t first;
-    size_t size;
-};
+#include "hb_safety.h"
 
 /* Owned by the caller; only hb_init and the functions below write to it, whoever likes may read. */
 struct hb_device {
     const struct hb_config *config;
     uint32_t boot_id;
     uint32_t tick;
-    uint8_t state; /* enum hb_state */
-    uint8_t cause; /* enum hb_cause: why it holds */
-    bool greeted;  /* HELLO has been said */
-    bool flipped;  /* the next tick is the first of another set */
+    uint8_t state;                /* enum hb_state */
+    uint8_t cause;                /* enum hb_cause: why it is in this state */
+    bool greeted;                 /* HELLO has been said */
     uint32_t heartbeat_age_ticks; /* stays at watchdog_ticks */
 
     struct hb_renderer bank[2];
-    uint8_t active;          /* bank in force; the other one is staged */
-    bool in_force;           /* there is a set in force */
-    uint8_t staging;         /* enum hb_staging, without READY for no contact */
-    uint16_t states_known;   /* exponentials received of the staged set */
-    uint32_t warm_left;      /* ticks until the staged history is warm */
-    uint32_t crc[2];         /* of each bank's bytes */
-    float offset_N;          /* what is left of the difference of two forces */
+    uint32_t crc[2];       /* of the bytes that each set came in */
+    uint8_t active;        /* bank in force; the other one is staged */
+    bool in_force;         /* there is a set in force */
+    uint8_t staging;       /* enum hb_staging; READY is told by warm_left */
+    uint16_t states_known; /* exponentials of the staged set that have come */
+    uint32_t warm_left;    /* ticks until the staged history is its own */
+    bool flipped;          /* the next tick is the first of a set that follows another */
+    bool starting;         /* the next tick is the first after START */
+    float offset_N;        /* what is left of the difference of two forces */
 
     struct hb_safety safety;
     struct hb_drive drive;
@@ -116,7 +54,7 @@ struct hb_device {
     struct hb_receiver receiver;
     struct hb_output output;
 
-    bool answered; /* the last request may be repeated: its seq, CRC and answer */
+    bool answered; /* the last request, if it comes again, gets the same answer */
     uint8_t answered_seq;
     uint32_t answered_crc;
     size_t answer_size;

@@ -6,8 +6,11 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#include "hb_config.h"
+#include "hb_renderer.h"
+
 #define HB_PROTOCOL_VERSION 1U
-#define HB_SCHEMA_CRC 0x00000000U /* CRC-32 of the schema block; a test compares it with PROTOCOL.md */
+#define HB_SCHEMA_CRC 0x1a3dd452U /* CRC-32 of the schema block; a test compares it with PROTOCOL.md */
 
 enum hb_type {
     HB_HELLO = 0x01,
@@ -103,5 +106,112 @@ enum hb_flag {
     HB_FLAG_RUNNING = 1 << 8,
     HB_FLAG_DRIVING = 1 << 9
 };
+
+/* Requests as structs. Unpacking reads a payload of the right length (hb_request_size) and returns whether the reserved
+ * fields are 0; it judges nothing else. */
+struct hb_hello {
+    uint16_t version;
+    uint32_t schema;
+};
+
+/* COMMIT and START */
+struct hb_confirmation {
+    uint16_t set_id;
+    uint32_t crc;
+    uint32_t boot_id;
+};
+
+struct hb_states {
+    uint16_t set_id;
+    uint8_t first;
+    uint8_t count; /* as sent; of more than 7 the first 7 are read */
+    float weight[7];
+    float loss[7];
+};
+
+struct hb_drive_request {
+    uint8_t mode;
+    uint8_t shape;
+    float offset;
+    float amplitude;
+    uint32_t period_ticks;
+    uint32_t duration_ticks;
+    uint32_t boot_id;
+};
+
+#define HB_NO_REQUEST SIZE_MAX
+
+/* Payload length that a request must have, given the payload itself, whose count decides for SET_STATES; HB_NO_REQUEST
+ * for a type that no host sends. */
+size_t hb_request_size(uint8_t type, const uint8_t *payload, size_t size);
+
+bool hb_unpack_hello(const uint8_t *payload, struct hb_hello *hello);
+bool hb_unpack_parameters(const uint8_t *payload, struct hb_parameters *set);
+void hb_unpack_states(const uint8_t *payload, struct hb_states *states);
+bool hb_unpack_confirmation(const uint8_t *payload, struct hb_confirmation *confirmation);
+bool hb_unpack_drive(const uint8_t *payload, struct hb_drive_request *drive);
+uint32_t hb_unpack_boot_id(const uint8_t *payload); /* CLEAR and HEARTBEAT */
+
+/* What the device sends. Packing fills a payload, and returns its length. */
+struct hb_nack {
+    uint8_t request;
+    uint8_t reason;
+    uint32_t ticks;
+    float value;
+    float limit;
+};
+
+struct hb_status {
+    uint32_t tick;
+    uint32_t boot_id;
+    uint8_t state;
+    uint8_t hold_reason;
+    uint8_t staging;
+    uint8_t contact;
+    uint16_t active_id;
+    uint16_t staged_id;
+    uint32_t active_crc;
+    uint32_t staged_crc;
+    uint32_t ticks_until_ready;
+    float position_mm;
+    float force_N;
+    float energy_mJ;
+    uint16_t counts[8]; /* in the order of the schema */
+};
+
+struct hb_set_reply {
+    uint8_t bank;
+    uint8_t flags;
+    struct hb_parameters set;
+    uint32_t crc;
+    float minimum_damping_N_s_per_m;
+};
+
+struct hb_notice {
+    uint32_t tick;
+    uint32_t boot_id;
+    uint8_t state;
+    uint8_t reason;
+};
+
+struct hb_sample {
+    int16_t position_counts;
+    uint16_t flags;
+    float force_N;
+    float sensed_N;
+};
+
+size_t hb_pack_hello_reply(const struct hb_config *config, uint32_t boot_id, uint8_t *payload);
+size_t hb_pack_limits(const struct hb_config *config, uint8_t *payload);
+size_t hb_pack_ack(uint8_t request, uint16_t set_id, uint32_t crc, uint8_t *payload);
+size_t hb_pack_nack(const struct hb_nack *nack, uint8_t *payload);
+size_t hb_pack_status(const struct hb_status *status, uint8_t *payload);
+size_t hb_pack_set(const struct hb_set_reply *reply, uint8_t *payload);
+size_t hb_pack_notice(const struct hb_notice *notice, uint8_t *payload);
+size_t hb_pack_telemetry_head(uint32_t tick, uint8_t divisor, uint8_t fields, uint16_t lost, uint8_t *payload);
+size_t hb_pack_sample(const struct hb_sample *sample, bool with_sensed, uint8_t *payload);
+
+#define HB_TELEMETRY_HEAD 8U
+#define HB_SAMPLE_SIZE(with_sensed) ((with_sensed) ? 12U : 8U)
 
 #endif

@@ -34,7 +34,9 @@ struct hb_renderer {
     float gain;                         /* g */
     float stiffness_N_per_mm;           /* k */
     float rest_share;                   /* y of the equilibrium at 1 mm */
-    float minimum_damping_N_s_per_m;    /* of the passive rendering */
+    float static_stiffness_N_per_mm;    /* H(1) */
+    bool static_is_passive;             /* it is not negative, to rounding */
+    float minimum_damping_N_s_per_m;    /* with which the rendering is passive */
     uint32_t warm_ticks;                /* until a history that starts at an equilibrium is its own */
     float tap[HB_MAX_TAPS];             /* short: |c_N| ... |c_1| */
     float history_mm[2U * HB_MAX_TAPS]; /* short: every y twice, N apart, so that the last N always lie in a row */
@@ -45,5 +47,22 @@ struct hb_renderer {
     float mean_mm[HB_MAX_STATES];       /* full: m_k, */
     float rest_mm[HB_MAX_STATES];       /* full: and what its last additions lost to rounding */
 };
+
+/* Everything that the parameters decide, for a set within its limits; full memory still lacks its exponentials. The
+ * history is left undefined: hb_renderer_rest comes next. */
+void hb_renderer_prepare(struct hb_renderer *renderer, const struct hb_parameters *set);
+
+/* One exponential of full memory, index < length, fastest first. */
+void hb_renderer_set_state(struct hb_renderer *renderer, size_t index, float weight, float loss);
+
+/* The exponentials are positive, in order, and their sums are those of alpha. To be asked when all have been set; also
+ * brings `warm_ticks` up to date. */
+bool hb_renderer_accept_states(struct hb_renderer *renderer);
+
+/* The history of having been held at x for ever. */
+void hb_renderer_rest(struct hb_renderer *renderer, float x_mm);
+
+/* One tick at x >= 0: the model's force, of either sign. */
+float hb_renderer_step(struct hb_renderer *renderer, float x_mm);
 
 #endif

@@ -1,0 +1,35 @@
+/* DRIVE: the device moves by itself. Forces here are positive inwards, towards positive positions: the opposite of the
+ * command, which is what telemetry reports. */
+#ifndef HB_DRIVE_H
+#define HB_DRIVE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "hb_config.h"
+#include "hb_messages.h"
+#include "hb_safety.h"
+
+enum hb_drive_mode { HB_DRIVE_FORCE = 0, HB_DRIVE_POSITION = 1 };
+enum hb_drive_shape { HB_DRIVE_CONSTANT = 0, HB_DRIVE_TRIANGLE = 1, HB_DRIVE_STEP = 2 };
+
+struct hb_drive {
+    struct hb_drive_request request;
+    uint32_t tick;      /* since the start */
+    float reference_mm; /* mode 1: where the servo wants to be now */
+    float integral_N;   /* mode 1: what its integral has come to */
+};
+
+/* HB_ACCEPTED, or why not, with the number and the bound it crosses. */
+enum hb_reason hb_drive_check(const struct hb_drive_request *request, const struct hb_config *config, float *value,
+                              float *limit);
+
+/* Start from a position. */
+void hb_drive_begin(struct hb_drive *drive, const struct hb_drive_request *request, float position_mm);
+
+bool hb_drive_has_ended(const struct hb_drive *drive);
+
+/* The command of one tick. */
+float hb_drive_step(struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety);
+
+#endif

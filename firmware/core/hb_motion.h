@@ -1,0 +1,18 @@
+/* The states, and the requests that change them. */
+#ifndef HB_MOTION_H
+#define HB_MOTION_H
+
+#include "hb_requests.h"
+
+bool hb_is_in(const struct hb_device *device, enum hb_state state);
+
+/* Change the state, and say so with a NOTICE. A difference of two forces ends with the state. */
+void hb_enter(struct hb_device *device, enum hb_state state, enum hb_cause cause);
+
+enum hb_reason hb_start(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply);
+enum hb_reason hb_drive(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply);
+enum hb_reason hb_clear(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply);
+void hb_stop(struct hb_device *device);
+void hb_estop(struct hb_device *device);
+
+#endif

@@ -1,0 +1,35 @@
+/* Closed forms of the sampled model: what the sums of the Grünwald-Letnikov coefficients say about passivity.
+ *
+ *     S = C(1), C(-1), M1 = -sum i c_i;   H(1) = K0 + series(K1, beta S),   b_min = T/2 (K0 + series(K1, beta C(-1)))
+ *
+ * with series(p, q) = p q/(p + q). docs/mechanics.md says what of this is proved, and why N must be odd. */
+#ifndef HB_PASSIVITY_H
+#define HB_PASSIVITY_H
+
+#include <stdbool.h>
+
+#include "hb_renderer.h"
+
+struct hb_sums {
+    float at_dc;      /* C(1) */
+    float at_nyquist; /* C(-1) */
+    float moment;     /* M1 in ticks; of full memory 0 here, because it depends on the exponentials */
+};
+
+/* Of a set's memory: for short memory with N >= 1 taps, |c_N| ... |c_1| go to `tap` (room for N). */
+struct hb_sums hb_memory_sums(const struct hb_parameters *set, float *tap);
+
+/* K1 and a pot in series. */
+float hb_series(float K1_N_per_mm, float pot_N_per_mm);
+
+/* H(1), N/mm. */
+float hb_static_stiffness(const struct hb_parameters *set, float beta_N_per_mm, struct hb_sums sums);
+
+/* The static stiffness is not negative. In float32 H(1) may be off by 2^-16 of K1's share, and a set that was meant to
+ * have H(1) = 0 passes. */
+bool hb_static_stiffness_is_passive(const struct hb_parameters *set, float beta_N_per_mm, struct hb_sums sums);
+
+/* Smallest device damping (N s/m) with which the rendering is passive. */
+float hb_minimum_damping(const struct hb_parameters *set, float beta_N_per_mm, struct hb_sums sums);
+
+#endif

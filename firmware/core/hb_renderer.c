@@ -1,0 +1,161 @@
+#include "hb_renderer.h"
+
+#include "hb_math.h"
+#include "hb_messages.h"
+#include "hb_passivity.h"
+
+/* Elongations below this count as 0: a history without contact ends, and no subnormal number ever slows a tick. */
+#define SMALLEST_MM (1.0F / 18446744073709551616.0F) /* 2^-64 */
+#define SUM_TOLERANCE 1e-5F
+#define NYQUIST_TOLERANCE 1e-4F
+
+/* Three mean delays of the rendering's positive kernel, beside the taps themselves. */
+static uint32_t warm_ticks(const struct hb_renderer *renderer, float moment)
+{
+    float mean_delay_ticks = renderer->beta_N_per_mm * moment * renderer->rest_share / renderer->set.K1_N_per_mm;
+    float taps = renderer->set.memory == HB_SHORT ? (float)renderer->set.length : 0.0F;
+    float ticks = taps + 3.0F * mean_delay_ticks;
+    if (!(ticks < (float)HB_MAX_WARM_TICKS)) {
+        return HB_MAX_WARM_TICKS;
+    }
+    uint32_t whole = (uint32_t)ticks;
+    return (float)whole < ticks ? whole + 1U : whole;
+}
+
+void hb_renderer_prepare(struct hb_renderer *renderer, const struct hb_parameters *set)
+{
+    renderer->set = *set;
+    struct hb_sums sums = hb_memory_sums(set, renderer->tap);
+    float K1 = set->K1_N_per_mm;
+    float beta = set->B1_N_s_alpha_per_mm * hb_power(set->tick_rate_Hz, set->alpha);
+    renderer->beta_N_per_mm = beta;
+    renderer->gain = K1 / (K1 + beta);
+    renderer->stiffness_N_per_mm = hb_series(K1, beta);
+    renderer->rest_share = K1 / (K1 + beta * sums.at_dc);
+    renderer->static_stiffness_N_per_mm = hb_static_stiffness(set, beta, sums);
+    renderer->static_is_passive = hb_static_stiffness_is_passive(set, beta, sums);
+    renderer->minimum_damping_N_s_per_m = hb_minimum_damping(set, beta, sums);
+    renderer->warm_ticks = warm_ticks(renderer, sums.moment);
+}
+
+void hb_renderer_set_state(struct hb_renderer *renderer, size_t index, float weight, float loss)
+{
+    if (index < HB_MAX_STATES) {
+        renderer->weight[index] = weight;
+        renderer->loss[index] = loss;
+    }
+}
+
+bool hb_renderer_accept_states(struct hb_renderer *renderer)
+{
+    float sum = 0.0F;
+    float nyquist = 0.0F;
+    float moment = 0.0F;
+    float slower = 1.0F;
+    for (size_t k = 0U; k < renderer->set.length; k += 1U) {
+        float weight = renderer->weight[k];
+        float loss = renderer->loss[k];
+        if (!(weight > 0.0F && weight <= 1.0F && loss > 0.0F && loss <= slower)) {
+            return false;
+        }
+        slower = loss;
+        sum = sum + weight;
+        nyquist = nyquist + weight * 2.0F / (2.0F - loss);
+        moment = moment + weight / loss;
+    }
+    renderer->warm_ticks = warm_ticks(renderer, moment);
+    float expected = hb_power(2U, renderer->set.alpha);
+    return hb_absolute(sum - 1.0F) <= SUM_TOLERANCE && hb_absolute(nyquist - expected) <= NYQUIST_TOLERANCE;
+}
+
+void hb_renderer_rest(struct hb_renderer *renderer, float x_mm)
+{
+    float y_mm = renderer->rest_share * x_mm;
+    size_t length = renderer->set.length;
+    if (renderer->set.memory == HB_FULL) {
+        for (size_t k = 0U; k < length; k += 1U) {
+            renderer->mean_mm[k] = y_mm;
+            renderer->rest_mm[k] = 0.0F;
+        }
+    } else {
+        for (size_t i = 0U; i < 2U * length; i += 1U) {
+            renderer->history_mm[i] = y_mm;
+        }
+    }
+    renderer->oldest = 0U;
+    renderer->quiet = y_mm == 0.0F ? length : 0U;
+}
+
+/* What the past of y contributes: one dot product, oldest first. */
+static float short_past(const struct hb_renderer *renderer)
+{
+    const float *row = &renderer->history_mm[renderer->oldest];
+    float past_mm = 0.0F;
+    for (size_t i = 0U; i < renderer->set.length; i += 1U) {
+        past_mm = past_mm + renderer->tap[i] * row[i];
+    }
+    return past_mm;
+}
+
+static void short_push(struct hb_renderer *renderer, float y_mm)
+{
+    size_t length = renderer->set.length;
+    renderer->history_mm[renderer->oldest] = y_mm;
+    renderer->history_mm[renderer->oldest + length] = y_mm;
+    renderer->oldest = renderer->oldest + 1U < length ? renderer->oldest + 1U : 0U;
+    if (y_mm != 0.0F) {
+        renderer->quiet = 0U;
+    } else if (renderer->quiet < length) {
+        renderer->quiet += 1U;
+    }
+}
+
+static float full_past(const struct hb_renderer *renderer)
+{
+    float past_mm = 0.0F;
+    for (size_t k = 0U; k < renderer->set.length; k += 1U) {
+        past_mm = past_mm + renderer->weight[k] * renderer->mean_mm[k];
+    }
+    return past_mm;
+}
+
+/* m += loss (y - m), where a slow mean moves by less than its own last place: what an addition drops waits in `rest`. */
+static void full_push(struct hb_renderer *renderer, float y_mm)
+{
+    size_t zeros = 0U;
+    for (size_t k = 0U; k < renderer->set.length; k += 1U) {
+        float mean = renderer->mean_mm[k];
+        float rest = renderer->rest_mm[k];
+        float change = rest + renderer->loss[k] * ((y_mm - mean) - rest);
+        float next = mean + change;
+        rest = change - (next - mean);
+        if (hb_absolute(next) < SMALLEST_MM) {
+            next = 0.0F;
+            rest = 0.0F;
+            zeros += 1U;
+        }
+        renderer->mean_mm[k] = next;
+        renderer->rest_mm[k] = rest;
+    }
+    renderer->quiet = zeros;
+}
+
+float hb_renderer_step(struct hb_renderer *renderer, float x_mm)
+{
+    if (x_mm == 0.0F && renderer->quiet == renderer->set.length) {
+        return 0.0F; /* no contact, and none remembered: what follows would give the same, and change nothing */
+    }
+    bool full = renderer->set.memory == HB_FULL;
+    float past_mm = full ? full_past(renderer) : short_past(renderer);
+    float spring_mm = x_mm - past_mm;
+    float y_mm = past_mm + renderer->gain * spring_mm;
+    if (hb_absolute(y_mm) < SMALLEST_MM) {
+        y_mm = 0.0F;
+    }
+    if (full) {
+        full_push(renderer, y_mm);
+    } else {
+        short_push(renderer, y_mm);
+    }
+    return renderer->set.K0_N_per_mm * x_mm + renderer->stiffness_N_per_mm * spring_mm;
+}

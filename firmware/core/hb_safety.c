@@ -1,0 +1,140 @@
+#include "hb_safety.h"
+
+#include "hb_math.h"
+
+#define ENERGY_SCALE 1048576.0F                /* 2^20: units of energy in a mJ */
+#define LARGEST_ENERGY (INT64_C(1) << 60)      /* the observer stays there: centuries of pressing */
+
+void hb_count_up(uint16_t *counter)
+{
+    if (*counter < UINT16_MAX) {
+        *counter = (uint16_t)(*counter + 1U);
+    }
+}
+
+static bool is_plausible(const struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input)
+{
+    float position_mm = (float)input->position_counts * config->encoder_step_mm;
+    if (!input->position_valid || position_mm < config->position_low_mm || position_mm > config->position_high_mm) {
+        return false;
+    }
+    if (!safety->known) {
+        return true;
+    }
+    float step_mm = (float)(input->position_counts - safety->counts) * config->encoder_step_mm;
+    return hb_absolute(step_mm) <= config->plausible_step_mm * (float)(safety->bad + 1U);
+}
+
+bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input)
+{
+    if (is_plausible(safety, config, input)) {
+        safety->step_counts = safety->known ? input->position_counts - safety->counts : 0;
+        safety->step_ticks = (uint16_t)(safety->bad + 1U);
+        safety->counts = input->position_counts;
+        safety->known = true;
+        safety->bad = 0U;
+        return true;
+    }
+    hb_count_up(&safety->count.input_held);
+    safety->flags |= (uint16_t)HB_FLAG_INPUT_HELD;
+    safety->step_counts = 0;
+    safety->step_ticks = 1U;
+    if (safety->bad + 1U < HB_BAD_POSITIONS) {
+        safety->bad = (uint16_t)(safety->bad + 1U);
+        return true;
+    }
+    safety->bad = 0U;
+    safety->known = false; /* lost: the next position within the stroke is a new beginning */
+    return false;
+}
+
+float hb_position_mm(const struct hb_safety *safety, const struct hb_config *config)
+{
+    return (float)safety->counts * config->encoder_step_mm;
+}
+
+bool hb_in_contact(const struct hb_safety *safety)
+{
+    return safety->counts > 0;
+}
+
+float hb_penetration_mm(const struct hb_safety *safety, const struct hb_config *config)
+{
+    return hb_in_contact(safety) ? hb_position_mm(safety, config) : 0.0F;
+}
+
+void hb_observe(struct hb_safety *safety, const struct hb_config *config)
+{
+    if (hb_in_contact(safety) && safety->counts - safety->step_counts <= 0) {
+        safety->energy = 0;
+    }
+    float step_mm = (float)safety->step_counts * config->encoder_step_mm;
+    int64_t taken = (int64_t)(safety->force_N * step_mm * ENERGY_SCALE);
+    int64_t energy = safety->energy + taken;
+    if (energy < LARGEST_ENERGY && energy > -LARGEST_ENERGY) {
+        safety->energy = energy;
+    }
+}
+
+float hb_energy_mJ(const struct hb_safety *safety)
+{
+    return (float)safety->energy / ENERGY_SCALE;
+}
+
+float hb_control(struct hb_safety *safety, const struct hb_config *config, float force_N)
+{
+    float step_mm = (float)safety->step_counts * config->encoder_step_mm;
+    if (safety->energy >= 0 || safety->step_counts == 0) {
+        return force_N;
+    }
+    hb_count_up(&safety->count.controlled);
+    safety->flags |= (uint16_t)HB_FLAG_CONTROLLED;
+    float controlled_N = force_N - hb_energy_mJ(safety) / step_mm;
+    return controlled_N > 0.0F ? controlled_N : 0.0F;
+}
+
+float hb_saturate(struct hb_safety *safety, float force_N, float limit_N)
+{
+    if (hb_absolute(force_N) <= limit_N) {
+        return force_N;
+    }
+    hb_count_up(&safety->count.saturated);
+    safety->flags |= (uint16_t)HB_FLAG_SATURATED;
+    return hb_clamp(force_N, -limit_N, limit_N);
+}
+
+float hb_slew(struct hb_safety *safety, const struct hb_config *config, float force_N, float expected_N)
+{
+    float step_N = config->slew_limit_N_per_s / (float)config->tick_rate_Hz;
+    if (hb_absolute(expected_N - safety->force_N) > step_N) {
+        hb_count_up(&safety->count.slewed);
+        safety->flags |= (uint16_t)HB_FLAG_SLEWED;
+    }
+    return hb_clamp(force_N, safety->force_N - step_N, safety->force_N + step_N);
+}
+
+bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *config)
+{
+    float step_mm = hb_absolute((float)safety->step_counts * config->encoder_step_mm);
+    return step_mm * (float)config->tick_rate_Hz > config->velocity_limit_mm_per_s * (float)safety->step_ticks;
+}
+
+void hb_ramp_begin(struct hb_safety *safety)
+{
+    safety->ramp_N = safety->force_N;
+    safety->ramp_ticks = 0U;
+}
+
+float hb_ramp(struct hb_safety *safety, const struct hb_config *config)
+{
+    if (safety->ramp_ticks < config->hold_ticks) {
+        safety->ramp_ticks = (uint16_t)(safety->ramp_ticks + 1U);
+    }
+    uint16_t left = (uint16_t)(config->hold_ticks - safety->ramp_ticks);
+    return safety->ramp_N * ((float)left / (float)config->hold_ticks);
+}
+
+bool hb_ramp_has_ended(const struct hb_safety *safety, const struct hb_config *config)
+{
+    return safety->ramp_ticks >= config->hold_ticks;
+}

@@ -1,0 +1,84 @@
+/* The safety chain of one tick, and what it has to remember. The device calls the links in this order:
+ *
+ *     input check - model - passivity observer and controller - saturation - slew limit - velocity limit and overrun
+ *
+ * Whatever acts is counted and flagged. Only the input, the velocity and an overrun lead to HOLD; the device decides. */
+#ifndef HB_SAFETY_H
+#define HB_SAFETY_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "hb_config.h"
+#include "hb_messages.h"
+
+/* What the port knows at a tick. */
+struct hb_input {
+    int32_t position_counts; /* of the encoder, 0 at the surface, positive into it */
+    bool position_valid;     /* false where the encoder gave no number: counts as bad input */
+    bool overrun;            /* a tick was missed, or the last one took longer than its period */
+    float sensed_N;          /* what pushes the handle towards positive positions; NaN where nothing was read.
+                              * Only passed on to telemetry. */
+};
+
+/* How often each safeguard acted since the start; each stays at 65535. */
+struct hb_counts {
+    uint16_t input_held;
+    uint16_t saturated;
+    uint16_t slewed;
+    uint16_t controlled;
+    uint16_t holds;
+    uint16_t estops;
+    uint16_t overruns;
+};
+
+struct hb_safety {
+    int32_t counts;      /* the last position that was believed */
+    int32_t step_counts; /* how it changed, over `step_ticks`; 0 while a position is held */
+    uint16_t step_ticks;
+    bool known;       /* there has been a position to compare with */
+    uint16_t bad;     /* bad positions in a row, up to HB_BAD_POSITIONS */
+    int64_t energy;   /* that went into the device during this touch, 2^-20 mJ */
+    float force_N;    /* the last command */
+    float ramp_N;     /* the command when HOLD or STOP began */
+    uint16_t ramp_ticks; /* since then, up to hold_ticks */
+    uint16_t flags;   /* of this tick, enum hb_flag */
+    struct hb_counts count;
+};
+
+#define HB_BAD_POSITIONS 3U /* in a row: the input is lost */
+
+/* One more, unless it is 65535. */
+void hb_count_up(uint16_t *counter);
+
+/* Believe the position, or keep the last one. False when the input is lost. */
+bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input);
+
+/* The position that is believed (mm), and the part of it that the model sees: x >= 0. */
+float hb_position_mm(const struct hb_safety *safety, const struct hb_config *config);
+float hb_penetration_mm(const struct hb_safety *safety, const struct hb_config *config);
+bool hb_in_contact(const struct hb_safety *safety);
+
+/* The energy that the last command took from the hand during the last period; begins anew with every touch. */
+void hb_observe(struct hb_safety *safety, const struct hb_config *config);
+float hb_energy_mJ(const struct hb_safety *safety);
+
+/* The force that brings a negative energy back to 0 in one period of the same motion, added to `force_N`. */
+float hb_control(struct hb_safety *safety, const struct hb_config *config, float force_N);
+
+/* Within +-limit_N. */
+float hb_saturate(struct hb_safety *safety, float force_N, float limit_N);
+
+/* Within one tick's change of the last command. `expected_N` is counted against, where the device itself is about to
+ * take a difference back: it differs from `force_N` by what this tick took. */
+float hb_slew(struct hb_safety *safety, const struct hb_config *config, float force_N, float expected_N);
+
+/* The believed position moved faster than the limit. */
+bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *config);
+
+/* Begin the way to zero force, and go one tick along it; at the end the force is 0 exactly. */
+void hb_ramp_begin(struct hb_safety *safety);
+float hb_ramp(struct hb_safety *safety, const struct hb_config *config);
+bool hb_ramp_has_ended(const struct hb_safety *safety, const struct hb_config *config);
+
+#endif
