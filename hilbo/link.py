@@ -59,7 +59,7 @@ class Link:
         self.name, self.patience, self.tries = port.name, patience, tries
         self.boot_id: int | None = None
         self.lost: str | None = None
-        self.restarted = False
+        self.restarted = self.silent = False
         self.retries = self.stray = self.strange = self.received = 0
         self.round_trips: deque[float] = deque(maxlen=100_000)
         self.notices: deque[Notice] = deque(maxlen=1000)
@@ -128,8 +128,8 @@ class Link:
             raise DeviceError(self._lose(error)) from error
 
     def heartbeat(self) -> None:
-        """One heartbeat, now."""
-        if self.boot_id is not None:
+        """One heartbeat, now; none before the device is known, and none while `silent`, for tests of the watchdog."""
+        if self.boot_id is not None and not self.silent:
             self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id), 0))
 
     def close(self) -> None:

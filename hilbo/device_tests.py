@@ -1,0 +1,203 @@
+"""What a device can be asked to do without a hand: test its line, measure its own damping, press a material.
+
+Everything is timed in ticks of the device. Drives are positive inwards, towards the material, and so is `sensed_N`;
+`force_N` is positive outwards (firmware/PROTOCOL.md, "Signs"). Units: mm, N, s.
+"""
+
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hilbo.errors import InputError
+from hilbo.friction import Friction, friction, sweeps
+from hilbo.hardware_bridge import Capability, DeviceError, Renderer, State
+from hilbo.reasons import HoldReason, SampleFlag, held_because, meaning
+from hilbo.telemetry import Samples
+
+__all__ = ["SelfTest", "characterise", "drive", "measure_damping", "selftest", "wait_until"]
+
+_SPEEDS = (10.0, 20.0, 35.0, 50.0)  # mm/s
+_SETTLE = 0.12  # s after each turn
+_PERIODS = 5  # at each speed
+_FREE = 0.1  # N that a free device's sensor may show
+_MOST = 2.0  # s of this clock for what the device does at once
+
+
+class SelfTest(NamedTuple):
+    """`echoes` came back whole of `asked`; round trip in ms; `watchdog_ticks` from the last heartbeat to HOLD."""
+
+    asked: int
+    echoes: int
+    median_ms: float
+    p99_ms: float
+    retries: int
+    dropped: int
+    watchdog_ticks: int
+    watchdog_limit: int
+    force_after_N: float
+
+
+def wait_until(done: Callable[[], Any], what: str, seconds: float = _MOST) -> Any:
+    """The first true value of `done`. Raises `DeviceError` when `what` has not come after `seconds`."""
+    give_up = time.monotonic() + seconds
+    while not (found := done()):
+        if time.monotonic() > give_up:
+            raise DeviceError(f"The device has not {what} within {seconds:g} s; check it, then try again.")
+        time.sleep(0.005)
+    return found
+
+
+def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: float = 0.0, **times: float) -> Samples:
+    """Let the device move by itself, and return the samples of it. Raises `DeviceError` if it does not finish."""
+    device.samples(0.0)
+    device.drive(mode, shape, offset, amplitude, **times)
+    parts = [device.samples(times["duration"])]
+    while not _ended(parts):
+        parts.append(device.samples(0.05))
+    wait_until(lambda: device.state() != State.STOPPING, "stopped")
+    whole = Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    driving = (whole.flags & SampleFlag.DRIVING) != 0
+    if driving.sum() * device.divisor < round(times["duration"] / device.tick_s) - device.divisor:
+        status = device.status()
+        raise DeviceError(
+            f"The device has ended its drive early, now {meaning(State, status.state)}:"
+            f" {held_because(status.hold_reason)}; nothing of it is used."
+        )
+    return Samples(*(column[driving] for column in whole))
+
+
+def _ended(parts) -> bool:
+    """Whether the last sample is past a drive; one that never began has ended too."""
+    flags = parts[-1].flags
+    return flags.size > 0 and not flags[-1] & SampleFlag.DRIVING
+
+
+def measure_damping(device: Renderer, say: Callable[[str], None], seed: int = 0) -> Friction:
+    """Damping b, Coulomb friction and mass of the free device, by sweeps through its stroke at several speeds.
+
+    Nothing may touch the handle. Raises `InputError` where the stroke is too short, `DeviceError` where something
+    touches it.
+    """
+    said = device.device
+    low, high = said.position_low_mm, said.position_high_mm
+    middle, reach = (low + high) / 2, 0.3 * (high - low)
+    found: list = []
+    for speed in (s for s in _SPEEDS if s < 0.2 * said.velocity_limit_mm_per_s):
+        period = 4 * reach / speed
+        say(f"{speed:g} mm/s")
+        first = drive(device, "position", "triangle", middle, reach, period=period, duration=(_PERIODS + 1) * period)
+        if np.mean(np.abs(first.sensed_N)) > _FREE:  # false without a sensor
+            raise DeviceError("Something touches the handle; take it away, damping is measured on the free device.")
+        settled = round(period / device.tick_s / device.divisor)  # the way to the middle, and the servo's start
+        tick = device.tick_s * device.divisor
+        position, force = first.position_mm[settled:], -first.force_N[settled:]
+        found += sweeps(position, force, tick, period, _SETTLE, len(found))
+    return friction(found, seed)
+
+
+def characterise(
+    device: Renderer,
+    say: Callable[[str], None],
+    *,
+    repeats: int = 16,
+    depth: float = 5.0,
+    force: float = 3.0,
+    after: float = 0.5,
+    hold: float = 3.0,
+    rest: float = 2.0,
+    seed: int = 0,
+) -> Any:
+    """The paper's relaxation (`depth` mm held) and creep (`force` N, then `after` N) of the material at position 0.
+
+    Returns the table that `hilbo identify` reads: test, repeat, time_s, position_mm, force_N. Each test begins off the
+    material and at rest; `rest` s between them let it recover. The depth is moved by up to half a step of the encoder,
+    another way in each repeat, so that its rounding averages out. Raises `InputError` and `DeviceError`.
+    """
+    import pandas as pd
+
+    step, low = device.device.encoder_step_mm, device.device.position_low_mm
+    if repeats < 1 or depth <= 0 or force <= 0 or hold <= 0:
+        raise InputError("Repeats, depth, force and hold must be above 0.")
+    away = max(low / 2, -1.0)
+    moved = step * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
+    tables = []
+    for repeat in range(repeats):
+        for kind in ("relaxation", "creep"):
+            say(f"{kind} {repeat + 1} of {repeats}")
+            begin = away if kind == "relaxation" else -step
+            drive(device, "position", "hold", begin, duration=rest)
+            if kind == "relaxation":
+                seen = drive(device, "position", "hold", depth + moved[repeat], duration=hold + 0.5)
+            else:
+                seen = drive(device, "force", "step", force, after, period=hold, duration=2 * hold)
+            part = _pressed(device, seen, kind)
+            part = part[part["time_s"] <= (hold if kind == "relaxation" else 2 * hold)]
+            tables.append(part.assign(test=kind, repeat=repeat + 1))
+    drive(device, "position", "hold", away, duration=0.5)
+    return pd.concat(tables)[["test", "repeat", "time_s", "position_mm", "force_N"]]
+
+
+def _pressed(device, seen: Samples, kind: str) -> Any:
+    """From the last sample off the material on; force of the material from the sensor, without one from the motor."""
+    import pandas as pd
+
+    inside = np.flatnonzero(seen.position_mm > 0)
+    if inside.size == 0 or np.all(seen.position_mm[inside] < 0.05):
+        raise DeviceError(f"The {kind} test has met nothing at position 0; put the material there.")
+    first = max(inside[0] - 1, 0)
+    sensed = bool(device.can & Capability.FORCE_SENSOR)
+    force = -seen.sensed_N if sensed else -seen.force_N
+    position = np.maximum(seen.position_mm, 0.0)
+    since = (seen.tick - seen.tick[first]) * device.tick_s
+    columns = {"time_s": since, "position_mm": position, "force_N": np.where(position > 0, force, 0.0)}
+    return pd.DataFrame(columns)[first:]
+
+
+def selftest(device: Renderer, say: Callable[[str], None], echoes: int = 300) -> SelfTest:
+    """Loopback of every byte and length, round trips, and whether silence stops the device in time."""
+    say("loopback")
+    rng, whole = np.random.default_rng(0), 0
+    device.link.round_trips.clear()
+    for n in range(echoes):
+        sent = bytes(range(4 * (n % 65), 4 * (n % 65) + n % 65 % 4)) if n < 65 else rng.bytes(n % 65)
+        whole += device.echo(sent) == sent
+    times = np.array(device.link.round_trips) * 1e3
+    say("watchdog")
+    ticks, force = _watchdog(device)
+    return SelfTest(
+        echoes,
+        whole,
+        float(np.median(times)),
+        float(np.quantile(times, 0.99)),
+        device.link.retries,
+        device.link.dropped,
+        ticks,
+        device.device.watchdog_ticks,
+        force,
+    )
+
+
+def _watchdog(device) -> tuple[int, float]:
+    """Ticks from the last heartbeat that the device can have heard to its HOLD, and the force (N) after the ramp."""
+    if not device.can & Capability.DRIVE:
+        raise InputError(
+            "This device cannot move by itself, and its watchdog is not tested; start a set, then pull the plug."
+        )
+    device.drive("force", "hold", 0.0, duration=5.0)
+    wait_until(lambda: device.state() == State.DRIVING, "begun to drive")
+    device.link.silent = True
+    last = device.status().tick  # whatever heartbeat there was has arrived by now
+    try:
+        wait_until(lambda: device.state() == State.HOLD, "let go without heartbeats")
+    finally:
+        device.link.silent = False
+    status = device.status()
+    if status.hold_reason != HoldReason.WATCHDOG:
+        raise DeviceError(f"The device is in HOLD, but {held_because(status.hold_reason)}; check that first.")
+    notice = next(n for n in reversed(device.link.notices) if n.state == State.HOLD)
+    wait_until(lambda: device.status().tick > notice.tick + device.device.hold_ticks, "gone on")
+    force = device.status().force_N
+    device.clear()
+    return notice.tick - last, force
