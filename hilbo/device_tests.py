@@ -18,9 +18,9 @@ from hilbo.telemetry import Samples
 
 __all__ = ["SelfTest", "characterise", "drive", "measure_damping", "selftest", "wait_until"]
 
-_SPEEDS = (10.0, 20.0, 35.0, 50.0)  # mm/s
+_SWEEPS = 24  # there and back
+_SLOWEST, _FASTEST = 10.0, 55.0  # mm/s
 _SETTLE = 0.12  # s after each turn
-_PERIODS = 5  # at each speed
 _FREE = 0.1  # N that a free device's sensor may show
 _MOST = 2.0  # s of this clock for what the device does at once
 
@@ -53,8 +53,8 @@ def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: flo
     """Let the device move by itself, and return the samples of it. Raises `DeviceError` if it does not finish."""
     device.samples(0.0)
     device.drive(mode, shape, offset, amplitude, **times)
-    parts = [device.samples(times["duration"])]
-    while not _ended(parts):
+    begun, parts = device.status().tick, [device.samples(times["duration"])]
+    while not _ended(parts[-1], begun):
         parts.append(device.samples(0.05))
     wait_until(lambda: device.state() != State.STOPPING, "stopped")
     whole = Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
@@ -68,10 +68,11 @@ def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: flo
     return Samples(*(column[driving] for column in whole))
 
 
-def _ended(parts) -> bool:
-    """Whether the last sample is past a drive; one that never began has ended too."""
-    flags = parts[-1].flags
-    return flags.size > 0 and not flags[-1] & SampleFlag.DRIVING
+def _ended(seen: Samples, begun: int) -> bool:
+    """Whether the last sample comes after a drive that had begun at the tick `begun`, of 32 bits, or one later."""
+    if seen.flags.size == 0 or seen.flags[-1] & SampleFlag.DRIVING:
+        return False
+    return 2 < (int(seen.tick[-1]) - begun) % 2**32 < 2**31
 
 
 def measure_damping(device: Renderer, say: Callable[[str], None], seed: int = 0) -> Friction:
@@ -80,20 +81,20 @@ def measure_damping(device: Renderer, say: Callable[[str], None], seed: int = 0)
     Nothing may touch the handle. Raises `InputError` where the stroke is too short, `DeviceError` where something
     touches it.
     """
-    said = device.device
+    said, rng = device.device, np.random.default_rng(seed)
     low, high = said.position_low_mm, said.position_high_mm
-    middle, reach = (low + high) / 2, 0.3 * (high - low)
-    found: list = []
-    for speed in (s for s in _SPEEDS if s < 0.2 * said.velocity_limit_mm_per_s):
-        period = 4 * reach / speed
-        say(f"{speed:g} mm/s")
-        first = drive(device, "position", "triangle", middle, reach, period=period, duration=(_PERIODS + 1) * period)
-        if np.mean(np.abs(first.sensed_N)) > _FREE:  # false without a sensor
+    middle, most, found = (low + high) / 2, 0.3 * (high - low), []
+    fastest = min(_FASTEST, 0.2 * said.velocity_limit_mm_per_s, 0.7 * most / _SETTLE)
+    # No two periods alike: what encoder and servo do wrong at one speed, they do again at the same speed.
+    for count, speed in enumerate(rng.permutation(np.geomspace(min(_SLOWEST, fastest / 4), fastest, _SWEEPS))):
+        say(f"sweep {count + 1} of {_SWEEPS}: {speed:.0f} mm/s")
+        reach = most * rng.uniform(0.8, 1.0)
+        period = round(4 * reach / speed, 3)
+        seen = drive(device, "position", "triangle", middle, reach, period=period, duration=1.25 * period + 0.02)
+        if np.mean(np.abs(seen.sensed_N)) > _FREE:  # false without a sensor
             raise DeviceError("Something touches the handle; take it away, damping is measured on the free device.")
-        settled = round(period / device.tick_s / device.divisor)  # the way to the middle, and the servo's start
         tick = device.tick_s * device.divisor
-        position, force = first.position_mm[settled:], -first.force_N[settled:]
-        found += sweeps(position, force, tick, period, _SETTLE, len(found))
+        found += sweeps(seen.position_mm, -seen.force_N, tick, period, _SETTLE, count)
     return friction(found, seed)
 
 

@@ -24,6 +24,7 @@ __all__ = ["Friction", "Interval", "Sweep", "friction", "sweeps"]
 
 _FEWEST = 8  # periods
 _DRAWS = 4000
+_CREEPS = 0.008  # s after a turn, until the handle surely moves
 
 
 class Sweep(NamedTuple):
@@ -61,12 +62,12 @@ def sweeps(
     tick: float,
     period: float,
     settle: float,
-    first: int = 0,
+    number: int = 0,
 ) -> list[Sweep]:
     """The sweeps of a triangle that begins at its middle and rises; `period` and `settle` in s.
 
     Each way is two sweeps: `settle` after the turn, where the servo swings and the mass shows, and the rest. `force`
-    (N) is the motor's, along the position (mm); samples every `tick` s. `first` is the number of the first period, so
+    (N) is the motor's, along the position (mm); samples every `tick` s. `number` is that of the first period, so
     that recordings can be joined.
     """
     half, skip = round(period / 2 / tick), round(settle / tick)
@@ -76,9 +77,10 @@ def sweeps(
     for count, start in enumerate(starts):
         way = position[start : start + half]
         # The handle turns later than the triangle, and rests there for as long as friction holds it.
-        turn = start + int(np.flatnonzero(way == (way.max() if way[0] > way[-1] else way.min()))[-1])
+        rests = np.flatnonzero(way == (way.max() if way[0] > way[-1] else way.min()))
+        turn = start + int(rests[-1]) + round(_CREEPS / tick)
         for begin, end in ((turn, turn + skip), (turn + skip, start + half)):
-            found.append(_sweep(position[begin:end], force[begin:end], tick, first + count // 2))
+            found.append(_sweep(position[begin:end], force[begin:end], tick, number + count // 2))
     return found
 
 
