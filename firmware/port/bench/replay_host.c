@@ -30,9 +30,10 @@ int main(int count, char **arguments)
         return 2;
     }
     const size_t size = read_all(arguments[1], input, sizeof input);
-    const bool good = replay_run(&replay, input, size, keep, output);
+    const struct replay_hooks hooks = {.context = output, .force = keep};
+    const bool good = replay_run(&replay, input, size, &hooks);
     const bool kept = fclose(output) == 0;
-    (void)printf("ticks %lu force %08lx sent %lu %08lx\n", (unsigned long)replay.ticks, (unsigned long)replay.force_crc,
+    (void)printf("all %lu force %08lx sent %lu %08lx\n", (unsigned long)replay.ticks, (unsigned long)replay.force_crc,
                  (unsigned long)replay.sent_bytes, (unsigned long)replay.sent_crc);
     return good && kept ? EXIT_SUCCESS : EXIT_FAILURE;
 }

@@ -93,7 +93,8 @@ static void tick(void)
 
 int main(void)
 {
-    const struct sim_rig_config config = sim_rig_defaults();
+    struct sim_rig_config config = sim_rig_defaults();
+    config.world.substeps = 10; /* a Cortex-M4 has no double precision in hardware */
     board_uart_start();
     board_start_ticks();
     if (sim_rig_start(&rig, &config, first_boot_id()) != HB_OK) {

@@ -1,0 +1,129 @@
+"""Cortex-M images in the emulator: the same bits as on the host, the protocol over a UART, and what a tick costs."""
+
+import select
+import socket
+import struct
+import subprocess
+import time
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from device_input import MACHINES, Recording, emulate, replay, rich_motion
+from device_port import FOAM, PATIENCE, SCHEMA, State, Talk, compilers, image
+from device_wire import Type, encode, set_params
+
+from hilbo import passivity, viscoelastic
+from hilbo.exponentials import exponentials
+
+each_cpu = pytest.mark.parametrize("cpu", MACHINES)
+
+
+def many_sets() -> bytes:
+    """60 s of pressing: 24 sets of both memories, switched in contact."""
+    rng = np.random.default_rng(1)
+    motion = rich_motion(60_000, 2)
+    recording = Recording()
+    recording.hello()
+    named = b""
+    for index, counts in enumerate(np.split(motion, 24)):
+        B1, alpha, full = float(np.exp(rng.uniform(-3, 3))), float(rng.uniform(0.02, 0.98)), index % 3 == 2
+        memory, N = "full" if full else "short", int(rng.choice([1, 25, 101, 255]))
+        K1 = min(float(passivity.largest_K1(B1, alpha, b=0.949, N=N, memory=memory)), 32.0) * rng.uniform(0.2, 1)
+        K0 = float(viscoelastic.K0_from_effective_stiffness(K1, B1, alpha, N=N, memory=memory))
+        states = [np.asarray(part) for part in exponentials(jnp.asarray(alpha), 8 + 2 * (index % 2))] if full else None
+        named = recording.set(index + 1, K0, K1, B1, alpha, states=states, N=N)
+        if index == 0:
+            recording.send(Type.COMMIT, named)
+            recording.ticks([0] * 10)
+            recording.send(Type.START, named)
+        recording.ticks(counts[:1800])
+        recording.send(Type.COMMIT, named)
+        recording.ticks(counts[1800:])
+    recording.send(Type.GET_STATUS)
+    recording.ticks([0])
+    return recording.done()
+
+
+@pytest.mark.parametrize("compiler", compilers()[1:])
+def test_every_compiler_gives_the_same_bits(compiler, tmp_path):
+    recording = many_sets()
+    said, forces = replay(recording, tmp_path, compilers()[0])
+    again, bits = replay(recording, tmp_path, compiler)
+    assert said == again
+    np.testing.assert_array_equal(bits, forces)
+    force = forces.view("<f4")
+    assert np.isfinite(force).all() and force.max() > 3 and np.unique(forces).size > 10_000
+
+
+@pytest.mark.deep
+@each_cpu
+def test_a_cortex_m_gives_the_same_bits(cpu, tmp_path):
+    recording = many_sets()
+    said, forces = replay(recording, tmp_path)
+    again, bits, _, _ = emulate(recording, tmp_path, cpu)
+    assert said == again
+    np.testing.assert_array_equal(bits, forces)
+
+
+class Emulator(Talk):
+    """The device image with its UART on a socket."""
+
+    def __init__(self, cpu: str, path):
+        self.listener = socket.socket(socket.AF_UNIX)
+        self.listener.bind(str(path))
+        self.listener.listen()
+        command = ["qemu-system-arm", "-M", MACHINES[cpu], "-display", "none", "-monitor", "none", "-icount", "shift=3"]
+        command += ["-chardev", f"socket,id=line,path={path}", "-serial", "chardev:line"]
+        self.process = subprocess.Popen([*command, "-kernel", image("device", cpu)])
+        assert select.select([self.listener], [], [], PATIENCE)[0], "the emulator does not start"
+        self.line, _ = self.listener.accept()
+        super().__init__(self.line.fileno())
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+        self.line.close()
+        self.listener.close()
+
+    def wait_for_tick(self, tick: int):
+        end = time.monotonic() + PATIENCE
+        while (status := self.status()).tick < tick:
+            assert time.monotonic() < end, f"the device stands at tick {status.tick}"
+        return status
+
+
+@pytest.mark.deep
+@each_cpu
+def test_a_conversation_over_the_uart(cpu, tmp_path):
+    with Emulator(cpu, tmp_path / "line") as device:
+        device.send(b"\0")
+        version, rate, schema, _, boot_id = struct.unpack_from("<HHIII", device.hello().payload)
+        assert (version, rate, schema) == (1, 1000, SCHEMA) and boot_id != 0
+        start = device.status()
+        assert (start.boot_id, start.state, start.frames_dropped) == (boot_id, State.STOPPED, 0)
+        device.send(b"no frame, and longer than any frame may be: " + 64 * b"?" + b"\0")
+        crc = device.expect_ack(Type.SET_PARAMS, set_params(9, *FOAM))
+        device.expect_ack(Type.COMMIT, device.named(9, crc))
+        device.wait_for_tick(start.tick + 5)
+        # In one piece, so that the heartbeat is fresh whatever this machine does in between.
+        named = device.named(9, crc)
+        device.seq = 201
+        device.send(encode(Type.HEARTBEAT, struct.pack("<I", boot_id)) + encode(Type.START, named, 201))
+        status = device.wait_for_tick(device.status().tick + 400)
+        assert (status.active_id, status.active_crc, status.frames_dropped) == (9, crc, 1)
+        assert (status.state, status.hold_reason, status.overruns) == (State.HOLD, 1, 0)  # nobody sent heartbeats
+        assert status.force_N == 0
+        starts = [a for a in device.unasked if a.seq == 201]
+        assert [a.type for a in starts] == [Type.ACK]
+        tick = struct.unpack_from("<IIBB", next(a for a in device.unasked if notice(a) == (State.HOLD, 1)).payload)[0]
+        began = struct.unpack_from("<I", next(a for a in device.unasked if notice(a)[0] == State.RUNNING).payload)[0]
+        assert tick - began <= 251
+
+
+def notice(answer) -> tuple[int, int]:
+    """State and reason, of a NOTICE."""
+    return struct.unpack_from("<BB", answer.payload, 8) if answer.type == Type.NOTICE else (-1, -1)
