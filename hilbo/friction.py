@@ -1,8 +1,8 @@
 """Damping and Coulomb friction of a free device, from sweeps at several speeds.
 
-While the handle moves one way, Newton's law m·x'' + b·x' + c·sign(x') + f0 = F holds for its position x and the motor's
-force F along it: mass, damping, Coulomb friction, a constant force such as weight. Weighted by w(t) = sin²(π t/L) over a
-stretch of length L, which vanishes with its slope at both ends, and integrated by parts,
+While the handle moves one way, Newton's law m·x'' + b·x' + c·sign(x') + f0 = F holds for its position x and the
+motor's force F along it: mass, damping, Coulomb friction, a constant force such as weight. Weighted by
+w(t) = sin²(π t/L) over a stretch of length L, which vanishes with its slope at both ends, and integrated by parts,
 
     ∫wF = m·∫w''x - b·∫w'x + c·sign·∫w + f0·∫w,
 
