@@ -13,6 +13,7 @@ import numpy as np
 from hilbo.errors import InputError
 from hilbo.friction import Friction, friction, sweeps
 from hilbo.hardware_bridge import Capability, DeviceError, Renderer, State
+from hilbo.pressing import Pressed, pressed, table_of
 from hilbo.reasons import HoldReason, SampleFlag, held_because, meaning
 from hilbo.telemetry import Samples
 
@@ -116,44 +117,31 @@ def characterise(
     material and at rest; `rest` s between them let it recover. The depth is moved by up to half a step of the encoder,
     another way in each repeat, so that its rounding averages out. Raises `InputError` and `DeviceError`.
     """
-    import pandas as pd
-
     step, low = device.device.encoder_step_mm, device.device.position_low_mm
     if repeats < 1 or depth <= 0 or force <= 0 or hold <= 0:
         raise InputError("Repeats, depth, force and hold must be above 0.")
     away = max(low / 2, -1.0)
     moved = step * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
-    tables = []
+    begin = {"relaxation": away, "creep": -step}
+    last = {"relaxation": hold, "creep": 2 * hold}
+    found: dict[str, list[Pressed]] = {"relaxation": [], "creep": []}
     for repeat in range(repeats):
-        for kind in ("relaxation", "creep"):
+        for kind, tests in found.items():
             say(f"{kind} {repeat + 1} of {repeats}")
-            begin = away if kind == "relaxation" else -step
-            drive(device, "position", "hold", begin, duration=rest)
+            free = drive(device, "position", "hold", begin[kind], duration=rest)
             if kind == "relaxation":
                 seen = drive(device, "position", "hold", depth + moved[repeat], duration=hold + 0.5)
             else:
-                seen = drive(device, "force", "step", force, after, period=hold, duration=2 * hold)
-            part = _pressed(device, seen, kind)
-            part = part[part["time_s"] <= (hold if kind == "relaxation" else 2 * hold)]
-            tables.append(part.assign(test=kind, repeat=repeat + 1))
+                seen = drive(device, "force", "step", force, after, period=hold, duration=2 * hold + 0.1)
+            tests.append(pressed(seen, kind, bool(device.can & Capability.FORCE_SENSOR), _noise(free)))
     drive(device, "position", "hold", away, duration=0.5)
-    return pd.concat(tables)[["test", "repeat", "time_s", "position_mm", "force_N"]]
+    return table_of(found, last, device.tick_s * device.divisor)
 
 
-def _pressed(device, seen: Samples, kind: str) -> Any:
-    """From the last sample off the material on; force of the material from the sensor, without one from the motor."""
-    import pandas as pd
-
-    inside = np.flatnonzero(seen.position_mm > 0)
-    if inside.size == 0 or np.all(seen.position_mm[inside] < 0.05):
-        raise DeviceError(f"The {kind} test has met nothing at position 0; put the material there.")
-    first = max(inside[0] - 1, 0)
-    sensed = bool(device.can & Capability.FORCE_SENSOR)
-    force = -seen.sensed_N if sensed else -seen.force_N
-    position = np.maximum(seen.position_mm, 0.0)
-    since = (seen.tick - seen.tick[first]) * device.tick_s
-    columns = {"time_s": since, "position_mm": position, "force_N": np.where(position > 0, force, 0.0)}
-    return pd.DataFrame(columns)[first:]
+def _noise(free: Samples) -> float:
+    """Standard deviation of the sensor's force (N) off the material; 0 without one."""
+    off = free.sensed_N[free.position_mm <= 0]
+    return float(np.std(off[off.size // 2 :])) if off.size and not np.isnan(off).any() else 0.0
 
 
 def selftest(device: Renderer, say: Callable[[str], None], echoes: int = 300) -> SelfTest:
