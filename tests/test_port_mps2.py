@@ -13,6 +13,7 @@ from device_input import MACHINES, Recording, emulate, replay, rich_motion
 from device_port import FOAM, PATIENCE, SCHEMA, State, Talk, compilers, image
 from device_wire import Type, encode, set_params
 
+from benchmarks.firmware import MEMORIES, measure, sizes, stack_of, state_bytes
 from hilbo import passivity, viscoelastic
 from hilbo.exponentials import exponentials
 
@@ -127,3 +128,38 @@ def test_a_conversation_over_the_uart(cpu, tmp_path):
 def notice(answer) -> tuple[int, int]:
     """State and reason, of a NOTICE."""
     return struct.unpack_from("<BB", answer.payload, 8) if answer.type == Type.NOTICE else (-1, -1)
+
+
+@pytest.mark.deep
+@each_cpu
+def test_what_a_tick_costs(cpu, tmp_path):
+    found = measure(cpu, tmp_path)
+    cost = found.sections
+    plain = cost["short memory, N = 101"]
+    assert 1000 < plain.mean < 2500
+    for name, N, states in MEMORIES:
+        # The cost depends neither on the force nor on the time since contact.
+        assert cost[name].ticks == 3050 and cost[name].most - cost[name].least <= 0.2 * cost[name].most + 400
+        assert found.rounding[name] < 1e-5
+        assert found.memory[name] < (1e-4 if states else 0.2)
+        assert (cost[name].mean < plain.mean) == (N < 101)
+    # What a scene does not need is skipped: no contact costs as little as no set.
+    idle = cost["no contact, forgotten"]
+    assert idle == cost["running, no contact"]._replace(ticks=idle.ticks, frames=idle.frames)
+    assert idle.mean < 0.6 * plain.mean and idle.mean < cost["stopped, no set"].mean + 150
+    staged = cost["contact, another set of N = 101 staged"].mean
+    assert plain.mean < staged < 2 * plain.mean
+    assert cost["contact, the tick of the swap"].most < 1.05 * staged
+    assert max(section.most_of_a_frame for section in cost.values()) < 20_000
+    assert found.stack < 2048
+
+
+@pytest.mark.deep
+@each_cpu
+def test_what_the_core_needs_of_memory(cpu, tmp_path):
+    image("replay", cpu)
+    code, variables = sizes(cpu)
+    assert code < 20_000 and variables == 0  # no variable outside the caller's state
+    assert state_bytes(cpu, tmp_path) < 10_000
+    stack = stack_of(cpu, tmp_path)
+    assert 0 < stack["hb_transmit"] < stack["hb_tick"] < 512 and stack["hb_receive"] < 1024
