@@ -22,6 +22,7 @@ __all__ = ["SelfTest", "characterise", "drive", "measure_damping", "selftest", "
 _SWEEPS = 24  # there and back
 _SLOWEST, _FASTEST = 10.0, 55.0  # mm/s
 _SETTLE = 0.12  # s after each turn
+_SPREAD = 0.01  # of depth and loads, from the least to the most
 _FREE = 0.1  # N that a free device's sensor may show
 _MOST = 2.0  # s of this clock for what the device does at once
 
@@ -114,14 +115,14 @@ def characterise(
     """The paper's relaxation (`depth` mm held) and creep (`force` N, then `after` N) of the material at position 0.
 
     Returns the table that `hilbo identify` reads: test, repeat, time_s, position_mm, force_N. Each test begins off the
-    material and at rest; `rest` s between them let it recover. The depth is moved by up to half a step of the encoder,
-    another way in each repeat, so that its rounding averages out. Raises `InputError` and `DeviceError`.
+    material and at rest; `rest` s between them let it recover. Depth and loads differ by up to half a per cent from
+    repeat to repeat, so that the encoder's rounding averages out. Raises `InputError` and `DeviceError`.
     """
     step, low = device.device.encoder_step_mm, device.device.position_low_mm
     if repeats < 1 or depth <= 0 or force <= 0 or hold <= 0:
         raise InputError("Repeats, depth, force and hold must be above 0.")
     away = max(low / 2, -1.0)
-    moved = step * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
+    spread = _SPREAD * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
     begin = {"relaxation": away, "creep": -step}
     last = {"relaxation": hold, "creep": 2 * hold}
     found: dict[str, list[Pressed]] = {"relaxation": [], "creep": []}
@@ -130,9 +131,10 @@ def characterise(
             say(f"{kind} {repeat + 1} of {repeats}")
             free = drive(device, "position", "hold", begin[kind], duration=rest)
             if kind == "relaxation":
-                seen = drive(device, "position", "hold", depth + moved[repeat], duration=hold + 0.5)
+                seen = drive(device, "position", "hold", depth * (1 + spread[repeat]), duration=hold + 0.5)
             else:
-                seen = drive(device, "force", "step", force, after, period=hold, duration=2 * hold + 0.1)
+                loads = force * (1 + spread[repeat]), after * (1 + spread[repeat])
+                seen = drive(device, "force", "step", *loads, period=hold, duration=2 * hold + 0.1)
             tests.append(pressed(seen, kind, bool(device.can & Capability.FORCE_SENSOR), _noise(free)))
     drive(device, "position", "hold", away, duration=0.5)
     return table_of(found, last, device.tick_s * device.divisor)

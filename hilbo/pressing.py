@@ -1,8 +1,9 @@
 """From samples of a device that presses a material to the table of tests that `hilbo identify` reads.
 
-A test begins with the last sample off the material. When a light load follows a heavy one, the handle's mass may carry
-it off the material for some milliseconds: the material's force is then 0, and the handle's position is not its surface's.
-Those rows are left out, but for the first and the last, so that the force between them is read as the 0 that it was.
+A test begins with the last sample off the material. When a light load follows a heavy one, the handle's mass may
+carry it off the material for some milliseconds: the material's force is then 0, and the handle's position is not its
+surface's. Those rows are left out, but for the first and the last, so that the force between them is read as the 0
+that it was.
 Units: mm, N, s; positions and forces are positive into the material.
 """
 
