@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
 import jax  # noqa: E402
@@ -29,7 +30,7 @@ from device_wire import Type  # noqa: E402
 from hilbo.exponentials import exponentials  # noqa: E402
 from hilbo.viscoelastic import FOSLS  # noqa: E402
 
-__all__ = ["measure", "stack_of", "state_bytes"]
+__all__ = ["DOCS", "MEMORIES", "measure", "sizes", "stack_of", "state_bytes"]
 
 SET = (0.44, 1.40, 5.89, 0.203)  # K0, K1, B1, alpha: memory foam, so soft that all memories are passive with it
 FLAGS = {"m4": "-mcpu=cortex-m4 -mfpu=fpv4-sp-d16", "m7": "-mcpu=cortex-m7 -mfpu=fpv5-d16"}
@@ -104,6 +105,11 @@ def scenes_recording() -> bytes:
     recording.section("contact, telemetry of every tick with sensed force")
     recording.ticks(PRESS[1500:2000])
     recording.section("")
+    stage(recording, 3, 101, 0)
+    recording.section("contact, both: a set staged and telemetry")
+    recording.ticks(PRESS[2000:2200])
+    recording.section("")
+    recording.send(Type.ABORT)
     recording.send(Type.STREAM, bytes([0, 0]))
     recording.ticks(PRESS[49::-1])
     recording.section("no contact, but still remembered")
@@ -228,7 +234,7 @@ def main() -> None:
         text = tables(Path(folder))
     print(text, end="")
     if write:
-        (ROOT / "docs" / "firmware.md").write_text(text, encoding="utf-8")
+        (DOCS / "firmware.md").write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

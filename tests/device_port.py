@@ -21,7 +21,7 @@ from typing import NamedTuple
 import pytest
 from device_wire import Answer, Type, decode, encode, set_crc, set_params
 
-__all__ = ["FIRMWARE", "FOAM", "SCHEMA", "Port", "State", "Status", "Talk", "compilers", "image", "program"]
+__all__ = ["BUILD", "COMPILERS", "FIRMWARE", "FOAM", "SCHEMA", "Port", "State", "Status", "Talk", "image", "program"]
 
 ROOT = Path(__file__).parents[1]
 FIRMWARE = ROOT / "firmware"
@@ -34,17 +34,15 @@ FOAM = (-2.89, 5.70, 5.89, 0.203)  # K0, K1, B1, alpha: memory foam, system iden
 TICKS_PER_HEARTBEAT = 50
 
 
-def compilers() -> list[str]:
-    """C compilers of this machine."""
-    return [name for name in ("gcc", "clang") if shutil.which(name)]
+COMPILERS = ("gcc", "clang")
 
 
 def program(name: str, compiler: str | None = None) -> Path:
-    """A host program, up to date. Skips without make or a compiler."""
-    found = compilers()
+    """A host program, up to date, by this compiler or the first that is here. Skips without one, or without make."""
+    found = [known for known in COMPILERS if shutil.which(known) and compiler in (None, known)]
     if not found or not shutil.which("make"):
-        pytest.skip("the device's programs need make and a C compiler (Debian: make, gcc)")
-    return _made(f"{compiler or found[0]}/{name}")
+        pytest.skip(f"the device's programs need make and {compiler or 'a C compiler'} (Debian: make, gcc, clang)")
+    return _made(f"{found[0]}/{name}")
 
 
 def image(name: str, cpu: str) -> Path:
@@ -117,20 +115,24 @@ class Talk:
     def request(self, type: int, payload: bytes = b"") -> Answer:
         """The answer with this request's seq; notices, telemetry and older answers are kept in `unasked`."""
         self.seq = (self.seq + 1) % 256
-        self.send(encode(type, payload, self.seq))
         end = time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            answers = self.listen()
-            mine = [a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY)]
-            self.unasked += [a for a in answers if a not in mine]
-            if mine:
-                return mine[0]
+            self.send(encode(type, payload, self.seq))  # again, too, where a full line has swallowed the answer
+            while answers := self.listen():
+                mine = [a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY)]
+                self.unasked += [a for a in answers if a not in mine]
+                if mine:
+                    return mine[0]
         raise AssertionError(f"no answer to request {type:#x}")
 
     def listen(self, patience: float = 1.0) -> list[Answer]:
-        """What has come, after at most `patience` s."""
-        if not select.select([self.file], [], [], patience)[0]:
-            return []
+        """The next frames that come, within about `patience` s; none if the line is silent."""
+        found: list[Answer] = []
+        while not found and select.select([self.file], [], [], patience)[0]:
+            found = self._read()
+        return found
+
+    def _read(self) -> list[Answer]:
         *frames, self.rest = (self.rest + os.read(self.file, 65536)).split(b"\0")
         if frames and self.joined_late:
             del frames[0]  # begun before this host listened, or empty

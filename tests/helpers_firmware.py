@@ -18,17 +18,17 @@ import numpy as np
 import pytest
 
 __all__ = [
-    "CONFIG", "CORE", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES", "TYPES", "Device", "build", "cobs", "compiler",
-    "decode", "frame", "pack", "schema", "unpack",
+    "CAUSES", "CONFIG", "CORE", "DOCUMENT", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES", "TYPES", "Device",
+    "build", "cobs", "compiler", "decode", "frame", "library", "pack", "parameters", "schema", "unpack",
 ]  # fmt: skip
 
 FIRMWARE = Path(__file__).parents[1] / "firmware"
-CORE = FIRMWARE / "core"
+CORE = Path(os.environ.get("HILBO_FIRMWARE_CORE", FIRMWARE / "core"))
 CACHE = Path(__file__).parents[1] / ".pytest_cache" / "firmware"
-STRICT = (
-    "-std=c11 -O2 -ffp-contract=off -Wall -Wextra -Wconversion -Wsign-conversion -Wdouble-promotion"
-    " -Wmissing-prototypes -Wstrict-prototypes -Wshadow -Wpedantic -Werror"
-).split()
+STRICT = [
+    "-std=c11", "-O2", "-ffp-contract=off", "-Wall", "-Wextra", "-Wconversion", "-Wsign-conversion",
+    "-Wdouble-promotion", "-Wmissing-prototypes", "-Wstrict-prototypes", "-Wshadow", "-Wpedantic", "-Werror",
+]  # fmt: skip
 DOCUMENT = (FIRMWARE / "PROTOCOL.md").read_text(encoding="utf-8")
 _SIZES = {"u8": "B", "i16": "h", "u16": "H", "u32": "I", "f32": "f"}
 
@@ -53,7 +53,8 @@ def _parse(schema: str) -> tuple[dict[str, int], dict[str, tuple[list, list]]]:
 
 TYPES, FIELDS = _parse(schema())
 NAMES = {number: name for name, number in TYPES.items()}
-REASONS = dict(enumerate(re.findall(r"^\| \d+ \| ([A-Z_0-9]+) \|", DOCUMENT.split("| NACK reason |")[1], re.M), start=1))
+_TABLE = DOCUMENT.split("| NACK reason |")[1]
+REASONS = {int(number): name for number, name in re.findall(r"^\| (\d+) \| ([A-Z_0-9]+) \|", _TABLE, re.M)}
 STATES = ("STOPPED", "RUNNING", "STOPPING", "DRIVING", "HOLD", "ESTOP")
 CAUSES = ("NONE", "WATCHDOG", "INPUT", "VELOCITY", "OVERRUN", "MODEL", "ENERGY", "ESTOP", "BOOT")
 FLAGS = ("contact", "held", "saturated", "slewed", "controlled", "switching", "hold", "estop", "running", "driving")
@@ -114,12 +115,14 @@ def compiler() -> str:
     return found
 
 
-def build(core: Path = CORE, extra: tuple[str, ...] = (), drivers: tuple[str, ...] = ("shim.c",)) -> Path:
+def build(
+    core: Path = CORE, extra: tuple[str, ...] = (), drivers: tuple[str, ...] = ("shim.c",), cc: str | None = None
+) -> Path:
     """Shared library (or, with a driver that has a main, a program) of these sources, from the cache if it is there."""
     sources = [*sorted(core.glob("*.c")), *(FIRMWARE / "tests" / name for name in drivers)]
     program = "shim.c" not in drivers
     extra = (*extra, *os.environ.get("HILBO_FIRMWARE_FLAGS", "").split())
-    command = [compiler(), *STRICT, *extra, *([] if program else ["-shared", "-fPIC"]), f"-I{core}"]
+    command = [cc or compiler(), *STRICT, *extra, *([] if program else ["-shared", "-fPIC"]), f"-I{core}"]
     texts = [path.read_bytes() for path in [*sources, *sorted(core.glob("*.h")), FIRMWARE / "tests" / "shim.h"]]
     key = hashlib.sha256(b"\0".join([" ".join(command).encode(), *texts])).hexdigest()[:16]
     target = CACHE / f"{'run' if program else 'lib'}-{key}"
@@ -202,7 +205,7 @@ class Device:
         answers = self.collect()
         if not answers:
             return None
-        ((name, seq, message),) = answers
+        ((name, _, message),) = answers
         if name == "NACK":
             message["reason"] = REASONS[message["reason"]]
         return name, message

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
-
 from helpers_firmware import NAMES, REASONS, Device, build, cobs, decode, frame, library, parameters, unpack
+
 from hilbo import passivity, viscoelastic
 
 POWER_BOUND = 0.6  # units in the last place, as hb_math.h says
@@ -29,7 +29,8 @@ def closed_forms(lib, *set_numbers) -> dict[str, float]:
 def test_power_is_exact_to_less_than_a_unit(lib, base):
     """Against 60 digits, at random exponents and at both ends."""
     rng = np.random.default_rng(base)
-    exponents = np.float32([0, 2**-30, 2**-10, 0.5, 1 - 2**-24, 1, *rng.uniform(0, 1, 300), *2 ** rng.uniform(-10, 0, 300)])
+    ends = [0, 2**-30, 2**-10, 0.5, 1 - 2**-24, 1]
+    exponents = np.float32([*ends, *rng.uniform(0, 1, 300), *2 ** rng.uniform(-10, 0, 300)])
     with mpmath.workdps(60):
         for exponent in exponents:
             exact = mpmath.mpf(base) ** mpmath.mpf(float(exponent))
@@ -108,7 +109,7 @@ def boundary_sets(count: int, b: float, memory: str, seed: int) -> np.ndarray:
 
 
 def verdicts(device: Device, sets: np.ndarray, full: bool) -> list[str]:
-    """"ACK" or the reason, for each set sent in SET_PARAMS."""
+    """ACK or the reason, for each set sent in SET_PARAMS."""
     found = []
     device.collect()
     for number, (K0, K1, B1, alpha) in enumerate(sets.tolist()):

@@ -2,20 +2,22 @@
 
 import ctypes
 import functools
+import shutil
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import qmc
-
 from helpers_firmware import CORE, build, library
+from scipy.stats import qmc
+from test_firmware_protocol import EXPONENTIALS
+
 from hilbo import viscoelastic
 from hilbo.exponentials import exponentials
 
 STEP = np.float32(0.0127)
-SHORT_BOUND, FULL_BOUND = 1e-4, 1e-4  # of the largest force
+SHORT_BOUND, FULL_BOUND = 2e-5, 2e-6  # of the largest force
 
 
 def motion(seconds: float = 60.0, seed: int = 1) -> np.ndarray:
@@ -33,7 +35,8 @@ def draw_sets(count: int, full: bool) -> np.ndarray:
     """K0, K1, B1, alpha of float32 over the whole search box, its corners first; static stiffness 0.44 N/mm."""
     corners = np.array(np.meshgrid([0, 1], [0, 1], [0, 1])).reshape(3, -1).T
     unit = np.vstack([corners, qmc.Sobol(3, rng=3).random_base2(8)])[:count]
-    K1, B1, alpha = (low + (high - low) * u for (low, high), u in zip([(1, 32), (0.001, 32), (0.01, 0.99)], unit.T))
+    low, high = np.array([(1, 0.001, 0.01), (32, 32, 0.99)])
+    K1, B1, alpha = (low + (high - low) * unit).T
     K0 = np.full(count, 0.44) if full else viscoelastic.K0_from_effective_stiffness(K1, B1, alpha)
     return np.column_stack([K0, K1, B1, alpha]).astype(np.float32)
 
@@ -53,7 +56,8 @@ def render(lib: ctypes.CDLL, row, x, states=None) -> np.ndarray:
     numbers = [0, 101, 1000, *row] if states is None else [1, len(weight), 1000, *row]
     forces = np.full(x.size, np.nan, np.float32)
     accepted = lib.shim_render(
-        (ctypes.c_double * 7)(*map(float, numbers)), *(part.ctypes.data_as(ctypes.c_void_p) for part in (weight, loss, x)),
+        (ctypes.c_double * 7)(*map(float, numbers)),
+        *(part.ctypes.data_as(ctypes.c_void_p) for part in (weight, loss, x)),
         ctypes.c_size_t(x.size), forces.ctypes.data_as(ctypes.c_void_p),
     )  # fmt: skip
     assert accepted, "the exponentials were refused"
@@ -64,10 +68,10 @@ def states_of(alpha, states: int):
     return exponentials(jnp.asarray(float(alpha)), states)
 
 
-def largest_error(count: int, memory: str) -> float:
+def largest_error(count: int, memory: str, x: np.ndarray | None = None) -> float:
     """Of the largest force, over the sets."""
     lib = library(build())
-    x = np.maximum(motion(), 0).astype(np.float32) * STEP
+    x = np.maximum(motion(), 0).astype(np.float32) * STEP if x is None else x
     sets, worst = draw_sets(count, memory == "full"), 0.0
     for first in range(0, count, 4):
         some = sets[first : first + 4]
@@ -81,6 +85,14 @@ def largest_error(count: int, memory: str) -> float:
 @pytest.mark.parametrize(("memory", "bound"), [("short", SHORT_BOUND), ("full", FULL_BOUND)])
 def test_a_minute_of_motion_at_the_corners_of_the_box(memory, bound):
     assert largest_error(12, memory) <= bound
+
+
+@pytest.mark.parametrize(("memory", "bound"), [("short", SHORT_BOUND), ("full", FULL_BOUND)])
+def test_a_minute_of_holding_still(memory, bound):
+    """Where what a tick adds is far below the last place of what there is."""
+    x = np.full(60_000, 5, np.float32)
+    x[:100] = np.linspace(0, 5, 100)
+    assert largest_error(36, memory, x) <= bound
 
 
 @pytest.mark.deep
@@ -125,4 +137,20 @@ def test_every_length_of_short_memory(N):
 @pytest.mark.parametrize("alpha", [0.01, 0.05, 0.2, 0.5, 0.8, 0.95, 0.99])
 @pytest.mark.parametrize("states", [8, 10, 12])
 def test_the_exponentials_of_the_host_are_accepted(alpha, states):
-    render(library(build()), np.float32([0.44, 1.0, 3.0, alpha]), np.zeros(3, np.float32), states_of(np.float32(alpha), states))
+    row = np.float32([0.44, 1.0, 3.0, alpha])
+    render(library(build()), row, np.zeros(3, np.float32), states_of(row[3], states))
+
+
+def test_the_exponentials_of_the_protocol_tests_are_the_hosts():
+    np.testing.assert_allclose(np.transpose(EXPONENTIALS), np.stack(states_of(np.float32(0.3), 10)), rtol=1e-6)
+
+
+def test_every_compiler_and_optimisation_gives_the_same_bits():
+    x = np.maximum(motion(2.0), 0).astype(np.float32) * STEP
+    row, given = np.float32([0.44, 1.0, 3.0, 0.3]), states_of(np.float32(0.3), 10)
+    found = set()
+    for cc in filter(shutil.which, ("gcc", "clang")):
+        for level in ("-O0", "-O2", "-O3"):
+            lib = library(build(extra=(level,), cc=cc))
+            found.add(render(lib, row, x).tobytes() + render(lib, row, x, given).tobytes())
+    assert len(found) == 1

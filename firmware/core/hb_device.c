@@ -5,6 +5,10 @@
 #include "hb_requests.h"
 #include "hb_staging.h"
 
+_Static_assert(HB_MAX_TAPS % 2U == 1U && HB_MAX_TAPS <= 65535U, "HB_MAX_TAPS must be odd and fit into 16 bits");
+_Static_assert(HB_MAX_STATES >= 1U && HB_MAX_STATES <= 255U, "HB_MAX_STATES must be 1 to 255");
+_Static_assert(HB_OUTPUT_BYTES >= 3U * HB_MAX_FRAME, "HB_OUTPUT_BYTES must hold two answers and one telemetry frame");
+
 enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, uint32_t boot_id)
 {
     enum hb_error error = hb_config_check(config);

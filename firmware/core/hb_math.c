@@ -1,6 +1,11 @@
 #include "hb_math.h"
 
+#include <float.h>
 #include <string.h>
+
+/* The same bits everywhere need float arithmetic in float, and no other format for it (16: half precision apart). */
+_Static_assert(FLT_EVAL_METHOD == 0 || FLT_EVAL_METHOD == 16, "float expressions must be evaluated in float");
+_Static_assert(FLT_MANT_DIG == 24 && FLT_MAX_EXP == 128 && sizeof(float) == 4, "float must be IEEE 754 binary32");
 
 #define ONE_Q28 (UINT32_C(1) << 28)
 #define ONE_Q30 (UINT32_C(1) << 30)

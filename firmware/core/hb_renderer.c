@@ -31,6 +31,7 @@ void hb_renderer_prepare(struct hb_renderer *renderer, const struct hb_parameter
     renderer->beta_N_per_mm = beta;
     renderer->gain = K1 / (K1 + beta);
     renderer->stiffness_N_per_mm = hb_series(K1, beta);
+    renderer->forgotten = sums.at_dc;
     renderer->rest_share = K1 / (K1 + beta * sums.at_dc);
     renderer->static_stiffness_N_per_mm = hb_static_stiffness(set, beta, sums);
     renderer->static_is_passive = hb_static_stiffness_is_passive(set, beta, sums);
@@ -72,6 +73,8 @@ void hb_renderer_rest(struct hb_renderer *renderer, float x_mm)
 {
     float y_mm = renderer->rest_share * x_mm;
     size_t length = renderer->set.length;
+    renderer->y_mm = y_mm;
+    renderer->y_rest_mm = 0.0F;
     if (renderer->set.memory == HB_FULL) {
         for (size_t k = 0U; k < length; k += 1U) {
             renderer->mean_mm[k] = y_mm;
@@ -86,47 +89,51 @@ void hb_renderer_rest(struct hb_renderer *renderer, float x_mm)
     renderer->quiet = y_mm == 0.0F ? length : 0U;
 }
 
-/* What the past of y contributes: one dot product, oldest first. */
-static float short_past(const struct hb_renderer *renderer)
+/* From the last y to s, short memory: one dot product, oldest first. */
+static float short_behind(const struct hb_renderer *renderer)
 {
     const float *row = &renderer->history_mm[renderer->oldest];
-    float past_mm = 0.0F;
+    float last_mm = renderer->y_mm;
+    float behind_mm = 0.0F;
     for (size_t i = 0U; i < renderer->set.length; i += 1U) {
-        past_mm = past_mm + renderer->tap[i] * row[i];
+        behind_mm = behind_mm + renderer->tap[i] * (row[i] - last_mm);
     }
-    return past_mm;
+    return behind_mm - renderer->forgotten * last_mm;
 }
 
-static void short_push(struct hb_renderer *renderer, float y_mm)
+static void short_push(struct hb_renderer *renderer)
 {
     size_t length = renderer->set.length;
-    renderer->history_mm[renderer->oldest] = y_mm;
-    renderer->history_mm[renderer->oldest + length] = y_mm;
+    renderer->history_mm[renderer->oldest] = renderer->y_mm;
+    renderer->history_mm[renderer->oldest + length] = renderer->y_mm;
     renderer->oldest = renderer->oldest + 1U < length ? renderer->oldest + 1U : 0U;
-    if (y_mm != 0.0F) {
+    if (renderer->y_mm != 0.0F) {
         renderer->quiet = 0U;
     } else if (renderer->quiet < length) {
         renderer->quiet += 1U;
     }
 }
 
-static float full_past(const struct hb_renderer *renderer)
+/* The same for full memory. */
+static float full_behind(const struct hb_renderer *renderer)
 {
-    float past_mm = 0.0F;
+    float behind_mm = 0.0F;
     for (size_t k = 0U; k < renderer->set.length; k += 1U) {
-        past_mm = past_mm + renderer->weight[k] * renderer->mean_mm[k];
+        float rest_mm = renderer->rest_mm[k] - renderer->y_rest_mm;
+        behind_mm = behind_mm + renderer->weight[k] * ((renderer->mean_mm[k] - renderer->y_mm) + rest_mm);
     }
-    return past_mm;
+    return behind_mm;
 }
 
-/* m += loss (y - m), where a slow mean moves by less than its own last place: what an addition drops waits in `rest`. */
-static void full_push(struct hb_renderer *renderer, float y_mm)
+/* m += loss (y - m), where a slow mean moves by less than its own last place. */
+static void full_push(struct hb_renderer *renderer)
 {
+    float y_mm = renderer->y_mm;
     size_t zeros = 0U;
     for (size_t k = 0U; k < renderer->set.length; k += 1U) {
         float mean = renderer->mean_mm[k];
         float rest = renderer->rest_mm[k];
-        float change = rest + renderer->loss[k] * ((y_mm - mean) - rest);
+        float change = rest + renderer->loss[k] * ((y_mm - mean) + (renderer->y_rest_mm - rest));
         float next = mean + change;
         rest = change - (next - mean);
         if (hb_absolute(next) < SMALLEST_MM) {
@@ -137,7 +144,7 @@ static void full_push(struct hb_renderer *renderer, float y_mm)
         renderer->mean_mm[k] = next;
         renderer->rest_mm[k] = rest;
     }
-    renderer->quiet = zeros;
+    renderer->quiet = y_mm == 0.0F ? zeros : 0U;
 }
 
 float hb_renderer_step(struct hb_renderer *renderer, float x_mm)
@@ -146,16 +153,19 @@ float hb_renderer_step(struct hb_renderer *renderer, float x_mm)
         return 0.0F; /* no contact, and none remembered: what follows would give the same, and change nothing */
     }
     bool full = renderer->set.memory == HB_FULL;
-    float past_mm = full ? full_past(renderer) : short_past(renderer);
-    float spring_mm = x_mm - past_mm;
-    float y_mm = past_mm + renderer->gain * spring_mm;
-    if (hb_absolute(y_mm) < SMALLEST_MM) {
-        y_mm = 0.0F;
-    }
+    float before_mm = renderer->y_mm;
+    float behind_mm = full ? full_behind(renderer) : short_behind(renderer);
+    float spring_mm = x_mm - (before_mm + behind_mm);
+    float change_mm = renderer->y_rest_mm + (behind_mm + renderer->gain * spring_mm);
+    float y_mm = before_mm + change_mm;
+    float y_rest_mm = change_mm - (y_mm - before_mm);
+    bool gone = hb_absolute(y_mm) < SMALLEST_MM;
+    renderer->y_mm = gone ? 0.0F : y_mm;
+    renderer->y_rest_mm = gone ? 0.0F : y_rest_mm;
     if (full) {
-        full_push(renderer, y_mm);
+        full_push(renderer);
     } else {
-        short_push(renderer, y_mm);
+        short_push(renderer);
     }
     return renderer->set.K0_N_per_mm * x_mm + renderer->stiffness_N_per_mm * spring_mm;
 }

@@ -4,6 +4,10 @@
  *     F = K0 x + k (x - s),   y = s + g (x - s),   s = what the past of y contributes:
  *     short memory: sum over N past samples |c_i| y_{n-i}, oldest first;   full memory: sum of p_k m_k, fading means
  *
+ * s is computed as the last y and what it lies behind, sum |c_i| (y_{n-i} - y_{n-1}) - S y_{n-1}: taps that should add
+ * up to 1 - S, and do not by a rounding, would be a spring of their own where beta is large. For the same reason what
+ * an addition to y loses is kept. A minute of holding still is then as good as a minute of motion.
+ *
  * float32 in a fixed order: the same bits on every machine with IEEE arithmetic. */
 #ifndef HB_RENDERER_H
 #define HB_RENDERER_H
@@ -38,6 +42,9 @@ struct hb_renderer {
     bool static_is_passive;             /* it is not negative, to rounding */
     float minimum_damping_N_s_per_m;    /* with which the rendering is passive */
     uint32_t warm_ticks;                /* until a history that starts at an equilibrium is its own */
+    float forgotten;                    /* S, what the taps lack to a sum of 1 */
+    float y_mm;                         /* the last y, */
+    float y_rest_mm;                    /* and what its last addition lost to rounding */
     float tap[HB_MAX_TAPS];             /* short: |c_N| ... |c_1| */
     float history_mm[2U * HB_MAX_TAPS]; /* short: every y twice, N apart, so that the last N always lie in a row */
     size_t oldest;                      /* short: where that row begins */
@@ -45,7 +52,7 @@ struct hb_renderer {
     float weight[HB_MAX_STATES];        /* full: p_k */
     float loss[HB_MAX_STATES];          /* full: 1 - lambda_k */
     float mean_mm[HB_MAX_STATES];       /* full: m_k, */
-    float rest_mm[HB_MAX_STATES];       /* full: and what its last additions lost to rounding */
+    float rest_mm[HB_MAX_STATES];       /* full: and what theirs lost */
 };
 
 /* Everything that the parameters decide, for a set within its limits; full memory still lacks its exponentials. The

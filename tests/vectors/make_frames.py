@@ -49,8 +49,8 @@ MESSAGES = [
     ("NACK_NOT_READY", 0x44, 5, struct.pack("<BBHIff", 0x04, 23, 0, 412, 0.0, 0.0)),
     (
         "STATUS", 0x45, 7,
-        struct.pack("<IIBBBBHHIIIfffHHHHHHHH", 123456, BOOT, 4, 1, 2, 1, 17, 18, SET_CRC, zlib.crc32(FULL + STATES), 412,
-                    3.81, 1.25, -0.125, 1, 2, 3, 4, 5, 6, 7, 65535),
+        struct.pack("<IIBBBBHHIIIfffHHHHHHHH", 123456, BOOT, 4, 1, 2, 1, 17, 18, SET_CRC, zlib.crc32(FULL + STATES),
+                    412, 3.81, 1.25, -0.125, 1, 2, 3, 4, 5, 6, 7, 65535),
     ),
     (
         "SET", 0x46, 8,
@@ -59,7 +59,8 @@ MESSAGES = [
     ("NOTICE", 0x47, 0, struct.pack("<IIBBH", 123457, BOOT, 4, 1, 0)),
     (
         "TELEMETRY", 0x48, 0,
-        struct.pack("<IBBH", 1000, 1, 0, 3) + b"".join(struct.pack("<hHf", 100 * i - 300, 257, 0.5 * i) for i in range(7)),
+        struct.pack("<IBBH", 1000, 1, 0, 3)
+        + b"".join(struct.pack("<hHf", 100 * i - 300, 257, 0.5 * i) for i in range(7)),
     ),
     (
         "TELEMETRY_SENSED", 0x48, 0,

@@ -108,7 +108,6 @@ static void restart_device(struct process *process)
 
 static void run_ticks(struct process *process, unsigned long count)
 {
-    receive(process);
     for (unsigned long i = 0; i < count && !stopping; i++) {
         tick(process);
         receive(process);

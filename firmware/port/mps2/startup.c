@@ -48,17 +48,18 @@ __attribute__((section(".vectors"), used)) static const union vector VECTORS[FIR
     [FIRST_INTERRUPT] = {.handler = uart_received_interrupt},
 };
 
+/* The linker's addresses are no bounds of one array to the compiler, so that they are compared as numbers. */
 static void copy(uint32_t *to, const uint32_t *end, const uint32_t *from)
 {
-    while (to < end) {
-        *to++ = *from++;
+    for (; (uintptr_t)to < (uintptr_t)end; to++, from++) {
+        *to = *from;
     }
 }
 
 static void fill(uint32_t *to, const uint32_t *end, uint32_t value)
 {
-    while (to < end) {
-        *to++ = value;
+    for (; (uintptr_t)to < (uintptr_t)end; to++) {
+        *to = value;
     }
 }
 
@@ -74,10 +75,11 @@ _Noreturn void reset(void)
 
 uint32_t board_stack_bytes_used(void)
 {
-    const uint32_t *deepest = stack_low;
-    while (deepest < stack_high && *deepest == (uint32_t)PAINT) {
-        deepest++;
+    const size_t words = ((uintptr_t)stack_high - (uintptr_t)stack_low) / sizeof stack_low[0];
+    size_t clean = 0;
+    while (clean < words && stack_low[clean] == (uint32_t)PAINT) {
+        clean++;
     }
-    return (uint32_t)((size_t)(stack_high - deepest) * sizeof *deepest);
+    return (uint32_t)((words - clean) * sizeof stack_low[0]);
 }
 

@@ -1,0 +1,130 @@
+"""Faults put into the core on purpose, and the tests that must notice each of them.
+
+    python firmware/tests/faults.py [NAME...]
+
+Each fault replaces one piece of text, which must occur exactly once, in a copy of the core; the named test file then
+runs on that copy and has to fail. Exit status 1 if a fault goes unnoticed.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+__all__ = ["FAULTS", "Fault", "is_noticed"]
+
+ROOT = Path(__file__).parents[2]
+CORE = ROOT / "firmware" / "core"
+
+
+class Fault(NamedTuple):
+    """What is broken, where, and which tests are to say so."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: str  # tests/test_firmware_*.py
+
+
+FAULTS = [
+    Fault("history written once", "hb_renderer.c",
+          "renderer->history_mm[renderer->oldest + length] = renderer->y_mm;", "", "renderer"),
+    Fault("skips while it remembers", "hb_renderer.c", " && renderer->quiet == renderer->set.length", "", "renderer"),
+    Fault("taps in the wrong order", "hb_renderer.c", "renderer->tap[i] *",
+          "renderer->tap[renderer->set.length - 1U - i] *", "renderer"),
+    Fault("rounding of the last elongation dropped", "hb_renderer.c", "gone ? 0.0F : y_rest_mm;", "0.0F;", "renderer"),
+    Fault("equilibrium at the position itself", "hb_renderer.c", "renderer->rest_share * x_mm;", "x_mm;", "switching"),
+    Fault("slowest exponentials drop small changes", "hb_renderer.c", "rest = change - (next - mean);", "rest = 0.0F;",
+          "renderer"),
+    Fault("loss may grow", "hb_renderer.c", "loss <= slower", "loss <= 1.0F", "protocol"),
+    Fault("signs of C(-1) exchanged", "hb_passivity.c", "i % 2U == 1U", "i % 2U == 0U", "passivity"),
+    Fault("damping too small by 0.2 %", "hb_passivity.c", "500.0F *", "499.0F *", "passivity"),
+    Fault("damping not compared", "hb_staging.c", "!(renderer->minimum_damping_N_s_per_m <=",
+          "!(0.0F * renderer->minimum_damping_N_s_per_m <=", "passivity"),
+    Fault("power not rounded", "hb_math.c", "(mantissa + 64U) >> 7", "mantissa >> 7", "passivity"),
+    Fault("one bit of the checksum ignored", "hb_frame.c", "if (crc != hb_crc32(0U, body, size))",
+          "if ((crc | 1U) != (hb_crc32(0U, body, size) | 1U))", "protocol"),
+    Fault("too long for ever", "hb_frame.c", "    receiver->overlong = false;\n", "", "protocol"),
+    Fault("bytes after an overlong frame kept", "hb_frame.c", "    receiver->size = 0U;\n", "", "frames"),
+    Fault("frames that end early taken for COBS", "hb_frame.c", "mark == size ? size - 1U : 0U", "size - 1U", "frames"),
+    Fault("big-endian", "hb_messages.c",
+          "(uint8_t)(value & 255U));\n    return put_u8(payload, at, (uint8_t)(value >> 8));",
+          "(uint8_t)(value >> 8));\n    return put_u8(payload, at, (uint8_t)(value & 255U));", "frames"),
+    Fault("four bad positions", "hb_safety.h", "HB_BAD_POSITIONS 3U", "HB_BAD_POSITIONS 4U", "safety"),
+    Fault("a gap counts as one tick", "hb_safety.c", "(float)(safety->bad + 1U);", "1.0F;", "safety"),
+    Fault("HOLD never quite at zero", "hb_safety.c", "return safety->ramp_N * (", "return 1e-6F + safety->ramp_N * (",
+          "safety"),
+    Fault("twice the slew limit", "hb_safety.c", "safety->force_N - step_N, safety->force_N + step_N",
+          "safety->force_N - 2.0F * step_N, safety->force_N + 2.0F * step_N", "safety"),
+    Fault("the set's own force limit ignored", "hb_device.c", "set_limit_N < config->force_limit_N ? set_limit_N :", "",
+          "safety"),
+    Fault("watchdog one tick late", "hb_device.c", "heartbeat_age_ticks < config->watchdog_ticks", 
+          "heartbeat_age_ticks < config->watchdog_ticks && device->tick % 250U != 7U", "safety"),
+    Fault("overrun not looked at", "hb_device.c", "    if (overrun) {", "    if (overrun && !overrun) {", "safety"),
+    Fault("difference of forces dropped at once", "hb_device.c", "hb_towards_zero(device->offset_N, room_N);", "0.0F;",
+          "switching"),
+    Fault("no difference taken", "hb_device.c", "device->offset_N = old_N - model_N;", "device->offset_N = 0.0F;",
+          "switching"),
+    Fault("COMMIT before the history is warm", "hb_staging.c", "device->warm_left == 0U || ",
+          "device->warm_left < 9U || ", "switching"),
+    Fault("staged history from nothing", "hb_staging.c",
+          "hb_renderer_rest(idle, hb_penetration_mm(&device->safety, device->config));",
+          "hb_renderer_rest(idle, 0.0F);", "switching"),
+    Fault("old history out of contact", "hb_staging.c",
+          "if (!hb_in_contact(&device->safety)) {\n        hb_renderer_rest",
+          "if (device->tick == 0U) {\n        hb_renderer_rest", "switching"),
+    Fault("a refused set stays staged", "hb_staging.c",
+          "    device->staging = (uint8_t)HB_EMPTY;\n    enum hb_reason reason = check_numbers",
+          "    enum hb_reason reason = check_numbers",
+          "protocol"),
+    Fault("COMMIT by id alone", "hb_staging.c", " && confirmation->crc == device->crc[bank]", "", "protocol"),
+    Fault("START for another start of the device", "hb_motion.c",
+          "    if (confirmation.boot_id != device->boot_id) {\n        return HB_NACK_BOOT_ID;\n    }\n    reply",
+          "    reply", "protocol"),
+    Fault("STOP ends ESTOP", "hb_motion.c", "if (hb_is_in(device, HB_RUNNING) || hb_is_in(device, HB_DRIVING))",
+          "if (!hb_is_in(device, HB_STOPPED))", "protocol"),
+    Fault("CLEAR during the ramp", "hb_motion.c", "hb_is_in(device, HB_HOLDING) && !hb_ramp_has_ended",
+          "hb_is_in(device, HB_STOPPED) && !hb_ramp_has_ended", "safety"),
+    Fault("any seq is a repetition", "hb_requests.c", "frame->seq != device->answered_seq || ", "", "protocol"),
+    Fault("repetitions carried out", "hb_requests.c", "device->answered = acts_once(frame->type);",
+          "device->answered = false;", "protocol"),
+    Fault("anybody's heartbeat", "hb_requests.c", " && hb_unpack_boot_id(frame->payload) == device->boot_id) {", ") {",
+          "protocol"),
+    Fault("telemetry fills the buffer", "hb_line.c", "(2U * HB_MAX_FRAME)", "0U", "protocol"),
+]  # fmt: skip
+
+
+def is_noticed(fault: Fault) -> bool:
+    """The tests fail on a core with the fault in it. Raises ValueError where the core has changed under the list."""
+    with tempfile.TemporaryDirectory() as folder:
+        core = Path(folder) / "core"
+        shutil.copytree(CORE, core)
+        source = core / fault.file
+        text = source.read_text(encoding="utf-8")
+        if text.count(fault.old) != 1:
+            raise ValueError(
+                f"{fault.name}: {fault.old!r} stands {text.count(fault.old)} times in {fault.file}, not once."
+            )
+        source.write_text(text.replace(fault.old, fault.new), encoding="utf-8")
+        tests = ROOT / "tests" / f"test_firmware_{fault.tests}.py"
+        environment = os.environ | {"HILBO_FIRMWARE_CORE": str(core), "HILBO_FIRMWARE_FLAGS": "-Wno-error"}
+        options = ["-x", "-q", "-n", "0", "-m", "not deep", "-p", "no:cacheprovider"]
+        command = [sys.executable, "-m", "pytest", *options, str(tests)]
+        done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    if done.returncode not in (0, 1) or "-std=c11" in done.stdout:
+        raise ValueError(f"{fault.name}: the tests did not run: {done.stdout[-2000:]}{done.stderr[-2000:]}")
+    return done.returncode == 1
+
+
+if __name__ == "__main__":
+    chosen = [fault for fault in FAULTS if not sys.argv[1:] or fault.name in sys.argv[1:]]
+    missed = 0
+    for fault in chosen:
+        noticed = is_noticed(fault)
+        missed += not noticed
+        print(f"{'noticed' if noticed else 'MISSED '}  {fault.name}", flush=True)
+    sys.exit(1 if missed else 0)

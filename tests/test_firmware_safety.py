@@ -1,0 +1,336 @@
+"""The safety chain, the states, and a restart at every step: what the hand can be made to feel, tick by tick."""
+
+import numpy as np
+import pytest
+from helpers_firmware import CAUSES, Device, frame, pack, parameters
+
+SET = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
+OTHER = {"K0": -2.5, "K1": 4.0, "B1": 6.0, "alpha": 0.2}
+STEP, WATCHDOG, HOLD = 0.0127, 250, 20
+
+
+@pytest.fixture
+def pressed():
+    """Running, with a force of about 2 N at 300 counts."""
+    device = Device()
+    device.go(SET)
+    device.run(np.linspace(0, 300, 200))
+    device.run([300] * 30)
+    return device
+
+
+def cause(device) -> str:
+    return CAUSES[device.status()["hold_reason"]]
+
+
+def assert_ramps_down(forces, start: float):
+    """Evenly to 0 in 20 ticks, and there it stays."""
+    ramp = np.float32(start) * np.arange(HOLD - 1, -1, -1) / HOLD
+    np.testing.assert_allclose(forces[:HOLD], ramp, rtol=1e-6, atol=0)
+    assert not np.any(forces[HOLD - 1 :])
+
+
+# HOLD and ESTOP
+
+
+def test_silence_of_the_host(pressed):
+    pressed.beat()
+    forces, flags = pressed.run([300] * 400, beating=False)
+    last = np.flatnonzero(forces)[-1]
+    assert last == WATCHDOG - 1 + HOLD - 2
+    assert_ramps_down(forces[WATCHDOG - 1 :], forces[WATCHDOG - 2])
+    assert pressed.state == "HOLD" and cause(pressed) == "WATCHDOG"
+    assert not np.any(flags[: WATCHDOG - 1] & 0x40) and np.all(flags[WATCHDOG - 1 :] & 0x40)
+    assert pressed.notices[-1]["state"] == 4 and pressed.notices[-1]["reason"] == 1
+
+
+def test_hold_is_latched_and_cleared_only_at_zero_force(pressed):
+    pressed.beat()
+    pressed.run([300] * 255, beating=False)
+    _, message = pressed.ask("CLEAR", boot_id=7)
+    assert (message["reason"], message["ticks"]) == ("BUSY", HOLD - 6)
+    pressed.beat()
+    assert not np.any(pressed.run([300] * 100)[0][HOLD:]) and pressed.state == "HOLD"
+    pressed.must("CLEAR", boot_id=7)
+    assert pressed.state == "STOPPED" and not np.any(pressed.run([300] * 10)[0])
+
+
+def test_heartbeats_every_fifty_ticks_keep_it_running(pressed):
+    for _ in range(40):
+        pressed.beat()
+        pressed.run([300] * 50, beating=False)
+    assert pressed.state == "RUNNING"
+
+
+def test_one_lost_acknowledgement_does_not_trip_the_watchdog(pressed):
+    """The host waits 100 ms, asks again, and beats on meanwhile."""
+    data = frame("SET_PARAMS", 200, parameters(OTHER, 2))
+    for attempt in range(2):
+        pressed.feed(data)
+        answer = pressed.drain()
+        if attempt == 0:
+            for _ in range(2):
+                pressed.beat()
+                pressed.run([300] * 50, beating=False)
+    assert answer and pressed.state == "RUNNING"
+
+
+def test_without_heartbeats_even_a_talking_host_is_silent(pressed):
+    for _ in range(30):
+        pressed.status()
+        pressed.run([300] * 10, beating=False)
+    assert pressed.state == "HOLD" and cause(pressed) == "WATCHDOG"
+
+
+def test_estop_is_zero_at_the_next_tick_and_latched(pressed):
+    assert pressed.tick(300) > 1
+    pressed.must("ESTOP")
+    assert pressed.tick(300) == 0
+    assert pressed.flags >= {"estop", "contact"} and pressed.state == "ESTOP" and cause(pressed) == "ESTOP"
+    pressed.beat()
+    assert not np.any(pressed.run([300] * 300)[0])
+    assert pressed.status()["estops"] == 1
+    pressed.must("CLEAR", boot_id=7)
+    assert pressed.state == "STOPPED"
+
+
+def test_estop_in_the_middle_of_a_ramp(pressed):
+    pressed.must("STOP")
+    assert pressed.tick(300) > 0
+    pressed.must("ESTOP")
+    assert pressed.tick(300) == 0
+
+
+def test_stop_ramps_down_and_starts_again(pressed):
+    before = pressed.tick(300)
+    pressed.must("STOP")
+    forces, _ = pressed.run([300] * 40)
+    assert_ramps_down(forces, before)
+    assert pressed.state == "STOPPED"
+
+
+@pytest.mark.parametrize(
+    ("bad", "valid"),
+    [([5000] * 3, True), ([-1600] * 3, True), ([300 + 158, 300 + 320, 300 + 480], True), ([300] * 3, False)],
+    ids=["beyond the stroke", "before it", "implausible steps", "no number"],
+)
+def test_three_bad_positions_hold_and_fewer_are_bridged(pressed, bad, valid):
+    for number in (1, 2):
+        held = pressed.status()["input_held"]
+        for counts in bad[:number]:
+            pressed.tick(counts, valid=valid)
+            assert "held" in pressed.flags
+        pressed.beat()
+        pressed.tick(300)
+        status = pressed.status()
+        assert (status["state"], status["input_held"]) == (1, held + number)
+        assert status["position_mm"] == np.float32(300) * np.float32(STEP)
+    before = pressed.tick(300)
+    forces = [pressed.tick(counts, valid=valid) for counts in bad]
+    assert pressed.state == "HOLD" and cause(pressed) == "INPUT"
+    assert forces[2] == pytest.approx(forces[1] * 19 / 20, rel=1e-6) and abs(forces[0] - before) < 0.1
+
+
+def test_a_large_but_plausible_step_over_a_gap(pressed):
+    """0.9 mm in a tick is too much for the velocity limit only if it took one tick."""
+    pressed.tick(300, valid=False)
+    pressed.tick(370)
+    pressed.tick(440, valid=False)
+    pressed.tick(580, valid=False)
+    pressed.tick(580)
+    assert pressed.state == "RUNNING"
+
+
+def test_after_a_lost_input_any_position_is_a_new_beginning(pressed):
+    for _ in range(3):
+        pressed.tick(0, valid=False)
+    pressed.tick(4000)
+    assert "held" not in pressed.flags and pressed.status()["position_mm"] == pytest.approx(50.8)
+
+
+def test_too_fast(pressed):
+    step = int(1000 / 1000 / STEP)  # 78 counts are 990.6 mm/s
+    pressed.tick(300 + step)
+    assert pressed.state == "RUNNING"
+    pressed.beat()
+    pressed.tick(300 + 2 * step + 1)
+    assert pressed.state == "HOLD" and cause(pressed) == "VELOCITY"
+
+
+def test_too_fast_is_no_matter_while_stopped():
+    device = Device()
+    device.run(np.arange(0, 4000, 120))
+    assert device.state == "STOPPED" and device.status()["holds"] == 0
+
+
+def test_an_overrun(pressed):
+    pressed.tick(300, overrun=True)
+    assert pressed.state == "HOLD" and cause(pressed) == "OVERRUN"
+    assert (pressed.status()["overruns"], pressed.status()["holds"]) == (1, 1)
+
+
+def test_saturation_is_at_the_smaller_limit_and_flagged():
+    for set_limit, device_limit in ((1.5, 40.0), (30.0, 1.5)):
+        device = Device(force_limit=device_limit)
+        device.go(SET | {"force_limit": min(set_limit, device_limit)})
+        forces, flags = device.run(np.linspace(0, 600, 400))
+        assert forces.max() == np.float32(1.5)
+        np.testing.assert_array_equal((flags & 4) > 0, forces == np.float32(1.5))
+        assert device.status()["saturated"] == np.count_nonzero(flags & 4) > 50
+
+
+def test_the_slew_limit_is_kept_and_flagged():
+    device = Device(slew=100.0)
+    device.go(SET)
+    forces, flags = device.run(np.r_[np.zeros(5), np.linspace(0, 600, 40), np.full(100, 600), np.linspace(600, 0, 60)])
+    assert np.max(np.abs(np.diff(forces))) <= 0.1 + 1e-6
+    assert np.count_nonzero(flags & 8) == device.status()["slewed"] > 50
+
+
+def test_force_only_pushes_and_follows_contact():
+    device = Device()
+    device.go(SET)
+    x = np.r_[np.linspace(-200, 400, 300), np.linspace(400, -200, 60), np.full(300, -200)]
+    forces, flags = device.run(x)
+    assert np.all(forces >= 0) and not np.any(forces[x.astype(int) <= 0])
+    np.testing.assert_array_equal(flags & 1 > 0, x.astype(int) > 0)
+    assert device.state == "RUNNING"
+
+
+def test_start_in_contact_fades_in_at_the_slew_limit_and_is_no_slew():
+    device = Device(slew=200.0)
+    staged = device.stage(SET)
+    device.confirm("COMMIT", staged)
+    device.run(np.linspace(0, 300, 200))
+    free = Device(slew=200.0)
+    free.go(SET)
+    expected, _ = free.run(np.r_[np.linspace(0, 300, 200), np.full(100, 300)])
+    device.beat()
+    device.confirm("START", staged)
+    forces, flags = device.run(np.full(100, 300))
+    assert forces[0] == 0 and np.max(np.diff(forces)) <= 0.2 + 1e-6
+    switching = flags & 32 > 0
+    assert 5 < np.count_nonzero(switching) < 20 and not np.any(flags & 8)
+    np.testing.assert_array_equal(forces[~switching][1:], expected[200:][~switching][1:])
+    assert device.status()["slewed"] == 0
+
+
+# Energy
+
+
+def test_the_observer_reports_the_work_of_a_touch():
+    device = Device()
+    device.go(SET)
+    x = np.round(200 * (1 - np.cos(np.arange(500) * 2 * np.pi / 500))).astype(int)
+    for touch in range(2):
+        forces, _ = device.run(x)
+        work = np.sum(np.r_[0, forces[:-1]] * np.diff(np.r_[0, x])) * STEP
+        assert work > 0.5
+        assert device.status()["energy_mJ"] == pytest.approx(work, rel=1e-3)
+        device.run(np.full(300 * touch, 0))
+
+
+def test_the_passivity_controller_acts_where_the_config_switches_it_on():
+    """A sampled spring gives energy to a quick hand; the controller keeps what it gave near 0."""
+    x = np.round(200 - 100 * np.cos(2 * np.pi * 20 * np.arange(1000) / 1000)).astype(int)
+    balance, acted = {}, {}
+    for capabilities in (0, 4):
+        device = Device(capabilities=capabilities)
+        device.go({"K0": 1.8, "K1": 0.5, "B1": 0.001, "alpha": 0.2})
+        device.run(np.linspace(1, 100, 30))
+        device.must("STOP")
+        device.run([100] * 30)
+        device.beat()
+        device.confirm("START", (1, device.crc))
+        device.run([100] * 30)
+        _, flags = device.run(x)
+        balance[capabilities], acted[capabilities] = device.status()["energy_mJ"], np.count_nonzero(flags & 16)
+        assert device.status()["controlled"] == acted[capabilities]
+    assert balance[0] < -3 and acted[0] == 0
+    assert balance[4] > -1 and acted[4] > 20
+
+
+# DRIVE
+
+
+def test_drive_force_triangle():
+    device = Device(slew=1e5)
+    device.beat()
+    device.must("DRIVE", mode=0, shape=1, offset=1.0, amplitude=2.0, period_ticks=40, duration_ticks=100, boot_id=7)
+    forces, flags = device.run([0] * 130)
+    phase = np.arange(100) % 40
+    wave = np.interp(phase, [0, 10, 30, 40], [0, 1, -1, 0])
+    np.testing.assert_allclose(forces[:99], -(1 + 2 * wave)[:99], atol=1e-5)  # inwards is negative
+    assert np.all(flags[:99] & 512) and device.state == "STOPPED" and not np.any(forces[99 + HOLD :])
+    assert [notice["state"] for notice in device.notices][-3:] == [3, 2, 0]
+
+
+def test_drive_step_is_creep_with_recovery():
+    device = Device(slew=1e5)
+    device.beat()
+    device.must("DRIVE", mode=0, shape=2, offset=3.0, amplitude=0.5, period_ticks=30, duration_ticks=50, boot_id=7)
+    forces, _ = device.run([0] * 49)
+    assert list(forces) == [-3.0] * 30 + [-0.5] * 19
+
+
+def test_drive_position_reaches_its_goal_without_a_hold():
+    """A handle of 0.3 kg with the device's damping, on a spring of 0.8 N/mm."""
+    device = Device(velocity=500.0)
+    device.beat()
+    device.must("DRIVE", mode=1, shape=0, offset=5.0, duration_ticks=3000, boot_id=7)
+    x = v = force = 0.0
+    trace = []
+    for _ in range(2900):
+        v += 1e-3 * (-force * 1000 - 800 * x - 0.95 * v) / 0.3  # mm/s
+        x += 1e-3 * v
+        device.beat()
+        force = device.tick(round(x / STEP))
+        trace.append(x)
+    assert device.state == "DRIVING"
+    assert abs(np.mean(trace[-200:]) - 5.0) < 0.03 and max(trace) < 6.5
+
+
+def test_drive_falls_silent_with_the_host():
+    device = Device()
+    device.beat()
+    device.must("DRIVE", mode=0, offset=3.0, duration_ticks=1000, boot_id=7)
+    forces, _ = device.run([0] * 400, beating=False)
+    assert np.flatnonzero(forces)[-1] == WATCHDOG - 1 + HOLD - 2 and device.state == "HOLD"
+
+
+# Restart
+
+
+def test_a_restart_at_every_step_renders_nothing_that_was_not_confirmed_to_this_start():
+    """The host's next words reach a device that has just begun anew: only HELLO and SET_PARAMS do something."""
+    old = Device(boot_id=7)
+    identity = dict(zip(("set_id", "crc"), old.stage(SET), strict=True)) | {"boot_id": 7}
+    words = [
+        frame("SET_PARAMS", 2, parameters(SET)),
+        frame("HEARTBEAT", 0, pack("HEARTBEAT", boot_id=7)),
+        frame("COMMIT", 3, pack("COMMIT", **identity)),
+        frame("HEARTBEAT", 0, pack("HEARTBEAT", boot_id=7)),
+        frame("START", 4, pack("START", **identity)),
+    ]
+    stream = b"".join(words)
+    for at in range(len(stream) + 1):  # also in the middle of a frame
+        for greeted in (False, True):
+            device = Device(boot_id=7)
+            device.feed(stream[:at])
+            device.run([100] * 5, beating=False)
+            device.boot(8)
+            if greeted:
+                device.hello()
+            device.feed(stream[at:])
+            device.feed(stream)  # and all of it once more
+            forces, _ = device.run([200] * 300)
+            assert not np.any(forces)
+            device.feed(b"\0")
+            status = device.status()
+            assert (status["state"], status["active_id"], status["boot_id"]) == (0, 0, 8)
+
+
+def test_counters_stay_at_their_largest():
+    device = Device()
+    forces, _ = device.run([5000] * 70_000)
+    assert device.status()["input_held"] == 65535 and not np.any(forces)
