@@ -52,7 +52,7 @@ class _View:
 
     def __init__(self, device: Renderer, title: str):
         self.device, self.title = device, title
-        self.words: deque[str] = deque(maxlen=4)
+        self.words: list[str] = []
         keep = round(_SHOWN / device.tick_s / max(1, device.divisor))
         self.position: deque[float] = deque(maxlen=keep)
         self.force: deque[float] = deque(maxlen=keep)
@@ -95,7 +95,7 @@ class _View:
             f"holds {s.holds}, e-stops {s.estops}, saturated {s.saturated}, slewed {s.slewed},"
             f" overruns {s.overruns}, frames lost {s.frames_dropped}, samples lost {counts.dropped + counts.missing}",
         )
-        return Group(Text(self.title), table, *(Text(word) for word in self.words))
+        return Group(Text(self.title), table, *(Text(word) for word in self.words[-4:]))
 
     def summary(self) -> dict[str, Any]:
         """For `--json`."""
@@ -153,7 +153,7 @@ def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float
 
     with _keyboard() as pressed:
         content = _show(view, seconds, lambda shown: obey(shown, pressed()))
-    return content | {"felt": felt, "words": list(view.words)}
+    return content | {"felt": felt, "words": view.words}
 
 
 def _press(device, view, key, names, sets, felt) -> None:

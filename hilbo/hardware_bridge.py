@@ -173,11 +173,12 @@ class Renderer:
         return in_force(self._link.request(protocol.GetSet(bank=0)))
 
     def start(self) -> None:
-        """Render the set that is in force."""
+        """Render the set that is in force. Telemetry from before is dropped."""
         found = self.in_force()
         if found is None:
             raise DeviceError("The device has no set in force; send one first.")
         self._link.heartbeat()
+        self._buffer.take()
         self._link.request(protocol.Start(set_id=found.set_id, crc=found.crc, boot_id=self.device.boot_id))
 
     def stop(self) -> None:
@@ -255,7 +256,7 @@ class Renderer:
         )
 
     def telemetry(self, seconds: SupportsFloat = 1.0) -> Any:
-        """A pandas table of everything since the last call, after waiting for `seconds` of the device's time.
+        """A pandas table of everything since `start` or the last call, after `seconds` more of the device's time.
 
         Columns: tick, time_s, position_mm, force_N (commanded), sensed_N (NaN without sensor), flags (`SampleFlag`).
         """
@@ -264,9 +265,10 @@ class Renderer:
     def samples(self, seconds: SupportsFloat = 1.0) -> Samples:
         """The same as columns of numbers, without pandas."""
         buffer, heard, ticks = self._buffer, time.monotonic(), float(seconds) / self.tick_s
-        while ticks > 0 and not buffer.spans(ticks):
+        first = buffer.tick
+        while buffer.tick - first < ticks:
             if buffer.wait(_POLL):
-                heard = time.monotonic()
+                heard, first = time.monotonic(), first or buffer.tick
             elif self._link.lost:
                 raise DeviceError(self._link.lost)
             elif self._link.restarted or time.monotonic() - heard > _STALLED:

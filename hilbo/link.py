@@ -11,12 +11,12 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from hilbo import protocol
 from hilbo.errors import InputError
 from hilbo.frames import Receiver, WireError
 from hilbo.messages import Ack, Message, Nack, Notice, Status, Telemetry, code_of, name_of
-from hilbo.ports import Port
 from hilbo.reasons import ABOUT_INPUT, NackReason, sentence
 
 __all__ = ["BEAT", "DeviceError", "Link", "RefusalError"]
@@ -49,13 +49,14 @@ class RefusalError(InputError):
 
 
 class Link:
-    """A conversation, from construction to `close`. `boot_id` is the device's, once known; heartbeats begin with it.
+    """A conversation over a `ports.Port`, from construction to `close`.
 
+    `boot_id` is the device's, once known; heartbeats begin with it.
     `patience` is how long (s) an answer may take. Counted: `retries`, `stray` answers that fit no request, `strange`
     frames that are no message of a device, `dropped` frames; `round_trips` has the last answers' times (s).
     """
 
-    def __init__(self, port: Port, *, patience: float = 0.1, tries: int = 3, capture: Callable | None = None):
+    def __init__(self, port: Any, *, patience: float = 0.1, tries: int = 3, capture: Callable | None = None):
         self.name, self.patience, self.tries = port.name, patience, tries
         self.boot_id: int | None = None
         self.lost: str | None = None

@@ -71,9 +71,11 @@ class TelemetryBuffer:
             self.newest = message
             self._news.notify_all()
 
-    def spans(self, ticks: float) -> bool:
-        """Whether what has come since the last `take` is that long."""
-        return bool(self._messages) and self._next is not None and self._next - self._messages[0][0] >= ticks
+    @property
+    def tick(self) -> int:
+        """The tick after the newest sample, or 0 before the first."""
+        with self._news:
+            return self._next or 0
 
     def counts(self) -> Counts:
         """Since the buffer was made."""

@@ -13,6 +13,7 @@ import pytest
 from peer import Peer
 
 from hilbo import handshake, hardware_bridge, protocol
+from hilbo.device_tests import wait_until
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer
 from hilbo.ports import open_port
@@ -304,7 +305,8 @@ def test_telemetry_arrives_in_columns():
     with peer.open(**PATIENT) as device:
         for tick in (2**32 - 3, 0, 3):
             peer.say(frame(tick, fields=1))
-        table = device.telemetry(0.009)
+        wait_until(lambda: device.counts().samples == 9, "sent everything")
+        table = device.telemetry(0.0)
         assert list(table.columns) == ["tick", "time_s", "position_mm", "force_N", "sensed_N", "flags"]
         assert np.all(np.diff(table["tick"]) == 1)
         np.testing.assert_allclose(table["time_s"], np.arange(9) * 1e-3, atol=1e-12)
