@@ -16,6 +16,7 @@ import typer
 
 from hilbo.console import Force, Json, Seed, fail, progress
 from hilbo.device_options import Chosen, Line, chosen_set, opened, sets_of, takes
+from hilbo.device_words import decoded, said, set_words
 from hilbo.errors import InputError
 
 __all__ = ["app"]
@@ -44,21 +45,21 @@ def hello(line: Line, as_json: Json = False) -> None:
     from hilbo.reasons import Capability
 
     with opened(line) as device:
-        said = asdict(device.device)
+        about = asdict(device.device)
         found = device.in_force()
-        can = [flag.name.lower() for flag in Capability(said["capabilities"]) if flag.name]
-        content = said | {
+        can = [flag.name.lower() for flag in Capability(about["capabilities"]) if flag.name]
+        content = about | {
             "can": can,
             "limits": device.limits(),
             "telemetry_divisor": device.divisor,
             "in_force": found and found._asdict(),
         }
     limits = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in content["limits"].items())
-    words = "\n".join(f"{name:26} {_said(name, value)}" for name, value in said.items())
-    set_words = _set_words(found) if found else "none"
+    words = "\n".join(f"{name:26} {said(name, value)}" for name, value in about.items())
+    now = set_words(found) if found else "none"
     _finish(
         content,
-        f"{words}\ncan                        {', '.join(can)}\nlimits  {limits}\nin force  {set_words}",
+        f"{words}\ncan                        {', '.join(can)}\nlimits  {limits}\nin force  {now}",
         as_json,
     )
 
@@ -72,7 +73,7 @@ def set_(chosen: Chosen, line: Line, as_json: Json = False) -> None:
         raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --name.")
     with opened(line) as device:
         found = device.send(**wanted)
-    _finish(found._asdict(), f"in force: {_set_words(found)}", as_json)
+    _finish(found._asdict(), f"in force: {set_words(found)}", as_json)
 
 
 @app.command()
@@ -171,7 +172,7 @@ def decode(
             rows.append({"byte": place, "seq": seq, "message": None, "wrong": str(message)})
         else:
             rows.append({"byte": place, "seq": seq, "message": name_of(type(message)), "fields": asdict(message)})
-    words = "\n".join(_decoded(row) for row in rows)
+    words = "\n".join(decoded(row) for row in rows)
     _finish(
         json.loads(json.dumps(rows, default=lambda value: value.hex())), words or "The file has no frames.", as_json
     )
@@ -287,15 +288,9 @@ def simulate(line: Line) -> None:
         device.close()
 
 
-def _said(name, value) -> str:
-    if name in ("schema", "firmware", "boot_id"):
-        return f"{value:08x}"
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
 def _begin(device, wanted) -> None:
     if wanted is not None:
-        print(f"in force: {_set_words(device.send(**wanted))}", file=sys.stderr)
+        print(f"in force: {set_words(device.send(**wanted))}", file=sys.stderr)
     device.start()
 
 
@@ -315,32 +310,6 @@ def _at_once(line, name, as_json) -> None:
         finally:
             link.close()
     _finish({"done": name.lower()}, "done", as_json)
-
-
-def _set_words(found) -> str:
-    length = f"N = {found.length}" if found.memory == "short" else f"full memory, {found.length} exponentials"
-    return (
-        f"K0 = {found.K0:.6g}, K1 = {found.K1:.6g} N/mm, B1 = {found.B1:.6g} N.s^alpha/mm, alpha = {found.alpha:.6g},"
-        f" {length}; at most {found.force_limit:.4g} N; needs {found.needs:.4g} N.s/m"
-    )
-
-
-def _decoded(row) -> str:
-    seq = "  -" if row["seq"] is None else f"{row['seq']:3}"
-    if row["message"] is None:
-        return f"{row['byte']:8} {seq}  ?  {row['wrong']}"
-    fields = "  ".join(f"{name}={_field(value)}" for name, value in row["fields"].items() if name != "reserved")
-    return f"{row['byte']:8} {seq}  {row['message']:12} {fields}"
-
-
-def _field(value) -> str:
-    if isinstance(value, bytes):
-        return value.hex()
-    if isinstance(value, float):
-        return f"{value:.7g}"
-    return (
-        " ".join(f"({','.join(map(_field, row))})" for row in value) if isinstance(value, tuple | list) else str(value)
-    )
 
 
 def _check_free(out: Path, force: bool) -> None:

@@ -22,7 +22,7 @@ from rich.text import Text
 
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, Renderer, State
-from hilbo.parameter_sets import InForce
+from hilbo.parameter_sets import InForce, wanted_for
 from hilbo.reasons import SampleFlag, held_because, meaning
 
 __all__ = ["feel", "trace", "watch"]
@@ -134,6 +134,8 @@ def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float
     """Keys 1 to 9 put sets in force, space starts and stops, e is the emergency stop, c clears, q ends."""
     if not sets or len(sets) > len(_KEYS):
         raise InputError(f"There are {len(sets)} sets; between 1 and {len(_KEYS)} can be felt, one on each key.")
+    for values in sets.values():
+        wanted_for(device.device, **values)  # says now what is wrong, and loads what full memory needs
     names = list(sets)
     title = "  ".join(f"[{key}] {name}" for key, name in zip(_KEYS, names, strict=False))
     view = _View(device, f"{title}\nspace: start or stop   e: emergency stop   c: clear   q: end")
@@ -230,4 +232,4 @@ class _Pipe:
     def __call__(self) -> Iterator[str]:
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + _PIPED
-            yield sys.stdin.read(1).replace("\n", "") or "q"
+            yield sys.stdin.read(1) or "q"

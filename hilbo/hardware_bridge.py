@@ -24,7 +24,7 @@ from hilbo.errors import InputError
 from hilbo.handshake import greet, take_over
 from hilbo.link import DeviceError, Link, RefusalError
 from hilbo.messages import Status
-from hilbo.parameter_sets import InForce, Wanted, in_force
+from hilbo.parameter_sets import InForce, in_force, wanted_for
 from hilbo.ports import BAUD, list_ports, open_port
 from hilbo.reasons import Capability, NackReason, State, held_because, meaning
 from hilbo.staging import put_in_force
@@ -41,6 +41,8 @@ _SHAPES = {"hold": 0, "triangle": 1, "step": 2}
 class Renderer:
     """A connected device; `device` is what it said of itself (`HelloReply`), `notes` what a person should know.
 
+    `simulator` is the `Simulator` behind a simulated one, else None.
+
     Make one with `open`. Every method raises `RefusalError` (an `InputError`) for numbers the device refuses, and
     `DeviceError` when device or line fail; both say in one sentence what to do.
     """
@@ -48,7 +50,7 @@ class Renderer:
     def __init__(self, connect: Callable[[], Link], *, damping: SupportsFloat | None = None, simulator: Any = None):
         self.notes: list[str] = []
         self.divisor = 0
-        self._connect, self._damping, self._simulator = connect, damping, simulator
+        self._connect, self._damping, self.simulator = connect, damping, simulator
         self._begin()
 
     @classmethod
@@ -101,8 +103,8 @@ class Renderer:
                 self._link.request(protocol.Stop())
         finally:
             self._link.close()
-            if self._simulator is not None:
-                self._simulator.close()
+            if self.simulator is not None:
+                self.simulator.close()
 
     @property
     def tick_s(self) -> float:
@@ -131,8 +133,8 @@ class Renderer:
         except BaseException:
             self._link.close()
             raise
-        if self._simulator is not None:
-            self._simulator.run(self._keep_up)
+        if self.simulator is not None:
+            self.simulator.run(self._keep_up)
 
     def _keep_up(self) -> None:
         """Between ticks of a simulated device whose time is ours: a heartbeat, and everything it sent has been read."""
@@ -158,14 +160,8 @@ class Renderer:
         In contact the device first warms the set's own history; `wait` is how long (s) that may take. `force_limit`
         (N) is the device's own if not given. A set that is in force already is not sent again.
         """
-        rate = self.device.tick_rate_Hz
-        if not abs(rate * float(T) - 1) < 1e-9:
-            raise InputError(
-                f"T is {T} s and the device's tick {self.tick_s} s; a set belongs to its T, choose another."
-            )
-        limit = self.device.force_limit_N if force_limit is None else force_limit
-        length = states if memory == "full" else N
-        wanted = Wanted(float(K0), float(K1), float(B1), float(alpha), memory, length, rate, float(limit))
+        numbers = {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "N": N, "T": T, "memory": memory, "states": states}
+        wanted = wanted_for(self.device, **numbers, force_limit=force_limit)
         return put_in_force(self._link, self.device, wanted, float(wait))
 
     def in_force(self) -> InForce | None:
@@ -177,6 +173,8 @@ class Renderer:
         found = self.in_force()
         if found is None:
             raise DeviceError("The device has no set in force; send one first.")
+        import pandas  # noqa: F401  (what `telemetry` needs: an import may keep heartbeats waiting for too long)
+
         self._link.heartbeat()
         self._buffer.take()
         self._link.request(protocol.Start(set_id=found.set_id, crc=found.crc, boot_id=self.device.boot_id))
@@ -300,7 +298,7 @@ class Renderer:
         """
         before, give_up = self.device.boot_id, time.monotonic() + float(timeout)
         self._link.close()
-        if self._simulator is not None and not self._simulator.alive():
+        if self.simulator is not None and not self.simulator.alive():
             raise DeviceError("The simulated device has ended; open a new one.")
         while True:
             try:

@@ -8,13 +8,13 @@ import math
 import struct
 import zlib
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, SupportsFloat
 
 from hilbo.errors import InputError
-from hilbo.messages import Exponential, Set, SetParams, SetStates
+from hilbo.messages import Exponential, HelloReply, Set, SetParams, SetStates
 from hilbo.protocol import payload_of
 
-__all__ = ["InForce", "Wanted", "crc_of", "differences", "in_force"]
+__all__ = ["InForce", "Wanted", "crc_of", "differences", "in_force", "wanted_for"]
 
 _PER_MESSAGE = 7  # exponentials
 _SAME = (
@@ -78,6 +78,33 @@ class InForce(NamedTuple):
     force_limit: float
     needs: float
     crc: int
+
+
+def wanted_for(
+    device: HelloReply,
+    *,
+    K0: SupportsFloat,
+    K1: SupportsFloat,
+    B1: SupportsFloat,
+    alpha: SupportsFloat,
+    N: int = 101,
+    T: SupportsFloat = 1e-3,
+    memory: str = "short",
+    states: int = 10,
+    force_limit: SupportsFloat | None = None,
+) -> Wanted:
+    """A set in numbers for a device, whose own force limit is the default. Raises `InputError` for what cannot be sent.
+
+    Full memory loads JAX here, so that it is there when the set has to be sent in a hurry.
+    """
+    rate = device.tick_rate_Hz
+    if not abs(rate * float(T) - 1) < 1e-9:
+        raise InputError(f"T is {T} s and the device's tick {1 / rate:g} s; a set belongs to its T, choose another.")
+    limit = device.force_limit_N if force_limit is None else float(force_limit)
+    length = states if memory == "full" else N
+    found = Wanted(float(K0), float(K1), float(B1), float(alpha), memory, length, rate, limit)
+    found.messages(1)
+    return found
 
 
 def crc_of(messages: Sequence[SetParams | SetStates]) -> int:

@@ -75,12 +75,12 @@ class Simulator:
             self._pump = threading.Thread(target=self._pass_time, args=(keep_up,), daemon=True)
             self._pump.start()
 
-    def close(self) -> None:
-        """End the process."""
+    def close(self) -> str:
+        """End the process; its last words say how many ticks it ran, and how many were late."""
         self._ending.set()
         if self._pump is not None:
             self._pump.join(5)
-        self._ended()
+        return self._ended()
 
     def _pass_time(self, keep_up) -> None:
         with contextlib.suppress(DeviceError):
@@ -92,7 +92,8 @@ class Simulator:
         return self._process.stdout.readline().decode().strip()
 
     def _ended(self) -> str:
-        """Ends the process; its last words."""
+        if self._process.stderr is None or self._process.stderr.closed:
+            return ""
         with contextlib.suppress(OSError, ValueError):
             self._process.stdin.close()  # type: ignore[union-attr]
         try:

@@ -148,7 +148,7 @@ def test_a_device_that_goes_to_hold_is_a_failure(device, monkeypatch):
 
     def start(self):
         begin(self)
-        self._simulator.tell("bad 5")
+        self.simulator.tell("bad 5")
 
     monkeypatch.setattr(Renderer, "start", start)
     code, _, stderr = device("start", *A, "--seconds", 0.5, *FAST)
@@ -174,7 +174,7 @@ def test_record_and_decode(device, tmp_path):
     assert device("record", out, *A, "--seconds", 0.1, "--force", *FAST)[0] == 0
     assert "exists" in device("hello", "--capture", capture, *FAST)[2]
     with open(capture, "ab") as file:
-        file.write(b"\0\x03??\0")  # the command may have ended within a frame
+        file.write(b"\0\x09??\0")  # the command may have ended within a frame
     code, stdout, _ = device("decode", capture, "--json")
     rows = json.loads(stdout)
     assert code == 0
@@ -299,7 +299,7 @@ def test_a_trace_shows_the_largest_excursions():
 
 
 def test_every_message_of_a_capture_can_be_shown():
-    from hilbo.cli_device import _field
+    from hilbo.device_words import _field
 
     assert _field((protocol.Exponential(0.5, 0.25),)) == "(0.5,0.25)"
     assert _field(b"\x01\xff") == "01ff"

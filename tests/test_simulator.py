@@ -50,7 +50,7 @@ def test_the_device_renders_what_viscoelastic_says(wanted):
     with Renderer.open("sim", options=FAST | {"finger": "none"}) as device:
         found = device.send(**wanted)
         device.start()
-        device._simulator.tell("finger sine")
+        device.simulator.tell("finger sine")
         seen = device.samples(3.0)
     assert np.all(np.diff(seen.tick) == 1)
     numbers = {name: float(np.float32(value)) for name, value in wanted.items() if name != "memory"}
@@ -151,7 +151,7 @@ def test_a_restart_at_any_step_never_renders_what_nobody_confirmed(step):
 
         def request(message):
             if isinstance(message, step) and next(restarts, None):
-                device._simulator.tell("restart")
+                device.simulator.tell("restart")
             return ask(message)
 
         device.link.request = request
@@ -196,16 +196,16 @@ def test_a_bad_line_costs_tries_and_never_a_wrong_set(rate):
 def test_a_port_that_is_used_is_busy_and_one_that_vanishes_is_gone():
     device = Renderer.open("sim")
     with pytest.raises(InputError, match="another program uses this port"):
-        Renderer.open(device._simulator.port)
-    device._simulator._process.kill()
+        Renderer.open(device.simulator.port)
+    device.simulator._process.kill()
     with pytest.raises(DeviceError, match="the line to the device is gone"):
         device.samples(10.0)
     with pytest.raises(DeviceError, match="The simulated device has ended"):
         device.reconnect()
     with pytest.raises(DeviceError, match="ended; open a new one"):
-        device._simulator.tell("restart")
+        device.simulator.tell("restart")
     device.link.close()
-    device._simulator.close()
+    device.simulator.close()
 
 
 def test_a_real_port_has_no_options():
@@ -308,7 +308,7 @@ def test_a_killed_host_is_zero_force_within_the_watchdog_and_its_ramp(times):
 def test_the_simulated_device_ends_with_a_killed_python():
     code = (
         "import os\nfrom hilbo.hardware_bridge import Renderer\n"
-        "d = Renderer.open('sim')\nprint(d._simulator._process.pid, flush=True)\nos.kill(os.getpid(), 9)"
+        "d = Renderer.open('sim')\nprint(d.simulator._process.pid, flush=True)\nos.kill(os.getpid(), 9)"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=ENVIRONMENT)
     assert run.returncode == -signal.SIGKILL, run.stderr
