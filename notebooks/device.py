@@ -57,16 +57,6 @@ print(table.describe().loc[["min", "mean", "max"], ["position_mm", "force_N", "s
 print("marks:", [flag.name for flag in SampleFlag if np.any(table["flags"] & int(flag))])
 
 # %% [markdown]
-# ## Compare
-# The same positions through `viscoelastic`, in double precision. Out of contact the model sees 0 and pushes nothing.
-
-# %%
-model = FOSLS(found.K0, found.K1, found.B1, found.alpha, N=found.length)
-expected = np.asarray(model.simulate(np.maximum(table["position_mm"].to_numpy(), 0), unilateral=True))
-error = np.abs(table["force_N"].to_numpy() - expected)
-print(f"largest force {expected.max():.3f} N, largest difference {error.max():.2e} N")
-
-# %% [markdown]
 # ## Change the set while the finger is there
 # The new set warms a history of its own first, then takes over; the difference fades out under the slew limit.
 
@@ -78,12 +68,22 @@ print(f"largest step of force {steps.max():.3f} N, slew limit {said.slew_limit_N
 
 # %% [markdown]
 # ## Stop
-# Before anything that keeps Python busy for long: without heartbeats the device lets go, as it should.
+# Before anything that keeps Python busy for long: without heartbeats for a quarter of a second the device lets go.
 
 # %%
 device.stop()
 print(device.state().name, device.events())
 device.close()
+
+# %% [markdown]
+# ## Compare
+# The same positions through `viscoelastic`, in double precision. Out of contact the model sees 0 and pushes nothing.
+
+# %%
+model = FOSLS(found.K0, found.K1, found.B1, found.alpha, N=found.length)
+expected = np.asarray(model.simulate(np.maximum(table["position_mm"].to_numpy(), 0), unilateral=True))
+error = np.abs(table["force_N"].to_numpy() - expected)
+print(f"largest force {expected.max():.3f} N, largest difference {error.max():.2e} N")
 
 # %% [markdown]
 # ## See it
