@@ -398,6 +398,12 @@ def test_stop_and_estop_are_obeyed_each_time_with_any_seq(device):
             assert device.state == "RUNNING"
 
 
+def test_other_bytes_with_the_same_seq_are_another_request(device):
+    for model, set_id in ((SET, 1), (OTHER, 2)):
+        assert device.exchange(frame("SET_PARAMS", 9, parameters(model, set_id)))[1]["set_id"] == set_id
+    assert device.status()["staged_id"] == 2
+
+
 def test_reading_again_reads_again(device):
     data = frame("GET_STATUS", 5)
     first = device.exchange(data)[1]["tick"]

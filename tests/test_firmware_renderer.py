@@ -145,6 +145,7 @@ def test_the_exponentials_of_the_protocol_tests_are_the_hosts():
     np.testing.assert_allclose(np.transpose(EXPONENTIALS), np.stack(states_of(np.float32(0.3), 10)), rtol=1e-6)
 
 
+@pytest.mark.deep
 def test_every_compiler_and_optimisation_gives_the_same_bits():
     x = np.maximum(motion(2.0), 0).astype(np.float32) * STEP
     row, given = np.float32([0.44, 1.0, 3.0, 0.3]), states_of(np.float32(0.3), 10)

@@ -96,12 +96,15 @@ def test_all_pairs_of_passive_sets_on_four_motions(count):
         print(f"{name}: differences up to {jumps.max():.2f} N, {late}")
 
 
-def test_out_of_contact_a_set_is_in_force_at_once_and_its_history_clear():
+@pytest.mark.parametrize("pressed", [False, True], ids=["staged off the surface", "staged in contact"])
+def test_out_of_contact_a_set_is_in_force_at_once_and_its_history_clear(pressed):
     device = Device()
     device.go({"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176})
-    device.run(np.r_[np.linspace(0, 400, 100), np.linspace(400, -10, 50)])
     new = {"K0": -2.5, "K1": 4.0, "B1": 6.0, "alpha": 0.2}
-    device.confirm("COMMIT", device.stage(new, 2))
+    device.run(np.linspace(0, 400, 100))
+    staged = device.stage(new, 2) if pressed else None
+    device.run(np.linspace(400, -10, 50))
+    device.confirm("COMMIT", staged or device.stage(new, 2))
     fresh = Device()
     fresh.go(new)
     x = np.r_[np.full(3, -10), np.linspace(0, 400, 100)]

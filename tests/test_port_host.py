@@ -12,7 +12,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from device_port import COMPILERS, FIRMWARE, FOAM, PATIENCE, SCHEMA, Port, State, program
+from device_port import COMPILERS, FIRMWARE, FOAM, PATIENCE, SCHEMA, Port, State, Status, program
 from device_wire import Type, encode, set_crc, set_params, set_states
 
 from hilbo import passivity, viscoelastic
@@ -52,12 +52,16 @@ def test_the_same_options_give_the_same_forces():
     assert forces("--seed", "5") != first
 
 
+def wait_for_tick(port: Port, tick: int) -> Status:
+    end = time.monotonic() + PATIENCE
+    while (status := port.status()).tick < tick:
+        assert time.monotonic() < end
+    return status
+
+
 def test_ticks_go_by_themselves_in_real_time():
     with Port(rate="realtime") as port:
-        before = port.status().tick
-        end = time.monotonic() + PATIENCE
-        while port.status().tick < before + 100:
-            assert time.monotonic() < end
+        wait_for_tick(port, port.status().tick + 100)
         assert port.command("tick 1")[0] == "unknown"
 
 
@@ -180,29 +184,31 @@ def wait_for(port: Port, type: int, count: int):
     return [a for a in port.unasked if a.type == type]
 
 
-def test_a_restarted_device_knows_nothing_and_obeys_no_old_name():
+@pytest.mark.parametrize("obeyed", range(5))
+def test_a_restarted_device_knows_nothing_and_obeys_no_old_name(obeyed):
     payload = set_params(3, *FOAM)
-    crc = set_crc(payload)
-    named = struct.pack("<HHII", 3, 0, crc, 0x55)
-    steps = [(Type.HELLO, struct.pack("<HHI", 1, 0, SCHEMA)), (Type.SET_PARAMS, payload), (Type.COMMIT, named)]
-    steps += [(Type.START, named)]
-    for before in range(1, len(steps) + 1):
-        with Port("--boot-id", "0x55", "--finger", "rest") as port:
-            port.boot_id = 0x55
-            for number, (type, body) in enumerate(steps):
-                if number == before:
-                    (_, new_id) = port.command("restart")
-                answer = port.request(type, body)
-                assert (answer.type in (Type.ACK, Type.HELLO_REPLY)) == (number < before), (before, number)
-                port.heartbeat()
-                assert port.tick(20) == 0
-            if before < len(steps):
-                assert answer.payload[1] == NACK_NO_HELLO
-                port.hello()
-                assert port.boot_id == int(new_id) != 0x55
-                assert port.request(*steps[-1]).payload[1] == NACK_BOOT_ID
-                status = port.status()
-                assert (status.state, status.active_id) == (State.STOPPED, 0)
+    named = struct.pack("<HHII", 3, 0, set_crc(payload), 0x55)
+    steps = [(Type.HELLO, struct.pack("<HHI", 1, 0, SCHEMA)), (Type.SET_PARAMS, payload)]
+    steps += [(Type.COMMIT, named), (Type.START, named)]
+    with Port("--boot-id", "0x55", "--finger", "hold") as port:
+        port.boot_id = 0x55
+        port.live(800)  # the finger presses, so that force would be felt
+        force = 0.0
+        for type, body in steps[:obeyed]:
+            assert port.request(type, body).type in (Type.ACK, Type.HELLO_REPLY)
+            force = port.live(300)
+        assert (force > 0.5) == (obeyed == 4) and (force == 0) == (obeyed < 4)
+        _, new_id = port.command("restart")
+        assert port.status().boot_id == int(new_id) != 0x55
+        for type, body in (*steps[max(obeyed, 1) :], steps[-1]):
+            assert port.request(type, body).payload[1] == NACK_NO_HELLO
+            assert port.live(300) == 0
+        port.hello()
+        for type, body in steps[2:]:
+            assert port.request(type, body).payload[1] == NACK_BOOT_ID
+            assert port.live(300) == 0
+        status = port.status()
+        assert (status.state, status.active_id, status.staged_id) == (State.STOPPED, 0, 0)
 
 
 def test_faults_are_those_of_the_protocol():
@@ -227,13 +233,12 @@ def test_faults_are_those_of_the_protocol():
 @pytest.mark.parametrize("strict", [False, True])
 def test_a_busy_laptop_is_no_fault_of_the_device_unless_asked(strict):
     with Port(*["--strict"] * strict, rate="realtime") as port:
-        for _ in range(3):
-            port.process.send_signal(signal.SIGSTOP)
-            time.sleep(0.05)
-            port.process.send_signal(signal.SIGCONT)
-        port.hello()
         before = port.status()
-        assert (before.overruns > 0) == strict
+        port.process.send_signal(signal.SIGSTOP)
+        time.sleep(0.05)
+        port.process.send_signal(signal.SIGCONT)
+        status = wait_for_tick(port, before.tick + 5)
+        assert (status.overruns > before.overruns) == strict
 
 
 def ends(process) -> int:

@@ -1,5 +1,7 @@
 #include "hb_device.h"
 
+#include <string.h>
+
 #include "hb_math.h"
 #include "hb_motion.h"
 #include "hb_requests.h"
@@ -12,7 +14,9 @@ _Static_assert(HB_OUTPUT_BYTES >= 3U * HB_MAX_FRAME, "HB_OUTPUT_BYTES must hold 
 enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, uint32_t boot_id)
 {
     enum hb_error error = hb_config_check(config);
-    *device = (struct hb_device){.config = config, .boot_id = boot_id};
+    memset(device, 0, sizeof *device); /* in place: a literal of this size may pass over the stack */
+    device->config = config;
+    device->boot_id = boot_id;
     if (error == HB_OK) {
         device->heartbeat_age_ticks = config->watchdog_ticks;
         hb_enter(device, HB_STOPPED, HB_CAUSE_BOOT);

@@ -9,12 +9,14 @@ static bool crosses(float number, float low, float high, float *value, float *li
     return number < low || number > high;
 }
 
+bool hb_drive_is_named(const struct hb_drive_request *request)
+{
+    return request->mode <= (uint8_t)HB_DRIVE_POSITION && request->shape <= (uint8_t)HB_DRIVE_STEP;
+}
+
 enum hb_reason hb_drive_check(const struct hb_drive_request *request, const struct hb_config *config, float *value,
                               float *limit)
 {
-    if (request->mode > (uint8_t)HB_DRIVE_POSITION || request->shape > (uint8_t)HB_DRIVE_STEP) {
-        return HB_NACK_RESERVED;
-    }
     if (!hb_is_finite(request->offset) || !hb_is_finite(request->amplitude)) {
         return HB_NACK_NOT_FINITE;
     }
@@ -72,7 +74,8 @@ static float wanted(const struct hb_drive *drive)
 }
 
 /* Inward force of a PI servo with damping on the measured velocity. */
-static float servo(struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety, float goal_mm)
+static float servo(struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety,
+                   float goal_mm)
 {
     float rate_Hz = (float)config->tick_rate_Hz;
     float reach_mm = config->servo_speed_mm_per_s / rate_Hz;

@@ -20,6 +20,9 @@ struct hb_drive {
     float integral_N;   /* mode 1: what its integral has come to */
 };
 
+/* Its mode and shape have names. */
+bool hb_drive_is_named(const struct hb_drive_request *request);
+
 /* HB_ACCEPTED, or why not, with the number and the bound it crosses. */
 enum hb_reason hb_drive_check(const struct hb_drive_request *request, const struct hb_config *config, float *value,
                               float *limit);

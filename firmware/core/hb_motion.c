@@ -61,7 +61,7 @@ enum hb_reason hb_start(struct hb_device *device, const struct hb_frame *frame, 
 enum hb_reason hb_drive(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply)
 {
     struct hb_drive_request request;
-    if (!hb_unpack_drive(frame->payload, &request)) {
+    if (!hb_unpack_drive(frame->payload, &request) || !hb_drive_is_named(&request)) {
         return HB_NACK_RESERVED;
     }
     if (request.boot_id != device->boot_id) {

@@ -17,7 +17,7 @@
 #include "options.h"
 #include "rig.h"
 
-enum { FAILED = 1, BAD_USAGE = 2, COMMAND_SIZE = 128, UNSENT_SIZE = 256 };
+enum { FAILED = 1, BAD_USAGE = 2, COMMAND_SIZE = 128, UNSENT_SIZE = 256, MOST_WAIT_MS = 100 };
 
 struct process {
     struct options options;
@@ -183,7 +183,7 @@ static void run(struct process *process)
     clock_start(&process->clock, (int64_t)(tick_s * 1e9 + 0.5));
     while (!stopping && !process->ended) {
         if (process->options.lockstep) {
-            serve(process, -1);
+            serve(process, MOST_WAIT_MS); /* a signal just before the wait would be seen after it */
             transmit(process);
             continue;
         }
