@@ -69,7 +69,23 @@ MATHS = {
 # What each module may import of hilbo, and with it what that one may import. Modules to come have their place already.
 MAY_IMPORT = MATHS | {
     "errors": set(),
-    "protocol": set(),
+    "frames": set(),
+    "messages": set(),
+    "reasons": set(),
+    "protocol": {"frames", "messages", "reasons"},
+    "ports": set(),
+    "link": {"protocol", "frames", "messages", "reasons"},
+    "handshake": {"link"},
+    "parameter_sets": {"protocol", "messages", "exponentials"},
+    "staging": {"link", "parameter_sets"},
+    "telemetry": {"messages"},
+    "simulator": {"link"},
+    "friction": set(),
+    "pressing": {"link", "telemetry"},
+    "device_tests": {"hardware_bridge", "friction", "pressing"},
+    "set_tables": set(),
+    "device_screen": {"hardware_bridge"},
+    "device_words": set(),
     "config": {"search_space", "ordinal_gp"},
     "tables": {"config"},
     "material_tables": {"tables", "identification"},
@@ -88,9 +104,11 @@ MAY_IMPORT = MATHS | {
     "plotting_mechanics": {"plotting", "characterise"},
     "report_people": {"study"},
     "page": {"config", "report_people"},
-    "hardware_bridge": {"protocol"},
+    "hardware_bridge": {"ports", "handshake", "staging", "telemetry", "simulator"},
+    "device_options": {"console", "hardware_bridge", "set_tables", "config", "viscoelastic"},
+    "cli_device": {"device_options", "device_tests", "device_screen", "device_words"},
 }
-MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material"}
+MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material", "device_options", "cli_device"}
 MAY_IMPORT["report_population"] = {"report", "report_people", "page", "batch_optimum"}
 MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
@@ -98,8 +116,19 @@ MAY_IMPORT["app"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 
-ONLY_IN = {"matplotlib": {"plotting", "plotting_mechanics"}, "serial": {"hardware_bridge"}}
-WITHOUT_JAX = {"errors", "protocol", "hardware_bridge"}
+ONLY_IN = {"matplotlib": {"plotting", "plotting_mechanics"}, "serial": {"ports"}}
+WITHOUT_JAX = {
+    "errors",
+    "protocol",
+    "hardware_bridge",
+    "link",
+    "ports",
+    "simulator",
+    "telemetry",
+    "device_tests",
+    "device_screen",
+    "cli_device",
+}
 OUTSIDE_WORLD = {"os", "io", "sys", "time", "datetime", "pathlib", "logging", "random", "socket", "subprocess"}
 MAY_ENABLE_X64 = {"console", "app", "__main__"}
 LONGEST = 400  # lines
@@ -251,7 +280,7 @@ def test_type_checkers_see_the_same_names():
     assert names == set(hilbo.__all__)
 
 
-LIGHT = ["hilbo", "hilbo.errors", "hilbo.protocol", "hilbo.hardware_bridge", "hilbo.cli"]
+LIGHT = ["hilbo", "hilbo.errors", "hilbo.protocol", "hilbo.hardware_bridge", "hilbo.device_tests", "hilbo.cli"]
 
 
 @pytest.mark.parametrize("module", [name for name in LIGHT if (PACKAGE / f"{name[6:] or '__init__'}.py").exists()])

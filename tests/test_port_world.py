@@ -49,8 +49,15 @@ def test_a_material_is_the_sampled_model_at_the_ticks(taps):
     force = np.r_[np.full(300, 3.0), np.full(300, 0.5), np.zeros(200), 2 + 2 * np.sin(np.arange(600) / 30)]
     options = ("--start", "-0.2", "--material", ",".join(map(str, (*FOAM, taps))))
     _, x, _, sensed = world(force, *options)
-    expected = np.asarray(FOSLS(*FOAM, N=taps).simulate(np.maximum(x, 0)))
-    np.testing.assert_allclose(-sensed, np.maximum(expected, 0), rtol=0, atol=1e-11 * expected.max())
+    # Where the handle has left the material, its surface goes on with no force on it: what presses is its own path.
+    surface = np.maximum(x, 0)
+    model = FOSLS(*FOAM, N=taps)
+    K = float(model.instantaneous_stiffness())
+    for n in np.flatnonzero(sensed == 0):
+        free = surface[n] - float(model.simulate(np.r_[surface[: n + 1], np.zeros(x.size - n - 1)])[n]) / K
+        surface[n] = max(surface[n], free)
+    expected = np.asarray(model.simulate(surface))
+    np.testing.assert_allclose(-sensed, np.maximum(expected, 0), rtol=0, atol=1e-9 * expected.max())
     assert (x > 0.5).any() and (x < 0).any()
 
 

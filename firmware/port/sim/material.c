@@ -36,11 +36,20 @@ double sim_material_force_N(const struct sim_material *material, double position
     return force_N > 0.0 ? force_N : 0.0;
 }
 
+/* Where the surface is when nothing presses on it: it comes back by itself, more slowly than a handle can leave it. */
+static double surface_mm(const struct sim_material *material)
+{
+    const struct sim_material_config *config = &material->config;
+    const double stiffness = config->K0_N_per_mm + config->K1_N_per_mm * (1.0 - material->gain);
+    return stiffness > 0.0 ? fmax(config->K1_N_per_mm * material->past_mm / stiffness, 0.0) : 0.0;
+}
+
 void sim_material_tick(struct sim_material *material, double position_mm)
 {
     const int taps = material->config.taps;
+    const double pressed_mm = fmax(position_mm, surface_mm(material));
     material->newest = (material->newest + 1) % taps;
-    material->elongation_mm[material->newest] = material->gain * touched(position_mm) + material->past_mm;
+    material->elongation_mm[material->newest] = material->gain * touched(pressed_mm) + material->past_mm;
     double past_mm = 0.0;
     for (int i = 0, place = material->newest; i < taps; i++, place = (place > 0 ? place : taps) - 1) {
         past_mm += material->weights[i] * material->elongation_mm[place];

@@ -1,0 +1,126 @@
+"""Damping and Coulomb friction of a free device, from sweeps at several speeds.
+
+While the handle moves one way, Newton's law m·x'' + b·x' + c·sign(x') + f0 = F holds for its position x and the
+motor's force F along it: mass, damping, Coulomb friction, a constant force such as weight. Weighted by
+w(t) = sin²(π t/L) over a stretch of length L, which vanishes with its slope at both ends, and integrated by parts,
+
+    ∫wF = m·∫w''x - b·∫w'x + c·sign·∫w + f0·∫w,
+
+which is linear in what is sought and differentiates no encoder (Shinbrot 1954). Least squares over the stretches;
+intervals by a bootstrap over whole periods, there and back, because what is wrong in one sweep, cogging or a servo that
+swings, is wrong in the next in the same way (Künsch 1989).
+Units: mm, N, s, b in N·s/m, m in kg.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hilbo.errors import InputError
+
+__all__ = ["Friction", "Interval", "Sweep", "friction", "sweeps"]
+
+_FEWEST = 8  # periods
+_DRAWS = 4000
+_CREEPS = 0.008  # s after a turn, until the handle surely moves
+
+
+class Sweep(NamedTuple):
+    """Means, weighted by w, of one stretch: force (N), velocity (mm/s), acceleration (mm/s²); and its period."""
+
+    force: float
+    velocity: float
+    acceleration: float
+    period: int
+
+
+class Interval(NamedTuple):
+    """An estimate and its 95 % interval."""
+
+    value: float
+    lower: float
+    upper: float
+
+
+class Friction(NamedTuple):
+    """What keeps a free device from moving; `residual` (N) is the standard deviation of what is left of the sweeps."""
+
+    damping: Interval  # N·s/m
+    coulomb: Interval  # N
+    mass: Interval  # kg
+    constant: Interval  # N
+    residual: float
+    sweeps: int
+    periods: int
+
+
+def sweeps(
+    position: Float[np.ndarray, " n"],
+    force: Float[np.ndarray, " n"],
+    tick: float,
+    period: float,
+    settle: float,
+    number: int = 0,
+) -> list[Sweep]:
+    """The sweeps of a triangle that begins at its middle and rises; `period` and `settle` in s.
+
+    Each way is two sweeps: `settle` after the turn, where the servo swings and the mass shows, and the rest. `force`
+    (N) is the motor's, along the position (mm); samples every `tick` s. `number` is that of the first period, so
+    that recordings can be joined.
+    """
+    half, skip = round(period / 2 / tick), round(settle / tick)
+    found, starts = [], range(round(period / 4 / tick), position.size - half + 1, half)  # where the triangle turns
+    if half < 2 * skip:
+        raise InputError(f"The sweeps are too short: {half * tick:.3g} s, and the first {settle:.3g} s are the turn.")
+    for count, start in enumerate(starts):
+        way = position[start : start + half]
+        # The handle turns later than the triangle, and rests there for as long as friction holds it.
+        rests = np.flatnonzero(way == (way.max() if way[0] > way[-1] else way.min()))
+        turn = start + int(rests[-1]) + round(_CREEPS / tick)
+        for begin, end in ((turn, turn + skip), (turn + skip, start + half)):
+            found.append(_sweep(position[begin:end], force[begin:end], tick, number + count // 2))
+    return found
+
+
+def _sweep(x, force, tick, period) -> Sweep:
+    """The integrals over ∫w = L/2; a force is held from its sample to the next."""
+    turns = 2 * np.pi * np.arange(x.size) / (x.size - 1)
+    length, held = (x.size - 1) * tick, (turns[:-1] + turns[1:]) / 2
+    # w = (1 - cos)/2. x may be counted from anywhere in w'' and w', whose integrals are 0: the smaller the better.
+    x = x - x.mean()
+    mean_force = np.sum((1 - np.cos(held)) * force[:-1]) * tick / length
+    ends = (x[0] + x[-1]) / 2  # the trapezoid rule, for w'' that does not vanish there
+    bend = np.sum(np.cos(turns) * x) - ends
+    velocity = -(2 * np.pi / length**2) * tick * np.sum(np.sin(turns) * x)
+    acceleration = (2 * np.pi / length) ** 2 * tick / length * bend
+    return Sweep(float(mean_force), float(velocity), float(acceleration), period)
+
+
+def friction(found: Sequence[Sweep], seed: int = 0) -> Friction:
+    """Least squares over the sweeps, with intervals by a bootstrap over periods. Raises `InputError` for too few."""
+    values = np.array([[s.force, s.velocity, s.acceleration] for s in found])
+    periods, period = np.unique([s.period for s in found], return_inverse=True)
+    if periods.size < _FEWEST or np.unique(np.abs(values[:, 1]).round(0)).size < 2:
+        raise InputError(
+            f"There are {periods.size} periods of sweeps; at least {_FEWEST}, at two speeds or more, tell damping from"
+            " friction."
+        )
+    ways = np.stack([values[:, 2] / 1e6, values[:, 1] / 1e3, np.sign(values[:, 1]), np.ones(len(values))], axis=1)
+    # Mass in kg from mm/s² needs 1e-3; the column is kept small and scaled below.
+    ways[:, 0] *= 1e3
+    products, sides = ways[:, :, None] * ways[:, None, :], ways * values[:, :1]
+    blocks = np.zeros((periods.size, 4, 4)), np.zeros((periods.size, 4))
+    np.add.at(blocks[0], period, products)
+    np.add.at(blocks[1], period, sides)
+    best = np.linalg.lstsq(ways, values[:, 0], rcond=None)[0]
+    drawn = np.random.default_rng(seed).multinomial(periods.size, np.full(periods.size, 1 / periods.size), _DRAWS)
+    normal, right = np.tensordot(drawn, blocks[0], 1), drawn @ blocks[1]
+    estimates = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
+    # Basic bootstrap, widened for the few blocks as a t-interval is: the errors' distribution turned over.
+    wide = np.sqrt(periods.size / (periods.size - 4))
+    lower, upper = best - wide * (np.quantile(estimates, [0.975, 0.025], axis=0) - best)
+    mass, damping, coulomb, constant = (Interval(*map(float, row)) for row in zip(best, lower, upper, strict=True))
+    left = values[:, 0] - ways @ best
+    return Friction(damping, coulomb, mass, constant, float(left.std(ddof=4)), len(found), int(periods.size))

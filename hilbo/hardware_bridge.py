@@ -1,0 +1,314 @@
+"""The bridge to a rendering device: a parameter set in, force and position out.
+
+    with Renderer.open("sim") as device:                       # or a port, or "socket://host:port"
+        device.send(K0=-3.18, K1=5.58, B1=7.88, alpha=0.176)   # staged, committed, read back
+        device.start()
+        table = device.telemetry(2.0)
+
+The device decides last: it checks every set again, with its own damping, and refuses by name. It renders only while
+this process sends heartbeats, and is stopped when the block ends, however it ends. What is in force is read back and
+compared bit for bit. A device that restarts is never started again by itself. No JAX here; firmware/PROTOCOL.md is the
+wire.
+
+Units: K N/mm, B1 N·s^α/mm, T s, mm, N, damping N·s/m.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, SupportsFloat
+
+from hilbo import protocol
+from hilbo.errors import InputError
+from hilbo.handshake import greet, take_over
+from hilbo.link import DeviceError, Link, RefusalError
+from hilbo.messages import Status
+from hilbo.parameter_sets import InForce, in_force, wanted_for
+from hilbo.ports import BAUD, list_ports, open_port
+from hilbo.reasons import Capability, NackReason, State, held_because, meaning
+from hilbo.staging import put_in_force
+from hilbo.telemetry import Counts, Samples, TelemetryBuffer
+
+__all__ = ["Capability", "DeviceError", "InForce", "RefusalError", "Renderer", "State", "list_ports"]
+
+_SIMULATED = 1.0  # s for an answer; the simulator shares this computer's processors
+_STALLED = 2.0  # s without telemetry
+_POLL = 0.1  # s
+_SHAPES = {"hold": 0, "triangle": 1, "step": 2}
+
+
+class Renderer:
+    """A connected device; `device` is what it said of itself (`HelloReply`), `notes` what a person should know.
+
+    `simulator` is the `Simulator` behind a simulated one, else None.
+
+    Make one with `open`. Every method raises `RefusalError` (an `InputError`) for numbers the device refuses, and
+    `DeviceError` when device or line fail; both say in one sentence what to do.
+    """
+
+    def __init__(self, connect: Callable[[], Link], *, damping: SupportsFloat | None = None, simulator: Any = None):
+        self.notes: list[str] = []
+        self.divisor = 0
+        self._connect, self._damping, self.simulator = connect, damping, simulator
+        self._begin()
+
+    @classmethod
+    def open(
+        cls,
+        where: str = "sim",
+        *,
+        damping: SupportsFloat | None = None,
+        baud: int = BAUD,
+        capture: Callable[[bytes], Any] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> "Renderer":
+        """Connect to "sim", a serial port, or "socket://host:port".
+
+        `damping` (N·s/m) is what a study counts on: a device with less is refused. `capture` gets every byte that
+        arrives. `options` are those of the simulated device (`simulator.Options`). Raises `InputError` for a line that
+        cannot be opened, and `DeviceError` for one on which no device of this protocol answers.
+        """
+        if where == "sim":
+            from hilbo.simulator import Simulator
+
+            simulator = Simulator(**(options or {}))
+        elif options:
+            raise InputError(f"{where}: options are for the simulated device; use them with sim.")
+        else:
+            simulator = None
+        port, patience = (simulator.port, _SIMULATED) if simulator else (where, 0.1)
+        connect = partial(_connected, port, baud, patience, capture)
+        try:
+            return cls(connect, damping=damping, simulator=simulator)
+        except BaseException:
+            if simulator:
+                simulator.close()
+            raise
+
+    def __enter__(self) -> "Renderer":
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        try:
+            self.close()
+        except DeviceError:
+            if error is None:
+                raise
+
+    def close(self) -> None:
+        """Stop the device and let go of the line. Raises `DeviceError` if it could not be told to stop."""
+        try:
+            if self._link.lost is None:
+                self._link.request(protocol.Stop())
+        finally:
+            self._link.close()
+            if self.simulator is not None:
+                self.simulator.close()
+
+    @property
+    def tick_s(self) -> float:
+        """Period of the control loop, s."""
+        return 1 / self.device.tick_rate_Hz
+
+    @property
+    def can(self) -> Capability:
+        """What the device can do."""
+        return Capability(self.device.capabilities)
+
+    @property
+    def link(self) -> Link:
+        """The conversation, with its counters."""
+        return self._link
+
+    def _begin(self) -> None:
+        """A new conversation: who is there, at rest, heartbeats, telemetry."""
+        self._link = self._connect()
+        try:
+            self.device = greet(self._link, self._damping)
+            self._buffer = TelemetryBuffer(self.device.encoder_step_mm)
+            self._link.on_telemetry = self._buffer.add
+            self.notes += take_over(self._link, self.device)
+            self.stream()
+        except BaseException:
+            self._link.close()
+            raise
+        if self.simulator is not None:
+            self.simulator.run(self._keep_up)
+
+    def _keep_up(self) -> None:
+        """Between ticks of a simulated device whose time is ours: a heartbeat, and everything it sent has been read."""
+        self._link.heartbeat()
+        self._link.request(protocol.GetStatus())
+
+    def send(
+        self,
+        *,
+        K0: SupportsFloat,
+        K1: SupportsFloat,
+        B1: SupportsFloat,
+        alpha: SupportsFloat,
+        N: int = 101,
+        T: SupportsFloat = 1e-3,
+        memory: str = "short",
+        states: int = 10,
+        force_limit: SupportsFloat | None = None,
+        wait: SupportsFloat = 5.0,
+    ) -> InForce:
+        """Put a set in force: staged, committed, read back and compared bit for bit.
+
+        In contact the device first warms the set's own history; `wait` is how long (s) that may take. `force_limit`
+        (N) is the device's own if not given. A set that is in force already is not sent again.
+        """
+        numbers = {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "N": N, "T": T, "memory": memory, "states": states}
+        wanted = wanted_for(self.device, **numbers, force_limit=force_limit)
+        return put_in_force(self._link, self.device, wanted, float(wait))
+
+    def in_force(self) -> InForce | None:
+        """The set in force, or None."""
+        return in_force(self._link.request(protocol.GetSet(bank=0)))
+
+    def start(self) -> None:
+        """Render the set that is in force. Telemetry from before is dropped."""
+        found = self.in_force()
+        if found is None:
+            raise DeviceError("The device has no set in force; send one first.")
+        import pandas  # noqa: F401  (what `telemetry` needs: an import may keep heartbeats waiting for too long)
+
+        self._link.heartbeat()
+        self._buffer.take()
+        self._link.request(protocol.Start(set_id=found.set_id, crc=found.crc, boot_id=self.device.boot_id))
+
+    def stop(self) -> None:
+        """Force to zero, smoothly."""
+        self._link.request(protocol.Stop())
+
+    def estop(self) -> None:
+        """Force to zero at once, latched until `clear`."""
+        self._link.request(protocol.Estop())
+
+    def clear(self) -> None:
+        """Leave HOLD or ESTOP, once the reason is understood."""
+        self._link.request(protocol.Clear(boot_id=self.device.boot_id))
+
+    def status(self) -> Status:
+        """State and counters."""
+        return self._link.request(protocol.GetStatus())
+
+    def state(self) -> State:
+        """The state alone."""
+        return State(self.status().state)
+
+    def limits(self) -> dict[str, tuple[float, float]]:
+        """What the device takes: lowest and highest K0, K1 (N/mm), B1 (N·s^α/mm) and alpha."""
+        found = self._link.request(protocol.GetLimits())
+        return {n: (getattr(found, f"{n}_low"), getattr(found, f"{n}_high")) for n in ("K0", "K1", "B1", "alpha")}
+
+    def echo(self, data: bytes) -> bytes:
+        """The same bytes back, from the device."""
+        return self._link.request(protocol.Echo(data=data)).data
+
+    def stream(self, divisor: int = 1, *, sensed: bool | None = None) -> int:
+        """Telemetry of every `divisor`-th tick, or of as many as the line carries; 0 switches it off.
+
+        `sensed`: with the force sensor, by default where there is one. Returns the divisor in force.
+        """
+        fields = int(bool(self.can & Capability.FORCE_SENSOR) if sensed is None else sensed)
+        try:
+            self._link.request(protocol.Stream(divisor=divisor, fields=fields))
+        except RefusalError as error:
+            if error.nack.reason != NackReason.LINE_TOO_SLOW:
+                raise
+            divisor = int(error.nack.limit)
+            self._link.request(protocol.Stream(divisor=divisor, fields=fields))
+        self.divisor = divisor
+        return divisor
+
+    def drive(
+        self,
+        mode: Literal["force", "position"],
+        shape: Literal["hold", "triangle", "step"],
+        offset: SupportsFloat,
+        amplitude: SupportsFloat = 0.0,
+        *,
+        period: SupportsFloat = 0.0,
+        duration: SupportsFloat,
+    ) -> None:
+        """The device moves by itself for `duration` s: see DRIVE in PROTOCOL.md. Force in N, position in mm, s."""
+        if not self.can & Capability.DRIVE:
+            raise DeviceError(
+                f"{self._link.name}: this device cannot move by itself; use one that can, or the simulator."
+            )
+        if mode not in ("force", "position") or shape not in _SHAPES:
+            raise InputError(f'The drive is "{mode}", "{shape}"; it is force or position, and {", ".join(_SHAPES)}.')
+        ticks = {
+            "period_ticks": round(float(period) / self.tick_s),
+            "duration_ticks": round(float(duration) / self.tick_s),
+        }
+        numbers = {"offset": float(offset), "amplitude": float(amplitude)}
+        self._link.heartbeat()
+        self._link.request(
+            protocol.Drive(
+                mode=int(mode == "position"), shape=_SHAPES[shape], **numbers, **ticks, boot_id=self.device.boot_id
+            )
+        )
+
+    def telemetry(self, seconds: SupportsFloat = 1.0) -> Any:
+        """A pandas table of everything since `start` or the last call, after `seconds` more of the device's time.
+
+        Columns: tick, time_s, position_mm, force_N (commanded), sensed_N (NaN without sensor), flags (`SampleFlag`).
+        """
+        return self.samples(seconds).table(self.tick_s)
+
+    def samples(self, seconds: SupportsFloat = 1.0) -> Samples:
+        """The same as columns of numbers, without pandas."""
+        buffer, heard, ticks = self._buffer, time.monotonic(), float(seconds) / self.tick_s
+        first = buffer.tick
+        while buffer.tick - first < ticks:
+            if buffer.wait(_POLL):
+                heard, first = time.monotonic(), first or buffer.tick
+            elif self._link.lost:
+                raise DeviceError(self._link.lost)
+            elif self._link.restarted or time.monotonic() - heard > _STALLED:
+                self.limits()  # says it better if device or line have a problem
+                raise DeviceError(f"{self._link.name}: no telemetry comes; switch it on with stream().")
+        return buffer.take()
+
+    def newest(self) -> Any:
+        """The newest telemetry message, or None; for displays."""
+        return self._buffer.newest
+
+    def counts(self) -> Counts:
+        """Samples received, dropped by the device, and missing."""
+        return self._buffer.counts()
+
+    def events(self) -> list[str]:
+        """What the device has told unasked since the last call, in words."""
+        found = []
+        with contextlib.suppress(IndexError):
+            while True:
+                notice = self._link.notices.popleft()
+                found.append(f"tick {notice.tick}: {meaning(State, notice.state)}, {held_because(notice.reason)}")
+        return found
+
+    def reconnect(self, timeout: SupportsFloat = 5.0) -> bool:
+        """Connect again after the line or the device was away; True if the device has not restarted meanwhile.
+
+        It is left stopped, and a restarted one without a set: send it again, and start it when somebody is ready.
+        """
+        before, give_up = self.device.boot_id, time.monotonic() + float(timeout)
+        self._link.close()
+        if self.simulator is not None and not self.simulator.alive():
+            raise DeviceError("The simulated device has ended; open a new one.")
+        while True:
+            try:
+                self._begin()
+                return self.device.boot_id == before
+            except InputError:
+                if time.monotonic() > give_up:
+                    raise
+                time.sleep(0.1)
+
+
+def _connected(port, baud, patience, capture) -> Link:
+    return Link(open_port(port, baud), patience=patience, capture=capture)

@@ -1,0 +1,126 @@
+"""Lines to a device: a serial port (pyserial) or a TCP socket, with one sentence for whatever keeps them from opening.
+
+A port reads what has arrived, waiting for at most `POLL` seconds, and writes; both raise OSError when it is gone.
+"""
+
+import contextlib
+import errno
+import os
+import socket
+from typing import Any, NamedTuple
+
+from hilbo.errors import InputError
+
+__all__ = ["BAUD", "POLL", "Port", "PortInfo", "SerialPort", "SocketPort", "list_ports", "open_port"]
+
+BAUD = 1_000_000
+"""Line rate (baud) where none is given; a pseudo-terminal and a USB device have none of their own."""
+POLL = 0.05  # s
+_STUCK = 2.0  # s, until a line that takes no bytes is given up
+_BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
+
+
+class PortInfo(NamedTuple):
+    """A serial port of this computer."""
+
+    name: str
+    description: str
+
+
+class SerialPort:
+    """A serial port, or a pseudo-terminal; nobody else can open it meanwhile."""
+
+    def __init__(self, name: str, baud: int = BAUD):
+        self.name = name
+        self._serial: Any = _opened(name, baud)
+
+    def read(self) -> bytes:
+        try:
+            return self._serial.read(max(1, self._serial.in_waiting))
+        except TypeError as error:  # pyserial's, when the port is closed while it reads
+            raise OSError(errno.EBADF, "the port is closed") from error
+
+    def write(self, data: bytes) -> None:
+        self._serial.write(data)
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._serial.close()
+
+
+class SocketPort:
+    """A connected stream socket."""
+
+    def __init__(self, connected: socket.socket, name: str):
+        self.name = name
+        self._socket = connected
+        self._socket.settimeout(POLL)
+
+    def read(self) -> bytes:
+        try:
+            data = self._socket.recv(4096)
+        except TimeoutError:
+            return b""
+        if not data:
+            raise OSError(errno.ENOTCONN, "the other side has closed the connection")
+        return data
+
+    def write(self, data: bytes) -> None:
+        self._socket.sendall(data)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+Port = SerialPort | SocketPort
+"""Anything with `name`, `read`, `write` and `close` will do."""
+
+
+def open_port(where: str, baud: int = BAUD) -> Port:
+    """The line called `where`: a port's name, or socket://host:port. Raises `InputError`."""
+    return _connected(where) if where.startswith("socket://") else SerialPort(where, baud)
+
+
+def list_ports() -> list[PortInfo]:
+    """The serial ports of this computer."""
+    from serial.tools.list_ports import comports
+
+    return [PortInfo(port.device, port.description or "") for port in sorted(comports())]
+
+
+def _connected(where):
+    host, separator, number = where.removeprefix("socket://").rpartition(":")
+    if not (separator and host and number.isdigit()):
+        raise InputError(f'"{where}" is no address; write it like socket://192.168.0.7:5000.')
+    try:
+        connected = socket.create_connection((host, int(number)), timeout=3)
+    except (OSError, OverflowError) as error:
+        raise InputError(f"{where}: nobody answers ({error}); check address and port, and that it listens.") from error
+    with contextlib.suppress(OSError):
+        connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    return SocketPort(connected, where)
+
+
+def _opened(name, baud):
+    try:
+        import serial
+    except ImportError as error:
+        raise InputError("Serial ports need pyserial; install it with: pip install 'hilbo[hardware]'.") from error
+    try:
+        # Exclusive, so that two programs never talk to one device.
+        return serial.Serial(name, baud, timeout=POLL, write_timeout=_STUCK, exclusive=True)
+    except (OSError, ValueError) as error:
+        raise InputError(_why_not(name, baud, error)) from error
+
+
+def _why_not(name, baud, error) -> str:
+    number = getattr(error, "errno", None)
+    if number in _BUSY or "exclusively lock" in str(error):
+        return f"{name}: another program uses this port; close it, or choose another port."
+    if number in (errno.EACCES, errno.EPERM) and os.path.exists(name):
+        return f"{name}: you may not open this port; on Linux, join the group that owns it (ls -l {name})."
+    if number in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in str(error):
+        return f"{name}: there is no such port; plug the device in, or choose one of `hilbo device ports`."
+    if number == errno.ENOTTY or "ioctl" in str(error) or not isinstance(error, OSError):
+        return f"{name}: is no serial port that takes {baud} baud ({error}); choose another port or --baud."
+    return f"{name}: cannot be opened ({error}); check the port."

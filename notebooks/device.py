@@ -1,0 +1,102 @@
+# %% [markdown]
+# # A set on a device: send it, press it, look at force and position
+# The device is simulated here: the firmware's own code, with an actuator, an encoder and a finger, in a process beside
+# this one. With a real device, put its port in place of "sim".
+
+# %%
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import os
+
+import numpy as np
+
+from hilbo.errors import InputError
+from hilbo.hardware_bridge import Renderer
+from hilbo.protocol import SampleFlag
+from hilbo.viscoelastic import FOSLS
+
+device = Renderer.open("sim", options={"finger": "none"})
+said = device.device
+print(
+    f"damping {said.damping_N_s_per_m:.3f} N.s/m, at most {said.force_limit_N:g} N, {said.tick_rate_Hz} ticks a second"
+)
+print(f"stroke {said.position_low_mm:.1f} to {said.position_high_mm:.1f} mm in steps of {said.encoder_step_mm:.4f} mm")
+
+# %% [markdown]
+# ## Send a set
+# The paper's aggregate parameters. The device checks them again with its own damping; what comes back is what it has in
+# force, bit for bit what was sent.
+
+# %%
+found = device.send(K0=-3.18, K1=5.58, B1=7.88, alpha=0.176)
+print(found)
+print(f"needs {found.needs:.4f} N.s/m of damping, has {said.damping_N_s_per_m:.4f}")
+
+# %% [markdown]
+# A set that is not passive on this device is refused, and the one in force stays.
+
+# %%
+try:
+    device.send(K0=-5.01, K1=8.44, B1=10.28, alpha=0.282)
+except InputError as error:
+    print(error)
+print("in force:", device.in_force() == found)
+
+# %% [markdown]
+# ## Press
+# A simulated finger presses in and swings at 2 Hz. On a real device this is your own.
+
+# %%
+seconds = 3.0 if "HILBO_NOTEBOOK_TRIALS" in os.environ else 10.0
+device.start()
+device.simulator.tell("finger sine")
+table = device.telemetry(seconds)
+print(table.describe().loc[["min", "mean", "max"], ["position_mm", "force_N", "sensed_N"]].round(3))
+print("marks:", [flag.name for flag in SampleFlag if np.any(table["flags"] & int(flag))])
+
+# %% [markdown]
+# ## Change the set while the finger is there
+# The new set warms a history of its own first, then takes over; the difference fades out under the slew limit.
+
+# %%
+device.send(K0=-2.89, K1=5.70, B1=5.89, alpha=0.203)
+after = device.telemetry(1.0)
+steps = np.abs(np.diff(after["force_N"]))
+print(f"largest step of force {steps.max():.3f} N, slew limit {said.slew_limit_N_per_s * device.tick_s:.3f} N a tick")
+
+# %% [markdown]
+# ## Stop
+# Before anything that keeps Python busy for long: without heartbeats for a quarter of a second the device lets go.
+
+# %%
+device.stop()
+print(device.state().name, device.events())
+device.close()
+
+# %% [markdown]
+# ## Compare
+# The same positions through `viscoelastic`, in double precision. Out of contact the model sees 0 and pushes nothing.
+
+# %%
+model = FOSLS(found.K0, found.K1, found.B1, found.alpha, N=found.length)
+expected = np.asarray(model.simulate(np.maximum(table["position_mm"].to_numpy(), 0), unilateral=True))
+error = np.abs(table["force_N"].to_numpy() - expected)
+print(f"largest force {expected.max():.3f} N, largest difference {error.max():.2e} N")
+
+# %% [markdown]
+# ## See it
+
+# %%
+import matplotlib.pyplot as plt
+
+figure, (top, bottom) = plt.subplots(2, sharex=True, figsize=(8, 5), layout="constrained")
+top.plot(table["time_s"], table["force_N"], label="device")
+top.plot(table["time_s"], expected, "--", label="viscoelastic")
+top.set_ylabel("force (N)")
+top.legend()
+bottom.plot(table["time_s"], table["position_mm"])
+bottom.set_ylabel("position (mm)")
+bottom.set_xlabel("time (s)")
+plt.show()
