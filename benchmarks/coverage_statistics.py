@@ -35,6 +35,10 @@ JUDGE, SET, EFFECT = 0.6, 0.4, 1.05  # table IV: sd of participants and of sets,
 SHOWN, SETS, TWICE = 8, 24, 2
 WIDTHS = 100  # studies whose bootstrap intervals are found; of the others only whether they hold the truth
 CASES = {"differ": (1.0, False), "unequal": (1.0, True), "alike": (0.0, False)}  # scale of effects; unequal
+PERSONS = ["iid", "clustered by participant", "wild bootstrap by participant"]
+WAYS = ["set", "participant and set"]
+KINDS = {"II": PERSONS, "III": PERSONS, "rate": ["Wilson", "exact"]}
+KINDS["IV"] = PERSONS + [f"{kind} by {way}" for way in WAYS for kind in ("clustered", "wild bootstrap")]
 NODES, WEIGHTS = hermegauss(60)
 WEIGHTS = WEIGHTS / WEIGHTS.sum()
 START, END = "<!-- coverage -->", "<!-- end of coverage -->"
@@ -115,12 +119,15 @@ def study(rng, participants, case, truths, widths):
 
 def intervals(name, table, truths):
     """The rows of a table, a separated coefficient's under every kind of error, and the largest of the plain ones."""
-    plain = table["errors"] != "profile likelihood"
-    kinds, rows = list(table.loc[plain, "errors"].unique()), []
+    rows = []
     for term, truth in truths.items():
         mine = table[table["term"] == term].set_index("errors")
         separated = "profile likelihood" in mine.index
-        found = {kind: mine.loc["profile likelihood" if separated else kind, ["low", "high"]] for kind in kinds}
+        found = {
+            kind: mine.loc["profile likelihood" if separated else kind, ["low", "high"]]
+            for kind in KINDS[name]
+            if separated or kind in mine.index
+        }
         sure = {kind: ends for kind, ends in found.items() if kind == "iid" or kind.startswith("clustered")}
         if sure:
             found["the largest of iid and clustered"] = max(sure.values(), key=lambda ends: np.nan_to_num(np.ptp(ends)))

@@ -12,7 +12,7 @@ from hilbo import ordered_logit, separation
 from hilbo import statistics as st
 from hilbo.errors import InputError
 
-CHI = stats.chi2.ppf(0.95, 1)
+DROP = -2 * np.log(0.025)
 
 
 # Separation
@@ -76,7 +76,7 @@ def test_a_cell_of_100_percent_has_a_one_sided_interval():
         least = minimize_scalar(one, bracket=(-3, 0), tol=1e-12).fun
         return 2 * (least + 24 * np.log(24 / 320) + 296 * np.log(296 / 320))
 
-    assert at(best["low"]) == pytest.approx(CHI, abs=1e-8)
+    assert at(best["low"]) == pytest.approx(DROP, abs=1e-8)
     # What is not separated is as if the others had not been asked.
     alone = st.binary_logit(category[group == 1] == 0, None, {"participant": person[group == 1]})
     for kind in ("iid", "clustered by participant", "wild bootstrap by participant"):
@@ -87,11 +87,11 @@ def test_a_cell_of_100_percent_has_a_one_sided_interval():
 def test_an_outcome_that_never_changes_has_the_closed_interval():
     found = st.binary_logit(np.ones(80), None, {"participant": np.arange(80) % 20})
     row = found.table.squeeze()
-    q = np.exp(-CHI / 160)
-    assert row["estimate"] == np.inf and row["low"] == pytest.approx(logit(q), abs=1e-9)
-    assert row["p_value"] == pytest.approx(stats.chi2.sf(160 * np.log(2), 1), rel=1e-8)
+    exact = stats.binomtest(80, 80)  # Clopper & Pearson
+    assert row["estimate"] == np.inf and row["low"] == pytest.approx(logit(exact.proportion_ci().low), abs=1e-9)
+    assert row["p_value"] == pytest.approx(exact.pvalue, rel=1e-8)
     losses = st.binary_logit(np.zeros(80)).table.squeeze()
-    assert losses["estimate"] == -np.inf and losses["high"] == pytest.approx(-logit(q), abs=1e-9)
+    assert losses["estimate"] == -np.inf and losses["high"] == pytest.approx(-row["low"], abs=1e-9)
 
 
 def test_a_combination_that_separates_is_found():
