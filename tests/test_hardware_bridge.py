@@ -16,7 +16,7 @@ from hilbo import handshake, hardware_bridge, protocol
 from hilbo.device_tests import wait_until
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer
-from hilbo.ports import open_port
+from hilbo.ports import list_ports, open_port
 from hilbo.protocol import NackReason, Sample
 from hilbo.telemetry import TelemetryBuffer
 
@@ -343,6 +343,14 @@ def test_a_port_that_is_none_is_one_sentence(where, words):
     with pytest.raises(InputError) as error:
         Renderer.open(where)
     assert words in str(error.value)
+
+
+def test_without_pyserial_there_is_one_sentence(monkeypatch):
+    for module in ("serial", "serial.tools.list_ports"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for attempt in (list_ports, lambda: open_port("/dev/ttyACM0")):
+        with pytest.raises(InputError, match="Serial ports need pyserial; install it with"):
+            attempt()
 
 
 def test_nobody_listens_at_an_address():
