@@ -197,7 +197,7 @@ def test_selftest(device):
 
 def test_feel_with_keys_from_a_pipe(device, sets, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("1 2\n3ec q"))
-    code, stdout, stderr = device("feel", sets, "--json", "--sim", "finger=sine")
+    code, stdout, stderr = device("feel", sets, "--json", *FAST, "--sim", "finger=sine")
     found = json.loads(stdout)
     assert (code, found["felt"], found["state"]) == (0, ["S", "A"], "RUNNING")
     assert any("The set needs 1.34" in word for word in found["words"])

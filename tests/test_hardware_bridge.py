@@ -345,6 +345,22 @@ def test_a_port_that_is_none_is_one_sentence(where, words):
     assert words in str(error.value)
 
 
+def test_a_device_behind_an_address():
+    peer = Peer()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            peer.socket, _ = server.accept()
+            peer._serve(peer.socket)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with Renderer.open(f"socket://127.0.0.1:{server.getsockname()[1]}", patience=5) as device:
+            device.send(**A)
+            assert device.in_force().alpha == float(np.float32(0.176))
+        thread.join()
+
+
 def test_without_pyserial_there_is_one_sentence(monkeypatch):
     for module in ("serial", "serial.tools.list_ports"):
         monkeypatch.setitem(sys.modules, module, None)
