@@ -23,6 +23,8 @@ __all__ = ["app"]
 
 app = typer.Typer(no_args_is_help=True, help="A rendering device: connect, send sets, feel, measure.")
 
+_FOAM = (-2.89, 5.70, 5.89, 0.203, 101)  # what lies under a simulated device that characterises
+
 Seconds = Annotated[float | None, typer.Option(help="End after so many seconds of the device's time.")]
 
 
@@ -188,7 +190,7 @@ def selftest(
     """Loopback, latency, and whether the device lets go when the host falls silent."""
     from hilbo import device_tests
 
-    with progress() as say, opened(line) as device:
+    with progress() as say, opened(line, finger="none") as device:
         found = device_tests.selftest(device, say, echoes)
         hold = device.device.hold_ticks
     good = found.echoes == found.asked and found.watchdog_ticks <= found.watchdog_limit and found.force_after_N == 0
@@ -226,7 +228,7 @@ def measure_damping(line: Line, seed: Seed = 0, as_json: Json = False) -> None:
     """Damping b and Coulomb friction of the free device, with 95 % intervals. It moves by itself."""
     from hilbo import device_tests
 
-    with progress() as say, opened(line) as device:
+    with progress() as say, opened(line, rate="lockstep", finger="none") as device:
         found = device_tests.measure_damping(device, say, seed)
         reported = device.device.damping_N_s_per_m
     rows = (("damping", "N.s/m"), ("coulomb", "N"), ("mass", "kg"), ("constant", "N"))
@@ -262,7 +264,7 @@ def characterise(
     from hilbo import device_tests
 
     _check_free(out, force)
-    with progress() as say, opened(line) as device:
+    with progress() as say, opened(line, rate="lockstep", material=_FOAM, noise=0.02) as device:
         numbers = {"repeats": repeats, "depth": depth, "force": load, "after": after, "hold": hold, "rest": rest}
         table = device_tests.characterise(device, say, **numbers, seed=seed)
         damping = device.device.damping_N_s_per_m

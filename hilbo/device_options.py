@@ -81,8 +81,11 @@ def takes(**groups: type) -> Callable:
 
 
 @contextlib.contextmanager
-def opened(line: Line) -> Iterator[Any]:
-    """A connected `Renderer`, stopped at the end also when the process is told to terminate."""
+def opened(line: Line, **simulated: Any) -> Iterator[Any]:
+    """A connected `Renderer`, stopped at the end also when the process is told to terminate.
+
+    `simulated` are options of the simulated device that suit the command, where the user gives no others.
+    """
     from hilbo.hardware_bridge import Renderer
 
     with contextlib.ExitStack() as stack:
@@ -94,7 +97,7 @@ def opened(line: Line) -> Iterator[Any]:
                 damping=_damping(line),
                 baud=line.baud,
                 capture=capture.write if capture else None,
-                options=_simulated(line.sim),
+                options=(simulated if line.device == "sim" else {}) | _simulated(line.sim),
             )
         )
         for note in device.notes:

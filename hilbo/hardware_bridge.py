@@ -32,6 +32,7 @@ from hilbo.telemetry import Counts, Samples, TelemetryBuffer
 
 __all__ = ["Capability", "DeviceError", "InForce", "RefusalError", "Renderer", "State", "list_ports"]
 
+_ANSWER = 0.1  # s
 _SIMULATED = 1.0  # s for an answer; the simulator shares this computer's processors
 _STALLED = 2.0  # s without telemetry
 _POLL = 0.1  # s
@@ -60,14 +61,16 @@ class Renderer:
         *,
         damping: SupportsFloat | None = None,
         baud: int = BAUD,
+        patience: SupportsFloat | None = None,
         capture: Callable[[bytes], Any] | None = None,
         options: dict[str, Any] | None = None,
     ) -> "Renderer":
         """Connect to "sim", a serial port, or "socket://host:port".
 
-        `damping` (N·s/m) is what a study counts on: a device with less is refused. `capture` gets every byte that
-        arrives. `options` are those of the simulated device (`simulator.Options`). Raises `InputError` for a line that
-        cannot be opened, and `DeviceError` for one on which no device of this protocol answers.
+        `damping` (N·s/m) is what a study counts on: a device with less is refused. `patience` (s) is for one answer,
+        0.1 on a line. `capture` gets every byte that arrives. `options` are those of the simulated device
+        (`simulator.Simulator`). Raises `InputError` for a line that cannot be opened, and `DeviceError` for one on
+        which no device of this protocol answers.
         """
         if where == "sim":
             from hilbo.simulator import Simulator
@@ -77,8 +80,8 @@ class Renderer:
             raise InputError(f"{where}: options are for the simulated device; use them with sim.")
         else:
             simulator = None
-        port, patience = (simulator.port, _SIMULATED) if simulator else (where, 0.1)
-        connect = partial(_connected, port, baud, patience, capture)
+        port, usual = (simulator.port, _SIMULATED) if simulator else (where, _ANSWER)
+        connect = partial(_connected, port, baud, usual if patience is None else float(patience), capture)
         try:
             return cls(connect, damping=damping, simulator=simulator)
         except BaseException:
@@ -134,12 +137,7 @@ class Renderer:
             self._link.close()
             raise
         if self.simulator is not None:
-            self.simulator.run(self._keep_up)
-
-    def _keep_up(self) -> None:
-        """Between ticks of a simulated device whose time is ours: a heartbeat, and everything it sent has been read."""
-        self._link.heartbeat()
-        self._link.request(protocol.GetStatus())
+            self.simulator.run(partial(_keep_up, self._link))
 
     def send(
         self,
@@ -308,6 +306,12 @@ class Renderer:
                 if time.monotonic() > give_up:
                     raise
                 time.sleep(0.1)
+
+
+def _keep_up(link: Link) -> None:
+    """Between ticks of a simulated device whose time is ours: a heartbeat, and everything it sent has been read."""
+    link.heartbeat()
+    link.request(protocol.GetStatus())
 
 
 def _connected(port, baud, patience, capture) -> Link:

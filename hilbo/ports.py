@@ -17,6 +17,7 @@ BAUD = 1_000_000
 """Line rate (baud) where none is given; a pseudo-terminal and a USB device have none of their own."""
 POLL = 0.05  # s
 _STUCK = 2.0  # s, until a line that takes no bytes is given up
+_NO_PYSERIAL = "Serial ports need pyserial; install it with: pip install 'hilbo[hardware]'."
 _BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
 
 
@@ -83,8 +84,10 @@ def open_port(where: str, baud: int = BAUD) -> Port:
 
 def list_ports() -> list[PortInfo]:
     """The serial ports of this computer."""
-    from serial.tools.list_ports import comports
-
+    try:
+        from serial.tools.list_ports import comports
+    except ImportError as error:
+        raise InputError(_NO_PYSERIAL) from error
     return [PortInfo(port.device, port.description or "") for port in sorted(comports())]
 
 
@@ -105,7 +108,7 @@ def _opened(name, baud):
     try:
         import serial
     except ImportError as error:
-        raise InputError("Serial ports need pyserial; install it with: pip install 'hilbo[hardware]'.") from error
+        raise InputError(_NO_PYSERIAL) from error
     try:
         # Exclusive, so that two programs never talk to one device.
         return serial.Serial(name, baud, timeout=POLL, write_timeout=_STUCK, exclusive=True)

@@ -72,6 +72,8 @@ class Simulator:
     def run(self, keep_up: Callable[[], None]) -> None:
         """In lockstep, time passes from now on; `keep_up` is called after every few ticks, and ends it by raising."""
         if self._lockstep:
+            if self._pump is not None:
+                self._pump.join()  # ends with the connection that it kept up with
             self._pump = threading.Thread(target=self._pass_time, args=(keep_up,), daemon=True)
             self._pump.start()
 

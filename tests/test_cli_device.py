@@ -197,7 +197,7 @@ def test_selftest(device):
 
 def test_feel_with_keys_from_a_pipe(device, sets, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("1 2\n3ec q"))
-    code, stdout, stderr = device("feel", sets, "--json", "--sim", "finger=sine")
+    code, stdout, stderr = device("feel", sets, "--json", *FAST, "--sim", "finger=sine")
     found = json.loads(stdout)
     assert (code, found["felt"], found["state"]) == (0, ["S", "A"], "RUNNING")
     assert any("The set needs 1.34" in word for word in found["words"])
@@ -213,7 +213,7 @@ def test_feel_takes_as_many_sets_as_there_are_keys(device, sets):
 
 
 def test_measure_damping(device):
-    code, stdout, _ = device("measure-damping", "--json", *FAST, "--sim", "finger=none", "--sim", "damping=0.8")
+    code, stdout, _ = device("measure-damping", "--json", "--sim", "damping=0.8")
     found = json.loads(stdout)
     assert code == 0
     assert found["damping"]["lower"] <= 0.8 <= found["damping"]["upper"]
@@ -221,9 +221,8 @@ def test_measure_damping(device):
 
 
 def test_characterise(device, tmp_path):
-    material = ["--sim", "material=-2.89,5.7,5.89,0.203,101", "--sim", "noise=0.01"]
     out = tmp_path / "tests.csv"
-    code, stdout, _ = device("characterise", out, "--repeats", 1, "--hold", 0.4, "--rest", 0.3, *FAST, *material)
+    code, stdout, _ = device("characterise", out, "--repeats", 1, "--hold", 0.4, "--rest", 0.3)
     assert code == 0 and "hilbo identify" in stdout and "--damping 0.95" in stdout
     table = pd.read_csv(out)
     assert list(table) == ["test", "repeat", "time_s", "position_mm", "force_N"]

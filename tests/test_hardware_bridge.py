@@ -16,7 +16,7 @@ from hilbo import handshake, hardware_bridge, protocol
 from hilbo.device_tests import wait_until
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer
-from hilbo.ports import open_port
+from hilbo.ports import list_ports, open_port
 from hilbo.protocol import NackReason, Sample
 from hilbo.telemetry import TelemetryBuffer
 
@@ -343,6 +343,30 @@ def test_a_port_that_is_none_is_one_sentence(where, words):
     with pytest.raises(InputError) as error:
         Renderer.open(where)
     assert words in str(error.value)
+
+
+def test_a_device_behind_an_address():
+    peer = Peer()
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            peer.socket, _ = server.accept()
+            peer._serve(peer.socket)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        with Renderer.open(f"socket://127.0.0.1:{server.getsockname()[1]}", patience=5) as device:
+            device.send(**A)
+            assert device.in_force().alpha == float(np.float32(0.176))
+        thread.join()
+
+
+def test_without_pyserial_there_is_one_sentence(monkeypatch):
+    for module in ("serial", "serial.tools.list_ports"):
+        monkeypatch.setitem(sys.modules, module, None)
+    for attempt in (list_ports, lambda: open_port("/dev/ttyACM0")):
+        with pytest.raises(InputError, match="Serial ports need pyserial; install it with"):
+            attempt()
 
 
 def test_nobody_listens_at_an_address():

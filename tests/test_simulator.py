@@ -135,10 +135,10 @@ def test_a_drive_that_is_out_of_range_is_refused():
 
 
 def test_a_drive_that_ends_early_is_not_used():
-    with Renderer.open("sim", options={"finger": "none"}) as device:
+    with Renderer.open("sim", options=FAST | {"finger": "none"}) as device:
         threading.Timer(0.3, device.estop).start()
         with pytest.raises(DeviceError, match="ended its drive early, now ESTOP"):
-            device_tests.drive(device, "position", "hold", 3.0, duration=1.0)
+            device_tests.drive(device, "position", "hold", 3.0, duration=120.0)
 
 
 STEPS = [protocol.SetParams, protocol.Commit, protocol.GetSet, protocol.Start]
@@ -146,7 +146,7 @@ STEPS = [protocol.SetParams, protocol.Commit, protocol.GetSet, protocol.Start]
 
 @pytest.mark.parametrize("step", STEPS, ids=lambda step: step.__name__)
 def test_a_restart_at_any_step_never_renders_what_nobody_confirmed(step):
-    with Renderer.open("sim", options={"finger": "hold"}) as device:
+    with Renderer.open("sim", options=FAST | {"finger": "hold"}) as device:
         ask, restarts = device.link.request, iter([step])
 
         def request(message):
