@@ -21,6 +21,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
 POINTS, TRIALS = 2000, 25
 HEAD = (
     "| participants | read, µs each | refit + merge, µs each | and optimum, µs each | own optima, µs each | peak MB |"
@@ -96,7 +97,7 @@ def agreement(chosen):
 
 def measured(device, **settings):
     command = [sys.executable, __file__, "--device", device, "--run", json.dumps(settings)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
     return json.loads(done.stdout.splitlines()[-1])
 
 
