@@ -98,7 +98,9 @@ def agreement(chosen):
 def measured(device, **settings):
     command = [sys.executable, __file__, "--device", device, "--run", json.dumps(settings)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    return json.loads(done.stdout.splitlines()[-1])
+    found = json.loads(done.stdout.splitlines()[-1])
+    print(found, file=sys.stderr, flush=True)
+    return found
 
 
 def distributed(people, count):
