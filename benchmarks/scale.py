@@ -181,7 +181,7 @@ def sized(team, people):
         cohort = cohort_of(read_trials(path, study, others=False), study)
         read = time.perf_counter() - begun
     population = batch.population_of(study, cohort, team)
-    few = population.every(2 * population.block)
+    few = population if people <= 1000 else population.every(2 * population.block)
     begun = time.perf_counter()
     fitted = batch.refit(few, points)
     optima_from(fitted.population, points, fitted.sums)
@@ -244,7 +244,7 @@ def run_gpu(people):
         batch.population_of(study, cohort_of(table, study), distributed.alone()),
         study.space.candidates(POINTS, 0),
     )
-    fitted = batch.refit(population.every(2 * population.block), points)
+    fitted = batch.refit(population, points)
     batch.sums(fitted.population, points)
     begun = time.perf_counter()
     fitted = batch.refit(population, points)
