@@ -188,7 +188,8 @@ def _round(study, points, blocks, task, inference, crew):
 
     def on_device(study, points, blocks):
         def make(block):
-            return _block(study, points, *block, task, inference, crew.platform)
+            trials, modes = block
+            return _block(study, points, trials, modes, task, inference, crew.platform)
 
         out = jax.lax.map(make, jax.tree.map(lambda leaf: leaf[0], blocks))
         return jax.tree.map(lambda leaf: leaf[None], out)
@@ -207,7 +208,7 @@ def _block(study, points, trials, modes, task, inference, platform):
         return _added(lambda expert: say(expert, points), experts, platform), {}
     posteriors = _each(lambda person: fit(study.gp, person, inference=inference, throw=False), trials, platform)
     total = _added(lambda posterior: _sums_of(_of(posterior), points), posteriors, platform)
-    kept = {"certificate": _fields(posteriors.certificate)}
+    kept: dict[str, Any] = {"certificate": _fields(posteriors.certificate)}
     if inference == "laplace":
         kept["modes"] = posteriors.latent.mode
     if task == "individuals":
