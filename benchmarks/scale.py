@@ -21,6 +21,7 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
 POINTS, TRIALS = 2000, 25
 HEAD = (
     "| participants | read, µs each | refit + merge, µs each | and optimum, µs each | own optima, µs each | peak MB |"
@@ -96,8 +97,10 @@ def agreement(chosen):
 
 def measured(device, **settings):
     command = [sys.executable, __file__, "--device", device, "--run", json.dumps(settings)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    return json.loads(done.stdout.splitlines()[-1])
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    found = json.loads(done.stdout.splitlines()[-1])
+    print(found, file=sys.stderr, flush=True)
+    return found
 
 
 def distributed(people, count):
@@ -178,7 +181,7 @@ def sized(team, people):
         cohort = cohort_of(read_trials(path, study, others=False), study)
         read = time.perf_counter() - begun
     population = batch.population_of(study, cohort, team)
-    few = population.every(2 * population.block)
+    few = population if people <= 1000 else population.every(2 * population.block)
     begun = time.perf_counter()
     fitted = batch.refit(few, points)
     optima_from(fitted.population, points, fitted.sums)
@@ -241,7 +244,7 @@ def run_gpu(people):
         batch.population_of(study, cohort_of(table, study), distributed.alone()),
         study.space.candidates(POINTS, 0),
     )
-    fitted = batch.refit(population.every(2 * population.block), points)
+    fitted = batch.refit(population, points)
     batch.sums(fitted.population, points)
     begun = time.perf_counter()
     fitted = batch.refit(population, points)

@@ -32,6 +32,8 @@ __all__ = ["Fitted", "Jets", "Population", "Say", "Sums", "block_size", "jets", 
 
 _TOGETHER = 64  # people whose predictions are made at once, except on CPUs: those hold one person's in their caches
 
+_LARGEST = {True: 256, False: 1024}  # people of a block, on CPUs and elsewhere
+
 Say = Callable[[str, int, int], None]
 """What is being done, to how many people so far, of how many."""
 
@@ -78,6 +80,8 @@ class Population(eqx.Module):
     """(M, n) of everybody's latent values, once they have been fitted by Laplace's method."""
     crew: Crew = eqx.field(static=True)
     block: int = eqx.field(static=True)
+    group: int = eqx.field(static=True)
+    """Blocks that a device makes in one round."""
     inference: Inference = eqx.field(static=True)
     say: Say = eqx.field(static=True)
 
@@ -110,13 +114,15 @@ class Fitted(NamedTuple):
 def population_of(study: Study, cohort: Cohort, crew: Crew, say: Say = _silent) -> Population:
     """The people of a cohort, not yet fitted; by the study's inference."""
     trials = jax.tree.map(np.asarray, cohort.trials)
-    block = block_size(len(cohort.names), crew.platform)
-    return Population(study, trials, None, crew, block, study.inference, say)
+    people = len(cohort.names)
+    block = block_size(people, crew.platform)
+    group = min(_LARGEST[crew.platform == "cpu"] // block, -(-people // (block * crew.devices)))
+    return Population(study, trials, None, crew, block, group, study.inference, say)
 
 
 def block_size(people: int, platform: str = "cpu") -> int:
     """People of a block: a power of two that makes 16 blocks or more, at most 256, on GPUs 1,024."""
-    return min(256 if platform == "cpu" else 1024, 2 ** math.ceil(math.log2(max(1.0, people / 16))))
+    return min(_LARGEST[platform == "cpu"], 2 ** math.ceil(math.log2(max(1.0, people / 16))))
 
 
 def refit(population: Population, points: Float[np.ndarray, "m d"], individuals: bool = False) -> Fitted:
@@ -148,13 +154,14 @@ _Task = Literal["first", "individuals", "sums", "jets"]
 def _pass(population, task: _Task, points, words) -> Any:
     """Block sums added in the order of the blocks, and what is kept of everybody in the order of people."""
     crew, people, size = population.crew, population.people, population.block
+    together = crew.devices * population.group * size
     total, kept = None, []
-    for begin in range(0, people, crew.devices * size):
-        rows = slice(begin, min(begin + crew.devices * size, people))
+    for begin in range(0, people, together):
+        rows = slice(begin, min(begin + together, people))
         count = rows.stop - begin
-        blocks = crew.deal(_padded(population, rows, size))
+        blocks = crew.deal(_padded(population, rows))
         found = _round(population.study, np.asarray(points), blocks, task, population.inference, crew)
-        block_sums, each = jax.tree.map(np.asarray, found)
+        block_sums, each = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), found)
         for i in range(-(-count // size)):
             block = jax.tree.map(lambda leaf, i=i: leaf[i], block_sums)
             total = block if total is None else jax.tree.map(np.add, total, block)
@@ -163,25 +170,28 @@ def _pass(population, task: _Task, points, words) -> Any:
     return total, jax.tree.map(lambda *leaves: np.concatenate(leaves), *kept)
 
 
-def _padded(population, rows, size):
-    """Trials and modes of some rows as (devices, size, ...), filled up with people who gave no answer."""
-    devices = population.crew.devices
+def _padded(population, rows):
+    """Trials and modes of some rows as (devices, group, block, ...), filled up with people who gave no answer."""
+    shape = population.crew.devices, population.group, population.block
 
     def block(leaf):
-        filled = np.zeros((devices * size, *leaf.shape[1:]), leaf.dtype)
+        filled = np.zeros((math.prod(shape), *leaf.shape[1:]), leaf.dtype)
         filled[: rows.stop - rows.start] = leaf[rows]
-        return filled.reshape(devices, size, *leaf.shape[1:])
+        return filled.reshape(*shape, *leaf.shape[1:])
 
     return jax.tree.map(block, (population.trials, population.modes))
 
 
 @eqx.filter_jit
 def _round(study, points, blocks, task, inference, crew):
-    """A block on each device; everything comes back to everybody."""
+    """A group of blocks on each device, one after the other; everything comes back to everybody."""
 
     def on_device(study, points, blocks):
-        trials, modes = jax.tree.map(lambda leaf: leaf[0], blocks)
-        out = _block(study, points, trials, modes, task, inference, crew.platform)
+        def make(block):
+            trials, modes = block
+            return _block(study, points, trials, modes, task, inference, crew.platform)
+
+        out = jax.lax.map(make, jax.tree.map(lambda leaf: leaf[0], blocks))
         return jax.tree.map(lambda leaf: leaf[None], out)
 
     dealt, copied = PartitionSpec(AXIS), PartitionSpec()
@@ -198,7 +208,7 @@ def _block(study, points, trials, modes, task, inference, platform):
         return _added(lambda expert: say(expert, points), experts, platform), {}
     posteriors = _each(lambda person: fit(study.gp, person, inference=inference, throw=False), trials, platform)
     total = _added(lambda posterior: _sums_of(_of(posterior), points), posteriors, platform)
-    kept = {"certificate": _fields(posteriors.certificate)}
+    kept: dict[str, Any] = {"certificate": _fields(posteriors.certificate)}
     if inference == "laplace":
         kept["modes"] = posteriors.latent.mode
     if task == "individuals":

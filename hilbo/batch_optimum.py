@@ -89,7 +89,7 @@ def optima_from(
     rows = {rule: _spread(maps[rule][0], candidates) for rule in rules}
     starts = np.concatenate([candidates[rows[rule]] for rule in rules])
     reached = optimum_near(population, starts, tuple(rule for rule in rules for _ in range(_STARTS)))
-    feasible = np.asarray(population.study.space.feasible(np.stack([optimum.x for optimum in reached])))
+    feasible = np.asarray(_feasible(population.study, np.stack([optimum.x for optimum in reached])))
     best = {}
     for i, rule in enumerate(rules):
         chosen = slice(i * _STARTS, (i + 1) * _STARTS)
@@ -100,6 +100,12 @@ def optima_from(
     return best
 
 
+@eqx.filter_jit
+def _feasible(study, x):
+    return study.space.feasible(x)
+
+
+@eqx.filter_jit
 def _optimum(study, x, mean, variance):
     mean, variance = jnp.asarray(mean), jnp.asarray(variance)
     return Optimum(jnp.asarray(x), mean, jnp.sqrt(variance), study.gp.likelihood.class_probabilities(mean, variance))

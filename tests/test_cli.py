@@ -163,3 +163,28 @@ def test_simulate_keeps_what_it_simulated(capsys, monkeypatch, tmp_path):
     code, stdout, _ = run(capsys, monkeypatch, *again)
     assert code == 0
     assert json.loads(stdout)["optimum"] == content["optimum"]  # the table holds the same bits
+
+
+@pytest.mark.deep
+def test_a_large_population_is_merged_without_its_individuals(capsys, monkeypatch, tmp_path):
+    """The way above 1,000 participants, here asked for by --no-individuals: the same optimum, no optima of people."""
+    few = ["--participants", "V01,V02,V03", "--json"]
+    out = tmp_path / "large"
+    code, stdout, stderr = run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", out, "--no-individuals", *few)
+    assert code == 0 and "of 3 participants fitted" in stderr
+    content = json.loads(stdout)
+    assert [p["participant"] for p in content["participants"]] == ["V01", "V02", "V03"]
+    assert all(p["optimum"] is None and p["certificate"]["converged"] for p in content["participants"])
+    assert content["mean_of_optima"] is None and set(content["alternatives"]) == {"average", "ep"}
+    page = (out / "report.html").read_text()
+    assert "Their own optima were not sought" in page and page.count("data:image/png;base64,") == 1
+    assert len(pd.read_csv(out / "optima.csv")) == 3
+    small = json.loads(run(capsys, monkeypatch, "aggregate", *VIDEO, "--out", tmp_path / "small", *few)[1])
+    assert content["optimum"]["unit"] == pytest.approx(small["optimum"]["unit"], abs=1e-6)
+    assert content["optimum"]["mean"] == pytest.approx(small["optimum"]["mean"], abs=1e-11)
+    assert content["alternatives"]["ep"]["unit"] == pytest.approx(small["alternatives"]["ep"]["unit"], abs=1e-3)
+    with (
+        xr.open_dataset(out / "map.nc", engine="h5netcdf") as one,
+        xr.open_dataset(tmp_path / "small" / "map.nc", engine="h5netcdf") as other,
+    ):
+        assert float(abs(one["mean"] - other["mean"]).max()) < 1e-11
