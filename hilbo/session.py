@@ -11,6 +11,7 @@ log, of a table, on another day) gives the same points bit for bit.
 """
 
 import functools
+import threading
 from collections.abc import Iterable, Mapping
 
 import equinox as eqx
@@ -252,6 +253,15 @@ class Session(eqx.Module):
     def done(self) -> bool:
         """Whether all the study's trials are answered."""
         return self.proposal is None
+
+    def warm(self) -> threading.Thread:
+        """Compile the step that chooses points, in a thread: while the first, given points are answered."""
+        nothing = np.zeros((self.step.capacity, self.study.space.dim)), np.zeros(self.step.capacity, np.int32)
+        thread = threading.Thread(
+            target=self.step.compiled, args=(self.step.arrays, *nothing, np.int32(0)), daemon=True
+        )
+        thread.start()
+        return thread
 
     def ask(self) -> dict[str, float]:
         """The rendering to present next: parameter -> value in physical units."""
