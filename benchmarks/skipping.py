@@ -13,8 +13,8 @@ import run
 
 HEAD = """# What a scene does not need
 
-Made by `python benchmarks/skipping.py --write`, on one core: medians of {rounds} rounds in turn, with and without the skip.
-Errors are the largest over all points, in units of the prior's sd. "Bound" is what the code guarantees.
+Made by `python benchmarks/skipping.py --write`, on one core: medians of {rounds} rounds, with and without the skip in
+turn. Errors are the largest over all points, in units of the prior's sd. "Bound" is what the code guarantees.
 
 | skip | without (us) | with (us) | saves | error | bound | held by |
 |---|---:|---:|---:|---:|---|---|
@@ -123,8 +123,8 @@ def tasks():
         "",
         f"- Warm starts: {int(warm_mode.steps)} steps in place of {int(cold_mode.steps)}; the bits of the next point"
         " would depend on the way to this state, and a log could not be replayed from its answers alone.",
-        "- Appended updates: all curvatures change with an answer, so that the Newton matrix is factorised anew whatever"
-        " is known of the last one, and the search needs no root of the covariance that could be updated.",
+        "- Appended updates: all curvatures change with an answer, so that the Newton matrix is factorised anew,"
+        " whatever is known of the last one, and the search needs no root of the covariance that could be updated.",
         "- Participants who cannot move a query: no answer within reach (covariance below 1e-3 with each of a person's"
         f" 25) holds for {100 * shares[0]:.1f} % of the (person, point) pairs, below 1e-6 for {100 * shares[1]:.1f} %;"
         " their exponentials are what one would have to compute to know.",
