@@ -19,7 +19,7 @@ References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1; paper, section 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -212,7 +212,8 @@ def _find_mode_jvp(primals, tangents):
 
     (_, curvature), (moved, _) = eqx.filter_jvp(image, (terms, covariance), tangents[:2])
     inverse, _ = inverse_and_log_determinant(covariance, curvature)
-    return found, _Mode(moved - covariance @ (inverse @ moved), None, None, None, None)
+    nothing: Any = None  # the rest has no derivative
+    return found, _Mode(moved - covariance @ (inverse @ moved), nothing, nothing, nothing, nothing)
 
 
 def _stationarity(eta, args):

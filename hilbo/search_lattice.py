@@ -30,8 +30,15 @@ def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
     low, high = _ends_of(space, np.insert(others, along, 0.0, axis=1))
     inside = (low <= even[:, None]) & (even[:, None] <= high) & (high > low)
     ends = np.stack([low, high] if space.mechanics.effective_damping else [high])
-    present = np.broadcast_to(high > low, ends.shape)
-    return Lattice(*map(jnp.asarray, (even, inside, ends, present, _steep_wall(space, even))), along, dim)
+    return Lattice(
+        nodes=jnp.asarray(even),
+        inside=jnp.asarray(inside),
+        ends=jnp.asarray(ends),
+        present=jnp.asarray(np.broadcast_to(high > low, ends.shape)),
+        extra=jnp.asarray(_steep_wall(space, even)),
+        along=along,
+        dim=dim,
+    )
 
 
 def _steep_wall(space, levels):

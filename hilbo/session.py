@@ -265,11 +265,14 @@ class Session(eqx.Module):
 
     def ask(self) -> dict[str, float]:
         """The rendering to present next: parameter -> value in physical units."""
+        return dict(zip(self.study.space.names, self._asked().tolist(), strict=True))
+
+    def _asked(self) -> np.ndarray:
         if self.proposal is None:
             raise InputError(
                 f"Session: all {len(self.answers)} trials of the study are answered; nothing is left to ask."
             )
-        return dict(zip(self.study.space.names, self.proposal.tolist(), strict=True))
+        return self.proposal
 
     def tell(self, response: str, at: Mapping[str, float] | None = None) -> "Session":
         """The next state, after the participant's answer (one of the study's responses) to the asked point.
@@ -279,9 +282,7 @@ class Session(eqx.Module):
         study, responses = self.study, self.study.responses
         if response not in responses:
             raise InputError(f'Session: "{response}" is no answer of this study; give one of {responses}.')
-        if self.proposal is None:
-            self.ask()  # says that nothing is left to ask
-        shown = self.proposal if at is None else np.array([at[name] for name in study.space.names])
+        shown = self._asked() if at is None else np.array([at[name] for name in study.space.names])
         points = np.concatenate([self.points, shown[None, :]])
         answers = np.append(self.answers, responses.index(response))
         return Session(study, self.plan, points, answers, self.step(points, answers), self.seed, self.step)
