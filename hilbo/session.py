@@ -186,7 +186,7 @@ class _Step:
         leaves, structure = jax.tree.flatten(fixed)
         self.arrays, self.compiled = arrays, _compiled(structure, tuple(leaves))
         self.initial = np.asarray(_to_physical(study.space, plan.initial))
-        self.capacity = study.selection.trials
+        self.capacity, self.responses, self.names = study.selection.trials, study.responses, study.space.names
         self.middle = np.array([(p.low + p.high) / 2 for p in study.space.parameters])
 
     def __call__(self, points, answers):
@@ -265,7 +265,7 @@ class Session(eqx.Module):
 
     def ask(self) -> dict[str, float]:
         """The rendering to present next: parameter -> value in physical units."""
-        return dict(zip(self.study.space.names, self._asked().tolist(), strict=True))
+        return dict(zip(self.step.names, self._asked().tolist(), strict=True))
 
     def _asked(self) -> np.ndarray:
         if self.proposal is None:
@@ -279,13 +279,13 @@ class Session(eqx.Module):
 
         `at`: the point that was really presented, if it was not the asked one.
         """
-        study, responses = self.study, self.study.responses
-        if response not in responses:
-            raise InputError(f'Session: "{response}" is no answer of this study; give one of {responses}.')
-        shown = self._asked() if at is None else np.array([at[name] for name in study.space.names])
+        step = self.step
+        if response not in step.responses:
+            raise InputError(f'Session: "{response}" is no answer of this study; give one of {step.responses}.')
+        shown = self._asked() if at is None else np.array([at[name] for name in step.names])
         points = np.concatenate([self.points, shown[None, :]])
-        answers = np.append(self.answers, responses.index(response))
-        return Session(study, self.plan, points, answers, self.step(points, answers), self.seed, self.step)
+        answers = np.append(self.answers, step.responses.index(response))
+        return Session(self.study, self.plan, points, answers, step(points, answers), self.seed, step)
 
     def posterior(self) -> Posterior:
         """The participant's posterior after the answers so far."""
