@@ -263,8 +263,8 @@ def document(runs, rounds):
     lines = [
         "# Run time",
         "",
-        "Made by `python benchmarks/run.py --write` (`make bench` prints the first table). hilbo and the textbook NumPy",
-        "form, benchmarks/reference_numpy.py, take turns in one run; medians of",
+        "Made by `python benchmarks/run.py --write` (`make bench` prints the first table). hilbo and the textbook",
+        "NumPy form, benchmarks/reference_numpy.py, take turns in one run; medians of",
         f"{rounds} rounds ({40 * rounds} of the live step); {platform.machine()}, Python {platform.python_version()},",
         f"jax {jax.__version__}. What the chosen points are worth: [choice.md](choice.md). Cold start:",
         "[cold_start.md](cold_start.md). What is skipped: [skipping.md](skipping.md).",

@@ -19,7 +19,7 @@ References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1; paper, section 
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -145,9 +145,8 @@ def _find_mode(terms, covariance, start, max_steps) -> _Mode:
 
 
 class _PlainState(NamedTuple):
-    weights: Float[Array, " n"]  # a, with eta = K a
-    following: Float[Array, " n"]  # the weights after a full step
-    eta: Float[Array, " n"]
+    following: Float[Array, " n"]  # the weights a after the next full step
+    eta: Float[Array, " n"]  # K a, before it
     objective: Float[Array, ""]
     residual: Float[Array, ""]
     steps: Int[Array, ""]
@@ -159,7 +158,8 @@ def _plain_mode(terms, covariance, start, max_steps) -> _Mode:
     epsilon = jnp.finfo(start.dtype).eps
     tolerance = jnp.asarray(epsilon ** (2 / 3), start.dtype)
 
-    def at(weights, steps, before):
+    def step(state):
+        weights = state.following
         eta = covariance @ weights
         values, slope, curvature = terms(eta)
         root, _, lower = factorise(covariance, curvature)
@@ -171,12 +171,15 @@ def _plain_mode(terms, covariance, start, max_steps) -> _Mode:
         residual = jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(covariance @ off))
         objective = jnp.sum(values) - 0.5 * weights @ eta
         slack = 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + jnp.abs(weights @ eta))
-        return _PlainState(weights, following, eta, objective, residual, steps, objective >= before - slack)
+        risen = objective >= state.objective - slack
+        return _PlainState(following, eta, objective, residual, state.steps + 1, risen)
 
+    infinite = jnp.asarray(jnp.inf, start.dtype)
+    # Nowhere yet: the first step evaluates the start, so that the terms are compiled once.
     last = jax.lax.while_loop(
         lambda state: state.risen & (state.residual > tolerance) & (state.steps < max_steps),
-        lambda state: at(state.following, state.steps + 1, state.objective),
-        at(start, jnp.asarray(1), jnp.asarray(-jnp.inf, start.dtype)),
+        step,
+        _PlainState(start, start, -infinite, infinite, jnp.asarray(0), jnp.asarray(True)),
     )
     return _Mode(last.eta, last.residual, tolerance, last.steps, jnp.zeros_like(tolerance))
 
@@ -211,7 +214,8 @@ def _find_mode_jvp(primals, tangents):
 
     (_, curvature), (moved, _) = eqx.filter_jvp(image, (terms, covariance), tangents[:2])
     inverse, _ = inverse_and_log_determinant(covariance, curvature)
-    return found, _Mode(moved - covariance @ (inverse @ moved), None, None, None, None)
+    nothing: Any = None  # the rest has no derivative
+    return found, _Mode(moved - covariance @ (inverse @ moved), nothing, nothing, nothing, nothing)
 
 
 def _stationarity(eta, args):

@@ -27,11 +27,18 @@ def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
         return Lattice(jnp.asarray(even), inside, none, none > 0, extra, 0, dim)
     along = space.names.index("K1")
     others = np.stack(np.meshgrid(*[even] * (dim - 1), indexing="ij"), axis=-1).reshape(-1, dim - 1)
-    low, high = (np.asarray(end) for end in column_ends(space, np.insert(others, along, 0.0, axis=1)))
+    low, high = _ends_of(space, np.insert(others, along, 0.0, axis=1))
     inside = (low <= even[:, None]) & (even[:, None] <= high) & (high > low)
     ends = np.stack([low, high] if space.mechanics.effective_damping else [high])
-    present = np.broadcast_to(high > low, ends.shape)
-    return Lattice(*map(jnp.asarray, (even, inside, ends, present, _steep_wall(space, even))), along, dim)
+    return Lattice(
+        nodes=jnp.asarray(even),
+        inside=jnp.asarray(inside),
+        ends=jnp.asarray(ends),
+        present=jnp.asarray(np.broadcast_to(high > low, ends.shape)),
+        extra=jnp.asarray(_steep_wall(space, even)),
+        along=along,
+        dim=dim,
+    )
 
 
 def _steep_wall(space, levels):
@@ -47,6 +54,19 @@ def _steep_wall(space, levels):
         found = np.ones((len(line), 3))
         found[:, [space.names.index(name) for name in names]] = np.stack([lines[at][line], place], axis=1)
         points = np.concatenate([points, found])
-    low, high = (np.asarray(end) for end in column_ends(space, points))
+    low, high = _ends_of(space, points)
     points[:, space.names.index("K1")] = high
     return points[high > low]
+
+
+def _ends_of(space, points):
+    """Both ends of the columns of some points; as many at a time as the table has, so that nothing new is compiled."""
+    shape = (len(ROWS), len(COLUMNS), space.dim)
+    parts = []
+    for begin in range(0, len(points), shape[0] * shape[1]):
+        part = points[begin : begin + shape[0] * shape[1]]
+        filled = np.full((shape[0] * shape[1], space.dim), 0.5)
+        filled[: len(part)] = part
+        ends = column_ends(space, filled.reshape(shape))
+        parts.append([np.asarray(end).reshape(-1)[: len(part)] for end in ends])
+    return tuple(np.concatenate(end) for end in zip(*parts, strict=True))

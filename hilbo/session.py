@@ -11,6 +11,7 @@ log, of a table, on another day) gives the same points bit for bit.
 """
 
 import functools
+import threading
 from collections.abc import Iterable, Mapping
 
 import equinox as eqx
@@ -185,7 +186,7 @@ class _Step:
         leaves, structure = jax.tree.flatten(fixed)
         self.arrays, self.compiled = arrays, _compiled(structure, tuple(leaves))
         self.initial = np.asarray(_to_physical(study.space, plan.initial))
-        self.capacity = study.selection.trials
+        self.capacity, self.responses, self.names = study.selection.trials, study.responses, study.space.names
         self.middle = np.array([(p.low + p.high) / 2 for p in study.space.parameters])
 
     def __call__(self, points, answers):
@@ -253,28 +254,38 @@ class Session(eqx.Module):
         """Whether all the study's trials are answered."""
         return self.proposal is None
 
+    def warm(self) -> threading.Thread:
+        """Compile the step that chooses points, in a thread: while the first, given points are answered."""
+        nothing = np.zeros((self.step.capacity, self.study.space.dim)), np.zeros(self.step.capacity, np.int32)
+        thread = threading.Thread(
+            target=self.step.compiled, args=(self.step.arrays, *nothing, np.int32(0)), daemon=True
+        )
+        thread.start()
+        return thread
+
     def ask(self) -> dict[str, float]:
         """The rendering to present next: parameter -> value in physical units."""
+        return dict(zip(self.step.names, self._asked().tolist(), strict=True))
+
+    def _asked(self) -> np.ndarray:
         if self.proposal is None:
             raise InputError(
                 f"Session: all {len(self.answers)} trials of the study are answered; nothing is left to ask."
             )
-        return dict(zip(self.study.space.names, self.proposal.tolist(), strict=True))
+        return self.proposal
 
     def tell(self, response: str, at: Mapping[str, float] | None = None) -> "Session":
         """The next state, after the participant's answer (one of the study's responses) to the asked point.
 
         `at`: the point that was really presented, if it was not the asked one.
         """
-        study, responses = self.study, self.study.responses
-        if response not in responses:
-            raise InputError(f'Session: "{response}" is no answer of this study; give one of {responses}.')
-        if self.proposal is None:
-            self.ask()  # says that nothing is left to ask
-        shown = self.proposal if at is None else np.array([at[name] for name in study.space.names])
+        step = self.step
+        if response not in step.responses:
+            raise InputError(f'Session: "{response}" is no answer of this study; give one of {step.responses}.')
+        shown = self._asked() if at is None else np.array([at[name] for name in step.names])
         points = np.concatenate([self.points, shown[None, :]])
-        answers = np.append(self.answers, responses.index(response))
-        return Session(study, self.plan, points, answers, self.step(points, answers), self.seed, self.step)
+        answers = np.append(self.answers, step.responses.index(response))
+        return Session(self.study, self.plan, points, answers, step(points, answers), self.seed, step)
 
     def posterior(self) -> Posterior:
         """The participant's posterior after the answers so far."""

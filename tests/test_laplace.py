@@ -299,3 +299,15 @@ def test_terms_that_are_nothing_leave_the_prior():
     np.testing.assert_array_equal(posterior.inverse, np.zeros((3, 3)))
     assert posterior.log_evidence == 0.0
     assert posterior.certificate.smallest_variance == 1.0
+
+
+def test_both_searches_find_the_same_mode(monkeypatch):
+    data = separated()
+    covariance = gram(RBF(data.theta, data.variance), jnp.asarray(data.x), jnp.asarray(data.x))
+    terms = Ordinal(OrdinalProbit(data.thresholds, data.noise), jnp.asarray(data.q), jnp.ones(len(data.q), bool))
+    plain = laplace(covariance, terms)
+    monkeypatch.setattr("hilbo.laplace._PLAIN_STEPS", 0)
+    safe = laplace(covariance, terms)
+    assert bool(plain.certificate.converged) and bool(safe.certificate.converged)
+    assert float(plain.certificate.jitter) == 0.0 < float(safe.certificate.jitter)
+    np.testing.assert_allclose(plain.mode, safe.mode, atol=1e-10)

@@ -177,7 +177,8 @@ def test_wall_points_lie_on_every_wall_of_the_feasible_set(space):
     assert np.all(at_end.any(axis=1))
     edges = np.mean(at_end.sum(axis=1) > 1)
     if space.mechanics is None or space.mechanics.effective_damping is None:
-        assert 0.25 < edges < 0.4  # three in ten are made on edges, and a few more end there
+        made = {2: 2 / 9, 3: 0.3}[space.dim]  # a few of them where nothing is feasible
+        assert 0.8 * made < edges < 1.2 * made
     else:
         assert 0.05 < edges < 0.5  # edges whose columns hold nothing feasible drop out
     for column in range(space.dim):

@@ -47,6 +47,17 @@ def test_a_whole_session_compiles_once(study, finished):
     assert compiled._cache_size() == 1
 
 
+def test_warming_compiles_the_step_that_is_used(study, finished):
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["selection"] = {"trials": 8}
+    session = Session.start(Study.from_dict(raw))
+    session.warm().join()
+    assert session.step.compiled._cache_size() == 1
+    for _ in range(6):
+        session = session.tell("different")
+    assert session.step.compiled._cache_size() == 1
+
+
 def test_replay_gives_the_same_points_bit_for_bit(study, finished):
     session, asked = finished
     responses = [study.responses[q] for q in session.answers]
