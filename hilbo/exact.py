@@ -41,7 +41,7 @@ class SamplingCertificate(eqx.Module):
     """What a sampled answer can say of its own accuracy."""
 
     residual: Float[Array, ""]
-    """The larger of the two standard errors below."""
+    """The larger of the two standard errors below; infinite where the variance of f given z is below rounding."""
     tolerance: Float[Array, ""]
     """What is still called exact: 0.02."""
     log_evidence_error: Float[Array, ""]
@@ -155,6 +155,7 @@ def exact(
     wide = (jnp.max(jnp.diagonal(covariance)) + noise**2) * jnp.max(jnp.sum(box.half**2, axis=1))
     rounding = jnp.finfo(x.dtype).eps * wide * jnp.abs(log_evidence)
     certificate = _certificate(covariance, box, tilt, x, shares, excess, rounding)
+    certificate = _unless_resolved(certificate, covariance, box.half, answered)
     return ExactPosterior(
         covariance @ weights, weights, factor, factor.T @ factor, log_evidence, certificate, x, shares, box, tilt
     )  # fmt: skip
@@ -192,6 +193,16 @@ def _certificate(covariance, box, tilt, x, shares, excess, rounding):
         jitter=excess,
         converged=worst <= tolerance,
     )
+
+
+def _unless_resolved(certificate, covariance, half, answered):
+    """Not converged where the rounding of an asked point's variance given z hides that variance, near noise^2."""
+    prior = jnp.diagonal(covariance)
+    left = prior - jnp.sum((half @ covariance) ** 2, axis=0)
+    least = jnp.finfo(prior.dtype).eps * prior.shape[0] ** 0.5 * jnp.max(prior)
+    resolved = jnp.all(~answered | (left >= least))
+    residual = jnp.where(resolved, certificate.residual, jnp.inf)
+    return eqx.tree_at(lambda c: (c.residual, c.converged), certificate, (residual, certificate.converged & resolved))
 
 
 def _weighted(shares, values):
