@@ -9,7 +9,7 @@ from benchmarks.stress import INFERENCES, _committee, fit_case
 SMALL = list(stress_cases("small", 240))
 OF_THREE = [case for case in SMALL if len(case.thresholds) == 2]  # one compilation for each inference
 
-# Float32 fits that are wrong and do not know it (docs/stress.md): 1,000 noises between prior sd and thresholds, or more.
+# Float32 fits that are wrong and do not know it (docs/stress.md names them).
 FLOAT32_MISSES = (
     "noise=0.001 theta=1000 variance=0.001 gap=100 categories=10 dimensions=20 conflicting n=7: mean",
     "noise=0.1 theta=0.001 variance=1000 gap=100 categories=3 dimensions=2 one point n=25: evidence",
