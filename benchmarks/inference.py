@@ -43,7 +43,7 @@ BEGIN, END = "<!-- made by benchmarks/inference.py -->", "<!-- end -->"
 
 
 def sampled(data: Dataset, key, samples: int) -> Posterior:
-    gp, trials = model(data), answers(data, len(data.q))
+    gp, trials = model(data), answers(data)
     edges = jnp.asarray([-jnp.inf, *data.thresholds, jnp.inf])
     covariance = gram(gp.kernel, trials.x, trials.x)
     low, high = edges[trials.q], edges[trials.q + 1]
@@ -71,7 +71,7 @@ def errors(data: Dataset, truth: np.ndarray) -> list[str]:
     points, rows = len(data.x_new), []
     evidence, mean, variance, probability = split(truth, points)
     for method in APPROXIMATE:
-        posterior = fit(model(data), answers(data, len(data.q)), inference=method)
+        posterior = fit(model(data), answers(data), inference=method)
         found = split(np.asarray(results(posterior, jnp.asarray(data.x_new))), points)
         off = np.abs(found[1] - mean)
         figures = (
@@ -88,7 +88,7 @@ def errors(data: Dataset, truth: np.ndarray) -> list[str]:
 
 def independent(data: Dataset) -> str:
     """Largest distance of means, and that of the evidence, from two other methods, in standard errors of both."""
-    posterior, x = fit(model(data), answers(data, len(data.q)), inference="exact"), jnp.asarray(data.x_new)
+    posterior, x = fit(model(data), answers(data), inference="exact"), jnp.asarray(data.x_new)
     evidence, evidence_error = genz(data)
     mean, mean_error = slice_sampled(data)
     own = posterior.certificate.log_evidence_error

@@ -1,6 +1,6 @@
 """Float32 against float64 for every public result: how far apart they are, and whether that is enough.
 
-    python benchmarks/precision.py [--write]      writes docs/precision.md
+    python benchmarks/precision.py [--write] [PART ...]      writes docs/precision.md; PARTS are functions below
 
 Both get the same inputs, rounded to float32, so that the difference is that of the arithmetic. "Needed" is what the
 result is for: a hundredth of the answers' noise for latent values, a thousandth for probabilities, a thousandth of the
@@ -243,7 +243,8 @@ prior sd of more than about 100 noises, is in [stress.md](stress.md).
 
 def main():
     rows = []
-    for part in PARTS:
+    asked = [name for name in sys.argv[1:] if name != "--write"]
+    for part in (part for part in PARTS if not asked or part.__name__ in asked):
         try:
             rows += list(part())
         except InputError as error:

@@ -13,6 +13,9 @@ __all__ = ["committee", "optimum"]
 
 PEOPLE = ((4, 25), (10, 10))
 STATES = 24
+INFERENCES = ("laplace", "ep", "ep_corrected", "exact")
+COUNTS = (256, 4096, 20000)
+BEST_KNOWN = 65536
 
 
 def clock(function, *args, rounds: int = 9) -> tuple[object, float]:
@@ -42,7 +45,7 @@ def committee(reference) -> str:
     for people, each in ((1, 100), *PEOPLE):
         parts = [Trials.from_arrays(x[i::people], q[i::people], each) for i in range(people)]
         trials = jax.tree.map(lambda *leaves: jnp.stack(leaves), *parts)
-        for inference in ("laplace", "ep", "ep_corrected", "exact"):
+        for inference in INFERENCES:
 
             def merged(trials, inference=inference):
                 one = lambda t: fit(gp, t, inference=inference, throw=False).predict_explained(x_new)  # noqa: E731
@@ -91,8 +94,8 @@ def optimum() -> str:
     """Loss of UCB and time, by candidates, precision of the screening, and polishing."""
     study = Study.load("hilbo/data/paper.toml")
     states = list(_states(study))
-    choices = {"best known": _chooser(study, search_points(study.space, 999, 65536), 24, jnp.float64)}
-    for count in (256, 4096, 20000):
+    choices = {"best known": _chooser(study, search_points(study.space, 999, BEST_KNOWN), 24, jnp.float64)}
+    for count in COUNTS:
         candidates = search_points(study.space, 7, count)
         choices[f"{count:,} | - | float64"] = _chooser(study, candidates, 0, jnp.float64)
         choices[f"{count:,} | 3 | float64"] = _chooser(study, candidates, 3, jnp.float64)

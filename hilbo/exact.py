@@ -41,11 +41,12 @@ class SamplingCertificate(eqx.Module):
     """What a sampled answer can say of its own accuracy."""
 
     residual: Float[Array, ""]
-    """The larger of the two standard errors below."""
+    """The larger of the two standard errors below; infinite where the variance of f given z is below rounding."""
     tolerance: Float[Array, ""]
     """What is still called exact: 0.02."""
     log_evidence_error: Float[Array, ""]
-    """Standard error of the log evidence."""
+    """Standard error of the log evidence, and a bound on its rounding: eps |log evidence| max S / min of L's diagonal
+    squared, which counts where answers contradict each other under a prior that is very much wider than the noise."""
     mean_error: Float[Array, ""]
     """Largest standard error of a latent mean at an asked point, in prior standard deviations."""
     effective_samples: Float[Array, ""]
@@ -151,7 +152,10 @@ def exact(
     factor = narrowed @ box.half
     weights = box.half.T @ mean
     log_evidence = tilt.highest + jnp.log(total / samples)
-    certificate = _certificate(covariance, box, tilt, x, shares, excess)
+    wide = (jnp.max(jnp.diagonal(covariance)) + noise**2) * jnp.max(jnp.sum(box.half**2, axis=1))
+    rounding = jnp.finfo(x.dtype).eps * wide * jnp.abs(log_evidence)
+    certificate = _certificate(covariance, box, tilt, x, shares, excess, rounding)
+    certificate = _unless_resolved(certificate, covariance, box.half, answered)
     return ExactPosterior(
         covariance @ weights, weights, factor, factor.T @ factor, log_evidence, certificate, x, shares, box, tilt
     )  # fmt: skip
@@ -172,9 +176,9 @@ def _narrowed(x, shares, mean, answered):
     return root, jnp.where(eigenvalues[0] < 0, -eigenvalues[0], 0.0)
 
 
-def _certificate(covariance, box, tilt, x, shares, excess):
+def _certificate(covariance, box, tilt, x, shares, excess, rounding):
     total = jnp.sum(shares, axis=1)
-    log_error = jnp.std(total, ddof=1) / jnp.mean(total) / total.shape[0] ** 0.5
+    log_error = jnp.hypot(jnp.std(total, ddof=1) / jnp.mean(total) / total.shape[0] ** 0.5, rounding)
     latent = jnp.moveaxis(x, 0, -1) @ (box.half @ covariance)
     mean_error = jnp.max(_weighted(shares, latent)[1] / jnp.sqrt(jnp.diagonal(covariance)))
     worst = jnp.maximum(log_error, mean_error)
@@ -189,6 +193,16 @@ def _certificate(covariance, box, tilt, x, shares, excess):
         jitter=excess,
         converged=worst <= tolerance,
     )
+
+
+def _unless_resolved(certificate, covariance, half, answered):
+    """Not converged where the rounding of an asked point's variance given z hides that variance, near noise^2."""
+    prior = jnp.diagonal(covariance)
+    left = prior - jnp.sum((half @ covariance) ** 2, axis=0)
+    least = jnp.finfo(prior.dtype).eps * prior.shape[0] ** 0.5 * jnp.max(prior)
+    resolved = jnp.all(~answered | (left >= least))
+    residual = jnp.where(resolved, certificate.residual, jnp.inf)
+    return eqx.tree_at(lambda c: (c.residual, c.converged), certificate, (residual, certificate.converged & resolved))
 
 
 def _weighted(shares, values):

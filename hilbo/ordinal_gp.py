@@ -311,6 +311,10 @@ def _exactly(likelihood, trials, covariance):
     return exact(jax.random.key(0), covariance, edges[trials.q], edges[trials.q + 1], noise, trials.mask)
 
 
+def _unresolved(certificate: Certificate) -> Bool[Array, ""]:
+    return certificate.smallest_variance < certificate.variance_resolution
+
+
 def _checked(posterior: Posterior, sought: str) -> Posterior:
     certificate = posterior.certificate
     if isinstance(certificate.converged, jax.core.Tracer):
@@ -324,7 +328,8 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
                 f"fit: an answer has category {highest}, but the likelihood has {categories - 1} thresholds and so the"
                 f" categories 0 to {categories - 1}; check the answers or the thresholds."
             )
-        if bool(certificate.residual <= certificate.tolerance):
+        found = bool(certificate.residual <= certificate.tolerance)
+        if found and isinstance(certificate, Certificate) and bool(_unresolved(certificate)):
             raise InferenceError(
                 f"the {sought} was found (residual {float(certificate.residual):.3g}), but the answers leave a variance"
                 " too small a part of the prior's for this precision to tell; use a larger noise, float64, or"
