@@ -18,7 +18,7 @@ const char *hb_error_sentence(enum hb_error error)
     case HB_ERROR_LIMITS:
         return "damping, force limit (at most 1000 N), slew limit and velocity limit must be finite and above 0.";
     case HB_ERROR_STROKE:
-        return "The stroke must include 0 and a position above it, and lie within 32767 encoder steps of at most 0.1 mm.";
+        return "The stroke must include 0 and a position above it, and lie within 32767 encoder steps, each <= 0.1 mm.";
     case HB_ERROR_STEP:
         return "plausible_step_mm must be finite and larger than what the velocity limit allows in one tick.";
     case HB_ERROR_PARAMETERS:

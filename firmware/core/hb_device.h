@@ -11,7 +11,9 @@
  * One context: none of these may interrupt another on the same device (call them from one loop, or with the tick's
  * interrupt masked around the others). None waits, allocates or calls back. hb_receive returns after the first frame
  * that it carried out, so that its longest run is that of one SET_PARAMS; a port that must not be late calls it
- * once between two ticks. No answer is later than the call of hb_receive that took the last byte of its request. */
+ * once between two ticks. ESTOP acts at the next tick; a port that can cut the motor's supply looks at device->state
+ * after hb_receive and does so at once. No answer is later than the call of hb_receive that took the last byte of its
+ * request. */
 #ifndef HB_DEVICE_H
 #define HB_DEVICE_H
 

@@ -74,7 +74,8 @@ static float wanted(const struct hb_drive *drive)
 }
 
 /* Inward force of a PI servo with damping on the measured velocity. */
-static float servo(struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety, float goal_mm)
+static float servo(struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety,
+                   float goal_mm)
 {
     float rate_Hz = (float)config->tick_rate_Hz;
     float reach_mm = config->servo_speed_mm_per_s / rate_Hz;

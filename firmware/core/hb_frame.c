@@ -108,7 +108,8 @@ static bool take(const struct hb_receiver *receiver, struct hb_frame *frame)
     }
     size -= 4U;
     uint32_t crc = 0U;
-    /*@ loop invariant i <= 4;
+    /*@ loop pragma UNROLL 4;
+        loop invariant i <= 4;
         loop assigns i, crc;
         loop variant 4 - i; */
     for (uint32_t i = 0U; i < 4U; i += 1U) {

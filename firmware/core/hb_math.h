@@ -5,8 +5,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* base^exponent for a whole base of 1 to 65535 and 0 <= exponent <= 1, within 0.6 units in the last place of float32. */
-/*@ assigns \nothing; */
+/* base^exponent for a whole base of 1 to 65535 and 0 <= exponent <= 1, within 0.6 units in the last place. */
 float hb_power(uint32_t base, float exponent);
 
 /*@ assigns \nothing; */

@@ -2,7 +2,7 @@
  *
  *     input check - model - passivity observer and controller - saturation - slew limit - velocity limit and overrun
  *
- * Whatever acts is counted and flagged. Only the input, the velocity and an overrun lead to HOLD; the device decides. */
+ * Whatever acts is counted and flagged. Input, velocity and overrun lead to HOLD, which the device decides. */
 #ifndef HB_SAFETY_H
 #define HB_SAFETY_H
 

@@ -40,8 +40,9 @@ static uint32_t identify(const struct hb_frame *frame, uint32_t sent)
     for (uint32_t k = 0U; k < 4U && frame->size >= 4U; k += 1U) {
         i |= (uint32_t)frame->payload[k] << (8U * k);
     }
-    bool same = frame->size >= 4U && i < sent && frame->type == (uint8_t)(i & 15U) && frame->seq == (uint8_t)(i >> 8 & 255U) &&
-                frame->size == frame_of(i, payload) && memcmp(frame->payload, payload, frame->size) == 0;
+    bool same = frame->size >= 4U && i < sent && frame->type == (uint8_t)(i & 15U) &&
+                frame->seq == (uint8_t)(i >> 8 & 255U) && frame->size == frame_of(i, payload) &&
+                memcmp(frame->payload, payload, frame->size) == 0;
     return same ? i : UINT32_MAX;
 }
 

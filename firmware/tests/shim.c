@@ -1,4 +1,4 @@
-/* The core as a shared library for tests: flat arguments, loops that would be slow in Python, and a view of the state. */
+/* The core as a shared library for tests: flat arguments, loops that would be slow in Python, a view of the state. */
 #include "shim.h"
 
 #include <math.h>

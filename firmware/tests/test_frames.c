@@ -1,5 +1,5 @@
-/* Reads the golden frames: each must come out of the receiver, and go back in, as it stands in the file; what the device
- * sends must be packed from its numbers into the same bytes. Usage: test_frames FILE */
+/* Reads the golden frames: each must come out of the receiver, and be written, as it stands in the file; what the
+ * device sends must be packed from its numbers into the same bytes. Usage: test_frames FILE */
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
