@@ -6,6 +6,7 @@
 #include <stdint.h>
 
 /* base^exponent for a whole base of 1 to 65535 and 0 <= exponent <= 1, within 0.6 units in the last place. */
+/*@ assigns \nothing; */
 float hb_power(uint32_t base, float exponent);
 
 /*@ assigns \nothing; */

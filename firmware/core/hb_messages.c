@@ -25,7 +25,7 @@ static float get_f32(const uint8_t *bytes)
     return hb_float_of_bits(get_u32(bytes));
 }
 
-/*@ requires at <= HB_MAX_PAYLOAD && \valid(payload + (at));
+/*@ requires at < HB_MAX_PAYLOAD && \valid(payload + at);
     assigns payload[at];
     ensures \result == at + 1; */
 static size_t put_u8(uint8_t *payload, size_t at, uint8_t value)
@@ -34,7 +34,7 @@ static size_t put_u8(uint8_t *payload, size_t at, uint8_t value)
     return at + 1U;
 }
 
-/*@ requires at <= HB_MAX_PAYLOAD && \valid(payload + (at .. at + 1));
+/*@ requires at + 1 < HB_MAX_PAYLOAD && \valid(payload + (at .. at + 1));
     assigns payload[at .. at + 1];
     ensures \result == at + 2; */
 static size_t put_u16(uint8_t *payload, size_t at, uint16_t value)
@@ -43,7 +43,7 @@ static size_t put_u16(uint8_t *payload, size_t at, uint16_t value)
     return put_u8(payload, at, (uint8_t)(value >> 8));
 }
 
-/*@ requires at <= HB_MAX_PAYLOAD && \valid(payload + (at .. at + 3));
+/*@ requires at + 3 < HB_MAX_PAYLOAD && \valid(payload + (at .. at + 3));
     assigns payload[at .. at + 3];
     ensures \result == at + 4; */
 static size_t put_u32(uint8_t *payload, size_t at, uint32_t value)
@@ -52,7 +52,7 @@ static size_t put_u32(uint8_t *payload, size_t at, uint32_t value)
     return put_u16(payload, at, (uint16_t)(value >> 16));
 }
 
-/*@ requires at <= HB_MAX_PAYLOAD && \valid(payload + (at .. at + 3));
+/*@ requires at + 3 < HB_MAX_PAYLOAD && \valid(payload + (at .. at + 3));
     assigns payload[at .. at + 3];
     ensures \result == at + 4; */
 static size_t put_f32(uint8_t *payload, size_t at, float value)
@@ -60,7 +60,7 @@ static size_t put_f32(uint8_t *payload, size_t at, float value)
     return put_u32(payload, at, hb_bits_of_float(value));
 }
 
-/*@ requires at <= HB_MAX_PAYLOAD && \valid(payload + (at .. at + 7));
+/*@ requires at + 7 < HB_MAX_PAYLOAD && \valid(payload + (at .. at + 7));
     assigns payload[at .. at + 7];
     ensures \result == at + 8; */
 static size_t put_range(uint8_t *payload, size_t at, struct hb_range range)

@@ -7,6 +7,7 @@
 #include <stdint.h>
 
 #include "hb_config.h"
+#include "hb_frame.h"
 #include "hb_renderer.h"
 
 #define HB_PROTOCOL_VERSION 1U
