@@ -43,7 +43,7 @@ static bool with_sensed(uint8_t fields)
 
 /*@ requires fields <= 1;
     assigns \nothing;
-    ensures \result == hb_most_samples(fields); */
+    ensures \result == (fields == 1 ? 4 : 7); */
 static uint8_t samples_a_frame(uint8_t fields)
 {
     return (uint8_t)((HB_MAX_PAYLOAD - HB_TELEMETRY_HEAD) / HB_SAMPLE_SIZE(with_sensed(fields)));

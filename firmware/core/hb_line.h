@@ -29,11 +29,11 @@ struct hb_stream {
     uint8_t payload[HB_MAX_PAYLOAD];
 };
 
-/*@ logic integer hb_sample_bytes(integer fields) = fields == 1 ? 12 : 8;
-    logic integer hb_most_samples(integer fields) = fields == 1 ? 4 : 7;
+/*@ predicate hb_stream_holds(struct hb_stream *s, integer most, integer bytes) =
+      s->samples < most && (s->samples > 0 ==> s->size == HB_TELEMETRY_HEAD + s->samples * bytes);
     predicate hb_stream_is_sound(struct hb_stream *s) =
-      s->fields <= 1 && (s->divisor > 0 ==> s->until > 0) && s->samples < hb_most_samples(s->fields) &&
-      (s->samples > 0 ==> s->size == HB_TELEMETRY_HEAD + s->samples * hb_sample_bytes(s->fields)); */
+      s->fields <= 1 && (s->divisor > 0 ==> s->until > 0) &&
+      (s->fields == 0 ==> hb_stream_holds(s, 7, 8)) && (s->fields == 1 ==> hb_stream_holds(s, 4, 12)); */
 
 /* Put a whole frame in, if `spare` bytes stay free; false and nothing otherwise. */
 /*@ requires \valid(output) && hb_output_is_sound(output) && \valid_read(bytes + (0 .. size - 1));
