@@ -112,7 +112,6 @@ static bool take(const struct hb_receiver *receiver, struct hb_frame *frame)
         loop assigns i, crc;
         loop variant 4 - i; */
     for (uint32_t i = 0U; i < 4U; i += 1U) {
-        /*@ assert i == 0 || i == 1 || i == 2 || i == 3; */
         crc |= (uint32_t)body[size + i] << (8U * i);
     }
     if (crc != hb_crc32(0U, body, size)) {

@@ -117,9 +117,10 @@ static void check_frame(struct rig *rig, const struct hb_frame *frame, const str
         hb_unpack_boot_id(frame->payload) == device->boot_id) {
         rig->silent_ticks = 0U;
     }
-    if (frame->type == (uint8_t)HB_SET_PARAMS && frame->size == 28U && device->staging != (uint8_t)HB_EMPTY) {
+    if (frame->type == (uint8_t)HB_SET_PARAMS && frame->size == 28U && device->staging != (uint8_t)HB_EMPTY &&
+        device->crc[1U - device->active] == hb_crc32(0U, frame->payload, frame->size)) {
         (void)hb_unpack_parameters(frame->payload, &rig->staged.set);
-        rig->staged.crc = hb_crc32(0U, frame->payload, frame->size);
+        rig->staged.crc = device->crc[1U - device->active];
     }
     if (frame->type == (uint8_t)HB_SET_STATES && device->states_known != before->states_known) {
         rig->staged.crc = hb_crc32(rig->staged.crc, frame->payload, frame->size);
