@@ -55,7 +55,7 @@ def test_nothing_breaks_the_device(fuzzer, tmp_path):
         ("hb_safety.c", "return hb_clamp(force_N, -limit_N, limit_N);", "return force_N;"),
         ("hb_device.c", "device->heartbeat_age_ticks += 1U;", ""),
         ("hb_motion.c", "return HB_NACK_NO_SET;", "(void)reply;"),
-        ("hb_device.c", "hb_enter(device, HB_HOLDING, cause);", "hb_enter(device, HB_STOPPED, cause);"),
+        ("hb_safety.c", "return safety->ramp_N * (", "return 1e-6F + safety->ramp_N * ("),
     ],
     ids=["receiver", "other set", "other bank", "saturation", "watchdog", "no set", "hold"],
 )

@@ -193,6 +193,8 @@ static void tick(struct rig *rig, uint8_t flags)
         must(device->state == state, "moves by itself");
         must(rig->silent_ticks < rig->config.watchdog_ticks, "moves without a host");
         must(fabsf(force_N - before_N) <= 2.0F + 1e-4F, "slew");
+        float limit_N = device->bank[device->active].set.force_limit_N;
+        must(state != (uint8_t)HB_RUNNING || fabsf(force_N) <= fmaxf(limit_N, fabsf(before_N)), "limit of the set");
         rig->ramp_ticks = 0U;
     } else if (device->state == (uint8_t)HB_HOLDING || device->state == (uint8_t)HB_STOPPING) {
         rig->ramp_ticks += 1U;
