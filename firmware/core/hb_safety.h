@@ -56,11 +56,7 @@ bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, co
 
 /* The position that is believed (mm), and the part of it that the model sees: x >= 0. */
 float hb_position_mm(const struct hb_safety *safety, const struct hb_config *config);
-/*@ requires \valid_read(safety) && \valid_read(config);
-    assigns \nothing; */
 float hb_penetration_mm(const struct hb_safety *safety, const struct hb_config *config);
-/*@ requires \valid_read(safety);
-    assigns \nothing; */
 bool hb_in_contact(const struct hb_safety *safety);
 
 /* The energy that the last command took from the hand during the last period; begins anew with every touch. */

@@ -3,9 +3,6 @@
 #include "hb_math.h"
 #include "hb_passivity.h"
 
-/*@ requires \valid(device) && device->active <= 1;
-    assigns \nothing;
-    ensures \result == &device->bank[1 - device->active]; */
 static struct hb_renderer *idle_bank(struct hb_device *device)
 {
     return &device->bank[1U - device->active];
@@ -83,10 +80,6 @@ static enum hb_reason check_passivity(const struct hb_config *config, const stru
 }
 
 /* From here on the staged set follows the same motion, beginning at the equilibrium of where the device is. */
-/*@ requires \valid(device) && device->active <= 1 && \valid_read(device->config);
-    requires \separated(device, device->config) && hb_set_fits(&device->bank[1 - device->active].set);
-    assigns device->bank[1 - device->active], device->warm_left, device->staging;
-    ensures hb_renderer_is_sound(&device->bank[1 - device->active]) && device->staging == HB_WARMING; */
 static void begin_history(struct hb_device *device)
 {
     struct hb_renderer *idle = idle_bank(device);
@@ -144,9 +137,6 @@ enum hb_reason hb_stage_states(struct hb_device *device, const struct hb_frame *
         states.count == 0U || states.count > 7U || states.first + states.count > idle->set.length) {
         return HB_NACK_STATES;
     }
-    /*@ loop invariant i <= states.count;
-        loop assigns i, idle->weight[0 .. HB_MAX_STATES - 1], idle->loss[0 .. HB_MAX_STATES - 1];
-        loop variant states.count - i; */
     for (size_t i = 0U; i < states.count; i += 1U) {
         hb_renderer_set_state(idle, states.first + i, states.weight[i], states.loss[i]);
     }
@@ -175,8 +165,6 @@ enum hb_staging hb_staging_now(const struct hb_device *device, uint32_t *ticks)
     return HB_WARMING;
 }
 
-/*@ requires \valid_read(confirmation) && \valid_read(device) && bank <= 1;
-    assigns \nothing; */
 static bool names(const struct hb_confirmation *confirmation, const struct hb_device *device, uint8_t bank)
 {
     return confirmation->set_id == device->bank[bank].set.set_id && confirmation->crc == device->crc[bank];
