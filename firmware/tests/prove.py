@@ -30,8 +30,7 @@ FILES = {
 }
 OPTIONS = [
     "-machdep", "gcc_x86_32", "-warn-special-float", "none", "-warn-unsigned-overflow",
-    "-wp", "-wp-rte", "-wp-prover", "z3,cvc4", "-wp-auto", "wp:range,wp:bitshift", "-wp-timeout", "20",
-    "-wp-par", "1", "-wp-cache", "none",
+    "-wp", "-wp-rte", "-wp-prover", "z3,cvc4", "-wp-auto", "wp:range,wp:bitshift", "-wp-par", "1", "-wp-cache", "none",
 ]  # fmt: skip
 
 
@@ -48,16 +47,21 @@ def missing() -> list[str]:
     return [tool for tool in TOOLS if shutil.which(tool) is None]
 
 
-def prove(file: str, functions: tuple[str, ...] = (), core: Path = CORE) -> Outcome:
-    """All goals of a file of the core, or of some of its functions."""
+def prove(file: str, functions: tuple[str, ...] = (), core: Path = CORE, seconds: int = 20) -> Outcome:
+    """All goals of a file of the core, or of some of its functions; each prover has so many seconds for a goal."""
     chosen = ["-wp-fct", ",".join(functions)] if functions else []
     believed = ["-wp-skip-fct", ",".join(FILES[file])] if FILES[file] else []
     with tempfile.TemporaryDirectory() as folder:
         environment = os.environ | {"HOME": folder, "WHY3CONFIG": f"{folder}/why3.conf"}
         subprocess.run(["why3", "config", "detect"], env=environment, capture_output=True, check=False)
-        command = ["frama-c", f"-cpp-extra-args=-I{core}", *OPTIONS, *chosen, *believed, "-wp-session", folder]
+        command = ["frama-c", f"-cpp-extra-args=-I{core}", *OPTIONS, *chosen, *believed]
         run = subprocess.run(
-            [*command, str(core / file)], env=environment, cwd=folder, capture_output=True, text=True, check=False
+            [*command, "-wp-timeout", str(seconds), "-wp-session", folder, str(core / file)],
+            env=environment,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
         )
     found = re.search(r"Proved goals: +(\d+) / (\d+)", run.stdout)
     lines = [line for line in run.stdout.splitlines() if not re.search(r"Goal \S+ : Valid|annotating", line)]
