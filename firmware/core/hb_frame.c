@@ -11,6 +11,9 @@ static const uint32_t crc_of_nibble[16] = {
 uint32_t hb_crc32(uint32_t crc, const uint8_t *bytes, size_t size)
 {
     crc = ~crc;
+    /*@ loop invariant i <= size;
+        loop assigns i, crc;
+        loop variant size - i; */
     for (size_t i = 0U; i < size; i += 1U) {
         crc ^= bytes[i];
         crc = (crc >> 4) ^ crc_of_nibble[crc & 15U];
@@ -25,6 +28,10 @@ size_t hb_cobs_encode(const uint8_t *bytes, size_t size, uint8_t *encoded)
     if (size > LONGEST_COBS) {
         return 0U;
     }
+    /*@ loop invariant mark <= i <= size;
+        loop invariant \forall integer j; 0 <= j <= i && j != mark ==> encoded[j] != 0;
+        loop assigns i, mark, encoded[0 .. size];
+        loop variant size - i; */
     for (size_t i = 0U; i < size; i += 1U) {
         encoded[i + 1U] = bytes[i];
         if (bytes[i] == 0U) {
@@ -42,6 +49,9 @@ size_t hb_cobs_decode(const uint8_t *encoded, size_t size, uint8_t *bytes)
     if (size < 2U || size > LONGEST_COBS + 1U) {
         return 0U;
     }
+    /*@ loop invariant i <= size && i <= mark <= i + 255;
+        loop assigns i, mark, bytes[0 .. size - 2];
+        loop variant size - i; */
     for (size_t i = 0U; i < size; i += 1U) {
         if (encoded[i] == 0U) {
             return 0U;
@@ -65,11 +75,17 @@ size_t hb_frame_write(uint8_t type, uint8_t seq, const uint8_t *payload, size_t 
     }
     body[0] = type;
     body[1] = seq;
+    /*@ loop invariant i <= size && end == i + 2;
+        loop assigns i, end, body[2 .. HB_MAX_BODY - 1];
+        loop variant size - i; */
     for (size_t i = 0U; i < size; i += 1U) {
         body[end] = payload[i];
         end += 1U;
     }
     uint32_t crc = hb_crc32(0U, body, end);
+    /*@ loop invariant i <= 4 && end == size + 2 + i;
+        loop assigns i, end, body[2 .. HB_MAX_BODY - 1];
+        loop variant 4 - i; */
     for (uint32_t i = 0U; i < 4U; i += 1U) {
         body[end] = (uint8_t)(crc >> (8U * i) & 255U);
         end += 1U;
@@ -80,6 +96,9 @@ size_t hb_frame_write(uint8_t type, uint8_t seq, const uint8_t *payload, size_t 
 }
 
 /* The frame that the receiver holds, or false. */
+/*@ requires \valid_read(receiver) && \valid(frame) && \separated(receiver, frame) && hb_receiver_is_sound(receiver);
+    assigns *frame;
+    ensures \result ==> hb_frame_fits(frame); */
 static bool take(const struct hb_receiver *receiver, struct hb_frame *frame)
 {
     uint8_t body[HB_MAX_BODY];
@@ -89,6 +108,9 @@ static bool take(const struct hb_receiver *receiver, struct hb_frame *frame)
     }
     size -= 4U;
     uint32_t crc = 0U;
+    /*@ loop invariant i <= 4;
+        loop assigns i, crc;
+        loop variant 4 - i; */
     for (uint32_t i = 0U; i < 4U; i += 1U) {
         crc |= (uint32_t)body[size + i] << (8U * i);
     }
@@ -99,6 +121,9 @@ static bool take(const struct hb_receiver *receiver, struct hb_frame *frame)
     frame->seq = body[1];
     frame->crc = crc;
     frame->size = size - 2U;
+    /*@ loop invariant i <= frame->size == size - 2;
+        loop assigns i, frame->payload[0 .. HB_MAX_PAYLOAD - 1];
+        loop variant frame->size - i; */
     for (size_t i = 0U; i < frame->size; i += 1U) {
         frame->payload[i] = body[i + 2U];
     }

@@ -7,6 +7,9 @@ bool hb_output_put(struct hb_output *output, const uint8_t *bytes, size_t size, 
     if (size + spare > HB_OUTPUT_BYTES - output->size) {
         return false;
     }
+    /*@ loop invariant i <= size && output->size == \at(output->size, Pre) + i;
+        loop assigns i, output->bytes[0 .. HB_OUTPUT_BYTES - 1], output->size;
+        loop variant size - i; */
     for (size_t i = 0U; i < size; i += 1U) {
         output->bytes[(output->first + output->size) % HB_OUTPUT_BYTES] = bytes[i];
         output->size += 1U;
@@ -17,6 +20,10 @@ bool hb_output_put(struct hb_output *output, const uint8_t *bytes, size_t size, 
 size_t hb_output_take(struct hb_output *output, uint8_t *bytes, size_t room)
 {
     size_t taken = 0U;
+    /*@ loop invariant taken <= room && taken + output->size == \at(output->size, Pre);
+        loop invariant output->first < HB_OUTPUT_BYTES;
+        loop assigns taken, output->first, output->size, bytes[0 .. room - 1];
+        loop variant output->size; */
     while (taken < room && output->size > 0U) {
         bytes[taken] = output->bytes[output->first];
         output->first = (output->first + 1U) % HB_OUTPUT_BYTES;
@@ -26,11 +33,17 @@ size_t hb_output_take(struct hb_output *output, uint8_t *bytes, size_t room)
     return taken;
 }
 
+/*@ requires fields <= 1;
+    assigns \nothing;
+    ensures \result <==> fields == 1; */
 static bool with_sensed(uint8_t fields)
 {
     return (fields & 1U) != 0U;
 }
 
+/*@ requires fields <= 1;
+    assigns \nothing;
+    ensures \result == (fields == 1 ? 4 : 7); */
 static uint8_t samples_a_frame(uint8_t fields)
 {
     return (uint8_t)((HB_MAX_PAYLOAD - HB_TELEMETRY_HEAD) / HB_SAMPLE_SIZE(with_sensed(fields)));
@@ -54,6 +67,10 @@ void hb_stream_begin(struct hb_stream *stream, uint8_t divisor, uint8_t fields)
     stream->size = 0U;
 }
 
+/*@ requires \valid(stream) && \valid(output) && \separated(stream, output) && hb_output_is_sound(output);
+    requires stream->size <= HB_MAX_PAYLOAD;
+    assigns stream->lost, stream->samples, stream->size, output->bytes[0 .. HB_OUTPUT_BYTES - 1], output->size;
+    ensures stream->samples == 0 && hb_output_is_sound(output); */
 static void send(struct hb_stream *stream, struct hb_output *output)
 {
     uint8_t bytes[HB_MAX_FRAME];

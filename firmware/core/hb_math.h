@@ -6,19 +6,26 @@
 #include <stdint.h>
 
 /* base^exponent for a whole base of 1 to 65535 and 0 <= exponent <= 1, within 0.6 units in the last place. */
+/*@ assigns \nothing; */
 float hb_power(uint32_t base, float exponent);
 
+/*@ assigns \nothing; */
 bool hb_is_finite(float value);
 
+/*@ assigns \nothing; */
 float hb_absolute(float value);
 
 /* `value`, or the nearer of the two bounds; low <= high, none of them NaN. */
+/*@ assigns \nothing; */
 float hb_clamp(float value, float low, float high);
 
 /* `value` moved towards 0 by `step` >= 0, and no further than 0. */
+/*@ assigns \nothing; */
 float hb_towards_zero(float value, float step);
 
+/*@ assigns \nothing; */
 uint32_t hb_bits_of_float(float value);
+/*@ assigns \nothing; */
 float hb_float_of_bits(uint32_t bits);
 
 #endif

@@ -4,44 +4,65 @@
 #include "hb_math.h"
 
 /* Little-endian, byte by byte: no struct ever meets the wire. */
+/*@ requires \valid_read(bytes + (0 .. 1));
+    assigns \nothing; */
 static uint16_t get_u16(const uint8_t *bytes)
 {
     return (uint16_t)(bytes[0] | (uint32_t)bytes[1] << 8);
 }
 
+/*@ requires \valid_read(bytes + (0 .. 3));
+    assigns \nothing; */
 static uint32_t get_u32(const uint8_t *bytes)
 {
     return get_u16(bytes) | (uint32_t)get_u16(bytes + 2) << 16;
 }
 
+/*@ requires \valid_read(bytes + (0 .. 3));
+    assigns \nothing; */
 static float get_f32(const uint8_t *bytes)
 {
     return hb_float_of_bits(get_u32(bytes));
 }
 
+/*@ requires at < HB_MAX_PAYLOAD && \valid(payload + at);
+    assigns payload[at];
+    ensures \result == at + 1; */
 static size_t put_u8(uint8_t *payload, size_t at, uint8_t value)
 {
     payload[at] = value;
     return at + 1U;
 }
 
+/*@ requires at + 1 < HB_MAX_PAYLOAD && \valid(payload + (at .. at + 1));
+    assigns payload[at .. at + 1];
+    ensures \result == at + 2; */
 static size_t put_u16(uint8_t *payload, size_t at, uint16_t value)
 {
     at = put_u8(payload, at, (uint8_t)(value & 255U));
     return put_u8(payload, at, (uint8_t)(value >> 8));
 }
 
+/*@ requires at + 3 < HB_MAX_PAYLOAD && \valid(payload + (at .. at + 3));
+    assigns payload[at .. at + 3];
+    ensures \result == at + 4; */
 static size_t put_u32(uint8_t *payload, size_t at, uint32_t value)
 {
     at = put_u16(payload, at, (uint16_t)(value & 65535U));
     return put_u16(payload, at, (uint16_t)(value >> 16));
 }
 
+/*@ requires at + 3 < HB_MAX_PAYLOAD && \valid(payload + (at .. at + 3));
+    assigns payload[at .. at + 3];
+    ensures \result == at + 4; */
 static size_t put_f32(uint8_t *payload, size_t at, float value)
 {
     return put_u32(payload, at, hb_bits_of_float(value));
 }
 
+/*@ requires at + 7 < HB_MAX_PAYLOAD && \valid(payload + (at .. at + 7));
+    assigns payload[at .. at + 7];
+    ensures \result == at + 8; */
 static size_t put_range(uint8_t *payload, size_t at, struct hb_range range)
 {
     at = put_f32(payload, at, range.low);
@@ -108,6 +129,9 @@ void hb_unpack_states(const uint8_t *payload, struct hb_states *states)
     states->set_id = get_u16(payload);
     states->first = payload[2];
     states->count = payload[3];
+    /*@ loop invariant i <= states->count && i <= 7;
+        loop assigns i, states->weight[0 .. 6], states->loss[0 .. 6];
+        loop variant 7 - i; */
     for (size_t i = 0U; i < states->count && i < 7U; i += 1U) {
         states->weight[i] = get_f32(payload + 4U + 8U * i);
         states->loss[i] = get_f32(payload + 8U + 8U * i);
@@ -203,6 +227,9 @@ size_t hb_pack_status(const struct hb_status *status, uint8_t *payload)
     at = put_f32(payload, at, status->position_mm);
     at = put_f32(payload, at, status->force_N);
     at = put_f32(payload, at, status->energy_mJ);
+    /*@ loop invariant i <= 8 && at == 40 + 2 * i;
+        loop assigns i, at, payload[40 .. 55];
+        loop variant 8 - i; */
     for (size_t i = 0U; i < 8U; i += 1U) {
         at = put_u16(payload, at, status->counts[i]);
     }

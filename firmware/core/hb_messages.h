@@ -7,6 +7,7 @@
 #include <stdint.h>
 
 #include "hb_config.h"
+#include "hb_frame.h"
 #include "hb_renderer.h"
 
 #define HB_PROTOCOL_VERSION 1U
@@ -143,14 +144,32 @@ struct hb_drive_request {
 
 /* Payload length that a request must have, given the payload itself, whose count decides for SET_STATES; HB_NO_REQUEST
  * for a type that no host sends. */
+/*@ requires \valid_read(payload + (0 .. size - 1)) && size <= HB_MAX_PAYLOAD;
+    assigns \nothing;
+    ensures \result <= HB_MAX_PAYLOAD || \result == HB_NO_REQUEST; */
 size_t hb_request_size(uint8_t type, const uint8_t *payload, size_t size);
 
+/*@ requires \valid_read(payload + (0 .. 7)) && \valid(hello);
+    assigns *hello; */
 bool hb_unpack_hello(const uint8_t *payload, struct hb_hello *hello);
+/*@ requires \valid_read(payload + (0 .. 27)) && \valid(set);
+    assigns *set; */
 bool hb_unpack_parameters(const uint8_t *payload, struct hb_parameters *set);
+/*@ requires \valid_read(payload + (0 .. 59)) && \valid(states) && \separated(payload + (0 .. 59), states);
+    assigns *states; */
 void hb_unpack_states(const uint8_t *payload, struct hb_states *states);
+/*@ requires \valid_read(payload + (0 .. 11)) && \valid(confirmation);
+    assigns *confirmation; */
 bool hb_unpack_confirmation(const uint8_t *payload, struct hb_confirmation *confirmation);
+/*@ requires \valid_read(payload + (0 .. 23)) && \valid(drive);
+    assigns *drive; */
 bool hb_unpack_drive(const uint8_t *payload, struct hb_drive_request *drive);
+/*@ requires \valid_read(payload + (0 .. 3));
+    assigns \nothing; */
 uint32_t hb_unpack_boot_id(const uint8_t *payload); /* CLEAR and HEARTBEAT */
+
+#define HB_TELEMETRY_HEAD 8U
+#define HB_SAMPLE_SIZE(with_sensed) ((with_sensed) ? 12U : 8U)
 
 /* What the device sends. Packing fills a payload, and returns its length. */
 struct hb_nack {
@@ -201,17 +220,41 @@ struct hb_sample {
     float sensed_N;
 };
 
+/*@ requires \valid(payload + (0 .. 55)) && \valid_read(config);
+    assigns payload[0 .. 55];
+    ensures \result == 56; */
 size_t hb_pack_hello_reply(const struct hb_config *config, uint32_t boot_id, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 31)) && \valid_read(config);
+    assigns payload[0 .. 31];
+    ensures \result == 32; */
 size_t hb_pack_limits(const struct hb_config *config, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 7));
+    assigns payload[0 .. 7];
+    ensures \result == 8; */
 size_t hb_pack_ack(uint8_t request, uint16_t set_id, uint32_t crc, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 15)) && \valid_read(nack);
+    assigns payload[0 .. 15];
+    ensures \result == 16; */
 size_t hb_pack_nack(const struct hb_nack *nack, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 55)) && \valid_read(status);
+    assigns payload[0 .. 55];
+    ensures \result == 56; */
 size_t hb_pack_status(const struct hb_status *status, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 35)) && \valid_read(reply);
+    assigns payload[0 .. 35];
+    ensures \result == 36; */
 size_t hb_pack_set(const struct hb_set_reply *reply, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 11)) && \valid_read(notice);
+    assigns payload[0 .. 11];
+    ensures \result == 12; */
 size_t hb_pack_notice(const struct hb_notice *notice, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 7));
+    assigns payload[0 .. 7];
+    ensures \result == 8; */
 size_t hb_pack_telemetry_head(uint32_t tick, uint8_t divisor, uint8_t fields, uint16_t lost, uint8_t *payload);
+/*@ requires \valid_read(sample) && \valid(payload + (0 .. HB_SAMPLE_SIZE(with_sensed) - 1));
+    assigns payload[0 .. HB_SAMPLE_SIZE(with_sensed) - 1];
+    ensures \result == HB_SAMPLE_SIZE(with_sensed); */
 size_t hb_pack_sample(const struct hb_sample *sample, bool with_sensed, uint8_t *payload);
-
-#define HB_TELEMETRY_HEAD 8U
-#define HB_SAMPLE_SIZE(with_sensed) ((with_sensed) ? 12U : 8U)
 
 #endif

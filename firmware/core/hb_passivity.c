@@ -11,6 +11,9 @@ struct hb_sums hb_memory_sums(const struct hb_parameters *set, float *tap)
     if (set->memory == HB_FULL) {
         return (struct hb_sums){.at_dc = 0.0F, .at_nyquist = hb_power(2U, set->alpha), .moment = 0.0F};
     }
+    /*@ loop invariant 1 <= i <= set->length + 1;
+        loop assigns i, sums, tap[0 .. set->length - 1];
+        loop variant set->length + 1 - i; */
     for (size_t i = 1U; i <= set->length; i += 1U) {
         float share = set->alpha / (float)i;
         float weight = share * sums.at_dc; /* |c_i| */

@@ -10,6 +10,8 @@
 #define NYQUIST_TOLERANCE 1e-4F
 
 /* Three mean delays of the rendering's positive kernel, beside the taps themselves. */
+/*@ requires \valid_read(renderer);
+    assigns \nothing; */
 static uint32_t warm_ticks(const struct hb_renderer *renderer, float moment)
 {
     float mean_delay_ticks = renderer->beta_N_per_mm * moment * renderer->rest_share / renderer->set.K1_N_per_mm;
@@ -53,6 +55,9 @@ bool hb_renderer_accept_states(struct hb_renderer *renderer)
     float nyquist = 0.0F;
     float moment = 0.0F;
     float slower = 1.0F;
+    /*@ loop invariant k <= renderer->set.length;
+        loop assigns k, sum, nyquist, moment, slower;
+        loop variant renderer->set.length - k; */
     for (size_t k = 0U; k < renderer->set.length; k += 1U) {
         float weight = renderer->weight[k];
         float loss = renderer->loss[k];
@@ -76,11 +81,17 @@ void hb_renderer_rest(struct hb_renderer *renderer, float x_mm)
     renderer->y_mm = y_mm;
     renderer->y_rest_mm = 0.0F;
     if (renderer->set.memory == HB_FULL) {
+        /*@ loop invariant k <= length;
+            loop assigns k, renderer->mean_mm[0 .. HB_MAX_STATES - 1], renderer->rest_mm[0 .. HB_MAX_STATES - 1];
+            loop variant length - k; */
         for (size_t k = 0U; k < length; k += 1U) {
             renderer->mean_mm[k] = y_mm;
             renderer->rest_mm[k] = 0.0F;
         }
     } else {
+        /*@ loop invariant i <= 2 * length;
+            loop assigns i, renderer->history_mm[0 .. 2 * HB_MAX_TAPS - 1];
+            loop variant 2 * length - i; */
         for (size_t i = 0U; i < 2U * length; i += 1U) {
             renderer->history_mm[i] = y_mm;
         }
@@ -90,17 +101,25 @@ void hb_renderer_rest(struct hb_renderer *renderer, float x_mm)
 }
 
 /* From the last y to s, short memory: one dot product, oldest first. */
+/*@ requires \valid_read(renderer) && hb_renderer_is_sound(renderer) && renderer->set.memory != 1;
+    assigns \nothing; */
 static float short_behind(const struct hb_renderer *renderer)
 {
     const float *row = &renderer->history_mm[renderer->oldest];
     float last_mm = renderer->y_mm;
     float behind_mm = 0.0F;
+    /*@ loop invariant i <= renderer->set.length;
+        loop assigns i, behind_mm;
+        loop variant renderer->set.length - i; */
     for (size_t i = 0U; i < renderer->set.length; i += 1U) {
         behind_mm = behind_mm + renderer->tap[i] * (row[i] - last_mm);
     }
     return behind_mm - renderer->forgotten * last_mm;
 }
 
+/*@ requires \valid(renderer) && hb_renderer_is_sound(renderer) && renderer->set.memory != 1;
+    assigns renderer->history_mm[0 .. 2 * HB_MAX_TAPS - 1], renderer->oldest, renderer->quiet;
+    ensures hb_renderer_is_sound(renderer); */
 static void short_push(struct hb_renderer *renderer)
 {
     size_t length = renderer->set.length;
@@ -115,9 +134,14 @@ static void short_push(struct hb_renderer *renderer)
 }
 
 /* The same for full memory. */
+/*@ requires \valid_read(renderer) && hb_renderer_is_sound(renderer) && renderer->set.memory == 1;
+    assigns \nothing; */
 static float full_behind(const struct hb_renderer *renderer)
 {
     float behind_mm = 0.0F;
+    /*@ loop invariant k <= renderer->set.length;
+        loop assigns k, behind_mm;
+        loop variant renderer->set.length - k; */
     for (size_t k = 0U; k < renderer->set.length; k += 1U) {
         float rest_mm = renderer->rest_mm[k] - renderer->y_rest_mm;
         behind_mm = behind_mm + renderer->weight[k] * ((renderer->mean_mm[k] - renderer->y_mm) + rest_mm);
@@ -126,10 +150,16 @@ static float full_behind(const struct hb_renderer *renderer)
 }
 
 /* m += loss (y - m), where a slow mean moves by less than its own last place. */
+/*@ requires \valid(renderer) && hb_renderer_is_sound(renderer) && renderer->set.memory == 1;
+    assigns renderer->quiet, renderer->mean_mm[0 .. HB_MAX_STATES - 1], renderer->rest_mm[0 .. HB_MAX_STATES - 1];
+    ensures hb_renderer_is_sound(renderer); */
 static void full_push(struct hb_renderer *renderer)
 {
     float y_mm = renderer->y_mm;
     size_t zeros = 0U;
+    /*@ loop invariant zeros <= k <= renderer->set.length;
+        loop assigns k, zeros, renderer->mean_mm[0 .. HB_MAX_STATES - 1], renderer->rest_mm[0 .. HB_MAX_STATES - 1];
+        loop variant renderer->set.length - k; */
     for (size_t k = 0U; k < renderer->set.length; k += 1U) {
         float mean = renderer->mean_mm[k];
         float rest = renderer->rest_mm[k];

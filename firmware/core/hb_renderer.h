@@ -55,21 +55,43 @@ struct hb_renderer {
     float rest_mm[HB_MAX_STATES];       /* full: and what theirs lost */
 };
 
+/* What each set that is staged or in force keeps true; memory 1 is HB_FULL. */
+/*@ predicate hb_set_fits(struct hb_parameters *s) = s->length <= (s->memory == 1 ? HB_MAX_STATES : HB_MAX_TAPS);
+    predicate hb_renderer_is_sound(struct hb_renderer *r) =
+      hb_set_fits(&r->set) && (r->oldest < r->set.length || r->oldest == 0) && r->quiet <= r->set.length; */
+
 /* Everything that the parameters decide, for a set within its limits; full memory still lacks its exponentials. The
  * history is left undefined: hb_renderer_rest comes next. */
+/*@ requires \valid(renderer) && \valid_read(set) && \separated(renderer, set) && hb_set_fits(set);
+    assigns *renderer;
+    ensures hb_set_fits(&renderer->set);
+    ensures renderer->set.memory == set->memory && renderer->set.length == set->length;
+    ensures renderer->static_is_passive == 0 || renderer->static_is_passive == 1; */
 void hb_renderer_prepare(struct hb_renderer *renderer, const struct hb_parameters *set);
 
 /* One exponential of full memory, index < length, fastest first. */
+/*@ requires \valid(renderer);
+    assigns renderer->weight[0 .. HB_MAX_STATES - 1], renderer->loss[0 .. HB_MAX_STATES - 1]; */
 void hb_renderer_set_state(struct hb_renderer *renderer, size_t index, float weight, float loss);
 
 /* The exponentials are positive, in order, and their sums are those of alpha. To be asked when all have been set; also
  * brings `warm_ticks` up to date. */
+/*@ requires \valid(renderer) && renderer->set.length <= HB_MAX_STATES;
+    assigns renderer->warm_ticks; */
 bool hb_renderer_accept_states(struct hb_renderer *renderer);
 
 /* The history of having been held at x for ever. */
+/*@ requires \valid(renderer) && hb_set_fits(&renderer->set);
+    assigns renderer->y_mm, renderer->y_rest_mm, renderer->history_mm[0 .. 2 * HB_MAX_TAPS - 1], renderer->oldest,
+      renderer->quiet, renderer->mean_mm[0 .. HB_MAX_STATES - 1], renderer->rest_mm[0 .. HB_MAX_STATES - 1];
+    ensures hb_renderer_is_sound(renderer); */
 void hb_renderer_rest(struct hb_renderer *renderer, float x_mm);
 
 /* One tick at x >= 0: the model's force, of either sign. */
+/*@ requires \valid(renderer) && hb_renderer_is_sound(renderer);
+    assigns renderer->y_mm, renderer->y_rest_mm, renderer->history_mm[0 .. 2 * HB_MAX_TAPS - 1], renderer->oldest,
+      renderer->quiet, renderer->mean_mm[0 .. HB_MAX_STATES - 1], renderer->rest_mm[0 .. HB_MAX_STATES - 1];
+    ensures hb_renderer_is_sound(renderer); */
 float hb_renderer_step(struct hb_renderer *renderer, float x_mm);
 
 #endif

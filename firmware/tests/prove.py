@@ -1,0 +1,92 @@
+"""Proves the contracts in the core: Frama-C/WP with z3 and cvc4, for the word sizes of a Cortex-M.
+
+    python3 firmware/tests/prove.py [FILE.c...]
+
+Prints the number of goals of each file; exit status 1 if one of them is not proved, 2 if a tool is missing. Needs
+frama-c, why3, z3 and cvc4 (on Debian: frama-c-base why3 z3 cvc4). docs/proofs.md says what the contracts say.
+"""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+__all__ = ["FILES", "TOOLS", "Outcome", "missing", "prove"]
+
+CORE = Path(os.environ.get("HILBO_FIRMWARE_CORE", Path(__file__).parents[1] / "core"))
+TOOLS = ("frama-c", "why3", "z3", "cvc4")
+
+# Each file that is proved, and the functions of it whose contracts are believed (docs/proofs.md says why).
+FILES = {
+    "hb_frame.c": (),
+    "hb_line.c": (),
+    "hb_messages.c": (),
+    "hb_passivity.c": (),
+    "hb_renderer.c": ("warm_ticks", "hb_renderer_prepare"),
+}
+OPTIONS = [
+    "-machdep", "gcc_x86_32", "-warn-special-float", "none", "-warn-unsigned-overflow",
+    "-wp", "-wp-rte", "-wp-prover", "z3,cvc4", "-wp-auto", "wp:range,wp:bitshift", "-wp-par", "1", "-wp-cache", "none",
+]  # fmt: skip
+
+
+class Outcome(NamedTuple):
+    """Goals of one file, and what the prover said of those that it did not prove."""
+
+    proved: int
+    goals: int
+    report: str
+
+
+def missing() -> list[str]:
+    """The tools that are not installed."""
+    return [tool for tool in TOOLS if shutil.which(tool) is None]
+
+
+def prove(file: str, functions: tuple[str, ...] = (), core: Path = CORE, seconds: int = 20) -> Outcome:
+    """All goals of a file of the core, or of some of its functions; each prover has so many seconds for a goal."""
+    chosen = ["-wp-fct", ",".join(functions)] if functions else []
+    believed = ["-wp-skip-fct", ",".join(FILES[file])] if FILES[file] else []
+    with tempfile.TemporaryDirectory() as folder:
+        environment = os.environ | {"HOME": folder, "WHY3CONFIG": f"{folder}/why3.conf"}
+        subprocess.run(["why3", "config", "detect"], env=environment, capture_output=True, check=False)
+        command = ["frama-c", f"-cpp-extra-args=-I{core}", *OPTIONS, *chosen, *believed]
+        run = subprocess.run(
+            [*command, "-wp-timeout", str(seconds), "-wp-session", folder, str(core / file)],
+            env=environment,
+            cwd=folder,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    found = re.search(r"Proved goals: +(\d+) / (\d+)", run.stdout)
+    lines = [line for line in run.stdout.splitlines() if not re.search(r"Goal \S+ : Valid|annotating", line)]
+    report = "\n".join([*lines, run.stderr])
+    if found is None or run.returncode != 0:
+        return Outcome(0, 0, report)
+    return Outcome(int(found[1]), int(found[2]), report)
+
+
+def main(files: list[str]) -> int:
+    """Prove these files, or all."""
+    if missing():
+        print("The proofs need " + ", ".join(missing()) + ": on Debian, apt install frama-c-base why3 z3 cvc4.")
+        return 2
+    total, good = 0, True
+    for file in files or FILES:
+        outcome = prove(file)
+        print(f"{file:16} {outcome.proved:4} of {outcome.goals:4} goals proved", flush=True)
+        if outcome.proved != outcome.goals or outcome.goals == 0:
+            print(outcome.report)
+            good = False
+        total += outcome.proved
+    print(f"{total} goals proved")
+    return 0 if good else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
