@@ -22,8 +22,8 @@ TOOLS = ("frama-c", "why3", "z3", "cvc4")
 
 
 class Plan(NamedTuple):
-    """Functions of a file whose contracts are believed (docs/proofs.md says why), and those for which WP first takes the
-    goal apart, by a strategy that would cost minutes elsewhere."""
+    """Functions of a file whose contracts are believed (docs/proofs.md says why), and those for which WP first takes
+    the goal apart, by a strategy that would cost minutes elsewhere."""
 
     believed: tuple[str, ...] = ()
     apart: tuple[str, ...] = ()
