@@ -41,5 +41,5 @@ def test_what_is_wrong_is_not_proved(tmp_path, file, function, old, new):
     text = (core / file).read_text(encoding="utf-8")
     assert text.count(old) == 1
     (core / file).write_text(text.replace(old, new), encoding="utf-8")
-    outcome = prover.prove(file, (function,), core, seconds=2)
+    outcome = prover.prove(file, function, core, seconds=2)
     assert 0 < outcome.proved < outcome.goals, outcome.report
