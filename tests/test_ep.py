@@ -132,7 +132,8 @@ def differences(fn, h):
     return np.stack(columns, axis=-1)
 
 
-@pytest.mark.parametrize("make", [near_separable, pytest.param(repeated, marks=pytest.mark.deep)])
+@pytest.mark.deep
+@pytest.mark.parametrize("make", [near_separable, repeated])
 def test_gradients_in_every_hyperparameter(make):
     """Evidence, means and variances, by both modes, with exactly repeated stimuli; second derivatives of the
     evidence, whose slope uses no derivative of the sites."""
@@ -190,6 +191,7 @@ def test_no_answers_give_exactly_the_prior():
     assert posterior.certificate.converged and posterior.certificate.iterations <= 1
 
 
+@pytest.mark.deep
 def test_growing_data_are_traced_once_and_start_warm():
     data = noisy()
     gp, whole, weights = model(data), answers(data, 27), jnp.zeros(27)

@@ -65,6 +65,7 @@ def test_nearer_to_the_truth_in_every_respect(make):
     assert np.all(misses(found) <= misses(plain) + slack)
 
 
+@pytest.mark.deep
 def test_root_and_covariance_agree_and_padding_has_no_part():
     for make in (separated, repeated_19):
         data, posterior = make(), corrected(make(), 29)

@@ -205,6 +205,7 @@ def assert_same(one, other, rtol=1e-12):
 
 
 @pytest.mark.parametrize("make", [repeated])
+@pytest.mark.deep
 def test_padded_equals_unpadded_and_a_batch_a_loop(make):
     data, full = make(), answers(make())
     rubbish = Trials(jnp.where(full.mask[:, None], full.x, 0.77), jnp.where(full.mask, full.q, 2), full.mask)
@@ -236,6 +237,7 @@ def test_one_category_only(category):
     np.testing.assert_allclose(posterior.predict(trials.x[:20])[0], by_ep.predict(trials.x[:20])[0], atol=0.01)
 
 
+@pytest.mark.deep
 def test_growing_data_are_traced_once():
     data = separated()
     gp, whole = model(data), answers(data, 26)

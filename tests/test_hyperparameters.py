@@ -76,6 +76,7 @@ def checked():
     return study, cohort, robustness(study, cohort)
 
 
+@pytest.mark.deep
 def test_robustness_compares_optima(checked):
     _, _, found = checked
     assert float(found.nrmse) == pytest.approx(float(np.sqrt(np.mean((found.fixed.x - found.optimised.x) ** 2))))
@@ -84,6 +85,7 @@ def test_robustness_compares_optima(checked):
     assert found.learned.learn == ("theta", "noise", "thresholds")
 
 
+@pytest.mark.deep
 def test_the_optimum_moves_as_its_derivative_says(checked):
     study, cohort, found = checked
     candidates = jnp.asarray(study.space.candidates(4096, 0))

@@ -261,7 +261,7 @@ def test_bad_trials_are_refused_in_a_sentence(x, q, capacity, message):
 
 
 def test_an_unknown_inference_is_refused():
-    with pytest.raises(InputError, match='inference is "magic"; it must be one of laplace, ep, exact'):
+    with pytest.raises(InputError, match='inference is "magic"; it must be one of laplace, ep, ep_corrected, exact'):
         fit(model(repeated()), answers(repeated()), inference="magic")
 
 

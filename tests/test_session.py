@@ -125,6 +125,7 @@ def test_other_acquisitions_choose_feasible_points(study, kind):
     assert bool(jnp.all(study.space.feasible(study.space.to_unit(session.points))))
 
 
+@pytest.mark.deep
 def test_a_smallest_distance_keeps_trials_apart(study):
     raw = json.loads(study.content) | {"schema": 1}
     raw["selection"] = {"minimum_distance": 0.2, "trials": 12}

@@ -145,7 +145,7 @@ def test_the_optimum_is_where_the_map_is_highest(cohort):
     np.testing.assert_allclose(own[-1], found.individuals.x, atol=1e-3)
 
 
-@pytest.mark.parametrize("inference", ["ep", "exact"])
+@pytest.mark.parametrize("inference", ["ep", pytest.param("exact", marks=pytest.mark.deep)])
 def test_a_study_may_ask_for_another_inference(cohort, inference):
     study = dataclasses.replace(STUDY, inference=inference)
     posteriors = fit_cohort(study, cohort)
