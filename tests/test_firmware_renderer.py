@@ -99,7 +99,7 @@ def test_a_minute_of_holding_still(memory, bound):
 @pytest.mark.parametrize(("memory", "bound"), [("short", SHORT_BOUND), ("full", FULL_BOUND)])
 def test_a_minute_of_motion_at_two_hundred_sets(memory, bound, record_property):
     error = largest_error(200, memory)
-    record_property("largest error of the largest force", error)
+    record_property("largest error of the largest force", float(error))
     print(f"{memory} memory: {error:.2e} of the largest force")
     assert error <= bound
 
