@@ -34,7 +34,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hilbo.gaussian import Certificate, GaussianPosterior, factor, inverse_and_log_determinant, square_root
+from hilbo.gaussian import GaussianPosterior, certify, factor, inverse_and_log_determinant, square_root
 from hilbo.linalg import cholesky, one_at_a_time, solve_lower
 
 __all__ = ["Tilted", "coupling", "ep", "fixed_point", "gaussian", "inverse_of", "settled", "sites_of"]
@@ -78,21 +78,19 @@ def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
     log_evidence = _log_evidence(terms, covariance, mean, variance)
     fixed = jax.lax.stop_gradient((covariance, precision))
     root, condition = factor(*fixed)
-    prior_variance = jnp.diagonal(fixed[0])
-    largest = jnp.max(prior_variance)
-    explained = jnp.sum((root @ fixed[0]) ** 2, axis=0)
-    smallest = jnp.min(jnp.where(fixed[1] > 0, prior_variance - explained, largest))
-    resolution = jnp.finfo(mean.dtype).eps * largest * mean.shape[0] ** 0.5
-    resolved = smallest >= resolution
-    certificate = Certificate(
+    terms, middle, cavity, weights = jax.lax.stop_gradient((terms, mean, variance, slope))
+    certificate = certify(
+        fixed[0],
+        middle + cavity * weights,
+        weights,
+        root,
+        lambda eta: terms(eta - cavity * weights, cavity)[2],
+        jax.lax.stop_gradient(log_evidence),
         residual=found.residual,
         tolerance=found.tolerance,
         iterations=found.iterations,
-        jitter=found.changed / largest,
+        jitter=found.changed / jnp.max(jnp.diagonal(fixed[0])),
         condition=condition,
-        smallest_variance=smallest,
-        variance_resolution=resolution,
-        converged=(found.residual <= found.tolerance) & jnp.isfinite(log_evidence) & resolved,
     )
     return GaussianPosterior(covariance @ slope, slope, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 

@@ -5,6 +5,9 @@ inverted, nothing is added to it, and W = 0 (padding, or an answer that says not
 k* the prior covariances with eta, the mean is k*'a and the variance k - k*'C k*.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,12 +18,16 @@ from hilbo.linalg import cholesky, eigh, solve_lower
 __all__ = [
     "Certificate",
     "GaussianPosterior",
+    "certify",
     "factor",
     "factorise",
     "inverse_and_log_determinant",
     "mean_and_explained",
     "square_root",
 ]
+
+
+_NATS = 0.02  # of a log evidence, which nobody reads more closely
 
 
 class Certificate(eqx.Module):
@@ -40,8 +47,12 @@ class Certificate(eqx.Module):
     """Smallest posterior variance among the eta's that the data say anything about."""
     variance_resolution: Float[Array, ""]
     """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
+    evidence_error: Float[Array, ""]
+    """What the residual and the rounding of K a may have done to the log evidence, to first order."""
+    evidence_tolerance: Float[Array, ""]
+    """0.02 + eps^(1/2) |log evidence|: evidences that are nearer than that decide nothing."""
     converged: Bool[Array, ""]
-    """residual <= tolerance, a finite log evidence, and no variance below its resolution."""
+    """residual <= tolerance, evidence_error <= evidence_tolerance, no variance below its resolution, all finite."""
 
 
 class GaussianPosterior(eqx.Module):
@@ -56,6 +67,46 @@ class GaussianPosterior(eqx.Module):
     """C, for derivatives."""
     log_evidence: Float[Array, ""]
     certificate: Certificate
+
+
+def certify(
+    covariance: Float[Array, "n n"],
+    mode: Float[Array, " n"],
+    weights: Float[Array, " n"],
+    factor: Float[Array, "n n"],
+    curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+    log_evidence: Float[Array, ""],
+    **search: Any,
+) -> Certificate:
+    """The certificate of the posterior with these `weights` a and this `factor` V; `search` says how it was found.
+
+    The mode may be off by d_i = residual sqrt(K_ii) + eps (|K| |a|)_i + |mode - K a|_i, the last of which is 0 but for
+    rounding and may not exceed eps^(1/4) prior standard deviations. The log posterior is stationary, so the sums in
+    the log evidence move by at most sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior
+    variances, dW the change of the curvatures within d. Where the noise is far below the prior's standard deviation,
+    these notice what a residual in units of the latter cannot.
+    """
+    epsilon, prior = jnp.finfo(weights.dtype).eps, jnp.diagonal(covariance)
+    largest, sd = jnp.max(prior), jnp.sqrt(prior)
+    variance = prior - jnp.sum((factor @ covariance) ** 2, axis=0)
+    apart = jnp.abs(mode - covariance @ weights)
+    off = search["residual"] * sd + epsilon * (jnp.abs(covariance) @ jnp.abs(weights)) + apart
+    curvature, *beside = jax.vmap(curvature_at)(jnp.stack([mode, mode - off, mode + off]))
+    change = jnp.maximum(jnp.abs(beside[0] - curvature), jnp.abs(beside[1] - curvature))
+    error = 0.5 * jnp.sum(curvature * off**2) + 0.5 * jnp.sum(jnp.abs(variance) * change)
+    allowed = _NATS + epsilon**0.5 * jnp.abs(log_evidence)
+    smallest = jnp.min(jnp.where(curvature > 0, variance, largest))
+    resolution = epsilon * largest * weights.shape[0] ** 0.5
+    found = (search["residual"] <= search["tolerance"]) & jnp.all(apart <= epsilon**0.25 * sd)
+    sure = jnp.isfinite(log_evidence) & (error <= allowed)
+    return Certificate(
+        **search,
+        smallest_variance=smallest,
+        variance_resolution=resolution,
+        evidence_error=error,
+        evidence_tolerance=allowed,
+        converged=found & sure & (smallest >= resolution),
+    )
 
 
 @jax.custom_jvp

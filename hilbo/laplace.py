@@ -28,8 +28,8 @@ import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.gaussian import (
-    Certificate,
     GaussianPosterior,
+    certify,
     factor,
     factorise,
     inverse_and_log_determinant,
@@ -87,20 +87,17 @@ def laplace(
     fixed = jax.lax.stop_gradient((covariance, curvature))
     root, condition = factor(*fixed)
     log_evidence = jnp.sum(values) - 0.5 * gradient @ mode - 0.5 * log_determinant
-    prior_variance = jnp.diagonal(fixed[0])
-    largest = jnp.max(prior_variance)
-    variance = prior_variance - jnp.sum((root @ fixed[0]) ** 2, axis=0)
-    smallest = jnp.min(jnp.where(fixed[1] > 0, variance, largest))
-    resolution = jnp.finfo(mode.dtype).eps * largest * mode.shape[0] ** 0.5
-    certificate = Certificate(
+    certificate = certify(
+        fixed[0],
+        *jax.lax.stop_gradient((mode, gradient)),
+        root,
+        lambda eta: jax.lax.stop_gradient(terms)(eta)[2],
+        jax.lax.stop_gradient(log_evidence),
         residual=residual,
         tolerance=tolerance,
         iterations=iterations,
-        jitter=changed / largest,
+        jitter=changed / jnp.max(jnp.diagonal(fixed[0])),
         condition=condition,
-        smallest_variance=smallest,
-        variance_resolution=resolution,
-        converged=(residual <= tolerance) & jnp.isfinite(log_evidence) & (smallest >= resolution),
     )
     return GaussianPosterior(mode, gradient, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))
 

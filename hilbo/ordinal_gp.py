@@ -335,6 +335,12 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
                 " too small a part of the prior's for this precision to tell; use a larger noise, float64, or"
                 " throw=False to look at the certificate."
             )
+        if found and isinstance(certificate, Certificate):
+            raise InferenceError(
+                f"the {sought} was found (residual {float(certificate.residual):.3g}), but not closely enough for its"
+                f" evidence, which may be off by {float(certificate.evidence_error):.3g}; use a larger noise, float64,"
+                " or throw=False to look at the certificate."
+            )
         raise InferenceError(
             f"the {sought} was not found: its residual is {float(certificate.residual):.3g} after"
             f" {int(certificate.iterations)} steps and should be at most {float(certificate.tolerance):.3g}; use a"
