@@ -34,7 +34,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hilbo.gaussian import GaussianPosterior, certify, factor, inverse_and_log_determinant, square_root
+from hilbo.gaussian import GaussianPosterior, certify, factor, inverse_and_log_determinant, square_root, still
 from hilbo.linalg import cholesky, one_at_a_time, solve_lower
 
 __all__ = ["Tilted", "coupling", "ep", "fixed_point", "gaussian", "inverse_of", "settled", "sites_of"]
@@ -78,7 +78,7 @@ def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
     log_evidence = _log_evidence(terms, covariance, mean, variance)
     fixed = jax.lax.stop_gradient((covariance, precision))
     root, condition = factor(*fixed)
-    terms, middle, cavity, weights = jax.lax.stop_gradient((terms, mean, variance, slope))
+    terms, (middle, cavity, weights) = still(terms), jax.lax.stop_gradient((mean, variance, slope))
     certificate = certify(
         fixed[0],
         middle + cavity * weights,

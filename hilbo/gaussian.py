@@ -6,7 +6,7 @@ k* the prior covariances with eta, the mean is k*'a and the variance k - k*'C k*
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -24,9 +24,11 @@ __all__ = [
     "inverse_and_log_determinant",
     "mean_and_explained",
     "square_root",
+    "still",
 ]
 
 
+Terms = TypeVar("Terms")
 _NATS = 0.02  # of a log evidence, which nobody reads more closely
 
 
@@ -48,7 +50,7 @@ class Certificate(eqx.Module):
     variance_resolution: Float[Array, ""]
     """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
     evidence_error: Float[Array, ""]
-    """What the residual and the rounding of K a may have done to the log evidence, to first order."""
+    """What the distance from the exact mode, and the rounding of K a, do to the log evidence, to first order."""
     evidence_tolerance: Float[Array, ""]
     """0.02 + eps^(1/2) |log evidence|: evidences that are nearer than that decide nothing."""
     converged: Bool[Array, ""]
@@ -80,24 +82,27 @@ def certify(
 ) -> Certificate:
     """The certificate of the posterior with these `weights` a and this `factor` V; `search` says how it was found.
 
-    The mode may be off by d_i = residual sqrt(K_ii) + eps (|K| |a|)_i + |mode - K a|_i, the last of which is 0 but for
-    rounding and may not exceed eps^(1/4) prior standard deviations. The log posterior is stationary, so the sums in
-    the log evidence move by at most sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior
-    variances, dW the change of the curvatures within d. Where the noise is far below the prior's standard deviation,
-    these notice what a residual in units of the latter cannot.
+    K a, which predictions use, and the mode are equal but for rounding, and may differ by eps^(1/4) prior standard
+    deviations. To first order the mode is off by d = P (K a - mode), P = (I + KW)^-1 = I - K C, beside the rounding
+    P eps |K| |a| + eps |mode|. The log posterior being stationary, the sums in the log evidence move by at most
+    sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior variances, dW the change of the
+    curvatures within d. Where the noise is far below the prior's standard deviation, these notice what a residual in
+    units of the latter cannot.
     """
     epsilon, prior = jnp.finfo(weights.dtype).eps, jnp.diagonal(covariance)
     largest, sd = jnp.max(prior), jnp.sqrt(prior)
     variance = prior - jnp.sum((factor @ covariance) ** 2, axis=0)
-    apart = jnp.abs(mode - covariance @ weights)
-    off = search["residual"] * sd + epsilon * (jnp.abs(covariance) @ jnp.abs(weights)) + apart
+    apart = mode - covariance @ weights
+    rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
+    steps = jnp.stack([apart, rounding], axis=1)
+    off = jnp.sum(jnp.abs(steps - covariance @ (factor.T @ (factor @ steps))), axis=1) + epsilon * jnp.abs(mode)
     curvature, *beside = jax.vmap(curvature_at)(jnp.stack([mode, mode - off, mode + off]))
     change = jnp.maximum(jnp.abs(beside[0] - curvature), jnp.abs(beside[1] - curvature))
     error = 0.5 * jnp.sum(curvature * off**2) + 0.5 * jnp.sum(jnp.abs(variance) * change)
     allowed = _NATS + epsilon**0.5 * jnp.abs(log_evidence)
     smallest = jnp.min(jnp.where(curvature > 0, variance, largest))
     resolution = epsilon * largest * weights.shape[0] ** 0.5
-    found = (search["residual"] <= search["tolerance"]) & jnp.all(apart <= epsilon**0.25 * sd)
+    found = (search["residual"] <= search["tolerance"]) & jnp.all(jnp.abs(apart) <= epsilon**0.25 * sd)
     sure = jnp.isfinite(log_evidence) & (error <= allowed)
     return Certificate(
         **search,
@@ -107,6 +112,11 @@ def certify(
         evidence_tolerance=allowed,
         converged=found & sure & (smallest >= resolution),
     )
+
+
+def still(terms: Terms) -> Terms:
+    """The terms without derivatives in their arrays."""
+    return jax.tree.map(lambda leaf: jax.lax.stop_gradient(leaf) if eqx.is_array(leaf) else leaf, terms)
 
 
 @jax.custom_jvp

@@ -34,6 +34,7 @@ from hilbo.gaussian import (
     factorise,
     inverse_and_log_determinant,
     square_root,
+    still,
 )
 from hilbo.linalg import cholesky, solve_lower, solve_lower_transposed
 
@@ -91,7 +92,7 @@ def laplace(
         fixed[0],
         *jax.lax.stop_gradient((mode, gradient)),
         root,
-        lambda eta: jax.lax.stop_gradient(terms)(eta)[2],
+        lambda eta: still(terms)(eta)[2],
         jax.lax.stop_gradient(log_evidence),
         residual=residual,
         tolerance=tolerance,
