@@ -52,11 +52,21 @@ class Link:
     """A conversation over a `ports.Port`, from construction to `close`.
 
     `boot_id` is the device's, once known; heartbeats begin with it.
-    `patience` is how long (s) an answer may take. Counted: `retries`, `stray` answers that fit no request, `strange`
-    frames that are no message of a device, `dropped` frames; `round_trips` has the last answers' times (s).
+    `patience` is how long (s) an answer may take. `ticks` runs so many ticks of 1 ms of a device whose time is ours:
+    it passes in `pause` alone then, and nothing beats by a clock. Counted: `retries`, `stray` answers that fit no
+    request, `strange` frames that are no message of a device, `dropped` frames; `round_trips` has the last answers'
+    times (s).
     """
 
-    def __init__(self, port: Any, *, patience: float = 0.1, tries: int = 3, capture: Callable | None = None):
+    def __init__(
+        self,
+        port: Any,
+        *,
+        patience: float = 0.1,
+        tries: int = 3,
+        capture: Callable | None = None,
+        ticks: Callable[[int], Any] | None = None,
+    ):
         self.name, self.patience, self.tries = port.name, patience, tries
         self.boot_id: int | None = None
         self.lost: str | None = None
@@ -66,12 +76,14 @@ class Link:
         self.notices: deque[Notice] = deque(maxlen=1000)
         self.on_telemetry: Callable[[Telemetry], None] | None = None
         self._port, self._capture, self._receiver = port, capture, Receiver()
+        self._ticks, self._passed = ticks, 0
         self._seq = random.randrange(256)  # an earlier host's last request must not look like this one's first
         self._expected: tuple[int, int, type] | None = None
         self._answer: Message = None
         self._asking, self._writing, self._news = threading.Lock(), threading.Lock(), threading.Condition()
         self._closing = threading.Event()
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._read, self._beat)]
+        works = (self._read, self._beat) if ticks is None else (self._read,)
+        self._threads = [threading.Thread(target=work, daemon=True) for work in works]
         self.write(b"\0")
         for thread in self._threads:
             thread.start()
@@ -120,10 +132,10 @@ class Link:
 
     def write(self, data: bytes) -> None:
         """Bytes onto the line, whole frames only. Raises `DeviceError` when the line is gone."""
-        if self.lost:
-            raise DeviceError(self.lost)
         try:
-            with self._writing:
+            with self._writing:  # which `close` takes too, so that no port is closed under a writer's hands
+                if self.lost:
+                    raise DeviceError(self.lost)
                 self._port.write(data)
         except OSError as error:
             raise DeviceError(self._lose(error)) from error
@@ -133,16 +145,39 @@ class Link:
         if self.boot_id is not None and not self.silent:
             self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id), 0))
 
+    @property
+    def ours(self) -> bool:
+        """Whether the device's time is ours, and passes in `pause` alone."""
+        return self._ticks is not None
+
+    def now(self) -> float:
+        """Seconds, from anywhere on, of the clock that `pause` goes by."""
+        return self._passed / 1000 if self.ours else time.monotonic()
+
+    def pause(self, seconds: float) -> None:
+        """Let so much time pass; where it is ours, with heartbeats, until everything the device sent has been read."""
+        if self._ticks is None:
+            time.sleep(seconds)
+            return
+        until = self._passed + max(1, round(1000 * seconds))
+        while self._passed < until:
+            count = min(until - self._passed, round(1000 * BEAT))
+            self.heartbeat()
+            self._ticks(count)
+            self._passed += count
+            self.request(protocol.GetStatus())
+
     def close(self) -> None:
-        """Ends both threads and closes the port."""
+        """Ends the threads and closes the port."""
         self._closing.set()
         with self._news:
             self.lost = self.lost or f"{self.name}: the connection has been closed; open it again."
             self._news.notify_all()
         for thread in self._threads:
             if thread is not threading.current_thread():
-                thread.join(2)
-        self._port.close()
+                thread.join()  # a port neither reads nor writes for long
+        with self._writing:
+            self._port.close()
 
     def _beat(self) -> None:
         due = time.monotonic()

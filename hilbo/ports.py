@@ -38,11 +38,14 @@ class SerialPort:
     def read(self) -> bytes:
         try:
             return self._serial.read(max(1, self._serial.in_waiting))
-        except TypeError as error:  # pyserial's, when the port is closed while it reads
-            raise OSError(errno.EBADF, "the port is closed") from error
+        except TypeError as error:
+            raise _closed() from error
 
     def write(self, data: bytes) -> None:
-        self._serial.write(data)
+        try:
+            self._serial.write(data)
+        except TypeError as error:
+            raise _closed() from error
 
     def close(self) -> None:
         with contextlib.suppress(OSError):
@@ -71,6 +74,11 @@ class SocketPort:
 
     def close(self) -> None:
         self._socket.close()
+
+
+def _closed() -> OSError:
+    """What pyserial means by a TypeError: its port was closed by another thread while it read or wrote."""
+    return OSError(errno.EBADF, "the port is closed")
 
 
 Port = SerialPort | SocketPort

@@ -204,7 +204,7 @@ class Port(Talk):
 
     def tick(self, count: int) -> float:
         """`count` ticks without a heartbeat; the last force (N)."""
-        word, _, force = self.command(f"tick {count}")
+        word, _, force, _ = self.command(f"tick {count}")
         assert word == "tick"
         return float(force)
 

@@ -305,7 +305,7 @@ def test_telemetry_arrives_in_columns():
     with peer.open(**PATIENT) as device:
         for tick in (2**32 - 3, 0, 3):
             peer.say(frame(tick, fields=1))
-        wait_until(lambda: device.counts().samples == 9, "sent everything")
+        wait_until(device, lambda: device.counts().samples == 9, "sent everything")
         table = device.telemetry(0.0)
         assert list(table.columns) == ["tick", "time_s", "position_mm", "force_N", "sensed_N", "flags"]
         assert np.all(np.diff(table["tick"]) == 1)
@@ -316,7 +316,7 @@ def test_telemetry_arrives_in_columns():
 
 
 def test_silence_instead_of_telemetry_is_said(monkeypatch):
-    monkeypatch.setattr(hardware_bridge, "_STALLED", 0.2)
+    monkeypatch.setattr(hardware_bridge, "_STALLED", 2)
     with Peer().open(**PATIENT) as device, pytest.raises(DeviceError, match="no telemetry comes"):
         device.samples(0.5)
 
