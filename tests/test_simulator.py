@@ -202,7 +202,7 @@ def test_a_bad_line_costs_tries_and_never_a_wrong_set(rate):
 
 
 def test_a_port_that_is_used_is_busy_and_one_that_vanishes_is_gone():
-    device = Renderer.open("sim")
+    device = Renderer.open("sim", patience=30)
     with pytest.raises(InputError, match="another program uses this port"):
         Renderer.open(device.simulator.port)
     device.simulator._process.kill()
@@ -268,8 +268,8 @@ def tick(found, count):
 
 
 def keep_up(found):
-    """Five ticks in about their time, but none while the host's heartbeats are late: this computer is busy."""
-    time.sleep(0.005)
+    """Five ticks, but none while the host's heartbeats are late: this computer is busy."""
+    time.sleep(0.001)
     tick(found, 5 if tick(found, 0)[2] < 150 else 0)
 
 
