@@ -177,12 +177,9 @@ def _watchdog(device) -> tuple[int, float]:
         )
     device.drive("force", "hold", 0.0, duration=5.0)
     wait_until(device, lambda: device.state() == State.DRIVING, "begun to drive")
-    device.link.silent = True
-    last = device.status().tick  # whatever heartbeat there was has arrived by now
-    try:
+    with device.link.silence():
+        last = device.status().tick  # whatever heartbeat there was has arrived by now
         wait_until(device, lambda: device.state() == State.HOLD, "let go without heartbeats")
-    finally:
-        device.link.silent = False
     status = device.status()
     if status.hold_reason != HoldReason.WATCHDOG:
         raise DeviceError(f"The device is in HOLD, but {held_because(status.hold_reason)}; check that first.")

@@ -62,8 +62,8 @@ def take_over(link: Link, device: HelloReply) -> list[str]:
     if status.state in (State.HOLD, State.ESTOP):
         why = held_because(status.hold_reason)
         notes.append(f"The device is in {meaning(State, status.state)}: {why}; clear it before the next start.")
-    link.boot_id, link.restarted = device.boot_id, False
-    link.heartbeat()
+    link.restarted = False
+    link.beat(device.boot_id)
     return notes
 
 

@@ -170,8 +170,6 @@ class Renderer:
         found = self.in_force()
         if found is None:
             raise DeviceError("The device has no set in force; send one first.")
-        import pandas  # noqa: F401  (what `telemetry` needs: an import may keep heartbeats waiting for too long)
-
         self._link.heartbeat()
         self._buffer.take()
         self._link.request(protocol.Start(set_id=found.set_id, crc=found.crc, boot_id=self.device.boot_id))
@@ -317,8 +315,7 @@ class Renderer:
 
 
 def _connected(port, baud, patience, capture, simulator) -> Link:
-    lockstep = simulator is not None and simulator.lockstep
+    ticks = simulator.ticks if simulator is not None and simulator.lockstep else None
     if patience is None:
-        patience = _LOCKSTEP if lockstep else _SIMULATED if simulator else _ANSWER
-    ticks = simulator.ticks if lockstep else None
+        patience = _LOCKSTEP if ticks else _SIMULATED if simulator else _ANSWER
     return Link(open_port(port, baud), patience=patience, capture=capture, ticks=ticks)

@@ -35,6 +35,9 @@ class SerialPort:
         self.name = name
         self._serial: Any = _opened(name, baud)
 
+    def fileno(self) -> int:
+        return self._serial.fileno()
+
     def read(self) -> bytes:
         try:
             return self._serial.read(max(1, self._serial.in_waiting))
@@ -60,6 +63,9 @@ class SocketPort:
         self._socket = connected
         self._socket.settimeout(POLL)
 
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
     def read(self) -> bytes:
         try:
             data = self._socket.recv(4096)
@@ -82,7 +88,7 @@ def _closed() -> OSError:
 
 
 Port = SerialPort | SocketPort
-"""Anything with `name`, `read`, `write` and `close` will do."""
+"""Anything with `name`, `read`, `write` and `close` will do; with `fileno`, heartbeats come from their own process."""
 
 
 def open_port(where: str, baud: int = BAUD) -> Port:

@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -339,18 +338,9 @@ def test_a_port_that_is_none_is_one_sentence(where, words):
 
 def test_a_device_behind_an_address():
     peer = Peer()
-    with socket.create_server(("127.0.0.1", 0)) as server:
-
-        def serve():
-            peer.socket, _ = server.accept()
-            peer._serve(peer.socket)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        with Renderer.open(f"socket://127.0.0.1:{server.getsockname()[1]}", patience=5) as device:
-            device.send(**A)
-            assert device.in_force().alpha == float(np.float32(0.176))
-        thread.join()
+    with peer.listening() as where, Renderer.open(where, **PATIENT) as device:
+        device.send(**A)
+        assert device.in_force().alpha == float(np.float32(0.176))
 
 
 def test_without_pyserial_there_is_one_sentence(monkeypatch):

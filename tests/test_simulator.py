@@ -104,9 +104,8 @@ def test_silence_of_the_host_is_hold(device):
     device.send(**A)
     device.start()
     device.samples(0.5)
-    device.link.silent = True
-    device_tests.wait_until(device, lambda: device.state() == State.HOLD, "let go")
-    device.link.silent = False
+    with device.link.silence():
+        device_tests.wait_until(device, lambda: device.state() == State.HOLD, "let go")
     with pytest.raises(DeviceError, match="START is refused while the device is HOLD"):
         device.start()
     device_tests.wait_until(device, lambda: device.status().force_N == 0, "rested")
@@ -241,7 +240,8 @@ with Renderer.open(sys.argv[1]) as device:
 
 def killed(found, rng):
     """Device ticks from the death of a host at a random moment to force zero, and the force before."""
-    host = subprocess.Popen([sys.executable, "-c", HOST, found.port], stdout=subprocess.PIPE, env=ENVIRONMENT)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    host = subprocess.Popen([sys.executable, "-c", HOST, found.port], **pipes, env=ENVIRONMENT)
     ready = threading.Thread(target=host.stdout.readline)
     ready.start()
     while ready.is_alive():
@@ -250,7 +250,9 @@ def killed(found, rng):
         keep_up(found)
     host.kill()
     host.wait()
+    assert host.stderr.read() == b""  # ends with the helper that sends heartbeats
     host.stdout.close()
+    host.stderr.close()
     dead, before, _ = tick(found, 1)  # takes in what was still on its way
     for _ in range(1000):
         now, force, _ = tick(found, 1)
