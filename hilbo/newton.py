@@ -46,7 +46,10 @@ class _State(eqx.Module):
 
 
 class TrustRegionNewton(optx.AbstractMinimiser):
-    """For `optimistix.minimise`; `options` may hold the bounds "lower" and "upper", each like the variables.
+    """For `optimistix.minimise`; `options` may hold the bounds "lower" and "upper", each like the variables, and "expand":
+    a function that takes the variables, those of the best point so far and what the function returned there besides its
+    value, and gives value, gradient (p,), Hessian (p, p), of the variables as one vector, and that besides. It stands for
+    automatic differentiation.
 
     Ends where no free component of the gradient is above `atol`, or where the radius is below `resolution` (a kink of
     the function, or its rounding); `state.here` is the expansion at the end. A start at which the function is not
@@ -73,7 +76,12 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         del tags
         flat, restore = ravel_pytree(y)
         ahead = flat + state.move
-        there = _expand(lambda at: fn(restore(at), args), ahead)
+        expand = options.get("expand")
+        there = (
+            _expand(lambda at: fn(restore(at), args), ahead)
+            if expand is None
+            else _Expansion(*expand(restore(ahead), restore(flat), state.here.aux))
+        )
         achieved = state.here.value - there.value
         taken = achieved > _ENOUGH * state.promised  # never if it is not a number
         good = taken & jnp.isfinite(achieved) & (achieved > _GOOD * state.promised)
