@@ -5,8 +5,9 @@ evidence is the value at a = g(eta; x), g the terms' slopes and W their curvatur
 
     G(a, x) = sum l - a'K a / 2 - log|I + K W| / 2.
 
-Its Hessian is that of G + mu'(g - a) along the line a + A dx, A = da/dx, where the adjoint mu stands for how the weights
-bend. With S = (K^-1 + W)^-1, C = (K + 1/W)^-1, T = I - C K, s = diag(S), and for each hyperparameter K_i = dK/dx_i,
+Its Hessian is that of G + mu'(g - a) along the line a + A dx, A = da/dx, where the adjoint mu stands for how the
+weights bend. With S = (K^-1 + W)^-1, C = (K + 1/W)^-1, T = I - C K, s = diag(S), and for each hyperparameter
+K_i = dK/dx_i,
 
     lambda = -T (s dW/deta) / 2,   mu = K lambda,   m_i = T'(K_i a + K dg/dx_i),   A_i = dg/dx_i - W m_i,
     w_i = dW/dx_i + (dW/deta) m_i,   t_i = diag(T'K_i T),

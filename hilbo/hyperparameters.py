@@ -25,10 +25,10 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.errors import InputError
-from hilbo.evidence import laplace_evidence
+from hilbo.evidence import Evidence, laplace_evidence
 from hilbo.kernels import gram
 from hilbo.linalg import eigh, one_at_a_time
-from hilbo.newton import TrustRegionNewton
+from hilbo.newton import TrustRegionNewton, arrives
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, OrdinalTerms, Trials, fit
 
 __all__ = ["Learnable", "Learned", "log_prior", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
@@ -130,21 +130,30 @@ def _searched(gp, trials, options):
     objective = _closed if options.inference == "laplace" else _differentiated
     fn, expand = objective(gp, trials, options, answers)
 
-    def ended(start):
+    def ended(known, start):
         solution = optx.minimise(
-            fn, TrustRegionNewton(), start, has_aux=True, max_steps=options.max_steps, throw=False, options=expand
+            fn,
+            TrustRegionNewton(),
+            start,
+            has_aux=True,
+            max_steps=options.max_steps,
+            throw=False,
+            options=expand | {"known": known},
         )
         evidence, certified = solution.aux[:2]
-        # An evidence without its certificate is no evidence: such an end never wins.
-        end = solution.state.here
-        value = jnp.where(certified & jnp.isfinite(end.value), end.value, jnp.inf)
+        # An evidence without its certificate is no evidence: such an end never wins. Nor one that is known already.
+        end, joined = solution.state.here, arrives(solution.value, solution.state.move, known)
+        value = jnp.where(certified & jnp.isfinite(end.value) & ~joined, end.value, jnp.inf)
         done = (solution.result == optx.RESULTS.successful) & certified
         flat = eigh(end.hessian)[0][0] * answers < _FLAT
-        return solution.value, value, evidence, done, flat, jnp.asarray(solution.stats["num_steps"])
+        found = jnp.where(done & ~joined, ravel_pytree(solution.value)[0], jnp.nan)
+        known = jnp.concatenate([known[1:], found[None, :]])
+        return known, (solution.value, value, evidence, done, flat, jnp.asarray(solution.stats["num_steps"]))
 
     begin = _coordinates(gp, options.learn)
-    # One search after the other: each stops when it is done.
-    ends, values, evidences, done, flat, steps = jax.lax.map(ended, _spread(begin, options.starts))
+    # One search after the other: each stops when it is done, or on its way to where an earlier one ended.
+    unknown = jnp.full((options.starts, ravel_pytree(begin)[0].size), jnp.nan, answers.dtype)
+    _, (ends, values, evidences, done, flat, steps) = jax.lax.scan(ended, unknown, _spread(begin, options.starts))
     best = jnp.argmin(values)
     chosen = jax.tree.map(lambda leaf: leaf[best], ends)
     moved = [jnp.max(jnp.abs(chosen[k] - begin[k])) for k in chosen if k != "first" and chosen[k].size]
@@ -193,28 +202,30 @@ def _closed(gp, trials, options, answers):
     return cost, {"expand": expand}
 
 
+@one_at_a_time
+def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: Float[Array, " n"]) -> Evidence:
+    """One person's evidence by Laplace's method, expanded in the coordinates, which are in alphabetical order.
+
+    `start`: weights near which the mode is sought.
+    """
+    own = {name: value for name, value in coordinates.items() if name in _OWN}
+    shape = {name: value for name, value in coordinates.items() if name not in _OWN}
+    (flat_own, restore_own), (flat_shape, restore_shape) = ravel_pytree(own), ravel_pytree(shape)
+
+    def covariance(at):
+        return gram(_model(own | restore_shape(at), gp).kernel, trials.x, trials.x)
+
+    def terms(at):
+        return OrdinalTerms(_model(restore_own(at) | shape, gp).likelihood, trials.q, trials.mask)
+
+    return laplace_evidence(covariance, terms, flat_own.astype(start.dtype), flat_shape.astype(start.dtype), start)
+
+
 def _people(gp, trials, coordinates, starts):
-    """Everybody's evidence, expanded in the coordinates."""
-
-    @one_at_a_time
-    def one(gp, coordinates, person, start):
-        own = {name: value for name, value in coordinates.items() if name in _OWN}
-        shape = {name: value for name, value in coordinates.items() if name not in _OWN}
-        (flat_own, restore_own), (flat_shape, restore_shape) = ravel_pytree(own), ravel_pytree(shape)
-
-        def covariance(at):
-            return gram(_model(own | restore_shape(at), gp).kernel, person.x, person.x)
-
-        def terms(at):
-            return OrdinalTerms(_model(restore_own(at) | shape, gp).likelihood, person.q, person.mask)
-
-        dtype = start.dtype
-        return laplace_evidence(covariance, terms, flat_own.astype(dtype), flat_shape.astype(dtype), start)
-
-    if starts.shape[0] == 1:
-        alone = one(gp, coordinates, jax.tree.map(lambda leaf: leaf[0], trials), starts[0])
-        return jax.tree.map(lambda leaf: leaf[None], alone)
-    return jax.vmap(one, in_axes=(None, None, 0, 0))(gp, coordinates, trials, starts)
+    if starts.shape[0] > 1:
+        return jax.vmap(person_evidence, in_axes=(None, None, 0, 0))(gp, coordinates, trials, starts)
+    alone = person_evidence(gp, coordinates, jax.tree.map(lambda leaf: leaf[0], trials), starts[0])
+    return jax.tree.map(lambda leaf: leaf[None], alone)
 
 
 def _evidence(gp, trials, inference):

@@ -120,8 +120,10 @@ class Mode(NamedTuple):
 
 @eqx.filter_custom_jvp
 def find_mode(terms, covariance, start, max_steps) -> Mode:
-    """The mode, sought from weights `start` and then, if need be, from 0. Under `vmap` one matrix after the other on CPUs,
-    each stopping when it is done; elsewhere all at once in v."""
+    """The mode, sought from weights `start` and then, if need be, from 0.
+
+    Under `vmap` one matrix after the other on CPUs, each stopping when it is done; elsewhere all at once in v.
+    """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
     def safe(arrays, covariance, start):
