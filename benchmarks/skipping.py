@@ -30,7 +30,7 @@ def tasks():
     from hilbo.acquisition import UCB
     from hilbo.kernels import gram
     from hilbo.laplace import _plain_mode, _whitened_mode
-    from hilbo.ordinal_gp import _OrdinalTerms, fit
+    from hilbo.ordinal_gp import OrdinalTerms, fit
     from hilbo.search_lattice import lattice_of
 
     study, candidates, _, _, one, trials = run.data()
@@ -49,7 +49,7 @@ def tasks():
     few = jax.jit(lambda p, x: lattice.screen_points(*known(p), x, score))
     columns = jax.jit(lambda p: lattice.screen(*known(p), found, score)[0])
     all_values = everywhere(posterior, points)
-    terms = _OrdinalTerms(study.gp.likelihood, one.q, one.mask)
+    terms = OrdinalTerms(study.gp.likelihood, one.q, one.mask)
     covariance = gram(study.gp.kernel, one.x, one.x)
     zeros = jnp.zeros(25)
     plain = jax.jit(lambda k, start: _plain_mode(terms, k, start, 20))

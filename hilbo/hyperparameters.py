@@ -15,18 +15,21 @@ Reference: Rasmussen & Williams (2006), section 5.5.1; paper, section IV-3 (robu
 """
 
 from collections.abc import Callable, Sequence
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.errors import InputError
-from hilbo.linalg import eigh
-from hilbo.newton import TrustRegionNewton
-from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo.evidence import Evidence, laplace_evidence
+from hilbo.kernels import gram
+from hilbo.linalg import eigh, one_at_a_time
+from hilbo.newton import TrustRegionNewton, arrives
+from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, OrdinalTerms, Trials, fit
 
 __all__ = ["Learnable", "Learned", "log_prior", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
 
@@ -36,6 +39,7 @@ Coordinates = dict[str, Float[Array, "..."]]
 _RUNAWAY = 6.9  # a factor of 1000: that far from where the search began there is no maximum to speak of
 _FLAT = 1e-3  # curvature of the log evidence: less leaves a hyperparameter open by a factor exp(30) either way
 _PRIOR_SD = {"theta": 1.5, "variance": 1.0, "noise": 1.0, "first": 1.0, "gaps": 1.0}
+_OWN = ("first", "gaps", "noise")  # coordinates of the likelihood; in a sorted record they come before the kernel's
 _FIELDS = {"theta": ("theta",), "variance": ("variance",), "noise": ("noise",), "thresholds": ("first", "gaps")}
 
 
@@ -107,33 +111,121 @@ def _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference):
         raise InputError(
             'hyperparameters: inference "exact" has no derivatives to learn by; use "ep", which is near it.'
         )
+    options = _Search(learn, weak_priors, starts, max_steps, inference)
+    # Person by person on a CPU: each search stops when it is done, where a batch would wait for its slowest.
+    return one_at_a_time(lambda gp, trials: _searched(gp, trials, options))(gp, trials)
+
+
+class _Search(NamedTuple):
+    learn: tuple[str, ...]
+    weak_priors: bool
+    starts: int
+    max_steps: int
+    inference: str
+
+
+def _searched(gp, trials, options):
     # Per answer the cost has curvatures near 1, so that the first step, down the bare gradient, is a sensible one.
     answers = jnp.sum(trials.mask, dtype=gp.likelihood.noise.dtype) + 1.0
+    objective = _closed if options.inference == "laplace" else _differentiated
+    fn, expand = objective(gp, trials, options, answers)
 
-    def cost(coordinates, _):
-        model = _model(coordinates, gp)
-        evidence, certified = _evidence(model, trials, inference)
-        prior = log_prior(model, gp, learn) if weak_priors else jnp.zeros_like(evidence)
-        return -(evidence + prior) / answers, (evidence, certified)
-
-    def ended(start):
-        solution = optx.minimise(cost, TrustRegionNewton(), start, has_aux=True, max_steps=max_steps, throw=False)
-        evidence, certified = solution.aux
-        # An evidence without its certificate is no evidence: such an end never wins.
-        end = solution.state.here
-        value = jnp.where(certified & jnp.isfinite(end.value), end.value, jnp.inf)
+    def ended(known, start):
+        solution = optx.minimise(
+            fn,
+            TrustRegionNewton(),
+            start,
+            has_aux=True,
+            max_steps=options.max_steps,
+            throw=False,
+            options=expand | {"known": known},
+        )
+        evidence, certified = solution.aux[:2]
+        # An evidence without its certificate is no evidence: such an end never wins. Nor one that is known already.
+        end, joined = solution.state.here, arrives(solution.value, solution.state.move, known)
+        value = jnp.where(certified & jnp.isfinite(end.value) & ~joined, end.value, jnp.inf)
         done = (solution.result == optx.RESULTS.successful) & certified
         flat = eigh(end.hessian)[0][0] * answers < _FLAT
-        return solution.value, value, evidence, done, flat, jnp.asarray(solution.stats["num_steps"])
+        found = jnp.where(done & ~joined, ravel_pytree(solution.value)[0], jnp.nan)
+        known = jnp.concatenate([known[1:], found[None, :]])
+        return known, (solution.value, value, evidence, done, flat, jnp.asarray(solution.stats["num_steps"]))
 
-    begin = _coordinates(gp, learn)
-    # One search after the other: each stops when it is done, where a batch would wait for its slowest.
-    ends, values, evidences, done, flat, steps = jax.lax.map(ended, _spread(begin, starts))
+    begin = _coordinates(gp, options.learn)
+    # One search after the other: each stops when it is done, or on its way to where an earlier one ended.
+    unknown = jnp.full((options.starts, ravel_pytree(begin)[0].size), jnp.nan, answers.dtype)
+    _, (ends, values, evidences, done, flat, steps) = jax.lax.scan(ended, unknown, _spread(begin, options.starts))
     best = jnp.argmin(values)
     chosen = jax.tree.map(lambda leaf: leaf[best], ends)
     moved = [jnp.max(jnp.abs(chosen[k] - begin[k])) for k in chosen if k != "first" and chosen[k].size]
     runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | flat[best]
-    return Learned(_model(chosen, gp), evidences[best], steps[best], done[best], runaway, learn)
+    return Learned(_model(chosen, gp), evidences[best], steps[best], done[best], runaway, options.learn)
+
+
+def _differentiated(gp, trials, options, answers):
+    """The cost, by automatic differentiation."""
+
+    def cost(coordinates, _):
+        model = _model(coordinates, gp)
+        evidence, certified = _evidence(model, trials, options.inference)
+        prior = log_prior(model, gp, options.learn) if options.weak_priors else jnp.zeros_like(evidence)
+        return -(evidence + prior) / answers, (evidence, certified)
+
+    return cost, {}
+
+
+def _closed(gp, trials, options, answers):
+    """The cost with Laplace's evidence, by its closed derivatives; the modes are sought from the last ones."""
+
+    def prior(coordinates):
+        return log_prior(_model(coordinates, gp), gp, options.learn)
+
+    def expand(coordinates, last, aux):
+        flat, restore = ravel_pytree(coordinates)
+        ahead = flat - ravel_pytree(last)[0]
+        _, _, weights, moved = aux
+        found = _people(gp, trials, coordinates, weights + moved @ ahead)
+        value, gradient, hessian = (jnp.sum(part, axis=0) for part in found[:3])
+        evidence = value
+        if options.weak_priors:
+            value, gradient = value + prior(coordinates), gradient + jax.grad(lambda at: prior(restore(at)))(flat)
+            hessian = hessian + jax.hessian(lambda at: prior(restore(at)))(flat)
+        kept = evidence, jnp.all(found.certified), found.weights, found.moved
+        return -value / answers, -gradient / answers, -hessian / answers, kept
+
+    def cost(coordinates, _):
+        nothing = jnp.zeros(trials.q.shape, answers.dtype)
+        count = ravel_pytree(coordinates)[0].size
+        kept = jnp.zeros_like(answers), jnp.zeros((), bool), nothing, jnp.zeros((*nothing.shape, count), answers.dtype)
+        value, _, _, kept = expand(coordinates, coordinates, kept)
+        return value, kept
+
+    return cost, {"expand": expand}
+
+
+@one_at_a_time
+def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: Float[Array, " n"]) -> Evidence:
+    """One person's evidence by Laplace's method, expanded in the coordinates, which are in alphabetical order.
+
+    `start`: weights near which the mode is sought.
+    """
+    own = {name: value for name, value in coordinates.items() if name in _OWN}
+    shape = {name: value for name, value in coordinates.items() if name not in _OWN}
+    (flat_own, restore_own), (flat_shape, restore_shape) = ravel_pytree(own), ravel_pytree(shape)
+
+    def covariance(at):
+        return gram(_model(own | restore_shape(at), gp).kernel, trials.x, trials.x)
+
+    def terms(at):
+        return OrdinalTerms(_model(restore_own(at) | shape, gp).likelihood, trials.q, trials.mask)
+
+    return laplace_evidence(covariance, terms, flat_own.astype(start.dtype), flat_shape.astype(start.dtype), start)
+
+
+def _people(gp, trials, coordinates, starts):
+    if starts.shape[0] > 1:
+        return jax.vmap(person_evidence, in_axes=(None, None, 0, 0))(gp, coordinates, trials, starts)
+    alone = person_evidence(gp, coordinates, jax.tree.map(lambda leaf: leaf[0], trials), starts[0])
+    return jax.tree.map(lambda leaf: leaf[None], alone)
 
 
 def _evidence(gp, trials, inference):

@@ -38,13 +38,13 @@ from hilbo.gaussian import (
 )
 from hilbo.linalg import cholesky, solve_lower, solve_lower_transposed
 
-__all__ = ["Pointwise", "Terms", "laplace"]
+__all__ = ["Mode", "Pointwise", "Terms", "find_mode", "laplace"]
 
 Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 """Log-likelihood terms l_i(eta_i), their slopes l_i' and curvatures -l_i'' >= 0; [`Pointwise`][] derives the latter."""
 
 
-_PLAIN_STEPS = 20
+_PLAIN_STEPS, _STEPS = 20, 200
 
 
 class Pointwise(eqx.Module):
@@ -67,7 +67,7 @@ def laplace(
     terms: Terms,
     *,
     start: Float[Array, " n"] | None = None,
-    max_steps: int = 200,
+    max_steps: int = _STEPS,
 ) -> GaussianPosterior:
     """Approximate p(eta | data) by a Gaussian at its mode.
 
@@ -82,7 +82,7 @@ def laplace(
     read `certificate.converged`.
     """
     start = jnp.zeros_like(covariance[0]) if start is None else start
-    mode, residual, tolerance, iterations, changed = _find_mode(terms, covariance, start, max_steps)
+    mode, residual, tolerance, iterations, changed = find_mode(terms, covariance, start, max_steps)
     values, gradient, curvature = terms(mode)
     inverse, log_determinant = inverse_and_log_determinant(covariance, curvature)
     fixed = jax.lax.stop_gradient((covariance, curvature))
@@ -106,7 +106,7 @@ def laplace(
 # --- the mode
 
 
-class _Mode(NamedTuple):
+class Mode(NamedTuple):
     """The mode, its residual and the tolerance that was to be met, steps taken, and what the square root dropped."""
 
     eta: Float[Array, " n"]
@@ -117,12 +117,15 @@ class _Mode(NamedTuple):
 
 
 @eqx.filter_custom_jvp
-def _find_mode(terms, covariance, start, max_steps) -> _Mode:
-    """Under `vmap` one matrix after the other on CPUs, each stopping when it is done; elsewhere all at once in v."""
+def find_mode(terms, covariance, start, max_steps) -> Mode:
+    """The mode, sought from weights `start` and then, if need be, from 0.
+
+    Under `vmap` one matrix after the other on CPUs, each stopping when it is done; elsewhere all at once in v.
+    """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
     def safe(arrays, covariance, start):
-        return _whitened_mode(eqx.combine(arrays, rest), covariance, start, max_steps)
+        return _whitened_mode(eqx.combine(arrays, rest), covariance, jnp.zeros_like(start), max_steps)
 
     def quick(arrays, covariance, start):
         found = _plain_mode(eqx.combine(arrays, rest), covariance, start, min(max_steps, _PLAIN_STEPS))
@@ -151,7 +154,7 @@ class _PlainState(NamedTuple):
     risen: Bool[Array, ""]
 
 
-def _plain_mode(terms, covariance, start, max_steps) -> _Mode:
+def _plain_mode(terms, covariance, start, max_steps) -> Mode:
     """Full Newton steps on the weights, as long as the log posterior rises."""
     epsilon = jnp.finfo(start.dtype).eps
     tolerance = jnp.asarray(epsilon ** (2 / 3), start.dtype)
@@ -179,10 +182,10 @@ def _plain_mode(terms, covariance, start, max_steps) -> _Mode:
         step,
         _PlainState(start, start, -infinite, infinite, jnp.asarray(0), jnp.asarray(True)),
     )
-    return _Mode(last.eta, last.residual, tolerance, last.steps, jnp.zeros_like(tolerance))
+    return Mode(last.eta, last.residual, tolerance, last.steps, jnp.zeros_like(tolerance))
 
 
-def _whitened_mode(terms, covariance, start, max_steps) -> _Mode:
+def _whitened_mode(terms, covariance, start, max_steps) -> Mode:
     """Damped Newton steps in v."""
     root, changed = square_root(covariance)
     solution = optx.root_find(
@@ -196,14 +199,14 @@ def _whitened_mode(terms, covariance, start, max_steps) -> _Mode:
     )
     state = solution.state
     steps = jnp.asarray(solution.stats["num_steps"])
-    return _Mode(solution.value, state.residual, state.tolerance, steps, changed)
+    return Mode(solution.value, state.residual, state.tolerance, steps, changed)
 
 
-@_find_mode.def_jvp
-def _find_mode_jvp(primals, tangents):
+@find_mode.def_jvp
+def find_mode_jvp(primals, tangents):
     """eta = K grad l(eta), hence (I + K W) d eta = d(K grad l) at fixed eta, and (I + K W)^-1 = I - K C."""
     terms, covariance, _, _ = primals
-    found = _find_mode(*primals)
+    found = find_mode(*primals)
     mode = found.eta
 
     def image(terms, matrix):
@@ -213,7 +216,7 @@ def _find_mode_jvp(primals, tangents):
     (_, curvature), (moved, _) = eqx.filter_jvp(image, (terms, covariance), tangents[:2])
     inverse, _ = inverse_and_log_determinant(covariance, curvature)
     nothing: Any = None  # the rest has no derivative
-    return found, _Mode(moved - covariance @ (inverse @ moved), nothing, nothing, nothing, nothing)
+    return found, Mode(moved - covariance @ (inverse @ moved), nothing, nothing, nothing, nothing)
 
 
 def _stationarity(eta, args):

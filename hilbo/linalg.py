@@ -17,12 +17,12 @@ __all__ = ["cholesky", "eigh", "one_at_a_time", "solve_lower", "solve_lower_tran
 
 
 def one_at_a_time(function: Callable) -> Callable:
-    """`function` of arrays with a rule for `vmap`: a loop on CPUs, the batched kernel elsewhere."""
+    """`function` of pytrees of arrays with a rule for `vmap`: a loop on CPUs, the batched kernel elsewhere."""
     mapped = jax.custom_batching.custom_vmap(function)
 
     @mapped.def_vmap
     def rule(size, in_batched, *args):
-        whole = [a if b else jnp.broadcast_to(a, (size, *a.shape)) for a, b in zip(args, in_batched, strict=True)]
+        whole = jax.tree.map(lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape)), args, tuple(in_batched))
         out = jax.lax.platform_dependent(
             *whole, cpu=lambda *stacked: jax.lax.map(lambda row: mapped(*row), stacked), default=jax.vmap(function)
         )

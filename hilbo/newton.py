@@ -18,13 +18,14 @@ import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.linalg import eigh
 
-__all__ = ["TrustRegionNewton"]
+__all__ = ["TrustRegionNewton", "arrives"]
 
 _FIRST_RADIUS = 1.0
+_SAME = 1e-2  # points so near to each other lie below the same minimum: of functions of logarithms, that is
 _ENOUGH, _GOOD = 1e-4, 0.75  # shares of the promised fall: to take a step, and to trust the model further
 
 
@@ -46,7 +47,13 @@ class _State(eqx.Module):
 
 
 class TrustRegionNewton(optx.AbstractMinimiser):
-    """For `optimistix.minimise`; `options` may hold the bounds "lower" and "upper", each like the variables.
+    """For `optimistix.minimise`. `options` may hold
+
+    - "lower" and "upper": bounds, each like the variables;
+    - "expand": a function of the variables, those of the best point so far, and what the function returned there
+      besides its value; it gives value, gradient (p,) and Hessian (p, p) in the variables as one vector, and that
+      besides, in place of automatic differentiation;
+    - "known": ends (k, p) of other searches, NaN where there is none. A search whose next step goes to one ends.
 
     Ends where no free component of the gradient is above `atol`, or where the radius is below `resolution` (a kink of
     the function, or its rounding); `state.here` is the expansion at the end. A start at which the function is not
@@ -73,7 +80,12 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         del tags
         flat, restore = ravel_pytree(y)
         ahead = flat + state.move
-        there = _expand(lambda at: fn(restore(at), args), ahead)
+        expand = options.get("expand")
+        there = (
+            _expand(lambda at: fn(restore(at), args), ahead)
+            if expand is None
+            else _Expansion(*expand(restore(ahead), restore(flat), state.here.aux))
+        )
         achieved = state.here.value - there.value
         taken = achieved > _ENOUGH * state.promised  # never if it is not a number
         good = taken & jnp.isfinite(achieved) & (achieved > _GOOD * state.promised)
@@ -84,14 +96,22 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         return restore(flat), _State(here, *_plan(here, flat, radius, *bounds)), here.aux
 
     def terminate(self, fn, y, args, options, state, tags):
-        """Stationary within the box, or stuck."""
-        del fn, y, args, options, tags
-        return (state.pressing <= self.atol) | (state.radius < self.resolution), optx.RESULTS.successful
+        """Stationary within the box, or stuck, or on the way to a known end."""
+        del fn, args, tags
+        ended = (state.pressing <= self.atol) | (state.radius < self.resolution)
+        known = options.get("known")
+        return (ended if known is None else ended | arrives(y, state.move, known)), optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Nothing to add."""
         del fn, args, options, state, tags, result
         return y, aux, {}
+
+
+def arrives(y: PyTree, move: Float[Array, " p"], known: Float[Array, "k p"]) -> Bool[Array, ""]:
+    """Whether this step from `y` goes to one of the known ends."""
+    ahead = ravel_pytree(y)[0] + move
+    return jnp.any(jnp.max(jnp.abs(known - ahead[None, :]), axis=1) < _SAME)
 
 
 def _expand(function, at):

@@ -30,7 +30,7 @@ from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
 
-__all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
+__all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "OrdinalTerms", "Posterior", "Trials", "fit"]
 
 _SOUGHT = {
     "laplace": "Laplace mode",
@@ -122,7 +122,7 @@ def _check_arrays(points, answers):
         raise InputError("Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).")
 
 
-class _OrdinalTerms(eqx.Module):
+class OrdinalTerms(eqx.Module):
     """The answers as log-likelihood terms with slopes and curvatures, 0 where there is no answer."""
 
     likelihood: OrdinalProbit
@@ -300,7 +300,7 @@ def _fit(gp, trials, start, inference):
         return Posterior(gp, trials, (ep if inference == "ep" else ep_corrected)(covariance, tilted, start=start))
     if inference == "exact":
         return Posterior(gp, trials, _exactly(gp.likelihood, trials, covariance))
-    terms = _OrdinalTerms(gp.likelihood, trials.q, trials.mask)
+    terms = OrdinalTerms(gp.likelihood, trials.q, trials.mask)
     return Posterior(gp, trials, laplace(covariance, terms, start=start))
 
 
