@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo import cli_device, cli_material
+from hilbo import cli_device, cli_live, cli_material
 from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, results, start
 from hilbo.errors import InputError
 
@@ -135,6 +135,8 @@ def robustness(
 app.command()(cli_material.identify)
 app.command()(cli_material.passivity)
 app.add_typer(cli_device.app, name="device")
+app.command()(cli_live.session)
+app.command()(cli_live.doctor)
 
 
 @app.command()

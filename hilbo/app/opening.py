@@ -1,0 +1,74 @@
+"""From what was asked for on the command line to a hub: study, plan, log, choosing; compiled before the device runs."""
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from hilbo.app.hub import Hub
+from hilbo.app.slices import Maps
+from hilbo.config import Study
+from hilbo.errors import InputError
+from hilbo.event_log import EventLog, log_name
+from hilbo.live_choice import LiveChooser
+from hilbo.live_session import Header
+from hilbo.study_plan import header_for
+
+__all__ = ["Wanted", "opened"]
+
+
+class Wanted(NamedTuple):
+    """A session as a person asks for it."""
+
+    study: Path
+    participant: str
+    session: str = "1"
+    seed: int = 0
+    logs: Path = Path("logs")
+    plan: Path | None = None
+    material: str | None = None
+    resume: bool = False
+
+
+def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable[[str], Any]) -> tuple[Hub, EventLog]:
+    """The hub of a session, new or resumed, and its open log. Raises `InputError`."""
+    study = Study.load(wanted.study)
+    mechanics = study.space.mechanics
+    if mechanics is None:
+        raise InputError(f"{wanted.study}: has no [renderer], and a device nothing to render.")
+    log = _log(wanted, study)
+    try:
+        say("compiling what chooses")
+        chooser = LiveChooser(log.state)
+        chooser.warm()
+        maps = Maps(log.state)
+        maps.warm(log.state)
+        import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
+    except BaseException:
+        log.close()
+        raise
+    damping = max(_damping(study, block.material) for block in log.state.header.blocks)
+    return Hub(log, chooser, lambda: connect(damping), tag=_tag(log.state.header), maps=maps), log
+
+
+def _damping(study, material) -> float:
+    return float((study if material is None else study.material(material)).space.mechanics.damping)
+
+
+def _log(wanted, study) -> EventLog:
+    header = header_for(study, wanted.participant, wanted.session, wanted.seed, materials=(wanted.material,))
+    path = wanted.logs / log_name(header)
+    if wanted.resume:
+        return EventLog.resume(path, study)
+    if path.exists():
+        raise InputError(
+            f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
+        )
+    return EventLog.create(path, study, header)
+
+
+def _tag(header: Header) -> str:
+    """What this session's trials are known by in browsers."""
+    return hashlib.sha256(msgspec.json.encode(header)).hexdigest()[:12]
