@@ -160,7 +160,14 @@ DEFINITIONS = {
 """The paper's, verbatim."""
 
 TEXTS = {
+    "lang": "en",
     "title": "Feel and compare",
+    "hello": "Feel one after the other, then say how similar they were. There is no right or wrong answer.",
+    "start": "Begin",
+    "space_key": "Space",
+    "let_go": "Let go of both handles, please",
+    "trouble": "One moment, please. The experimenter is looking after the device.",
+    "moved": "This session goes on in another window.",
     "question": "What is the similarity between the test and the reference?",
     "question_a": "What is the similarity between rendering A and the reference?",
     "question_b": "What is the similarity between rendering B and the reference?",

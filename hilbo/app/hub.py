@@ -51,8 +51,8 @@ class Watcher:
 
 
 class Hub:
-    """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` opens the device, `maps` makes the
-    slices of the posterior, if anything does.
+    """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` opens the device, `maps` what makes
+    the slices of its posterior.
 
     `invite`, once set, makes a new link for the participant; `gap` (s) is the pause between two trials, `tag` is what trials of
     this session are known by in browsers.
@@ -65,7 +65,7 @@ class Hub:
         connect: Callable[[], Any],
         *,
         tag: str,
-        maps: Any = None,
+        maps: Callable[[LiveSession], Any] | None = None,
         gap: float = 0.7,
     ):
         self.log, self.chooser, self.tag, self.gap = log, chooser, tag, gap
@@ -77,7 +77,8 @@ class Hub:
         self.recent: deque = deque(maxlen=200)
         self.delays: list[dict[str, float]] = []  # s, from each answer on
         self.invite: Callable[[], dict[str, str]] | None = None
-        self._connect, self._maps = connect, maps
+        self._connect, self._make_maps, self._maps = connect, maps, None
+        self.warm: asyncio.Future | None = None
         self._watchers: list[Watcher] = []
         self._disk = ThreadPoolExecutor(1, "hilbo-disk")
         self.compute = ThreadPoolExecutor(1, "hilbo-choice")
@@ -97,9 +98,19 @@ class Hub:
         self.rig = await self._loop.run_in_executor(
             self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed)
         )
+        self.warm = self._loop.run_in_executor(self.compute, self._warm)
         await self._device_changed(self.rig.snapshot)
         self._tasks = [asyncio.create_task(self._watch_time())]
         self.runner.restart()
+
+    def _warm(self) -> None:
+        """Compile what choosing and drawing need; nothing is rendered before it is done."""
+        self.chooser.warm()
+        if self._make_maps is not None:
+            maps = self._make_maps(self.state)
+            maps.warm(self.state)
+            self._maps = maps
+        self._loop.call_soon_threadsafe(self.publish)
 
     async def close(self) -> None:
         """Stop the device, let go of everything."""
@@ -256,11 +267,12 @@ class Hub:
         return {"done": "clear"}
 
     async def map(self) -> dict[str, Any] | None:
-        """Slices of the posterior, made once for each state of the answers; None where there is nothing to show."""
+        """Slices of the posterior, made once for each state of the answers; None where there is nothing to show, empty
+        while they are being prepared."""
         state = self.state
         version = views.map_version(state)
         if self._maps is None:
-            return None
+            return {}
         if self._map is None or self._map[0] != version:
             self._map = version, await self._loop.run_in_executor(self._drawing, self._maps.slices, state)
         return self._map[1]
@@ -291,6 +303,11 @@ class Hub:
             if watcher.role == role:
                 watcher.ended, watcher.why = True, self.state.study.session.text("moved")
                 watcher.news.set()
+
+    @property
+    def draws(self) -> bool:
+        """Whether there are slices to be had."""
+        return self._maps is not None
 
     @property
     def present(self) -> bool:

@@ -40,17 +40,14 @@ def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable
         raise InputError(f"{wanted.study}: has no [renderer], and a device nothing to render.")
     log = _log(wanted, study)
     try:
-        say("compiling what chooses")
+        say("preparing what chooses")
         chooser = LiveChooser(log.state)
-        chooser.warm()
-        maps = Maps(log.state)
-        maps.warm(log.state)
         import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
     except BaseException:
         log.close()
         raise
     damping = max(_damping(study, block.material) for block in log.state.header.blocks)
-    return Hub(log, chooser, lambda: connect(damping), tag=_tag(log.state.header), maps=maps), log
+    return Hub(log, chooser, lambda: connect(damping), tag=_tag(log.state.header), maps=Maps), log
 
 
 def _damping(study, material) -> float:

@@ -57,7 +57,7 @@ class Runner:
         if self._task is not None:
             self._task.cancel()
             self._task = None
-        self.step = None
+        self.stage, self.step = "idle", None
 
     def wake(self) -> None:
         """What is waited for may have happened."""
@@ -128,6 +128,7 @@ class Runner:
         await self._device_ready()
         loading = asyncio.ensure_future(self._load(trial, _next_side(steps, 0), stop))
         try:
+            await asyncio.shield(hub.warm)  # a long arithmetic start, and a device that renders, do not go together
             while not hub.begun:
                 self._wake.clear()
                 self._at("hello")

@@ -123,7 +123,7 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "log": [_log_line(event) for event in list(hub.recent)[:60]],
         "alert": hub.alert or (runner.trouble if runner.stage == "trouble" else None),
         "may": _may(hub),
-        "map_version": map_version(state),
+        "map_version": map_version(state) + ("" if hub.draws else " later"),
         "participant_here": hub.present,
         "delays": hub.delays[-1] if hub.delays else None,
         "whole": experimenter_view(state),
@@ -155,7 +155,8 @@ def _trial_rows(hub, trial):
         rows.append(["Chosen by", f"{choice['by']}, mean {choice['mean']:.3f} ± {choice['sd']:.3f}"])
         rows.append(["Answers", ", ".join(f"{n} {100 * p:.0f} %" for n, p in choice["probabilities"].items())])
         certificate = choice["certificate"]
-        rows.append(["Certificate", ", ".join(f"{name} {_short(value)}" for name, value in certificate.items())])
+        words = "fit converged" if certificate["converged"] else "fit NOT converged"
+        rows.append(["Certificate", f"{words}, residual {certificate['residual']:.1g}"])
     margin = choice.get("margin")
     if margin is not None:
         many = margin if isinstance(margin, dict) else {"": margin}
@@ -169,10 +170,6 @@ def _trial_rows(hub, trial):
 
 def _set_words(values):
     return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
-
-
-def _short(value):
-    return f"{value:.2g}" if isinstance(value, float) else str(value)
 
 
 def _device(hub):
@@ -207,18 +204,19 @@ def _may(hub):
 
 def _table(state: LiveSession):
     names = list(state.study.space.names)
+    chosen = any(not trial.sets for trial in state.trials)
+    width = len(names) if chosen else 1
     rows = []
     for trial in reversed(state.trials):
         kind = "now" if trial.status == "pending" else "" if trial.status == "answered" else "voided"
         answer = " ".join((trial.values or {}).values())
         place = trial.data["phase"][0].upper() + str(trial.number)
         if trial.sets:
-            cells = [place, " / ".join(trial.sets.values()), answer or trial.status]
+            cells = [place, " / ".join(trial.sets.values()), *[""] * (width - 1), answer or trial.status]
         else:
             cells = [place, *(trial.renderings["a"][name] for name in names), answer or trial.status]
         rows.append({"kind": kind, "cells": cells})
-    planned = any(trial.sets for trial in state.trials)
-    return {"head": ["", "sets", "answer"] if planned else ["", *names, "answer"], "rows": rows}
+    return {"head": ["", *names, "answer"] if chosen else ["", "sets", "answer"], "rows": rows}
 
 
 def _log_line(event):
