@@ -158,14 +158,16 @@ def test_a_voided_answer_can_be_restored_until_its_place_is_filled():
 
 
 def test_a_pause_in_mid_trial_begins_the_trial_again():
-    driver = to_first_answerable()
+    driver = to_first_answerable("validation")
     trial = driver.state.pending
-    driver.log(live.present(driver.state, trial.id, 0, True, 1.0))
+    for step in (0, 1):
+        driver.log(live.present(driver.state, trial.id, step, True, 1.0))
+    assert driver.state.pending.felt == {"a"}
     driver.do("pause", 0)
     assert driver.state.screen == "paused" and participant_view(driver.state)["screen"] == "paused"
     driver.do("resume", 0)
     again = driver.state.pending
-    assert (again.id, again.presentation, again.step) == (trial.id, 2, None)
+    assert (again.id, again.presentation, again.step, again.felt) == (trial.id, 2, None, frozenset())
 
 
 def test_an_answered_trial_can_be_repeated_and_does_not_count():
