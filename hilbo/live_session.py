@@ -9,7 +9,7 @@ Pure: `at` is the time in s since the epoch. `hilbo.live_state` says what an eve
 
 import math
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from hilbo.live_records import Block, Event, Header, Need, Planned, RefusedError, Trial
 from hilbo.live_state import LiveSession, Screen
@@ -43,6 +43,7 @@ __all__ = [
 ]
 
 
+@runtime_checkable
 class Chooser(Protocol):
     """What finds renderings: `hilbo.live_choice.LiveChooser`."""
 
@@ -92,18 +93,18 @@ def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> E
 
 def answer(
     state: LiveSession,
-    trial: int,
-    client: str,
-    values: Mapping[str, str],
+    trial: Any,
+    client: Any,
+    values: Any,
     at: float,
     *,
-    browser: Mapping[str, float] | None = None,
+    browser: Any = None,
     felt: bool = True,
 ) -> Event | None:
     """A participant's answer; None if this very answer (trial and client id) has been accepted already.
 
     `values`: class_a, class_b (responses of the study), preferred ("a" or "b"), as the phase asks. `browser`: its time
-    and the response time, s. `felt`: refuse an answer to what was not felt. Raises RefusedError.
+    and the response time, s; numbers by name. `felt`: refuse an answer to what was not felt. Raises RefusedError.
     """
     if not isinstance(trial, int) or isinstance(trial, bool) or not isinstance(client, str) or not client:
         raise RefusedError("bad-answer", "an answer needs the number of its trial and the id of its client.")
@@ -120,8 +121,7 @@ def answer(
     if felt and found.felt != frozenset(found.renderings):
         raise RefusedError("unfelt", f"trial {trial} has not been felt yet.")
     _check_values(state, found, values)
-    times = {key: float(value) for key, value in (browser or {}).items() if math.isfinite(value)}
-    return _event(state, "answer", at, id=trial, client=client, values=dict(values), browser=times)
+    return _event(state, "answer", at, id=trial, client=client, values=dict(values), browser=_times(browser))
 
 
 def undo(state: LiveSession, at: float) -> Event:
@@ -254,11 +254,22 @@ def _live(state, id):
     return found
 
 
+def _times(browser):
+    if browser is None:
+        return {}
+    pairs = browser.items() if isinstance(browser, Mapping) else [("", None)]
+    if len(pairs) > 8 or not all(
+        isinstance(name, str) and isinstance(value, int | float) and math.isfinite(value) for name, value in pairs
+    ):
+        raise RefusedError("bad-answer", "the browser's times must be numbers of seconds.")
+    return {name: float(value) for name, value in pairs}
+
+
 def _check_values(state, trial, values):
     asks = protocol(state.study.session, state.header.blocks[trial.block].phase).asks
     if not isinstance(values, Mapping) or set(values) != set(asks):
         raise RefusedError("bad-answer", f"an answer to trial {trial.id} has {', '.join(asks)}, and nothing else.")
     for ask in asks:
         allowed = ("a", "b") if ask == "preferred" else state.study.responses
-        if values[ask] not in allowed:
+        if not isinstance(values[ask], str) or values[ask] not in allowed:
             raise RefusedError("bad-answer", f"{ask} must be one of {', '.join(allowed)}.")

@@ -203,7 +203,7 @@ def _stimulus(state, event):
 
 def _answered(state, event):
     data = event.data
-    facts = {"seq": event.seq, "time": event.time, **data["browser"]}
+    facts = {"seq": event.seq, "time": event.time, "browser": data["browser"]}
     return state.with_trial(
         data["id"], status="answered", values=data["values"], client=data["client"], answered=facts, on=None
     )
