@@ -96,8 +96,18 @@ def simulate(
     seed: Seed = 0,
     force: Force = False,
     as_json: Json = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="One person's session instead: real server, pages and simulated device.")
+    ] = False,
+    phase: Annotated[str, typer.Option(help="With --live: optimisation, validation or aggregate-best.")] = (
+        "optimisation"
+    ),
+    seconds: Annotated[float | None, typer.Option(min=0.05, help="With --live: duration of every step.")] = None,
 ) -> None:
-    """Simulate a study whose truth is known, and aggregate it."""
+    """Simulate a study whose truth is known, and aggregate it; or hold one session without people."""
+    if live:
+        _simulate_live(preset, study, out, phase, seconds, seed, as_json)
+        return
     with results(out, force) as folder, progress() as say:
         content = _simulate(preset, study, participants, seed, folder, say)
     finish(content, out, as_json)
@@ -212,6 +222,16 @@ def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
     truth = np.asarray(chosen.space.to_unit(np.array([population.truth[name] for name in chosen.space.names])))
     table["category"] = table["response"].map({label: i for i, label in enumerate(chosen.responses)})
     return _aggregate(chosen, cohort_of(table, chosen), folder, seed, say, truth)
+
+
+def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
+    import json
+    from importlib.resources import files
+
+    source = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if study is None else study
+    with progress() as say:
+        found = cli_live.live(source, out, phase, seconds, seed, say)
+    print(json.dumps(found, indent=2) if as_json else f"{found['answers']} answers in {found['seconds']} s: {out}")
 
 
 def _print_demo(real, simulated, out) -> None:

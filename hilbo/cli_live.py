@@ -98,7 +98,7 @@ def _serve(hub, place, served, as_json) -> None:
 
     hub.invite = invite
     try:
-        serve.serve(place, application(hub, place.gate), lambda: _started(hub, place, served, as_json))
+        serve.serve(place, application(hub, place.gate), lambda _: _started(hub, place, served, as_json))
     except DeviceError as error:
         fail(str(error), 1)
 
@@ -171,5 +171,23 @@ def doctor(
         raise typer.Exit(1)
 
 
-def live(*arguments: Any) -> None:
-    """Placeholder."""
+def live(study: Path, out: Path, phase: str, seconds: float | None, seed: int, say: Any) -> dict[str, Any]:
+    """A whole session without people, into a new folder: `hilbo simulate --live`."""
+    _need_extra()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: exists already; choose another --out.")
+    start()
+    from hilbo.app.rehearsal import rehearse
+    from hilbo.app.robot import find_browser
+    from hilbo.trial_protocols import PHASES
+
+    if phase not in PHASES[1:]:
+        raise InputError(f'--phase is "{phase}", it must be one of {", ".join(PHASES[1:])}.')
+    if find_browser() is None:
+        raise InputError(
+            "--live needs Chromium and playwright; install them (Debian: apt install chromium; pip install"
+            " 'hilbo[browser]')."
+        )
+    return rehearse(
+        study, out, phase=phase, seconds=seconds, warm_up=None if seconds is None else 3, seed=seed, say=say
+    )

@@ -37,7 +37,7 @@ class Check(NamedTuple):
 
 
 def checks(study: Path | None, connect: Callable[[float | None], Any], folder: Path, port: int) -> Iterator[Check]:
-    """One check after the other. `connect(damping)` opens the device; `folder` is where logs go; `port` the server's."""
+    """One check after the other. `connect(damping)` opens the device, logs go to `folder`, `port` is the server's."""
     yield _versions()
     yield _disk(folder)
     yield _port(port)

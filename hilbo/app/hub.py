@@ -9,6 +9,7 @@ choosing's, and the server's own. What a participant does next is in `runner`.
 
 import asyncio
 import contextlib
+import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -33,6 +34,7 @@ COMMANDS = ("pause", "resume", "repeat", "undo", "void", "abort", "note", "estop
 _STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
 _LATER = 1.0  # s between two looks at the clock
 _JUMP = 3.0  # s by which the clock, or the wait for it, may be off before somebody must have closed the laptop
+_SILENT = 10.0  # s without a word from a program in the participant's place until it counts as gone
 _GONE = 3.0  # s without a participant's page until a trial that is being felt is begun again
 
 
@@ -54,8 +56,8 @@ class Hub:
     """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` opens the device, `maps` what makes
     the slices of its posterior.
 
-    `invite`, once set, makes a new link for the participant; `gap` (s) is the pause between two trials, `tag` is what trials of
-    this session are known by in browsers.
+    `invite`, once set, makes a new link for the participant; `gap` (s) is the pause between two trials, `tag` is what
+    trials of this session are known by in browsers.
     """
 
     def __init__(
@@ -85,6 +87,7 @@ class Hub:
         self._lock: asyncio.Lock | None = None
         self._tasks: list[asyncio.Task] = []
         self._absent: float | None = None
+        self._asked = -math.inf
         self._map: tuple[str, Any] | None = None
         self._drawing = ThreadPoolExecutor(1, "hilbo-map")
         self._device_was = ""
@@ -311,8 +314,14 @@ class Hub:
 
     @property
     def present(self) -> bool:
-        """Whether a participant's page is open."""
+        """Whether a participant's page is open, or a program in its place has asked for something lately."""
+        if time.monotonic() - self._asked < _SILENT:
+            return True
         return any(w.role == "participant" and not w.ended for w in self._watchers)
+
+    def heard(self) -> None:
+        """A program asks in the participant's place."""
+        self._asked = time.monotonic()
 
     def _check_page(self, page) -> None:
         """Only a participant's newest window counts; a program with a key is one."""

@@ -1,7 +1,9 @@
 """From what was asked for on the command line to a hub: study, plan, log, choosing; compiled before the device runs."""
 
 import hashlib
+import json
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +16,7 @@ from hilbo.errors import InputError
 from hilbo.event_log import EventLog, log_name
 from hilbo.live_choice import LiveChooser
 from hilbo.live_session import Header
-from hilbo.study_plan import header_for
+from hilbo.study_plan import header_for, planned_header
 
 __all__ = ["Wanted", "opened"]
 
@@ -55,7 +57,7 @@ def _damping(study, material) -> float:
 
 
 def _log(wanted, study) -> EventLog:
-    header = header_for(study, wanted.participant, wanted.session, wanted.seed, materials=(wanted.material,))
+    header = _header(wanted, study)
     path = wanted.logs / log_name(header)
     if wanted.resume:
         return EventLog.resume(path, study)
@@ -64,6 +66,27 @@ def _log(wanted, study) -> EventLog:
             f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
         )
     return EventLog.create(path, study, header)
+
+
+def _header(wanted, study) -> Header:
+    facts = {"protocol_number": study.session.protocol_number, "versions": _versions()}
+    if wanted.plan is None:
+        place = (wanted.participant, wanted.session, wanted.seed)
+        return header_for(study, *place, materials=(wanted.material,), **facts)
+    try:
+        plan = json.loads(wanted.plan.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{wanted.plan}: cannot be read ({error.strerror}); check the path.") from error
+    except ValueError as error:
+        raise InputError(f"{wanted.plan}: is no plan ({error}); make one with `hilbo plan`.") from error
+    try:
+        return planned_header(plan, study, wanted.participant, **facts)
+    except InputError as error:
+        raise InputError(f"{wanted.plan}: {error}") from error
+
+
+def _versions() -> dict[str, str]:
+    return {part: metadata.version(part) for part in ("hilbo", "jax", "jaxlib", "numpy")}
 
 
 def _tag(header: Header) -> str:

@@ -24,7 +24,7 @@ _SOON = 0.05  # s
 
 
 class Runner:
-    """The stage of a `Hub`: `stage` says what it is at, for the views; `ends` when the present step does (monotonic)."""
+    """Leads a `Hub` on: `stage` says what it is at, for the views; `ends` when the present step does (monotonic)."""
 
     def __init__(self, hub: Any):
         self.hub = hub
@@ -38,6 +38,7 @@ class Runner:
         self._wake = asyncio.Event()
         self._rendering = False
         self._ahead: Future | None = None
+        self.fits_after = 0  # fits that a participant had to wait for
         self._mechanics: dict[str | None, Any] = {}
 
     def key(self) -> tuple:
@@ -104,8 +105,10 @@ class Runner:
         hub = self.hub
         state = hub.state
         loop = asyncio.get_running_loop()
-        begun = time.perf_counter()
+        begun, fits = time.perf_counter(), getattr(hub.chooser, "fits", 0)
         event = await loop.run_in_executor(hub.compute, live_session.propose, state, hub.chooser, time.time())
+        if "came" in self.clock:
+            self.fits_after += getattr(hub.chooser, "fits", 0) - fits
 
         def make(newest, at):
             if newest.seq == event.seq - 1:

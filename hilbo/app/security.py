@@ -8,6 +8,7 @@ Host and Origin of every request are compared with the addresses that the server
 else's that reaches this computer by a name of its own (DNS rebinding) or by a form is refused, whatever cookies it has.
 """
 
+import contextlib
 import hashlib
 import hmac
 import json
@@ -105,14 +106,9 @@ def _kept(file: Path | None) -> dict[Role, str]:
 def lan_addresses() -> list[str]:
     """Addresses of this computer in its networks, the one towards other networks first; no packet is sent."""
     found = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # reserved for documentation
-            found.append(probe.getsockname()[0])
-        except OSError:
-            pass
-    try:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+        probe.connect(("192.0.2.1", 9))  # reserved for documentation
+        found.append(probe.getsockname()[0])
+    with contextlib.suppress(OSError):
         found += [info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
-    except OSError:
-        pass
     return [str(address) for address in dict.fromkeys(found) if not str(address).startswith("127.")]

@@ -62,8 +62,8 @@ def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> P
     return Place(listening, addresses, keys)
 
 
-def serve(place: Place, application: Any, started: Callable[[], Any]) -> None:
-    """Answers until Ctrl-C or SIGTERM. `started` is called once the hub is open. Failures of opening are raised."""
+def serve(place: Place, application: Any, started: Callable[[Callable[[], None]], Any]) -> None:
+    """Answers until Ctrl-C or SIGTERM, or until what `started` was given, once the hub was open, is called."""
     import uvicorn
 
     config = uvicorn.Config(
@@ -76,7 +76,10 @@ def serve(place: Place, application: Any, started: Callable[[], Any]) -> None:
     async def startup(sockets=None):
         await before(sockets=sockets)
         if not server.should_exit:
-            started()
+            started(stop)
+
+    def stop() -> None:
+        server.should_exit = True
 
     server.startup = startup  # type: ignore[method-assign]
     try:

@@ -30,6 +30,7 @@ from hilbo.app import messages
 from hilbo.app.hub import COMMANDS, PRESSES, Hub, NotNowError
 from hilbo.app.security import COOKIES, Gate, Role
 from hilbo.errors import InputError
+from hilbo.event_log import LogError
 
 __all__ = ["application"]
 
@@ -143,11 +144,15 @@ def _for(hub, gate):
 
     def guarded(role: Role, handler: Callable):
         async def handle(request: Request) -> Response:
-            key = _bearer(request) or request.cookies.get(COOKIES[role])
-            if not gate.admits(role, key):
+            program = _bearer(request)
+            if not gate.admits(role, program or request.cookies.get(COOKIES[role])):
                 return _error(401, "Open the link of this session first; this page is no longer part of it.")
+            if program and role == "participant":
+                hub.heard()
             try:
                 return await handler(hub, role, request)
+            except LogError as error:
+                return _json({"error": str(error)}, 503)
             except NotNowError as error:
                 return _json({"error": str(error), "view": hub.view(role)}, 409)
             except InputError as error:

@@ -84,9 +84,14 @@ def _slice(study, best, mean, feasible, pair, marks, levels, now):
         [round(float(v), 4) if ok else None for v, ok in zip(row, oks, strict=True)]
         for row, oks in zip(mean, feasible, strict=True)
     ]
-    held_words = ", ".join(held)
-    return {"across": names[across], "up": names[up], "held": held_words, "best": [float(best[across]), float(best[up])],
-            "mean": shown, "trials": trials}  # fmt: skip
+    return {
+        "across": names[across],
+        "up": names[up],
+        "held": ", ".join(held),
+        "best": [float(best[across]), float(best[up])],
+        "mean": shown,
+        "trials": trials,
+    }
 
 
 @eqx.filter_jit

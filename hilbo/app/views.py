@@ -125,7 +125,8 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "may": _may(hub),
         "map_version": map_version(state) + ("" if hub.draws else " later"),
         "participant_here": hub.present,
-        "delays": hub.delays[-1] if hub.delays else None,
+        "all_delays": hub.delays[-1000:],
+        "fits_after_an_answer": hub.runner.fits_after,
         "whole": experimenter_view(state),
     }
 
@@ -199,7 +200,7 @@ def _may(hub):
     found += ["repeat"] if begun else []
     found += ["undo"] if answered else []
     found += ["void"] if answered or begun else []
-    return found + ["abort"]
+    return [*found, "abort"]
 
 
 def _table(state: LiveSession):
