@@ -21,6 +21,7 @@ __all__ = ["Loaded", "Rig", "Snapshot"]
 _POLL = 0.1  # s between two looks at the device
 _NEAR = 0.01  # s between them while a set waits for the hand to leave
 _RETRY = 1.0  # s
+_PUSHED = 1.0  # s
 COUNTERS = ("holds", "estops", "overruns", "saturated", "slewed", "controlled", "input_held", "frames_dropped")
 
 
@@ -73,6 +74,10 @@ class Rig:
         """The set in force once nobody presses: `Loaded`; None if `stop` was set before that."""
         return self.do(lambda device: self._load(device, wanted, stop or self._ending))
 
+    def render(self) -> Future:
+        """The set in force, from now on; nothing where it is rendered already."""
+        return self.do(self._render)
+
     def estop(self) -> None:
         """Force to zero at once: overtakes everything that waits. Called from any thread but the event loop's."""
         self.device.estop()
@@ -90,11 +95,19 @@ class Rig:
             raise DeviceError(self.snapshot.lost)
         return self.device
 
+    def _render(self, device) -> None:
+        self._see(self._look())
+        if self.snapshot.state != "RUNNING":
+            device.start()
+
     def _load(self, device, wanted, stop):
+        patient = time.monotonic() + _PUSHED
         while True:
             self._see(self._look())
             if not self.snapshot.contact:
                 break
+            if time.monotonic() > patient and self.snapshot.state == "STOPPED" and device.in_force() is not None:
+                device.start()  # nothing but the last set's force brings a handle back that was left pressed
             if stop.wait(_NEAR) or self._ending.is_set():
                 return None
         begun = time.perf_counter()

@@ -1,8 +1,9 @@
 """What happens next in a session: propose, put on the device, lead through the steps, wait for the answer.
 
 One task at a time, begun anew whenever an event changes what is to be felt (an answer, a break, an undo, a HOLD …).
-Sets go over to the device out of contact only, while the participant feels the reference or nothing; the renderer runs
-during the steps that show a rendering, and is stopped after each. While the participant feels, the next proposal is
+Sets go over to the device out of contact only, while the participant feels the reference or nothing. The renderer runs
+from the first rendering to the next break or end: what is in force pushes the handle back when the hand leaves it, and
+is then changed. While the participant feels, the next proposal is
 made ready for every possible answer, so that after the answer it is only looked up.
 """
 
@@ -71,7 +72,8 @@ class Runner:
     async def _run(self, stop: threading.Event) -> None:
         """Until there is nothing to do before somebody does something."""
         hub = self.hub
-        await self._halt()
+        if hub.state.screen not in ("wait", "trial") or not hub.begun:
+            await self._halt()
         try:
             while hub.state.screen in ("wait", "trial"):
                 if hub.state.screen == "wait":
@@ -154,11 +156,10 @@ class Runner:
         rig, commit = self.hub.rig, self.hub.commit
         if show in trial.renderings:
             self._rendering = True
-            await asyncio.wrap_future(rig.do(lambda device: device.start()))
+            await asyncio.wrap_future(rig.render())
         await commit(lambda state, at: live_session.present(state, trial.id, i, True, at), mine=True)
         self._at("step", i, seconds)
         await asyncio.sleep(seconds)
-        await self._halt()
         await commit(lambda state, at: live_session.present(state, trial.id, i, False, at), mine=True)
 
     async def _arrived(self, loading) -> None:
@@ -212,7 +213,7 @@ class Runner:
                 await asyncio.wait_for(self._wake.wait(), _LATER)
 
     async def _halt(self) -> None:
-        """The renderer rests between presentations."""
+        """The renderer rests while nobody is to feel anything."""
         if self._rendering:
             self._rendering = False
             with contextlib.suppress(DeviceError, ValueError):  # a device that is lost stops by itself
