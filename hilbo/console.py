@@ -32,9 +32,22 @@ _MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
 _EVERY = 10.0  # s
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
-_WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
-    f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES for kind in ("png", "svg")
-}
+_WRITTEN = {
+    "dataset_description.json",
+    "data",
+    "trials.nc",
+    "result.json",
+    "report.html",
+    "map.nc",
+    "study.toml",
+    "renderer.toml",
+    *_TABLES,
+    *PARTS,
+} | {f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES for kind in ("png", "svg")}
+
+
+# What `hilbo export` writes besides tables and sidecars that end in _data.
+_EXPORTED = {"dataset_description.json", "data", "trials.nc"}
 
 
 def start(devices: int | None = None) -> None:
@@ -82,7 +95,8 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{out}: is a file; choose a folder for --out.")
     if any(out.iterdir()) and not force:
         raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
-    foreign = next((path for path in out.rglob("*") if path.name not in _WRITTEN), None)
+    ours = _WRITTEN | _EXPORTED
+    foreign = next((p for p in out.rglob("*") if p.name not in ours and not p.stem.endswith("_data")), None)
     if foreign is not None:
         raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
 
