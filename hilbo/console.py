@@ -32,18 +32,9 @@ _MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
 _EVERY = 10.0  # s
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
-_WRITTEN = {
-    "dataset_description.json",
-    "data",
-    "trials.nc",
-    "result.json",
-    "report.html",
-    "map.nc",
-    "study.toml",
-    "renderer.toml",
-    *_TABLES,
-    *PARTS,
-} | {f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES for kind in ("png", "svg")}
+_WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
+    f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES for kind in ("png", "svg")
+}
 
 
 # What `hilbo export` writes besides tables and sidecars that end in _data.

@@ -2,8 +2,8 @@
 
 `trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
 and `sets_table` are those of `hilbo.validation_table` (voided comparisons left out), `presentations_table` has every
-trial that was ever proposed, and what became of it. `read_log_trials` reads a folder of logs as `hilbo.tables.read_trials`
-reads the exported table, through the very same text, so that both give the same bits.
+trial that was ever proposed, and what became of it. `read_log_trials` reads a folder of logs as
+`hilbo.tables.read_trials` reads the exported table, through the very same text, so that both give the same bits.
 """
 
 import json
