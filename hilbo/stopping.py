@@ -25,7 +25,7 @@ from hilbo.ordinal_gp import Trials, fit
 from hilbo.session import best_point, physical_trials, search_points
 from hilbo.trial_protocols import protocol
 
-__all__ = ["Consistency", "Trust", "consistency", "minutes_left", "trust"]
+__all__ = ["Consistency", "Trust", "consistency", "minutes_left", "trust", "trust_of"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,23 @@ def _trust(study, data: Trials, following: Float[Array, " d"], candidates):
 
     moved = jax.lax.map(after, jnp.arange(len(study.responses), dtype=data.q.dtype))
     return now, probabilities[0, -1], jnp.sum(probabilities[1] * moved)
+
+
+def trust_of(state: LiveSession, block: int) -> Trust | None:
+    """`trust` in an optimisation block of a session; None before its first answer."""
+    name = state.header.blocks[block].material
+    study = state.study if name is None else state.study.material(name)
+    answered = state.answers(block)
+    if not answered:
+        return None
+
+    def point(trial):
+        return [trial.renderings["a"][name] for name in study.space.names]
+
+    asked = state.pending if state.pending is not None and state.pending.block == block else None
+    upcoming = None if asked is None else np.array(point(asked))
+    answers = [study.responses.index(trial.values["class_a"]) for trial in answered if trial.values is not None]
+    return trust(study, np.array([point(trial) for trial in answered]), answers, upcoming, state.header.seed)
 
 
 def consistency(state: LiveSession) -> Consistency:
