@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo import cli_device, cli_live, cli_material
+from hilbo import cli_device, cli_live, cli_material, cli_session
 from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, results, start
 from hilbo.errors import InputError
 
@@ -28,7 +28,9 @@ app = typer.Typer(
 _LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
-Table = Annotated[Path, typer.Argument(help="Trial table (CSV or Parquet).", show_default=False)]
+Table = Annotated[
+    Path, typer.Argument(help="Trial table (CSV or Parquet), or a folder of session logs.", show_default=False)
+]
 
 
 def main() -> None:
@@ -147,6 +149,9 @@ app.command()(cli_material.passivity)
 app.add_typer(cli_device.app, name="device")
 app.command()(cli_live.session)
 app.command()(cli_live.doctor)
+app.command()(cli_session.plan)
+app.command()(cli_session.export)
+app.add_typer(cli_session.app_participants, name="participants")
 
 
 @app.command()
@@ -171,9 +176,14 @@ def _read(trials, study, material, say):
     from hilbo.study import cohort_of
     from hilbo.tables import read_trials
 
-    chosen = Study.load(study)
-    chosen = chosen.material(material) if material and chosen.materials else chosen
-    table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
+    whole = Study.load(study)
+    chosen = whole.material(material) if material and whole.materials else whole
+    if trials.is_dir():
+        from hilbo.log_tables import read_log_trials
+
+        table = read_log_trials(trials, whole, material, others=False)
+    else:
+        table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
     return chosen, cohort_of(table, chosen)
 
 

@@ -64,6 +64,13 @@ def session(
     plan: Annotated[Path | None, typer.Option(help="Plan of the study, from `hilbo plan`.")] = None,
     material: Annotated[str | None, typer.Option(help="Which of the study's materials.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the session that has a log.")] = False,
+    people: Annotated[Path | None, typer.Option(help="participants.csv; by default the one among the logs.")] = None,
+    warm_start: Annotated[
+        Path | None, typer.Option("--warm-start", help="map.nc of a population, that selection begins with.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Nobody takes part: no consent is looked for, and the log says so.")
+    ] = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -80,7 +87,9 @@ def session(
             start()
             from hilbo.app.opening import Wanted, opened
 
-            wanted = Wanted(study, participant, name, seed, served.logs, plan, material, resume)
+            wanted = Wanted(
+                study, participant, name, seed, served.logs, plan, material, resume, people, warm_start, dry_run
+            )
             hub, log = opened(wanted, line.open, say)
         held.callback(log.close)
         hub.gap = served.gap

@@ -50,9 +50,9 @@ def orders(n: int, participants: int, seed: int) -> Int[np.ndarray, "participant
 def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> list[Comparison]:
     """Each pair `repeats` times, in rounds of all pairs, each round in a random order.
 
-    Within each pair, sides and what is felt first are balanced over every two rounds, their combinations over every
-    four; what an odd number of rounds leaves over is balanced between pairs. No round begins with the pair that ended
-    the last.
+    Within each pair, the sides of its sets and which of them is felt first are balanced over every two rounds, and
+    over every four which side is felt first; what fewer rounds leave over is balanced between pairs. No round begins
+    with the pair that ended the last.
     """
     rng = np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 2]))
     ways = [_ways(repeats, offset, rng) for offset in rng.permutation(len(pairs))]
@@ -78,5 +78,5 @@ def _ways(repeats, start, rng):
     return list(itertools.chain.from_iterable([chunk[j] for j in rng.permutation(len(chunk))] for chunk in chunks))
 
 
-_WAYS = {"1": (False, "a"), "2": (True, "b"), "3": (True, "a"), "4": (False, "b")}
+_WAYS = {"1": (False, "a"), "2": (True, "a"), "3": (False, "b"), "4": (True, "b")}
 _CYCLES = [[_WAYS[c] for c in text] for text in ("1234", "3412", "2143", "4321")]

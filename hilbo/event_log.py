@@ -23,7 +23,7 @@ from hilbo.errors import InputError
 from hilbo.live_records import Event, Header
 from hilbo.live_state import LiveSession
 
-__all__ = ["EventLog", "LogError", "log_name", "log_paths", "read_log"]
+__all__ = ["EventLog", "LogError", "in_use", "log_name", "log_paths", "read_log"]
 
 _SUFFIX = ".session.jsonl"
 
@@ -136,6 +136,18 @@ def read_log(path: str | os.PathLike, study: Study | None = None) -> tuple[Heade
     if study is not None:
         _check_study(path, study, header)
     return header, events, dropped
+
+
+def in_use(path: str | os.PathLike) -> bool:
+    """Whether somebody is writing this log."""
+    file = os.open(path, os.O_RDWR)
+    try:
+        _lock(file, Path(path))
+    except InputError:
+        return True
+    finally:
+        os.close(file)
+    return False
 
 
 def log_name(header: Header) -> str:

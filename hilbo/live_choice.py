@@ -5,6 +5,8 @@ Optimisation renderings are `hilbo.session.Session`'s, bit for bit: they depend 
 that count. A rendering voided twice is replaced: in the space-filling trials by the candidate farthest from all others,
 afterwards by the highest UCB that keeps a distance of `APART` from it in the unit cube.
 
+With a warm start (`hilbo.warm_start`, one for each material) there are no space-filling trials, and points come from it.
+
 Every choice says why: `choice` has what chose it, mean and sd of the latent score, the acquisition's value, the
 probabilities of the answers, the passivity margin (N.s/m) and the certificate of the fit.
 """
@@ -21,10 +23,12 @@ import numpy as np
 
 from hilbo import acquisition
 from hilbo.config import Study
+from hilbo.errors import InputError
 from hilbo.live_records import Need
 from hilbo.live_state import LiveSession
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.session import Session, search_points
+from hilbo.warm_start import WarmStart, warm_point
 
 __all__ = ["APART", "LiveChooser"]
 
@@ -41,9 +45,9 @@ class LiveChooser:
     `fits` counts the choices that had to be computed with a posterior, `found` those that were looked up.
     """
 
-    def __init__(self, state: LiveSession, warm=None) -> None:
+    def __init__(self, state: LiveSession, warm: Mapping[str | None, WarmStart] | None = None) -> None:
         self.fits, self.found = 0, 0
-        self._warm = warm
+        self._warm_starts = _checked_warm(state, warm or {})
         self._lock = threading.Lock()
         self._known: dict[_Key, dict[str, Any]] = {}
         header, study = state.header, state.study
@@ -60,10 +64,10 @@ class LiveChooser:
 
     def warm(self) -> None:
         """Compile what optimisation trials need."""
-        for name, session in self._sessions.items():
-            study = self._studies[name]
-            middle = tuple(float(v) for v in session.step.initial[0])
-            self._compute(study, session, ((middle, 0),) * max(1, study.selection.space_filling), ())
+        for name, study in self._studies.items():
+            if name in self._sessions:
+                middle = tuple((p.low + p.high) / 2 for p in study.space.parameters)
+                self._compute(name, ((middle, 0),) * max(1, study.selection.space_filling), ())
 
     def choose(self, state: LiveSession, need: Need) -> dict[str, Any]:
         """The data of a proposal: `renderings`, and `sets`, `first` or `choice`."""
@@ -106,16 +110,19 @@ class LiveChooser:
             if key in self._known:
                 self.found += count
             else:
-                self._known[key] = self._compute(self._studies[material], self._sessions[material], key[1], key[2])
+                self._known[key] = self._compute(material, key[1], key[2])
             return self._known[key]
 
-    def _compute(self, study, session, history, excluded):
+    def _compute(self, material, history, excluded):
+        study, session, warm = self._studies[material], self._sessions[material], self._warm_starts.get(material)
         points = np.array([point for point, _ in history], float).reshape(len(history), study.space.dim)
         answers = np.array([category for _, category in history], int)
         initial = session.step.initial
         gone = np.array(excluded, float).reshape(-1, study.space.dim)
-        filling = len(history) < len(initial)
-        if filling:
+        if warm is not None:
+            self.fits += 1
+            found, by = _from_map(study, warm, *_padded(study, points, answers), np.int32(len(history)), gone), "map"
+        elif len(history) < len(initial):
             found = _not_among(study, initial[len(history)], gone, np.concatenate([initial, points]), session.seed)
             by = "latin hypercube"
         else:
@@ -134,6 +141,35 @@ def _key(state, block) -> _Key:
         for t in state.answers(block)
     )
     return block, history, tuple(tuple(point[n] for n in names) for point in state.excluded(block))
+
+
+def _checked_warm(state, warm):
+    """The warm starts, which must be those of the header: the next trial is to be the same after a resume."""
+    told = ",".join(f"{name or ''}={warm[name].source}" for name in sorted(warm, key=str)) or None
+    if told != state.header.warm_start:
+        raise InputError(
+            f"the session's warm start is {state.header.warm_start or 'none'}, not {told or 'none'}; give the maps that"
+            " it was begun with."
+        )
+    return dict(warm)
+
+
+def _from_map(study, warm, x, q, count, gone):
+    return np.asarray(_map_point(study, warm, x, q, count, _held(study, gone)))
+
+
+def _held(study, gone):
+    """The points that are gone, padded with places far away, so that nothing is compiled again for one more."""
+    held = np.full((max(8, len(gone)), study.space.dim), 9.0)
+    if len(gone):
+        held[-len(gone) :] = _units(study, gone)
+    return jnp.asarray(held)
+
+
+@eqx.filter_jit
+def _map_point(study, warm, points, answers, count, gone):
+    trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)
+    return study.space.to_physical(warm_point(study, warm, trials, gone, APART))
 
 
 def _near(study, point, gone) -> bool:
@@ -222,9 +258,7 @@ def _facts(study, values):
 def _apart(study, session, points, answers, gone: Sequence) -> np.ndarray:
     candidates = search_points(study.space, session.seed)
     x, q = _padded(study, points, answers)
-    held = np.full((8, study.space.dim), 9.0)  # far away
-    held[-len(gone) :] = _units(study, gone)[-8:]
-    return np.asarray(_apart_point(study, x, q, np.int32(len(answers)), jnp.asarray(held), candidates))
+    return np.asarray(_apart_point(study, x, q, np.int32(len(answers)), _held(study, gone), candidates))
 
 
 @eqx.filter_jit

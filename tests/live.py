@@ -1,5 +1,6 @@
-"""What the tests of live sessions share: a small study, a chooser without fits, and a driver of all that can be done."""
+"""What tests of live sessions share: a small study, a chooser without fits, and a driver of all that can be done."""
 
+import contextlib
 import hashlib
 import itertools
 import json
@@ -97,10 +98,8 @@ class Driver:
 
     def do(self, kind, number):
         self.clock += 1.0
-        try:
+        with contextlib.suppress(RefusedError):
             self._do(kind, number)
-        except RefusedError as error:
-            assert str(error).endswith(".")
         self.step()
 
     def _do(self, kind, number):

@@ -75,7 +75,7 @@ class Hub:
         self.rig: Rig | None = None
         self.begun = False  # whether the participant has said so, since the server started or the page came back
         self.alert: str | None = None
-        self.trust: dict[str, Any] = {}
+        self.trust: list[list[str]] = []
         self.recent: deque = deque(maxlen=200)
         self.delays: list[dict[str, float]] = []  # s, from each answer on
         self.invite: Callable[[], dict[str, str]] | None = None
@@ -278,6 +278,8 @@ class Hub:
             return {}
         if self._map is None or self._map[0] != version:
             self._map = version, await self._loop.run_in_executor(self._drawing, self._maps.slices, state)
+            self.trust = await self._loop.run_in_executor(self._drawing, self._maps.trust, state)
+            self.publish()
         return self._map[1]
 
     # Who looks.

@@ -16,7 +16,9 @@ from hilbo.errors import InputError
 from hilbo.event_log import EventLog, log_name
 from hilbo.live_choice import LiveChooser
 from hilbo.live_session import Header
+from hilbo.people_table import check_consent, read_people
 from hilbo.study_plan import header_for, planned_header
+from hilbo.warm_start import read_warm_start
 
 __all__ = ["Wanted", "opened"]
 
@@ -32,6 +34,9 @@ class Wanted(NamedTuple):
     plan: Path | None = None
     material: str | None = None
     resume: bool = False
+    people: Path | None = None
+    warm_start: Path | None = None
+    dry_run: bool = False
 
 
 def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable[[str], Any]) -> tuple[Hub, EventLog]:
@@ -43,7 +48,7 @@ def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable
     log = _log(wanted, study)
     try:
         say("preparing what chooses")
-        chooser = LiveChooser(log.state)
+        chooser = LiveChooser(log.state, _warm_starts(wanted, log.state))
         import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
     except BaseException:
         log.close()
@@ -69,7 +74,13 @@ def _log(wanted, study) -> EventLog:
 
 
 def _header(wanted, study) -> Header:
-    facts = {"protocol_number": study.session.protocol_number, "versions": _versions()}
+    number = study.session.protocol_number
+    facts: dict[str, Any] = {"protocol_number": number, "versions": _versions()}
+    if not wanted.dry_run:
+        people = read_people(wanted.people or wanted.logs / "participants.csv")
+        facts["consent"] = check_consent(people, wanted.participant, number)["consent_time"]
+    if wanted.warm_start is not None:
+        facts["warm_start"] = _map(wanted, study, wanted.material).source
     if wanted.plan is None:
         place = (wanted.participant, wanted.session, wanted.seed)
         return header_for(study, *place, materials=(wanted.material,), **facts)
@@ -83,6 +94,17 @@ def _header(wanted, study) -> Header:
         return planned_header(plan, study, wanted.participant, **facts)
     except InputError as error:
         raise InputError(f"{wanted.plan}: {error}") from error
+
+
+def _map(wanted, study, material):
+    return read_warm_start(wanted.warm_start, study if material is None else study.material(material), wanted.seed)
+
+
+def _warm_starts(wanted, state) -> dict[str | None, Any] | None:
+    if wanted.warm_start is None:
+        return None
+    materials = {block.material for block in state.header.blocks if not block.trials}
+    return {name: _map(wanted, state.study, name) for name in materials}
 
 
 def _versions() -> dict[str, str]:

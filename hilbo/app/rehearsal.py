@@ -141,7 +141,18 @@ def rehearse(
     out.mkdir(parents=True, exist_ok=True)
     file = fast_study(source, out / "study.toml", seconds, warm_up)
     study = Study.load(file)
-    arguments = [str(file), "--participant", "P01", "--logs", str(out / "logs"), "--port", "0", "--seed", str(seed)]
+    arguments = [
+        str(file),
+        "--participant",
+        "P01",
+        "--logs",
+        str(out / "logs"),
+        "--port",
+        "0",
+        "--seed",
+        str(seed),
+        "--dry-run",
+    ]
     arguments += ["--gap", "0.7" if seconds is None else "0.05"]
     if phase != "optimisation":
         arguments += ["--plan", str(_plan(study, out, phase, seed))]

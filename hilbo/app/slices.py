@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hilbo import stopping
 from hilbo.live_session import LiveSession
 from hilbo.ordinal_gp import fit
 from hilbo.session import physical_trials, search_points
@@ -32,6 +33,27 @@ class Maps:
         """Compile what `slices` needs."""
         for material in self._studies:
             self._found(state, material, [])
+            study = self._studies[material][0]
+            middle = np.array([[(p.low + p.high) / 2 for p in study.space.parameters]])
+            stopping.trust(study, middle, [0], middle[0], state.header.seed)
+
+    def trust(self, state: LiveSession) -> list[list[str]]:
+        """How far the session has come, in words: name and value."""
+        rows = []
+        block = next((i for i, b in enumerate(state.header.blocks) if not b.trials and not state.full(i)), None)
+        found = None if block is None else stopping.trust_of(state, block)
+        if found is not None:
+            rows.append(["Best so far", ", ".join(f"{name} {value:.3g}" for name, value in found.best.items())])
+            top = state.study.responses[-1]
+            rows.append([f'… would be "{top}"', f"{100 * found.top:.0f} %"])
+            if found.movement is not None:
+                rows.append(["… would move by one more answer", f"{100 * found.movement:.1f} % of the ranges"])
+        twice = stopping.consistency(state)
+        if twice.pairs:
+            rows.append(["Asked twice", f"{twice.alike} of {twice.pairs} alike"])
+        if state.screen not in ("done", "ended"):
+            rows.append(["Minutes left", f"{stopping.minutes_left(state):.0f}"])
+        return rows
 
     def slices(self, state: LiveSession) -> dict[str, Any] | None:
         """For each pair of parameters: mean on a grid (row by row, None where not feasible), the maximum, and the

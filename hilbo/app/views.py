@@ -118,7 +118,7 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "phase_words": phase,
         "trial": _trial_rows(hub, trial),
         "device": _device(hub),
-        "trust": [[name, value] for name, value in hub.trust.items()],
+        "trust": hub.trust,
         "table": _table(state),
         "log": [_log_line(event) for event in list(hub.recent)[:60]],
         "alert": hub.alert or (runner.trouble if runner.stage == "trouble" else None),
