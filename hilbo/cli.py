@@ -101,14 +101,14 @@ def simulate(
     live: Annotated[
         bool, typer.Option("--live", help="One person's session instead: real server, pages and simulated device.")
     ] = False,
-    phase: Annotated[str, typer.Option(help="With --live: optimisation, validation or aggregate-best.")] = (
+    kind: Annotated[str, typer.Option(help="With --live: optimisation, validation or aggregate-best.")] = (
         "optimisation"
     ),
     seconds: Annotated[float | None, typer.Option(min=0.05, help="With --live: duration of every step.")] = None,
 ) -> None:
     """Simulate a study whose truth is known, and aggregate it; or hold one session without people."""
     if live:
-        _simulate_live(preset, study, out, phase, seconds, seed, as_json)
+        _simulate_live(preset, study, out, kind, seconds, seed, as_json)
         return
     with results(out, force) as folder, progress() as say:
         content = _simulate(preset, study, participants, seed, folder, say)

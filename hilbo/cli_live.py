@@ -191,7 +191,7 @@ def live(study: Path, out: Path, phase: str, seconds: float | None, seed: int, s
     from hilbo.trial_protocols import PHASES
 
     if phase not in PHASES[1:]:
-        raise InputError(f'--phase is "{phase}", it must be one of {", ".join(PHASES[1:])}.')
+        raise InputError(f'--kind is "{phase}", it must be one of {", ".join(PHASES[1:])}.')
     if find_browser() is None:
         raise InputError(
             "--live needs Chromium and playwright; install them (Debian: apt install chromium; pip install"

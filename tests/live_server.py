@@ -6,6 +6,8 @@ import time
 import urllib.error
 from pathlib import Path
 
+import pytest
+
 from hilbo.app import serve
 from hilbo.app.hub import Hub
 from hilbo.app.rehearsal import example_sets, fast_study
@@ -18,7 +20,7 @@ from hilbo.live_choice import LiveChooser
 from hilbo.live_records import Block, Header, Planned
 from hilbo.live_state import LiveSession
 
-__all__ = ["DATA", "Live", "study_of"]
+__all__ = ["DATA", "PATIENCE", "Live", "refused", "study_of"]
 
 DATA = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts a time
@@ -138,12 +140,9 @@ class Live:
 @contextlib.contextmanager
 def refused(status: int):
     """What is done within must be answered with this status, and one sentence."""
-    try:
+    with pytest.raises(urllib.error.HTTPError) as caught:
         yield
-    except urllib.error.HTTPError as error:
-        with error:
-            text = error.read().decode()
-        assert error.code == status, (error.code, text)
-        assert '"error"' in text
-        return
-    raise AssertionError("was not refused")
+    with caught.value as error:
+        text = error.read().decode()
+    assert caught.value.code == status, text
+    assert '"error"' in text

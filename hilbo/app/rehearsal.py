@@ -203,7 +203,7 @@ def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
     for page in (window, experimenter):
         page.on("pageerror", lambda error: mishaps.append(str(error)))
     participant = Participant(window, links["participant"], watch, decide, feel)
-    taken, delays, begun = set(), [], time.monotonic()
+    taken, cleared, begun = set(), 0, time.monotonic()
     while True:
         phase = participant.phase
         question = window.is_visible("#options")
@@ -219,16 +219,26 @@ def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
                 screenshots(experimenter, screens, f"experimenter-{participant.answered}")
         if phase in ("done", "ended"):
             break
+        cleared += phase == "wait" and _cleared(experimenter)
         time.sleep(0.02)
     view = watch()
     screenshots(experimenter, screens, "experimenter-end")
     screenshots(window, screens, "participant-end")
-    delays = view["all_delays"]
     return {
         "answers": participant.answered,
         "seconds": round(time.monotonic() - begun, 1),
         "fits_after_an_answer": view["fits_after_an_answer"],
-        "answer_to_device_ms": [round(1000 * d["total"], 1) for d in delays],
+        "answer_to_device_ms": [round(1000 * d["total"], 1) for d in view["all_delays"]],
+        "holds_cleared": cleared,
         "mishaps": mishaps,
         "screens": sorted(path.name for path in screens.iterdir()),
     }
+
+
+def _cleared(experimenter) -> bool:
+    """A device that held on a busy computer is let go again, as the experimenter would."""
+    if not experimenter.is_visible("#clear"):
+        return False
+    experimenter.click("#clear")
+    experimenter.wait_for_selector("#clear", state="hidden")
+    return True
