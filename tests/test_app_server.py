@@ -1,8 +1,11 @@
 """The server of a live session, its hub and a simulated device, through the JSON that pages and programs speak."""
 
+import contextlib
+import http.client
 import json
 import os
 import random
+import threading
 import urllib.request
 from pathlib import Path
 
@@ -148,6 +151,8 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
             return found
 
         live.participant._ask = ear
+        listening = threading.Thread(target=listen, args=(live, heard))
+        listening.start()
         live.begin()
         for _ in range(12):
             view = live.question()
@@ -164,16 +169,31 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
         assert {event.data["client"] for event in answers} == {"me"}
         assert answers[0].data["browser"]["response_s"] == 0.0125
         assert live.replayed() == live.hub.state
-        check_blinding("\n".join(heard), live)
         check_order(live.events())
+        state = live.hub.state
+    listening.join(PATIENCE)
+    assert any(line.startswith("event: view") for line in heard)
+    check_blinding("\n".join(heard), state)
 
 
-def check_blinding(heard, live):
+def listen(live, heard):
+    """Everything that comes as server-sent events, until the server ends; and the page itself."""
+    key = {"Authorization": f"Bearer {live.participant._key}"}
+    with (
+        ask(live, "/api/participant/events?page=ear", **key) as stream,
+        contextlib.suppress(OSError, http.client.HTTPException),
+    ):
+        heard += [ask(live, f"/static/participant.{kind}").read().decode() for kind in ("html", "js")]
+        for line in stream:
+            heard.append(line.decode())
+
+
+def check_blinding(heard, state):
     """Nothing of what a participant must not know is in what their browser was told."""
     words = ["best", "mid", "worst", "mean", "margin", "certificate", "K1", "B1", "alpha", "renderings", "choice"]
     for word in [*words, "passiv", "probabilit", "aggregate", "individual", "validation"]:
         assert word not in heard, word
-    for values in live.hub.state.trials[0].renderings.values():
+    for values in [values for trial in state.trials for values in trial.renderings.values()]:
         for value in values.values():
             assert f"{value:.4g}" not in heard
             assert str(value) not in heard

@@ -2,9 +2,10 @@
 
 import json
 import subprocess
+import time
 
 import pytest
-from live_server import DATA, Live
+from live_server import DATA, PATIENCE, Live
 
 from hilbo.app import rehearsal
 from hilbo.app.robot import Participant, browser, find_browser
@@ -40,15 +41,13 @@ def test_a_whole_session_by_one_command(tmp_path, kind, trials):
 
 @pytest.fixture
 def pages(tmp_path):
-    """A session in this process, its two pages, and everything that the participant's browser received."""
+    """A session in this process, the participant's page and the experimenter's."""
     with Live(tmp_path, seconds=0.1) as live, browser() as program:
         links = live.place.links()
         experimenter = program.new_context().new_page()
         experimenter.goto(links["experimenter"])
         experimenter.wait_for_url("**/experimenter")
-        heard: list[str] = []
-        context = program.new_context()
-        window = context.new_page()
+        window = program.new_context().new_page()
 
         def watch():
             return experimenter.evaluate("fetch('/api/experimenter').then(r => r.json())")
@@ -56,7 +55,7 @@ def pages(tmp_path):
         participant = Participant(
             window, links["participant"], watch, lambda _, ask: "a" if ask == "preferred" else "close"
         )
-        yield live, participant, experimenter, heard
+        yield live, participant, experimenter
 
 
 def press(experimenter, command, reason=None):
@@ -68,13 +67,16 @@ def press(experimenter, command, reason=None):
         experimenter.click("#sure button[value=yes]")
 
 
-def until_answered(participant, count, seconds=120):
+def until_answered(participant, count):
+    end = time.monotonic() + PATIENCE
     while participant.answered < count:
-        participant.until(("step", "answer", "wait", "hello", "saving", "done"), seconds)
+        participant.act()
+        assert time.monotonic() < end, participant.phase
+        time.sleep(0.02)
 
 
 def test_every_button_of_the_experimenter_is_an_event(pages):
-    live, participant, experimenter, _ = pages
+    live, participant, experimenter = pages
     until_answered(participant, 1)
     press(experimenter, "pause")
     participant.window.wait_for_selector("body[data-phase=paused]")
@@ -98,7 +100,7 @@ def test_every_button_of_the_experimenter_is_an_event(pages):
 
 
 def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
-    live, participant, _, _ = pages
+    live, participant, _ = pages
     window = participant.window
     until_answered(participant, 1)
     window.wait_for_selector("#options:visible")
@@ -129,7 +131,7 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
 
 
 def test_the_pages_load_nothing_from_elsewhere_and_names_reach_a_screen_reader(pages):
-    _, participant, _, _ = pages
+    _, participant, _ = pages
     window = participant.window
     asked: list[str] = []
     window.on("request", lambda request: asked.append(request.url))
@@ -145,7 +147,7 @@ def test_the_pages_load_nothing_from_elsewhere_and_names_reach_a_screen_reader(p
 
 
 def test_a_second_window_takes_over_and_the_first_says_so(pages):
-    live, participant, _, _ = pages
+    live, participant, _ = pages
     first = participant.window
     second = first.context.new_page()
     second.goto(live.participant.address + "/participant")

@@ -9,7 +9,6 @@ import contextlib
 import json
 import shutil
 import tempfile
-import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -125,16 +124,6 @@ class Participant:
             with contextlib.suppress(Exception):  # gone meanwhile
                 self.window.click("#go", timeout=1000)
         return phase
-
-    def until(self, phases: tuple[str, ...], seconds: float, every: float = 0.03) -> str:
-        """Act until the page's phase is one of these. Raises TimeoutError."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            phase = self.act()
-            if phase in phases:
-                return phase
-            time.sleep(every)
-        raise TimeoutError(f"the participant's page is still in the phase {self.phase}")
 
     def _rendering(self) -> bool:
         return self.window.evaluate("!!(view && view.step && ['a', 'b'].includes(view.step.show))")
