@@ -50,11 +50,11 @@ $(STAMP): pyproject.toml constraints.txt
 	@if command -v uv >/dev/null; then \
 	  set -x; \
 	  test -x $(BIN)/python || uv venv --quiet --python $(PYTHON) $(VENV); \
-	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[dev,hardware]'; \
+	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[dev,hardware,live,browser]'; \
 	else \
 	  test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || { \
 	    echo "'$(PYTHON) -m venv' failed: install Python's venv module, on Debian the package python3-venv." >&2; exit 1; }; \
 	  set -x; \
-	  $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,hardware]'; \
+	  $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,hardware,live,browser]'; \
 	fi
 	@touch $@

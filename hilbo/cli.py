@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo import cli_device, cli_material
+from hilbo import cli_device, cli_live, cli_material, cli_session
 from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, results, start
 from hilbo.errors import InputError
 
@@ -28,7 +28,9 @@ app = typer.Typer(
 _LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
-Table = Annotated[Path, typer.Argument(help="Trial table (CSV or Parquet).", show_default=False)]
+Table = Annotated[
+    Path, typer.Argument(help="Trial table (CSV or Parquet), or a folder of session logs.", show_default=False)
+]
 
 
 def main() -> None:
@@ -96,8 +98,18 @@ def simulate(
     seed: Seed = 0,
     force: Force = False,
     as_json: Json = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="One person's session instead: real server, pages and simulated device.")
+    ] = False,
+    kind: Annotated[str, typer.Option(help="With --live: optimisation, validation or aggregate-best.")] = (
+        "optimisation"
+    ),
+    seconds: Annotated[float | None, typer.Option(min=0.05, help="With --live: duration of every step.")] = None,
 ) -> None:
-    """Simulate a study whose truth is known, and aggregate it."""
+    """Simulate a study whose truth is known, and aggregate it; or hold one session without people."""
+    if live:
+        _simulate_live(preset, study, out, kind, seconds, seed, as_json)
+        return
     with results(out, force) as folder, progress() as say:
         content = _simulate(preset, study, participants, seed, folder, say)
     finish(content, out, as_json)
@@ -135,6 +147,11 @@ def robustness(
 app.command()(cli_material.identify)
 app.command()(cli_material.passivity)
 app.add_typer(cli_device.app, name="device")
+app.command()(cli_live.session)
+app.command()(cli_live.doctor)
+app.command()(cli_session.plan)
+app.command()(cli_session.export)
+app.add_typer(cli_session.app_participants, name="participants")
 
 
 @app.command()
@@ -159,9 +176,14 @@ def _read(trials, study, material, say):
     from hilbo.study import cohort_of
     from hilbo.tables import read_trials
 
-    chosen = Study.load(study)
-    chosen = chosen.material(material) if material and chosen.materials else chosen
-    table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
+    whole = Study.load(study)
+    chosen = whole.material(material) if material and whole.materials else whole
+    if trials.is_dir():
+        from hilbo.log_tables import read_log_trials
+
+        table = read_log_trials(trials, whole, material, others=False)
+    else:
+        table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
     return chosen, cohort_of(table, chosen)
 
 
@@ -210,6 +232,16 @@ def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
     truth = np.asarray(chosen.space.to_unit(np.array([population.truth[name] for name in chosen.space.names])))
     table["category"] = table["response"].map({label: i for i, label in enumerate(chosen.responses)})
     return _aggregate(chosen, cohort_of(table, chosen), folder, seed, say, truth)
+
+
+def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
+    import json
+    from importlib.resources import files
+
+    source = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if study is None else study
+    with progress() as say:
+        found = cli_live.live(source, out, phase, seconds, seed, say)
+    print(json.dumps(found, indent=2) if as_json else f"{found['answers']} answers in {found['seconds']} s: {out}")
 
 
 def _print_demo(real, simulated, out) -> None:

@@ -9,9 +9,7 @@ defaults left out: spelling a default out changes nothing, the order of the para
 import hashlib
 import itertools
 import json
-import math
 import os
-import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,21 +22,15 @@ from hilbo.errors import InputError
 from hilbo.memory import Memory
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.search_space import Mechanics, Parameter, SearchSpace
+from hilbo.study_tables import NotNegative as _NotNegative
+from hilbo.study_tables import Number as _Number
+from hilbo.study_tables import Positive as _Positive
+from hilbo.study_tables import Table as _Table
+from hilbo.study_tables import check_keys, check_table, enclosing, lines_of, prefix, read_table, shown
+from hilbo.study_tables import words as _text
+from hilbo.trial_protocols import SessionTable
 
 __all__ = ["RBF", "Inference", "OrdinalGP", "OrdinalProbit", "Selection", "Study"]
-
-
-def _text(words: str, example: str):
-    return msgspec.Meta(description=words, examples=[example])
-
-
-_Number = Annotated[float, msgspec.Meta(description="a finite number")]
-_Positive = Annotated[float, msgspec.Meta(gt=0, description="a number above 0")]
-_NotNegative = Annotated[float, msgspec.Meta(ge=0, description="a number, 0 or above")]
-
-
-class _Table(msgspec.Struct, frozen=True, omit_defaults=True):
-    """One table of the study file."""
 
 
 class _StudyTable(_Table, frozen=True):
@@ -113,12 +105,19 @@ class _Content(_Table, frozen=True):
     renderer: _RendererTable | None = None
     selection: Selection = Selection()
     aggregation: _AggregationTable = _AggregationTable()
-    materials: dict[str, dict[str, Any]] = {}
+    materials: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
+    session: SessionTable = SessionTable()
 
 
-_TABLES = {"study": _StudyTable, "gp": _GPTable, "selection": Selection, "aggregation": _AggregationTable}
+_TABLES = {
+    "study": _StudyTable,
+    "gp": _GPTable,
+    "selection": Selection,
+    "aggregation": _AggregationTable,
+    "session": SessionTable,
+}
 _REQUIRED = ("schema", "study", "parameters", "gp")
-_KEYS = ("schema", "study", "parameters", "renderer", "gp", "selection", "aggregation", "materials")
+_KEYS = ("schema", "study", "parameters", "renderer", "gp", "selection", "aggregation", "session", "materials")
 _OVERRIDES = ("renderer", "parameters")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
 
@@ -139,6 +138,7 @@ class Study(eqx.Module):
     rule: Literal["bcm"] = eqx.field(static=True)
     source: str = eqx.field(static=True)
     content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON
+    session: SessionTable = eqx.field(static=True, repr=False, default=SessionTable())
 
     @staticmethod
     def load(path: str | os.PathLike) -> "Study":
@@ -178,7 +178,7 @@ class Study(eqx.Module):
         """The study of one material: its overrides of [renderer] and [parameters] applied."""
         if name not in self.materials:
             known = ", ".join(self.materials) or "there are none"
-            raise InputError(f"{_prefix(self.source)}materials.{name} is not in the study, its materials: {known}.")
+            raise InputError(f"{prefix(self.source)}materials.{name} is not in the study, its materials: {known}.")
         return _checked(_override({"schema": 1} | json.loads(self.content), name), self.source, "")
 
 
@@ -200,9 +200,9 @@ def _checked(raw, source, text):
             place = f"materials.{name}."
             _study(_override(raw, name), source)
     except InputError as error:
-        lines = _lines(text)
-        where = next((lines[key] for key in _enclosing(place + str(error).split()[0], place) if key in lines), None)
-        raise InputError(f"{_prefix(source, where)}{place}{error}") from None
+        lines = lines_of(text)
+        where = next((lines[key] for key in enclosing(place + str(error).split()[0], place) if key in lines), None)
+        raise InputError(f"{prefix(source, where)}{place}{error}") from None
     return study
 
 
@@ -211,7 +211,7 @@ def _study(raw, source):
     space = _space(content)
     labels, thresholds, theta = content.study.responses, content.gp.thresholds, content.gp.theta
     if len(set(labels)) < len(labels):
-        raise InputError(f"study.responses is {_shown(labels)}, it must not have one label twice.")
+        raise InputError(f"study.responses is {shown(labels)}, it must not have one label twice.")
     if len(thresholds) != len(labels) - 1:
         raise InputError(
             f"gp.thresholds has {len(thresholds)} numbers, it must have one fewer than the {len(labels)} responses."
@@ -222,7 +222,8 @@ def _study(raw, source):
             f" trials = {content.selection.trials}."
         )
     if any(low >= high for low, high in itertools.pairwise(thresholds)):
-        raise InputError(f"gp.thresholds is {_shown(thresholds)}, it must rise from each number to the next.")
+        raise InputError(f"gp.thresholds is {shown(thresholds)}, it must rise from each number to the next.")
+    content.session.check(labels)
     if isinstance(theta, tuple) and len(theta) != space.dim:
         raise InputError(f"gp.theta has {len(theta)} numbers, it must be one number or {space.dim}, one per parameter.")
     return Study(
@@ -235,6 +236,7 @@ def _study(raw, source):
         rule=content.aggregation.rule,
         source=source,
         content=json.dumps(msgspec.to_builtins(content), ensure_ascii=False, separators=(",", ":")),
+        session=content.session,
     )
 
 
@@ -255,56 +257,21 @@ def _space(content):
 
 def _read(raw):
     """The parsed file as records, every key known and of its type."""
-    _check_keys(raw, "", _KEYS, _REQUIRED)
+    check_keys(raw, "", _KEYS, _REQUIRED)
     if raw["schema"] is True or raw["schema"] != 1:
-        raise InputError(f"schema is {_shown(raw['schema'])}, it must be 1: this hilbo reads no other.")
-    tables = {key: _table(kind, raw[key], key) for key, kind in _TABLES.items() if key in raw}
+        raise InputError(f"schema is {shown(raw['schema'])}, it must be 1: this hilbo reads no other.")
+    tables = {key: read_table(kind, raw[key], key) for key, kind in _TABLES.items() if key in raw}
     if "renderer" in raw:
-        tables["renderer"] = _table(_RendererTable, raw["renderer"], "renderer")
-    _check_table(raw["parameters"], "parameters")
+        tables["renderer"] = read_table(_RendererTable, raw["renderer"], "renderer")
+    check_table(raw["parameters"], "parameters")
     parameters = {
-        name: _table(_ParameterTable, table, f"parameters.{name}") for name, table in raw["parameters"].items()
+        name: read_table(_ParameterTable, table, f"parameters.{name}") for name, table in raw["parameters"].items()
     }
     materials = raw.get("materials", {})
-    _check_table(materials, "materials")
+    check_table(materials, "materials")
     for name, table in materials.items():
-        _check_keys(table, f"materials.{name}", _OVERRIDES)
+        check_keys(table, f"materials.{name}", _OVERRIDES)
     return _Content(parameters=parameters, materials=dict(materials), **tables)
-
-
-def _table(kind, raw, path):
-    fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
-    _check_keys(raw, path, fields, [key for key, field in fields.items() if field.required])
-    return kind(**{key: _value(fields[key].type, value, f"{path}.{key}") for key, value in raw.items()})
-
-
-def _value(kind, raw, path):
-    try:
-        value = msgspec.convert(raw, kind)
-        if all(math.isfinite(v) for v in (value if isinstance(value, tuple) else (value,)) if isinstance(v, float)):
-            return value
-    except msgspec.ValidationError:
-        pass  # its text speaks of types and of `$`; the schema has the words
-    notes = [note for note in kind.__metadata__ if isinstance(note, msgspec.Meta)]
-    words = next(note.description for note in reversed(notes) if note.description)
-    example = next((f"; write for example {path.split('.')[-1]} = {n.examples[0]}" for n in notes if n.examples), "")
-    raise InputError(f"{path} is {_shown(raw)}, it must be {words}{example}.")
-
-
-def _check_keys(raw, path, known, required=()):
-    _check_table(raw, path)
-    dot = f"{path}." if path else ""
-    for key in raw:
-        if key not in known:
-            raise InputError(f"{dot}{key} is not a key of a study file, those known here are {', '.join(known)}.")
-    for key in required:
-        if key not in raw:
-            raise InputError(f"{dot}{key} is missing, add it.")
-
-
-def _check_table(raw, path):
-    if not isinstance(raw, Mapping):
-        raise InputError(f"{path} is {_shown(raw)}, it must be a table; write it as [{path}].")
 
 
 def _override(raw, name):
@@ -319,36 +286,3 @@ def _merged(base, changes):
     if not (isinstance(base, Mapping) and isinstance(changes, Mapping)):
         return changes
     return {**base, **{key: _merged(base.get(key, {}), value) for key, value in changes.items()}}
-
-
-def _shown(value):
-    return json.dumps(value, ensure_ascii=False, default=str)
-
-
-def _prefix(source, line=None):
-    place = source if line is None else f"{source}:{line}"
-    return f"{place}: " if place else ""
-
-
-def _enclosing(path, place):
-    """The key path and the tables around it, innermost first; for a material then those of the study itself."""
-    parts = path.rstrip(",:").split(".")
-    yield from (".".join(parts[:n]) for n in range(len(parts), len(place.split(".")) - 1 if place else 0, -1))
-    if place:
-        yield from _enclosing(path.removeprefix(place), "")
-
-
-def _lines(text):
-    """Line number of every table and key in the file."""
-    lines, table = {}, ""
-    for number, line in enumerate(text.splitlines(), 1):
-        if header := re.match(r"\s*\[([^\[\]]+)\]", line):
-            table = _path(header[1])
-            lines.setdefault(table, number)
-        elif key := re.match(r"""\s*([\w."' -]+?)\s*=""", line):
-            lines.setdefault(f"{table}.{_path(key[1])}" if table else _path(key[1]), number)
-    return lines
-
-
-def _path(key):
-    return ".".join(part.strip().strip("\"'") for part in key.split("."))

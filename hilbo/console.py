@@ -37,6 +37,10 @@ _WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml
 }
 
 
+# What `hilbo export` writes besides tables and sidecars that end in _data.
+_EXPORTED = {"dataset_description.json", "data", "trials.nc"}
+
+
 def start(devices: int | None = None) -> None:
     """Float64, and compiled functions kept in the user's cache folder from one command to the next.
 
@@ -82,7 +86,8 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{out}: is a file; choose a folder for --out.")
     if any(out.iterdir()) and not force:
         raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
-    foreign = next((path for path in out.rglob("*") if path.name not in _WRITTEN), None)
+    ours = _WRITTEN | _EXPORTED
+    foreign = next((p for p in out.rglob("*") if p.name not in ours and not p.stem.endswith("_data")), None)
     if foreign is not None:
         raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
 

@@ -18,7 +18,7 @@ import typer
 from hilbo.console import fail
 from hilbo.errors import InputError
 
-__all__ = ["Chosen", "Line", "chosen_set", "opened", "sets_of", "simulator", "takes"]
+__all__ = ["Chosen", "Line", "chosen_set", "opened", "sets_of", "sim_options", "simulator", "takes"]
 
 _Path = Path | None
 _Number = float | None
@@ -99,7 +99,7 @@ def opened(line: Line, **simulated: Any) -> Iterator[Any]:
                 baud=line.baud,
                 patience=line.patience,
                 capture=capture.write if capture else None,
-                options=(simulated if line.device == "sim" else {}) | _simulated(line.sim),
+                options=(simulated if line.device == "sim" else {}) | sim_options(line.sim),
             )
         )
         for note in device.notes:
@@ -113,7 +113,7 @@ def simulator(line: Line) -> Any:
 
     if line.device != "sim":
         raise InputError("Only the simulated device can be simulated; leave --device out.")
-    return Simulator(**_simulated(line.sim))
+    return Simulator(**sim_options(line.sim))
 
 
 def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
@@ -181,7 +181,8 @@ def _damping(line) -> float | None:
     return _mechanics(line).damping
 
 
-def _simulated(pairs) -> dict[str, Any]:
+def sim_options(pairs: list[str] | None) -> dict[str, Any]:
+    """Options of the simulated device, from KEY=VALUE."""
     found: dict[str, Any] = {}
     for pair in pairs or ():
         name, separator, value = pair.partition("=")

@@ -17,8 +17,10 @@ import pandas as pd
 from hilbo.config import Study
 from hilbo.errors import InputError
 
-__all__ = ["numbers", "of_material", "place", "read_cells", "read_trials", "refuse", "write_trials"]
+__all__ = ["NOT_FITTED", "numbers", "of_material", "place", "read_cells", "read_trials", "refuse", "write_trials"]
 
+NOT_FITTED = ("warm-up", "repeat")
+"""Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
 _KEY = ("participant", "session", "phase", "material", "trial")
 _TRUE = {"1", "1.0", "true", "yes"}
 _FALSE = {"", "0", "0.0", "false", "no", "nan", "none", "<na>"}
@@ -35,9 +37,9 @@ def read_trials(
 ) -> pd.DataFrame:
     """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
 
-    Adds the column `category` (0 = lowest response). Warm-up and voided rows are checked and left out. `material`
-    selects the rows of one material, and must be given if there are several. `others`: keep the columns that are
-    nobody's business. `say` is told how many rows have been read. Raises `InputError`.
+    Adds the column `category` (0 = lowest response). Warm-up, repeated and voided rows are checked and left out.
+    `material` selects the rows of one material, and must be given if there are several. `others`: keep the columns that
+    are nobody's business. `say` is told how many rows have been read. Raises `InputError`.
     """
     source, known, pieces, rows = str(path), {}, [], 0
     for text in _pieces(path):
@@ -51,7 +53,7 @@ def read_trials(
     _check_duplicates(table, source)
     table = table[table.pop("_fitted")]
     if table.empty:
-        raise InputError(f"{source}: has no rows to fit; all are warm-up or voided.")
+        raise InputError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
     table = of_material(table, material, source)
     ranks = pd.factorize(table["participant"])[0]
     sessions = _session_order(table["session"]) if "session" in table else 0
@@ -74,7 +76,7 @@ def _checked(text, study, source, others, known):
     for parameter in study.space.parameters:
         table[parameter.name] = _parameter(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
-    table["_fitted"] = ~_flags(text, "voided", source) & (text["phase"] != "warm-up" if "phase" in text else True)
+    table["_fitted"] = ~_flags(text, "voided", source) & (~text["phase"].isin(NOT_FITTED) if "phase" in text else True)
     return table
 
 

@@ -88,7 +88,22 @@ MAY_IMPORT = MATHS | {
     "set_tables": set(),
     "device_screen": {"hardware_bridge"},
     "device_words": set(),
-    "config": {"search_space", "ordinal_gp"},
+    "study_tables": set(),
+    "trial_protocols": {"study_tables"},
+    "config": {"search_space", "ordinal_gp", "study_tables", "trial_protocols"},
+    "counterbalance": set(),
+    "live_records": {"trial_protocols"},
+    "live_state": {"config", "live_records"},
+    "live_session": {"live_state"},
+    "live_views": {"live_session"},
+    "live_choice": {"live_state", "session", "acquisition", "warm_start"},
+    "warm_start": {"session", "config"},
+    "stopping": {"live_state", "session"},
+    "study_plan": {"config", "counterbalance", "live_records"},
+    "plan_sets": {"study", "study_plan", "validation"},
+    "log_tables": {"event_log", "tables"},
+    "people_table": {"event_log"},
+    "cli_session": {"console", "study_plan", "plan_sets", "log_tables", "people_table"},
     "tables": {"config"},
     "material_tables": {"tables", "identification"},
     "validation_table": {"tables"},
@@ -96,7 +111,7 @@ MAY_IMPORT = MATHS | {
     "paper_tables": {"preferences"},
     "console": set(),
     "cli_material": {"console", "characterise", "material_tables", "report_material"},
-    "event_log": {"session"},
+    "event_log": {"live_state"},
     "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm"},
     "distributed": set(),
     "batch": {"study", "distributed", "gaussian", "kernels"},
@@ -110,7 +125,7 @@ MAY_IMPORT = MATHS | {
     "device_options": {"console", "hardware_bridge", "set_tables", "config", "viscoelastic"},
     "cli_device": {"device_options", "device_tests", "device_screen", "device_words"},
 }
-MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material", "device_options", "cli_device"}
+MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material", "cli_session", "device_options", "cli_device"}
 MAY_IMPORT["report_population"] = {"report", "report_people", "page", "batch_optimum"}
 MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}

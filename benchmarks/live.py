@@ -1,0 +1,156 @@
+"""How long a participant waits: from an answer to the next parameters in force on the device, through the real server.
+
+    python benchmarks/live.py --trials 500 --write      # into docs/live.md
+
+Sessions of the paper's study follow each other, each a process of its own as `hilbo session` starts it, with short
+steps, on the simulated device (host port); a program answers. Times are parts of the server's own clock: the answer's
+arrival, on the disk (fsync), next proposal looked up, on the disk, conversation with the device (serial). Beside them,
+in the same run: the choice as it is without looking ahead, a session's bare step, and starts beside `import jax`.
+"""
+
+import argparse
+import json
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from hilbo.app.rehearsal import Decider, fast_study, server
+from hilbo.app.robot import Client
+from hilbo.config import Study
+from hilbo.console import start
+from hilbo.live_choice import LiveChooser
+from hilbo.live_session import answer, present, propose
+from hilbo.live_state import LiveSession
+from hilbo.session import Session
+from hilbo.study_plan import header_for
+
+ROOT = Path(__file__).parents[1]
+PAPER = ROOT / "hilbo" / "data" / "paper.toml"
+
+
+def one_session(file: Path, study: Study, folder: Path, number: int) -> tuple[list[dict], float, int]:
+    """Delays of a whole session (s), the time from its start to the first Begin, and fits that somebody waited for."""
+    arguments = [str(file), "--participant", f"P{number:02d}", "--logs", str(folder), "--port", "0", "--gap", "0"]
+    decide, begun = Decider(study, seed=number), time.perf_counter()
+    with server(*arguments, "--seed", str(number), "--dry-run", "--sim", "finger=none") as (_, links):
+        person, watch = Client(links["participant"]), Client(links["experimenter"])
+        ready = None
+        while True:
+            view = person.get("/api/participant")
+            if view["may"]["begin"]:
+                ready = ready or time.perf_counter() - begun
+                person.post("/api/participant/begin", {})
+            elif view["questions"]:
+                whole = watch.get("/api/experimenter")["whole"]
+                trial = next(t for t in whole["trials"] if t["id"] == whole["pending"])
+                answers = {q["name"]: decide(trial, q["name"]) for q in view["questions"]}
+                person.post(
+                    "/api/participant/answer", {"trial": view["trial"]["id"], "client": "c", "answers": answers}
+                )
+            elif view["phase"] == "done":
+                break
+            time.sleep(0.01)
+        seen = watch.get("/api/experimenter")
+    return seen["all_delays"], ready or 0.0, seen["fits_after_an_answer"]
+
+
+def choices(study: Study, seed: int) -> tuple[list[float], list[float]]:
+    """Times (s) of proposals without looking ahead, and of `Session.tell`, for the same answers; compiled before."""
+    chooser, bare = (
+        LiveChooser(LiveSession.start(study, header_for(study, "P", seed=seed, warm=False))),
+        Session.start(study, seed),
+    )
+    chooser.warm()
+    bare.warm().join()
+    state, decide = LiveSession.start(study, header_for(study, "P", seed=seed, warm=False)), Decider(study, seed=seed)
+    proposed, told = [], []
+    while state.screen != "done":
+        begun = time.perf_counter()
+        event = propose(state, chooser, 0.0)
+        proposed.append(time.perf_counter() - begun)
+        state = state.after(event)
+        trial = state.trials[-1]
+        state = state.after(present(state, trial.id, 1, True, 0.0))
+        label = decide({"renderings": trial.renderings}, "class_a")
+        begun = time.perf_counter()
+        bare = bare.tell(label)
+        told.append(time.perf_counter() - begun)
+        found = answer(state, trial.id, "c", {"class_a": label}, 0.0)
+        assert found is not None
+        state = state.after(found)
+    fitted = study.selection.space_filling
+    return proposed[fitted:], told[fitted - 1 : -1]
+
+
+def import_times(count: int) -> list[float]:
+    """Of `import jax` in a fresh interpreter, s."""
+    times = []
+    for _ in range(count):
+        begun = time.perf_counter()
+        subprocess.run([sys.executable, "-c", "import jax"], check=True)
+        times.append(time.perf_counter() - begun)
+    return times
+
+
+def quantiles(values) -> str:
+    """Median, 99 % and largest, ms."""
+    found = 1000 * np.quantile(np.asarray(values), [0.5, 0.99, 1.0])
+    return " | ".join(f"{value:.1f}" for value in found)
+
+
+def table(delays, ready, imports, proposed, told, fits) -> str:
+    """Markdown."""
+    parts = {
+        "answer to parameters in force": "total",
+        "… of which the answer's fsync": "fsync",
+        "… the answer acknowledged after": "acknowledged",
+        "… the next proposal looked up": "chosen",
+        "… conversation with the device": "serial",
+    }
+    rows = [f"| {name} | {quantiles([d[key] for d in delays])} |" for name, key in parts.items()]
+    rows.append(f"| the choice without looking ahead, {len(proposed)} trials | {quantiles(proposed)} |")
+    rows.append(f"| a session's bare step (`Session.tell`), the same trials | {quantiles(told)} |")
+    rows.append(f"| start of the command to the first Begin, {len(ready)} starts, warm cache | {quantiles(ready)} |")
+    rows.append(f"| `import jax` alone, {len(imports)} starts | {quantiles(imports)} |")
+    head = (
+        f"{len(delays)} answers, {fits} fits after an answer. Python {platform.python_version()}, {platform.system()}."
+    )
+    return "\n".join(["| ms | median | 99 % | largest |", "|---|---:|---:|---:|", *rows, "", head])
+
+
+def main() -> None:
+    """Run, print, and with --write put the table into docs/live.md."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--trials", type=int, default=500)
+    parser.add_argument("--seconds", type=float, default=0.25, help="of each step")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    start()
+    with tempfile.TemporaryDirectory() as name:
+        file = fast_study(PAPER, Path(name) / "study.toml", options.seconds, 1)
+        study = Study.load(file)
+        delays, ready, imports, fits, number = [], [], [], 0, 0
+        while len(delays) < options.trials:
+            found, first, waited = one_session(file, study, Path(name) / "logs", number)
+            delays += found
+            ready.append(first)
+            imports += import_times(1)
+            fits, number = fits + waited, number + 1
+            print(json.dumps({"answers": len(delays), "ready_s": round(first, 2)}), file=sys.stderr, flush=True)
+        proposed, told = choices(study, 0)
+    text = table(delays, ready[1:] or ready, imports, proposed, told, fits)
+    print(text)
+    if options.write:
+        path = ROOT / "docs" / "live.md"
+        before, _, rest = path.read_text(encoding="utf-8").partition("<!-- times -->\n")
+        _, end, after = rest.partition("<!-- end of times -->")
+        path.write_text(f"{before}<!-- times -->\n{text}\n{end}{after}", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

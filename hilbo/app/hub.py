@@ -1,0 +1,393 @@
+"""The one place that changes a live session: it owns the log, the state, the device and the choosing.
+
+    page or program --> answer / press / command --> event --> log (fsync) --> state --> views to everybody
+
+Events are made one after the other, and one counts only when it is on the disk: then the state moves on, the sender is
+told, and the next proposal is made. Four threads work beside the event loop: the disk's, the device's (`rig`), the
+choosing's, and the server's own. What a participant does next is in `runner`.
+"""
+
+import asyncio
+import contextlib
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+from hilbo import live_session
+from hilbo.app import views
+from hilbo.app.messages import Answer, Command, Press
+from hilbo.app.rig import Rig, Snapshot
+from hilbo.app.runner import Runner
+from hilbo.app.security import Role
+from hilbo.errors import InputError
+from hilbo.event_log import LogError
+from hilbo.live_session import LiveSession, RefusedError
+from hilbo.reasons import held_because
+
+__all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError", "Watcher"]
+
+PRESSES = ("begin", "break", "more")
+COMMANDS = ("pause", "resume", "repeat", "undo", "void", "abort", "note", "estop", "clear", "invite")
+_STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
+_LATER = 1.0  # s between two looks at the clock
+_JUMP = 3.0  # s by which the clock, or the wait for it, may be off before somebody must have closed the laptop
+_SILENT = 10.0  # s without a word from a program in the participant's place until it counts as gone
+_GONE = 3.0  # s without a participant's page until a trial that is being felt is begun again
+
+
+class NotNowError(InputError):
+    """What cannot be done now; the view says what can."""
+
+
+class Watcher:
+    """Somebody who looks at a role's view. `news` is set when there is a newer one."""
+
+    def __init__(self, role: Role, page: str):
+        self.role, self.page = role, page
+        self.news = asyncio.Event()
+        self.ended = False
+        self.why = ""
+
+
+class Hub:
+    """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` opens the device, `maps` what makes
+    the slices of its posterior.
+
+    `invite`, once set, makes a new link for the participant; `gap` (s) is the pause between two trials, `tag` is what
+    trials of this session are known by in browsers.
+    """
+
+    def __init__(
+        self,
+        log: Any,
+        chooser: Any,
+        connect: Callable[[], Any],
+        *,
+        tag: str,
+        maps: Callable[[LiveSession], Any] | None = None,
+        gap: float = 0.7,
+    ):
+        self.log, self.chooser, self.tag, self.gap = log, chooser, tag, gap
+        self.state: LiveSession = log.state
+        self.rig: Rig | None = None
+        self.begun = False  # whether the participant has said so, since the server started or the page came back
+        self.alert: str | None = None
+        self.trust: list[list[str]] = []
+        self.recent: deque = deque(maxlen=200)
+        self.delays: list[dict[str, float]] = []  # s, from each answer on
+        self.invite: Callable[[], dict[str, str]] | None = None
+        self._connect, self._make_maps, self._maps = connect, maps, None
+        self.warm: asyncio.Future | None = None
+        self._watchers: list[Watcher] = []
+        self._disk = ThreadPoolExecutor(1, "hilbo-disk")
+        self.compute = ThreadPoolExecutor(1, "hilbo-choice")
+        self._lock: asyncio.Lock | None = None
+        self._tasks: list[asyncio.Task] = []
+        self._absent: float | None = None
+        self._asked = -math.inf
+        self._map: tuple[str, Any] | None = None
+        self._drawing = ThreadPoolExecutor(1, "hilbo-map")
+        self._device_was = ""
+        self.runner = Runner(self)
+
+    # Life.
+
+    async def open(self) -> None:
+        """Connect to the device, and begin. Raises `InputError` or `DeviceError`."""
+        self._lock, self._loop = asyncio.Lock(), asyncio.get_running_loop()
+        self.rig = await self._loop.run_in_executor(
+            self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed)
+        )
+        self.warm = self._loop.run_in_executor(self.compute, self._warm)
+        await self._device_changed(self.rig.snapshot)
+        self._tasks = [asyncio.create_task(self._watch_time())]
+        self.runner.restart()
+
+    def _warm(self) -> None:
+        """Compile what choosing and drawing need; nothing is rendered before it is done."""
+        self.chooser.warm()
+        if self._make_maps is not None:
+            maps = self._make_maps(self.state)
+            maps.warm(self.state)
+            self._maps = maps
+        self._loop.call_soon_threadsafe(self.publish)
+
+    async def close(self) -> None:
+        """Stop the device, let go of everything."""
+        for task in self._tasks:
+            task.cancel()
+        self.runner.cancel()
+        for watcher in list(self._watchers):
+            watcher.ended = True
+            watcher.news.set()
+        if self.rig is not None:
+            await self._loop.run_in_executor(None, self.rig.close)
+        self._disk.shutdown()
+        for pool in (self.compute, self._drawing):
+            pool.shutdown(wait=False, cancel_futures=True)
+
+    # Events.
+
+    async def commit(self, make: Callable[[LiveSession, float], Any], *, mine: bool = False) -> Any:
+        """Have an event made from the newest state, on the disk, and counted; None if there is none to make.
+
+        `mine`: the runner itself asks, and goes on by itself. Raises `RefusedError`, or `LogError`. Whoever waits for
+        it may give up: the event is finished all the same, so that log and state never part.
+        """
+        return await asyncio.shield(asyncio.ensure_future(self._commit(make, mine)))
+
+    async def _commit(self, make, mine):
+        assert self._lock is not None
+        async with self._lock:
+            event = make(self.state, time.time())
+            if event is None:
+                return None
+            before = self.runner.key()
+            try:
+                self.state = await self._loop.run_in_executor(self._disk, self.log.append, event)
+            except LogError as error:
+                self.alert = str(error)
+                self.publish()
+                raise
+            self.alert = None
+            self.recent.appendleft(event)
+        if not mine and self.runner.key() != before:
+            self.runner.restart()
+        self.publish()
+        return event
+
+    def publish(self) -> None:
+        """Tell everybody who looks that there is news."""
+        for watcher in self._watchers:
+            watcher.news.set()
+
+    # What pages and programs ask for.
+
+    def view(self, role: Role) -> dict[str, Any]:
+        """What a role may see now."""
+        return views.participant(self) if role == "participant" else views.experimenter(self)
+
+    async def answer(self, message: Answer, page: str | None) -> dict[str, Any]:
+        """A participant's answer, accepted once; on the disk when this returns. Raises `NotNowError`."""
+        self._check_page(page)
+        trial, presentation = self._trial_of(message.trial)
+        browser = {} if message.response_ms is None else {"response_s": message.response_ms / 1000}
+        clicked = views.seconds_of(message.clicked)
+        browser |= {} if clicked is None else {"clicked": clicked}
+
+        def make(state, at):
+            found = state.trial(trial)
+            if found.values is None and found.presentation != presentation:
+                raise RefusedError("old-trial", "This trial has been begun again since.")
+            if state.paused is not None and found.values is None:
+                raise RefusedError("paused", "There is a break.")
+            return live_session.answer(state, trial, message.client, message.answers, at, browser=browser)
+
+        came = time.perf_counter()
+        try:
+            event = await self.commit(make)
+        except RefusedError as error:
+            raise NotNowError(str(error)) from None
+        if event is not None:
+            self.runner.clock = {"came": came, "logged": time.perf_counter(), "fsync": self.log.sync_s}
+        return {"accepted": message.trial, "again": event is None}
+
+    async def press(self, what: str, message: Press, page: str | None) -> None:
+        """A participant's button. Raises `NotNowError`."""
+        self._check_page(page)
+        try:
+            if what == "break":
+                await self.commit(lambda state, at: live_session.pause(state, "participant", at))
+            elif what == "more":
+                await self.commit(live_session.more)
+            elif self.state.screen == "ready":
+                await self.commit(live_session.go_on)
+            elif not self.begun:
+                self.begun = True
+                self.runner.wake()
+        except RefusedError as error:
+            raise NotNowError(str(error)) from None
+
+    async def command(self, what: str, message: Command) -> dict[str, Any]:
+        """An experimenter's command. Raises `NotNowError`."""
+        if what == "estop":
+            return await self._estop()
+        if what == "clear":
+            return await self._clear()
+        if what == "invite":
+            if self.invite is None:
+                raise NotNowError("This session gives no links.")
+            return self.invite()
+        try:
+            await self.commit(self._event_of(what, message))
+        except RefusedError as error:
+            raise NotNowError(str(error)) from None
+        return {"done": what}
+
+    def _event_of(self, what, message):
+        if what == "note":
+            if not message.text.strip():
+                raise InputError("The note is empty; write something.")
+            return lambda state, at: live_session.note(state, message.text.strip(), at)
+        if what == "void":
+            return lambda state, at: live_session.void(state, self._last(state), message.reason, at)
+        if what == "abort":
+            return lambda state, at: live_session.abort(state, message.reason, at)
+        if what == "pause":
+            return lambda state, at: live_session.pause(state, "experimenter", at)
+        if what == "resume":
+            self.begun = True
+            return live_session.resume if self.state.paused is not None else live_session.go_on
+        return {"repeat": live_session.repeat, "undo": live_session.undo}[what]
+
+    @staticmethod
+    def _last(state) -> int:
+        """The trial that a person means: the one being felt, or the newest answered one."""
+        if state.pending is not None and state.pending.step is not None:
+            return state.pending.id
+        given = [t.id for t in state.trials if t.status == "answered"]
+        if not given:
+            raise RefusedError("nothing", "There is no trial to void yet.")
+        return given[-1]
+
+    async def _estop(self):
+        assert self.rig is not None
+        try:
+            await self._loop.run_in_executor(None, self.rig.estop)
+        except (RuntimeError, ValueError) as error:
+            raise NotNowError(f"The device could not be told: {error}") from None
+        return {"done": "estop"}
+
+    async def _clear(self):
+        assert self.rig is not None
+        try:
+            await asyncio.wrap_future(self.rig.do(lambda device: device.clear()))
+        except (RuntimeError, ValueError) as error:
+            raise NotNowError(str(error)) from None
+        return {"done": "clear"}
+
+    async def map(self) -> dict[str, Any] | None:
+        """Slices of the posterior, made once for each state of the answers; None where there is nothing to show, empty
+        while they are being prepared."""
+        state = self.state
+        version = views.map_version(state)
+        if self._maps is None:
+            return {}
+        if self._map is None or self._map[0] != version:
+            self._map = version, await self._loop.run_in_executor(self._drawing, self._maps.slices, state)
+            self.trust = await self._loop.run_in_executor(self._drawing, self._maps.trust, state)
+            self.publish()
+        return self._map[1]
+
+    # Who looks.
+
+    def watch(self, role: Role, page: str) -> Watcher:
+        """A new watcher; a participant's newest window ends the others."""
+        watcher = Watcher(role, page)
+        if role == "participant":
+            for other in self._watchers:
+                if other.role == role and other.page != page:
+                    other.ended, other.why = True, self.state.study.session.text("moved")
+                    other.news.set()
+        self._watchers.append(watcher)
+        self.publish()
+        return watcher
+
+    def unwatch(self, watcher: Watcher) -> None:
+        """It looks no more."""
+        with contextlib.suppress(ValueError):
+            self._watchers.remove(watcher)
+        self.publish()
+
+    def joined(self, role: Role) -> None:
+        """Somebody has used a role's link: those who had its key are out."""
+        for watcher in self._watchers:
+            if watcher.role == role:
+                watcher.ended, watcher.why = True, self.state.study.session.text("moved")
+                watcher.news.set()
+
+    @property
+    def draws(self) -> bool:
+        """Whether there are slices to be had."""
+        return self._maps is not None
+
+    @property
+    def present(self) -> bool:
+        """Whether a participant's page is open, or a program in its place has asked for something lately."""
+        if time.monotonic() - self._asked < _SILENT:
+            return True
+        return any(w.role == "participant" and not w.ended for w in self._watchers)
+
+    def heard(self) -> None:
+        """A program asks in the participant's place."""
+        self._asked = time.monotonic()
+
+    def _check_page(self, page) -> None:
+        """Only a participant's newest window counts; a program with a key is one."""
+        newest = next((w.page for w in reversed(self._watchers) if w.role == "participant" and not w.ended), None)
+        if page is not None and newest is not None and page != newest:
+            raise NotNowError(self.state.study.session.text("moved"))
+
+    def _trial_of(self, name: str) -> tuple[int, int]:
+        tag, _, numbers = name.rpartition(":")
+        trial, _, presentation = numbers.partition(".")
+        if tag != self.tag or not (trial.isdecimal() and presentation.isdecimal() and len(numbers) < 16):
+            raise NotNowError("This trial is not of this session.")
+        return int(trial), int(presentation)
+
+    # The device, and time.
+
+    def _from_rig(self, seen: Snapshot) -> None:
+        self._loop.call_soon_threadsafe(lambda: self._spawn(self._device_changed(seen)))
+
+    def _noticed(self, sentence: str) -> None:
+        self._loop.call_soon_threadsafe(self.publish)
+
+    def _spawn(self, work) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.append(task)
+        task.add_done_callback(self._tasks.remove)
+
+    async def _device_changed(self, seen: Snapshot) -> None:
+        """What the device does unasked is an event where it matters to a trial."""
+        condition = "lost" if seen.lost else _STOPPED.get(seen.state, "ready")
+        changed, self._device_was = condition != self._device_was, condition
+        if changed:
+            reason = seen.lost or (held_because(seen.hold_reason) if condition != "ready" else "")
+            facts = {"reason": reason, "counters": seen.counters}
+            with contextlib.suppress(InputError, LogError):
+                await self.commit(lambda state, at: live_session.device(state, condition, at, **facts))
+            if condition == "lost":
+                self.runner.forget()
+            self.runner.wake()
+        self.publish()
+
+    async def _watch_time(self) -> None:
+        """A laptop that slept, and a page that was closed."""
+        wall, steady = time.time(), time.monotonic()
+        while True:
+            await asyncio.sleep(_LATER)
+            now, mono = time.time(), time.monotonic()
+            slept = max(abs((now - wall) - (mono - steady)), mono - steady - _LATER)
+            wall, steady = now, mono
+            if slept > _JUMP:
+                await self._interrupted(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
+            if self.present or not self.begun:
+                self._absent = None
+            elif self._absent is None:
+                self._absent = mono
+            elif mono - self._absent > _GONE:
+                self._absent = None
+                await self._interrupted("The participant's page is closed.")
+
+    async def _interrupted(self, why: str) -> None:
+        """What was being felt is felt again from its beginning, once somebody presses Begin."""
+        pending, self.begun = self.state.pending, False
+        with contextlib.suppress(InputError, LogError):
+            await self.commit(lambda state, at: live_session.note(state, why, at))
+            if pending is not None and pending.step is not None and pending.felt != frozenset(pending.renderings):
+                await self.commit(live_session.repeat)
+        self.runner.restart()

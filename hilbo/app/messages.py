@@ -1,0 +1,63 @@
+"""What the two pages, and programs in their place, may send: JSON, every key known, every value of its type and size.
+
+docs/live.md is the same for a reader. Whatever does not fit is refused with one sentence, and changes nothing.
+"""
+
+from typing import Annotated, Any
+
+import msgspec
+
+from hilbo.errors import InputError
+
+__all__ = ["LARGEST", "Answer", "Command", "Join", "Press", "read"]
+
+LARGEST = 16_384  # bytes of a message
+
+_Id = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
+_Text = Annotated[str, msgspec.Meta(max_length=2000)]
+_Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+
+
+class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One message."""
+
+
+class Join(_Message, frozen=True):
+    """A one-time token for the key of its role; `bearer`: in the answer, for a program, instead of in a cookie."""
+
+    token: _Id
+    bearer: bool = False
+
+
+class Answer(_Message, frozen=True):
+    """All answers of one trial, question -> label. `clicked`: the browser's time, ISO 8601. `response_ms`: since the
+    questions could be answered."""
+
+    trial: _Id
+    client: Annotated[str, msgspec.Meta(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.:-]+$")]
+    answers: Annotated[dict[_Id, _Id], msgspec.Meta(min_length=1, max_length=8)]
+    clicked: Annotated[str, msgspec.Meta(max_length=40)] = ""
+    response_ms: _Milliseconds | None = None
+
+
+class Press(_Message, frozen=True):
+    """A participant's begin, break, or wish for more; `trial` is the one that was on the page."""
+
+    trial: _Id | None = None
+
+
+class Command(_Message, frozen=True):
+    """An experimenter's command."""
+
+    reason: _Text = ""
+    text: _Text = ""
+
+
+def read(kind: type, body: bytes) -> Any:
+    """The message in a request's body. Raises `InputError` with what is wrong with it."""
+    if len(body) > LARGEST:
+        raise InputError(f"The message has {len(body)} bytes; {LARGEST} are the most.")
+    try:
+        return msgspec.json.decode(body or b"{}", type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"The message is not understood: {error}.") from None

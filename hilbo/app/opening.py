@@ -1,0 +1,116 @@
+"""From what was asked for on the command line to a hub: study, plan, log, choosing; compiled before the device runs."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from hilbo.app.hub import Hub
+from hilbo.app.slices import Maps
+from hilbo.config import Study
+from hilbo.errors import InputError
+from hilbo.event_log import EventLog, log_name
+from hilbo.live_choice import LiveChooser
+from hilbo.live_session import Header
+from hilbo.people_table import check_consent, read_people
+from hilbo.study_plan import header_for, planned_header
+from hilbo.warm_start import read_warm_start
+
+__all__ = ["Wanted", "opened"]
+
+
+class Wanted(NamedTuple):
+    """A session as a person asks for it."""
+
+    study: Path
+    participant: str
+    session: str = "1"
+    seed: int = 0
+    logs: Path = Path("logs")
+    plan: Path | None = None
+    material: str | None = None
+    resume: bool = False
+    people: Path | None = None
+    warm_start: Path | None = None
+    dry_run: bool = False
+
+
+def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable[[str], Any]) -> tuple[Hub, EventLog]:
+    """The hub of a session, new or resumed, and its open log. Raises `InputError`."""
+    study = Study.load(wanted.study)
+    mechanics = study.space.mechanics
+    if mechanics is None:
+        raise InputError(f"{wanted.study}: has no [renderer], and a device nothing to render.")
+    log = _log(wanted, study)
+    try:
+        say("preparing what chooses")
+        chooser = LiveChooser(log.state, _warm_starts(wanted, log.state))
+        import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
+    except BaseException:
+        log.close()
+        raise
+    damping = max(_damping(study, block.material) for block in log.state.header.blocks)
+    return Hub(log, chooser, lambda: connect(damping), tag=_tag(log.state.header), maps=Maps), log
+
+
+def _damping(study, material) -> float:
+    return float((study if material is None else study.material(material)).space.mechanics.damping)
+
+
+def _log(wanted, study) -> EventLog:
+    header = _header(wanted, study)
+    path = wanted.logs / log_name(header)
+    if wanted.resume:
+        return EventLog.resume(path, study)
+    if path.exists():
+        raise InputError(
+            f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
+        )
+    return EventLog.create(path, study, header)
+
+
+def _header(wanted, study) -> Header:
+    number = study.session.protocol_number
+    facts: dict[str, Any] = {"protocol_number": number, "versions": _versions()}
+    if not wanted.dry_run:
+        people = read_people(wanted.people or wanted.logs / "participants.csv")
+        facts["consent"] = check_consent(people, wanted.participant, number)["consent_time"]
+    if wanted.warm_start is not None:
+        facts["warm_start"] = _map(wanted, study, wanted.material).source
+    if wanted.plan is None:
+        place = (wanted.participant, wanted.session, wanted.seed)
+        return header_for(study, *place, materials=(wanted.material,), **facts)
+    try:
+        plan = json.loads(wanted.plan.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{wanted.plan}: cannot be read ({error.strerror}); check the path.") from error
+    except ValueError as error:
+        raise InputError(f"{wanted.plan}: is no plan ({error}); make one with `hilbo plan`.") from error
+    try:
+        return planned_header(plan, study, wanted.participant, **facts)
+    except InputError as error:
+        raise InputError(f"{wanted.plan}: {error}") from error
+
+
+def _map(wanted, study, material):
+    return read_warm_start(wanted.warm_start, study if material is None else study.material(material), wanted.seed)
+
+
+def _warm_starts(wanted, state) -> dict[str | None, Any] | None:
+    if wanted.warm_start is None:
+        return None
+    materials = {block.material for block in state.header.blocks if not block.trials}
+    return {name: _map(wanted, state.study, name) for name in materials}
+
+
+def _versions() -> dict[str, str]:
+    return {part: metadata.version(part) for part in ("hilbo", "jax", "jaxlib", "numpy")}
+
+
+def _tag(header: Header) -> str:
+    """What this session's trials are known by in browsers."""
+    return hashlib.sha256(msgspec.json.encode(header)).hexdigest()[:12]

@@ -1,0 +1,244 @@
+"""A whole session without people: a simulated participant drives real server, real pages and a simulated device.
+
+The server is a process of its own, as `hilbo session` starts it; the device is the firmware's core on a
+pseudo-terminal, whose finger presses while a rendering is shown; the participant's page is in Chromium. The participant
+is one of `simulate.PRESETS` and answers from what was really on the device.
+"""
+
+import contextlib
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hilbo import simulate
+from hilbo.app.robot import Participant, browser, screenshots
+from hilbo.config import Study
+from hilbo.errors import InputError
+from hilbo.event_log import read_log
+from hilbo.simulator import Simulator
+from hilbo.study_plan import make_plan
+
+__all__ = ["HILBO", "Decider", "example_sets", "fast_study", "rehearse", "server"]
+
+HILBO = [sys.executable, "-c", "from hilbo.cli import main; main()"]
+_STEPS = {
+    "warm_up": ("reference", "a"),
+    "optimisation": ("reference", "a"),
+    "validation": ("reference", "a", "neutral", "b"),
+    "aggregate_best": ("reference", "a", "neutral", "b"),
+}
+
+
+class Decider:
+    """A simulated person's answers about renderings, in the labels of the study."""
+
+    def __init__(self, study: Study, preset: str = "paper", seed: int = 0):
+        self._study, self._key, self._count = study, jax.random.key(seed), 0
+        people = simulate.people(study, simulate.PRESETS[preset], 1, seed)
+        self._person = jax.tree.map(lambda leaf: leaf[0], people)
+        self._answer = jax.jit(lambda key, x: self._person.answer(key, x, jnp.asarray(0.5, x.dtype)))
+
+    def __call__(self, trial: dict[str, Any], ask: str) -> str:
+        """The label for one question about a trial of the experimenter's view."""
+        unit = {side: self._unit(values) for side, values in trial["renderings"].items()}
+        if ask == "preferred":
+            return min(unit, key=lambda side: self._distance(unit[side]))
+        self._count += 1
+        key = jax.random.fold_in(self._key, self._count)
+        return self._study.responses[int(self._answer(key, jnp.asarray(unit[ask[-1]])))]
+
+    def _unit(self, values):
+        space = self._study.space
+        return np.asarray(space.to_unit(np.array([values[name] for name in space.names])))
+
+    def _distance(self, x):
+        return float(np.linalg.norm((x - np.asarray(self._person.optimum)) / np.asarray(self._person.tolerance)))
+
+
+def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int | None = None) -> Path:
+    """A copy of a study file, whose steps all last `seconds`. Raises `InputError` if it has its own."""
+    text = source.read_text(encoding="utf-8")
+    if seconds is not None:
+        if "[session" in text:
+            raise InputError(f"{source}: has a [session] of its own; leave --seconds out.")
+        for name, shows in _STEPS.items():
+            steps = ", ".join(f'{{show = "{show}", seconds = {seconds}}}' for show in shows)
+            text += f"\n[session.{name}]\nsteps = [{steps}]\n"
+            text += f"count = {warm_up}\n" if name == "warm_up" and warm_up else ""
+    target.write_text(text, encoding="utf-8")
+    return target
+
+
+def example_sets(study: Study, preset: str = "paper") -> dict[str, dict[str, float]]:
+    """Best, mid and worst renderings of a simulated population, by their distance from its truth."""
+    space, truth = study.space, simulate.PRESETS[preset].truth
+    points = space.candidates(256, 0)
+    centre = np.asarray(space.to_unit(np.array([truth[name] for name in space.names])))
+    order = np.argsort(np.linalg.norm(points - centre, axis=1))
+    chosen = {"best": points[order[0]], "mid": points[order[len(order) // 3]], "worst": points[order[-1]]}
+    return {
+        n: dict(zip(space.names, np.asarray(space.to_physical(x)).tolist(), strict=True)) for n, x in chosen.items()
+    }
+
+
+@contextlib.contextmanager
+def server(*arguments: str, patience: float = 600.0) -> Iterator[tuple[subprocess.Popen, dict[str, str]]]:
+    """`hilbo session` as a process, and its links; told to end at the end. Raises `RuntimeError` with its words."""
+    process = subprocess.Popen(
+        [*HILBO, "session", *arguments, "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    words: list[str] = []
+    reading = _reader(process.stderr, words)
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        if not line:
+            process.wait(patience)
+            reading.join(10)
+            raise RuntimeError("the server did not start: " + " ".join("".join(words).split()[-60:]))
+        yield process, json.loads(line)
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(30)
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        reading.join(10)
+        for file in (process.stdout, process.stderr):
+            if file is not None:
+                file.close()
+
+
+def _reader(file, words):
+    import threading
+
+    thread = threading.Thread(target=lambda: words.extend(file), daemon=True)
+    thread.start()
+    return thread
+
+
+def rehearse(
+    source: Path,
+    out: Path,
+    *,
+    phase: str = "optimisation",
+    seconds: float | None = None,
+    warm_up: int | None = None,
+    seed: int = 0,
+    say: Callable[[str], Any] = lambda _: None,
+) -> dict[str, Any]:
+    """The session's log, screenshots of both pages, and how long answers took to be felt, in `out`."""
+    out.mkdir(parents=True, exist_ok=True)
+    file = fast_study(source, out / "study.toml", seconds, warm_up)
+    study = Study.load(file)
+    arguments = [
+        str(file),
+        "--participant",
+        "P01",
+        "--logs",
+        str(out / "logs"),
+        "--port",
+        "0",
+        "--seed",
+        str(seed),
+        "--dry-run",
+    ]
+    arguments += ["--gap", "0.7" if seconds is None else "0.05"]
+    if phase != "optimisation":
+        arguments += ["--plan", str(_plan(study, out, phase, seed))]
+    say("starting the server")
+    finger = Simulator(finger="rest")
+    try:
+        with server(*arguments, "--device", finger.port) as (_, links), browser() as program:
+            say("in session")
+            found = _session(program, links, Decider(study, seed=seed), finger, out, say)
+        found["log"] = links["log"]
+        found["events"] = len(read_log(links["log"], study)[1])
+    finally:
+        finger.close()
+    (out / "result.json").write_text(json.dumps(found, indent=2), encoding="utf-8")
+    return found
+
+
+def _plan(study, out, phase, seed) -> Path:
+    sets = example_sets(study)
+    if phase == "aggregate-best":
+        sets = {"aggregate": sets["best"], "individual:S1": sets["mid"], "individual:S2": sets["worst"]}
+    plan = make_plan(study, ["P01"], seed, phase, sets={"": sets}, source="aggregate")  # type: ignore[arg-type]
+    path = out / "plan.json"
+    path.write_text(json.dumps(plan, indent=2), encoding="utf-8")
+    return path
+
+
+def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
+    screens = out / "screens"
+    screens.mkdir(exist_ok=True)
+    experimenter = program.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    experimenter.goto(links["experimenter"])
+    experimenter.wait_for_url("**/experimenter")
+
+    def watch():
+        return experimenter.evaluate("fetch('/api/experimenter').then(r => r.json())")
+
+    fingers = {True: "finger sine", False: "finger rest"}
+    pressing = [False]
+
+    def feel(on):
+        if on != pressing[0]:
+            pressing[0] = on
+            finger.tell(fingers[on])
+
+    window = program.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    mishaps: list[str] = []
+    for page in (window, experimenter):
+        page.on("pageerror", lambda error: mishaps.append(str(error)))
+    participant = Participant(window, links["participant"], watch, decide, feel)
+    taken, cleared, begun = set(), 0, time.monotonic()
+    while True:
+        phase = participant.phase
+        question = window.is_visible("#options")
+        mark = (phase, question, window.inner_text("#title") if question else "")
+        if mark not in taken and len(taken) < 12 and phase != "wait":
+            taken.add(mark)
+            screenshots(window, screens, f"participant-{len(taken)}-{phase}{'-question' if question else ''}")
+        before = participant.answered
+        phase = participant.act()
+        if participant.answered > before:
+            say(f"{participant.answered} answers")
+            if participant.answered in (1, 3, 8):
+                screenshots(experimenter, screens, f"experimenter-{participant.answered}")
+        if phase in ("done", "ended"):
+            break
+        cleared += phase == "wait" and _cleared(experimenter)
+        time.sleep(0.02)
+    view = watch()
+    screenshots(experimenter, screens, "experimenter-end")
+    screenshots(window, screens, "participant-end")
+    return {
+        "answers": participant.answered,
+        "seconds": round(time.monotonic() - begun, 1),
+        "fits_after_an_answer": view["fits_after_an_answer"],
+        "answer_to_device_ms": [round(1000 * d["total"], 1) for d in view["all_delays"]],
+        "holds_cleared": cleared,
+        "mishaps": mishaps,
+        "screens": sorted(path.name for path in screens.iterdir()),
+    }
+
+
+def _cleared(experimenter) -> bool:
+    """A device that held on a busy computer is let go again, as the experimenter would."""
+    if not experimenter.is_visible("#clear"):
+        return False
+    experimenter.click("#clear")
+    experimenter.wait_for_selector("#clear", state="hidden")
+    return True

@@ -1,0 +1,230 @@
+"""What happens next in a session: propose, put on the device, lead through the steps, wait for the answer.
+
+One task at a time, begun anew whenever an event changes what is to be felt (an answer, a break, an undo, a HOLD …).
+Sets go over to the device out of contact only, while the participant feels the reference or nothing. The renderer runs
+from the first rendering to the next break or end: what is in force pushes the handle back when the hand leaves it, and
+is then changed. While the participant feels, the next proposal is
+made ready for every possible answer, so that after the answer it is only looked up.
+"""
+
+import asyncio
+import contextlib
+import threading
+import time
+from concurrent.futures import Future
+from typing import Any
+
+from hilbo import live_session
+from hilbo.hardware_bridge import DeviceError
+from hilbo.live_session import RefusedError, Trial
+
+__all__ = ["Runner"]
+
+_LATER = 1.0  # s until what the device refused is tried again
+_SOON = 0.05  # s
+
+
+class Runner:
+    """Leads a `Hub` on: `stage` says what it is at, for the views; `ends` when the present step does (monotonic)."""
+
+    def __init__(self, hub: Any):
+        self.hub = hub
+        self.stage, self.trouble = "idle", ""
+        self.step: int | None = None
+        self.ends = 0.0
+        self.clock: dict[str, float] = {}
+        self._task: asyncio.Task | None = None
+        self._stop = threading.Event()
+        self._in_force: tuple[int, int, str] | None = None
+        self._wake = asyncio.Event()
+        self._rendering = False
+        self._ahead: Future | None = None
+        self.fits_after = 0  # fits that a participant had to wait for
+        self._mechanics: dict[str | None, Any] = {}
+
+    def key(self) -> tuple:
+        """What is to be felt now: a change begins everything anew."""
+        pending = self.hub.state.pending
+        return self.hub.state.screen, pending and (pending.id, pending.presentation)
+
+    def restart(self) -> None:
+        """Leave what is going on, and begin with what the state says now."""
+        self.cancel()
+        self._stop = threading.Event()
+        self._task = asyncio.create_task(self._run(self._stop))
+
+    def cancel(self) -> None:
+        """Leave what is going on."""
+        self._stop.set()
+        if self._task is not None:
+            self._task.cancel()
+            self._task = None
+        self.stage, self.step = "idle", None
+
+    def wake(self) -> None:
+        """What is waited for may have happened."""
+        self._wake.set()
+
+    def forget(self) -> None:
+        """The device has no set any more."""
+        self._in_force = None
+
+    async def _run(self, stop: threading.Event) -> None:
+        """Until there is nothing to do before somebody does something."""
+        hub = self.hub
+        if hub.state.screen not in ("wait", "trial") or not hub.begun:
+            await self._halt()
+        try:
+            while hub.state.screen in ("wait", "trial"):
+                if hub.state.screen == "wait":
+                    self._at("choosing")
+                    await self._propose()
+                else:
+                    await self._present(hub.state.pending, stop)
+                    return
+            self._at("idle")
+        except RefusedError:  # the state has changed meanwhile, and with it what is to be done
+            await asyncio.sleep(_SOON)
+            self._again(stop)
+        except (OSError, ValueError, RuntimeError) as error:
+            self.trouble = str(error)
+            self._at("trouble")
+            await asyncio.sleep(_LATER)
+            self._again(stop)
+
+    def _again(self, stop) -> None:
+        if not stop.is_set():
+            asyncio.get_running_loop().call_soon(self.restart)
+
+    def _at(self, stage: str, step: int | None = None, seconds: float = 0.0) -> None:
+        self.stage, self.step, self.ends = stage, step, time.monotonic() + seconds
+        if stage != "trouble":
+            self.trouble = ""
+        self.hub.publish()
+
+    async def _propose(self) -> None:
+        """The next trial, in the log; chosen in the choosing's thread."""
+        hub = self.hub
+        state = hub.state
+        loop = asyncio.get_running_loop()
+        begun, fits = time.perf_counter(), getattr(hub.chooser, "fits", 0)
+        event = await loop.run_in_executor(hub.compute, live_session.propose, state, hub.chooser, time.time())
+        if "came" in self.clock:
+            self.fits_after += getattr(hub.chooser, "fits", 0) - fits
+
+        def make(newest, at):
+            if newest.seq == event.seq - 1:
+                return event
+            if newest.need != state.need or newest.trials != state.trials:
+                raise RefusedError("nothing", "what is to be proposed has changed.")
+            return live_session.Event(seq=newest.seq + 1, kind=event.kind, time=at, data=event.data)
+
+        self.clock["chosen"] = time.perf_counter() - begun
+        await hub.commit(make, mine=True)
+        self.clock["proposed"] = time.perf_counter()
+
+    async def _present(self, trial: Trial, stop: threading.Event) -> None:
+        hub = self.hub
+        if trial.felt == frozenset(trial.renderings):  # all felt already: after a break, or a restart of the server
+            self._look_ahead()
+            self._at("answer")
+            return
+        steps = live_session.steps_of(hub.state, trial)
+        await self._device_ready()
+        loading = asyncio.ensure_future(self._load(trial, _next_side(steps, 0), stop))
+        try:
+            await asyncio.shield(hub.warm)  # a long arithmetic start, and a device that renders, do not go together
+            while not hub.begun:
+                self._wake.clear()
+                self._at("hello")
+                await self._wake.wait()
+            self._look_ahead()
+            if hub.gap and trial.id > 1:
+                self._at("between")
+                await asyncio.sleep(hub.gap)
+            for i, (show, seconds) in enumerate(steps):
+                if show in trial.renderings:
+                    await self._arrived(loading)
+                elif i and loading.done():
+                    loading = asyncio.ensure_future(self._load(trial, _next_side(steps, i), stop))
+                await self._step(trial, i, show, seconds)
+        finally:
+            loading.cancel()
+        self._at("answer")
+
+    async def _step(self, trial, i, show, seconds) -> None:
+        rig, commit = self.hub.rig, self.hub.commit
+        if show in trial.renderings:
+            self._rendering = True
+            await asyncio.wrap_future(rig.render())
+        await commit(lambda state, at: live_session.present(state, trial.id, i, True, at), mine=True)
+        self._at("step", i, seconds)
+        await asyncio.sleep(seconds)
+        await commit(lambda state, at: live_session.present(state, trial.id, i, False, at), mine=True)
+
+    async def _arrived(self, loading) -> None:
+        """The set is in force; if a hand keeps it from that, it is asked to leave."""
+        done, _ = await asyncio.wait([loading], timeout=0.15)
+        if not done:
+            self._at("let-go")
+        await loading
+
+    async def _load(self, trial: Trial, side: str | None, stop: threading.Event) -> None:
+        """A side's set in force, and in the log that it is."""
+        hub = self.hub
+        if side is None or self._in_force == (trial.id, trial.presentation, side):
+            return
+        loaded = await asyncio.wrap_future(hub.rig.load(self._wanted(trial, side), stop))
+        if loaded is None:
+            raise asyncio.CancelledError
+        facts = {"in_force": loaded.in_force._asdict(), "serial_s": loaded.serial_s}
+        self._note_times(loaded)
+        self._in_force = (trial.id, trial.presentation, side)
+        await hub.commit(lambda state, at: live_session.sent(state, trial.id, side, at, **facts), mine=True)
+
+    def _wanted(self, trial: Trial, side: str) -> dict[str, Any]:
+        """What `Renderer.send` takes."""
+        material = self.hub.state.header.blocks[trial.block].material
+        if material not in self._mechanics:
+            study = self.hub.state.study
+            self._mechanics[material] = (study if material is None else study.material(material)).space.mechanics
+        m, values = self._mechanics[material], trial.renderings[side]
+        numbers = {name: values[name] for name in ("K0", "K1", "B1", "alpha")}
+        return numbers | {"N": m.N, "T": m.T, "memory": m.memory, "states": m.states}
+
+    def _note_times(self, loaded) -> None:
+        """How long it took from an answer to parameters in force, in parts."""
+        clock, now = self.clock, time.perf_counter()
+        if {"came", "proposed"} <= set(clock):
+            parts = {"total": now - clock["came"], "fsync": clock["fsync"], "chosen": clock["chosen"]}
+            self.hub.delays.append(parts | {"serial": loaded.serial_s, "acknowledged": clock["logged"] - clock["came"]})
+        self.clock = {}
+
+    async def _device_ready(self) -> None:
+        """Wait while the device is lost, or holds."""
+        while True:
+            seen = self.hub.rig.snapshot
+            if seen.lost is None and seen.state not in ("HOLD", "ESTOP"):
+                return
+            self.trouble = seen.lost or f"The device is in {seen.state}."
+            self._at("trouble")
+            self._wake.clear()
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._wake.wait(), _LATER)
+
+    async def _halt(self) -> None:
+        """The renderer rests while nobody is to feel anything."""
+        if self._rendering:
+            self._rendering = False
+            with contextlib.suppress(DeviceError, ValueError):  # a device that is lost stops by itself
+                await asyncio.wrap_future(self.hub.rig.do(lambda device: device.stop()))
+
+    def _look_ahead(self) -> None:
+        """In the choosing's thread, while somebody feels: what comes next after each possible answer."""
+        hub = self.hub
+        state = hub.state
+        self._ahead = hub.compute.submit(hub.chooser.lookahead, state)
+
+
+def _next_side(steps, i) -> str | None:
+    return next((show for show, _ in steps[i:] if show in ("a", "b")), None)

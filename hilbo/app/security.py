@@ -1,0 +1,114 @@
+"""Who may ask the server for what: one-time links, keys for two roles, and where a request may come from.
+
+A link ends in `#token`, which browsers do not send: the page that it opens trades the token, once, for the role's key,
+in a cookie that scripts cannot read (or, for programs, in the answer). Keys outlive the server, in a file beside the
+log that only its owner may read, so that pages find their session again after a restart; tokens do not.
+
+Host and Origin of every request are compared with the addresses that the server was started for: a page of somebody
+else's that reaches this computer by a name of its own (DNS rebinding) or by a form is refused, whatever cookies it has.
+"""
+
+import contextlib
+import hashlib
+import hmac
+import json
+import os
+import secrets
+import socket
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Literal, get_args
+
+from hilbo.errors import InputError
+
+__all__ = ["COOKIES", "Gate", "Role", "lan_addresses"]
+
+Role = Literal["participant", "experimenter"]
+COOKIES: dict[Role, str] = {"participant": "hilbo_participant", "experimenter": "hilbo_experimenter"}
+_BYTES = 24
+
+
+class Gate:
+    """Tokens, keys and addresses of one server. `keys` is the file that keeps the keys from one start to the next."""
+
+    def __init__(self, hosts: Iterable[str], keys: Path | None = None):
+        self.hosts = frozenset(host.lower() for host in hosts)
+        self.origins = frozenset(f"http://{host}" for host in self.hosts)
+        self._file = keys
+        self._keys: dict[Role, str] = _kept(keys)
+        self._tokens: dict[str, Role] = {}
+
+    def invite(self, role: Role) -> str:
+        """A new token for a role, good for one use; earlier ones of the role that nobody has used are void."""
+        self._tokens = {digest: other for digest, other in self._tokens.items() if other != role}
+        token = secrets.token_urlsafe(_BYTES)
+        self._tokens[_digest(token)] = role
+        return token
+
+    def redeem(self, token: str) -> tuple[Role, str] | None:
+        """The role of a token and a new key for it, None if it is unknown or used.
+
+        The key replaces the one before: a participant's second browser ends the first.
+        """
+        role = self._tokens.pop(_digest(token), None)
+        if role is None:
+            return None
+        key = secrets.token_urlsafe(_BYTES)
+        self._keys[role] = _digest(key)
+        self._keep()
+        return role, key
+
+    def admits(self, role: Role, key: str | None) -> bool:
+        """Whether this is the role's key."""
+        known = self._keys.get(role)
+        return known is not None and key is not None and hmac.compare_digest(known, _digest(key))
+
+    def refuses(self, headers: Mapping[str, str], *, changes: bool, cookie: bool) -> str | None:
+        """Why a request of these headers is refused, or None. `changes`: it is no mere look; `cookie`: its key was."""
+        if headers.get("host", "").lower() not in self.hosts:
+            return "This address is not the one that the session was started for; use the link that it gave."
+        origin = headers.get("origin")
+        if origin is not None and origin.lower() not in self.origins:
+            return "The request comes from a page of another site."
+        if headers.get("sec-fetch-site", "same-origin") not in ("same-origin", "none"):
+            return "The request comes from a page of another site."
+        if changes and cookie and origin is None:
+            return "The request does not say which page it comes from; a program sends its key in Authorization."
+        return None
+
+    def _keep(self) -> None:
+        if self._file is None:
+            return
+        part = self._file.with_name(f"{self._file.name}.part")
+        try:
+            with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
+                json.dump(self._keys, file)
+            part.replace(self._file)
+        except OSError as error:
+            raise InputError(f"{self._file}: cannot be written ({error.strerror}); make room for it.") from error
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _kept(file: Path | None) -> dict[Role, str]:
+    """The digests in a file of keys; none where it is missing or damaged, and everybody is invited again."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8")) if file else {}
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(found, dict):
+        return {}
+    return {role: found[role] for role in get_args(Role) if isinstance(found.get(role), str)}
+
+
+def lan_addresses() -> list[str]:
+    """Addresses of this computer in its networks, the one towards other networks first; no packet is sent."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
+        probe.connect(("192.0.2.1", 9))  # reserved for documentation
+        found.append(probe.getsockname()[0])
+    with contextlib.suppress(OSError):
+        found += [info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+    return [str(address) for address in dict.fromkeys(found) if not str(address).startswith("127.")]

@@ -1,0 +1,106 @@
+"""Starting and ending the server of a session: address, links, QR codes, signals.
+
+The socket is bound before anything slow happens, so that a port in use is said at once; nobody is answered before the
+hub is open.
+"""
+
+import base64
+import io
+import socket
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, get_args
+
+from hilbo.app.security import Gate, Role, lan_addresses
+from hilbo.errors import InputError
+
+__all__ = ["PORT", "Place", "bound", "qr_image", "qr_text", "serve"]
+
+PORT = 8642
+_LINGER = 3  # s for open streams when the server ends
+
+
+class Place:
+    """Where a session is served: a bound socket, its gate, and links to hand out."""
+
+    def __init__(self, listening: socket.socket, addresses: list[str], keys: Path | None):
+        number = listening.getsockname()[1]
+        self.socket = listening
+        self.hosts = [f"{host}:{number}" for host in ("127.0.0.1", "localhost", *addresses)]
+        self._near, self._far = self.hosts[0], self.hosts[2] if addresses else self.hosts[0]
+        self.gate = Gate(self.hosts, keys)
+
+    def link(self, role: Role) -> str:
+        """A one-time link for a role. The participant's is for the network where there is one, the experimenter's for
+        this computer."""
+        host = self._far if role == "participant" else self._near
+        return f"http://{host}/#{self.gate.invite(role)}"
+
+    def links(self) -> dict[str, str]:
+        """One link for each role."""
+        return {role: self.link(role) for role in get_args(Role)}
+
+
+def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> Place:
+    """A socket that nobody else uses. Only this computer reaches it, with `lan` its networks too.
+
+    Raises `InputError` if the port is in use, or there is no network.
+    """
+    addresses = lan_addresses() if lan else []
+    if lan and not addresses:
+        raise InputError("--lan: this computer is in no network; connect it to one, or leave --lan out.")
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind(("0.0.0.0" if lan else "127.0.0.1", port))
+    except (OSError, OverflowError) as error:
+        listening.close()
+        raise InputError(
+            f"--port {port}: cannot be used ({getattr(error, 'strerror', error)}); end the other session, or choose"
+            " another --port."
+        ) from error
+    return Place(listening, addresses, keys)
+
+
+def serve(place: Place, application: Any, started: Callable[[Callable[[], None]], Any]) -> None:
+    """Answers until Ctrl-C or SIGTERM, or until what `started` was given, once the hub was open, is called."""
+    import uvicorn
+
+    config = uvicorn.Config(
+        application, log_level="warning", access_log=False, lifespan="on", timeout_graceful_shutdown=_LINGER,
+        server_header=False, ws="none",
+    )  # fmt: skip
+    server = uvicorn.Server(config)
+    before = server.startup
+
+    async def startup(sockets=None):
+        await before(sockets=sockets)
+        if not server.should_exit:
+            started(stop)
+
+    def stop() -> None:
+        server.should_exit = True
+
+    server.startup = startup  # type: ignore[method-assign]
+    try:
+        server.run(sockets=[place.socket])
+    finally:
+        place.socket.close()
+
+
+def qr_image(link: str) -> str:
+    """A link as a picture, in a data: URI."""
+    import segno
+
+    file = io.BytesIO()
+    segno.make(link, error="m").save(file, kind="svg", scale=4, border=3, xmldecl=False, svgns=True)
+    return "data:image/svg+xml;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+def qr_text(link: str) -> str:
+    """A link as a picture made of characters, for a terminal."""
+    import segno
+
+    file = io.StringIO()
+    segno.make(link, error="l").terminal(file, border=2, compact=True)
+    return file.getvalue()

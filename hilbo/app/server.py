@@ -1,0 +1,241 @@
+"""HTTP around a hub: pages, JSON, and a stream of views for each role.
+
+    GET  /                       trades the token of a link for a key
+    POST /api/join               {"token": …}
+    GET  /participant            the page; so /experimenter
+    GET  /api/participant        the view; so /api/experimenter, and /api/experimenter/map
+    GET  /api/participant/events the same as server-sent events, at every change
+    POST /api/participant/…      answer, begin, break, more
+    POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite
+
+Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 409 not now, 413 too large. The
+event loop only waits here: files, device and arithmetic have threads of their own.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any, get_args
+
+import msgspec
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.routing import Mount, Route
+from starlette.staticfiles import StaticFiles
+
+from hilbo.app import messages
+from hilbo.app.hub import COMMANDS, PRESSES, Hub, NotNowError
+from hilbo.app.security import COOKIES, Gate, Role
+from hilbo.errors import InputError
+from hilbo.event_log import LogError
+
+__all__ = ["application"]
+
+_STATIC = Path(__file__).parent / "static"
+_ALIVE = 5.0  # s between signs of life in a silent stream
+_DAY = 86_400
+_HEADERS = {
+    b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
+    b" img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    b"x-content-type-options": b"nosniff",
+    b"referrer-policy": b"no-referrer",
+    b"cache-control": b"no-store",
+    b"cross-origin-opener-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+}
+
+
+class _Guard:
+    """Refuses what comes from elsewhere, before anything looks at it; and says to browsers what pages may do."""
+
+    def __init__(self, app: Any, gate: Gate):
+        self.app, self.gate = app, gate
+
+    async def __call__(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        request = Request(scope)
+        cookie = any(name in request.cookies for name in COOKIES.values()) and not _bearer(request)
+        why = self.gate.refuses(request.headers, changes=request.method not in ("GET", "HEAD"), cookie=cookie)
+
+        async def sending(message):
+            if message["type"] == "http.response.start":
+                message["headers"] = [*message["headers"], *_HEADERS.items()]
+            await send(message)
+
+        await (_error(403, why) if why else self.app)(scope, receive, sending)
+
+
+def application(hub: Hub, gate: Gate) -> Starlette:
+    """The server of one session."""
+    guarded = _for(hub, gate)
+    routes = [
+        Route("/", _page("join.html")),
+        Route("/api/join", _join(hub, gate), methods=["POST"]),
+        Route("/api/experimenter/map", guarded("experimenter", _map), methods=["GET"]),
+    ]
+    for role in get_args(Role):
+        routes += [
+            Route(f"/{role}", _role_page(gate, role)),
+            Route(f"/api/{role}", guarded(role, _view), methods=["GET"]),
+            Route(f"/api/{role}/events", guarded(role, _events), methods=["GET"]),
+        ]
+    routes += [Route("/api/participant/answer", guarded("participant", _answer), methods=["POST"])]
+    routes += [Route(f"/api/participant/{n}", guarded("participant", _press), methods=["POST"]) for n in PRESSES]
+    routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
+    routes += [Mount("/static", StaticFiles(directory=_STATIC))]
+    return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)], lifespan=_lifespan(hub))
+
+
+def _lifespan(hub):
+    @contextlib.asynccontextmanager
+    async def lifespan(_app: Starlette) -> AsyncIterator[None]:
+        await hub.open()
+        try:
+            yield
+        finally:
+            await hub.close()
+
+    return lifespan
+
+
+def _page(name):
+    async def page(_request: Request) -> Response:
+        return FileResponse(_STATIC / name)
+
+    return page
+
+
+def _role_page(gate, role):
+    async def page(request: Request) -> Response:
+        if not gate.admits(role, request.cookies.get(COOKIES[role])):
+            return FileResponse(_STATIC / "join.html", status_code=401)
+        return FileResponse(_STATIC / f"{role}.html")
+
+    return page
+
+
+def _join(hub, gate):
+    async def join(request: Request) -> Response:
+        try:
+            message = messages.read(messages.Join, await _body(request))
+        except InputError as error:
+            return _error(400, str(error))
+        found = gate.redeem(message.token)
+        if found is None:
+            return _error(401, "This link has been used, or is not of this session; ask for a new one.")
+        role, key = found
+        hub.joined(role)
+        if message.bearer:
+            return JSONResponse({"role": role, "key": key})
+        reply = JSONResponse({"role": role})
+        reply.set_cookie(COOKIES[role], key, max_age=_DAY, httponly=True, samesite="strict", path="/")
+        return reply
+
+    return join
+
+
+def _for(hub, gate):
+    """Makes handlers of (hub, role, request) that only somebody with the role's key reaches."""
+
+    def guarded(role: Role, handler: Callable):
+        async def handle(request: Request) -> Response:
+            program = _bearer(request)
+            if not gate.admits(role, program or request.cookies.get(COOKIES[role])):
+                return _error(401, "Open the link of this session first; this page is no longer part of it.")
+            if program and role == "participant":
+                hub.heard()
+            try:
+                return await handler(hub, role, request)
+            except LogError as error:
+                return _json({"error": str(error)}, 503)
+            except NotNowError as error:
+                return _json({"error": str(error), "view": hub.view(role)}, 409)
+            except InputError as error:
+                return _error(400, str(error))
+
+        return handle
+
+    return guarded
+
+
+async def _view(hub, role, _request) -> Response:
+    return _json(hub.view(role))
+
+
+async def _map(hub, _role, _request) -> Response:
+    found = await hub.map()
+    return _error(404, "This session has no map.") if found is None else _json(found)
+
+
+async def _answer(hub, role, request) -> Response:
+    message = messages.read(messages.Answer, await _body(request))
+    found = await hub.answer(message, _page_of(request))
+    return _json(found | {"view": hub.view(role)})
+
+
+async def _press(hub, role, request) -> Response:
+    message = messages.read(messages.Press, await _body(request))
+    await hub.press(request.url.path.rpartition("/")[2], message, _page_of(request))
+    return _json({"view": hub.view(role)})
+
+
+async def _command(hub, _role, request) -> Response:
+    message = messages.read(messages.Command, await _body(request))
+    return _json(await hub.command(request.url.path.rpartition("/")[2], message))
+
+
+async def _events(hub, role, request) -> Response:
+    page = request.query_params.get("page", "")
+    return StreamingResponse(_stream(hub, role, page[:64]), media_type="text/event-stream")
+
+
+async def _stream(hub, role, page) -> AsyncIterator[bytes]:
+    """The view now and after every change; the newest one where several came at once."""
+    watcher = hub.watch(role, page)
+    try:
+        yield b"retry: 1000\n\n"
+        while not watcher.ended:
+            watcher.news.clear()
+            yield b"event: view\ndata: " + msgspec.json.encode(hub.view(role)) + b"\n\n"
+            while not watcher.news.is_set():
+                try:
+                    await asyncio.wait_for(watcher.news.wait(), _ALIVE)
+                except TimeoutError:
+                    yield b": alive\n\n"
+        if watcher.why:
+            yield b"event: moved\ndata: " + msgspec.json.encode({"error": watcher.why}) + b"\n\n"
+    finally:
+        hub.unwatch(watcher)
+
+
+async def _body(request) -> bytes:
+    """The body, or as much of it as shows that it is too large."""
+    found = b""
+    async for part in request.stream():
+        found += part
+        if len(found) > messages.LARGEST:
+            break
+    return found
+
+
+def _bearer(request) -> str | None:
+    kind, _, key = request.headers.get("authorization", "").partition(" ")
+    return key.strip() if kind.lower() == "bearer" and key.strip() else None
+
+
+def _page_of(request) -> str | None:
+    """Which window of a browser sends this; None for a program with a key."""
+    return None if _bearer(request) else request.headers.get("x-hilbo-page", "")[:64]
+
+
+def _json(content, status=200) -> Response:
+    return Response(msgspec.json.encode(content), status, media_type="application/json")
+
+
+def _error(status, sentence) -> Response:
+    return JSONResponse({"error": sentence}, status)

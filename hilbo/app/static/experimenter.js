@@ -1,0 +1,147 @@
+// The experimenter's page: everything the server knows, and the commands. Nothing is decided here.
+"use strict";
+
+const at = (id) => document.getElementById(id);
+const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent = text; };
+let view = null, mapOf = null, lastEscape = 0;
+
+function number(value, digits = 4) {
+  if (value === null || value === undefined) return "–";
+  return typeof value === "number" ? String(Number(value.toPrecision(digits))) : String(value);
+}
+
+function list(id, rows) {
+  const marks = rows.map(([name, text]) => `${name}\u0000${text}`);
+  if (at(id).dataset.shown === marks.join("\n")) return;
+  at(id).dataset.shown = marks.join("\n");
+  at(id).replaceChildren(...rows.flatMap(([name, text]) => [
+    Object.assign(document.createElement("dt"), { textContent: name }),
+    Object.assign(document.createElement("dd"), { textContent: text }),
+  ]));
+}
+
+function draw() {
+  if (!view) return;
+  put("who", view.who); put("what", view.what); put("phase", view.phase_words);
+  document.title = `${view.who} – ${view.phase_words}`;
+  document.body.dataset.phase = view.phase;
+  list("trial", view.trial); list("trust", view.trust);
+  drawDevice(); drawAlert(view.alert || ""); drawAnswers(); drawLog();
+  put("watch", view.participant_here ? "Connected." : "Not connected.");
+  for (const b of document.querySelectorAll("[data-command]")) b.disabled = !view.may.includes(b.dataset.command);
+  at("estop").disabled = !view.may.includes("estop");
+  if (view.map_version !== mapOf) { mapOf = view.map_version; loadMap(); }
+}
+
+function drawDevice() {
+  const d = view.device;
+  put("device-state", d.state); at("device-state").dataset.level = d.level;
+  put("device-words", d.words);
+  list("device", d.rows);
+  at("clear").hidden = !view.may.includes("clear");
+}
+
+function drawAlert(text) { at("alert").hidden = !text; put("alert", text); }
+
+function drawAnswers() {
+  const t = view.table;
+  const head = t.head.join("\u0000"), mark = JSON.stringify(t.rows);
+  const table = at("answers").parentElement;
+  if (table.dataset.head !== head) {
+    table.dataset.head = head;
+    const row = document.createElement("tr");
+    row.append(...t.head.map((name) => Object.assign(document.createElement("th"), { textContent: name, scope: "col" })));
+    table.tHead.replaceChildren(row);
+  }
+  if (at("answers").dataset.shown === mark) return;
+  at("answers").dataset.shown = mark;
+  at("answers").replaceChildren(...t.rows.map((r) => {
+    const row = document.createElement("tr");
+    row.className = r.kind;
+    row.append(...r.cells.map((cell) => Object.assign(document.createElement("td"), { textContent: number(cell) })));
+    return row;
+  }));
+}
+
+function drawLog() {
+  const mark = String(view.log.length ? view.log[0][0] : "");
+  if (at("log").dataset.shown === mark) return;
+  at("log").dataset.shown = mark;
+  at("log").replaceChildren(...view.log.map((cells) => {
+    const item = document.createElement("li");
+    item.append(...cells.map((cell, i) => Object.assign(document.createElement("span"), { textContent: cell, className: i === 2 ? "kind" : "" })));
+    return item;
+  }));
+}
+
+async function loadMap() {
+  try {
+    const reply = await fetch("/api/experimenter/map");
+    if (reply.ok) { const map = await reply.json(); if (map.slices) drawMap(at("map"), map); }
+    at("map-box").hidden = reply.status === 404;
+  } catch { mapOf = null; }
+}
+
+async function command(name, more = {}) {
+  try {
+    const reply = await fetch(`/api/experimenter/${name}`, {
+      method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(more),
+    });
+    const news = await reply.json();
+    if (!reply.ok) drawAlert(news.error);
+    return news;
+  } catch {
+    drawAlert("The server does not answer; look at the terminal it was started in.");
+    return null;
+  }
+}
+
+const SURE = { abort: "End the session here? What has been answered stays; nothing more is asked.",
+               void: "Void this trial? Its answer, if there is one, is not used; it stays in the log.",
+               undo: "Take the last answer back? The trial is asked again." };
+
+function sure(name) {
+  if (!SURE[name]) return Promise.resolve("");
+  const box = at("sure");
+  at("sure-why").value = "";
+  put("sure-text", SURE[name]);
+  box.returnValue = "no";
+  box.showModal();
+  return new Promise((done) => box.addEventListener("close",
+    () => done(box.returnValue === "yes" ? at("sure-why").value : null), { once: true }));
+}
+
+for (const b of document.querySelectorAll("[data-command]")) {
+  b.addEventListener("click", async () => {
+    const why = await sure(b.dataset.command);
+    if (why !== null) command(b.dataset.command, why ? { reason: why } : {});
+  });
+}
+at("estop").addEventListener("click", () => command("estop"));
+document.addEventListener("keydown", (e) => {
+  if (e.key !== "Escape" || at("sure").open) return;
+  if (performance.now() - lastEscape < 1000) command("estop");
+  lastEscape = performance.now();
+});
+at("note").addEventListener("submit", async (e) => {
+  e.preventDefault();
+  const text = at("note-text").value.trim();
+  if (text && await command("note", { text })) at("note-text").value = "";
+});
+at("invite").addEventListener("click", async () => {
+  const found = await command("invite");
+  if (!found || !found.link) return;
+  put("link-text", found.link);
+  at("qr").src = found.qr;
+  at("link").hidden = false;
+});
+
+function listen() {
+  const source = new EventSource("/api/experimenter/events");
+  source.addEventListener("view", (e) => { view = JSON.parse(e.data); draw(); });
+  source.onerror = () => {
+    drawAlert("The connection to the server is gone; it is being restored.");
+    if (source.readyState === EventSource.CLOSED) setTimeout(listen, 1500);
+  };
+}
+listen();

@@ -1,0 +1,249 @@
+"""What each role's page is told, from the state, the runner's stage and the device.
+
+The participant's view is made from `participant_view`, that is from the protocol and its texts: nothing here adds a
+parameter, a set or a prediction to it. Times go over as seconds that are left, so that clocks need not agree.
+"""
+
+import math
+import time
+from datetime import datetime
+from typing import Any
+
+from hilbo.live_session import LiveSession
+from hilbo.live_views import experimenter_view, participant_view
+
+__all__ = ["experimenter", "map_version", "participant", "seconds_of", "trial_name"]
+
+_TEXTS = {
+    "page_title": "title", "more": "another", "break": "break", "saving": "sent", "disconnected": "offline",
+    "moved": "moved", "space_key": "space_key",
+}  # fmt: skip
+_PHASE_WORDS = {
+    "hello": "Waiting for the participant to press Begin",
+    "choosing": "Choosing the next rendering",
+    "between": "Between two trials",
+    "let-go": "Waiting for the hand to leave the device",
+    "answer": "Waiting for the answer",
+    "idle": "Nothing to do",
+}
+_SCREEN_WORDS = {
+    "ready": "Warm-up done: the participant may have another one, or begin",
+    "rest": "Rest: go on when the participant is ready",
+    "done": "All trials are answered",
+    "ended": "Ended",
+}
+
+
+def trial_name(hub: Any) -> str | None:
+    """What the pending trial is called in browsers: another one whenever it is begun again."""
+    trial = hub.state.pending
+    return None if trial is None else f"{hub.tag}:{trial.id}.{trial.presentation}"
+
+
+def participant(hub: Any) -> dict[str, Any]:
+    """The participant's view; docs/live.md describes it."""
+    seen, session, stage = participant_view(hub.state), hub.state.study.session, hub.runner.stage
+    trial, screen = seen["trial"], seen["screen"]
+    step = _step(hub, trial) if screen == "trial" and stage == "step" else None
+    asking = (
+        screen == "trial" and trial["felt"] and (stage == "answer" or (step and step["index"] + 1 == step["count"]))
+    )
+    title, message, phase = _words(screen, stage, session.text)
+    if step is not None:
+        title, message, phase = trial["steps"][step["index"]]["text"], "", "step"
+    hello = screen == "trial" and stage == "hello"
+    return {
+        "lang": session.text("lang"),
+        "phase": "answer" if asking and step is None else phase,
+        "title": title,
+        "message": message,
+        "trial": None if trial is None else {"id": trial_name(hub)},
+        "step": step,
+        "questions": [_question(ask) for ask in trial["asks"]] if asking else None,
+        "progress": _progress(seen["progress"], session.text),
+        "may": {
+            "begin": hello or seen["may"]["go_on"],
+            "more": seen["may"]["another"],
+            "break": seen["may"]["break"] and not hello,
+        },
+        "texts": {name: session.text(key) for name, key in _TEXTS.items()}
+        | {"begin": session.text("start" if hello else "begin")},
+    }
+
+
+def _words(screen, stage, text):
+    """Title, message and phase where nothing is felt."""
+    if screen == "trial":
+        key = {"hello": "title", "between": "sent", "let-go": "let_go", "trouble": "trouble"}.get(stage, "wait")
+        return text(key), text("hello") if stage == "hello" else "", stage if stage == "hello" else "wait"
+    heads = {"wait": "wait", "ready": "ready", "rest": "rest", "paused": "paused", "done": "done", "ended": "ended"}
+    title, stop, message = text(heads[screen]).partition(". ")
+    return title + stop.strip(), message, screen
+
+
+def _step(hub, trial):
+    index, steps = hub.runner.step, trial["steps"]
+    left = max(0.0, hub.runner.ends - time.monotonic())
+    return {
+        "index": index,
+        "show": steps[index]["show"],
+        "count": len(steps),
+        "labels": [step["text"] for step in steps],
+        "seconds": steps[index]["seconds"],
+        "left": round(left, 3),
+    }
+
+
+def _question(ask):
+    options = [{"value": c["value"], "label": c["label"], "text": c["definition"]} for c in ask["choices"]]
+    return {"name": ask["name"], "text": ask["question"], "options": options}
+
+
+def _progress(found, text):
+    words = f"{text('warm_up')}: {found['text']}" if found["warm_up"] else found["text"]
+    return {"done": found["done"], "of": found["of"], "text": words}
+
+
+def experimenter(hub: Any) -> dict[str, Any]:
+    """Everything, in the order of the page; `whole` is the session's own view, for programs."""
+    state, runner = hub.state, hub.runner
+    header, trial = state.header, state.pending
+    phase = _SCREEN_WORDS.get(state.screen) or _phase_words(hub, trial)
+    if state.screen == "paused":
+        phase = f"Paused by the {state.paused}"
+    return {
+        "who": f"{header.participant}, session {header.session}",
+        "what": f"{state.study.name}, study {state.study.hash}" + (f", plan {header.plan}" if header.plan else ""),
+        "phase": state.screen if state.screen != "trial" else runner.stage,
+        "phase_words": phase,
+        "trial": _trial_rows(hub, trial),
+        "device": _device(hub),
+        "trust": hub.trust,
+        "table": _table(state),
+        "log": [_log_line(event) for event in list(hub.recent)[:60]],
+        "alert": hub.alert or (runner.trouble if runner.stage == "trouble" else None),
+        "may": _may(hub),
+        "map_version": map_version(state) + ("" if hub.draws else " later"),
+        "participant_here": hub.present,
+        "all_delays": hub.delays[-1000:],
+        "fits_after_an_answer": hub.runner.fits_after,
+        "whole": experimenter_view(state),
+    }
+
+
+def _phase_words(hub, trial):
+    runner = hub.runner
+    if runner.stage == "step" and trial is not None:
+        return participant_view(hub.state)["trial"]["steps"][runner.step]["text"]
+    if runner.stage == "trouble":
+        return "Stopped: " + runner.trouble
+    return _PHASE_WORDS.get(runner.stage, runner.stage)
+
+
+def _trial_rows(hub, trial):
+    state = hub.state
+    rows = []
+    for i, block in enumerate(state.header.blocks):
+        name = block.phase + (f", {block.material}" if block.material else "")
+        rows.append([("→ " if i == state.block else "") + name, f"{len(state.answers(i))} of {state.quota(i)}"])
+    if trial is None:
+        return rows
+    for side, values in trial.renderings.items():
+        name = trial.sets.get(side)
+        rows.append([f"Rendering {side.upper()}" + (f" ({name})" if name else ""), _set_words(values)])
+    choice = trial.data.get("choice", {})
+    if "mean" in choice:
+        rows.append(["Chosen by", f"{choice['by']}, mean {choice['mean']:.3f} ± {choice['sd']:.3f}"])
+        rows.append(["Answers", ", ".join(f"{n} {100 * p:.0f} %" for n, p in choice["probabilities"].items())])
+        certificate = choice["certificate"]
+        words = "fit converged" if certificate["converged"] else "fit NOT converged"
+        rows.append(["Certificate", f"{words}, residual {certificate['residual']:.1g}"])
+    margin = choice.get("margin")
+    if margin is not None:
+        many = margin if isinstance(margin, dict) else {"": margin}
+        rows.append(
+            ["Passivity margin", ", ".join(f"{k} {v:.4f} N·s/m".strip() for k, v in many.items() if v is not None)]
+        )
+    if hub.delays:
+        rows.append(["Answer to device", f"{1000 * hub.delays[-1]['total']:.0f} ms"])
+    return rows
+
+
+def _set_words(values):
+    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+
+
+def _device(hub):
+    seen = hub.rig.snapshot
+    level = "bad" if seen.lost or seen.state in ("HOLD", "ESTOP") else "good" if seen.state == "RUNNING" else "rest"
+    rows = [
+        ["Contact", "yes" if seen.contact else "no"],
+        ["Position", f"{seen.position_mm:.2f} mm"],
+        ["Force", f"{seen.force_N:.2f} N"],
+    ]
+    rows += [[name.replace("_", " "), str(value)] for name, value in seen.counters.items() if value]
+    said = hub.rig.device.device
+    words = seen.lost or f"{hub.rig.device.link.name}, damping {said.damping_N_s_per_m:.3g} N·s/m"
+    return {"state": "lost" if seen.lost else seen.state.lower(), "level": level, "words": words, "rows": rows}
+
+
+def _may(hub):
+    state, seen = hub.state, hub.rig.snapshot
+    found = ["note", "invite"] + ([] if seen.lost else ["estop"])
+    if seen.state in ("HOLD", "ESTOP") and not seen.lost:
+        found.append("clear")
+    if state.screen in ("ended",):
+        return found
+    found += ["resume"] if state.screen in ("paused", "ready", "rest") else ["pause"] if state.screen != "done" else []
+    answered = any(t.status == "answered" for t in state.trials)
+    begun = state.pending is not None and state.pending.step is not None
+    found += ["repeat"] if begun else []
+    found += ["undo"] if answered else []
+    found += ["void"] if answered or begun else []
+    return [*found, "abort"]
+
+
+def _table(state: LiveSession):
+    names = list(state.study.space.names)
+    chosen = any(not trial.sets for trial in state.trials)
+    width = len(names) if chosen else 1
+    rows = []
+    for trial in reversed(state.trials):
+        kind = "now" if trial.status == "pending" else "" if trial.status == "answered" else "voided"
+        answer = " ".join((trial.values or {}).values())
+        place = trial.data["phase"][0].upper() + str(trial.number)
+        if trial.sets:
+            cells = [place, " / ".join(trial.sets.values()), *[""] * (width - 1), answer or trial.status]
+        else:
+            cells = [place, *(trial.renderings["a"][name] for name in names), answer or trial.status]
+        rows.append({"kind": kind, "cells": cells})
+    return {"head": ["", *names, "answer"] if chosen else ["", "sets", "answer"], "rows": rows}
+
+
+def _log_line(event):
+    at = datetime.fromtimestamp(event.time).strftime("%H:%M:%S")
+    return [str(event.seq), at, event.kind, ", ".join(f"{k} {_text(v)}" for k, v in event.data.items() if _plain(v))]
+
+
+def _plain(value):
+    return isinstance(value, str | int | float | bool) and value != ""
+
+
+def _text(value):
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def map_version(state: LiveSession) -> str:
+    """Changes with the answers and the present trial."""
+    answered = sum(1 for t in state.trials if t.status == "answered")
+    undone = sum(1 for t in state.trials if t.status in ("undone", "void"))
+    return f"{answered}.{undone}.{state.pending.id if state.pending else 0}"
+
+
+def seconds_of(text: str) -> float | None:
+    """A browser's time in s since the epoch; None if it is not one."""
+    try:
+        found = datetime.fromisoformat(text).timestamp()
+    except (ValueError, OverflowError, OSError):
+        return None
+    return found if math.isfinite(found) else None

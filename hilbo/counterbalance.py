@@ -1,0 +1,82 @@
+"""Orders that balance each other: Williams designs for materials, balanced pairs for comparisons; all from a seed.
+
+A *Williams design* of n treatments is a set of orders in which every treatment stands at every position equally often,
+and follows every other equally often: n orders for even n, a Latin square of n and its mirror image, 2n, for odd n
+(E. J. Williams 1949): 6 orders for three materials, 2 for two.
+
+`orders` deals them to participants in blocks, each a whole design in a seeded sequence, square by square, treatments
+renamed at random per seed. Over complete blocks the balance is exact. Whatever the number of participants, each order,
+and each treatment at each position, has been used the same number of times or once more; of the ordered neighbours
+this holds for even n, for odd n they may differ by two within a block, since half of it cannot balance them.
+"""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Int
+
+__all__ = ["Comparison", "block_size", "comparisons", "orders", "williams"]
+
+Comparison = tuple[str, str, str]
+"""Set on side a, set on side b, the side that is felt first."""
+
+
+def williams(n: int) -> Int[np.ndarray, "rows n"]:
+    """The orders of n treatments 0..n-1; for odd n the second half mirrors the first."""
+    zigzag = [(k + 1) // 2 if k % 2 else (n - k // 2) % n for k in range(n)]
+    square = (np.array(zigzag)[None, :] + np.arange(n)[:, None]) % n
+    return square if n % 2 == 0 or n == 1 else np.concatenate([square, square[:, ::-1]])
+
+
+def block_size(n: int) -> int:
+    """How many participants make a complete block: the balance is exact at its multiples."""
+    return len(williams(n))
+
+
+def orders(n: int, participants: int, seed: int) -> Int[np.ndarray, "participants n"]:
+    """An order of n treatments for each participant."""
+    rng = np.random.default_rng(np.random.SeedSequence([seed, n, 1]))
+    square = williams(n)
+    halves = np.split(square, len(square) // n)
+    rows = []
+    while len(rows) < participants:
+        names = rng.permutation(n)
+        for half in rng.permutation(len(halves)):
+            rows += [names[halves[half][row]] for row in rng.permutation(n)]
+    return np.array(rows[:participants], int).reshape(participants, n)
+
+
+def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> list[Comparison]:
+    """Each pair `repeats` times, in rounds of all pairs, each round in a random order.
+
+    Within each pair, the sides of its sets and which of them is felt first are balanced over every two rounds, and
+    over every four which side is felt first; what fewer rounds leave over is balanced between pairs. No round begins
+    with the pair that ended the last.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 2]))
+    ways = [_ways(repeats, offset, rng) for offset in rng.permutation(len(pairs))]
+    found: list[Comparison] = []
+    last = -1
+    for turn in range(repeats):
+        order = rng.permutation(len(pairs))
+        if len(pairs) > 1 and order[0] == last:
+            order = np.roll(order, 1)
+        last = order[-1]
+        for k in order:
+            swapped, first = ways[k][turn]
+            a, b = pairs[k][::-1] if swapped else pairs[k]
+            found.append((a, b, first))
+    return found
+
+
+def _ways(repeats, start, rng):
+    """(swapped, felt first) for each round: complementary ones two by two, all four over four; pairs that start
+    elsewhere have other leftovers."""
+    cycle = [_CYCLES[start % 4][i % 4] for i in range(repeats)]
+    chunks = [cycle[i : i + 2] for i in range(0, repeats, 2)]
+    return list(itertools.chain.from_iterable([chunk[j] for j in rng.permutation(len(chunk))] for chunk in chunks))
+
+
+_WAYS = {"1": (False, "a"), "2": (True, "a"), "3": (False, "b"), "4": (True, "b")}
+_CYCLES = [[_WAYS[c] for c in text] for text in ("1234", "3412", "2143", "4321")]

@@ -1,0 +1,128 @@
+"""What reads the tables of a study file: every key known and of its type, every mistake one sentence with its place.
+
+A table is a `Table` (msgspec) whose annotations carry the type, the range and the words for both; a field that is
+itself a `Table` is a table within the table.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+
+from hilbo.errors import InputError
+
+__all__ = [
+    "Name",
+    "NotNegative",
+    "Number",
+    "Positive",
+    "Table",
+    "check_keys",
+    "check_table",
+    "enclosing",
+    "lines_of",
+    "prefix",
+    "read_table",
+    "shown",
+    "words",
+]
+
+
+def words(description: str, example: str) -> msgspec.Meta:
+    """What a value must be, in words, and how one is written."""
+    return msgspec.Meta(description=description, examples=[example])
+
+
+Number = Annotated[float, msgspec.Meta(description="a finite number")]
+Positive = Annotated[float, msgspec.Meta(gt=0, description="a number above 0")]
+NotNegative = Annotated[float, msgspec.Meta(ge=0, description="a number, 0 or above")]
+Name = Annotated[str, msgspec.Meta(min_length=1), words("a text", '"memory foam"')]
+
+
+class Table(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One table of the study file."""
+
+
+_T = TypeVar("_T", bound=Table)
+
+
+def read_table(kind: type[_T], raw: Any, path: str) -> _T:
+    """A parsed table as its record. Raises `InputError` with the key's path first."""
+    fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+    check_keys(raw, path, fields, [key for key, field in fields.items() if field.required])
+    return kind(**{key: _field(fields[key].type, value, f"{path}.{key}") for key, value in raw.items()})
+
+
+def _field(kind, raw, path):
+    if isinstance(kind, type) and issubclass(kind, Table):
+        return read_table(kind, raw, path)
+    return _value(kind, raw, path)
+
+
+def _value(kind, raw, path):
+    try:
+        value = msgspec.convert(raw, kind)
+        if all(math.isfinite(v) for v in (value if isinstance(value, tuple) else (value,)) if isinstance(v, float)):
+            return value
+    except msgspec.ValidationError:
+        pass  # its text speaks of types and of `$`; the schema has the words
+    notes = [note for note in kind.__metadata__ if isinstance(note, msgspec.Meta)]
+    must = next(note.description for note in reversed(notes) if note.description)
+    example = next((f"; write for example {path.split('.')[-1]} = {n.examples[0]}" for n in notes if n.examples), "")
+    raise InputError(f"{path} is {shown(raw)}, it must be {must}{example}.")
+
+
+def check_keys(raw: Any, path: str, known: Iterable[str], required: Iterable[str] = ()) -> None:
+    """Refuse what is no table, has a key that is not known, or lacks a required one."""
+    check_table(raw, path)
+    dot = f"{path}." if path else ""
+    for key in raw:
+        if key not in known:
+            raise InputError(f"{dot}{key} is not a key of a study file, those known here are {', '.join(known)}.")
+    for key in required:
+        if key not in raw:
+            raise InputError(f"{dot}{key} is missing, add it.")
+
+
+def check_table(raw: Any, path: str) -> None:
+    """Refuse what is no table."""
+    if not isinstance(raw, Mapping):
+        raise InputError(f"{path} is {shown(raw)}, it must be a table; write it as [{path}].")
+
+
+def shown(value: Any) -> str:
+    """A value as it stands in a sentence."""
+    return json.dumps(value, ensure_ascii=False, default=str)
+
+
+def prefix(source: str, line: int | None = None) -> str:
+    """`file:line: `, or nothing where there is no file."""
+    place = source if line is None else f"{source}:{line}"
+    return f"{place}: " if place else ""
+
+
+def enclosing(path: str, place: str) -> Iterator[str]:
+    """The key path and the tables around it, innermost first; for a material then those of the study itself."""
+    parts = path.rstrip(",:").split(".")
+    yield from (".".join(parts[:n]) for n in range(len(parts), len(place.split(".")) - 1 if place else 0, -1))
+    if place:
+        yield from enclosing(path.removeprefix(place), "")
+
+
+def lines_of(text: str) -> dict[str, int]:
+    """Line number of every table and key in the file."""
+    lines, table = {}, ""
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := re.match(r"\s*\[([^\[\]]+)\]", line):
+            table = _path(header[1])
+            lines.setdefault(table, number)
+        elif key := re.match(r"""\s*([\w."' -]+?)\s*=""", line):
+            lines.setdefault(f"{table}.{_path(key[1])}" if table else _path(key[1]), number)
+    return lines
+
+
+def _path(key):
+    return ".".join(part.strip().strip("\"'") for part in key.split("."))

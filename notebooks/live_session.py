@@ -1,0 +1,83 @@
+# %% [markdown]
+# # A dry run: a session with nobody in it
+# A simulated participant feels a simulated device through the same code that serves the pages of `hilbo session`: the
+# log on disk, the fold of its events, the choosing ahead. Only the browser is left out; `hilbo simulate --live` has it.
+
+# %%
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import os
+import tempfile
+import time
+from pathlib import Path
+
+from hilbo.app.rehearsal import Decider
+from hilbo.config import Study
+from hilbo.event_log import EventLog, log_name
+from hilbo.hardware_bridge import Renderer
+from hilbo.live_choice import LiveChooser
+from hilbo.live_session import answer, go_on, present, propose, sent, steps_of
+from hilbo.live_views import participant_view
+from hilbo.study_plan import header_for
+
+# %% [markdown]
+# ## The study and its session
+# 25 trials; here a few, so that the notebook is quick when it is tested.
+
+# %%
+paper = Path(__import__("hilbo").__file__).parent / "data" / "paper.toml"
+text = paper.read_text()
+if "HILBO_NOTEBOOK_TRIALS" in os.environ:
+    text = text.replace("trials = 25", f"trials = {os.environ['HILBO_NOTEBOOK_TRIALS']}")
+folder = Path(tempfile.mkdtemp())
+(folder / "study.toml").write_text(text + "\n[session.warm_up]\ncount = 2\n")
+study = Study.load(folder / "study.toml")
+header = header_for(study, "P01", seed=0)
+log = EventLog.create(folder / log_name(header), study, header)
+chooser = LiveChooser(log.state)
+chooser.warm()
+decide = Decider(study, seed=0)
+device = Renderer.open("sim", options={"finger": "none"})
+
+# %% [markdown]
+# ## The session
+# Every line that ends in `append` is on the disk when it returns.
+
+# %%
+mechanics = study.space.mechanics
+while log.state.screen not in ("done", "ended"):
+    if log.state.screen == "ready":  # the end of the warm-up
+        log.append(go_on(log.state, time.time()))
+        continue
+    log.append(propose(log.state, chooser, time.time()))
+    trial = log.state.pending
+    numbers = {name: trial.renderings["a"][name] for name in ("K0", "K1", "B1", "alpha")}
+    found = device.send(**numbers, N=mechanics.N, T=mechanics.T)
+    log.append(sent(log.state, trial.id, "a", time.time(), in_force=found._asdict()))
+    for step, _ in enumerate(steps_of(log.state, trial)):
+        log.append(present(log.state, trial.id, step, True, time.time()))
+        chooser.lookahead(log.state)  # while somebody feels
+        log.append(present(log.state, trial.id, step, False, time.time()))
+    label = decide({"renderings": trial.renderings}, "class_a")
+    log.append(answer(log.state, trial.id, "notebook", {"class_a": label}, time.time()))
+    print(f"{trial.data['phase']:>12} {trial.number:2d}  K1 {numbers['K1']:5.2f}  B1 {numbers['B1']:5.2f}", end="  ")
+    print(f"alpha {numbers['alpha']:.3f}  {label}")
+device.close()
+
+# %% [markdown]
+# ## What a participant would have seen, and nothing more
+
+# %%
+print(participant_view(log.state)["message"])
+
+# %% [markdown]
+# ## The log is the session
+# Replayed, it gives the same state; and the fits that somebody would have had to wait for are none.
+
+# %%
+log.close()
+with EventLog.resume(log.path, study) as again:
+    print("the same state:", again.state == log.state, "in", again.state.seq, "events")
+print("looked up:", chooser.found, "computed while somebody felt:", chooser.fits)

@@ -1,0 +1,100 @@
+"""Who gets in: one-time links, keys of two roles, and where a request may come from."""
+
+import stat
+
+import pytest
+
+from hilbo.app.security import Gate, lan_addresses
+
+HERE = "127.0.0.1:8642"
+
+
+@pytest.fixture
+def gate(tmp_path):
+    return Gate([HERE, "localhost:8642"], tmp_path / "keys")
+
+
+def test_a_link_is_good_once_and_for_its_role(gate):
+    role, key = gate.redeem(token := gate.invite("participant"))
+    assert role == "participant"
+    assert gate.redeem(token) is None
+    assert gate.admits("participant", key)
+    assert not gate.admits("experimenter", key)
+    assert not gate.admits("participant", None)
+    assert not gate.admits("participant", key[:-1])
+
+
+def test_a_new_link_voids_the_one_that_nobody_has_used(gate):
+    first, other = gate.invite("participant"), gate.invite("experimenter")
+    second = gate.invite("participant")
+    assert gate.redeem(first) is None
+    assert gate.redeem(second)[0] == "participant"
+    assert gate.redeem(other)[0] == "experimenter"
+
+
+def test_a_second_browser_ends_the_first(gate):
+    _, first = gate.redeem(gate.invite("participant"))
+    _, second = gate.redeem(gate.invite("participant"))
+    assert not gate.admits("participant", first)
+    assert gate.admits("participant", second)
+
+
+def test_nobody_is_admitted_before_somebody_was_invited(gate):
+    assert not gate.admits("participant", "")
+    assert gate.redeem("") is None
+
+
+def test_keys_outlive_the_server_and_only_their_owner_may_read_them(gate, tmp_path):
+    _, key = gate.redeem(gate.invite("experimenter"))
+    token = gate.invite("participant")
+    assert stat.S_IMODE((tmp_path / "keys").stat().st_mode) == 0o600
+    assert key not in (tmp_path / "keys").read_text()
+    again = Gate([HERE], tmp_path / "keys")
+    assert again.admits("experimenter", key)
+    assert again.redeem(token) is None
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"experimenter": 1}', "\0"])
+def test_a_damaged_file_of_keys_admits_nobody(tmp_path, text):
+    (tmp_path / "keys").write_text(text)
+    gate = Gate([HERE], tmp_path / "keys")
+    assert not gate.admits("experimenter", "1")
+    _, key = gate.redeem(gate.invite("experimenter"))
+    assert Gate([HERE], tmp_path / "keys").admits("experimenter", key)
+
+
+GOOD = {"host": HERE, "origin": f"http://{HERE}", "sec-fetch-site": "same-origin"}
+
+
+@pytest.mark.parametrize(
+    ("changed", "refused"),
+    [
+        ({}, False),
+        ({"host": "localhost:8642", "origin": "http://localhost:8642"}, False),
+        ({"host": "LOCALHOST:8642"}, False),
+        ({"host": "example.org"}, True),
+        ({"host": "127.0.0.1:80"}, True),
+        ({"host": None}, True),
+        ({"origin": "http://example.org"}, True),
+        ({"origin": "null"}, True),
+        ({"origin": f"https://{HERE}"}, True),
+        ({"origin": f"http://{HERE}.example.org"}, True),
+        ({"sec-fetch-site": "cross-site"}, True),
+        ({"sec-fetch-site": "same-site"}, True),
+        ({"sec-fetch-site": "none"}, False),
+        ({"origin": None}, True),
+    ],
+)
+def test_where_a_request_comes_from(gate, changed, refused):
+    headers = {name: value for name, value in (GOOD | changed).items() if value is not None}
+    assert (gate.refuses(headers, changes=True, cookie=True) is not None) == refused
+
+
+def test_a_program_needs_no_origin_but_must_not_bring_another(gate):
+    assert gate.refuses({"host": HERE}, changes=True, cookie=False) is None
+    assert gate.refuses({"host": HERE}, changes=False, cookie=True) is None
+    assert gate.refuses({"host": HERE, "origin": "http://example.org"}, changes=False, cookie=False)
+
+
+def test_addresses_of_networks_are_not_this_computers_own():
+    assert all(not address.startswith("127.") for address in lan_addresses())
