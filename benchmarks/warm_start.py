@@ -4,9 +4,9 @@
 
 A map is made from 24 simulated participants of the preset `paper`; as many new people as asked for, drawn from the same
 population, then answer the study's trials, chosen cold (5 space-filling trials, then UCB) or from the map (after some
-space-filling trials or none). After every trial each person's best rendering is read from their own answers under the study's
-prior, as aggregation does: the candidate with the highest posterior mean. It is judged by the truth that was simulated:
-the probability that this person would answer "close" to it, and its distance from their optimum.
+space-filling trials or none). After every trial each person's best rendering is read from their own answers under the
+study's prior, as aggregation does: the candidate with the highest posterior mean. It is judged by the truth that was
+simulated: the probability that this person would answer "close" to it, and its distance from their optimum.
 """
 
 import argparse
