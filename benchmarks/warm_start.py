@@ -4,9 +4,9 @@
 
 A map is made from 24 simulated participants of the preset `paper`; as many new people as asked for, drawn from the same
 population, then answer the study's trials, chosen cold (5 space-filling trials, then UCB) or from the map (after some
-space-filling trials or none). After every trial each person's best rendering is read from their own answers under the study's
-prior, as aggregation does: the candidate with the highest posterior mean. It is judged by the truth that was simulated:
-the probability that this person would answer "close" to it, and its distance from their optimum.
+space-filling trials or none). After every trial each person's best rendering is read from their own answers under the
+study's prior, as aggregation does: the candidate with the highest posterior mean. It is judged by the truth that was
+simulated: the probability that this person would answer "close" to it, and its distance from their optimum.
 """
 
 import argparse
@@ -35,8 +35,8 @@ def sessions(study: Study, persons: Person, initial, keys, plan, points, warm):
     def one(person, first, key):
         def step(trials, trial):
             chosen = next_point(study, plan, trials, trial) if warm is None else warm_point(study, warm, trials)
-            filling = first[jnp.minimum(trial, first.shape[0] - 1)]
-            x = jnp.where(trial < first.shape[0], filling, chosen) if first.shape[0] else chosen
+            count = first.shape[0]
+            x = jnp.where(trial < count, first[jnp.minimum(trial, count - 1)], chosen) if count else chosen
             progress = (trial / TRIALS).astype(x.dtype)
             trials = trials.append(x, person.answer(jax.random.fold_in(key, trial), x, progress))
             own = fit(study.gp, trials, inference=study.inference, throw=False)
