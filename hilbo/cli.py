@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo import cli_device, cli_material
+from hilbo import cli_device, cli_material, cli_study
 from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, results, start
 from hilbo.errors import InputError
 
@@ -134,6 +134,7 @@ def robustness(
 
 app.command()(cli_material.identify)
 app.command()(cli_material.passivity)
+app.command()(cli_study.validate)
 app.add_typer(cli_device.app, name="device")
 
 

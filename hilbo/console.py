@@ -29,12 +29,15 @@ Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.
 # What the commands write: a folder with anything else in it is never replaced.
 _FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
 _MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
+_STUDY_FIGURES = ("validation", "aggregate-best")
+_STUDY_TABLES = ("confusion", "preferences", "table_II", "table_III", "table_IV", "aggregate_best", "aggregate_best_people")
 _EVERY = 10.0  # s
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
 _WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
-    f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES for kind in ("png", "svg")
+    f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES + _STUDY_FIGURES for kind in ("png", "svg")
 }
+_WRITTEN |= {f"{table}.csv" for table in _STUDY_TABLES}
 
 
 def start(devices: int | None = None) -> None:
@@ -82,7 +85,7 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{out}: is a file; choose a folder for --out.")
     if any(out.iterdir()) and not force:
         raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
-    foreign = next((path for path in out.rglob("*") if path.name not in _WRITTEN), None)
+    foreign = next((path for path in out.rglob("*") if path.name not in _WRITTEN and not path.is_dir()), None)
     if foreign is not None:
         raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
 

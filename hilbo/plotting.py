@@ -49,7 +49,6 @@ _NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are dr
 _APART = 0.15  # between slices, in the unit cube
 _OTHER: dict = {"s": 7, "marker": "o", "facecolor": "white", "edgecolor": "black", "linewidth": 0.4}
 _TOP: dict = {"s": 16, "marker": "o", "facecolor": ORANGE, "edgecolor": "black", "linewidth": 0.5}
-_REALISM = "perceived realism f"
 
 
 def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
@@ -187,7 +186,7 @@ def _slices(study, grids):
         figure = Figure(figsize=(4.0 if len(grids) == 1 else 7.4, 2.7), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
         scale = ScalarMappable(Normalize(low, high), "cividis")
-        figure.colorbar(scale, ax=list(panels), label=f"{_REALISM} (mean)", fraction=0.05, pad=0.02)
+        figure.colorbar(scale, ax=list(panels), label=f"{study.attribute} f (mean)", fraction=0.05, pad=0.02)
         for axes in panels:
             _axes(axes, study, 0, 1)
         for axes in panels[1:]:
@@ -233,7 +232,7 @@ def _curve_axes(study):
     figure = Figure(figsize=(4.5, 2.9), layout="constrained")
     axes = figure.subplots()
     _axes(axes, study, 0, 0)
-    axes.set(yscale="linear", ylabel=_REALISM)
+    axes.set(yscale="linear", ylabel=f"{study.attribute} f")
     return figure, axes
 
 

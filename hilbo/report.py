@@ -247,11 +247,11 @@ def map_dataset(
     shape = x.shape[:-1]
     return xr.Dataset(
         {
-            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": "perceived realism, posterior mean"}),
+            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": f"{study.attribute}, posterior mean"}),
             "variance": (
                 names,
                 np.asarray(variance).reshape(shape),
-                {"long_name": "perceived realism, posterior variance"},
+                {"long_name": f"{study.attribute}, posterior variance"},
             ),
             "feasible": (
                 names,
@@ -304,7 +304,7 @@ def _captions(study, truth):
     return {
         "map": (
             "The population map",
-            "How realistic people find each rendering, as far as their answers tell: brighter is better, and the star"
+            f"The {study.attribute} of each rendering, as far as people's answers tell: brighter is better, and the star"
             f" is the optimum.{white} Dots are renderings that were asked, orange where somebody answered"
             f' "{top}".{third}{rest}',
         ),

@@ -59,7 +59,7 @@ def _figures(study, merged, grid):
     if study.space.dim <= 3:
         some = _some(merged.cohort)
         caption = (
-            "How realistic people find each rendering, as far as their answers tell, from the grid of map.nc: brighter"
+            f"The {study.attribute} of each rendering, as far as people's answers tell, from the grid of map.nc: brighter"
             f" is better, and the star is the optimum. Dots are answers of {len(some.names)} participants, orange where"
             f' one answered "{study.responses[-1]}".'
         )
