@@ -135,6 +135,7 @@ def robustness(
 app.command()(cli_material.identify)
 app.command()(cli_material.passivity)
 app.command()(cli_study.validate)
+app.command()(cli_study.power)
 app.add_typer(cli_device.app, name="device")
 
 

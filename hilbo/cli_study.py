@@ -1,13 +1,15 @@
 """The commands of a whole study: `hilbo validate`, `hilbo power` and `hilbo report`."""
 
+import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from hilbo.console import Force, Json, Out, Seed, finish, progress, results, start
+from hilbo.errors import InputError
 
-__all__ = ["power", "report", "validate"]
+__all__ = ["power", "validate"]
 
 StudyFile = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
 
@@ -30,3 +32,46 @@ def validate(
 
         content = write_validation(Study.load(study), responses, sets, material, folder, seed, say)
     finish(content, out, as_json)
+
+
+def power(
+    study: Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)],
+    out: Out,
+    preset: Annotated[str, typer.Option(help="Population that the people are drawn from.")] = "paper",
+    participants: Annotated[str, typer.Option(help="How many people, separated by commas.")] = "6,12,24",
+    trials: Annotated[str, typer.Option(help="How many trials each, separated by commas.")] = "10,15,20,25",
+    error: Annotated[float, typer.Option(min=0, max=1, help="Wanted of the optimum: NRMSE of the search ranges.")] = 0.15,
+    studies: Annotated[int, typer.Option(min=2, help="How many studies to simulate.")] = 40,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """How many participants and trials are enough for a given error of the optimum: from simulated studies."""
+    begun = time.perf_counter()
+    with results(out, force) as folder, progress() as say:
+        start()
+        from hilbo.config import Study
+        from hilbo.power import Plan, cores, simulate_power
+        from hilbo.report_power import write_power
+        from hilbo.simulate import PRESETS
+
+        chosen = Study.load(study)
+        if preset not in PRESETS:
+            raise InputError(f'--preset is "{preset}"; there are {", ".join(PRESETS)}.')
+        plan = Plan(_numbers(participants, "--participants"), _numbers(trials, "--trials"), studies, seed)
+        jobs = min(jobs or cores(), studies)
+        say(f"simulating {studies} studies in {jobs} processes")
+        errors = simulate_power(
+            chosen, PRESETS[preset], plan, jobs=jobs, begin=start, say=lambda done: say("studies", done, studies)
+        )
+        cost = {"seconds": time.perf_counter() - begun, "jobs": jobs, "cores": cores(), "preset": preset}
+        content = write_power(chosen, errors, plan, error, cost, folder)
+    finish(content, out, as_json)
+
+
+def _numbers(text: str, option: str) -> tuple[int, ...]:
+    try:
+        return tuple(sorted(int(part) for part in text.split(",")))
+    except ValueError:
+        raise InputError(f'{option} is "{text}"; write whole numbers separated by commas, as in 6,12,24.') from None

@@ -29,8 +29,8 @@ Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.
 # What the commands write: a folder with anything else in it is never replaced.
 _FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
 _MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
-_STUDY_FIGURES = ("validation", "aggregate-best")
-_STUDY_TABLES = ("confusion", "preferences", "table_II", "table_III", "table_IV", "aggregate_best", "aggregate_best_people")
+_STUDY_FIGURES = ("power", "validation", "aggregate-best")
+_STUDY_TABLES = ("errors", "power", "confusion", "preferences", "table_II", "table_III", "table_IV", "aggregate_best", "aggregate_best_people")
 _EVERY = 10.0  # s
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}

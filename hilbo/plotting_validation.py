@@ -13,8 +13,6 @@ from hilbo.plotting import BLUE, GREY, ORANGE, RED, STYLE
 
 __all__ = ["aggregate_best_figure", "preference_rows", "validation_figure"]
 
-_ORDER = ("clustered by participant and set", "clustered by participant", "exact, of", "exact", "Wilson")
-
 
 def validation_figure(confusion: pd.DataFrame, preferences: pd.DataFrame) -> Figure:
     """Left: how often each set (row) was put in each class (column). Right: how often one of a pair was preferred.
@@ -51,7 +49,7 @@ def aggregate_best_figure(people: pd.DataFrame, overall: pd.DataFrame) -> Figure
 
 
 def preference_rows(preferences: pd.DataFrame) -> pd.DataFrame:
-    """Of each pair the counts and its most cautious interval: clustered if there is one, else of the people, exact."""
+    """Of each pair the counts and its widest interval, docs/statistics.md."""
     if preferences.empty:
         return preferences
     groups = preferences.groupby(["set", "over"], sort=False)
@@ -59,14 +57,14 @@ def preference_rows(preferences: pd.DataFrame) -> pd.DataFrame:
 
 
 def _widest(rows):
-    """The row with the interval that assumes least."""
+    """The widest interval among Wilson's and the clustered ones, or where all agreed that of the people."""
     if "errors" not in rows:
         return rows.iloc[0]
-    for begin in _ORDER:
-        found = rows[[str(name).startswith(begin) for name in rows["errors"]]]
-        if len(found) and np.isfinite(found["low"].iloc[0]):
-            return found.iloc[0]
-    return rows.iloc[0]
+    people = rows[rows["errors"].str.startswith("exact, of")]
+    if len(people):
+        return people.loc[(people["high"] - people["low"]).idxmax()]
+    plain = rows[(rows["errors"] == "Wilson") | rows["errors"].str.startswith("clustered")]
+    return plain.loc[(plain["high"] - plain["low"]).fillna(-1.0).idxmax()]
 
 
 def _matrix(axes, counts):
