@@ -136,6 +136,7 @@ app.command()(cli_material.identify)
 app.command()(cli_material.passivity)
 app.command()(cli_study.validate)
 app.command()(cli_study.power)
+app.command()(cli_study.report)
 app.add_typer(cli_device.app, name="device")
 
 

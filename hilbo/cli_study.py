@@ -9,7 +9,7 @@ import typer
 from hilbo.console import Force, Json, Out, Seed, finish, progress, results, start
 from hilbo.errors import InputError
 
-__all__ = ["power", "validate"]
+__all__ = ["power", "report", "validate"]
 
 StudyFile = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
 
@@ -40,7 +40,9 @@ def power(
     preset: Annotated[str, typer.Option(help="Population that the people are drawn from.")] = "paper",
     participants: Annotated[str, typer.Option(help="How many people, separated by commas.")] = "6,12,24",
     trials: Annotated[str, typer.Option(help="How many trials each, separated by commas.")] = "10,15,20,25",
-    error: Annotated[float, typer.Option(min=0, max=1, help="Wanted of the optimum: NRMSE of the search ranges.")] = 0.15,
+    error: Annotated[
+        float, typer.Option(min=0, max=1, help="Wanted of the optimum: NRMSE of the search ranges.")
+    ] = 0.15,
     studies: Annotated[int, typer.Option(min=2, help="How many studies to simulate.")] = 40,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
     seed: Seed = 0,
@@ -75,3 +77,24 @@ def _numbers(text: str, option: str) -> tuple[int, ...]:
         return tuple(sorted(int(part) for part in text.split(",")))
     except ValueError:
         raise InputError(f'{option} is "{text}"; write whole numbers separated by commas, as in 6,12,24.') from None
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder with study.toml and trials.csv.", show_default=False)],
+    out: Out,
+    exclude: Annotated[
+        str | None, typer.Option(help='Rule that leaves people out, instead of the study\'s: "trials < 10".')
+    ] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """The whole results section from a folder of sessions: one page, figures and tables, in the paper's order."""
+    with results(out, force) as made, progress() as say:
+        start()
+        say("reading")
+        from hilbo.report_study import write_study
+        from hilbo.study_folder import read_folder
+
+        content = write_study(read_folder(folder, exclude), made, seed, say)
+    finish(content, out, as_json)

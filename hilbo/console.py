@@ -29,12 +29,41 @@ Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.
 # What the commands write: a folder with anything else in it is never replaced.
 _FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
 _MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
-_STUDY_FIGURES = ("power", "validation", "aggregate-best")
-_STUDY_TABLES = ("errors", "power", "confusion", "preferences", "table_II", "table_III", "table_IV", "aggregate_best", "aggregate_best_people")
+_STUDY_FIGURES = (
+    "progression",
+    "convergence",
+    "maps-after",
+    "population-convergence",
+    "classes",
+    "people",
+    "predictive",
+    "power",
+    "validation",
+    "aggregate-best",
+)
+_STUDY_TABLES = (
+    "table_I",
+    "convergence",
+    "tolerance",
+    "people",
+    "passivity",
+    "comparison",
+    "validation",
+    "sets",
+    "errors",
+    "power",
+    "confusion",
+    "preferences",
+    "table_II",
+    "table_III",
+    "table_IV",
+    "aggregate_best",
+    "aggregate_best_people",
+)
 _EVERY = 10.0  # s
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
-_WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
+_WRITTEN = {"result.json", "report.html", "map.nc", "inference.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
     f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES + _STUDY_FIGURES for kind in ("png", "svg")
 }
 _WRITTEN |= {f"{table}.csv" for table in _STUDY_TABLES}

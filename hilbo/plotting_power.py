@@ -8,7 +8,14 @@ from hilbo.plotting import BLUE, GREEN, GREY, ORANGE, RED, STYLE
 
 __all__ = ["power_figure"]
 
-_LOOKS = [(RED, "o", "-"), (ORANGE, "s", "--"), (GREEN, "^", "-."), (BLUE, "D", ":"), ("black", "v", "-"), (GREY, "P", "--")]
+_LOOKS = [
+    (RED, "o", "-"),
+    (ORANGE, "s", "--"),
+    (GREEN, "^", "-."),
+    (BLUE, "D", ":"),
+    ("black", "v", "-"),
+    (GREY, "P", "--"),
+]
 
 
 def power_figure(summary: pd.DataFrame, error: float) -> Figure:

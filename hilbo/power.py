@@ -189,5 +189,3 @@ def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:
 def power_table(summary: pd.DataFrame, value: str) -> pd.DataFrame:
     """One of the summary's columns as participants by trials."""
     return summary.pivot(index="participants", columns="trials", values=value)
-
-

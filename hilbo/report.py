@@ -219,7 +219,7 @@ def save_figures(figures: Mapping[str, tuple[Any, str, str]], folder: Path) -> l
         figure.savefig(buffer, format="png", dpi=200)
         (folder / f"{name}.png").write_bytes(buffer.getvalue())
         png = base64.b64encode(buffer.getvalue()).decode()
-        pictures.append({"png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
+        pictures.append({"name": name, "png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
     return pictures
 
 

@@ -68,7 +68,9 @@ def _page(study, summary, plan, error, cost, pictures, content):
     for caption, column, words in blocks:
         cells = power_table(summary, column)
         head = ["participants", *(f"{count} trials" for count in cells.columns)]
-        tables.append((caption, head, [[str(m), *map(words, row)] for m, row in zip(cells.index, cells.to_numpy(), strict=True)]))
+        tables.append(
+            (caption, head, [[str(m), *map(words, row)] for m, row in zip(cells.index, cells.to_numpy(), strict=True)])
+        )
     found = [
         f"{row['participants']:.0f} participants: {row['trials']:.0f} trials" if row["trials"] == row["trials"]
         else f"{row['participants']:.0f} participants: more than {max(plan.trials)} trials"

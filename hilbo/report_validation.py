@@ -218,7 +218,13 @@ def p_words(p: float) -> str:
 
 
 def write_validation(
-    study: Study, path: Path, sets: Path | None, material: str | None, folder: Path, seed: int = 0, say=lambda text: None
+    study: Study,
+    path: Path,
+    sets: Path | None,
+    material: str | None,
+    folder: Path,
+    seed: int = 0,
+    say=lambda text: None,
 ) -> dict[str, Any]:
     """Write the folder of `hilbo validate`; returns the content of result.json."""
     say("reading")
