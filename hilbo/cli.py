@@ -142,7 +142,7 @@ app.add_typer(cli_device.app, name="device")
 
 @app.command()
 def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) -> None:
-    """Real people's answers, then a simulated haptic study of known truth: two results folders to look at."""
+    """Real people's answers, then a whole simulated haptic study of known truth and its report."""
     from importlib.resources import files
 
     data = files("hilbo") / "data"
@@ -151,7 +151,7 @@ def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) 
             (folder / part).mkdir()
         chosen, cohort = _read(Path(str(data / "video_quality.csv")), Path(str(data / "video_quality.toml")), None, say)
         real = _aggregate(chosen, cohort, folder / PARTS[0], seed, say)
-        simulated = _simulate("paper", None, 24, seed, folder / PARTS[1], say)
+        simulated = cli_study.simulated_report(folder / PARTS[1], seed, say)["materials"][""]
     _print_demo(real, simulated, out)
 
 

@@ -1,15 +1,16 @@
 """The commands of a whole study: `hilbo validate`, `hilbo power` and `hilbo report`."""
 
+import shutil
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from hilbo.console import Force, Json, Out, Seed, finish, progress, results, start
+from hilbo.console import Force, Json, Out, Say, Seed, finish, progress, results, start
 from hilbo.errors import InputError
 
-__all__ = ["power", "report", "validate"]
+__all__ = ["power", "report", "simulated_report", "validate"]
 
 StudyFile = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
 
@@ -90,6 +91,8 @@ def report(
     as_json: Json = False,
 ) -> None:
     """The whole results section from a folder of sessions: one page, figures and tables, in the paper's order."""
+    if out.resolve() in (folder.resolve(), *folder.resolve().parents):
+        raise InputError(f"{out}: holds the folder that is read; choose another --out.")
     with results(out, force) as made, progress() as say:
         start()
         say("reading")
@@ -98,3 +101,36 @@ def report(
 
         content = write_study(read_folder(folder, exclude), made, seed, say)
     finish(content, out, as_json)
+
+
+def simulated_report(folder: Path, seed: int, say: Say, count: int = 24) -> dict[str, Any]:
+    """A simulated study of the paper's kind with its validation sessions, as a folder that `hilbo report` reads, and
+    its report in the same folder; returns the content of result.json."""
+    from importlib.resources import files
+
+    import numpy as np
+
+    from hilbo import simulate as simulation
+    from hilbo.analysis import analyse
+    from hilbo.config import Study
+    from hilbo.report_study import write_study
+    from hilbo.simulate_validation import sets_table, validation_table
+    from hilbo.study_folder import read_folder
+    from hilbo.tables import write_trials
+
+    say("simulating")
+    source = Path(str(files("hilbo") / "data" / "paper.toml"))
+    study, population = Study.load(source), simulation.PRESETS["paper"]
+    people = simulation.people(study, population, count, seed)
+    write_trials(simulation.to_table(study, simulation.simulate_study(study, people, seed)), folder / "trials.csv")
+    write_trials(simulation.truth_table(study, population, people), folder / "truth.csv")
+    shutil.copyfile(source, folder / "study.toml")
+    (material,) = read_folder(folder).materials
+    found = analyse(material.study, material.cohort, seed, say)
+    if found.sets is not None:
+        say("simulated validation sessions")
+        own = np.asarray(found.aggregate.individuals.x)
+        sets = sets_table(study, found.sets, own, found.cohort.names)
+        sets.to_csv(folder / "sets.csv", index=False)
+        validation_table(study, population, sets, seed=seed).to_csv(folder / "validation.csv", index=False)
+    return write_study(read_folder(folder), folder, seed, say, {material.name: found})

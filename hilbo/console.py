@@ -61,6 +61,7 @@ _STUDY_TABLES = (
     "aggregate_best_people",
 )
 _EVERY = 10.0  # s
+_INPUTS = {"study.toml", "trials.csv", "truth.csv", "validation.csv", "sets.csv"}  # replaced beside a result.json only
 PARTS = ("video-quality", "simulated-memory-foam")
 _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
 _WRITTEN = {"result.json", "report.html", "map.nc", "inference.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
@@ -114,9 +115,16 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{out}: is a file; choose a folder for --out.")
     if any(out.iterdir()) and not force:
         raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
-    foreign = next((path for path in out.rglob("*") if path.name not in _WRITTEN and not path.is_dir()), None)
+    foreign = next((path for path in out.rglob("*") if _is_foreign(path)), None)
     if foreign is not None:
         raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
+
+
+def _is_foreign(path: Path) -> bool:
+    """Whether a file is not hilbo's to replace: it has another name, or may be somebody's data."""
+    if path.is_dir():
+        return False
+    return path.name not in _WRITTEN or (path.name in _INPUTS and not (path.parent / "result.json").exists())
 
 
 class Say(Protocol):

@@ -228,6 +228,7 @@ def _materials(results):
             side: Side = "for" if row["low"] > 0 else "against" if row["high"] < 0 else "open"
             yield Evidence(
                 side,
-                f"{one.name}: the aggregate's set was preferred in {100 * one.validated.overall['rate'].iloc[0]:.1f} % of"
-                f" the comparisons (table IV: {row['estimate']:.2f}, 95 % interval {row['low']:.2f} to {row['high']:.2f}).",
+                f"{one.name}: the aggregate's set was preferred in {100 * one.validated.overall['rate'].iloc[0]:.1f} %"
+                f" of the comparisons (table IV: {row['estimate']:.2f}, 95 % interval {row['low']:.2f} to"
+                f" {row['high']:.2f}).",
             )

@@ -10,12 +10,13 @@ expectation propagation, C = (K + 1/W)^-1 and a = C's weights, leaving answer i 
     v_i = (C K)_ii / C_ii,   m_i = m_i - v_i a_i,   p_i(q) = P(q | N(m_i, v_i)),
 
 so that no fit is repeated. Here the model's prior has a constant of variance 4 k added: the level of a person's answers
-is their own affair, and an answer far from all others is expected to be like them, not like the prior's mean. The lapse rate l is the share of answers that are any category at random,
-P(q_i) = (1 - l) p_i(q_i) + l / C; drift d is a shift of the latent score from the first trial to the last (negative:
-stricter), p_i(q) with m_i + d (s_i - 1/2), s_i the share of the session that is over. Noise beyond the model's looks
-like lapses: a rate says how much of the answers the person's own model cannot tell from chance. Both are maximum likelihood over
-these left-out probabilities, with intervals where twice the log likelihood falls by less than 3.84. Those are
-approximate, since answers left out one at a time are not independent: docs/report.md has their coverage.
+is their own affair, and an answer far from all others is expected to be like them, not like the prior's mean. The lapse
+rate l is the share of answers that are any category at random, P(q_i) = (1 - l) p_i(q_i) + l / C; drift d is a shift of
+the latent score from the first trial to the last (negative: stricter), p_i(q) with m_i + d (s_i - 1/2), s_i being the
+share of the session that is over. Noise beyond the model's looks like lapses: a rate says how much of the answers the
+person's own model cannot tell from chance. Both are maximum likelihood over these left-out probabilities, with
+intervals where twice the log likelihood falls by less than 3.84. Those are approximate, since answers left out one at a
+time are not independent: docs/report.md has their coverage.
 
 An exclusion rule, "trials < 10 or lapse_low > 0.3", speaks of a person's own answers only, and is applied before
 anything is merged.

@@ -144,8 +144,13 @@ def sets_on_map(study: Study, surface, sets: Sets | None, best: Float[np.ndarray
         for n in points
     ]
     handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="not sampled"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+    figure.legend(handles=handles, loc="outside upper center", ncols=_columns(figure, handles), frameon=False)
     return figure
+
+
+def _columns(figure, handles):
+    """As many columns of a legend as the figure is wide enough for."""
+    return max(1, min(len(handles), int(figure.get_figwidth() / 1.25)))
 
 
 def _hatch(axes, study, surface, best, third, values):
@@ -213,7 +218,7 @@ def class_regions(readings: Mapping[str, Reading]) -> Figure:
             Patch(facecolor=shades(k), edgecolor="black", linewidth=0.5, label=label) for k, label in enumerate(labels)
         ]
         handles.append(Line2D([], [], color=RED, linewidth=2, label="tolerance interval"))
-        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles), frameon=False)
+        figure.legend(handles=handles, loc="outside upper center", ncols=_columns(figure, handles), frameon=False)
     return figure
 
 

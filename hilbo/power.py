@@ -67,7 +67,7 @@ def simulate_power(
 ) -> pd.DataFrame:
     """Errors of every study at every (m, t): columns `study`, `participants`, `trials`, `optimum`, `map`.
 
-    `jobs`: processes, by default as many as there are cores; each calls `begin` first, to set JAX up (float64, a cache).
+    `jobs`: processes, by default as many as there are cores; each calls `begin` first (float64, a cache).
     `say` is told how many studies are done.
     """
     jobs = min(cores() if jobs is None else jobs, plan.studies)

@@ -304,8 +304,8 @@ def _captions(study, truth):
     return {
         "map": (
             "The population map",
-            f"The {study.attribute} of each rendering, as far as people's answers tell: brighter is better, and the star"
-            f" is the optimum.{white} Dots are renderings that were asked, orange where somebody answered"
+            f"The {study.attribute} of each rendering, as far as people's answers tell: brighter is better, and the"
+            f" star is the optimum.{white} Dots are renderings that were asked, orange where somebody answered"
             f' "{top}".{third}{rest}',
         ),
         "progress": (

@@ -1,4 +1,4 @@
-"""The figures of a study's report with their titles and captions: what is to be seen, and which of the paper's it is."""
+"""The figures of a study's report, with titles and captions: what is to be seen, and which of the paper's it is."""
 
 from typing import Any
 
@@ -61,9 +61,9 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
                 {"fixed hyperparameters": found.fixed, "optimised hyperparameters": found.optimised}
             ),
             "Where each answer is the likeliest (paper, figure 8)",
-            f'The most probable answer on slices through each optimum (star). Lines: how far a parameter may move while "{top}"'
-            " stays the likeliest answer, on the nearest slice that may be rendered; the paper's figure uses optimised"
-            f" hyperparameters.{white}",
+            f"The most probable answer on slices through each optimum (star). Lines: how far a parameter may move"
+            f' while "{top}" stays the likeliest answer, on the nearest slice that may be rendered; the paper\'s figure'
+            f" uses optimised hyperparameters.{white}",
         ),
         "people": (
             plotting_study.people_figure(found.people, found.left_out),

@@ -28,16 +28,26 @@ from hilbo.study_folder import Material, StudyFolder
 __all__ = ["convergence_table", "table_1", "tolerance_table", "write_study"]
 
 
-def write_study(folder: StudyFolder, out: Path, seed: int = 0, say=lambda text: None) -> dict[str, Any]:
-    """Write the results folder of `hilbo report`; returns the content of result.json."""
+def write_study(
+    folder: StudyFolder,
+    out: Path,
+    seed: int = 0,
+    say=lambda text: None,
+    analyses: Mapping[str, Analysis] | None = None,
+) -> dict[str, Any]:
+    """Write the results folder of `hilbo report`; returns the content of result.json.
+
+    `analyses`: of materials (by name) whose results are known already.
+    """
     results, contents, sections = [], {}, []
+    analyses = {} if analyses is None else analyses
     for material in folder.materials:
         words = f" ({material.name})" if material.name else ""
 
         def tell(text, words=words):
             say(f"{text}{words}")
 
-        found = analyse(material.study, material.cohort, seed, tell)
+        found = analyses.get(material.name) or analyse(material.study, material.cohort, seed, tell)
         validated = _validated(material, folder, seed, tell)
         results.append(Results(material.name, found, validated, material.reference, material.reference_name))
         part = out / slug(material.name) if len(folder.materials) > 1 else out
@@ -209,11 +219,11 @@ def _section(material, found, validated, tables, pictures: list[dict[str, str]],
         "rule": study.exclude,
         "figures": by_name,
         "table_1": _shown(tables["table_I"], _words_of_table_1(material)),
-        "passivity": _shown(tables["passivity"]),
-        "tolerance": _shown(tables["tolerance"]),
+        "passivity": _shown(tables["passivity"].dropna(axis=1, how="all"), {"p_top": f'P("{study.responses[-1]}")'}),
+        "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"])),
-        "robust": f"Under the hyperparameters of maximum evidence the optimum moves by {100 * content['optimised']['nrmse']:.1f} %"
-        " of the search ranges.",
+        "robust": "Under the hyperparameters of maximum evidence the optimum moves by"
+        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges.",
         "comparison": None,
     }
     if validated is not None:
@@ -238,6 +248,22 @@ def _shown(table: pd.DataFrame, heads: Mapping[str, str] | None = None) -> tuple
     heads = {} if heads is None else heads
     head = [heads.get(str(name), str(name).replace("_", " ")) for name in table.columns]
     return head, [[_cell(value) for value in row] for row in table.itertuples(index=False)]
+
+
+def _tolerances(table):
+    """The tolerance intervals as they are read: each end with what it is, and with its interval."""
+    rows = []
+    for row in table.to_dict("records"):
+        ends = [
+            [f"{_cell(row[end])} ({row[f'{end}_end']})", f"{_cell(row[f'{end}_from'])} to {_cell(row[f'{end}_to'])}"]
+            if np.isfinite(row[end])
+            else ["–", "–"]
+            for end in ("low", "high")
+        ]
+        rows.append(
+            [row["hyperparameters"], row["parameter"], *ends[0], *ends[1], f"{100 * row['draws_without']:.0f} %"]
+        )
+    return ["hyperparameters", "parameter", "from", "95 % of draws", "to", "95 % of draws", "no interval"], rows
 
 
 def _cell(value):

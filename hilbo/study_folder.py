@@ -1,4 +1,4 @@
-"""A folder of results to report: study file, trial tables, and what there is of validation and sets tables.
+"""A folder to report: study file, trial tables, and what there is of validation and sets tables.
 
     study.toml        the study file
     trials*.csv       one or several trial tables (or .parquet); a column `material` tells materials apart
@@ -49,7 +49,10 @@ class StudyFolder(NamedTuple):
 
 
 def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
-    """Read everything in a folder; `exclude`: a rule in place of the study file's own. Raises `InputError` for what is wrong or missing."""
+    """Read everything in a folder; `exclude`: a rule in place of the study file's own.
+
+    Raises `InputError` for what is wrong or missing.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; hilbo report wants one with study.toml and trials.csv.")
     study = _ruled(Study.load(folder / "study.toml"), exclude)
@@ -132,7 +135,7 @@ def _once(table, path):
     if again.any():
         row = table[again].iloc[0]
         raise InputError(
-            f"{path.parent}: participant {row['participant']}, trial {row['trial']} is in two of the trial tables; keep one."
+            f"{path.parent}: participant {row['participant']}, trial {row['trial']} is in two trial tables; keep one."
         )
 
 
@@ -159,7 +162,8 @@ def _reference(study, name, sets, truth):
             return np.asarray(study.space.to_unit(physical)), words
         if len(rows) > 1:
             raise InputError(
-                f'there are {len(rows)} sets of source "{source}" for material "{name}"; keep one, or add a column "material".'
+                f'there are {len(rows)} sets of source "{source}" for material "{name}"; keep one, or add a'
+                ' column "material".'
             )
     return None, ""
 
