@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo import cli_device, cli_live, cli_material, cli_session
+from hilbo import cli_device, cli_live, cli_material, cli_session, cli_study
 from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, results, start
 from hilbo.errors import InputError
 
@@ -146,6 +146,9 @@ def robustness(
 
 app.command()(cli_material.identify)
 app.command()(cli_material.passivity)
+app.command()(cli_study.validate)
+app.command()(cli_study.power)
+app.command()(cli_study.report)
 app.add_typer(cli_device.app, name="device")
 app.command()(cli_live.session)
 app.command()(cli_live.doctor)
@@ -156,7 +159,7 @@ app.add_typer(cli_session.app_participants, name="participants")
 
 @app.command()
 def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) -> None:
-    """Real people's answers, then a simulated haptic study of known truth: two results folders to look at."""
+    """Real people's answers, then a whole simulated haptic study of known truth and its report."""
     from importlib.resources import files
 
     data = files("hilbo") / "data"
@@ -165,7 +168,7 @@ def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) 
             (folder / part).mkdir()
         chosen, cohort = _read(Path(str(data / "video_quality.csv")), Path(str(data / "video_quality.toml")), None, say)
         real = _aggregate(chosen, cohort, folder / PARTS[0], seed, say)
-        simulated = _simulate("paper", None, 24, seed, folder / PARTS[1], say)
+        simulated = cli_study.simulated_report(folder / PARTS[1], seed, say)["materials"][""]
     _print_demo(real, simulated, out)
 
 

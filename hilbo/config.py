@@ -40,6 +40,8 @@ class _StudyTable(_Table, frozen=True):
         msgspec.Meta(min_length=2),
         _text("a list of two or more texts, lowest first", '["different", "similar", "close"]'),
     ]
+    attribute: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"perceived realism"')] = "perceived realism"
+    exclude: Annotated[str, _text("a rule, or nothing", '"trials < 10 or lapse_low > 0.3"')] = ""
 
 
 class _ParameterTable(_Table, frozen=True):
@@ -133,6 +135,10 @@ class Study(eqx.Module):
     space: SearchSpace
     name: str = eqx.field(static=True)
     responses: tuple[str, ...] = eqx.field(static=True)
+    attribute: str = eqx.field(static=True)
+    """What is judged, in words: labels of axes."""
+    exclude: str = eqx.field(static=True)
+    """The rule by which people are left out (`hilbo.people`), empty for nobody."""
     selection: Selection = eqx.field(static=True)
     inference: Inference = eqx.field(static=True)
     rule: Literal["bcm"] = eqx.field(static=True)
@@ -231,6 +237,8 @@ def _study(raw, source):
         space=space,
         name=content.study.name,
         responses=labels,
+        attribute=content.study.attribute,
+        exclude=content.study.exclude,
         selection=content.selection,
         inference=content.gp.inference,
         rule=content.aggregation.rule,

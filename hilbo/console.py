@@ -5,6 +5,8 @@ and nothing is overwritten without `--force`. Progress goes to stderr, results w
 """
 
 import contextlib
+import hashlib
+import json
 import math
 import os
 import shutil
@@ -26,19 +28,9 @@ Seed = Annotated[int, typer.Option("--seed", help="Decides candidates, and in si
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
 
-# What the commands write: a folder with anything else in it is never replaced.
-_FIGURES = ("map", "progress", "slices", "optima", "maps", "moves")
-_MATERIAL_FIGURES = ("tests", "memory", "passivity", "passive-set", "bode")
-_EVERY = 10.0  # s
 PARTS = ("video-quality", "simulated-memory-foam")
-_TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
-_WRITTEN = {"result.json", "report.html", "map.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
-    f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES for kind in ("png", "svg")
-}
-
-
-# What `hilbo export` writes besides tables and sidecars that end in _data.
-_EXPORTED = {"dataset_description.json", "data", "trials.nc"}
+_EVERY = 10.0  # s
+_MANIFEST = ".hilbo.json"
 
 
 def start(devices: int | None = None) -> None:
@@ -60,7 +52,8 @@ def start(devices: int | None = None) -> None:
 
 @contextlib.contextmanager
 def results(out: Path, force: bool) -> Iterator[Path]:
-    """A new folder that becomes `out` when everything in it is complete."""
+    """A new folder that becomes `out` when everything in it is complete; with a list of what it holds, so that
+    `force` replaces nothing else later."""
     out = out.resolve()
     _check_free(out, force)
     try:
@@ -71,6 +64,7 @@ def results(out: Path, force: bool) -> Iterator[Path]:
     try:
         yield made
         made.chmod(0o755)
+        _list_files(made)
         if out.exists():
             shutil.rmtree(out)
         made.rename(out)
@@ -86,10 +80,35 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{out}: is a file; choose a folder for --out.")
     if any(out.iterdir()) and not force:
         raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
-    ours = _WRITTEN | _EXPORTED
-    foreign = next((p for p in out.rglob("*") if p.name not in ours and not p.stem.endswith("_data")), None)
-    if foreign is not None:
-        raise InputError(f"{foreign}: is not a result of hilbo's; choose another --out, so that it is not lost.")
+    ours = _listed(out)
+    for path in sorted(path for path in out.rglob("*") if not path.is_dir()):
+        name = path.relative_to(out).as_posix()
+        if name not in ours and name != _MANIFEST:
+            raise InputError(f"{path}: is not a result of hilbo's; choose another --out, so that it is not lost.")
+        if name in ours and _digest(path) != ours[name]:
+            raise InputError(f"{path}: has been changed since hilbo wrote it; choose another --out, or delete it.")
+
+
+def _listed(folder: Path) -> dict[str, str]:
+    """The files that hilbo wrote into a folder, and what they held; none if it did not write that folder."""
+    try:
+        found = json.loads((folder / _MANIFEST).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _list_files(folder: Path) -> None:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    listed = {path.relative_to(folder).as_posix(): _digest(path) for path in files}
+    (folder / _MANIFEST).write_text(json.dumps(listed, indent=0), encoding="utf-8")
+
+
+def _digest(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class Say(Protocol):

@@ -30,12 +30,13 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
     return sheet.render(
         title=f"{study.name}: the population's optimum",
         lead=f"{count:,} participants gave {answers:,} answers ({', '.join(study.responses)}). Each person's"
-        " answers were turned into a map of perceived realism; the maps were merged, and this is where the merged map"
+        f" answers were turned into a map of {study.attribute}; the maps were merged, and this is where the merged map"
         " is highest.",
         warnings=content["warnings"],
         study_rows=_study_rows(study),
         optimum=[(_head(study, name), _number(value)) for name, value in best["parameters"].items()],
         probabilities=[(label, f"{100 * p:.0f} %") for label, p in best["class_probabilities"].items()],
+        attribute=study.attribute,
         realism=f"{best['mean']:.2f} ± {best['sd']:.2f} (mean and standard deviation of f)",
         passivity=_passivity_words(best["passivity_margin"]),
         **_comparison(study, content),

@@ -7,7 +7,7 @@ an intercept alone. II and III are clustered by participant, IV by participant a
 Ties in IV are modelled (`statistics.tied_preferences`): 0 is still "neither is preferred".
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import numpy as np
@@ -19,9 +19,10 @@ from hilbo.regression import Regression
 from hilbo.statistics import binary_logit, ordered_logit, tied_preferences
 from hilbo.validation_table import NONE, RESPONSES, TIE, check_validation, of_material, source_kind
 
-__all__ = ["PaperTables", "paper_tables"]
+__all__ = ["PaperTables", "aggregate_comparisons", "paper_tables", "set_sources"]
 
 _ROLES = ("best", "mid", "worst")
+_OURS, _THEIRS = "Aggregate-Best", "individual"
 
 
 class PaperTables(eqx.Module):
@@ -55,7 +56,7 @@ def paper_tables(
     "individual:PARTICIPANT". Raises `InputError` for a bad table.
     """
     table = of_material(check_validation(validation, responses), material)
-    sources, roles = _meanings(table, sets)
+    sources, roles = set_sources(table, sets)
     staged = table.assign(set_a=table["set_a"].map(roles), set_b=table["set_b"].map(roles))
     staged["preferred"] = [roles.get(name, name) for name in table["preferred"]]
     staged = staged[staged["set_a"].isin(_ROLES) & staged["set_b"].isin(_ROLES) & (staged["set_a"] != staged["set_b"])]
@@ -78,8 +79,8 @@ def paper_tables(
     return PaperTables(tables["II"], tables["III"], tables["IV"], counts, rates, tuple(limits))
 
 
-def _meanings(table, sets):
-    """Source and role of every set of the table."""
+def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[str, str], dict[str, str]]:
+    """Source and role of every set of a validation table; without a sets table their names say both."""
     used = sorted({*table["set_a"], *table["set_b"]})
     if sets is None:
         return {name: name for name in used}, {name: name for name in used}
@@ -105,20 +106,27 @@ def _table_3(answers, responses, options):
 
 
 def _table_4(table, sources, options):
+    rows = aggregate_comparisons(table, sources)
+    if rows.empty:
+        raise InputError("no comparison of an aggregate's set with an individual's holds a preference.")
+    clusters, preferred = rows[["participant", "set"]], rows["preferred"].to_numpy()
+    if (preferred != TIE).all():
+        return binary_logit(preferred == _OURS, None, clusters, intercept=_OURS, **options)
+    one, other = np.full(len(rows), _OURS), np.full(len(rows), _THEIRS)
+    return tied_preferences(one, other, preferred, clusters, reference=_THEIRS, **options)
+
+
+def aggregate_comparisons(table: pd.DataFrame, sources: Mapping[str, str]) -> pd.DataFrame:
+    """Preferences between an aggregate's set and an individual's: `participant`, `set` (the individual's) and
+    `preferred` ("Aggregate-Best", "individual" or "tie"). `sources`: set -> source, as in a sets table."""
     left, right = (table[side].map(lambda name: source_kind(sources[name])) for side in ("set_a", "set_b"))
     mixed = ((left == "aggregate") & (right == "individual")) | ((left == "individual") & (right == "aggregate"))
     rows = table[mixed & (table["preferred"] != NONE)]
-    if rows.empty:
-        raise InputError("no comparison of an aggregate's set with an individual's holds a preference.")
-    ours = np.where(left[rows.index] == "aggregate", rows["set_a"], rows["set_b"])
-    theirs = np.where(left[rows.index] == "aggregate", rows["set_b"], rows["set_a"])
-    clusters = pd.DataFrame({"participant": rows["participant"].to_numpy(), "set": theirs})
+    first = (left[rows.index] == "aggregate").to_numpy()
+    ours, theirs = (np.where(first == swap, rows["set_a"], rows["set_b"]) for swap in (True, False))
     preferred = rows["preferred"].to_numpy()
-    if (preferred != TIE).all():
-        return binary_logit(preferred == ours, None, clusters, intercept="Aggregate-Best", **options)
-    names = np.where(preferred == ours, "Aggregate-Best", np.where(preferred == TIE, TIE, "individual"))
-    one, other = np.full(len(rows), "Aggregate-Best"), np.full(len(rows), "individual")
-    return tied_preferences(one, other, names, clusters, reference="individual", **options)
+    words = np.where(preferred == ours, _OURS, np.where(preferred == TIE, TIE, _THEIRS))
+    return pd.DataFrame({"participant": rows["participant"].to_numpy(), "set": theirs, "preferred": words})
 
 
 def _need(answers, roles):

@@ -27,12 +27,20 @@ __all__ = [
     "ORANGE",
     "RED",
     "STYLE",
+    "band",
+    "grid_slice",
+    "label_axes",
+    "level_words",
+    "map_panels",
     "map_slices",
     "maps_beside",
+    "mark_trials",
     "moved_optima",
     "optima_scatter",
     "progress_figure",
+    "sides",
     "slices_after",
+    "star",
 ]
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
@@ -49,7 +57,6 @@ _NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are dr
 _APART = 0.15  # between slices, in the unit cube
 _OTHER: dict = {"s": 7, "marker": "o", "facecolor": "white", "edgecolor": "black", "linewidth": 0.4}
 _TOP: dict = {"s": 16, "marker": "o", "facecolor": ORANGE, "edgecolor": "black", "linewidth": 0.5}
-_REALISM = "perceived realism f"
 
 
 def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
@@ -62,15 +69,17 @@ def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohor
     if study.space.dim == 1:
         return _map_curve(study, posteriors, optimum, cohort)
     thirds = [None] if study.space.dim == 2 else _levels(float(optimum[2]))
-    grids = [_slice(study, posteriors, optimum, third) for third in thirds]
-    figure, panels, draw = _slices(study, grids)
+    grids = [grid_slice(study, posteriors, optimum, third) for third in thirds]
+    figure, panels, draw = map_panels(study, grids)
     for axes, third, values in zip(panels, thirds, grids, strict=True):
         draw(axes, values)
-        _mark_trials(axes, study, cohort, third)
+        mark_trials(axes, study, cohort, third)
         here = third is None or third == float(optimum[2])
         if here:
-            _star(axes, study, optimum)
-        axes.set_title("" if third is None else _level(study, 2, third) + (" (optimum)" if here else ""), fontsize=9)
+            star(axes, study, optimum)
+        axes.set_title(
+            "" if third is None else level_words(study, 2, third) + (" (optimum)" if here else ""), fontsize=9
+        )
     return figure
 
 
@@ -84,12 +93,12 @@ def maps_beside(study: Study, maps: Mapping[str, Posterior], optima: Float[np.nd
     if study.space.dim == 1:
         return _curves_beside(study, maps, optima)
     thirds = [float(x[2]) if study.space.dim > 2 else None for x in optima]
-    grids = [_slice(study, p, x, third) for p, x, third in zip(maps.values(), optima, thirds, strict=True)]
-    figure, panels, draw = _slices(study, grids)
+    grids = [grid_slice(study, p, x, third) for p, x, third in zip(maps.values(), optima, thirds, strict=True)]
+    figure, panels, draw = map_panels(study, grids)
     for axes, name, x, third, values in zip(panels, maps, optima, thirds, grids, strict=True):
         draw(axes, values)
-        _star(axes, study, x)
-        axes.set_title(name + (f", {_level(study, 2, third)}" if third is not None else ""), fontsize=9)
+        star(axes, study, x)
+        axes.set_title(name + (f", {level_words(study, 2, third)}" if third is not None else ""), fontsize=9)
     return figure
 
 
@@ -130,7 +139,7 @@ def progress_figure(
         figure = Figure(figsize=(7.2, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
         goal = "the final optimum" if truth is None else "the truth"
-        _band(left, trials, 100 * own.T, BLUE, "individuals: median, quartiles")
+        band(left, trials, 100 * own.T, BLUE, "individuals: median, quartiles")
         left.plot(trials, 100 * merged, color=RED, marker="o", markersize=3, label="population map")
         if truth is not None:
             to_end = np.sqrt(np.mean((population_optima - population_optima[-1]) ** 2, axis=1))
@@ -138,7 +147,7 @@ def progress_figure(
         left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
         left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
         left.legend(frameon=False, loc="upper right")
-        _band(right, trials, top, GREEN, "median, quartiles")
+        band(right, trials, top, GREEN, "median, quartiles")
         right.set(xlabel="trials of each participant", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
         right.legend(frameon=False, loc="upper left")
     return figure
@@ -160,7 +169,7 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
             for (name, point), (marker, colour, size) in zip(points.items(), styles, strict=False):
                 look = {"marker": marker, "s": size, "color": colour, "edgecolor": "white", "linewidth": 0.6}
                 axes.scatter(point[i], point[j], label=name, zorder=3, clip_on=False, **look)
-            _axes(axes, study, i, j)
+            label_axes(axes, study, i, j)
         labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(*labels, loc="outside upper center", ncols=4 if len(pairs) > 1 else 2, frameon=False)
     return figure
@@ -180,32 +189,33 @@ def _levels(third):
     return sorted((third, *beside))
 
 
-def _slices(study, grids):
+def map_panels(study: Study, grids):
     """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
     low, high = min(np.nanmin(g) for g in grids), max(np.nanmax(g) for g in grids)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.0 if len(grids) == 1 else 7.4, 2.7), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
         scale = ScalarMappable(Normalize(low, high), "cividis")
-        figure.colorbar(scale, ax=list(panels), label=f"{_REALISM} (mean)", fraction=0.05, pad=0.02)
+        figure.colorbar(scale, ax=list(panels), label=f"{study.attribute} f (mean)", fraction=0.05, pad=0.02)
         for axes in panels:
-            _axes(axes, study, 0, 1)
+            label_axes(axes, study, 0, 1)
         for axes in panels[1:]:
             axes.set_ylabel("")
 
     def draw(axes, values):
-        first, second = _sides(study)
+        first, second = sides(study)
         axes.pcolormesh(first, second, values, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
 
     return figure, panels, draw
 
 
-def _sides(study):
+def sides(study: Study) -> list[np.ndarray]:
+    """Physical values of the first two parameters along a slice."""
     side = np.linspace(0.0, 1.0, _CELLS)
     return [np.asarray(p.to_physical(jnp.asarray(side))) for p in study.space.parameters[:2]]
 
 
-def _slice(study, posteriors, optimum, third):
+def grid_slice(study, posteriors, optimum, third):
     """Mean of the population map over the first two parameters, NaN where nothing may be rendered."""
     side = np.linspace(0.0, 1.0, _CELLS)
     x = np.tile(np.asarray(optimum, float), (_CELLS, _CELLS, 1))
@@ -232,8 +242,8 @@ def _curve(study, posteriors):
 def _curve_axes(study):
     figure = Figure(figsize=(4.5, 2.9), layout="constrained")
     axes = figure.subplots()
-    _axes(axes, study, 0, 0)
-    axes.set(yscale="linear", ylabel=_REALISM)
+    label_axes(axes, study, 0, 0)
+    axes.set(yscale="linear", ylabel=f"{study.attribute} f")
     return figure, axes
 
 
@@ -269,7 +279,8 @@ def _curves_beside(study, maps, optima):
     return figure
 
 
-def _axes(axes, study, i, j):
+def label_axes(axes, study: Study, i: int, j: int) -> None:
+    """Names, units, limits and scales of two parameters."""
     for which, parameter in (("x", study.space.parameters[i]), ("y", study.space.parameters[j])):
         unit = f" ({_unit(parameter.unit)})" if parameter.unit else ""
         getattr(axes, f"set_{which}label")(_name(parameter.name) + unit)
@@ -291,13 +302,15 @@ def _unit(unit):
     return unit.replace("s^alpha", "s$^α$").replace(".", "·")
 
 
-def _level(study, index, unit_value):
+def level_words(study: Study, index: int, unit_value: float) -> str:
+    """A parameter's name and physical value."""
     parameter = study.space.parameters[index]
     value = float(parameter.to_physical(jnp.asarray(float(unit_value))))
     return f"{_name(parameter.name)} = {value:.3g} {parameter.unit}".strip()
 
 
-def _mark_trials(axes, study, cohort, third):
+def mark_trials(axes, study: Study, cohort: Cohort, third: float | None) -> None:
+    """Renderings that were asked near a slice, those with the highest answer filled."""
     mask = np.asarray(cohort.trials.mask)
     x, q = np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
     near = np.ones(len(x), bool) if third is None else np.abs(x[:, 2] - third) < _NEAR
@@ -307,12 +320,14 @@ def _mark_trials(axes, study, cohort, third):
     axes.scatter(*physical[top, :2].T, **_TOP)
 
 
-def _star(axes, study, x):
-    point = np.asarray(study.space.to_physical(np.asarray(x)))
-    axes.plot(point[0], point[1], marker="*", markersize=13, color=RED, markeredgecolor="white", clip_on=False)
+def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:
+    """An optimum, on axes of two of the parameters."""
+    point = np.asarray(study.space.to_physical(np.asarray(x)))[list(pair)]
+    axes.plot(*point, marker="*", markersize=13, color=RED, markeredgecolor="white", clip_on=False)
 
 
-def _band(axes, trials, values, colour, label):
+def band(axes, trials, values, colour: str, label: str) -> None:
+    """Median over the first axis of `values` as a line, quartiles as a band."""
     low, middle, high = np.percentile(values, [25, 50, 75], axis=0)
     axes.fill_between(trials, low, high, color=colour, alpha=0.25, linewidth=0)
     axes.plot(trials, middle, color=colour, label=label)

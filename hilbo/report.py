@@ -219,7 +219,7 @@ def save_figures(figures: Mapping[str, tuple[Any, str, str]], folder: Path) -> l
         figure.savefig(buffer, format="png", dpi=200)
         (folder / f"{name}.png").write_bytes(buffer.getvalue())
         png = base64.b64encode(buffer.getvalue()).decode()
-        pictures.append({"png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
+        pictures.append({"name": name, "png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
     return pictures
 
 
@@ -247,11 +247,11 @@ def map_dataset(
     shape = x.shape[:-1]
     return xr.Dataset(
         {
-            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": "perceived realism, posterior mean"}),
+            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": f"{study.attribute}, posterior mean"}),
             "variance": (
                 names,
                 np.asarray(variance).reshape(shape),
-                {"long_name": "perceived realism, posterior variance"},
+                {"long_name": f"{study.attribute}, posterior variance"},
             ),
             "feasible": (
                 names,
@@ -304,8 +304,8 @@ def _captions(study, truth):
     return {
         "map": (
             "The population map",
-            "How realistic people find each rendering, as far as their answers tell: brighter is better, and the star"
-            f" is the optimum.{white} Dots are renderings that were asked, orange where somebody answered"
+            f"The {study.attribute} of each rendering, as far as people's answers tell: brighter is better, and the"
+            f" star is the optimum.{white} Dots are renderings that were asked, orange where somebody answered"
             f' "{top}".{third}{rest}',
         ),
         "progress": (

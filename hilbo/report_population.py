@@ -59,9 +59,9 @@ def _figures(study, merged, grid):
     if study.space.dim <= 3:
         some = _some(merged.cohort)
         caption = (
-            "How realistic people find each rendering, as far as their answers tell, from the grid of map.nc: brighter"
-            f" is better, and the star is the optimum. Dots are answers of {len(some.names)} participants, orange where"
-            f' one answered "{study.responses[-1]}".'
+            f"The {study.attribute} of each rendering, as far as people's answers tell, from the grid of map.nc:"
+            f" brighter is better, and the star is the optimum. Dots are answers of {len(some.names)} participants,"
+            f' orange where one answered "{study.responses[-1]}".'
         )
         white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
         found["map"] = (plotting.map_slices(study, _from(grid), best, some), "The population map", caption + white)

@@ -66,6 +66,8 @@ MATHS = {
     "wild_bootstrap": {"ordered_logit", "cluster_robust"},
     "regression": {"separation", "wild_bootstrap"},
     "statistics": {"regression"},
+    "people": {"ordinal_gp"},
+    "sensitivity": {"aggregation", "validation"},
 }
 # What each module may import of hilbo, and with it what that one may import. Modules to come have their place already.
 MAY_IMPORT = MATHS | {
@@ -109,6 +111,10 @@ MAY_IMPORT = MATHS | {
     "validation_table": {"tables"},
     "preferences": {"statistics", "validation_table"},
     "paper_tables": {"preferences"},
+    "analysis": {"study", "validation", "sensitivity", "people", "hyperparameters"},
+    "inference_data": {"study", "kernels"},
+    "study_folder": {"study", "validation_table"},
+    "power": {"study", "simulate"},
     "console": set(),
     "cli_material": {"console", "characterise", "material_tables", "report_material"},
     "event_log": {"live_state"},
@@ -119,6 +125,9 @@ MAY_IMPORT = MATHS | {
     "robustness": {"study", "hyperparameters"},
     "plotting": set(MATHS) | {"study"},
     "plotting_mechanics": {"plotting", "characterise"},
+    "plotting_validation": {"plotting"},
+    "plotting_power": {"plotting"},
+    "plotting_study": {"plotting", "analysis"},
     "report_people": {"study"},
     "page": {"config", "report_people"},
     "hardware_bridge": {"ports", "handshake", "staging", "telemetry", "simulator"},
@@ -128,12 +137,20 @@ MAY_IMPORT = MATHS | {
 MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material", "cli_session", "device_options", "cli_device"}
 MAY_IMPORT["report_population"] = {"report", "report_people", "page", "batch_optimum"}
 MAY_IMPORT["report_robustness"] = {"report"}
+MAY_IMPORT["simulate_validation"] = {"report", "simulate", "validation"}
+MAY_IMPORT["report_validation"] = {"report", "page", "paper_tables", "plotting_validation"}
+MAY_IMPORT["report_power"] = {"report", "page", "power", "plotting_power"}
+MAY_IMPORT["report_figures"] = {"analysis", "study_folder", "plotting_study"}
+MAY_IMPORT["hypotheses"] = {"analysis", "report_validation"}
+MAY_IMPORT["report_study"] = {"hypotheses", "inference_data", "report_figures", "report_validation", "study_folder"}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
+MAY_IMPORT["cli_study"] = {"console", "power", "report_power", "report_study", "simulate_validation"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 
-ONLY_IN = {"matplotlib": {"plotting", "plotting_mechanics"}, "serial": {"ports"}}
+PLOTTING = {"plotting", "plotting_mechanics", "plotting_power", "plotting_study", "plotting_validation"}
+ONLY_IN = {"matplotlib": PLOTTING, "serial": {"ports"}}
 WITHOUT_JAX = {
     "errors",
     "protocol",

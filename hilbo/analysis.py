@@ -1,0 +1,197 @@
+"""Everything that a study's results say of one material, computed once for report, tables and figures.
+
+Exclusion comes first: everybody's answers are measured (`hilbo.people`), the study's rule is applied, and only then is
+anything merged. Then: the aggregate, the optima after fewer trials, best, mid and worst, tolerance intervals under the
+study's hyperparameters and under those of maximum evidence, with their bootstrap over people.
+What cannot be had from these answers is a sentence in `limits`, not an error.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+
+from hilbo.config import Study
+from hilbo.errors import InputError
+from hilbo.hyperparameters import Learned, maximise_shared_evidence
+from hilbo.people import excluded, measure_people
+from hilbo.sensitivity import Ends, tolerance_ends
+from hilbo.session import search_points
+from hilbo.study import Aggregate, Cohort, aggregate_cohort, fit_cohort, nrmse, population_optimum, progress
+from hilbo.validation import Sets, Tolerance, best_mid_worst, tolerance
+
+__all__ = ["Analysis", "Progress", "Reading", "analyse", "limits_of", "moved_by_evidence", "settled"]
+
+Say = Callable[[str], None]
+_LEARN = ("theta", "noise", "thresholds")
+_SETTLED = 0.05  # NRMSE: an optimum that stays this near to its last place has settled
+_LONGEST = 25  # points of a progress curve
+
+
+class Progress(NamedTuple):
+    """Optima (unit cube) after the first `counts` trials of everybody: the population's, and each person's."""
+
+    counts: Int[np.ndarray, " p"]
+    merged: Float[np.ndarray, "p d"]
+    own: Float[np.ndarray, "p M d"]
+
+    def to_end(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
+        """NRMSE of the population's and of everybody's running optimum to the final one."""
+        merged = np.sqrt(np.mean((self.merged - self.merged[-1]) ** 2, axis=1))
+        return merged, np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
+
+
+class Reading(NamedTuple):
+    """A population map and what is read from it: tolerance interval and its ends' bootstrap for each parameter."""
+
+    study: Study
+    aggregate: Aggregate
+    tolerances: dict[str, tuple[Tolerance | None, Ends | None]]
+
+
+class Analysis(NamedTuple):
+    """All results of one material."""
+
+    study: Study
+    cohort: Cohort
+    fixed: Reading
+    optimised: Reading
+    learned: Learned
+    progress: Progress
+    sets: Sets | None
+    people: pd.DataFrame
+    """Everybody's measures, those left out too."""
+    left_out: dict[str, str]
+    """Who was left out by the study's rule, and why."""
+    limits: tuple[str, ...]
+
+    @property
+    def aggregate(self) -> Aggregate:
+        """The population's results under the study's own hyperparameters."""
+        return self.fixed.aggregate
+
+
+def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None) -> Analysis:
+    """Results of one material from all its participants' answers. Raises `InputError` if the rule leaves nobody."""
+    say("consistency, lapses and drift of everybody")
+    people = measure_people(study.gp, everybody.trials, everybody.names)
+    left = excluded(people, study.exclude)
+    if len(left) == len(everybody.names):
+        raise InputError(
+            f'the rule "{study.exclude}" leaves out all {len(left)} participants; there is nothing to merge.'
+        )
+    cohort = everybody.of([name for name in everybody.names if name not in left]) if left else everybody
+    say(f"fitting {len(cohort.names)} participants")
+    aggregate = aggregate_cohort(study, cohort, seed)
+    say("the optima after fewer trials")
+    counts = _counts(cohort)
+    merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts.tolist()))
+    say("hyperparameters by maximum evidence")
+    learned, optimised = _optimised(study, cohort, aggregate, seed)
+    say("reading the maps")
+    sets, words = _sets(study, aggregate, seed)
+    limits = (*limits_of(study, cohort), *words)
+    if bool(learned.runaway) or not bool(learned.converged):
+        limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
+    return Analysis(
+        study,
+        cohort,
+        _read(study, aggregate, seed),
+        _read(optimised[0], optimised[1], seed),
+        learned,
+        Progress(counts, merged, own),
+        sets,
+        people,
+        left,
+        limits,
+    )
+
+
+def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
+    """What these answers cannot say, in sentences."""
+    counts, found = cohort.counts(), []
+    if len(cohort.names) == 1:
+        found.append(
+            f"{cohort.names[0]} is the only participant: the population map is that person's own, and nothing is"
+            " known of how people differ."
+        )
+    few = [name for name, count in zip(cohort.names, counts, strict=True) if count < 5]
+    if few:
+        found.append(f"Fewer than 5 answers were given by {', '.join(few)}; their maps are nearly the prior.")
+    if counts.min() != counts.max():
+        found.append(
+            f"Participants gave between {counts.min()} and {counts.max()} answers; after n trials, those with fewer"
+            " enter with what they have."
+        )
+    mask, q = np.asarray(cohort.trials.mask), np.asarray(cohort.trials.q)
+    one = [
+        f'{name} ("{study.responses[int(q[j][mask[j]][0])]}")'
+        for j, name in enumerate(cohort.names)
+        if len(np.unique(q[j][mask[j]])) == 1
+    ]
+    if one:
+        found.append(f"One answer only was ever given by {', '.join(one)}: that is no map of where to go.")
+    planned = study.selection.trials
+    if counts.max() < planned:
+        found.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
+    return tuple(found)
+
+
+def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], within: float = _SETTLED) -> int | None:
+    """The first of `counts` from which all errors are `within`; None if only the last one is, which says nothing."""
+    beyond = np.flatnonzero(errors > within)
+    first = 0 if not len(beyond) else int(beyond[-1]) + 1
+    return int(counts[first]) if first < len(counts) - 1 else None
+
+
+def _counts(cohort):
+    longest = int(cohort.counts().max())
+    counts = [
+        *np.linspace(1, longest, min(longest, _LONGEST)).round().astype(int),
+        *(n for n in (5, 15, 25) if n <= longest),
+    ]
+    return np.unique(counts)
+
+
+def _optimised(study, cohort, aggregate, seed):
+    learned = _learn(study, cohort.trials)
+    again = eqx.tree_at(lambda s: s.gp, study, learned.gp)
+    posteriors = fit_cohort(again, cohort)
+    best = population_optimum(again, posteriors, search_points(study.space, seed))
+    return learned, (again, eqx.tree_at(lambda a: (a.posteriors, a.optimum), aggregate, (posteriors, best)))
+
+
+@eqx.filter_jit
+def _learn(study, trials):
+    return maximise_shared_evidence(study.gp, trials, _LEARN, weak_priors=True, inference=study.inference)
+
+
+def _read(study, aggregate, seed):
+    """Tolerance intervals through the map's optimum, along every parameter."""
+    x = aggregate.optimum.x
+    return Reading(
+        study,
+        aggregate,
+        {
+            name: (
+                tolerance(study, aggregate.surface, x, name),
+                tolerance_ends(study, aggregate.posteriors, x, name, seed),
+            )
+            for name in study.space.names
+        },
+    )
+
+
+def _sets(study, aggregate, seed):
+    try:
+        return best_mid_worst(study, aggregate.surface, search_points(study.space, seed)), ()
+    except InputError as error:
+        return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
+
+
+def moved_by_evidence(found: Analysis) -> float:
+    """NRMSE between the optima under fixed and under optimised hyperparameters."""
+    return float(nrmse(found.optimised.aggregate.optimum.x, found.aggregate.optimum.x))

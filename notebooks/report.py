@@ -1,0 +1,89 @@
+# %% [markdown]
+# # The paper's study, re-enacted
+# Simulated people feel three materials, answer "different", "similar" or "close", and are asked again in validation
+# sessions; one folder then holds what a laboratory would have, and `hilbo report` writes the results section.
+
+# %%
+import dataclasses
+import os
+import tempfile
+from pathlib import Path
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+import numpy as np
+import pandas as pd
+
+from hilbo import Study
+from hilbo.report_study import write_study
+from hilbo.session import search_points
+from hilbo.simulate import PRESETS, people, simulate_study, to_table, truth_table
+from hilbo.simulate_validation import sets_table, validation_table
+from hilbo.study import aggregate_cohort, cohort_of
+from hilbo.study_folder import read_folder
+from hilbo.tables import read_trials, write_trials
+from hilbo.validation import best_mid_worst
+
+folder = Path(tempfile.mkdtemp())
+participants, trials = 6, int(os.environ.get("HILBO_NOTEBOOK_TRIALS", "25"))
+
+# %% [markdown]
+# ## Three materials
+# They share the study but for the effective stiffness; each has its own set around which people's optima lie.
+
+# %%
+MATERIALS = {
+    "memory foam": (0.44, {"K1": 5.70, "B1": 5.89, "alpha": 0.203}),
+    "medium silicone": (0.60, {"K1": 4.00, "B1": 8.00, "alpha": 0.150}),
+    "stiff silicone": (0.80, {"K1": 3.00, "B1": 12.0, "alpha": 0.120}),
+}
+text = Path("hilbo/data/paper.toml").read_text().replace("trials = 25", f"trials = {trials}")
+for name, (stiffness, _) in MATERIALS.items():
+    text += f'\n[materials."{name}".renderer]\nK_eff = {stiffness}\n'
+(folder / "study.toml").write_text(text)
+study = Study.load(folder / "study.toml")
+
+# %% [markdown]
+# ## Sessions
+# Everybody's trials are chosen by the session's own rule. The simulated people are those of docs/simulation.md.
+
+# %%
+answers, truths, sets, compared = [], [], [], []
+for number, (name, (_, truth)) in enumerate(MATERIALS.items()):
+    own, population = study.material(name), dataclasses.replace(PRESETS["paper"], truth=truth)
+    crowd = people(own, population, participants, seed=number)
+    table = to_table(own, simulate_study(own, crowd, seed=number))
+    answers.append(table.assign(material=name))
+    truths.append(truth_table(own, population, crowd).assign(material=name))
+    write_trials(table, folder / "one.csv")
+    cohort = cohort_of(read_trials(folder / "one.csv", own), own)
+    aggregate = aggregate_cohort(own, cohort, alternatives=False)
+    three = best_mid_worst(own, aggregate.surface, search_points(own.space, 0), known=0.95)
+    renderings = sets_table(own, three, np.asarray(aggregate.individuals.x), cohort.names)
+    judged = validation_table(own, population, renderings, participants=8, judges=4, seed=number)
+    prefix = f"{name}: "
+    sets.append(renderings.assign(set_id=prefix + renderings["set_id"], material=name))
+    for column in ("set_a", "set_b", "preferred"):
+        judged[column] = prefix + judged[column]
+    compared.append(judged.assign(material=name))
+write_trials(pd.concat(answers), folder / "trials.csv")
+pd.concat(truths).to_csv(folder / "truth.csv", index=False)
+pd.concat(sets).to_csv(folder / "sets.csv", index=False)
+pd.concat(compared).to_csv(folder / "validation.csv", index=False)
+(folder / "one.csv").unlink()
+
+# %% [markdown]
+# ## The report
+# The same as `hilbo report FOLDER --out results`.
+
+# %%
+out = folder / "results"
+out.mkdir()
+content = write_study(read_folder(folder), out)
+for claim in content["hypotheses"]:
+    print(claim["number"], claim["verdict"])
+    for item in claim["evidence"]:
+        print("   ", item["side"], "-", item["text"])
+print("written:", len(list(out.rglob("*"))), "files,", out / "report.html")

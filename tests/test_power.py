@@ -1,0 +1,57 @@
+"""Simulated studies for planning: truths in closed form, prefixes that are studies of their own, and bad plans."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+from hilbo import Study
+from hilbo.errors import InputError
+from hilbo.power import Plan, one_study, power_table, simulate_power, summarise, top_probability
+from hilbo.report_power import enough
+from hilbo.simulate import PRESETS, people
+
+
+def study():
+    return Study.load("hilbo/data/paper.toml")
+
+
+def test_the_probability_of_the_highest_answer_is_that_of_many_answers():
+    persons = people(study(), PRESETS["paper"], 3, 5)
+    x = np.array([[0.15, 0.2, 0.2], [0.6, 0.6, 0.4]])
+    keys, half = jax.random.split(jax.random.key(0), 20_000), jnp.asarray(0.5)
+
+    @jax.jit
+    def share(point):
+        given = jax.vmap(lambda person: jax.vmap(lambda key: person.answer(key, point, half))(keys))(persons)
+        return jnp.mean(given == 2)
+
+    found = [float(share(jnp.asarray(point))) for point in x]
+    np.testing.assert_allclose(top_probability(persons, 3, x), found, atol=0.01)
+
+
+def test_summaries_of_errors_that_are_known():
+    rows = [(s, m, t, 0.1 * s / m, 0.01 * t) for s in range(5) for m in (1, 2) for t in (10, 20)]
+    errors = pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
+    table = summarise(errors, 0.2)
+    assert power_table(table, "optimum_median").loc[1, 10] == pytest.approx(0.2)
+    assert power_table(table, "reached").to_numpy().tolist() == [[0.6, 0.6], [1.0, 1.0]]
+    assert power_table(table, "map_median").loc[2, 20] == pytest.approx(0.2)
+    assert enough(table)["trials"].tolist()[1] == 10 and np.isnan(enough(table)["trials"][0])
+
+
+@pytest.mark.parametrize("plan", [((), (5,), 4), ((3, 3), (5,), 4), ((0,), (5,), 4), ((3,), (5,), 1)])
+def test_plans_that_say_nothing_are_refused(plan):
+    with pytest.raises(InputError, match="power: "):
+        Plan(*plan, seed=0)
+
+
+@pytest.mark.deep
+def test_a_smaller_study_is_the_start_of_a_larger_one():
+    """The first people and trials alone give what they give within a larger study, to rounding."""
+    large = one_study(study(), PRESETS["paper"], Plan((2, 3), (6, 8), 2, 1), 0)
+    assert large["study"].eq(0).all() and large[["optimum", "map"]].gt(0).all(axis=None)
+    again = simulate_power(study(), PRESETS["paper"], Plan((2, 3), (6, 8), 2, 1), jobs=1)
+    pd.testing.assert_frame_equal(again[again["study"] == 0].reset_index(drop=True), large)
+    assert not np.allclose(again["optimum"][:4], again["optimum"][4:])
