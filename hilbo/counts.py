@@ -142,7 +142,8 @@ def _tolerance(likelihood, share, covariance, counts, state):
     """eps^(2/3), or the rounding error of the residual where that is larger, as in `laplace`."""
     epsilon = jnp.finfo(covariance.dtype).eps
     _, slope, curvature = _expand(likelihood, counts, state.eta)
-    summed = jnp.abs(slope) + curvature * jnp.abs(state.eta) + jnp.abs(state.weights)
+    size = jnp.abs(state.weights)
+    summed = jnp.abs(slope) + curvature * _latent(share, jnp.abs(covariance), size) + size
     rounding = jnp.linalg.norm(summed) * jnp.linalg.norm(_latent(share, covariance, summed))
     return jnp.clip(4.0 * epsilon * jnp.sqrt(rounding), epsilon ** (2 / 3), epsilon**0.25)
 
