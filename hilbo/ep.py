@@ -17,6 +17,8 @@ Rasmussen & Williams' (3.65) without its differences of large terms, and without
 
 * Coordinates as in `laplace`: eta = R w, R the eigenvector root of K, and only I + R'TR >= 1 is factorised. K may be
   singular (the same stimulus asked twice); nothing is added to it.
+* The search begins at Laplace's mode, which is near, and with S = K - K C K, which needs no root. Where it does not end
+  below the tolerance it begins anew with R and from the prior, or from `start`.
 * For given v the means are the maximum of a concave function, so that only v is in need of a careful search. Far from
   the fixed point damped parallel updates, near it Newton's steps in (m, v), the mean eliminated: n unknowns. A Newton
   step that does not halve the mismatch sends the search back to updates, which are damped more the longer they take.
@@ -28,13 +30,23 @@ exponential families". The elimination of the mean is derived in docs/design.md,
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hilbo.gaussian import GaussianPosterior, certify, factor, inverse_and_log_determinant, square_root, still
+from hilbo.gaussian import (
+    GaussianPosterior,
+    certify,
+    factor,
+    factorise,
+    inverse_and_log_determinant,
+    square_root,
+    still,
+)
+from hilbo.laplace import plain_mode
 from hilbo.linalg import cholesky, one_at_a_time, solve_lower
 
 __all__ = ["Tilted", "coupling", "ep", "fixed_point", "gaussian", "inverse_of", "settled", "sites_of"]
@@ -44,6 +56,7 @@ Tilted = Callable[
 ]
 """Cavity means and variances -> L_i, its slopes in the mean, and the sites' precisions t_i >= 0, elementwise."""
 
+_QUICK_STEPS = 20
 _BASIN = 3.0  # a mismatch, in posterior sds, below which Newton's step is tried
 
 
@@ -98,15 +111,13 @@ def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
 # --- the fixed point
 
 
-class _Found(eqx.Module):
-    """How the search ended."""
+class _Found(NamedTuple):
+    """How the search ended; `changed` is what the square root dropped, 0 where none was needed."""
 
     residual: Float[Array, ""]
     tolerance: Float[Array, ""]
     iterations: Int[Array, ""]
     changed: Float[Array, ""]
-    root: Float[Array, "n n"]
-    """R with R R' = K."""
 
 
 class _Search(eqx.Module):
@@ -122,20 +133,51 @@ class _Search(eqx.Module):
 
 @eqx.filter_custom_jvp
 def fixed_point(terms, covariance, start, max_steps):
-    """Cavity means and variances, and how they were found."""
-    root, changed = square_root(covariance)
+    """Cavity means and variances, and how they were found.
+
+    Under `vmap` one problem after the other on CPUs, each stopping when it is done; elsewhere all at once with a root.
+    """
+    arrays, rest = eqx.partition(terms, eqx.is_array)
+
+    def safe(arrays, covariance, start):
+        terms = eqx.combine(arrays, rest)
+        root, changed = square_root(covariance)
+        begun = _begin(terms, covariance, root, start)
+        return _searched(terms, covariance, root, begun, max_steps, changed)
+
+    def quick(arrays, covariance, start):
+        terms = eqx.combine(arrays, rest)
+        near = jnp.zeros_like(covariance[0]) if start is None else start
+        eta = plain_mode(_AtPoints(terms), covariance, near, _QUICK_STEPS).eta
+        begun = _begin(terms, covariance, None, _AtPoints(terms)(eta)[1])
+        steps = min(max_steps, _QUICK_STEPS)
+        found = _searched(terms, covariance, None, begun, steps, jnp.zeros_like(covariance[0, 0]))
+        done = found[2].residual <= found[2].tolerance
+        return jax.lax.cond(done, lambda *_: found, safe, arrays, covariance, start)
+
+    return one_at_a_time(quick, safe)(arrays, covariance, start)
+
+
+class _AtPoints(eqx.Module):
+    """The terms at single values, which are cavities of no width: Laplace's terms."""
+
+    terms: Tilted
+
+    def __call__(self, eta):
+        return self.terms(eta, jnp.zeros_like(eta))
+
+
+def _searched(terms, covariance, root, begun, max_steps, changed):
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
-    begin = _Search(
-        *_begin(terms, covariance, root, start), largest, jnp.zeros_like(largest), largest,
-        jnp.full_like(largest, _BASIN), count, count,
-    )  # fmt: skip
+    basin = jnp.full_like(largest, _BASIN)
+    begin = _Search(*begun, largest, jnp.zeros_like(largest), largest, basin, count, count)
 
     def unfinished(search):
         return (search.steps < max_steps) & ~(search.residual <= search.tolerance) & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
-    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, changed, root)
+    return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, changed)
 
 
 def _begin(terms, covariance, root, start):
@@ -145,7 +187,7 @@ def _begin(terms, covariance, root, start):
         return jnp.zeros_like(prior), prior
     mean = covariance @ start
     _, _, precision = terms(mean, jnp.zeros_like(mean))
-    posterior = _posterior_of(root, precision)
+    posterior = _posterior_of(covariance, root, precision)
     variance = posterior.variance / posterior.left
     return mean - variance * start, variance
 
@@ -174,8 +216,14 @@ class _Posterior(eqx.Module):
     left: Float[Array, " n"]  # 1 - t s: the share of the variance that is left when the site joins its cavity
 
 
-def _posterior_of(root, precision):
-    """S = G'G with L G = R', LL' = I + R'TR: a sum of squares, no inverse of K or T."""
+def _posterior_of(covariance, root, precision):
+    """S = G'G with L G = R', LL' = I + R'TR: a sum of squares, no inverse of K or T; without R, S = K - K C K."""
+    if root is None:
+        scale, _, lower = factorise(covariance, precision)
+        through = solve_lower(lower, scale[:, None] * covariance)
+        joint = covariance - through.T @ through
+        variance = jnp.diagonal(covariance) - jnp.sum(through**2, axis=0)
+        return _Posterior(joint, variance, 1.0 - precision * variance)
     matrix = jnp.eye(root.shape[0], dtype=root.dtype) + (root.T * precision[None, :]) @ root
     half = solve_lower(cholesky(matrix), root.T)
     variance = jnp.sum(half**2, axis=0)
@@ -186,7 +234,7 @@ def _advance(terms, covariance, root, search):
     """Evaluate the mismatch of the cavities and move them, by Newton's step or a damped update."""
     m, v = search.mean, search.variance
     sites = sites_of(terms, m, v)
-    posterior = _posterior_of(root, sites.precision)
+    posterior = _posterior_of(covariance, root, sites.precision)
     tilted = m + v * sites.slope
     natural = sites.slope + sites.precision * tilted
     matched = posterior.covariance @ natural
@@ -198,7 +246,11 @@ def _advance(terms, covariance, root, search):
     newton = mismatch < basin
     share = 0.5 / (1 + search.updates // 8).astype(v.dtype)
     target = matched - cavity * (natural - sites.precision * matched)
-    dm, dv = _newton_step(sites, posterior, v, matched - tilted, cavity - v)
+    dm, dv = jax.lax.cond(
+        newton & ~(residual <= tolerance),  # the end needs no further step
+        lambda: _newton_step(sites, posterior, v, matched - tilted, cavity - v),
+        lambda: (jnp.zeros_like(m), jnp.zeros_like(v)),
+    )
     growth = jnp.clip(dv / v, -1.0, 1.0)
     return _Search(
         mean=jnp.where(newton, m + dm, m + share * (target - m)),
@@ -220,10 +272,12 @@ def _mismatch(covariance, root, search, sites, posterior, means):
     ratio = posterior.variance / (posterior.left * search.variance)
     stretched = jnp.where(sites.precision > 0, jnp.abs(jnp.log(ratio)), 0.0)
     prior = jnp.diagonal(covariance)
-    summed = jnp.abs(root).T @ (jnp.abs(natural) + sites.precision * jnp.abs(matched))
     residuals = jnp.stack([jnp.max(apart / jnp.sqrt(prior)), jnp.max(stretched)])
-    rounding = jnp.stack([jnp.linalg.norm(summed), jnp.max(1.0 + sites.precision * search.variance)])
-    tolerances = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
+    tolerances = jnp.full((2,), epsilon ** (2 / 3), tilted.dtype)
+    if root is not None:  # the last resort ends at its rounding
+        summed = jnp.abs(root).T @ (jnp.abs(natural) + sites.precision * jnp.abs(matched))
+        rounding = jnp.stack([jnp.linalg.norm(summed), jnp.max(1.0 + sites.precision * search.variance)])
+        tolerances = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
     worse = jnp.argmax(residuals / tolerances)
     mismatch = jnp.maximum(jnp.max(apart / jnp.sqrt(posterior.variance)), residuals[1])
     return residuals[worse], tolerances[worse], mismatch
@@ -260,8 +314,7 @@ def coupling(sites, posterior, variance):
 @jax.custom_jvp
 def _joint(covariance, precision, root):
     """S from the root R of K, without the difference K - K C K; its derivative needs none of R's."""
-    del covariance
-    return _posterior_of(root, precision).covariance
+    return _posterior_of(covariance, root, precision).covariance
 
 
 @_joint.defjvp
@@ -271,8 +324,9 @@ def _joint_jvp(primals, tangents):
     return joint, transfer @ tangents[0] @ transfer.T - (joint * tangents[1][None, :]) @ joint
 
 
-def settled(covariance, sites, variance, root):
+def settled(covariance, sites, variance):
     """At the fixed point, written so that it can be differentiated: S and its kin, and I - S T."""
+    root, _ = square_root(jax.lax.stop_gradient(covariance))
     joint = _joint(covariance, sites.precision, root)
     transfer = jnp.eye(variance.shape[0], dtype=variance.dtype) - joint * sites.precision[None, :]
     return _Posterior(joint, jnp.diagonal(joint), 1.0 / (1.0 + variance * sites.precision)), transfer
@@ -306,7 +360,7 @@ def _fixed_point_jvp(primals, tangents):
     terms, covariance, _, _ = primals
     mean, variance, found = fixed_point(*primals)
     sites = sites_of(terms, mean, variance)
-    posterior, transfer = settled(covariance, sites, variance, found.root)
+    posterior, transfer = settled(covariance, sites, variance)
     joint, ratio = posterior.covariance, 1.0 / posterior.left
     follow, spread, matrix = coupling(sites, posterior, variance)
 

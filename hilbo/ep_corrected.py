@@ -45,7 +45,7 @@ def ep_corrected(
     mean, variance, found = fixed_point(terms, covariance, start, max_steps)
     plain = gaussian(terms, covariance, mean, variance, found)
     sites = sites_of(terms, mean, variance)
-    posterior, transfer = settled(covariance, sites, variance, found.root)
+    posterior, transfer = settled(covariance, sites, variance)
     follow, spread, matrix = coupling(sites, posterior, variance)
     response = inverse_of(matrix)
     skew, moved = _skewness(terms, mean, variance)

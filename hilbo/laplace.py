@@ -36,9 +36,9 @@ from hilbo.gaussian import (
     square_root,
     still,
 )
-from hilbo.linalg import cholesky, solve_lower, solve_lower_transposed
+from hilbo.linalg import cholesky, one_at_a_time, solve_lower, solve_lower_transposed
 
-__all__ = ["Mode", "Pointwise", "Terms", "find_mode", "laplace"]
+__all__ = ["Mode", "Pointwise", "Terms", "find_mode", "laplace", "plain_mode"]
 
 Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 """Log-likelihood terms l_i(eta_i), their slopes l_i' and curvatures -l_i'' >= 0; [`Pointwise`][] derives the latter."""
@@ -128,21 +128,11 @@ def find_mode(terms, covariance, start, max_steps) -> Mode:
         return _whitened_mode(eqx.combine(arrays, rest), covariance, jnp.zeros_like(start), max_steps)
 
     def quick(arrays, covariance, start):
-        found = _plain_mode(eqx.combine(arrays, rest), covariance, start, min(max_steps, _PLAIN_STEPS))
+        found = plain_mode(eqx.combine(arrays, rest), covariance, start, min(max_steps, _PLAIN_STEPS))
         done = found.residual <= found.tolerance
         return jax.lax.cond(done, lambda *_: found, safe, arrays, covariance, start)
 
-    mapped = jax.custom_batching.custom_vmap(quick)
-
-    @mapped.def_vmap
-    def rule(size, in_batched, *args):
-        whole = jax.tree.map(lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape)), args, tuple(in_batched))
-        found = jax.lax.platform_dependent(
-            *whole, cpu=lambda *stacked: jax.lax.map(lambda row: mapped(*row), stacked), default=jax.vmap(safe)
-        )
-        return found, jax.tree.map(lambda _: True, found)
-
-    return mapped(arrays, covariance, start)
+    return one_at_a_time(quick, safe)(arrays, covariance, start)
 
 
 class _PlainState(NamedTuple):
@@ -154,7 +144,7 @@ class _PlainState(NamedTuple):
     risen: Bool[Array, ""]
 
 
-def _plain_mode(terms, covariance, start, max_steps) -> Mode:
+def plain_mode(terms, covariance, start, max_steps) -> Mode:
     """Full Newton steps on the weights, as long as the log posterior rises."""
     epsilon = jnp.finfo(start.dtype).eps
     tolerance = jnp.asarray(epsilon ** (2 / 3), start.dtype)

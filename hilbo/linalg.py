@@ -16,15 +16,17 @@ from jaxtyping import Array, Float
 __all__ = ["cholesky", "eigh", "one_at_a_time", "solve_lower", "solve_lower_transposed"]
 
 
-def one_at_a_time(function: Callable) -> Callable:
-    """`function` of pytrees of arrays with a rule for `vmap`: a loop on CPUs, the batched kernel elsewhere."""
+def one_at_a_time(function: Callable, together: Callable | None = None) -> Callable:
+    """`function` of pytrees of arrays with a rule for `vmap`: a loop on CPUs, elsewhere the batched kernel, or that of
+    `together`, which does the same."""
     mapped = jax.custom_batching.custom_vmap(function)
+    batched = jax.vmap(function if together is None else together)
 
     @mapped.def_vmap
     def rule(size, in_batched, *args):
         whole = jax.tree.map(lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape)), args, tuple(in_batched))
         out = jax.lax.platform_dependent(
-            *whole, cpu=lambda *stacked: jax.lax.map(lambda row: mapped(*row), stacked), default=jax.vmap(function)
+            *whole, cpu=lambda *stacked: jax.lax.map(lambda row: mapped(*row), stacked), default=batched
         )
         return out, jax.tree.map(lambda _: True, out)
 

@@ -23,7 +23,7 @@ MATHS = {
     "gaussian": set(),
     "laplace": {"gaussian"},
     "evidence": {"gaussian", "laplace"},
-    "ep": {"gaussian"},
+    "ep": {"gaussian", "laplace"},
     "ep_corrected": {"ep"},
     "sobol": set(),
     "tilting": {"likelihoods"},
