@@ -335,11 +335,11 @@ def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
 
 def test_the_newest_window_of_a_participant_is_the_one_that_counts(live):
     live.begin()
-    first, second = live.hub.watch("participant", "one"), live.hub.watch("participant", "two")
+    first, second = live.hub.watchers.add("participant", "one"), live.hub.watchers.add("participant", "two")
     assert first.ended
     assert "another window" in first.why
     assert not second.ended
-    live.hub.unwatch(second)
+    live.hub.watchers.remove(second)
     assert live.question()
 
 

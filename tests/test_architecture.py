@@ -101,6 +101,7 @@ MAY_IMPORT = MATHS | {
     "plan_sets": {"study", "study_plan", "validation"},
     "log_tables": {"event_log", "tables"},
     "people_table": {"event_log"},
+    "doctor": {"session", "ports", "link"},
     "cli_session": {"console", "study_plan", "plan_sets", "log_tables", "people_table"},
     "tables": {"config"},
     "material_tables": {"tables", "identification"},
@@ -128,6 +129,7 @@ MAY_IMPORT["report_population"] = {"report", "report_people", "page", "batch_opt
 MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)
+MAY_IMPORT["cli_live"] = {"app", "doctor"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 
