@@ -29,7 +29,8 @@ def refused(*arguments):
     return str(caught.value)
 
 
-def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path):
+def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")  # commands would choose the user's
     logs = tmp_path / "logs"
     place = ("--logs", logs, "--port", 0, "--participant", "P01")
     assert "has no [renderer]" in refused(DATA.parent / "video_quality.toml", *place, "--dry-run")
