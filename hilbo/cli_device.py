@@ -306,7 +306,7 @@ def _at_once(line, name, as_json) -> None:
         with opened(line) as device:
             getattr(device, name.lower())()
     else:
-        link = Link(open_port(line.device, line.baud))
+        link = Link(open_port(line.device, line.baud), patience=line.patience or 0.1)
         try:
             link.request(getattr(protocol, name)())
         finally:

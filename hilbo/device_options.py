@@ -34,6 +34,7 @@ class Line(NamedTuple):
     ] = None
     study: Annotated[_Path, typer.Option("--study", help="Its damping must not exceed the device's.")] = None
     damping: Annotated[_Number, typer.Option(help="Damping that is counted on, N.s/m; else the study's.")] = None
+    patience: Annotated[_Number, typer.Option(min=0.001, help="How long an answer may take, s; 0.1 on a line.")] = None
     capture: Annotated[_Path, typer.Option(help="Write the bytes that the device sends to this file.")] = None
 
 
@@ -96,6 +97,7 @@ def opened(line: Line, **simulated: Any) -> Iterator[Any]:
                 line.device,
                 damping=_damping(line),
                 baud=line.baud,
+                patience=line.patience,
                 capture=capture.write if capture else None,
                 options=(simulated if line.device == "sim" else {}) | sim_options(line.sim),
             )

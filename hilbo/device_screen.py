@@ -31,7 +31,7 @@ _PAINT = 0.1  # s
 _SHOWN = 4.0  # s of the trace
 _BARS = " ▁▂▃▄▅▆▇█"
 _KEYS = "123456789"
-_PIPED = 0.5  # s between two keys from a pipe
+_PIPED = 5  # pictures from one key of a pipe to the next
 
 
 def trace(values: Any, width: int) -> str:
@@ -188,7 +188,7 @@ def _show(view, seconds, go_on: Callable[[_View], bool]) -> dict[str, Any]:
                 over = seconds is not None and (view.status.tick - first) % 2**32 * view.device.tick_s >= seconds
                 if over or not go_on(view):
                     break
-                time.sleep(_PAINT)
+                view.device.link.pause(_PAINT)
     if live is None:
         for word in view.words:
             console.print(word)
@@ -227,9 +227,9 @@ class _Pipe:
     """Keys from a pipe, one every half a second."""
 
     def __init__(self):
-        self._next = time.monotonic()
+        self._asked = 0
 
     def __call__(self) -> Iterator[str]:
-        if time.monotonic() >= self._next:
-            self._next = time.monotonic() + _PIPED
+        self._asked += 1
+        if self._asked % _PIPED == 1:
             yield sys.stdin.read(1) or "q"

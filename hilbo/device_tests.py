@@ -4,7 +4,6 @@ Everything is timed in ticks of the device. Drives are positive inwards, towards
 `force_N` is positive outwards (firmware/PROTOCOL.md, "Signs"). Units: mm, N, s.
 """
 
-import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -24,7 +23,7 @@ _SLOWEST, _FASTEST = 10.0, 55.0  # mm/s
 _SETTLE = 0.12  # s after each turn
 _SPREAD = 0.01  # of depth and loads, from the least to the most
 _FREE = 0.1  # N that a free device's sensor may show
-_MOST = 2.0  # s of this clock for what the device does at once
+_MOST = 2.0  # s for what the device does at once
 
 
 class SelfTest(NamedTuple):
@@ -41,13 +40,13 @@ class SelfTest(NamedTuple):
     force_after_N: float
 
 
-def wait_until(done: Callable[[], Any], what: str, seconds: float = _MOST) -> Any:
+def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: float = _MOST) -> Any:
     """The first true value of `done`. Raises `DeviceError` when `what` has not come after `seconds`."""
-    give_up = time.monotonic() + seconds
+    give_up = device.link.now() + seconds
     while not (found := done()):
-        if time.monotonic() > give_up:
+        if device.link.now() > give_up:
             raise DeviceError(f"The device has not {what} within {seconds:g} s; check it, then try again.")
-        time.sleep(0.005)
+        device.link.pause(0.005)
     return found
 
 
@@ -58,7 +57,7 @@ def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: flo
     begun, parts = device.status().tick, [device.samples(times["duration"])]
     while not _ended(parts[-1], begun):
         parts.append(device.samples(0.05))
-    wait_until(lambda: device.state() != State.STOPPING, "stopped")
+    wait_until(device, lambda: device.state() != State.STOPPING, "stopped")
     whole = Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
     driving = (whole.flags & SampleFlag.DRIVING) != 0
     if driving.sum() * device.divisor < round(times["duration"] / device.tick_s) - device.divisor:
@@ -177,18 +176,15 @@ def _watchdog(device) -> tuple[int, float]:
             "This device cannot move by itself, and its watchdog is not tested; start a set, then pull the plug."
         )
     device.drive("force", "hold", 0.0, duration=5.0)
-    wait_until(lambda: device.state() == State.DRIVING, "begun to drive")
-    device.link.silent = True
-    last = device.status().tick  # whatever heartbeat there was has arrived by now
-    try:
-        wait_until(lambda: device.state() == State.HOLD, "let go without heartbeats")
-    finally:
-        device.link.silent = False
+    wait_until(device, lambda: device.state() == State.DRIVING, "begun to drive")
+    with device.link.silence():
+        last = device.status().tick  # whatever heartbeat there was has arrived by now
+        wait_until(device, lambda: device.state() == State.HOLD, "let go without heartbeats")
     status = device.status()
     if status.hold_reason != HoldReason.WATCHDOG:
         raise DeviceError(f"The device is in HOLD, but {held_because(status.hold_reason)}; check that first.")
     notice = next(n for n in reversed(device.link.notices) if n.state == State.HOLD)
-    wait_until(lambda: device.status().tick > notice.tick + device.device.hold_ticks, "gone on")
+    wait_until(device, lambda: device.status().tick > notice.tick + device.device.hold_ticks, "gone on")
     force = device.status().force_N
     device.clear()
     return notice.tick - last, force

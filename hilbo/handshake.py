@@ -16,7 +16,7 @@ from hilbo.reasons import State, held_because, meaning
 __all__ = ["greet", "take_over"]
 
 _BOOT = 3.0  # s that a board may take to start when its port is opened
-_STOPPING = 2.0  # s of this clock
+_STOPPING = 2.0  # s
 
 
 def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
@@ -53,17 +53,17 @@ def take_over(link: Link, device: HelloReply) -> list[str]:
     if status.state in (State.RUNNING, State.DRIVING, State.STOPPING):
         notes.append(f"The device was {meaning(State, status.state)} for an earlier host; it has been stopped.")
         link.request(protocol.Stop())
-        give_up = time.monotonic() + _STOPPING
+        give_up = link.now() + _STOPPING
         while status.state in (State.RUNNING, State.DRIVING, State.STOPPING):
-            if time.monotonic() > give_up:
+            if link.now() > give_up:
                 raise DeviceError(f"{link.name}: the device does not stop; switch off its motor.")
-            time.sleep(0.01)
+            link.pause(0.01)
             status = link.request(protocol.GetStatus())
     if status.state in (State.HOLD, State.ESTOP):
         why = held_because(status.hold_reason)
         notes.append(f"The device is in {meaning(State, status.state)}: {why}; clear it before the next start.")
-    link.boot_id, link.restarted = device.boot_id, False
-    link.heartbeat()
+    link.restarted = False
+    link.beat(device.boot_id)
     return notes
 
 

@@ -34,8 +34,9 @@ __all__ = ["Capability", "DeviceError", "InForce", "RefusalError", "Renderer", "
 
 _ANSWER = 0.1  # s
 _SIMULATED = 1.0  # s for an answer; the simulator shares this computer's processors
-_STALLED = 2.0  # s without telemetry
+_LOCKSTEP = 30.0  # s, where no time passes meanwhile
 _POLL = 0.1  # s
+_STALLED = 20  # polls without telemetry
 _SHAPES = {"hold": 0, "triangle": 1, "step": 2}
 
 
@@ -80,8 +81,8 @@ class Renderer:
             raise InputError(f"{where}: options are for the simulated device; use them with sim.")
         else:
             simulator = None
-        port, usual = (simulator.port, _SIMULATED) if simulator else (where, _ANSWER)
-        connect = partial(_connected, port, baud, usual if patience is None else float(patience), capture)
+        waits = None if patience is None else float(patience)
+        connect = partial(_connected, simulator.port if simulator else where, baud, waits, capture, simulator)
         try:
             return cls(connect, damping=damping, simulator=simulator)
         except BaseException:
@@ -136,8 +137,6 @@ class Renderer:
         except BaseException:
             self._link.close()
             raise
-        if self.simulator is not None:
-            self.simulator.run(partial(_keep_up, self._link))
 
     def send(
         self,
@@ -171,8 +170,6 @@ class Renderer:
         found = self.in_force()
         if found is None:
             raise DeviceError("The device has no set in force; send one first.")
-        import pandas  # noqa: F401  (what `telemetry` needs: an import may keep heartbeats waiting for too long)
-
         self._link.heartbeat()
         self._buffer.take()
         self._link.request(protocol.Start(set_id=found.set_id, crc=found.crc, boot_id=self.device.boot_id))
@@ -260,17 +257,26 @@ class Renderer:
 
     def samples(self, seconds: SupportsFloat = 1.0) -> Samples:
         """The same as columns of numbers, without pandas."""
-        buffer, heard, ticks = self._buffer, time.monotonic(), float(seconds) / self.tick_s
+        buffer, quiet, ticks = self._buffer, 0, float(seconds) / self.tick_s
         first = buffer.tick
         while buffer.tick - first < ticks:
-            if buffer.wait(_POLL):
-                heard, first = time.monotonic(), first or buffer.tick
+            if self._more():
+                quiet, first = 0, first or buffer.tick
             elif self._link.lost:
                 raise DeviceError(self._link.lost)
-            elif self._link.restarted or time.monotonic() - heard > _STALLED:
+            elif self._link.restarted or (quiet := quiet + 1) > _STALLED:
                 self.limits()  # says it better if device or line have a problem
                 raise DeviceError(f"{self._link.name}: no telemetry comes; switch it on with stream().")
         return buffer.take()
+
+    def _more(self) -> bool:
+        """Whether telemetry comes soon."""
+        seen = self._buffer.counts()
+        if self._link.ours:
+            self._link.pause(_POLL / 2)
+        else:
+            self._buffer.wait(_POLL)
+        return self._buffer.counts() != seen
 
     def newest(self) -> Any:
         """The newest telemetry message, or None; for displays."""
@@ -308,11 +314,8 @@ class Renderer:
                 time.sleep(0.1)
 
 
-def _keep_up(link: Link) -> None:
-    """Between ticks of a simulated device whose time is ours: a heartbeat, and everything it sent has been read."""
-    link.heartbeat()
-    link.request(protocol.GetStatus())
-
-
-def _connected(port, baud, patience, capture) -> Link:
-    return Link(open_port(port, baud), patience=patience, capture=capture)
+def _connected(port, baud, patience, capture, simulator) -> Link:
+    ticks = simulator.ticks if simulator is not None and simulator.lockstep else None
+    if patience is None:
+        patience = _LOCKSTEP if ticks else _SIMULATED if simulator else _ANSWER
+    return Link(open_port(port, baud), patience=patience, capture=capture, ticks=ticks)

@@ -1,27 +1,28 @@
 """One conversation over one line: requests with answers, heartbeats, and what comes unasked.
 
-One request is in flight at a time; without an answer the same bytes are sent again, three times in all. Two threads
-work beside the caller's: one reads, one sends a heartbeat every 50 ms. The heartbeat takes no lock but the one around
-the writing of a single frame, so that it goes out while a request waits, and for as long as this process lives: when it
-dies, the device hears nothing any more and lets go. firmware/PROTOCOL.md has the rules and the bytes.
+One request is in flight at a time; without an answer the same bytes are sent again, three times in all. A thread reads
+beside the caller's, and a heart beats (`hilbo.heartbeat`): while a request waits, while this process computes, and for
+as long as it lives. When it dies, the device hears nothing any more and lets go. firmware/PROTOCOL.md has the rules and
+the bytes.
 """
 
+import contextlib
 import random
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from hilbo import protocol
 from hilbo.errors import InputError
 from hilbo.frames import Receiver, WireError
+from hilbo.heartbeat import BEAT, GRACE, HelperHeart, ThreadHeart, heart_for
 from hilbo.messages import Ack, Message, Nack, Notice, Status, Telemetry, code_of, name_of
 from hilbo.reasons import ABOUT_INPUT, NackReason, sentence
 
-__all__ = ["BEAT", "DeviceError", "Link", "RefusalError"]
+__all__ = ["DeviceError", "Link", "RefusalError"]
 
-BEAT = 0.05  # s between heartbeats
 _ANSWER = {
     protocol.Hello: protocol.HelloReply,
     protocol.GetStatus: Status,
@@ -51,30 +52,41 @@ class RefusalError(InputError):
 class Link:
     """A conversation over a `ports.Port`, from construction to `close`.
 
-    `boot_id` is the device's, once known; heartbeats begin with it.
-    `patience` is how long (s) an answer may take. Counted: `retries`, `stray` answers that fit no request, `strange`
-    frames that are no message of a device, `dropped` frames; `round_trips` has the last answers' times (s).
+    `boot_id` is the device's, once known.
+    `patience` is how long (s) an answer may take. `ticks` runs so many ticks of 1 ms of a device whose time is ours:
+    it passes in `pause` alone then, and nothing beats by a clock. Counted: `retries`, `stray` answers that fit no
+    request, `strange` frames that are no message of a device, `dropped` frames; `round_trips` has the last answers'
+    times (s).
     """
 
-    def __init__(self, port: Any, *, patience: float = 0.1, tries: int = 3, capture: Callable | None = None):
+    def __init__(
+        self,
+        port: Any,
+        *,
+        patience: float = 0.1,
+        tries: int = 3,
+        capture: Callable | None = None,
+        ticks: Callable[[int], Any] | None = None,
+    ):
         self.name, self.patience, self.tries = port.name, patience, tries
         self.boot_id: int | None = None
         self.lost: str | None = None
-        self.restarted = self.silent = False
+        self.restarted = self.faint = False
         self.retries = self.stray = self.strange = self.received = 0
         self.round_trips: deque[float] = deque(maxlen=100_000)
         self.notices: deque[Notice] = deque(maxlen=1000)
         self.on_telemetry: Callable[[Telemetry], None] | None = None
         self._port, self._capture, self._receiver = port, capture, Receiver()
+        self._ticks, self._passed = ticks, 0
         self._seq = random.randrange(256)  # an earlier host's last request must not look like this one's first
         self._expected: tuple[int, int, type] | None = None
         self._answer: Message = None
         self._asking, self._writing, self._news = threading.Lock(), threading.Lock(), threading.Condition()
         self._closing = threading.Event()
-        self._threads = [threading.Thread(target=work, daemon=True) for work in (self._read, self._beat)]
+        self._heart: HelperHeart | ThreadHeart | None = None
+        self._reader = threading.Thread(target=self._read, daemon=True)
         self.write(b"\0")
-        for thread in self._threads:
-            thread.start()
+        self._reader.start()
 
     @property
     def dropped(self) -> int:
@@ -84,8 +96,8 @@ class Link:
     def request(self, message: Message) -> Message:
         """The answer to a request. Raises `RefusalError` or `DeviceError`, each with one sentence."""
         with self._asking:
-            if self.restarted and not isinstance(message, _ALWAYS):
-                raise DeviceError(self._restart_words())
+            if (self.restarted or self.faint) and not self.lost and not isinstance(message, _ALWAYS):
+                raise DeviceError(self._restart_words() if self.restarted else self._faint_words())
             self._seq = (self._seq + 1) % 256
             try:
                 frame = protocol.encode(message, self._seq)
@@ -120,38 +132,86 @@ class Link:
 
     def write(self, data: bytes) -> None:
         """Bytes onto the line, whole frames only. Raises `DeviceError` when the line is gone."""
-        if self.lost:
-            raise DeviceError(self.lost)
         try:
-            with self._writing:
+            with self._writing:  # which `close` takes too, so that no port is closed under a writer's hands
+                if self.lost:
+                    raise DeviceError(self.lost)
                 self._port.write(data)
         except OSError as error:
             raise DeviceError(self._lose(error)) from error
 
+    def beat(self, boot_id: int | None) -> None:
+        """From now on heartbeats for this start of the device, or with None no heartbeats."""
+        self.boot_id = boot_id
+        if self._heart is not None:
+            self._heart.close()
+            self._heart = None
+        if boot_id is not None:
+            self.heartbeat()
+            if not self.ours:
+                frame = protocol.encode(protocol.Heartbeat(boot_id=boot_id), 0)
+                try:
+                    self._heart = heart_for(self._port, frame, self._beat_here, self._fainted)
+                except OSError as error:
+                    raise DeviceError(f"The process that sends heartbeats cannot be started: {error}.") from error
+
+    @contextlib.contextmanager
+    def silence(self) -> Iterator[None]:
+        """No heartbeats within this block, to test the watchdog."""
+        boot_id = self.boot_id
+        self.beat(None)
+        try:
+            yield
+        finally:
+            self.beat(boot_id)
+
     def heartbeat(self) -> None:
-        """One heartbeat, now; none before the device is known, and none while `silent`, for tests of the watchdog."""
-        if self.boot_id is not None and not self.silent:
+        """One heartbeat, now, if the device is known."""
+        if self.boot_id is not None:
             self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id), 0))
 
+    @property
+    def ours(self) -> bool:
+        """Whether the device's time is ours, and passes in `pause` alone."""
+        return self._ticks is not None
+
+    def now(self) -> float:
+        """Seconds, from anywhere on, of the clock that `pause` goes by."""
+        return self._passed / 1000 if self.ours else time.monotonic()
+
+    def pause(self, seconds: float) -> None:
+        """Let so much time pass; where it is ours, with heartbeats, until everything the device sent has been read."""
+        if self._ticks is None:
+            time.sleep(seconds)
+            return
+        until = self._passed + max(1, round(1000 * seconds))
+        while self._passed < until:
+            count = min(until - self._passed, round(1000 * BEAT))
+            self.heartbeat()
+            self._ticks(count)
+            self._passed += count
+            self.request(protocol.GetStatus())
+
     def close(self) -> None:
-        """Ends both threads and closes the port."""
+        """Ends the heartbeats and the reading, and closes the port."""
         self._closing.set()
         with self._news:
             self.lost = self.lost or f"{self.name}: the connection has been closed; open it again."
             self._news.notify_all()
-        for thread in self._threads:
-            if thread is not threading.current_thread():
-                thread.join(2)
-        self._port.close()
+        self.beat(None)
+        if self._reader is not threading.current_thread():
+            self._reader.join()  # a port neither reads nor writes for long
+        with self._writing:
+            self._port.close()
 
-    def _beat(self) -> None:
-        due = time.monotonic()
-        while not self._closing.wait(max(0.0, due - time.monotonic())):
-            try:
-                self.heartbeat()
-            except DeviceError:
-                return
-            due = max(due + BEAT, time.monotonic())
+    def _beat_here(self) -> None:
+        try:
+            self.heartbeat()
+        except DeviceError as error:
+            raise OSError(str(error)) from error
+
+    def _fainted(self) -> None:
+        self.faint = True
 
     def _read(self) -> None:
         while not self._closing.is_set():
@@ -216,6 +276,12 @@ class Link:
     def _restart_words(self) -> str:
         return (
             f"{self.name}: the device has restarted; it is stopped and knows no set: connect again, then send the set."
+        )
+
+    def _faint_words(self) -> str:
+        return (
+            f"{self.name}: heartbeats have ended, because this program hung for {GRACE:g} s or their process was ended;"
+            " the device lets go: connect again."
         )
 
     def _silence_words(self, request) -> str:

@@ -35,14 +35,20 @@ class SerialPort:
         self.name = name
         self._serial: Any = _opened(name, baud)
 
+    def fileno(self) -> int:
+        return self._serial.fileno()
+
     def read(self) -> bytes:
         try:
             return self._serial.read(max(1, self._serial.in_waiting))
-        except TypeError as error:  # pyserial's, when the port is closed while it reads
-            raise OSError(errno.EBADF, "the port is closed") from error
+        except TypeError as error:
+            raise _closed() from error
 
     def write(self, data: bytes) -> None:
-        self._serial.write(data)
+        try:
+            self._serial.write(data)
+        except TypeError as error:
+            raise _closed() from error
 
     def close(self) -> None:
         with contextlib.suppress(OSError):
@@ -56,6 +62,9 @@ class SocketPort:
         self.name = name
         self._socket = connected
         self._socket.settimeout(POLL)
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
 
     def read(self) -> bytes:
         try:
@@ -73,8 +82,13 @@ class SocketPort:
         self._socket.close()
 
 
+def _closed() -> OSError:
+    """What pyserial means by a TypeError: its port was closed by another thread while it read or wrote."""
+    return OSError(errno.EBADF, "the port is closed")
+
+
 Port = SerialPort | SocketPort
-"""Anything with `name`, `read`, `write` and `close` will do."""
+"""Anything with `name`, `read`, `write` and `close` will do; with `fileno`, heartbeats come from their own process."""
 
 
 def open_port(where: str, baud: int = BAUD) -> Port:

@@ -14,7 +14,7 @@ import sys
 import tempfile
 import threading
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,15 +26,15 @@ __all__ = ["Simulator", "built"]
 _PARTS = ("core", "port/sim", "port/host")
 _FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-strict-aliasing", "-D_XOPEN_SOURCE=700")
 _COMPILERS = ("cc", "gcc", "clang")
-_STEP = 50  # ticks at a time when the device's time is ours: as many as between two heartbeats
 
 
 class Simulator:
     """A running simulated device; `port` is the name of its pseudo-terminal.
 
     Options are those of `hilbo-device --help`, with _ for -: finger="sine", material=(-2.89, 5.7, 5.89, 0.203, 101),
-    damping=0.95, sensor=False, … `rate="lockstep"` makes time pass as fast as host and device can keep up with each
-    other, for long measurements. Raises `DeviceError` where none can be built or started.
+    damping=0.95, sensor=False, … With `rate="lockstep"` its time is ours: it passes where the host waits for it, as
+    fast as both can, and nothing depends on this computer's clock. Raises `DeviceError` where none can be built or
+    started.
     """
 
     def __init__(self, *, rate: str = "realtime", **options: Any):
@@ -47,8 +47,7 @@ class Simulator:
             stderr=subprocess.PIPE,
             start_new_session=True,
         )
-        self._lockstep, self._telling = rate == "lockstep", threading.Lock()
-        self._ending, self._pump = threading.Event(), None
+        self.lockstep, self._telling = rate == "lockstep", threading.Lock()
         self.port = self._answer()
         if not self.port:
             words = self._ended()
@@ -69,25 +68,16 @@ class Simulator:
                 raise DeviceError("The simulated device has ended; open a new one.") from error
             return self._answer()
 
-    def run(self, keep_up: Callable[[], None]) -> None:
-        """In lockstep, time passes from now on; `keep_up` is called after every few ticks, and ends it by raising."""
-        if self._lockstep:
-            if self._pump is not None:
-                self._pump.join()  # ends with the connection that it kept up with
-            self._pump = threading.Thread(target=self._pass_time, args=(keep_up,), daemon=True)
-            self._pump.start()
+    def ticks(self, count: int) -> str:
+        """Run so many ticks, in lockstep. Raises `DeviceError` if the process has ended."""
+        said = self.tell(f"tick {count}")
+        if not said.startswith("tick "):
+            raise DeviceError("The simulated device has ended; open a new one.")
+        return said
 
     def close(self) -> str:
         """End the process; its last words say how many ticks it ran, and how many were late."""
-        self._ending.set()
-        if self._pump is not None:
-            self._pump.join(5)
         return self._ended()
-
-    def _pass_time(self, keep_up) -> None:
-        with contextlib.suppress(DeviceError):
-            while not self._ending.is_set() and self.tell(f"tick {_STEP}"):
-                keep_up()
 
     def _answer(self) -> str:
         assert self._process.stdout is not None

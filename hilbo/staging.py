@@ -1,6 +1,5 @@
 """A set on its way into force: sent, checked by CRC, committed when the device lets it, read back bit for bit."""
 
-import time
 from collections.abc import Sequence
 
 from hilbo import protocol
@@ -24,7 +23,7 @@ def put_in_force(link: Link, device: HelloReply, wanted: Wanted, wait: float) ->
     parts = wanted.messages(status.active_id)
     if status.active_id == 0 or crc_of(parts) != status.active_crc:
         parts = wanted.messages(max(status.active_id, status.staged_id) % 0xFFFF + 1)
-        give_up = time.monotonic() + wait
+        give_up = link.now() + wait
         _stage(link, device, parts, give_up)
         commit = protocol.Commit(set_id=parts[0].set_id, crc=crc_of(parts), boot_id=device.boot_id)
         _patiently(link, device, commit, give_up)
@@ -45,9 +44,9 @@ def _patiently(link, device, message, give_up) -> Ack:
         try:
             return link.request(message)
         except DeviceError as error:
-            if error.nack is None or error.nack.reason not in _LATER or time.monotonic() > give_up:
+            if error.nack is None or error.nack.reason not in _LATER or link.now() > give_up:
                 raise
-            time.sleep(min(max(error.nack.ticks, 1) / device.tick_rate_Hz, _NAP))
+            link.pause(min(max(error.nack.ticks, 1) / device.tick_rate_Hz, _NAP))
 
 
 def _confirmed(link, parts) -> InForce:

@@ -6,7 +6,6 @@ It knows just enough of firmware/PROTOCOL.md to hold a conversation; the real co
 import contextlib
 import socket
 import threading
-import time
 import zlib
 from collections import Counter
 from functools import partial
@@ -23,18 +22,21 @@ NO_SET = dict.fromkeys(NUMBERS, 0.0) | {"set_id": 0, "memory": 0, "length": 0}
 
 
 class Peer:
-    """`delay` (s), `swallow` and `double` answers; `refuse` maps a class of requests to a NACK's fields; `restart_at`
-    is a class of requests whose arrival finds the device restarted; `lie` replaces fields of SET."""
+    """`swallow` so many answers, `double` them, or keep a `late` one until its request has come again, or until so many
+    `beats` have come; `refuse` maps a class of requests to a NACK's fields, and how many `times`; `restart_at` is a
+    class of requests whose arrival finds the device restarted; `lie` replaces fields of SET."""
 
     def __init__(self, **hello):
         self.hello = {"damping_N_s_per_m": 0.95, "force_limit_N": 20.0} | hello
-        self.delay, self.swallow, self.double, self.refuse, self.restart_at, self.lie = 0.0, 0, False, {}, None, {}
+        self.swallow, self.double, self.late, self.beats = 0, False, False, 0
+        self.refuse, self.restart_at, self.lie = {}, None, {}
+        self.kept = b""
         self.done: Counter = Counter()
-        self.heartbeats: list[float] = []
+        self.heartbeats = 0
         self.boot_id, self.greeted = 100, False
         self.state, self.active, self.staged = State.STOPPED, None, None
         self.last, self.last_answer = None, b""
-        self.socket = None
+        self.socket, self.over = None, False
 
     def connect(self, **options) -> Link:
         """A new line to this device."""
@@ -42,6 +44,20 @@ class Peer:
         self.socket = theirs
         threading.Thread(target=self._serve, args=(theirs,), daemon=True).start()
         return Link(SocketPort(ours, "peer"), **options)
+
+    @contextlib.contextmanager
+    def listening(self):
+        """Where a host in another process can connect, once."""
+        with socket.create_server(("127.0.0.1", 0)) as server:
+
+            def serve():
+                self.socket, _ = server.accept()
+                self._serve(self.socket)
+
+            thread = threading.Thread(target=serve)
+            thread.start()
+            yield f"socket://127.0.0.1:{server.getsockname()[1]}"
+            thread.join()
 
     def open(self, *, damping=None, **options) -> Renderer:
         return Renderer(partial(self.connect, **options), damping=damping)
@@ -63,11 +79,16 @@ class Peer:
             while data := line.recv(4096):
                 for frame in receiver.feed(data):
                     self._take(line, frame)
+        self.over = True
 
     def _take(self, line, frame):
         message = protocol.decode(frame)
         if isinstance(message, protocol.Heartbeat):
-            self.heartbeats.append(time.monotonic())
+            self.heartbeats += 1
+            self.beats -= self.beats > 0
+            if self.kept and not self.late and not self.beats:
+                answer, self.kept = self.kept, b""
+                line.sendall(answer)
             return
         if isinstance(message, self.restart_at or ()):
             self.restart_at = None
@@ -76,16 +97,24 @@ class Peer:
             self.last = frame
             self.last_answer = protocol.encode(self._answer(message), frame.seq)
             self.done[type(message)] += 1
-        time.sleep(self.delay)
         if self.swallow:
             self.swallow -= 1
-            return
-        line.sendall(self.last_answer * (2 if self.double else 1))
+        elif (self.late or self.beats) and not self.kept:
+            self.kept = self.last_answer
+        elif not self.beats:
+            answers = self.kept + self.last_answer * (2 if self.double else 1)
+            self.kept, self.late = b"", False  # the test may ask for the next as soon as it has its answer
+            line.sendall(answers)
 
     def _answer(self, message):
         kind = type(message)
         if kind in self.refuse:
-            return self._nack(kind, **self.refuse[kind])
+            refusal = dict(self.refuse[kind])
+            times = refusal.pop("times", 0)
+            self.refuse[kind] = refusal | ({"times": times - 1} if times > 1 else {})
+            if times == 1:
+                del self.refuse[kind]
+            return self._nack(kind, **refusal)
         if not self.greeted and kind not in (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop):
             return self._nack(kind, reason=NackReason.NO_HELLO)
         if getattr(message, "boot_id", self.boot_id) != self.boot_id:

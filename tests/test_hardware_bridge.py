@@ -4,7 +4,6 @@ import os
 import socket
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -13,15 +12,15 @@ import pytest
 from peer import Peer
 
 from hilbo import handshake, hardware_bridge, protocol
-from hilbo.device_tests import wait_until
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer
+from hilbo.link import Link
 from hilbo.ports import list_ports, open_port
 from hilbo.protocol import NackReason, Sample
 from hilbo.telemetry import TelemetryBuffer
 
 A = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
-PATIENT = {"patience": 5.0}  # where a test is not about time
+PATIENT = {"patience": 60.0}  # where a test is not about time
 
 
 def send_and_start(device):
@@ -98,9 +97,9 @@ def test_a_refusal_is_one_sentence_with_its_numbers():
 def test_commit_waits_until_the_history_is_warm():
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        peer.refuse[protocol.Commit] = {"reason": NackReason.NOT_READY, "ticks": 5}
-        threading.Timer(0.1, peer.refuse.clear).start()
+        peer.refuse[protocol.Commit] = {"reason": NackReason.NOT_READY, "ticks": 5, "times": 4}
         assert device.send(**A).set_id == 1
+        assert peer.refuse == {}
         peer.refuse[protocol.Commit] = {"reason": NackReason.NOT_READY, "ticks": 5}
         with pytest.raises(DeviceError, match="needs 5 more ticks"):
             device.send(**(A | {"K1": 5.0}), wait=0.1)
@@ -117,7 +116,7 @@ def test_a_device_with_another_set_in_force_is_found_out(lie):
 
 def test_a_lost_answer_costs_a_retry_and_nothing_is_done_twice():
     peer = Peer()
-    with peer.open(patience=0.2) as device:
+    with peer.open(patience=0.2, tries=100) as device:
         peer.swallow = 2
         device.send(**A)
         assert peer.done[protocol.SetParams] == 1
@@ -126,8 +125,8 @@ def test_a_lost_answer_costs_a_retry_and_nothing_is_done_twice():
 
 def test_three_silences_are_one_sentence():
     peer = Peer()
-    device = peer.open(patience=0.2)
-    peer.swallow = 10**6
+    device = peer.open(**PATIENT)
+    device.link.patience, peer.swallow = 0.05, 10**6
     with pytest.raises(DeviceError, match="GET_STATUS has had no answer in 3 tries; check the line"):
         device.status()
     with pytest.raises(DeviceError, match="STOP has had no answer in 3 tries"):
@@ -136,19 +135,15 @@ def test_three_silences_are_one_sentence():
 
 def test_late_and_double_answers_are_dropped_and_counted():
     peer = Peer()
-    with peer.open(patience=0.5) as device:
+    with peer.open(patience=0.2, tries=100) as device:
         peer.double = True
         for n in range(5):
             assert device.echo(bytes([n])) == bytes([n])
         peer.double, before = False, device.link.stray
         assert before >= 4
-        peer.delay = 0.7  # the first answer comes after the second try went out
+        peer.late = True  # the first answer comes after the second try went out
         assert device.echo(b"late") == b"late"
-        peer.delay = 0.0
         assert device.echo(b"now") == b"now"
-        deadline = time.monotonic() + 5
-        while device.link.stray == before and time.monotonic() < deadline:
-            time.sleep(0.01)
         assert device.link.stray > before
 
 
@@ -166,15 +161,10 @@ def test_garbage_is_survived():
 
 def test_heartbeats_go_out_while_a_request_waits():
     peer = Peer()
-    with peer.open(patience=1.0) as device:
-        peer.delay = 0.8
-        before = len(peer.heartbeats)
-        asked = threading.Thread(target=device.echo, args=(b"slow",))
-        asked.start()
-        asked.join()
-        peer.delay = 0.0
-        device.echo(b"now")  # the peer, which slept in its only thread, has read by now what waited for it
-        assert len(peer.heartbeats) - before >= 8
+    with peer.open(**PATIENT) as device:
+        peer.beats = 8  # the answer comes after as many heartbeats
+        assert device.echo(b"slow") == b"slow"
+        assert device.link.retries == 0
 
 
 def test_no_heartbeat_before_the_boot_id_is_known():
@@ -182,7 +172,7 @@ def test_no_heartbeat_before_the_boot_id_is_known():
     peer.hello["version"] = 7
     with pytest.raises(DeviceError, match="speaks version 7"):
         peer.open(**PATIENT)
-    assert peer.heartbeats == []
+    assert peer.heartbeats == 0
 
 
 @pytest.mark.parametrize(
@@ -305,7 +295,8 @@ def test_telemetry_arrives_in_columns():
     with peer.open(**PATIENT) as device:
         for tick in (2**32 - 3, 0, 3):
             peer.say(frame(tick, fields=1))
-        wait_until(lambda: device.counts().samples == 9, "sent everything")
+        device.status()  # comes after them
+        assert device.counts().samples == 9
         table = device.telemetry(0.0)
         assert list(table.columns) == ["tick", "time_s", "position_mm", "force_N", "sensed_N", "flags"]
         assert np.all(np.diff(table["tick"]) == 1)
@@ -316,7 +307,7 @@ def test_telemetry_arrives_in_columns():
 
 
 def test_silence_instead_of_telemetry_is_said(monkeypatch):
-    monkeypatch.setattr(hardware_bridge, "_STALLED", 0.2)
+    monkeypatch.setattr(hardware_bridge, "_STALLED", 2)
     with Peer().open(**PATIENT) as device, pytest.raises(DeviceError, match="no telemetry comes"):
         device.samples(0.5)
 
@@ -347,18 +338,9 @@ def test_a_port_that_is_none_is_one_sentence(where, words):
 
 def test_a_device_behind_an_address():
     peer = Peer()
-    with socket.create_server(("127.0.0.1", 0)) as server:
-
-        def serve():
-            peer.socket, _ = server.accept()
-            peer._serve(peer.socket)
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        with Renderer.open(f"socket://127.0.0.1:{server.getsockname()[1]}", patience=5) as device:
-            device.send(**A)
-            assert device.in_force().alpha == float(np.float32(0.176))
-        thread.join()
+    with peer.listening() as where, Renderer.open(where, **PATIENT) as device:
+        device.send(**A)
+        assert device.in_force().alpha == float(np.float32(0.176))
 
 
 def test_without_pyserial_there_is_one_sentence(monkeypatch):
@@ -400,26 +382,18 @@ def test_a_port_where_nothing_answers(terminal, monkeypatch):
 
 
 def test_a_device_that_is_not_ours(terminal, monkeypatch):
-    monkeypatch.setattr(handshake, "_BOOT", 0.3)
-    done = threading.Event()
-
-    def talk():
-        while not done.wait(0.02):
-            os.write(terminal[0], b"T=21.5\r\n\0")
-
-    thread = threading.Thread(target=talk)
-    thread.start()
-    try:
-        with pytest.raises(DeviceError, match="what comes back is not of this protocol; check the port and its baud"):
-            Renderer.open(terminal[1])
-    finally:
-        done.set()
-        thread.join()
+    monkeypatch.setattr(handshake, "_BOOT", 0.0)
+    link = Link(open_port(terminal[1]), patience=0.05)
+    os.write(terminal[0], b"T=21.5\r\n\0")
+    while not link.dropped:
+        time.sleep(0.01)
+    with pytest.raises(DeviceError, match="what comes back is not of this protocol; check the port and its baud"):
+        Renderer(lambda: link)
 
 
 def test_the_interpreter_ends_although_a_device_is_open():
     """A program that forgets to close its device ends, and with it the heartbeats."""
-    code = "from peer import Peer; device = Peer().open(patience=5.0); print(device.state().name)"
+    code = "from peer import Peer; device = Peer().open(patience=60.0); print(device.state().name)"
     root = Path(__file__).parents[1]
     paths = os.pathsep.join([str(root), str(root / "tests")])
     run = subprocess.run(

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import threading
 import time
-from functools import partial
 
 import numpy as np
 import pytest
@@ -19,6 +18,7 @@ from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer, State
 from hilbo.link import Link
 from hilbo.material_tables import read_material
+from hilbo.ports import open_port
 from hilbo.pressing import pressed
 from hilbo.protocol import NackReason, SampleFlag
 from hilbo.sampled import Sampled
@@ -93,7 +93,7 @@ def test_sets_are_changed_while_somebody_presses(device):
     device.samples(0.5)
     slew = device.device.slew_limit_N_per_s * device.tick_s
     for wanted in (S, FULL, A):
-        confirmed = device.send(**wanted, wait=20.0)
+        confirmed = device.send(**wanted)
         assert np.float32(wanted["K1"]) == confirmed.K1
         seen = device.samples(0.5)
         assert np.abs(np.diff(seen.force_N)).max() <= 3 * slew
@@ -104,12 +104,11 @@ def test_silence_of_the_host_is_hold(device):
     device.send(**A)
     device.start()
     device.samples(0.5)
-    device.link.silent = True
-    device_tests.wait_until(lambda: device.state() == State.HOLD, "let go", 20.0)
-    device.link.silent = False
+    with device.link.silence():
+        device_tests.wait_until(device, lambda: device.state() == State.HOLD, "let go")
     with pytest.raises(DeviceError, match="START is refused while the device is HOLD"):
         device.start()
-    device_tests.wait_until(lambda: device.status().force_N == 0, "rested", 20.0)
+    device_tests.wait_until(device, lambda: device.status().force_N == 0, "rested")
     device.clear()
     device.start()
     assert device.state() == State.RUNNING
@@ -136,7 +135,15 @@ def test_a_drive_that_is_out_of_range_is_refused():
 
 def test_a_drive_that_ends_early_is_not_used():
     with Renderer.open("sim", options=FAST | {"finger": "none"}) as device:
-        threading.Timer(0.3, device.estop).start()
+        samples = device.samples
+
+        def stopped(seconds):
+            found = samples(min(seconds, 0.3))
+            if seconds > 1:
+                device.estop()
+            return found
+
+        device.samples = stopped
         with pytest.raises(DeviceError, match="ended its drive early, now ESTOP"):
             device_tests.drive(device, "position", "hold", 3.0, duration=120.0)
 
@@ -172,12 +179,12 @@ def _send_and_start(device):
 
 @pytest.mark.parametrize("rate", [1e-4, 1e-3])
 def test_a_bad_line_costs_tries_and_never_a_wrong_set(rate):
-    found = Simulator(finger="sine")
+    found = Simulator(finger="sine", rate="lockstep")
     ports = []
 
     def connect():
         ports.append(FaultyPort(found.port, rate, len(ports)))
-        return Link(ports[-1], patience=0.15, tries=20)
+        return Link(ports[-1], patience=0.15, tries=200, ticks=found.ticks)
 
     device = Renderer(connect, simulator=found)
     rng = random.Random(0)
@@ -194,7 +201,7 @@ def test_a_bad_line_costs_tries_and_never_a_wrong_set(rate):
 
 
 def test_a_port_that_is_used_is_busy_and_one_that_vanishes_is_gone():
-    device = Renderer.open("sim")
+    device = Renderer.open("sim", patience=30)
     with pytest.raises(InputError, match="another program uses this port"):
         Renderer.open(device.simulator.port)
     device.simulator._process.kill()
@@ -220,7 +227,7 @@ import sys, time
 from hilbo.hardware_bridge import Renderer
 sets = [dict(K0=-3.18, K1=5.58, B1=7.88, alpha=0.176), dict(K0=-2.89, K1=5.70, B1=5.89, alpha=0.203)]
 with Renderer.open(sys.argv[1]) as device:
-    device.link.patience = 10.0
+    device.link.patience = 30.0
     device.send(**sets[0])
     device.start()
     print("running", flush=True)
@@ -233,19 +240,22 @@ with Renderer.open(sys.argv[1]) as device:
 
 def killed(found, rng):
     """Device ticks from the death of a host at a random moment to force zero, and the force before."""
-    host = subprocess.Popen([sys.executable, "-c", HOST, found.port], stdout=subprocess.PIPE, env=ENVIRONMENT)
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    host = subprocess.Popen([sys.executable, "-c", HOST, found.port], **pipes, env=ENVIRONMENT)
     ready = threading.Thread(target=host.stdout.readline)
     ready.start()
     while ready.is_alive():
-        tick(found, 5)
+        keep_up(found)
     for _ in range(rng.randrange(150, 400)):  # the finger takes some time to press
-        tick(found, 5)
+        keep_up(found)
     host.kill()
     host.wait()
+    assert host.stderr.read() == b""  # ends with the helper that sends heartbeats
     host.stdout.close()
-    dead, before = tick(found, 1)  # takes in what was still on its way
+    host.stderr.close()
+    dead, before, _ = tick(found, 1)  # takes in what was still on its way
     for _ in range(1000):
-        now, force = tick(found, 1)
+        now, force, _ = tick(found, 1)
         if force == 0:
             break
     rest = [tick(found, 1)[1] for _ in range(300)]
@@ -254,42 +264,31 @@ def killed(found, rng):
 
 
 def tick(found, count):
-    """So many ticks, in about their time; the tick and the force (N) after them."""
-    time.sleep(1e-3 * count if count > 1 else 0)
-    _, now, force = found.tell(f"tick {count}").split()
-    return int(now), float(force)
+    """So many ticks; the tick, the force (N) and the age of the last heartbeat after them."""
+    _, now, force, age = found.ticks(count).split()
+    return int(now), float(force), int(age)
+
+
+def keep_up(found):
+    """Five ticks, but none while the host's heartbeats are late: this computer is busy."""
+    time.sleep(0.001)
+    tick(found, 5 if tick(found, 0)[2] < 150 else 0)
 
 
 def takes_over(found):
     """The next host finds the device in HOLD, clears it and renders."""
-    ticking = threading.Event()
 
-    def go_on():
-        while not ticking.is_set():
-            tick(found, 5)
+    def connect():
+        return Link(open_port(found.port), patience=30.0, ticks=found.ticks)
 
-    thread = threading.Thread(target=go_on)
-    thread.start()
-    try:
-        with Renderer(partial(connected, found.port)) as device:
-            assert device.notes == [
-                "The device is in HOLD: it heard no heartbeat from the host; clear it before the next start."
-            ]
-            assert device.in_force() is not None
-            device.clear()
-            device.start()
-            assert device.state() == State.RUNNING
-    finally:
-        ticking.set()
-        thread.join()
-
-
-def connected(port):
-    return Link(simulator_port(port), patience=10.0)
-
-
-def simulator_port(name):
-    return FaultyPort(name, 0.0, 0)
+    with Renderer(connect) as device:
+        assert device.notes == [
+            "The device is in HOLD: it heard no heartbeat from the host; clear it before the next start."
+        ]
+        assert device.in_force() is not None
+        device.clear()
+        device.start()
+        assert device.state() == State.RUNNING
 
 
 @pytest.mark.parametrize("times", [5, pytest.param(100, marks=pytest.mark.deep)])

@@ -112,7 +112,9 @@ static void run_ticks(struct process *process, unsigned long count)
         tick(process);
         receive(process);
     }
-    (void)printf("tick %lu %.9g\n", (unsigned long)process->rig.device.tick, (double)process->force_N);
+    const struct hb_device *device = &process->rig.device;
+    (void)printf("tick %lu %.9g %lu\n", (unsigned long)device->tick, (double)process->force_N,
+                 (unsigned long)device->heartbeat_age_ticks);
 }
 
 /* One line from stdin; every command is answered by one line. */
