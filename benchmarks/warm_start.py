@@ -4,9 +4,9 @@
 
 A map is made from 24 simulated participants of the preset `paper`; as many new people as asked for, drawn from the same
 population, then answer the study's trials, chosen cold (5 space-filling trials, then UCB) or from the map (after some
-space-filling trials or none). After every trial each person's best rendering is read from their own answers under the study's
-prior, as aggregation does: the candidate with the highest posterior mean. It is judged by the truth that was simulated:
-the probability that this person would answer "close" to it, and its distance from their optimum.
+space-filling trials or none). After every trial each person's best rendering is read from their own answers under the
+study's prior, as aggregation does: the candidate with the highest posterior mean. It is judged by the truth that was
+simulated: the probability that this person would answer "close" to it, and its distance from their optimum.
 """
 
 import argparse
@@ -35,8 +35,8 @@ def sessions(study: Study, persons: Person, initial, keys, plan, points, warm):
     def one(person, first, key):
         def step(trials, trial):
             chosen = next_point(study, plan, trials, trial) if warm is None else warm_point(study, warm, trials)
-            filling = first[jnp.minimum(trial, first.shape[0] - 1)]
-            x = jnp.where(trial < first.shape[0], filling, chosen) if first.shape[0] else chosen
+            count = first.shape[0]
+            x = jnp.where(trial < count, first[jnp.minimum(trial, count - 1)], chosen) if count else chosen
             progress = (trial / TRIALS).astype(x.dtype)
             trials = trials.append(x, person.answer(jax.random.fold_in(key, trial), x, progress))
             own = fit(study.gp, trials, inference=study.inference, throw=False)
@@ -90,24 +90,33 @@ def main() -> None:
     cold = judged(new, best)
     target = cold["close"].mean(0)[-1]
     print(f"cold, 25 trials: P(close) {target:.3f}, NRMSE {np.median(cold['nrmse'][:, -1]):.3f} (median)")
-    print("| start | space-filling | P(close) after 5 | 10 | 15 | 25 | median NRMSE | trials to the cold 25's |")
-    print("|---|---|---|---|---|---|---|---|")
-    row("cold", 5, cold, target)
+    heads = ("start", "space-filling", "P(close) after 5", "10", "15", "25", "median NRMSE", "trials to the cold 25's")
+    print("| " + " | ".join((*heads, "gain there, paired")) + " |")
+    print("|---|---|---|---|---|---|---|---|---|")
+    row("cold", 5, cold, cold)
+    everybody = jnp.broadcast_to(points[jnp.argmax(mean)], (args.people, 1, study.space.dim))
+    same = judged(new, everybody)
+    print(
+        f"the map's own best, felt by nobody: P(close) {same['close'].mean():.3f}, NRMSE {np.median(same['nrmse']):.3f}"
+    )
     for share in args.share:
         warm = warm_start(study, points, mean, variance, "simulated", share)
         for count in args.filling:
             _, best = sessions(study, new, jnp.asarray(filling[:, :count]), keys, plan, points, warm)
-            row(f"map, p = {share:g}", count, judged(new, best), target)
+            row(f"map, p = {share:g}", count, judged(new, best), cold)
             sys.stdout.flush()
 
 
-def row(name, count, found, target):
+def row(name, count, found, cold):
+    target = cold["close"].mean(0)[-1]
     curve = found["close"].mean(0)
     error = found["close"].std(0, ddof=1) / np.sqrt(len(found["close"]))
     cells = [f"{curve[n - 1]:.3f}" for n in (5, 10, 15)] + [f"{curve[24]:.3f} ± {error[24]:.3f}"]
     when = reached(curve, target)
     miss = np.median(found["nrmse"][:, -1])
-    print(f"| {name} | {count} | " + " | ".join(cells) + f" | {miss:.3f} | {when or '> 25'} |")
+    gain = found["close"][:, (when or TRIALS) - 1] - cold["close"][:, -1]
+    paired = f"{gain.mean():+.3f} ± {gain.std(ddof=1) / np.sqrt(len(gain)):.3f}"
+    print(f"| {name} | {count} | " + " | ".join(cells) + f" | {miss:.3f} | {when or '> 25'} | {paired} |")
 
 
 if __name__ == "__main__":

@@ -12,13 +12,15 @@ this holds for even n, for odd n they may differ by two within a block, since ha
 
 import itertools
 from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Int
 
-__all__ = ["Comparison", "block_size", "comparisons", "orders", "williams"]
+__all__ = ["Comparison", "Side", "block_size", "comparisons", "orders", "williams"]
 
-Comparison = tuple[str, str, str]
+Side = Literal["a", "b"]
+Comparison = tuple[str, str, Side]
 """Set on side a, set on side b, the side that is felt first."""
 
 
@@ -78,5 +80,5 @@ def _ways(repeats, start, rng):
     return list(itertools.chain.from_iterable([chunk[j] for j in rng.permutation(len(chunk))] for chunk in chunks))
 
 
-_WAYS = {"1": (False, "a"), "2": (True, "a"), "3": (False, "b"), "4": (True, "b")}
+_WAYS: dict[str, tuple[bool, Side]] = {"1": (False, "a"), "2": (True, "a"), "3": (False, "b"), "4": (True, "b")}
 _CYCLES = [[_WAYS[c] for c in text] for text in ("1234", "3412", "2143", "4321")]

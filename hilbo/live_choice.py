@@ -5,7 +5,7 @@ Optimisation renderings are `hilbo.session.Session`'s, bit for bit: they depend 
 that count. A rendering voided twice is replaced: in the space-filling trials by the candidate farthest from all others,
 afterwards by the highest UCB that keeps a distance of `APART` from it in the unit cube.
 
-With a warm start (`hilbo.warm_start`, one for each material) there are no space-filling trials, and points come from it.
+With a warm start (`hilbo.warm_start`, one for each material) there are no space-filling trials: points come from it.
 
 Every choice says why: `choice` has what chose it, mean and sd of the latent score, the acquisition's value, the
 probabilities of the answers, the passivity margin (N.s/m) and the certificate of the fit.
@@ -13,7 +13,7 @@ probabilities of the answers, the passivity margin (N.s/m) and the certificate o
 
 import dataclasses
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -255,7 +255,7 @@ def _facts(study, values):
     return study.space.derived(values), study.space.passivity_margin(values)
 
 
-def _apart(study, session, points, answers, gone: Sequence) -> np.ndarray:
+def _apart(study, session, points, answers, gone) -> np.ndarray:
     candidates = search_points(study.space, session.seed)
     x, q = _padded(study, points, answers)
     return np.asarray(_apart_point(study, x, q, np.int32(len(answers)), _held(study, gone), candidates))

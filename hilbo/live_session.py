@@ -257,12 +257,13 @@ def _live(state, id):
 def _times(browser):
     if browser is None:
         return {}
-    pairs = browser.items() if isinstance(browser, Mapping) else [("", None)]
-    if len(pairs) > 8 or not all(
-        isinstance(name, str) and isinstance(value, int | float) and math.isfinite(value) for name, value in pairs
+    good = isinstance(browser, Mapping) and len(browser) <= 8
+    if not good or not all(
+        isinstance(name, str) and isinstance(value, int | float) and math.isfinite(value)
+        for name, value in browser.items()
     ):
         raise RefusedError("bad-answer", "the browser's times must be numbers of seconds.")
-    return {name: float(value) for name, value in pairs}
+    return {name: float(value) for name, value in browser.items()}
 
 
 def _check_values(state, trial, values):

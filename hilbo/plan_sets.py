@@ -33,8 +33,10 @@ def read_result(path: str | os.PathLike, study: Study) -> dict[str, Any]:
     """A result.json of this study. Raises InputError."""
     try:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
+        whole = "parameters" in found["optimum"] and all("participant" in row for row in found["participants"])
         same = found["study"] == study.hash
-        found["optimum"]["parameters"], found["participants"][0]["participant"]
+        if not whole:
+            raise KeyError("parameters")
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -74,14 +74,14 @@ _Steps = Annotated[
     ),
 ]
 _Texts = Annotated[dict[str, str], words("a table of texts", '{question = "…"}')]
-_Count = Annotated[int, msgspec.Meta(ge=1, le=1000), words("a whole number from 1 to 1000", "12")]
+_Count = Annotated[Annotated[int, msgspec.Meta(ge=1, le=1000)] | None, words("a whole number from 1 to 1000", "12")]
 
 
 class PhaseTable(Table, frozen=True):
     """[session.PHASE]: what a study changes of a phase; see `Protocol`."""
 
     steps: _Steps = None
-    count: _Count | None = None
+    count: _Count = None
     rest: Annotated[Positive | None, words("a number of seconds", "600")] = None
 
 

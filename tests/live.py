@@ -44,6 +44,7 @@ class FakeChooser:
             return {"sets": sets, "first": planned.first, "renderings": renderings}
         gone = state.excluded(need.block)
         told = [(t.renderings["a"], t.values["class_a"]) for t in state.answers(need.block)]
+        told.append(state.header.seed)
         for salt in itertools.count():
             text = json.dumps([told, salt, need.block])
             u = int(hashlib.sha256(text.encode()).hexdigest()[:8], 16) / 2**32

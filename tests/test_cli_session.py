@@ -1,0 +1,144 @@
+"""hilbo plan, export, participants, and aggregate from logs, as a user types them."""
+
+import json
+import sys
+
+import msgspec
+import pytest
+from live import Driver
+
+from hilbo import Study, cli
+from hilbo.event_log import EventLog, log_name
+from hilbo.live_session import Block
+from hilbo.study_plan import planned_header
+
+TOML = """\
+schema = 1
+[study]
+name = "plain"
+responses = ["different", "similar", "close"]
+[parameters.u]
+low = 0.0
+high = 1.0
+[parameters.v]
+low = 0.0
+high = 1.0
+[gp]
+theta = 10.0
+variance = 1.0
+thresholds = [-0.5, 0.5]
+noise = 0.5
+[selection]
+space_filling = 2
+trials = {trials}
+"""
+
+
+@pytest.fixture
+def hilbo(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["hilbo", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            cli.main()
+        captured = capsys.readouterr()
+        return stopped.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6))
+    study = Study.load("study.toml")
+    code, out, err = hilbo("plan", "study.toml", "--participants", 3, "--seed", 5, "--json")
+    plan = json.loads(out)
+    assert code == 0 and "complete blocks" in err and plan == json.loads((tmp_path / "plan.json").read_text())
+    assert [row["participant"] for row in plan["participants"]] == ["P01", "P02", "P03"]
+    assert planned_header(plan, study, "P02").seed == plan["participants"][1]["header"]["seed"]
+    code, _, err = hilbo("plan", "study.toml", "--participants", 3)
+    assert code == 2 and "plan.json: exists already" in err
+    assert hilbo("plan", "study.toml", "--reissue", "P02=P09")[0] == 0
+    changed = json.loads((tmp_path / "plan.json").read_text())
+    assert planned_header(changed, study, "P09").seed == planned_header(plan, study, "P02").seed
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((), "give either --participants (how many) or --names"),
+        (("--participants", 2, "--kind", "dance"), '--kind is "dance"'),
+        (("--participants", 2, "--kind", "validation"), "give --from result.json"),
+        (("--participants", 2, "--kind", "validation", "--from", "none.json"), "none.json: cannot be read"),
+        (("--names", "P1,P1"), "each once"),
+        (("--reissue", "P1=P2"), "is no plan that can be read"),
+    ],
+)
+def test_a_wrong_plan_is_one_sentence(hilbo, tmp_path, arguments, sentence):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6))
+    code, _, err = hilbo("plan", "study.toml", *arguments)
+    assert code == 2 and sentence in err and not (tmp_path / "plan.json").exists()
+
+
+def test_participants_are_listed_and_deleted(hilbo, tmp_path):
+    consent = ("--consent-time", "2026-05-04T10:00", "--protocol-number", "7")
+    assert hilbo("participants", "add", "participants.csv", "P01", *consent)[0] == 0
+    assert hilbo("participants", "add", "participants.csv", "P01", *consent)[0] == 2
+    code, _, err = hilbo("participants", "delete", ".", "P01")
+    assert code == 2 and "add --yes" in err and "P01" in (tmp_path / "participants.csv").read_text()
+    assert hilbo("participants", "delete", ".", "P01", "--yes")[0] == 0
+    assert "P01" not in (tmp_path / "participants.csv").read_text()
+
+
+def felt(point):
+    apart = ((point["u"] - 0.3) ** 2 + (point["v"] - 0.6) ** 2) ** 0.5
+    return "close" if apart < 0.2 else "similar" if apart < 0.4 else "different"
+
+
+def logs_of(folder, study, people, trials):
+    """Sessions whose renderings a fake chooser found, and whose answers follow one rule."""
+    folder.mkdir()
+    for person in people:
+        driver = Driver()
+        blocks = (Block("optimisation", trials),)
+        seed = int(person[1:])
+        driver.header = msgspec.structs.replace(
+            driver.header, study=study.hash, participant=person, blocks=blocks, sets={}, seed=seed
+        )
+        driver.state = type(driver.state).start(study, driver.header)
+        driver.values = lambda trial, number: {"class_a": felt(trial.renderings["a"])}
+        driver.step()
+        driver.finish()
+        with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
+            for event in driver.events:
+                log.append(event)
+
+
+@pytest.mark.deep
+def test_from_logs_to_a_validation_plan(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=20))
+    study = Study.load("study.toml")
+    people = ["P01", "P02", "P03"]
+    logs_of(tmp_path / "logs", study, people, 20)
+    assert hilbo("export", "logs", "--study", "study.toml", "--out", "tables")[0] == 0
+    table = "tables/data/study-plain_table-trials_data.csv"
+    for source, out in (("logs", "a"), (table, "b")):
+        code, _, err = hilbo("aggregate", source, "--study", "study.toml", "--out", out)
+        assert code == 0, err
+    assert (tmp_path / "a" / "result.json").read_bytes() == (tmp_path / "b" / "result.json").read_bytes()
+    assert (tmp_path / "a" / "optima.csv").read_bytes() == (tmp_path / "b" / "optima.csv").read_bytes()
+    given = ("--kind", "validation", "--from", "a/result.json", "--trials")
+    code, _, err = hilbo("plan", "study.toml", "--participants", 4, *given, "logs", "--out", "v.json")
+    assert code == 0, err
+    plan = json.loads((tmp_path / "v.json").read_text())
+    sets = plan["participants"][0]["header"]["sets"]
+    best = json.loads((tmp_path / "a" / "result.json").read_text())["optimum"]["parameters"]
+    assert sets["best"] == pytest.approx(best, abs=1e-6)
+    own = ("--names", "P01,P03", "--source", "individual", *given, table, "--out", "w.json")
+    code, _, err = hilbo("plan", "study.toml", *own)
+    assert code == 0, err
+    assert "P03 worst" in json.loads((tmp_path / "w.json").read_text())["participants"][1]["header"]["sets"]
+    code, _, err = hilbo("plan", "study.toml", "--names", "P01", *given, "logs", "--out", "x.json")
+    assert code == 2 and "invite people who are not" in err
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables", "--force")
+    assert code == 0, err
