@@ -210,7 +210,7 @@ def test_killed_servers_lose_and_double_nothing(tmp_path, phase, share):
     kills = max(2, round(share * KILLS))
     if phase == "validation":
         text = file.read_text().replace(
-            "[session.validation]\n", f"[session.validation]\ncount = {max(4, kills * 2 // 3)}\n"
+            "[session.validation]\n", f"[session.validation]\ncount = {max(4, kills // 2)}\n"
         )
         file.write_text(text)
     study = Study.load(file)
