@@ -228,7 +228,7 @@ def _repeated(state, event):
 
 def _made_void(state, trial, by, reason):
     changes = trial.status == "answered" and not trial.repeats
-    sides = [trial.on] if trial.on in trial.renderings else list(trial.renderings)
+    sides = [trial.on] if trial.on in trial.renderings else sorted(trial.felt)  # what nobody felt is not to blame
     state = state.dropped() if changes else state
     state = state.with_trial(trial.id, status="void", on=None, voided={"by": by, "reason": reason, "sides": sides})
     gone = state.excluded(trial.block)

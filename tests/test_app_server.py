@@ -79,16 +79,17 @@ def test_a_cookie_alone_does_not_change_anything(quiet):
     with refused(403):
         ask(quiet, "/api/participant/begin", data=b"{}", Cookie=f"hilbo_participant={key}")
     origin = quiet.participant.address
-    reply = ask(quiet, "/api/participant", Cookie=f"hilbo_participant={key}", Origin=origin)
-    assert "default-src 'none'" in reply.headers["Content-Security-Policy"]
-    assert reply.headers["Cache-Control"] == "no-store"
+    with ask(quiet, "/api/participant", Cookie=f"hilbo_participant={key}", Origin=origin) as reply:
+        assert "default-src 'none'" in reply.headers["Content-Security-Policy"]
+        assert reply.headers["Cache-Control"] == "no-store"
 
 
 def test_a_page_without_a_key_gets_nothing_but_the_way_in(quiet):
     with pytest.raises(urllib.error.HTTPError) as caught:
         ask(quiet, "/experimenter")
+    with caught.value as error:
+        assert "join.js" in error.read().decode()
     assert caught.value.code == 401
-    assert "join.js" in caught.value.read().decode()
     with refused(401):
         quiet.participant.post("/api/join", {"token": "again"})
 
@@ -183,7 +184,9 @@ def listen(live, heard):
         ask(live, "/api/participant/events?page=ear", **key) as stream,
         contextlib.suppress(OSError, http.client.HTTPException),
     ):
-        heard += [ask(live, f"/static/participant.{kind}").read().decode() for kind in ("html", "js")]
+        for kind in ("html", "js"):
+            with ask(live, f"/static/participant.{kind}") as page:
+                heard.append(page.read().decode())
         for line in stream:
             heard.append(line.decode())
 
@@ -335,11 +338,11 @@ def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
 
 def test_the_newest_window_of_a_participant_is_the_one_that_counts(live):
     live.begin()
-    first, second = live.hub.watch("participant", "one"), live.hub.watch("participant", "two")
+    first, second = live.hub.watchers.add("participant", "one"), live.hub.watchers.add("participant", "two")
     assert first.ended
     assert "another window" in first.why
     assert not second.ended
-    live.hub.unwatch(second)
+    live.hub.watchers.remove(second)
     assert live.question()
 
 

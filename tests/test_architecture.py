@@ -105,6 +105,7 @@ MAY_IMPORT = MATHS | {
     "plan_sets": {"study", "study_plan", "validation"},
     "log_tables": {"event_log", "tables"},
     "people_table": {"event_log"},
+    "doctor": {"session", "ports", "link"},
     "cli_session": {"console", "study_plan", "plan_sets", "log_tables", "people_table"},
     "tables": {"config"},
     "material_tables": {"tables", "identification"},
@@ -146,6 +147,7 @@ MAY_IMPORT["report_study"] = {"hypotheses", "inference_data", "report_figures", 
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
 MAY_IMPORT["cli_study"] = {"console", "power", "report_power", "report_study", "simulate_validation"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)
+MAY_IMPORT["cli_live"] = {"app", "doctor"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 

@@ -9,7 +9,6 @@ choosing's, and the server's own. What a participant does next is in `runner`.
 
 import asyncio
 import contextlib
-import math
 import time
 from collections import deque
 from collections.abc import Callable
@@ -22,34 +21,24 @@ from hilbo.app.messages import Answer, Command, Press
 from hilbo.app.rig import Rig, Snapshot
 from hilbo.app.runner import Runner
 from hilbo.app.security import Role
+from hilbo.app.watchers import Watchers
 from hilbo.errors import InputError
 from hilbo.event_log import LogError
 from hilbo.live_session import LiveSession, RefusedError
 from hilbo.reasons import held_because
 
-__all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError", "Watcher"]
+__all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
 
 PRESSES = ("begin", "break", "more")
 COMMANDS = ("pause", "resume", "repeat", "undo", "void", "abort", "note", "estop", "clear", "invite")
 _STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
 _LATER = 1.0  # s between two looks at the clock
 _JUMP = 3.0  # s by which the clock, or the wait for it, may be off before somebody must have closed the laptop
-_SILENT = 10.0  # s without a word from a program in the participant's place until it counts as gone
 _GONE = 3.0  # s without a participant's page until a trial that is being felt is begun again
 
 
 class NotNowError(InputError):
     """What cannot be done now; the view says what can."""
-
-
-class Watcher:
-    """Somebody who looks at a role's view. `news` is set when there is a newer one."""
-
-    def __init__(self, role: Role, page: str):
-        self.role, self.page = role, page
-        self.news = asyncio.Event()
-        self.ended = False
-        self.why = ""
 
 
 class Hub:
@@ -81,13 +70,12 @@ class Hub:
         self.invite: Callable[[], dict[str, str]] | None = None
         self._connect, self._make_maps, self._maps = connect, maps, None
         self.warm: asyncio.Future | None = None
-        self._watchers: list[Watcher] = []
+        self.watchers = Watchers(lambda: self.state.study.session.text("moved"))
         self._disk = ThreadPoolExecutor(1, "hilbo-disk")
         self.compute = ThreadPoolExecutor(1, "hilbo-choice")
         self._lock: asyncio.Lock | None = None
         self._tasks: list[asyncio.Task] = []
         self._absent: float | None = None
-        self._asked = -math.inf
         self._map: tuple[str, Any] | None = None
         self._drawing = ThreadPoolExecutor(1, "hilbo-map")
         self._device_was = ""
@@ -98,11 +86,10 @@ class Hub:
     async def open(self) -> None:
         """Connect to the device, and begin. Raises `InputError` or `DeviceError`."""
         self._lock, self._loop = asyncio.Lock(), asyncio.get_running_loop()
-        self.rig = await self._loop.run_in_executor(
-            self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed)
-        )
+        rig = await self._loop.run_in_executor(self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed))
+        self.rig = rig
         self.warm = self._loop.run_in_executor(self.compute, self._warm)
-        await self._device_changed(self.rig.snapshot)
+        await self._device_changed(rig.snapshot)
         self._tasks = [asyncio.create_task(self._watch_time())]
         self.runner.restart()
 
@@ -120,9 +107,7 @@ class Hub:
         for task in self._tasks:
             task.cancel()
         self.runner.cancel()
-        for watcher in list(self._watchers):
-            watcher.ended = True
-            watcher.news.set()
+        self.watchers.end_all()
         if self.rig is not None:
             await self._loop.run_in_executor(None, self.rig.close)
         self._disk.shutdown()
@@ -161,8 +146,7 @@ class Hub:
 
     def publish(self) -> None:
         """Tell everybody who looks that there is news."""
-        for watcher in self._watchers:
-            watcher.news.set()
+        self.watchers.tell()
 
     # What pages and programs ask for.
 
@@ -282,53 +266,13 @@ class Hub:
             self.publish()
         return self._map[1]
 
-    # Who looks.
-
-    def watch(self, role: Role, page: str) -> Watcher:
-        """A new watcher; a participant's newest window ends the others."""
-        watcher = Watcher(role, page)
-        if role == "participant":
-            for other in self._watchers:
-                if other.role == role and other.page != page:
-                    other.ended, other.why = True, self.state.study.session.text("moved")
-                    other.news.set()
-        self._watchers.append(watcher)
-        self.publish()
-        return watcher
-
-    def unwatch(self, watcher: Watcher) -> None:
-        """It looks no more."""
-        with contextlib.suppress(ValueError):
-            self._watchers.remove(watcher)
-        self.publish()
-
-    def joined(self, role: Role) -> None:
-        """Somebody has used a role's link: those who had its key are out."""
-        for watcher in self._watchers:
-            if watcher.role == role:
-                watcher.ended, watcher.why = True, self.state.study.session.text("moved")
-                watcher.news.set()
-
     @property
     def draws(self) -> bool:
         """Whether there are slices to be had."""
         return self._maps is not None
 
-    @property
-    def present(self) -> bool:
-        """Whether a participant's page is open, or a program in its place has asked for something lately."""
-        if time.monotonic() - self._asked < _SILENT:
-            return True
-        return any(w.role == "participant" and not w.ended for w in self._watchers)
-
-    def heard(self) -> None:
-        """A program asks in the participant's place."""
-        self._asked = time.monotonic()
-
     def _check_page(self, page) -> None:
-        """Only a participant's newest window counts; a program with a key is one."""
-        newest = next((w.page for w in reversed(self._watchers) if w.role == "participant" and not w.ended), None)
-        if page is not None and newest is not None and page != newest:
+        if not self.watchers.counts(page):
             raise NotNowError(self.state.study.session.text("moved"))
 
     def _trial_of(self, name: str) -> tuple[int, int]:
@@ -375,7 +319,7 @@ class Hub:
             wall, steady = now, mono
             if slept > _JUMP:
                 await self._interrupted(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
-            if self.present or not self.begun:
+            if self.watchers.participant_here or not self.begun:
                 self._absent = None
             elif self._absent is None:
                 self._absent = mono

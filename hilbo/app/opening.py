@@ -62,10 +62,10 @@ def _damping(study, material) -> float:
 
 
 def _log(wanted, study) -> EventLog:
+    if wanted.resume:  # consent was looked for when it began
+        return EventLog.resume(wanted.logs / log_name(_header(wanted._replace(dry_run=True), study)), study)
     header = _header(wanted, study)
     path = wanted.logs / log_name(header)
-    if wanted.resume:
-        return EventLog.resume(path, study)
     if path.exists():
         raise InputError(
             f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."

@@ -125,7 +125,7 @@ class Rig:
                 except BaseException as error:  # the waiting side's to judge
                     found.set_exception(error)
 
-    def _next(self):
+    def _next(self) -> Any:
         try:
             return self._jobs.get(timeout=_RETRY if self.snapshot.lost else _POLL) or (None, None)
         except queue.Empty:

@@ -129,7 +129,7 @@ def _join(hub, gate):
         if found is None:
             return _error(401, "This link has been used, or is not of this session; ask for a new one.")
         role, key = found
-        hub.joined(role)
+        hub.watchers.end(role)
         if message.bearer:
             return JSONResponse({"role": role, "key": key})
         reply = JSONResponse({"role": role})
@@ -148,7 +148,7 @@ def _for(hub, gate):
             if not gate.admits(role, program or request.cookies.get(COOKIES[role])):
                 return _error(401, "Open the link of this session first; this page is no longer part of it.")
             if program and role == "participant":
-                hub.heard()
+                hub.watchers.heard()
             try:
                 return await handler(hub, role, request)
             except LogError as error:
@@ -196,7 +196,8 @@ async def _events(hub, role, request) -> Response:
 
 async def _stream(hub, role, page) -> AsyncIterator[bytes]:
     """The view now and after every change; the newest one where several came at once."""
-    watcher = hub.watch(role, page)
+    watcher = hub.watchers.add(role, page)
+    hub.publish()
     try:
         yield b"retry: 1000\n\n"
         while not watcher.ended:
@@ -210,7 +211,8 @@ async def _stream(hub, role, page) -> AsyncIterator[bytes]:
         if watcher.why:
             yield b"event: moved\ndata: " + msgspec.json.encode({"error": watcher.why}) + b"\n\n"
     finally:
-        hub.unwatch(watcher)
+        hub.watchers.remove(watcher)
+        hub.publish()
 
 
 async def _body(request) -> bytes:

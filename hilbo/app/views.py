@@ -49,7 +49,7 @@ def participant(hub: Any) -> dict[str, Any]:
         screen == "trial" and trial["felt"] and (stage == "answer" or (step and step["index"] + 1 == step["count"]))
     )
     title, message, phase = _words(screen, stage, session.text)
-    if step is not None:
+    if step is not None and trial is not None:
         title, message, phase = trial["steps"][step["index"]]["text"], "", "step"
     hello = screen == "trial" and stage == "hello"
     return {
@@ -59,7 +59,7 @@ def participant(hub: Any) -> dict[str, Any]:
         "message": message,
         "trial": None if trial is None else {"id": trial_name(hub)},
         "step": step,
-        "questions": [_question(ask) for ask in trial["asks"]] if asking else None,
+        "questions": [_question(ask) for ask in trial["asks"]] if asking and trial is not None else None,
         "progress": _progress(seen["progress"], session.text),
         "may": {
             "begin": hello or seen["may"]["go_on"],
@@ -124,7 +124,7 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "alert": hub.alert or (runner.trouble if runner.stage == "trouble" else None),
         "may": _may(hub),
         "map_version": map_version(state) + ("" if hub.draws else " later"),
-        "participant_here": hub.present,
+        "participant_here": hub.watchers.participant_here,
         "all_delays": hub.delays[-1000:],
         "fits_after_an_answer": hub.runner.fits_after,
         "whole": experimenter_view(state),

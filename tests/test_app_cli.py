@@ -1,0 +1,133 @@
+"""`hilbo session` refuses in one sentence, before anything is begun; `hilbo doctor` says what to mend."""
+
+import json
+import socket
+
+import pytest
+from live_server import DATA, study_of
+
+from hilbo import doctor
+from hilbo.app import serve
+from hilbo.app.opening import Wanted, opened
+from hilbo.cli import app
+from hilbo.errors import InputError
+from hilbo.hardware_bridge import Renderer
+from hilbo.people_table import add_person
+
+PERSON = {"participant": "P01", "consent_time": "2026-03-02T10:00", "protocol_number": "7", "age": "", "handedness": ""}
+
+
+def command(*arguments):
+    """A command of hilbo, in this process."""
+    return app([str(a) for a in arguments], standalone_mode=False)
+
+
+def refused(*arguments):
+    """The sentence with which it is refused."""
+    with pytest.raises(InputError) as caught:
+        command("session", *arguments)
+    return str(caught.value)
+
+
+def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")  # commands would choose the user's
+    logs = tmp_path / "logs"
+    place = ("--logs", logs, "--port", 0, "--participant", "P01")
+    assert "has no [renderer]" in refused(DATA.parent / "video_quality.toml", *place, "--dry-run")
+    assert "cannot be read" in refused(tmp_path / "none.toml", *place)
+    assert "participants.csv: cannot be read" in refused(DATA, *place)
+    assert "pseudonym" in refused(DATA, "--logs", logs, "--port", 0, "--participant", "Jane Doe")
+    assert "cannot be opened" in refused(DATA, *place, "--resume")
+    (tmp_path / "plan.json").write_text("{}")
+    assert "is no plan" in refused(DATA, *place, "--plan", tmp_path / "plan.json", "--dry-run")
+    add_person(logs / "participants.csv", PERSON | {"participant": "P02"})
+    assert '"P01" is not in the list' in refused(DATA, *place)
+    assert "is no map" in refused(DATA, *place, "--dry-run", "--warm-start", tmp_path / "none.nc")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        assert "choose another --port" in refused(DATA, *place[:2], "--port", other.getsockname()[1], *place[4:])
+    assert list(logs.glob("*.jsonl")) == []
+
+
+def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_path):
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    logs.mkdir()
+    add_person(logs / "participants.csv", PERSON)
+    wanted = Wanted(file, "P01", logs=logs)
+    hub, log = opened(wanted, lambda _: None, lambda _: None)
+    assert log.state.header.consent == PERSON["consent_time"]
+    with pytest.raises(InputError, match="another hilbo"):
+        opened(wanted._replace(resume=True), lambda _: None, lambda _: None)
+    log.close()
+    with pytest.raises(InputError, match="--resume"):
+        opened(wanted, lambda _: None, lambda _: None)
+    with pytest.raises(InputError, match="another study"):
+        opened(wanted._replace(resume=True, study=DATA), lambda _: None, lambda _: None)
+    text = log.path.read_bytes()
+    log.path.write_bytes(text.replace(b"P01", b"P02", 1))
+    with pytest.raises(InputError, match="damaged"):
+        opened(wanted._replace(resume=True), lambda _: None, lambda _: None)
+    log.path.write_bytes(text)
+    again, log = opened(wanted._replace(resume=True), lambda _: None, lambda _: None)
+    log.close()
+    assert again.tag == hub.tag
+    assert again.state == hub.state
+
+
+def test_links_are_for_this_computer_unless_the_network_is_asked_for(monkeypatch):
+    place = serve.bound(0)
+    assert place.socket.getsockname()[0] == "127.0.0.1"
+    assert all(link.startswith("http://127.0.0.1:") for link in place.links().values())
+    place.socket.close()
+    monkeypatch.setattr(serve, "lan_addresses", lambda: ["192.0.2.7"])
+    place = serve.bound(0, lan=True)
+    links = place.links()
+    assert links["participant"].startswith("http://192.0.2.7:")
+    assert links["experimenter"].startswith("http://127.0.0.1:")
+    assert links["participant"].partition("#")[2] != links["experimenter"].partition("#")[2]
+    assert serve.qr_image(links["participant"]).startswith("data:image/svg+xml;base64,")
+    assert serve.qr_text(links["participant"]).count("\n") > 10
+    place.socket.close()
+    monkeypatch.setattr(serve, "lan_addresses", lambda: [])
+    with pytest.raises(InputError, match="no network"):
+        serve.bound(0, lan=True)
+
+
+def test_the_doctor_finds_all_well_with_the_simulated_device(tmp_path, capsys):
+    def connect(damping):
+        return Renderer.open("sim", damping=damping, options={"finger": "none"}, patience=10.0)
+
+    found = {check.name: check for check in doctor.checks(DATA, connect, tmp_path, 0)}
+    assert set(found) >= {
+        "versions", "disk", "server's port", "browser", "serial ports", "study", "precision and cache",
+        "feasible set", "time of a step", "device", "device loopback", "damping",
+    }  # fmt: skip
+    assert [name for name, check in found.items() if check.level == "bad"] == []
+    assert "0 wrong" in found["device loopback"].words
+
+
+def test_the_doctor_says_what_to_mend(tmp_path):
+    def connect(_):
+        return Renderer.open("sim", options={"finger": "none", "damping": 0.5}, patience=10.0)
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        found = {check.name: check for check in doctor.checks(DATA, connect, tmp_path / "no" / "where", port)}
+    assert found["damping"].level == "bad"
+    assert "measure-damping" in found["damping"].mend
+    assert found["server's port"].level == "bad"
+    assert found["disk"].level == "bad"
+    assert all(check.mend for check in found.values() if check.level == "bad")
+    (broken := tmp_path / "study.toml").write_text("schema = 2")
+    (tmp_path / "out").mkdir()
+    found = {check.name: check for check in doctor.checks(broken, lambda _: unplugged(), tmp_path / "out", 0)}
+    assert found["study"].level == found["device"].level == "bad"
+    assert json.dumps([check._asdict() for check in found.values()])
+
+
+def unplugged():
+    raise InputError("there is no such port")
