@@ -223,12 +223,28 @@ def _section(material, found, validated, tables, pictures: list[dict[str, str]],
         "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"])),
         "robust": "Under the hyperparameters of maximum evidence the optimum moves by"
-        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges.",
+        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges." + _without(found),
         "comparison": None,
     }
     if validated is not None:
         section["validation"] = report_validation.validation_section(validated, study.responses, [])
     return section
+
+
+def _without(found):
+    """Under which hyperparameters there is no tolerance interval at all."""
+    top = found.study.responses[-1]
+    names = [
+        name
+        for name, reading in (("fixed", found.fixed), ("optimised", found.optimised))
+        if all(interval is None for interval, _ in reading.tolerances.values())
+    ]
+    if not names:
+        return ""
+    return (
+        f' Under the {" and the ".join(names)} hyperparameters "{top}" is not the likeliest answer at the optimum, so'
+        " that there is no tolerance interval."
+    )
 
 
 def _words_of_table_1(material):
