@@ -2,12 +2,13 @@
 
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from hilbo.console import Force, Json, Out, Say, Seed, finish, progress, results, start
+from hilbo.console import Force, Json, Out, Seed, finish, progress, results, start
 from hilbo.errors import InputError
 
 __all__ = ["power", "report", "simulated_report", "validate"]
@@ -103,7 +104,7 @@ def report(
     finish(content, out, as_json)
 
 
-def simulated_report(folder: Path, seed: int, say: Say, count: int = 24) -> dict[str, Any]:
+def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: int = 24) -> dict[str, Any]:
     """A simulated study of the paper's kind with its validation sessions, as a folder that `hilbo report` reads, and
     its report in the same folder; returns the content of result.json."""
     from importlib.resources import files

@@ -89,8 +89,8 @@ def test_validate_refuses_in_one_sentence(capsys, monkeypatch, tmp_path):
 
 
 def test_what_one_comparison_can_say():
-    table = pd.DataFrame([("A", 1, "best", "mid", "close", "different", "a")],
-                         columns=["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"])  # fmt: skip
+    columns = ["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"]
+    table = pd.DataFrame([("A", 1, "best", "mid", "close", "different", "a")], columns=columns)
     found = validate(table)
     assert found.overall is None and found.people is None
     assert any("Table III is missing" in text for text in found.tables.limits)
