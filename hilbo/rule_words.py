@@ -39,7 +39,7 @@ def rule_warnings(study: Study, aggregate: Any) -> list[str]:
         return []
     low, high = (float(end) for end in found.interval)
     words = (
-        f'People differ: of the prior variance they share {float(found.mean):.2f} (95 % from {low:.2f} to {high:.2f}),'
+        f"People differ: of the prior variance they share {float(found.mean):.2f} (95 % from {low:.2f} to {high:.2f}),"
         f' and the rule "{study.rule}" takes that to be 1'
     )
     ratio = _ratio(aggregate)

@@ -43,6 +43,10 @@ MATHS = {
     "ordinal_gp": {"kernels", "likelihoods", "laplace", "ep_corrected", "exact"},
     "hierarchical": {"kernels", "ordinal_gp"},
     "joint": {"kernels", "ordinal_gp"},
+    "counts": {"kernels", "likelihoods", "gaussian", "ordinal_gp"},
+    "learn_people": {"counts"},
+    "population_rules": {"aggregation", "hierarchical", "counts", "ordinal_gp"},
+    "leave_one_out": {"population_rules"},
     "hyperparameters": {"ordinal_gp", "newton"},
     "passivity_certificate": {"viscoelastic"},
     "passivity": {"viscoelastic", "passivity_certificate"},
@@ -95,7 +99,10 @@ MAY_IMPORT = MATHS | {
     "console": set(),
     "cli_material": {"console", "characterise", "material_tables", "report_material"},
     "event_log": {"session"},
-    "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm"},
+    "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm", "population_rules"},
+    "rule_words": {"config", "hierarchical"},
+    "comparison": {"study", "session", "joint", "leave_one_out", "rule_words"},
+    "plotting_population": {"plotting"},
     "distributed": set(),
     "batch": {"study", "distributed", "gaussian", "kernels"},
     "batch_optimum": {"batch", "newton"},
@@ -109,6 +116,7 @@ MAY_IMPORT = MATHS | {
     "cli_device": {"device_options", "device_tests", "device_screen", "device_words"},
 }
 MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material", "device_options", "cli_device"}
+MAY_IMPORT["report_comparison"] = {"report", "comparison", "plotting_population"}
 MAY_IMPORT["report_population"] = {"report", "report_people", "page", "batch_optimum"}
 MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
@@ -116,7 +124,7 @@ MAY_IMPORT["app"] = set(MAY_IMPORT)
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 
-ONLY_IN = {"matplotlib": {"plotting", "plotting_mechanics"}, "serial": {"ports"}}
+ONLY_IN = {"matplotlib": {"plotting", "plotting_mechanics", "plotting_population"}, "serial": {"ports"}}
 WITHOUT_JAX = {
     "errors",
     "protocol",
