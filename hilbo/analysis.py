@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
+from hilbo.aggregation import RULES
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.hyperparameters import Learned, maximise_shared_evidence
@@ -170,13 +171,15 @@ def _learn(study, trials):
 def _read(study, aggregate, seed):
     """Tolerance intervals through the map's optimum, along every parameter."""
     x = aggregate.optimum.x
+    rule = study.rule if study.rule in RULES else "bcm"  # others merge all answers at once, not person by person
+    share = aggregate.map.share if rule == "hierarchical" else None
     return Reading(
         study,
         aggregate,
         {
             name: (
                 tolerance(study, aggregate.surface, x, name),
-                tolerance_ends(study, aggregate.posteriors, x, name, seed),
+                tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share),
             )
             for name in study.space.names
         },

@@ -51,6 +51,10 @@ def aggregate(
     participants: Annotated[str | None, typer.Option(help="Only these, separated by commas.")] = None,
     first: Annotated[int | None, typer.Option(min=1, help="Only everybody's first so many trials.")] = None,
     individuals: Annotated[bool, typer.Option(help="Seek everybody's own optimum: most of the work.")] = True,
+    rule: Annotated[str | None, typer.Option(help="How people are merged, in place of the study file's rule.")] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Besides, compare all rules: comparison.json, comparison.csv, figures.")
+    ] = False,
     devices: Annotated[int | None, typer.Option(min=1, help="Deal people to so many cores of the CPU.")] = None,
     distributed: Annotated[
         bool, typer.Option("--distributed", help="One of several processes: under srun, mpirun, or as the next three.")
@@ -76,11 +80,16 @@ def aggregate(
         with team.agreement() as agree:
             folder = held.enter_context(results(out, force)) if team.writes else None
             chosen, cohort = _read(trials, study, material, say)
+            chosen = chosen if rule is None else _by_rule(chosen, rule)
             cohort = cohort.of(participants.split(",")) if participants else cohort
             cohort = cohort.first(first) if first else cohort
-            agree(digest(chosen.content, seed, individuals, cohort))
+            agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
         if team.devices == 1 and len(cohort.names) <= _LARGE and individuals:
             content = _aggregate(chosen, cohort, folder, seed, say)
+            if compare:
+                _compare(chosen, cohort, folder, seed, say)
+        elif compare:
+            raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
         else:
             content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say)
     if team.writes:
@@ -166,6 +175,23 @@ def _read(trials, study, material, say):
     chosen = chosen.material(material) if material and chosen.materials else chosen
     table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
     return chosen, cohort_of(table, chosen)
+
+
+def _by_rule(study, rule):
+    import dataclasses
+
+    from hilbo.population_rules import ALL_RULES
+
+    if rule not in ALL_RULES:
+        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
+    return dataclasses.replace(study, rule=rule)
+
+
+def _compare(study, cohort, folder, seed, say) -> None:
+    from hilbo.report_comparison import write_comparison
+
+    say("every rule, with each person left out")
+    write_comparison(study, cohort, folder, seed)
 
 
 def _aggregate(study, cohort, folder, seed, say, truth=None) -> dict[str, Any]:

@@ -87,6 +87,9 @@ def report(
     exclude: Annotated[
         str | None, typer.Option(help='Rule that leaves people out, instead of the study\'s: "trials < 10".')
     ] = None,
+    compare: Annotated[
+        bool, typer.Option(help="Compare all rules of aggregation, each person left out in turn.")
+    ] = True,
     seed: Seed = 0,
     force: Force = False,
     as_json: Json = False,
@@ -100,7 +103,7 @@ def report(
         from hilbo.report_study import write_study
         from hilbo.study_folder import read_folder
 
-        content = write_study(read_folder(folder, exclude), made, seed, say)
+        content = write_study(read_folder(folder, exclude), made, seed, say, comparison=compare)
     finish(content, out, as_json)
 
 
@@ -134,4 +137,4 @@ def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: i
         sets = sets_table(study, found.sets, own, found.cohort.names)
         sets.to_csv(folder / "sets.csv", index=False)
         validation_table(study, population, sets, seed=seed).to_csv(folder / "validation.csv", index=False)
-    return write_study(read_folder(folder), folder, seed, say, {material.name: found})
+    return write_study(read_folder(folder), folder, seed, say, {material.name: found}, comparison=False)

@@ -25,7 +25,7 @@ from hilbo.memory import Memory
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.search_space import Mechanics, Parameter, SearchSpace
 
-__all__ = ["RBF", "Inference", "OrdinalGP", "OrdinalProbit", "Selection", "Study"]
+__all__ = ["RBF", "Inference", "OrdinalGP", "OrdinalProbit", "Rule", "Selection", "Study"]
 
 
 def _text(words: str, example: str):
@@ -102,8 +102,11 @@ class Selection(_Table, frozen=True):
     minimum_distance: Annotated[_NotNegative | None, _text("a number, 0 or above", "0.05")] = None
 
 
+Rule = Literal["bcm", "hierarchical", "rbcm", "gpoe", "poe", "average", "grbcm", "pooled"]
+
+
 class _AggregationTable(_Table, frozen=True):
-    rule: Annotated[Literal["bcm"], _text('"bcm"', '"bcm"')] = "bcm"
+    rule: Annotated[Rule, _text("one of " + ", ".join(f'"{name}"' for name in get_args(Rule)), '"bcm"')] = "bcm"
 
 
 class _Content(_Table, frozen=True):
@@ -142,7 +145,7 @@ class Study(eqx.Module):
     """The rule by which people are left out (`hilbo.people`), empty for nobody."""
     selection: Selection = eqx.field(static=True)
     inference: Inference = eqx.field(static=True)
-    rule: Literal["bcm"] = eqx.field(static=True)
+    rule: Rule = eqx.field(static=True)
     source: str = eqx.field(static=True)
     content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON
 

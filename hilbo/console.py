@@ -40,6 +40,9 @@ _STUDY_FIGURES = (
     "power",
     "validation",
     "aggregate-best",
+    "comparison",
+    "reliability",
+    "coverage",
 )
 _STUDY_TABLES = (
     "table_I",
@@ -67,7 +70,7 @@ _TABLES = {"optima.csv", "trials.csv", "truth.csv", "curves.csv"}
 _WRITTEN = {"result.json", "report.html", "map.nc", "inference.nc", "study.toml", "renderer.toml", *_TABLES, *PARTS} | {
     f"{figure}.{kind}" for figure in _FIGURES + _MATERIAL_FIGURES + _STUDY_FIGURES for kind in ("png", "svg")
 }
-_WRITTEN |= {f"{table}.csv" for table in _STUDY_TABLES}
+_WRITTEN |= {f"{table}.csv" for table in _STUDY_TABLES} | {"comparison.json"}
 
 
 def start(devices: int | None = None) -> None:

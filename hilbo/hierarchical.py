@@ -12,23 +12,36 @@ The pooled fit costs the cube of the number of answers. At the committee's cost,
 posterior, stands `aggregation.aggregate("hierarchical", ...)`, with the p learnt here.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike, DTypeLike
+from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
-from hilbo.kernels import Kernel
+from hilbo.kernels import RBF, Kernel
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 
-__all__ = ["NEWCOMER", "PersonKernel", "Share", "fit_people", "learn_share", "of_people", "population"]
+__all__ = [
+    "NEWCOMER",
+    "PersonKernel",
+    "Share",
+    "fit_people",
+    "learn_share",
+    "of_people",
+    "population",
+    "share_from",
+    "shared_posterior",
+]
 
 NEWCOMER = -1.0
 """The number of a person who has given no answers."""
 
-_NODES = 33  # of the log evidence's Chebyshev interpolation in p
+_NODES, _BATCH = 33, 9  # of the log evidence's Chebyshev interpolation in p; computed at a time
+_ENOUGH = 1e-5  # error of the log evidence between them
 _FINE = 2001
 
 
@@ -105,15 +118,44 @@ def population(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Arra
     return mean, kernel.share.astype(x.dtype) * jax.vmap(kernel.diagonal)(points) - explained
 
 
-def learn_share(gp: OrdinalGP, trials: Trials, *, inference: str = "laplace") -> Share:
-    """The posterior of the share p, from `of_people(...)`; `gp` is one person's model.
+def shared_posterior(posterior: Posterior) -> Posterior:
+    """The posterior of g alone, from one of `fit_people` with an RBF: a GP of p times the prior variance.
 
-    The log evidence is computed at 33 Chebyshev points of [0, 1] and interpolated: it is smooth in p, and so the whole
-    curve, its maximum and its intervals come at a fixed cost.
+    What answers say of g, their weights and C, is what they say of everybody: g's covariance with f_j is p k.
     """
-    nodes = -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
-    evidence, converged = _evidences(gp, trials, jnp.asarray((1 + nodes) / 2, trials.x.dtype), inference)
-    coefficients = np.polynomial.chebyshev.chebfit(nodes, np.asarray(evidence, float), _NODES - 1)
+    kernel, trials, latent = posterior.gp.kernel, posterior.trials, posterior.latent
+    own = kernel.kernel
+    shared = OrdinalGP(RBF(own.theta, kernel.share.astype(own.variance.dtype) * own.variance), posterior.gp.likelihood)
+    return Posterior(shared, Trials(trials.x[:, :-1], trials.q, trials.mask), latent)
+
+
+def learn_share(gp: OrdinalGP, trials: Trials, *, inference: str = "laplace") -> Share:
+    """The posterior of the share p, from `of_people(...)`; `gp` is one person's model."""
+    return share_from(lambda shares: _evidences(gp, trials, shares, inference), trials.x.dtype)
+
+
+def share_from(
+    evidences: Callable[[Float[Array, " k"]], tuple[Float[Array, " k"], Bool[Array, " k"]]], dtype: DTypeLike
+) -> Share:
+    """The posterior of the share from its log evidence: a function of shares (k,) to values and whether fits held.
+
+    The evidence is computed at Chebyshev points of [0, 1], 9, 17 or 33 of them, and interpolated: it is smooth in p,
+    and so the whole curve, its maximum and its intervals come at a small cost.
+    """
+    known: dict[int, tuple[float, bool]] = {}  # by place among the finest nodes, in which the coarser ones are
+    for step in (4, 2, 1):
+        ahead = [i for i in range(0, _NODES, step) if i not in known]
+        for begin in range(0, len(ahead), _BATCH):
+            places = ahead[begin : begin + _BATCH]
+            padded = places + places[:1] * (_BATCH - len(places))  # one shape, one compilation
+            values, held = evidences(jnp.asarray((1 + _nodes()[padded]) / 2, dtype))
+            known |= {i: (float(v), bool(h)) for i, v, h in zip(places, values, held, strict=False)}
+        every = sorted(known)
+        fitted = np.array([known[i][0] for i in every])
+        coefficients = np.polynomial.chebyshev.chebfit(_nodes()[every], fitted, len(every) - 1)
+        error = np.abs(coefficients[-2:]).sum()
+        if error < _ENOUGH:
+            break
     grid = np.linspace(0.0, 1.0, _FINE)
     curve = np.polynomial.chebyshev.chebval(2 * grid - 1, coefficients)
     weight = np.exp(curve - curve.max())
@@ -124,9 +166,13 @@ def learn_share(gp: OrdinalGP, trials: Trials, *, inference: str = "laplace") ->
         best=jnp.asarray(grid[curve.argmax()]),
         mean=jnp.asarray(np.trapezoid(weight * grid) / np.trapezoid(weight)),
         interval=jnp.asarray(np.interp([0.025, 0.975], area / area[-1], grid)),
-        interpolation_error=jnp.asarray(np.abs(coefficients[-2:]).sum()),
-        converged=jnp.all(converged),
+        interpolation_error=jnp.asarray(error),
+        converged=jnp.asarray(all(good for _, good in known.values())),
     )
+
+
+def _nodes() -> np.ndarray:
+    return -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
 
 
 @eqx.filter_jit

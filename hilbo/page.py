@@ -165,9 +165,10 @@ def _search_words(study):
 def _comparison(study, content):
     """Rows: what else one might ship, with its passivity and, where the truth is known, its miss."""
     truth = content.get("truth")
-    claims = {"population map (bcm)": ("aggregate", content["optimum"])}
+    claims = {f"population map ({content['rule']})": ("aggregate", content["optimum"])}
     words = {"average": "plain average of the latent functions", "pooled": "one model of all answers"}
     words |= {"ep": "population map, expectation propagation", "laplace": "population map, Laplace"}
+    words |= {"hierarchical": "people who differ (hierarchical)", "bcm": "committee machine (bcm)"}
     claims |= {words[name]: (name, found) for name, found in content["alternatives"].items()}
     if content["mean_of_optima"] is not None:
         claims["mean of the individual optima"] = ("mean_of_optima", content["mean_of_optima"])

@@ -25,6 +25,7 @@ from hilbo.batch_optimum import Merged
 from hilbo.config import Study
 from hilbo.page import results_page
 from hilbo.report_people import People, as_json, people_of
+from hilbo.rule_words import heterogeneity, rule_warnings
 from hilbo.study import Aggregate, Optimum, nrmse, other_inference, progress
 
 __all__ = [
@@ -116,6 +117,7 @@ def result(
         if mean is None
         else {"parameters": set_of(study, mean), "passivity_margin": margin_of(study, mean)},
         "rule": study.rule,
+        "heterogeneity": heterogeneity(aggregate),
         "inference": study.inference,
         "study": study.hash,
         "seed": seed,
@@ -125,7 +127,7 @@ def result(
     if other in aggregate.alternatives:
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
     failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
-    content["warnings"] = [_not_converged(failed)] if failed else []
+    content["warnings"] = ([_not_converged(failed)] if failed else []) + rule_warnings(study, aggregate)
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content
@@ -283,7 +285,7 @@ def _figures(study, aggregate, seed, truth):
     marks |= {} if truth is None else {"truth": truth}
     captions = _captions(study, truth)
     found = {
-        "map": plotting.map_slices(study, aggregate.posteriors, best, cohort),
+        "map": plotting.map_slices(study, aggregate.surface, best, cohort),
         "progress": plotting.progress_figure(study, cohort, merged, own, truth, counts),
         "slices": plotting.slices_after(study, cohort, merged[np.searchsorted(counts, after)], after),
     }

@@ -5,11 +5,11 @@
     aggregate = aggregate_cohort(study, cohort)
 
 All participants are fitted in one compiled batch over trials padded to one capacity. The population map is a
-committee machine over their posteriors (`hilbo.bcm`); its optimum is searched like a session's.
+committee machine over their posteriors (`hilbo.bcm`), or what the study's rule says (`hilbo.population_rules`); its
+optimum is searched like a session's.
 """
 
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -19,10 +19,12 @@ import pandas as pd
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-from hilbo import acquisition, bcm
+from hilbo import acquisition, aggregation, bcm
 from hilbo.config import Inference, Study
 from hilbo.errors import InputError
+from hilbo.hierarchical import Share
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.population_rules import RuleMap, rule_map, share_of
 from hilbo.session import best_point, search_points
 
 __all__ = [
@@ -33,6 +35,7 @@ __all__ = [
     "cohort_of",
     "fit_cohort",
     "individual_optima",
+    "map_optimum",
     "nrmse",
     "other_inference",
     "pooled_posterior",
@@ -41,7 +44,7 @@ __all__ = [
     "progress",
 ]
 
-Rule = Literal["bcm", "average"]
+Rule = aggregation.Rule
 _LARGEST_POOL = 3000  # answers: the pooled fit is cubic in their number
 
 
@@ -97,8 +100,15 @@ class Aggregate(eqx.Module):
     optimum: Optimum
     individuals: Optimum
     alternatives: dict[str, Optimum]
-    """Optimum of the plain average of the latent functions, of one GP on all answers (if not too many), and of the
-    population map by another inference: "ep", or "laplace" where the study itself says "ep"."""
+    """Optimum of the plain average of the latent functions, of one GP on all answers (if not too many), by the
+    hierarchical rule and by bcm where the study's rule is another, and of the population map by another inference:
+    "ep", or "laplace" where the study itself says "ep"."""
+    map: RuleMap
+    """The population map by the study's rule."""
+    hierarchical: RuleMap | None
+    """The map by the hierarchical rule, beside which the study's is judged."""
+    share: Share | None
+    """What the answers say of how people differ; None if it was not asked, or fewer than two people answered."""
 
     @property
     def certificates(self) -> dict[str, np.ndarray]:
@@ -108,7 +118,7 @@ class Aggregate(eqx.Module):
 
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube."""
-        return population(self.posteriors, jnp.asarray(x))
+        return _predict(self.map, jnp.asarray(x))
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"]:
@@ -164,35 +174,54 @@ def _fit_cohort(study, trials, gps, inference=None):
 
 @eqx.filter_jit
 def population(
-    posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm"
+    posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm", share: Float[Array, ""] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of the population map at points of the unit cube.
+    """Mean and variance (m,) of the population map at points of the unit cube, merged point by point.
 
-    Participants' predictions are made in blocks and never held all at once.
+    Of bcm, participants' predictions are made in blocks and never held all at once. `share`: of the hierarchical rule.
     """
     prior = jax.vmap(jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel.diagonal)(x)
-    if rule == "average":
+    if rule != "bcm":
         means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors)
-        return bcm.average(means, prior[None, :] - explained)
+        return aggregation.aggregate(rule, means, explained, prior, share=share)
     evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior)
     return evidence.merge(prior)
 
 
 @eqx.filter_jit
+def _predict(found: RuleMap, x):
+    return population(found.experts, x) if found.rule == "bcm" and found.experts is not None else found.predict(x)
+
+
+@eqx.filter_jit
 def population_optimum(
-    study: Study, posteriors: Posterior, candidates: Float[Array, "m d"], rule: Rule = "bcm"
+    study: Study,
+    posteriors: Posterior,
+    candidates: Float[Array, "m d"],
+    rule: Rule = "bcm",
+    share: Float[Array, ""] | None = None,
 ) -> Optimum:
     """Where the population map's mean is largest in the feasible set."""
+    return _optimum(study, lambda x: population(posteriors, x, rule, share), candidates)
+
+
+@eqx.filter_jit
+def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
+    """Where a rule's map has its largest mean in the feasible set."""
+    return _optimum(study, lambda x: _predict(found, x), candidates)
+
+
+def _optimum(study: Study, predict: Callable, candidates) -> Optimum:
     choice = acquisition.maximise(
-        population(posteriors, candidates, rule)[0],
+        predict(candidates)[0],
         candidates,
-        lambda x: population(posteriors, x[None, :], rule)[0][0],
+        lambda x: predict(x[None, :])[0][0],
         from_box=study.space.from_box,
         to_box=study.space.to_box,
         feasible=study.space.feasible,
         steps=300,
     )
-    mean, variance = population(posteriors, choice.x[None, :], rule)
+    mean, variance = predict(choice.x[None, :])
     probabilities = study.gp.likelihood.class_probabilities(mean[0], variance[0])
     return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
 
@@ -233,39 +262,62 @@ def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: 
     """
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
+    answered = int(np.sum(cohort.counts() > 0))
+    share = None
+    if study.rule == "hierarchical" or (alternatives and answered > 1):
+        share = share_of(study.gp, cohort.trials, study.inference)
+
+    def merged(rule, posteriors=posteriors, inference=study.inference):
+        part = None if share is None else share.mean
+        return rule_map(study.gp, cohort.trials, rule, posteriors=posteriors, share=part, inference=inference)
+
+    chosen = merged(study.rule)
+    beside = chosen if study.rule == "hierarchical" else None if share is None else merged("hierarchical")
     others = {}
     if alternatives:
-        others["average"] = population_optimum(study, posteriors, candidates, "average")
+        maps = {"hierarchical": beside, "bcm": merged("bcm"), "average": merged("average")}
+        maps = {name: found for name, found in maps.items() if found is not None and name != study.rule}
+        others = {name: map_optimum(study, found, candidates) for name, found in maps.items()}
         other = other_inference(study)
-        others[other] = population_optimum(study, fit_cohort(study, cohort, inference=other), candidates)
+        again = merged(study.rule, fit_cohort(study, cohort, inference=other), other)
+        others[other] = map_optimum(study, again, candidates)
         pooled = pooled_posterior(study, cohort)
-        if pooled is not None:
+        if pooled is not None and study.rule != "pooled":
             stacked = jax.tree.map(lambda leaf: leaf[None], pooled)
             others["pooled"] = jax.tree.map(lambda leaf: leaf[0], individual_optima(study, stacked, candidates))
     return Aggregate(
         cohort=cohort,
         posteriors=posteriors,
-        optimum=population_optimum(study, posteriors, candidates),
+        optimum=map_optimum(study, chosen, candidates),
         individuals=individual_optima(study, posteriors, candidates),
         alternatives=others,
+        map=chosen,
+        hierarchical=beside,
+        share=share,
     )
 
 
 def progress(
     study: Study, cohort: Cohort, seed: int = 0, prefixes: Sequence[int] | None = None
 ) -> tuple[Float[Array, "p d"], Float[Array, "p M d"]]:
-    """Optima (unit cube) after the first 1, 2, ... trials: of the population map (p, d), and of everybody (p, M, d)."""
+    """Optima (unit cube) after the first 1, 2, ... trials: of the population map (p, d), and of everybody (p, M, d).
+
+    The map is merged point by point by the study's rule, with the share that all answers say; by bcm where the rule
+    takes all answers at once.
+    """
     counts = range(1, int(cohort.counts().max()) + 1) if prefixes is None else prefixes
     candidates = search_points(study.space, seed)
-    return _progress(study, cohort.trials, candidates, jnp.asarray(list(counts)))
+    rule = study.rule if study.rule in aggregation.RULES else "bcm"
+    share = share_of(study.gp, cohort.trials, study.inference).mean if rule == "hierarchical" else None
+    return _progress(study, cohort.trials, candidates, jnp.asarray(list(counts)), rule, share)
 
 
 @eqx.filter_jit
-def _progress(study, trials, candidates, counts):
+def _progress(study, trials, candidates, counts, rule, share):
     def after(count):
         posteriors = _fit_cohort(study, jax.vmap(lambda t: t.first(count))(trials), None)
         best = individual_optima(study, posteriors, candidates).x
-        return population_optimum(study, posteriors, candidates).x, best
+        return population_optimum(study, posteriors, candidates, rule, share).x, best
 
     return jax.lax.map(after, counts)
 
