@@ -1,4 +1,4 @@
-"""Simulated studies for benchmarks/rules.py, made once and kept: the preset `paper` with people who differ more or less.
+"""Simulated studies for benchmarks/rules.py, made once and kept: people who differ more or less.
 
     python benchmarks/rules_sessions.py FOLDER [--seeds 100]
 

@@ -14,13 +14,14 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
+from hilbo.aggregation import RULES
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.hyperparameters import Learned, maximise_shared_evidence
 from hilbo.people import excluded, measure_people
 from hilbo.sensitivity import Ends, tolerance_ends
 from hilbo.session import search_points
-from hilbo.study import Aggregate, Cohort, aggregate_cohort, fit_cohort, nrmse, population_optimum, progress
+from hilbo.study import Aggregate, Cohort, aggregate_cohort, nrmse, progress
 from hilbo.validation import Sets, Tolerance, best_mid_worst, tolerance
 
 __all__ = ["Analysis", "Progress", "Reading", "analyse", "limits_of", "moved_by_evidence", "settled"]
@@ -90,7 +91,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     counts = _counts(cohort)
     merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts.tolist()))
     say("hyperparameters by maximum evidence")
-    learned, optimised = _optimised(study, cohort, aggregate, seed)
+    learned, optimised = _optimised(study, cohort, seed)
     say("reading the maps")
     sets, words = _sets(study, aggregate, seed)
     limits = (*limits_of(study, cohort), *words)
@@ -156,12 +157,10 @@ def _counts(cohort):
     return np.unique(counts)
 
 
-def _optimised(study, cohort, aggregate, seed):
+def _optimised(study, cohort, seed):
     learned = _learn(study, cohort.trials)
     again = eqx.tree_at(lambda s: s.gp, study, learned.gp)
-    posteriors = fit_cohort(again, cohort)
-    best = population_optimum(again, posteriors, search_points(study.space, seed))
-    return learned, (again, eqx.tree_at(lambda a: (a.posteriors, a.optimum), aggregate, (posteriors, best)))
+    return learned, (again, aggregate_cohort(again, cohort, seed, alternatives=False))
 
 
 @eqx.filter_jit
@@ -172,13 +171,15 @@ def _learn(study, trials):
 def _read(study, aggregate, seed):
     """Tolerance intervals through the map's optimum, along every parameter."""
     x = aggregate.optimum.x
+    rule = study.rule if study.rule in RULES else "bcm"  # others merge all answers at once, not person by person
+    share = aggregate.map.share if rule == "hierarchical" else None
     return Reading(
         study,
         aggregate,
         {
             name: (
                 tolerance(study, aggregate.surface, x, name),
-                tolerance_ends(study, aggregate.posteriors, x, name, seed),
+                tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share),
             )
             for name in study.space.names
         },

@@ -54,13 +54,15 @@ class Sums(NamedTuple):
     means: Any
     explained: Any
 
-    def merge(self, prior, people, rule: Rule = "bcm") -> tuple[Any, Any]:
-        """Mean and variance of the map of so many people with the prior variance `prior`, by the committee or by a
-        plain average of the latent functions."""
+    def merge(self, prior, people, rule: Rule = "bcm", share: float = 1.0) -> tuple[Any, Any]:
+        """Mean and variance of the map of so many people with the prior variance `prior`, by a rule of `aggregation`;
+        `added` and `weighted` are of that rule (bcm's serve poe and gpoe too)."""
         if rule == "average":
             return self.means / people, (prior - self.explained / people) / people
-        variance = prior / (1.0 + prior * self.added)
-        return variance * self.weighted, variance
+        weight = 1.0 / people if rule == "gpoe" else 1.0
+        kept = prior / people if rule == "poe" else prior * share
+        variance = kept / (1.0 + kept * weight * self.added)
+        return variance * weight * self.weighted, variance
 
 
 class Jets(NamedTuple):
@@ -84,6 +86,9 @@ class Population(eqx.Module):
     """Blocks that a device makes in one round."""
     inference: Inference = eqx.field(static=True)
     say: Say = eqx.field(static=True)
+    rule: Rule = eqx.field(static=True, default="bcm")
+    share: float = eqx.field(static=True, default=1.0)
+    """Of the hierarchical rule; 1 otherwise."""
 
     @property
     def people(self) -> int:
@@ -160,7 +165,8 @@ def _pass(population, task: _Task, points, words) -> Any:
         rows = slice(begin, min(begin + together, people))
         count = rows.stop - begin
         blocks = crew.deal(_padded(population, rows))
-        found = _round(population.study, np.asarray(points), blocks, task, population.inference, crew)
+        by = population.rule, population.share
+        found = _round(population.study, np.asarray(points), blocks, task, population.inference, crew, by)
         block_sums, each = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), found)
         for i in range(-(-count // size)):
             block = jax.tree.map(lambda leaf, i=i: leaf[i], block_sums)
@@ -183,13 +189,13 @@ def _padded(population, rows):
 
 
 @eqx.filter_jit
-def _round(study, points, blocks, task, inference, crew):
+def _round(study, points, blocks, task, inference, crew, by):
     """A group of blocks on each device, one after the other; everything comes back to everybody."""
 
     def on_device(study, points, blocks):
         def make(block):
             trials, modes = block
-            return _block(study, points, trials, modes, task, inference, crew.platform)
+            return _block(study, points, trials, modes, task, inference, crew.platform, by)
 
         out = jax.lax.map(make, jax.tree.map(lambda leaf: leaf[0], blocks))
         return jax.tree.map(lambda leaf: leaf[None], out)
@@ -201,13 +207,13 @@ def _round(study, points, blocks, task, inference, crew):
     return jax.lax.with_sharding_constraint(spread(study, points, blocks), crew.everywhere)
 
 
-def _block(study, points, trials, modes, task, inference, platform):
+def _block(study, points, trials, modes, task, inference, platform, by):
     if task in ("sums", "jets"):
         say = _sums_of if task == "sums" else _jets_of
         experts = _each(lambda person: _expert(study, inference, *person), (trials, modes), platform)
-        return _added(lambda expert: say(expert, points), experts, platform), {}
+        return _added(lambda expert: say(expert, points, by), experts, platform), {}
     posteriors = _each(lambda person: fit(study.gp, person, inference=inference, throw=False), trials, platform)
-    total = _added(lambda posterior: _sums_of(_of(posterior), points), posteriors, platform)
+    total = _added(lambda posterior: _sums_of(_of(posterior), points, by), posteriors, platform)
     kept: dict[str, Any] = {"certificate": _fields(posteriors.certificate)}
     if inference == "laplace":
         kept["modes"] = posteriors.latent.mode
@@ -268,17 +274,19 @@ def _added(function, people, platform):
     return jax.lax.scan(lambda total, group: (jax.tree.map(jnp.add, total, of_group(group)), None), nothing, groups)[0]
 
 
-def _sums_of(expert, points):
+def _sums_of(expert, points, by):
+    rule, share = by
     cross = gram(expert.kernel, expert.x, points)
     means, explained = mean_and_explained(expert.weights, expert.factor, expert.inverse, cross)
     prior = jax.vmap(expert.kernel.diagonal)(points)
-    remaining = prior - explained
-    return Sums(explained / (prior * remaining), means / remaining, means, explained)
+    remaining = prior - share * explained
+    weight = -0.5 * jnp.log1p(-explained / prior) if rule == "rbcm" else jnp.ones_like(means)
+    return Sums(weight * explained / (prior * remaining), weight * means / remaining, means, explained)
 
 
-def _jets_of(expert, points):
+def _jets_of(expert, points, by):
     def at(x):
-        return jax.tree.map(lambda leaf: leaf[0], _sums_of(expert, x[None, :]))
+        return jax.tree.map(lambda leaf: leaf[0], _sums_of(expert, x[None, :], by))
 
     slope = jax.jacrev(at)
     return jax.vmap(lambda x: Jets(at(x), slope(x), jax.jacfwd(slope)(x)))(points)

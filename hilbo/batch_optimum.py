@@ -8,16 +8,22 @@ Another inference costs a fit in every pass, so its optimum is sought from where
 under it. Usually one pass is left to do, in which the whole population corrects that.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hilbo.aggregation import RULES
 from hilbo.batch import Jets, Population, Say, Sums, jets, population_of, refit, sums
 from hilbo.config import Study
 from hilbo.distributed import Crew
+from hilbo.errors import InputError
+from hilbo.hierarchical import Share
 from hilbo.newton import TrustRegionNewton
+from hilbo.population_rules import share_of
 from hilbo.session import search_points
 from hilbo.study import Cohort, Optimum, Rule, other_inference
 
@@ -41,12 +47,17 @@ class Merged(eqx.Module):
     individuals: Optimum | None
     """Stacked; None if they were not asked for."""
     alternatives: dict[str, Optimum]
+    share: Share | None = None
+    """What the answers of an even choice of people say of how people differ, where the rule asks for it."""
+    hierarchical: None = None
 
     def surface(self, x: Float[np.ndarray, "m d"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube: a pass of the whole crew."""
         study = self.population.study
         prior = np.asarray(jax.vmap(study.gp.kernel.diagonal)(jnp.asarray(x)))
-        return sums(self.population, x, "participants asked for the map").merge(prior, self.population.people)
+        return sums(self.population, x, "participants asked for the map").merge(
+            prior, self.population.people, self.population.rule, self.population.share
+        )
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"] | None:
@@ -70,14 +81,27 @@ def aggregate_population(
     alternative here: its cost is cubic in their number.
     """
     candidates = np.asarray(search_points(study.space, seed))
+    rule = _streamed(study.rule, len(cohort.names))
+    share = share_of(study.gp, cohort.trials, study.inference) if rule == "hierarchical" else None
     population = population_of(study, cohort, crew) if say is None else population_of(study, cohort, crew, say)
+    population = dataclasses.replace(population, rule=rule, share=1.0 if share is None else float(share.mean))
     fitted = refit(population, candidates, individuals)
-    rules: tuple[Rule, ...] = ("bcm", "average") if alternatives else ("bcm",)
+    rules: tuple[Rule, ...] = tuple(dict.fromkeys((rule, "average"))) if alternatives else (rule,)
     best = optima_from(fitted.population, candidates, fitted.sums, rules)
-    others = {"average": best["average"]} if alternatives else {}
+    others = {"average": best["average"]} if alternatives and rule != "average" else {}
     if alternatives:
-        others[other_inference(study)] = _by_other_inference(fitted.population, best["bcm"])
-    return Merged(cohort, fitted.population, fitted.certificate, best["bcm"], fitted.individuals, others)
+        others[other_inference(study)] = _by_other_inference(fitted.population, best[rule])
+    return Merged(cohort, fitted.population, fitted.certificate, best[rule], fitted.individuals, others, share)
+
+
+def _streamed(rule: str, people: int) -> Rule:
+    """A rule that is a sum over people, as a stream of them needs it."""
+    if rule not in RULES:
+        raise InputError(
+            f'The rule "{rule}" needs all answers at once and cannot be streamed over {people:,} people; use'
+            f" {', '.join(RULES[:-1])} or {RULES[-1]}."
+        )
+    return rule
 
 
 def optima_from(
@@ -85,7 +109,7 @@ def optima_from(
 ) -> dict[str, Optimum]:
     """The maximum of the map by each rule in the feasible set, from the sums at candidates (m, d)."""
     prior = np.asarray(jax.vmap(population.study.gp.kernel.diagonal)(jnp.asarray(candidates)))
-    maps = {rule: found.merge(prior, population.people, rule) for rule in rules}
+    maps = {rule: found.merge(prior, population.people, rule, population.share) for rule in rules}
     rows = {rule: _spread(maps[rule][0], candidates) for rule in rules}
     starts = np.concatenate([candidates[rows[rule]] for rule in rules])
     reached = optimum_near(population, starts, tuple(rule for rule in rules for _ in range(_STARTS)))
@@ -127,13 +151,13 @@ def _by_other_inference(population, best):
     other = other_inference(study)
     pilot = population.every(min(_PILOT, population.people // _PILOT_SHARE))
     if pilot.people >= _FEWEST:
-        (own,), (moved,) = (optimum_near(p, at, ("bcm",)) for p in (pilot, pilot.by(other)))
+        (own,), (moved,) = (optimum_near(p, at, (population.rule,)) for p in (pilot, pilot.by(other)))
         box = study.space.to_box
         begin = jnp.clip(box(best.x) + box(moved.x) - box(own.x), 0.0, 1.0)
         at = np.asarray(study.space.from_box(begin))[None, :]
     name = {"ep": "expectation propagation", "laplace": "Laplace"}[other]
     words = f"participants fitted by {name} for comparison"
-    return optimum_near(population.by(other), at, ("bcm",), tolerance=_SETTLED, words=words)[0]
+    return optimum_near(population.by(other), at, (population.rule,), tolerance=_SETTLED, words=words)[0]
 
 
 def optimum_near(
@@ -157,7 +181,8 @@ def optimum_near(
     for _ in range(_STEPS):
         at = _ahead(study, w, state)
         there = jets(population, np.asarray(at), words)
-        w, state, finished, last = _advance(study, w, state, there, at, plain, jnp.asarray(float(population.people)))
+        people, by = jnp.asarray(float(population.people)), (population.rule, population.share)
+        w, state, finished, last = _advance(study, w, state, there, at, plain, people, by)
         if bool(jnp.all(finished | (jnp.max(jnp.abs(state.move), axis=1) <= tolerance))):
             break
     x, mean, variance = last if tolerance else state.here.aux
@@ -190,7 +215,7 @@ def _ahead(study, w, state):
 
 
 @eqx.filter_jit
-def _advance(study, w, state, jets, at, plain, people):
+def _advance(study, w, state, jets, at, plain, people, by):
     """A step of the solver, whose function is the map expanded at the point it asks for."""
     bounds = {"lower": jnp.zeros(w.shape[1:], w.dtype), "upper": jnp.ones(w.shape[1:], w.dtype)}
 
@@ -201,7 +226,7 @@ def _advance(study, w, state, jets, at, plain, people):
             there = jax.tree.map(lambda v, g, h: v + g @ off + 0.5 * off @ h @ off, *jets)
             mean, variance = (
                 jnp.where(plain, *both)
-                for both in zip(there.merge(prior, people, "average"), there.merge(prior, people), strict=True)
+                for both in zip(there.merge(prior, people, "average"), there.merge(prior, people, *by), strict=True)
             )
             return -mean, (x, mean, variance)
 

@@ -2,12 +2,13 @@
 
 import shutil
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from hilbo.console import Force, Json, Out, Say, Seed, finish, progress, results, start
+from hilbo.console import Force, Json, Out, Seed, finish, progress, results, start
 from hilbo.errors import InputError
 
 __all__ = ["power", "report", "simulated_report", "validate"]
@@ -86,6 +87,9 @@ def report(
     exclude: Annotated[
         str | None, typer.Option(help='Rule that leaves people out, instead of the study\'s: "trials < 10".')
     ] = None,
+    compare: Annotated[
+        bool, typer.Option(help="Compare all rules of aggregation, each person left out in turn.")
+    ] = True,
     seed: Seed = 0,
     force: Force = False,
     as_json: Json = False,
@@ -99,11 +103,11 @@ def report(
         from hilbo.report_study import write_study
         from hilbo.study_folder import read_folder
 
-        content = write_study(read_folder(folder, exclude), made, seed, say)
+        content = write_study(read_folder(folder, exclude), made, seed, say, comparison=compare)
     finish(content, out, as_json)
 
 
-def simulated_report(folder: Path, seed: int, say: Say, count: int = 24) -> dict[str, Any]:
+def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: int = 24) -> dict[str, Any]:
     """A simulated study of the paper's kind with its validation sessions, as a folder that `hilbo report` reads, and
     its report in the same folder; returns the content of result.json."""
     from importlib.resources import files
@@ -133,4 +137,4 @@ def simulated_report(folder: Path, seed: int, say: Say, count: int = 24) -> dict
         sets = sets_table(study, found.sets, own, found.cohort.names)
         sets.to_csv(folder / "sets.csv", index=False)
         validation_table(study, population, sets, seed=seed).to_csv(folder / "validation.csv", index=False)
-    return write_study(read_folder(folder), folder, seed, say, {material.name: found})
+    return write_study(read_folder(folder), folder, seed, say, {material.name: found}, comparison=False)

@@ -12,9 +12,9 @@ precision-like matrix V'V = (S^-1 + p K)^-1 at the covariance p K, and log|I + K
 log|I + (1 - p) K W_j| and log|I + p L'K L|. The cost is M m^3 in place of (M m)^3. The posterior of g is a `Posterior`
 like any other, of a prior p times as large; a new person's function has (1 - p) k more variance.
 
-Laplace's method by Newton's steps, halved where the log posterior would fall; the certificate says whether they arrived. The evidence has exact first
-derivatives: a last step from the mode, whose derivative in its start is 0 there. Reference: Rasmussen & Williams
-(2006), sections 3.4 and 5.5.1.
+Laplace's method by Newton's steps, halved where the log posterior would fall; the certificate says whether they
+arrived. The evidence has exact first derivatives: a last step from the mode, whose derivative in its start
+is 0 there. Reference: Rasmussen & Williams (2006), sections 3.4 and 5.5.1.
 """
 
 from typing import NamedTuple

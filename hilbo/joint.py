@@ -23,7 +23,7 @@ from hilbo.kernels import gram
 from hilbo.linalg import cholesky, eigh, solve_lower, solve_lower_transposed
 from hilbo.ordinal_gp import Posterior
 
-__all__ = ["JointMap", "joint_map"]
+__all__ = ["JointMap", "joint_map", "posterior_map"]
 
 
 class JointMap(eqx.Module):
@@ -88,3 +88,14 @@ def _roots(covariance):
     scale = jnp.sqrt(jnp.where(kept, eigenvalues, 1.0))
     kept = kept.astype(scale.dtype)
     return vectors * (kept * scale)[None, :], (vectors * (kept / scale)[None, :]).T
+
+
+@eqx.filter_jit
+def posterior_map(posterior: Posterior, x: Float[Array, "m d"]) -> JointMap:
+    """One posterior at points (m, d) as a joint Gaussian: of the hierarchical model's shared function, say."""
+    kernel = posterior.gp.kernel
+    cross = gram(kernel, posterior.trials.x, x)
+    known = posterior.latent.factor @ cross
+    eigenvalues, vectors = eigh(gram(kernel, x, x) - known.T @ known)
+    scale = jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))  # below 0 by rounding
+    return JointMap(posterior.latent.weights @ cross, vectors * scale[None, :])

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from hilbo import aggregation
 from hilbo.counts import Counts, counts_of, evidence, fit_counts, one_person
 from hilbo.errors import InputError
-from hilbo.hierarchical import Share, fit_people, learn_share, of_people, shared_posterior, share_from
+from hilbo.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 
 __all__ = ["ALL_RULES", "AnyRule", "RuleMap", "even_choice", "rule_map", "share_of"]
@@ -140,8 +140,23 @@ def _curve(gp, counts, shares):
     return jax.lax.map(lambda share: evidence(gp, share, counts), shares)
 
 
+def _experts(gp, trials, inference) -> Posterior:
+    """Everybody's own posterior, stacked; from counts where many answers are at the same points."""
+    if inference == "laplace":
+        counts = counts_of(trials, gp.likelihood.categories)
+        if 2 * counts.x.shape[0] < trials.mask.shape[1]:
+            return _counted(gp, counts)
+    return _fitted(gp, trials, inference)
+
+
 @eqx.filter_jit
-def _experts(gp, trials, inference):
+def _counted(gp, counts):
+    one = jnp.ones_like(gp.kernel.variance)
+    return jax.lax.map(lambda own: fit_counts(gp, one, Counts(counts.x, own[None])), counts.counts)
+
+
+@eqx.filter_jit
+def _fitted(gp, trials, inference):
     return jax.vmap(lambda person: fit(gp, person, inference=inference, throw=False))(trials)
 
 
@@ -157,11 +172,10 @@ def _counts(gp, trials, inference) -> Counts | None:
 def _together(gp, trials, share, inference, largest) -> Posterior | None:
     """The shared function's posterior from all answers at once; None if they are too many."""
     counts = _counts(gp, trials, inference)
-    if counts is not None:
-        if counts.people * counts.x.shape[0] ** 3 <= largest**3:
-            found = fit_counts(gp, share, counts if float(share) < 1 else one_person(counts))
-            if bool(found.certificate.converged):
-                return found
+    if counts is not None and counts.people * counts.x.shape[0] ** 3 <= largest**3:
+        found = fit_counts(gp, share, counts if float(share) < 1 else one_person(counts))
+        if bool(found.certificate.converged):
+            return found
     if inference == "exact" or int(np.asarray(trials.mask).sum()) > largest:
         return None
     return shared_posterior(fit_people(gp, of_people(trials), share, inference=inference, throw=False))
@@ -182,7 +196,7 @@ def _communicating(gp, trials, inference) -> tuple[Posterior, Posterior]:
         trials.x[person[chosen], row[chosen]], trials.q[person[chosen], row[chosen]], jnp.ones(len(chosen), bool)
     )
     people = mask.shape[0]
-    own = trials.mask & ~jnp.asarray(_at(mask.shape, person[chosen], row[chosen]))  # nobody's answer counts twice
+    own = trials.mask & ~jnp.asarray(_at(mask.shape, *at))  # nobody's answer counts twice
 
     def beside(shared, each):
         return jnp.concatenate([jnp.broadcast_to(shared[None], (people, *shared.shape)), each], axis=1)

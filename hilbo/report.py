@@ -47,6 +47,8 @@ __all__ = [
 MAP_CELLS = 41
 """Points of the map's grid along each parameter."""
 
+_PIXELS = 130  # of the page for an inch of a figure, so that all have letters of one size
+
 
 def set_of(study: Study, x: ArrayLike) -> dict[str, float]:
     """A point of the unit cube as a parameter set in physical units, derived K0 included."""
@@ -221,7 +223,9 @@ def save_figures(figures: Mapping[str, tuple[Any, str, str]], folder: Path) -> l
         figure.savefig(buffer, format="png", dpi=200)
         (folder / f"{name}.png").write_bytes(buffer.getvalue())
         png = base64.b64encode(buffer.getvalue()).decode()
-        pictures.append({"name": name, "png": png, "title": title, "caption": caption, "alt": f"{title}. {caption}"})
+        width = str(round(_PIXELS * figure.get_figwidth()))
+        words = {"title": title, "caption": caption, "alt": f"{title}. {caption}"}
+        pictures.append({"name": name, "png": png, "width": width} | words)
     return pictures
 
 

@@ -8,7 +8,7 @@ from hilbo.analysis import Analysis
 from hilbo.study import fit_cohort
 from hilbo.study_folder import Material
 
-__all__ = ["study_figures"]
+__all__ = ["comparison_figures", "study_figures"]
 
 Figures = dict[str, tuple[Any, str, str]]  # name -> figure, title, caption
 
@@ -41,7 +41,8 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
             plotting_study.sets_on_map(study, found.aggregate.surface, found.sets, best, cohort),
             "The population map and its best, mid and worst sets (paper, figure 6a)",
             f"Brighter: higher {study.attribute}. Hatched: hardly sampled, the map's sd there is above"
-            f" {100 * plotting_study.UNKNOWN:.0f} % of the prior's. Dots: what was asked near the slice.{white}",
+            f" {100 * plotting_study.UNKNOWN:.0f} % of the prior's. Dots: what was asked near the slice, and"
+            f" may lie in its white.{white}",
         ),
         "maps-after": (
             plotting.maps_beside(
@@ -87,6 +88,25 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
             "Each dot is one participant's own optimum.",
         )
     return figures
+
+
+def comparison_figures(content: dict[str, Any]) -> Figures:
+    """Every rule with each person left out, and the reliability of two of them; `content` of `comparison.compare`."""
+    from hilbo import plotting_population as plotting
+
+    return {
+        "comparison": (
+            plotting.rules_figure(content),
+            "How every rule foretells people left out",
+            "Left: mean negative log density of their answers, lower is better. Right: share of their answers within the"
+            " central 95 % of what was foretold; the line is where a calibrated map is. Bars: standard errors by person.",
+        ),
+        "reliability": (
+            plotting.reliability_figure(content),
+            "Reliability of the class probabilities",
+            "How often answers came that were foretold with a probability; on the line, as often as foretold.",
+        ),
+    }
 
 
 def _after(counts):

@@ -15,17 +15,21 @@ import pandas as pd
 
 from hilbo import report_validation
 from hilbo.analysis import Analysis, analyse, moved_by_evidence
+from hilbo.comparison import compare
 from hilbo.config import Study
 from hilbo.hypotheses import Results, hypotheses
 from hilbo.inference_data import groups, predictive_shares, write_groups
 from hilbo.page import template
 from hilbo.report import as_json, map_dataset, margin_of, moved, optima_table, result, save_figures, set_of, versions
-from hilbo.report_figures import study_figures
+from hilbo.report_comparison import comparison_table
+from hilbo.report_figures import comparison_figures, study_figures
 from hilbo.report_people import people_of
 from hilbo.report_validation import HEAD, Validated, slug, validate
 from hilbo.study_folder import Material, StudyFolder
 
 __all__ = ["convergence_table", "table_1", "tolerance_table", "write_study"]
+
+_FEWEST = 3  # people for a comparison of rules: each is left out in turn
 
 
 def write_study(
@@ -34,10 +38,12 @@ def write_study(
     seed: int = 0,
     say=lambda text: None,
     analyses: Mapping[str, Analysis] | None = None,
+    comparison: bool = True,
 ) -> dict[str, Any]:
     """Write the results folder of `hilbo report`; returns the content of result.json.
 
-    `analyses`: of materials (by name) whose results are known already.
+    `analyses`: of materials (by name) whose results are known already. `comparison`: every rule of aggregation with
+    each person left out in turn, which is most of the work.
     """
     results, contents, sections = [], {}, []
     analyses = {} if analyses is None else analyses
@@ -52,8 +58,9 @@ def write_study(
         results.append(Results(material.name, found, validated, material.reference, material.reference_name))
         part = out / slug(material.name) if len(folder.materials) > 1 else out
         part.mkdir(exist_ok=True)
+        compared = _compared(found, seed, tell) if comparison else None
         tell("figures and tables")
-        content, section = _write_material(material, found, validated, part, seed)
+        content, section = _write_material(material, found, validated, compared, part, seed)
         contents[material.name] = content
         sections.append(section)
     claims = hypotheses(results)
@@ -82,7 +89,15 @@ def _validated(material: Material, folder: StudyFolder, seed, say) -> Validated 
     return validate(material.validation, folder.sets, material.study.responses, name, seed=seed)
 
 
-def _write_material(material, found: Analysis, validated, part: Path, seed):
+def _compared(found: Analysis, seed, say) -> dict[str, Any] | None:
+    """Every rule beside the study's; None where people are too few."""
+    if np.sum(found.cohort.counts() > 0) < _FEWEST:
+        return None
+    say("comparing the rules of aggregation")
+    return compare(found.study, found.cohort, seed)
+
+
+def _write_material(material, found: Analysis, validated, compared, part: Path, seed):
     """Files of one material; its content for result.json, and its section of the page."""
     study, people = found.study, people_of(found.study, found.aggregate)
     truth = material.reference if material.reference_name == "the truth" else None
@@ -102,6 +117,9 @@ def _write_material(material, found: Analysis, validated, part: Path, seed):
     }
     shares = predictive_shares(data, len(study.responses))
     pictures = save_figures(study_figures(found, material, shares), part)
+    if compared is not None:
+        tables["comparison"] = comparison_table(compared)
+        pictures += save_figures(comparison_figures(compared), part)
     if validated is not None:
         content["validation"] = report_validation.validation_content(validated)
         tables |= report_validation.validation_csv(validated)
@@ -118,6 +136,7 @@ def _write_material(material, found: Analysis, validated, part: Path, seed):
             "nrmse": moved_by_evidence(found),
         },
         "tolerance": tables["tolerance"].to_dict("records"),
+        "comparison": compared,
     }
     return content, _section(material, found, validated, tables, pictures, content)
 
@@ -207,6 +226,7 @@ def passivity_table(found: Analysis) -> pd.DataFrame:
 
 def _section(material, found, validated, tables, pictures: list[dict[str, str]], content) -> dict[str, Any]:
     """What the template needs of one material."""
+    compared = content["comparison"]
     study, counts = found.study, found.cohort.counts()
     by_name = {picture["name"]: picture for picture in pictures}
     section: dict[str, Any] = {
@@ -223,12 +243,37 @@ def _section(material, found, validated, tables, pictures: list[dict[str, str]],
         "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"])),
         "robust": "Under the hyperparameters of maximum evidence the optimum moves by"
-        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges.",
-        "comparison": None,
+        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges." + _without(found),
+        "comparison": None if compared is None else _comparison(compared),
     }
     if validated is not None:
         section["validation"] = report_validation.validation_section(validated, study.responses, [])
     return section
+
+
+def _comparison(compared):
+    """Recommendation and table of the rules."""
+    table = comparison_table(compared)
+    return {
+        "words": compared["recommendation"],
+        "table": _shown(table.drop(columns=["most_influential"]).dropna(axis=1, how="all")),
+    }
+
+
+def _without(found):
+    """Under which hyperparameters there is no tolerance interval at all."""
+    top = found.study.responses[-1]
+    names = [
+        name
+        for name, reading in (("fixed", found.fixed), ("optimised", found.optimised))
+        if all(interval is None for interval, _ in reading.tolerances.values())
+    ]
+    if not names:
+        return ""
+    return (
+        f' Under the {" and the ".join(names)} hyperparameters "{top}" is not the likeliest answer at the optimum, so'
+        " that there is no tolerance interval."
+    )
 
 
 def _words_of_table_1(material):

@@ -53,7 +53,7 @@ print("population optimum", best, "; individual optima away from it, median NRMS
 
 # %% [markdown]
 # ## Orientation and confidence
-# Eight categories, orientation and contrast. A few hundred of each person's answers are enough to see how people differ.
+# Eight categories, orientation and contrast. A hundred of each person's answers show how people differ.
 
 # %%
 path = Path("../shared/data/orientation_confidence.csv")

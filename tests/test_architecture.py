@@ -44,6 +44,10 @@ MATHS = {
     "ordinal_gp": {"kernels", "likelihoods", "laplace", "ep_corrected", "exact"},
     "hierarchical": {"kernels", "ordinal_gp"},
     "joint": {"kernels", "ordinal_gp"},
+    "counts": {"kernels", "likelihoods", "gaussian", "ordinal_gp"},
+    "learn_people": {"counts"},
+    "population_rules": {"aggregation", "hierarchical", "counts", "ordinal_gp"},
+    "leave_one_out": {"population_rules"},
     "hyperparameters": {"ordinal_gp", "newton", "evidence", "kernels"},
     "passivity_certificate": {"viscoelastic"},
     "passivity": {"viscoelastic", "passivity_certificate"},
@@ -118,6 +122,11 @@ MAY_IMPORT = MATHS | {
     "power": {"study", "simulate"},
     "console": set(),
     "cli_material": {"console", "characterise", "material_tables", "report_material"},
+    "event_log": {"session"},
+    "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm", "population_rules"},
+    "rule_words": {"config", "hierarchical"},
+    "comparison": {"study", "session", "joint", "leave_one_out", "rule_words"},
+    "plotting_population": {"plotting"},
     "event_log": {"live_state"},
     "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm"},
     "distributed": set(),
@@ -136,14 +145,22 @@ MAY_IMPORT = MATHS | {
     "cli_device": {"device_options", "device_tests", "device_screen", "device_words"},
 }
 MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material", "cli_session", "device_options", "cli_device"}
+MAY_IMPORT["report_comparison"] = {"report", "comparison", "plotting_population"}
 MAY_IMPORT["report_population"] = {"report", "report_people", "page", "batch_optimum"}
 MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["simulate_validation"] = {"report", "simulate", "validation"}
 MAY_IMPORT["report_validation"] = {"report", "page", "paper_tables", "plotting_validation"}
 MAY_IMPORT["report_power"] = {"report", "page", "power", "plotting_power"}
-MAY_IMPORT["report_figures"] = {"analysis", "study_folder", "plotting_study"}
+MAY_IMPORT["report_figures"] = {"analysis", "study_folder", "plotting_study", "plotting_population"}
 MAY_IMPORT["hypotheses"] = {"analysis", "report_validation"}
-MAY_IMPORT["report_study"] = {"hypotheses", "inference_data", "report_figures", "report_validation", "study_folder"}
+MAY_IMPORT["report_study"] = {
+    "hypotheses",
+    "inference_data",
+    "report_comparison",
+    "report_figures",
+    "report_validation",
+    "study_folder",
+}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
 MAY_IMPORT["cli_study"] = {"console", "power", "report_power", "report_study", "simulate_validation"}
 MAY_IMPORT["app"] = set(MAY_IMPORT)
@@ -151,7 +168,7 @@ MAY_IMPORT["cli_live"] = {"app", "doctor"}
 MAY_IMPORT["cli"] = set(MAY_IMPORT)
 MAY_IMPORT["__main__"] = {"cli"}
 
-PLOTTING = {"plotting", "plotting_mechanics", "plotting_power", "plotting_study", "plotting_validation"}
+PLOTTING = {"plotting", *(f"plotting_{of}" for of in ("mechanics", "population", "power", "study", "validation"))}
 ONLY_IN = {"matplotlib": PLOTTING, "serial": {"ports"}}
 WITHOUT_JAX = {
     "errors",

@@ -1,12 +1,15 @@
 """Simulated studies for planning: truths in closed form, prefixes that are studies of their own, and bad plans."""
 
+import json
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
 
-from hilbo import Study
+from hilbo import Study, cli
 from hilbo.errors import InputError
 from hilbo.power import Plan, one_study, power_table, simulate_power, summarise, top_probability
 from hilbo.report_power import enough
@@ -45,6 +48,37 @@ def test_summaries_of_errors_that_are_known():
 def test_plans_that_say_nothing_are_refused(plan):
     with pytest.raises(InputError, match="power: "):
         Plan(*plan, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (("--participants", "six"), "write whole numbers separated by commas"),
+        (("--preset", "nobody"), '--preset is "nobody"'),
+        (("--trials", "5,5"), "give different whole numbers"),
+    ],
+)
+def test_bad_options_write_nothing(capsys, monkeypatch, tmp_path, option, words):
+    monkeypatch.setattr(
+        sys, "argv", ["hilbo", "power", "hilbo/data/paper.toml", "--out", str(tmp_path / "out"), *option]
+    )
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == 2 and words in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.deep
+def test_the_command_says_what_it_cost(capsys, monkeypatch, tmp_path):
+    out = tmp_path / "out"
+    few = ["--participants", "2,3", "--trials", "6", "--studies", "2", "--jobs", "2", "--json"]
+    monkeypatch.setattr(sys, "argv", ["hilbo", "power", "hilbo/data/paper.toml", "--out", str(out), *few])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    content = json.loads(capsys.readouterr().out)
+    assert not stopped.value.code and content["jobs"] == 2 and content["seconds"] > 0 and content["seed"] == 0
+    assert len(pd.read_csv(out / "errors.csv")) == 4 and len(content["summary"]) == 2
+    page = (out / "report.html").read_text()
+    assert "on 2 cores" in page and page.count("data:image/png;base64,") == 1
 
 
 @pytest.mark.deep

@@ -1,0 +1,53 @@
+"""comparison.json, comparison.csv and figures: what `hilbo aggregate --compare` adds to a results folder."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hilbo.comparison import KNOWN, compare
+from hilbo.config import Study
+from hilbo.population_rules import rule_map
+from hilbo.report import save_figures
+from hilbo.report_people import as_json
+from hilbo.study import Cohort
+
+__all__ = ["comparison_table", "write_comparison"]
+
+_COLUMNS = ("method", "negative_log_density", "negative_log_density_error", "central_95", "central_95_error", "z2")
+
+
+def write_comparison(study: Study, cohort: Cohort, folder: Path, seed: int = 0) -> dict[str, Any]:
+    """Write the comparison of all rules; returns the content of comparison.json."""
+    from hilbo import plotting_population as plotting
+
+    content = compare(study, cohort, seed)
+    (folder / "comparison.json").write_text(as_json(content))
+    comparison_table(content).to_csv(folder / "comparison.csv", index=False)
+    found = rule_map(study.gp, cohort.trials, "bcm", inference=study.inference)
+    best = np.array([content["rules"]["bcm"]["optimum"][name] for name in study.space.names])
+    at = np.asarray(study.space.to_unit(best))
+    figures = {
+        "comparison": (plotting.rules_figure(content), "Every rule, each person left out", "Errors are by person."),
+        "reliability": (plotting.reliability_figure(content), "Reliability", "On the line: as often as predicted."),
+        "coverage": (
+            plotting.coverage_figure(study, found.predict, at, KNOWN),
+            "What the answers cover",
+            f"Hatched: the map's standard deviation is more than {KNOWN:g} of the prior's.",
+        ),
+    }
+    save_figures(figures, folder)
+    return content
+
+
+def comparison_table(content: dict[str, Any]) -> pd.DataFrame:
+    """A row for each rule."""
+    rows = []
+    for rule, found in content["rules"].items():
+        row = {"rule": rule} | {name: found.get(name) for name in _COLUMNS}
+        row |= {"covered": found.get("covered"), "optimum_sd": found.get("optimum_sd")} | found.get("optimum", {})
+        influence = found.get("influence") or {}
+        row["most_influential"] = max(influence, key=influence.get) if influence else None
+        rows.append(row | {"refused": found.get("refused")})
+    return pd.DataFrame(rows)
