@@ -265,14 +265,7 @@ class Session(eqx.Module):
 
     def ask(self) -> dict[str, float]:
         """The rendering to present next: parameter -> value in physical units."""
-        return dict(zip(self.step.names, self._asked().tolist(), strict=True))
-
-    def _asked(self) -> np.ndarray:
-        if self.proposal is None:
-            raise InputError(
-                f"Session: all {len(self.answers)} trials of the study are answered; nothing is left to ask."
-            )
-        return self.proposal
+        return dict(zip(self.step.names, _asked(self).tolist(), strict=True))
 
     def tell(self, response: str, at: Mapping[str, float] | None = None) -> "Session":
         """The next state, after the participant's answer (one of the study's responses) to the asked point.
@@ -282,10 +275,10 @@ class Session(eqx.Module):
         step = self.step
         if response not in step.responses:
             raise InputError(f'Session: "{response}" is no answer of this study; give one of {step.responses}.')
-        shown = self._asked() if at is None else np.array([at[name] for name in step.names])
+        shown = _asked(self) if at is None else np.array([at[name] for name in step.names])
         points = np.concatenate([self.points, shown[None, :]])
         answers = np.append(self.answers, step.responses.index(response))
-        return Session(self.study, self.plan, points, answers, step(points, answers), self.seed, step)
+        return _following(self, points, answers, step(points, answers))
 
     def posterior(self) -> Posterior:
         """The participant's posterior after the answers so far."""
@@ -295,6 +288,26 @@ class Session(eqx.Module):
         """The rendering with the largest posterior mean: parameter -> value in physical units."""
         physical = _best_physical(self.study, self.plan, self.posterior())
         return dict(zip(self.study.space.names, np.asarray(physical).tolist(), strict=True))
+
+
+# Functions, because equinox wraps a record's method anew at each use, which takes 30 us.
+
+
+def _asked(session) -> np.ndarray:
+    if session.proposal is None:
+        raise InputError(
+            f"Session: all {len(session.answers)} trials of the study are answered; nothing is left to ask."
+        )
+    return session.proposal
+
+
+def _following(session, points, answers, proposal) -> Session:
+    """A copy with other answers. The record's own constructor would go through the whole study again."""
+    following = object.__new__(Session)
+    kept = {name: getattr(session, name) for name in ("study", "plan", "seed", "step")}
+    for name, value in (kept | {"points": points, "answers": answers, "proposal": proposal}).items():
+        object.__setattr__(following, name, value)
+    return following
 
 
 @eqx.filter_jit
