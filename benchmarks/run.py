@@ -45,7 +45,7 @@ def main():
         return
     limit_cores(chosen.cores)
     found = measure(chosen.rounds)
-    print(json.dumps(found) if chosen.json else table(found))
+    print(json.dumps(found) if chosen.json else table(found) + floor_text(found))
 
 
 def limit_cores(cores):
@@ -214,7 +214,7 @@ def measure(rounds):
 
 
 def floors(rounds):
-    """Seconds per operation of this machine through XLA: exponentials, products, a dispatch."""
+    """Seconds per operation of this machine through XLA, and how many steps the tasks take."""
     import jax
     import jax.numpy as jnp
 
@@ -236,7 +236,61 @@ def floors(rounds):
     one = jnp.ones(())
     once(lambda: nothing(one))
     numbers["dispatch"] = min(once(lambda: nothing(one)) for _ in range(40 * rounds))
+    return numbers | parts(rounds) | counts()
+
+
+def parts(rounds):
+    """Seconds of what a fit consists of, within a compiled loop."""
+    import jax.numpy as jnp
+
+    from hilbo.linalg import cholesky, solve_lower
+    from hilbo.ordinal_gp import OrdinalTerms
+
+    study, _, _, _, first, _ = data()
+    terms = OrdinalTerms(study.gp.likelihood, first.q, first.mask)
+    numbers = {}
+    for n, repeats in ((25, 300), (600, 3)):
+        places = jnp.linspace(0.0, 1.0, n)
+        matrix = jnp.exp(-30.0 * (places[:, None] - places[None, :]) ** 2) + jnp.eye(n)
+        column, lower = jnp.ones((n, 1)), jnp.linalg.cholesky(matrix)
+        for name, body, start in (
+            ("factor", lambda m, k=matrix: 1e-3 * cholesky(m) + k, matrix),
+            ("solve", lambda c, f=lower: 1e-3 * solve_lower(f, c) + 1.0, column),
+            ("solves", lambda m, f=lower, k=matrix: 1e-3 * solve_lower(f, m) + k, matrix),
+            ("product", lambda m, k=matrix: 1e-3 * (k @ m) + k, matrix),
+        ):
+            numbers[f"{name} {n}"] = within(body, start, repeats, rounds)
+    numbers["terms 25"] = within(lambda e: 0.9 * e + 1e-9 * sum(terms(e)), jnp.linspace(-1.0, 1.0, 25), 300, rounds)
     return numbers
+
+
+def within(body, start, repeats, rounds):
+    import jax
+
+    many = jax.jit(lambda x: jax.lax.fori_loop(0, repeats, lambda _, value: body(value), x))
+    once(lambda: many(start))
+    return min(once(lambda: many(start)) for _ in range(2 * rounds)) / repeats
+
+
+def counts():
+    """Newton steps of the fits, and evaluations of the search for hyperparameters, as many for each start as for the
+    best."""
+    import equinox as eqx
+    import jax
+    import numpy as np
+
+    from hilbo.hyperparameters import maximise_evidence
+    from hilbo.ordinal_gp import Trials, fit
+
+    study, _, _, people, first, trials = data()
+    pooled = Trials.from_arrays(*(np.concatenate(part) for part in zip(*people, strict=True)), 600)
+    learned = eqx.filter_jit(jax.vmap(lambda one: maximise_evidence(study.gp, one, starts=4)))(trials)
+    return {
+        "steps 25": int(fit(study.gp, first).certificate.iterations),
+        "steps 600": int(fit(study.gp, pooled).certificate.iterations),
+        "steps 600, ep": int(fit(study.gp, pooled, inference="ep").certificate.iterations),
+        "evaluations": 4 * int(np.sum(learned.steps)),
+    }
 
 
 def table(found):
@@ -294,20 +348,48 @@ def document(runs, rounds):
 def floor_text(run):
     """What the operations that cannot be skipped take, beside what the tasks take."""
     cost, tasks = run["floors"], run["tasks"]
+    step = cost["terms 25"] + cost["factor 25"] + 2 * cost["solve 25"]
+    fit = cost["steps 25"] * step + cost["factor 25"] + cost["solves 25"]
+    live = cost["dispatch"] + fit + 27 * 625 * 25 * cost["product 26 x 25 x 5,000, float32"]
     cohort = {
-        kind: 1e3 * 24 * 20_000 * (25 * cost[f"exp, {kind}"] + 26 * 25 * cost[f"product 26 x 25 x 5,000, {kind}"])
+        kind: 24 * (fit + 20_000 * (25 * cost[f"exp, {kind}"] + 26 * 25 * cost[f"product 26 x 25 x 5,000, {kind}"]))
         for kind in ("float32", "float64")
     }
-    pooled = 1e3 * 20_000 * 600 * (cost["exp, float64"] + 601 * cost["product 600 x 600 x 2,000, float64"])
+    large = cost["steps 600"] * cost["factor 600"] + cost["solves 600"]
+    screened = 20_000 * 600 * (cost["exp, float32"] + cost["product 600 x 600 x 2,000, float32"])
+    everywhere = 20_000 * 600 * (cost["exp, float64"] + 601 * cost["product 600 x 600 x 2,000, float64"])
+    expanded = 3 * step + cost["factor 25"] + cost["solves 25"] + 6 * cost["product 25"]
+    spread = cost["steps 600, ep"] * (cost["factor 600"] + cost["solves 600"] + cost["product 600"])
     rows = [
-        ("cohort", "24 x 20,000 x (25 exponentials, 26 x 25 products), float32", cohort["float32"]),
-        ("cohort, float64", "the same, float64", cohort["float64"]),
-        ("pooled, all", "20,000 x 600 x (1 exponential, 601 products), float64", pooled),
+        ("live step", 0, f"a call; {cost['steps 25']} Newton steps at 25 answers; means on the lattice, float32", live),
+        ("session", 0, "20 such steps", 20 * live),
+        ("cohort", 0, "24 fits; 24 x 20,000 x (25 exponentials, 26 x 25 products), float32", cohort["float32"]),
+        ("cohort, float64", 0, "the same, float64", cohort["float64"]),
+        (
+            "pooled",
+            0,
+            f"{cost['steps 600']} factors of 600 x 600; 20,000 x 600 exponentials, float32",
+            large + screened,
+        ),
+        ("pooled", 1, f"{cost['steps 600, ep']} sweeps: a factor, 600 solves, a product", large + spread + screened),
+        ("pooled, all", 0, "20,000 x 600 x (1 exponential, 601 products), float64", large + everywhere),
+        (
+            "hyperparameters",
+            0,
+            f"{cost['evaluations']} evaluations: 3 Newton steps, a factor, 25 solves, 6 products of 25 x 25",
+            cost["evaluations"] * expanded,
+        ),
     ]
-    lines = ["", "| task | operations that every point needs | floor (ms) | hilbo (ms) |", "|---|---|---:|---:|"]
-    lines += [f"| {key} | {what} | {floor:.1f} | {1e3 * tasks[key]['median'][0]:.1f} |" for key, what, floor in rows]
-    dispatch = 1e6 * cost["dispatch"]
-    return "\n".join([*lines, "", f"A call of a compiled function that does nothing takes {dispatch:.1f} us."]) + "\n"
+    lines = [
+        "",
+        "| task | inference | what it cannot do without | floor (ms) | hilbo (ms) | hilbo / floor |",
+        "|---|---|---|---:|---:|---:|",
+    ]
+    for key, which, what, floor in rows:
+        took, name = tasks[key]["median"][which], ("Laplace", "EP")[which]
+        lines.append(f"| {key} | {name} | {what} | {1e3 * floor:.2f} | {1e3 * took:.2f} | {took / floor:.1f} |")
+    lines += ["", f"A call of a function that does nothing takes {1e6 * cost['dispatch']:.1f} us."]
+    return "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

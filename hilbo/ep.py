@@ -18,7 +18,7 @@ Rasmussen & Williams' (3.65) without its differences of large terms, and without
 * Coordinates as in `laplace`: eta = R w, R the eigenvector root of K, and only I + R'TR >= 1 is factorised. K may be
   singular (the same stimulus asked twice); nothing is added to it.
 * The search begins at Laplace's mode, which is near, and with S = K - K C K, which needs no root. Where it does not end
-  below the tolerance it begins anew with R and from the prior, or from `start`.
+  below the tolerance it begins anew with R and from the prior; and where S has lost digits it goes on with R.
 * For given v the means are the maximum of a concave function, so that only v is in need of a careful search. Far from
   the fixed point damped parallel updates, near it Newton's steps in (m, v), the mean eliminated: n unknowns. A Newton
   step that does not halve the mismatch sends the search back to updates, which are damped more the longer they take.
@@ -139,21 +139,33 @@ def fixed_point(terms, covariance, start, max_steps):
     """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
+    def with_root(terms, covariance, begin):
+        root, changed = square_root(covariance)
+        return _searched(terms, covariance, root, begin(root), max_steps, changed)
+
     def safe(arrays, covariance, start):
         terms = eqx.combine(arrays, rest)
-        root, changed = square_root(covariance)
-        begun = _begin(terms, covariance, root, start)
-        return _searched(terms, covariance, root, begun, max_steps, changed)
+        return with_root(terms, covariance, lambda root: _begin(terms, covariance, root, start))
 
     def quick(arrays, covariance, start):
         terms = eqx.combine(arrays, rest)
         near = jnp.zeros_like(covariance[0]) if start is None else start
         eta = plain_mode(_AtPoints(terms), covariance, near, _QUICK_STEPS).eta
         begun = _begin(terms, covariance, None, _AtPoints(terms)(eta)[1])
-        steps = min(max_steps, _QUICK_STEPS)
-        found = _searched(terms, covariance, None, begun, steps, jnp.zeros_like(covariance[0, 0]))
-        done = found[2].residual <= found[2].tolerance
-        return jax.lax.cond(done, lambda *_: found, safe, arrays, covariance, start)
+        none = jnp.zeros_like(covariance[0, 0])
+        found = _searched(terms, covariance, None, begun, min(max_steps, _QUICK_STEPS), none)
+        mean, variance, end = found
+        met = end.residual <= end.tolerance
+        _, _, precision = terms(mean, variance)
+        # s = K - KCK errs by eps K, and the cavity's variance by this share:
+        blur = jnp.finfo(none.dtype).eps * jnp.max(jnp.diagonal(covariance) * precision * (1.0 + precision * variance))
+
+        def anew(root):
+            prior = _begin(terms, covariance, root, None)
+            return jax.tree.map(lambda a, b: jnp.where(met, a, b), (mean, variance), prior)
+
+        done = met & (blur <= 0.1 * end.tolerance)
+        return jax.lax.cond(done, lambda: found, lambda: with_root(terms, covariance, anew))
 
     return one_at_a_time(quick, safe)(arrays, covariance, start)
 
@@ -174,7 +186,9 @@ def _searched(terms, covariance, root, begun, max_steps, changed):
     begin = _Search(*begun, largest, jnp.zeros_like(largest), largest, basin, count, count)
 
     def unfinished(search):
-        return (search.steps < max_steps) & ~(search.residual <= search.tolerance) & ~jnp.isnan(search.mismatch)
+        # One step at least: Laplace's mode may be the fixed point, but only to the digits of its own variances.
+        done = (search.residual <= search.tolerance) & (search.steps > 1)
+        return (search.steps < max_steps) & ~done & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
     return end.mean, end.variance, _Found(end.residual, end.tolerance, end.steps, changed)
@@ -247,7 +261,7 @@ def _advance(terms, covariance, root, search):
     share = 0.5 / (1 + search.updates // 8).astype(v.dtype)
     target = matched - cavity * (natural - sites.precision * matched)
     dm, dv = jax.lax.cond(
-        newton & ~(residual <= tolerance),  # the end needs no further step
+        newton & ~((residual <= tolerance) & (search.steps > 0)),  # the end needs no further step
         lambda: _newton_step(sites, posterior, v, matched - tilted, cavity - v),
         lambda: (jnp.zeros_like(m), jnp.zeros_like(v)),
     )
