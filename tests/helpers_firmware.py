@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 
 __all__ = [
-    "CAUSES", "CONFIG", "CORE", "DOCUMENT", "EXPONENTIALS", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES", "TYPES", "Device",
-    "build", "cobs", "compiler", "decode", "frame", "full_set", "library", "pack", "parameters", "schema", "unpack",
+    "CAUSES", "CONFIG", "CORE", "DOCUMENT", "EXPONENTIALS", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES",
+    "TYPES", "Device", "build", "cobs", "compiler", "decode", "frame", "full_set", "library",
+    "pack", "parameters", "schema", "unpack",
 ]  # fmt: skip
 
 FIRMWARE = Path(__file__).parents[1] / "firmware"
