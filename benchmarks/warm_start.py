@@ -1,12 +1,13 @@
 """How many trials a warm start saves: new simulated participants with and without the map of an earlier study.
 
-    python benchmarks/warm_start.py [--people 100] [--markdown]
+    python benchmarks/warm_start.py [--people 100] [--studies 10]
 
-A map is made from 24 simulated participants of the preset `paper`; as many new people as asked for, drawn from the same
-population, then answer the study's trials, chosen cold (5 space-filling trials, then UCB) or from the map (after some
-space-filling trials or none). After every trial each person's best rendering is read from their own answers under the
-study's prior, as aggregation does: the candidate with the highest posterior mean. It is judged by the truth that was
-simulated: the probability that this person would answer "close" to it, and its distance from their optimum.
+Each of some earlier studies makes a map from 24 simulated participants of the preset `paper`; new people, drawn from
+the same population and dealt among the studies, then answer 25 trials, chosen cold (5 space-filling trials, then UCB)
+or from the map (after some space-filling trials or none). After every trial each person's best rendering is read from
+their own answers under the study's prior, as aggregation does: the candidate with the highest posterior mean. It is
+judged by the truth that was simulated: the probability that this person would answer "close" to it, and its distance
+from their optimum.
 """
 
 import argparse
@@ -67,47 +68,63 @@ def reached(curve, target):
     return None if first >= len(curve) else first + 1
 
 
+def studied(study, seed, count, fillings, share):
+    """One earlier study and the new people after it: start -> what `judged` says of them."""
+    preset, points = PRESETS["paper"], search_points(study.space, seed)
+    earlier = simulate_study(study, people(study, preset, 24, seed), seed)
+    posteriors = jax.vmap(lambda t: fit(study.gp, t, inference=study.inference, throw=False))(earlier)
+    mean, variance = population(posteriors, points)
+    new = people(study, preset, count, 1000 + seed)
+    keys = jax.random.split(jax.random.key(2000 + seed), count)
+    filling = np.stack([study.space.latin_hypercube(5, 3000 + seed * count + i) for i in range(count)])
+    plan = design(study, seed)
+    everybody = jnp.broadcast_to(points[jnp.argmax(mean)], (count, 1, study.space.dim))
+    found = {"the map's own best": judged(new, everybody)}
+    found["cold"] = judged(new, sessions(study, new, jnp.asarray(filling), keys, plan, points, None)[1])
+    warm = warm_start(study, points, mean, variance, "simulated", share)
+    for number in fillings:
+        best = sessions(study, new, jnp.asarray(filling[:, :number]), keys, plan, points, warm)[1]
+        found[f"map, {number} space-filling trials"] = judged(new, best)
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--people", type=int, default=100)
-    parser.add_argument("--earlier", type=int, default=24)
-    parser.add_argument("--share", type=float, nargs="*", default=[0.5])
-    parser.add_argument("--filling", type=int, nargs="*", default=[0, 2, 5])
+    parser.add_argument("--studies", type=int, default=10, help="earlier studies, among which the people are dealt")
+    parser.add_argument("--share", type=float, default=0.5)
+    parser.add_argument("--filling", type=int, nargs="*", default=[0, 2])
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     study = Study.load(Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml")
-    preset = PRESETS["paper"]
-    earlier = simulate_study(study, people(study, preset, args.earlier, args.seed), args.seed)
-    posteriors = jax.vmap(lambda t: fit(study.gp, t, inference=study.inference, throw=False))(earlier)
-    points = search_points(study.space, args.seed)
-    mean, variance = population(posteriors, points)
-    new = people(study, preset, args.people, args.seed + 1)
-    keys = jax.random.split(jax.random.key(args.seed + 2), args.people)
-    plan = design(study, args.seed)
-    filling = np.stack([study.space.latin_hypercube(5, 1000 + i) for i in range(args.people)])
-    _, best = sessions(study, new, jnp.asarray(filling), keys, plan, points, None)
-    cold = judged(new, best)
-    target = cold["close"].mean(0)[-1]
-    print(f"cold, 25 trials: P(close) {target:.3f}, NRMSE {np.median(cold['nrmse'][:, -1]):.3f} (median)")
-    heads = ("start", "space-filling", "P(close) after 5", "10", "15", "25", "median NRMSE", "trials to the cold 25's")
-    print("| " + " | ".join((*heads, "gain there, paired")) + " |")
-    print("|---|---|---|---|---|---|---|---|---|")
-    row("cold", 5, cold, cold)
-    everybody = jnp.broadcast_to(points[jnp.argmax(mean)], (args.people, 1, study.space.dim))
-    same = judged(new, everybody)
-    print(
-        f"the map's own best, felt by nobody: P(close) {same['close'].mean():.3f}, NRMSE {np.median(same['nrmse']):.3f}"
+    parts = []
+    for k in range(args.studies):
+        parts.append(studied(study, args.seed + k, args.people // args.studies, args.filling, args.share))
+        print(f"study {k + 1} of {args.studies}", file=sys.stderr, flush=True)
+    merged = {
+        name: {key: np.concatenate([part[name][key] for part in parts]) for key in ("close", "nrmse")}
+        for name in parts[0]
+    }
+    alone = merged.pop("the map's own best")
+    close, miss = alone["close"].mean(), np.median(alone["nrmse"])
+    print(f"The maps' own bests, felt by nobody: P(close) {close:.3f}, median NRMSE {miss:.3f}.\n")
+    heads = (
+        "start",
+        "P(close) after 5",
+        "10",
+        "15",
+        "25",
+        "median NRMSE",
+        "trials to the cold 25's",
+        "gain there, paired",
     )
-    for share in args.share:
-        warm = warm_start(study, points, mean, variance, "simulated", share)
-        for count in args.filling:
-            _, best = sessions(study, new, jnp.asarray(filling[:, :count]), keys, plan, points, warm)
-            row(f"map, p = {share:g}", count, judged(new, best), cold)
-            sys.stdout.flush()
+    print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads))
+    for name, found in merged.items():
+        row(name, found, merged["cold"])
 
 
-def row(name, count, found, cold):
+def row(name, found, cold):
     target = cold["close"].mean(0)[-1]
     curve = found["close"].mean(0)
     error = found["close"].std(0, ddof=1) / np.sqrt(len(found["close"]))
@@ -116,7 +133,7 @@ def row(name, count, found, cold):
     miss = np.median(found["nrmse"][:, -1])
     gain = found["close"][:, (when or TRIALS) - 1] - cold["close"][:, -1]
     paired = f"{gain.mean():+.3f} ± {gain.std(ddof=1) / np.sqrt(len(gain)):.3f}"
-    print(f"| {name} | {count} | " + " | ".join(cells) + f" | {miss:.3f} | {when or '> 25'} | {paired} |")
+    print(f"| {name} | " + " | ".join(cells) + f" | {miss:.3f} | {when or '> 25'} | {paired} |")
 
 
 if __name__ == "__main__":

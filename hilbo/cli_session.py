@@ -28,6 +28,7 @@ def plan(
         list[str] | None, typer.Option("--from", help="result.json of the optimisation; MATERIAL=PATH for several.")
     ] = None,
     trials: Annotated[Path | None, typer.Option(help="For a validation: the table or logs it was made from.")] = None,
+    material: Annotated[list[str] | None, typer.Option(help="Only this material; may be repeated.")] = None,
     source: Annotated[str, typer.Option(help="For a validation: aggregate or individual.")] = "aggregate",
     session: Annotated[str, typer.Option(help="Label of the session in tables and names of logs.")] = "",
     reissue: Annotated[str | None, typer.Option(help="OLD=NEW: give NEW the row of OLD in the plan --out.")] = None,
@@ -49,18 +50,22 @@ def plan(
         raise InputError(f'--kind is "{kind}"; it must be one of {", ".join(PHASES[1:])}.')
     if source not in ("aggregate", "individual"):
         raise InputError(f'--source is "{source}"; it must be aggregate or individual.')
+    materials = tuple(material or chosen.materials)
+    for name in materials:
+        chosen.material(name)  # refuses what is none
     people = _people(participants, names, "P" if kind == "optimisation" or source == "individual" else "V")
     _check_free(out, force)
     with progress() as say:
         sets = None
         if kind != "optimisation":
-            sets = _sets(chosen, kind, results_ or [], trials, source, people, say)
+            sets = _sets(chosen, kind, _by_material(materials, results_ or []), trials, source, people, say)
         label = session or {"optimisation": "1", "validation": "2", "aggregate-best": "3"}[kind]
         made = make_plan(
             chosen,
             people,
             seed,
             kind,
+            materials=materials,
             session=label,
             sets=sets,
             source=source if kind == "validation" else None,
@@ -128,14 +133,13 @@ def _people(count, names, letter) -> list[str]:
     return [f"{letter}{i + 1:0{width}d}" for i in range(count)]
 
 
-def _sets(study, kind, given, trials, source, people, say) -> dict[str, Any]:
+def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
     """Material ("" without) -> the sets to compare."""
     from hilbo import plan_sets
     from hilbo.log_tables import read_log_trials
     from hilbo.study import cohort_of
     from hilbo.tables import read_trials
 
-    paths = _by_material(study, given)
     found = {}
     for material, path in paths.items():
         here = study.material(material) if material else study
@@ -155,18 +159,15 @@ def _sets(study, kind, given, trials, source, people, say) -> dict[str, Any]:
     return found
 
 
-def _by_material(study, given) -> dict[str, Path]:
+def _by_material(materials, given) -> dict[str, Path]:
     if not given:
         raise InputError("plan: give --from result.json, of which the sets are made.")
-    if not study.materials:
-        if len(given) > 1:
-            raise InputError("plan: the study has no [materials]; give one --from.")
-        return {"": Path(given[0])}
+    if len(given) == 1 and len(materials) <= 1 and "=" not in given[0]:
+        return {"".join(materials): Path(given[0])}
     pairs = [text.partition("=") for text in given]
-    if sorted(name for name, _, _ in pairs) != sorted(study.materials):
-        raise InputError(
-            f"plan: give --from MATERIAL=result.json for each of the study's materials: {', '.join(study.materials)}."
-        )
+    if sorted(name for name, _, _ in pairs) != sorted(materials) or not materials:
+        names = ", ".join(materials) or "none, so that one --from result.json is all"
+        raise InputError(f"plan: give --from MATERIAL=result.json once for each material ({names}).")
     return {name: Path(path) for name, _, path in pairs}
 
 

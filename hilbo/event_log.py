@@ -76,7 +76,7 @@ class EventLog:
             raise InputError(f"{path}: cannot be opened ({error.strerror}); check the path.") from error
         try:
             _lock(file, path)
-            content = path.read_bytes()
+            content = _content(file)
             header, events, whole, dropped = _parsed(content, path)
             state = _folded(path, study, header, events)
         except BaseException:
@@ -249,11 +249,20 @@ def _sync_folder(folder):
         os.close(handle)
 
 
+def _content(file) -> bytes:
+    os.lseek(file, 0, os.SEEK_SET)
+    pieces = []
+    while piece := os.read(file, 2**20):
+        pieces.append(piece)
+    return b"".join(pieces)
+
+
 def _lock(file, path):
     try:
         if os.name == "nt":
             import msvcrt
 
+            os.lseek(file, 2**30, os.SEEK_SET)  # a byte that no log has: readers are not to be locked out
             msvcrt.locking(file, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
         else:
             import fcntl

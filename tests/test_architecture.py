@@ -96,6 +96,7 @@ MAY_IMPORT = MATHS | {
     "live_session": {"live_state"},
     "live_views": {"live_session"},
     "live_choice": {"live_state", "session", "acquisition", "warm_start"},
+    "logged_session": {"event_log", "live_choice", "live_session"},
     "warm_start": {"session", "config"},
     "stopping": {"live_state", "session"},
     "study_plan": {"config", "counterbalance", "live_records"},

@@ -70,7 +70,9 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
         (("--participants", 2, "--kind", "dance"), '--kind is "dance"'),
         (("--participants", 2, "--kind", "validation"), "give --from result.json"),
         (("--participants", 2, "--kind", "validation", "--from", "none.json"), "none.json: cannot be read"),
+        (("--participants", 2, "--kind", "validation", "--from", "a", "--from", "b"), "once for each material (none"),
         (("--names", "P1,P1"), "each once"),
+        (("--names", "P1", "--material", "foam"), "materials.foam is not in the study"),
         (("--reissue", "P1=P2"), "is no plan that can be read"),
     ],
 )
@@ -142,3 +144,17 @@ def test_from_logs_to_a_validation_plan(hilbo, tmp_path):
     assert code == 2 and "invite people who are not" in err
     code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables", "--force")
     assert code == 0, err
+
+
+def test_a_plan_of_one_material_or_of_all(hilbo, tmp_path):
+    materials = "[materials.foam]\n[materials.soft]\n[materials.hard]\n"
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6) + materials)
+    code, _, err = hilbo("plan", "study.toml", "--participants", 4, "--out", "all.json")
+    assert code == 0 and "balance is exact at multiples of 6 participants" in err
+    assert hilbo("plan", "study.toml", "--participants", 4, "--material", "soft", "--out", "one.json")[0] == 0
+    for name, count in (("all", 3), ("one", 1)):
+        plan = json.loads((tmp_path / f"{name}.json").read_text())
+        assert [len(row["header"]["blocks"]) for row in plan["participants"]] == [1 + count] * 4
+    given = ("--kind", "aggregate-best", "--from", "foam=a.json", "--from", "soft=b.json")
+    code, _, err = hilbo("plan", "study.toml", "--participants", 4, *given)
+    assert code == 2 and "once for each material (foam, soft, hard)" in err

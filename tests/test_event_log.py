@@ -79,6 +79,7 @@ def test_a_log_cut_anywhere_resumes_to_the_same_next_trial(tmp_path_factory, dri
         kept = driven.events[: lines - 1]
         assert log.state == LiveSession.fold(STUDY, driven.header, kept)
         assert bool(log.dropped) == (whole[:cut][-1:] != b"\n")
+        assert path.read_bytes() == whole[: whole[:cut].rfind(b"\n") + 1]
         following = driven.events[lines - 1] if lines - 1 < len(driven.events) else None
         if following is not None and following.kind == "propose":
             assert live.propose(log.state, CHOOSER, following.time) == following

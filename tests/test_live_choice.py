@@ -10,6 +10,7 @@ from hilbo import live_session as live
 from hilbo.errors import InputError
 from hilbo.live_choice import APART, LiveChooser
 from hilbo.live_session import Block, LiveSession
+from hilbo.logged_session import LoggedSession
 from hilbo.session import search_points
 from hilbo.stopping import consistency, minutes_left, trust_of
 from hilbo.warm_start import informed, warm_start
@@ -115,12 +116,49 @@ def test_the_informed_posterior_is_the_committee_of_map_and_answers():
     np.testing.assert_allclose(mu, (mean / before + own_mean / own_variance) / precision, rtol=1e-8, atol=1e-12)
 
 
-def test_stopping_measures(chooser):
+def begun(chooser):
     state = start()
-    assert trust_of(state, 0) is None
-    assert minutes_left(state) == pytest.approx(6 * 1.5 * 8 / 60)
     for number, response in enumerate(ANSWERS[:4]):
         state = told(asked(state, chooser), response, at=20.0 * number)
+    return state
+
+
+def test_pace_and_consistency(chooser):
+    assert minutes_left(start()) == pytest.approx(6 * 1.5 * 8 / 60)
+    state = begun(chooser)
+    assert minutes_left(state) == pytest.approx(2 * 20 / 60)
+    assert consistency(state).pairs == 0
+    state = asked(state.after(live.repeat(state, 1.0, 3)), chooser)
+    state = told(state, "similar")
+    assert consistency(state).__dict__ == {"pairs": 1, "alike": 0, "distance": 1.0}  # "similar" after "close"
+
+
+def test_a_logged_session_is_a_session_and_resumes(tmp_path):
+    head = msgspec.structs.replace(header(warm=1), seed=7)
+    session, asked_for = Session.start(STUDY, seed=7), []
+    for part in (3, 10):
+        with LoggedSession.open(tmp_path, STUDY, head) as logged:
+            for _ in range(part):
+                point = logged.ask()
+                assert logged.ask() == point
+                if point is None:
+                    break
+                if logged.state.pending.block == 1:
+                    asked_for.append(point)
+                    assert point == session.ask()
+                    session = session.tell(ANSWERS[len(asked_for) - 1])
+                logged.tell(ANSWERS[len(asked_for) - 1])
+    assert len(asked_for) == 6 and logged.state.screen == "done"
+    with pytest.raises(InputError, match="begun with another seed"):
+        LoggedSession.open(tmp_path, STUDY, header(warm=1))
+    with LoggedSession.open(tmp_path, STUDY, head) as logged, pytest.raises(InputError, match="call ask"):
+        logged.tell("close")
+
+
+@pytest.mark.deep
+def test_trust_in_the_best_rendering(chooser):
+    state = begun(chooser)
+    assert trust_of(start(), 0) is None
     found = trust_of(asked(state, chooser), 0)
     assert found is not None and 0 < found.top < 1 and 0 <= found.movement < 1
     session = Session.start(STUDY)
@@ -139,11 +177,6 @@ def test_stopping_measures(chooser):
         np.sqrt(np.mean((np.array(list(session.tell(r).best().values())) - best) ** 2)) for r in STUDY.responses
     ]  # the box is the unit square
     assert found.movement == pytest.approx(float(np.dot(chances, moved)), abs=1e-3)
-    assert minutes_left(state) == pytest.approx(2 * 20 / 60)
-    assert consistency(state).pairs == 0
-    state = asked(state.after(live.repeat(state, 1.0, 3)), chooser)
-    state = told(state, "similar")
-    assert consistency(state).__dict__ == {"pairs": 1, "alike": 0, "distance": 1.0}  # "similar" after "close"
 
 
 def test_several_materials_have_studies_of_their_own():

@@ -181,7 +181,12 @@ def test_an_answered_trial_can_be_repeated_and_does_not_count():
     assert repeated.repeats == trial.id and repeated.renderings == trial.renderings
     assert repeated.data["phase"] == "repeat"
     driver.do("answer", 0)
-    assert len(driver.state.answers(1)) == 3
+    driver.do("undo", 0)
+    assert driver.state.trial(repeated.id).status == "undone" and driver.state.pending.repeats is None
+    driver.do("answer", 0)
+    assert driver.state.pending.repeats == trial.id
+    driver.do("answer", 0)
+    assert len(driver.state.answers(1)) == 4
     driver.finish()
     assert len(driver.state.answers(1)) == 6
 
