@@ -67,6 +67,21 @@ def press(experimenter, command, reason=None):
         experimenter.click("#sure button[value=yes]")
 
 
+def until(window, expression):
+    """Waits for what is true in a page; pages allow no waiting by a script of others."""
+    end = time.monotonic() + PATIENCE
+    while not window.evaluate(expression):
+        assert time.monotonic() < end, expression
+        window.wait_for_timeout(20)
+
+
+def until_logged(live, window, count):
+    end = time.monotonic() + PATIENCE
+    while len(live.events("answer")) < count:
+        assert time.monotonic() < end
+        window.wait_for_timeout(50)
+
+
 def until_answered(participant, count):
     end = time.monotonic() + PATIENCE
     while participant.answered < count:
@@ -108,11 +123,11 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     trial = window.evaluate("trial")
     for _ in range(3):
         window.keyboard.press("1")
-    window.wait_for_function("localStorage.getItem('hilbo.answer') !== null")
+    until(window, "localStorage.getItem('hilbo.answer') !== null")
     window.wait_for_timeout(300)
     window.unroute("**/api/participant/answer")
     window.reload()  # as closed and opened again
-    window.wait_for_function("localStorage.getItem('hilbo.answer') === null")
+    until(window, "localStorage.getItem('hilbo.answer') === null")
     given = [event for event in live.events("answer") if f"tag:{event.data['id']}." in trial]
     assert len(given) == 1
     window.wait_for_selector("#options:visible, #go:visible")
@@ -123,10 +138,9 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     window.wait_for_selector("#options:visible")
     for _ in range(3):
         window.keyboard.press("2")
-    while len(live.events("answer")) == count:
-        window.wait_for_timeout(50)
+    until_logged(live, window, count + 1)
     window.unroute("**/api/participant/answer")
-    window.wait_for_function("localStorage.getItem('hilbo.answer') === null")
+    until(window, "localStorage.getItem('hilbo.answer') === null")
     assert len(live.events("answer")) == count + 1
 
 
@@ -151,6 +165,6 @@ def test_a_second_window_takes_over_and_the_first_says_so(pages):
     first = participant.window
     second = first.context.new_page()
     second.goto(live.participant.address + "/participant")
-    first.wait_for_function("document.body.dataset.phase === 'over'")
+    until(first, "document.body.dataset.phase === 'over'")
     assert "another window" in first.inner_text("#title")
     second.wait_for_selector("#go:visible")

@@ -76,6 +76,7 @@ class Hub:
         self._lock: asyncio.Lock | None = None
         self._tasks: list[asyncio.Task] = []
         self._absent: float | None = None
+        self._came = 0.0
         self._map: tuple[str, Any] | None = None
         self._drawing = ThreadPoolExecutor(1, "hilbo-map")
         self._device_was = ""
@@ -139,6 +140,8 @@ class Hub:
                 raise
             self.alert = None
             self.recent.appendleft(event)
+            if event.kind == "answer":
+                self.runner.clock = {"came": self._came, "logged": time.perf_counter(), "fsync": self.log.sync_s}
         if not mine and self.runner.key() != before:
             self.runner.restart()
         self.publish()
@@ -166,8 +169,7 @@ class Hub:
             found = state.trial(trial)
             if found.values is None and found.presentation != presentation:
                 raise RefusedError("old-trial", "This trial has been begun again since.")
-            if state.paused is not None and found.values is None:
-                raise RefusedError("paused", "There is a break.")
+            self._came = came
             return live_session.answer(state, trial, message.client, message.answers, at, browser=browser)
 
         came = time.perf_counter()
@@ -175,8 +177,6 @@ class Hub:
             event = await self.commit(make)
         except RefusedError as error:
             raise NotNowError(str(error)) from None
-        if event is not None:
-            self.runner.clock = {"came": came, "logged": time.perf_counter(), "fsync": self.log.sync_s}
         return {"accepted": message.trial, "again": event is None}
 
     async def press(self, what: str, message: Press, page: str | None) -> None:

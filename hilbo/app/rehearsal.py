@@ -190,13 +190,14 @@ def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
     def watch():
         return experimenter.evaluate("fetch('/api/experimenter').then(r => r.json())")
 
-    fingers = {True: "finger sine", False: "finger rest"}
     pressing = [False]
 
     def feel(on):
-        if on != pressing[0]:
-            pressing[0] = on
-            finger.tell(fingers[on])
+        if on and not pressing[0]:
+            finger.tell("finger sine")
+        elif pressing[0] and not on:
+            _let_go(finger, watch)
+        pressing[0] = on
 
     window = program.new_context(viewport={"width": 1280, "height": 800}).new_page()
     mishaps: list[str] = []
@@ -241,3 +242,14 @@ def _cleared(experimenter) -> bool:
         return False
     experimenter.evaluate("command('clear')")
     return True
+
+
+def _let_go(finger, watch) -> None:
+    """The simulated finger leaves the handle out of contact: it taps, and rests where it is away."""
+    for _ in range(50):
+        finger.tell("finger tap")
+        time.sleep(0.28)
+        finger.tell("finger rest")
+        time.sleep(0.15)
+        if ["Contact", "no"] in watch()["device"]["rows"]:
+            return

@@ -86,8 +86,8 @@ class Runner:
         except RefusedError:  # the state has changed meanwhile, and with it what is to be done
             await asyncio.sleep(_SOON)
             self._again(stop)
-        except (OSError, ValueError, RuntimeError) as error:
-            self.trouble = str(error)
+        except Exception as error:  # whatever it is, the experimenter is told, and it is tried again
+            self.trouble = str(error) or type(error).__name__
             self._at("trouble")
             await asyncio.sleep(_LATER)
             self._again(stop)
@@ -131,7 +131,7 @@ class Runner:
             return
         steps = live_session.steps_of(hub.state, trial)
         await self._device_ready()
-        loading = asyncio.ensure_future(self._load(trial, _next_side(steps, 0), stop))
+        loading = self._loading(trial, _next_side(steps, 0), stop)
         try:
             await asyncio.shield(hub.warm)  # a long arithmetic start, and a device that renders, do not go together
             while not hub.begun:
@@ -146,7 +146,7 @@ class Runner:
                 if show in trial.renderings:
                     await self._arrived(loading)
                 elif i and loading.done():
-                    loading = asyncio.ensure_future(self._load(trial, _next_side(steps, i), stop))
+                    loading = self._loading(trial, _next_side(steps, i), stop)
                 await self._step(trial, i, show, seconds)
         finally:
             loading.cancel()
@@ -168,6 +168,12 @@ class Runner:
         if not done:
             self._at("let-go")
         await loading
+
+    def _loading(self, trial, side, stop) -> asyncio.Task:
+        """`_load`, going on beside what the participant feels."""
+        task = asyncio.ensure_future(self._load(trial, side, stop))
+        task.add_done_callback(lambda done: done.cancelled() or done.exception())  # also where nobody waits for it
+        return task
 
     async def _load(self, trial: Trial, side: str | None, stop: threading.Event) -> None:
         """A side's set in force, and in the log that it is."""
@@ -195,7 +201,7 @@ class Runner:
     def _note_times(self, loaded) -> None:
         """How long it took from an answer to parameters in force, in parts."""
         clock, now = self.clock, time.perf_counter()
-        if {"came", "proposed"} <= set(clock):
+        if {"came", "chosen", "proposed"} <= set(clock):
             parts = {"total": now - clock["came"], "fsync": clock["fsync"], "chosen": clock["chosen"]}
             self.hub.delays.append(parts | {"serial": loaded.serial_s, "acknowledged": clock["logged"] - clock["came"]})
         self.clock = {}

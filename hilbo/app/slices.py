@@ -40,14 +40,15 @@ class Maps:
     def trust(self, state: LiveSession) -> list[list[str]]:
         """How far the session has come, in words: name and value."""
         rows = []
-        block = next((i for i, b in enumerate(state.header.blocks) if not b.trials and not state.full(i)), None)
+        chosen = [i for i, b in enumerate(state.header.blocks) if not b.trials and state.answers(i)]
+        block = next((i for i in chosen if not state.full(i)), chosen[-1] if chosen else None)
         found = None if block is None else stopping.trust_of(state, block)
         if found is not None:
             rows.append(["Best so far", ", ".join(f"{name} {value:.3g}" for name, value in found.best.items())])
             top = state.study.responses[-1]
             rows.append([f'… would be "{top}"', f"{100 * found.top:.0f} %"])
             if found.movement is not None:
-                rows.append(["… would move by one more answer", f"{100 * found.movement:.1f} % of the ranges"])
+                rows.append(["… moves with one more", f"by {100 * found.movement:.1f} % of the ranges"])
         twice = stopping.consistency(state)
         if twice.pairs:
             rows.append(["Asked twice", f"{twice.alike} of {twice.pairs} alike"])
