@@ -8,7 +8,8 @@ drift over the study's own number of trials), so that a short session drifts les
 For every (m, t) a study is merged by the study's rule, and two errors are taken:
   optimum: NRMSE of the population optimum to the truth, in units of the search ranges;
   map: root mean square, over feasible points, of the difference between the probability of the highest answer that the
-       map foretells for a new person and the one that the simulated population has (the mean over many people, in closed form).
+       map foretells for a new person and the one that the simulated population has (the mean over many people, in
+       closed form).
 Studies are dealt to processes, one core each; the numbers do not depend on how many there are.
 """
 
