@@ -12,6 +12,7 @@ _names, __dir__, __all__ = lazy_loader.attach(
     submodules=[
         "acquisition",
         "aggregation",
+        "analysis",
         "bcm",
         "config",
         "ep",
@@ -29,7 +30,9 @@ _names, __dir__, __all__ = lazy_loader.attach(
         "ordinal_gp",
         "paper_tables",
         "passivity",
+        "people",
         "plotting",
+        "power",
         "preferences",
         "protocol",
         "report",
@@ -53,6 +56,7 @@ _names, __dir__, __all__ = lazy_loader.attach(
 if TYPE_CHECKING:  # the same names for type checkers and editors; a test compares the two lists
     from hilbo import acquisition as acquisition
     from hilbo import aggregation as aggregation
+    from hilbo import analysis as analysis
     from hilbo import bcm as bcm
     from hilbo import config as config
     from hilbo import ep as ep
@@ -70,7 +74,9 @@ if TYPE_CHECKING:  # the same names for type checkers and editors; a test compar
     from hilbo import ordinal_gp as ordinal_gp
     from hilbo import paper_tables as paper_tables
     from hilbo import passivity as passivity
+    from hilbo import people as people
     from hilbo import plotting as plotting
+    from hilbo import power as power
     from hilbo import preferences as preferences
     from hilbo import protocol as protocol
     from hilbo import report as report

@@ -10,6 +10,7 @@ Groups and variables (dimensions chain, draw, participant, trial):
 """
 
 import os
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -39,7 +40,7 @@ def groups(
     chains = coords | {"chain": [0], "draw": np.arange(draws)}
     held = mask[None, None]
     observed = np.where(mask, np.asarray(cohort.trials.q), -1)
-    constants = {
+    constants: dict[str, Any] = {
         p.name: (("participant", "trial"), np.where(mask, cohort.physical[..., i], np.nan), {"units": p.unit})
         for i, p in enumerate(study.space.parameters)
     }

@@ -5,6 +5,7 @@ or words too, never by colour alone: the pages are printed, and read by the colo
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -126,7 +127,9 @@ def population_convergence(progress: Progress, references: Mapping[str, Float[np
 
 def sets_on_map(study: Study, surface, sets: Sets | None, best: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
     """The population map through its best, mid and worst sets; hatched where it is not sampled. Paper, figure 6a."""
-    points = {"best": best} if sets is None else dict(zip(("best", "mid", "worst"), np.asarray(sets.x), strict=True))
+    points: dict[str, Any] = {"best": best}
+    if sets is not None:
+        points = dict(zip(_MARKS, np.asarray(sets.x), strict=True))
     if study.space.dim == 1:
         return _sets_on_curve(study, surface, points)
     thirds = {name: float(x[2]) for name, x in points.items()} if study.space.dim > 2 else {"best": None}
@@ -139,7 +142,7 @@ def sets_on_map(study: Study, surface, sets: Sets | None, best: Float[np.ndarray
         for shown in points if third is None else [name]:
             _mark(axes, study, shown, points[shown])
         axes.set_title("" if third is None else f"{level_words(study, 2, third)} ({name})", fontsize=9)
-    handles = [
+    handles: list[Any] = [
         Line2D([], [], linestyle="", marker=_MARKS[n][0], color=_MARKS[n][2], markeredgecolor="black", label=n)
         for n in points
     ]
@@ -214,7 +217,7 @@ def class_regions(readings: Mapping[str, Reading]) -> Figure:
                 else:
                     _regions(axes, reading, i, j, shades)
                 axes.set_title(name, fontsize=9)
-        handles = [
+        handles: list[Any] = [
             Patch(facecolor=shades(k), edgecolor="black", linewidth=0.5, label=label) for k, label in enumerate(labels)
         ]
         handles.append(Line2D([], [], color=RED, linewidth=2, label="tolerance interval"))

@@ -8,7 +8,8 @@ drift over the study's own number of trials), so that a short session drifts les
 For every (m, t) a study is merged by the study's rule, and two errors are taken:
   optimum: NRMSE of the population optimum to the truth, in units of the search ranges;
   map: root mean square, over feasible points, of the difference between the probability of the highest answer that the
-       map foretells and the one that the simulated population has (the mean over many people, in closed form).
+       map foretells for a new person and the one that the simulated population has (the mean over many people, in
+       closed form).
 Studies are dealt to processes, one core each; the numbers do not depend on how many there are.
 """
 
@@ -28,9 +29,10 @@ from scipy.special import ndtr
 
 from hilbo.config import Study
 from hilbo.errors import InputError
+from hilbo.population_rules import rule_map
 from hilbo.session import search_points
 from hilbo.simulate import Person, Population, people, simulate_study
-from hilbo.study import Cohort, fit_cohort, population, population_optimum
+from hilbo.study import Cohort, fit_cohort, map_optimum
 
 __all__ = ["Plan", "cores", "one_study", "power_table", "simulate_power", "summarise", "top_probability"]
 
@@ -129,11 +131,13 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     target = top_probability(people(study, population_, _CROWD, 0), len(study.responses), np.asarray(points))
     rows = []
     for count in plan.trials:
-        posteriors = fit_cohort(staged, cohort.first(count))
+        so_far = cohort.first(count)
+        posteriors = fit_cohort(staged, so_far)
         for m in plan.participants:
-            some = jax.tree.map(lambda leaf, m=m: leaf[:m], posteriors)
-            x = np.asarray(population_optimum(study, some, candidates).x)
-            found = np.asarray(_foretold(study, some, points))
+            some, given = jax.tree.map(lambda leaf, m=m: leaf[:m], (posteriors, so_far.trials))
+            merged = rule_map(study.gp, given, study.rule, posteriors=some, inference=study.inference)
+            x = np.asarray(map_optimum(study, merged, candidates).x)
+            found = np.asarray(_foretold(study, merged, points))
             rows.append((index, m, count, _rms(x - truth), _rms(found - target)))
     return pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
 
@@ -143,8 +147,8 @@ def _rms(difference):
 
 
 @eqx.filter_jit
-def _foretold(study, posteriors, points):
-    mean, variance = population(posteriors, points)
+def _foretold(study, merged, points):
+    mean, variance = merged.newcomer(points)
     return jax.vmap(study.gp.likelihood.class_probabilities)(mean, variance)[:, -1]
 
 

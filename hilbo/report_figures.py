@@ -99,8 +99,7 @@ def comparison_figures(content: dict[str, Any]) -> Figures:
             plotting.rules_figure(content),
             "How every rule foretells people left out",
             "Left: mean negative log density of their answers, lower is better. Right: share of their answers within"
-            " the central 95 % of what was foretold; the line is where a calibrated map is. Bars: standard errors by"
-            " person.",
+            " the central 95 % of what was foretold; the line is a calibrated map. Bars: standard errors by person.",
         ),
         "reliability": (
             plotting.reliability_figure(content),

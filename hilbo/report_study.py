@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
@@ -155,7 +156,7 @@ def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
     if reference is not None:
         table.insert(1, "reference", list(set_of(study, reference).values()))
         for name, x in (("error_percent", best), ("mean_error_percent", mean)):
-            ways = moved(study, x, reference)["moved"]
+            ways = moved(study, x, jnp.asarray(reference))["moved"]
             table[name] = [abs(ways[parameter]["percent"]) for parameter in ours]
     return table
 

@@ -31,17 +31,16 @@ participants, trials = 6, int(os.environ.get("HILBO_NOTEBOOK_TRIALS", "25"))
 
 # %% [markdown]
 # ## Three materials
-# They share the study but for the effective stiffness; each has its own set around which people's optima lie.
+# They share the study file; each has its own set around which people's optima lie. (Where materials differ in their
+# effective stiffness, `[materials.NAME.renderer]` says so.)
 
 # %%
 MATERIALS = {
-    "memory foam": (0.44, {"K1": 5.70, "B1": 5.89, "alpha": 0.203}),
-    "medium silicone": (0.60, {"K1": 4.00, "B1": 8.00, "alpha": 0.150}),
-    "stiff silicone": (0.80, {"K1": 3.00, "B1": 12.0, "alpha": 0.120}),
+    "memory foam": {"K1": 5.70, "B1": 5.89, "alpha": 0.203},
+    "medium silicone": {"K1": 4.00, "B1": 8.00, "alpha": 0.150},
+    "stiff silicone": {"K1": 8.00, "B1": 4.00, "alpha": 0.120},
 }
 text = Path("hilbo/data/paper.toml").read_text().replace("trials = 25", f"trials = {trials}")
-for name, (stiffness, _) in MATERIALS.items():
-    text += f'\n[materials."{name}".renderer]\nK_eff = {stiffness}\n'
 (folder / "study.toml").write_text(text)
 study = Study.load(folder / "study.toml")
 
@@ -51,18 +50,18 @@ study = Study.load(folder / "study.toml")
 
 # %%
 answers, truths, sets, compared = [], [], [], []
-for number, (name, (_, truth)) in enumerate(MATERIALS.items()):
-    own, population = study.material(name), dataclasses.replace(PRESETS["paper"], truth=truth)
-    crowd = people(own, population, participants, seed=number)
-    table = to_table(own, simulate_study(own, crowd, seed=number))
+for number, (name, truth) in enumerate(MATERIALS.items()):
+    population = dataclasses.replace(PRESETS["paper"], truth=truth)
+    crowd = people(study, population, participants, seed=number)
+    table = to_table(study, simulate_study(study, crowd, seed=number))
     answers.append(table.assign(material=name))
-    truths.append(truth_table(own, population, crowd).assign(material=name))
+    truths.append(truth_table(study, population, crowd).assign(material=name))
     write_trials(table, folder / "one.csv")
-    cohort = cohort_of(read_trials(folder / "one.csv", own), own)
-    aggregate = aggregate_cohort(own, cohort, alternatives=False)
-    three = best_mid_worst(own, aggregate.surface, search_points(own.space, 0), known=0.95)
-    renderings = sets_table(own, three, np.asarray(aggregate.individuals.x), cohort.names)
-    judged = validation_table(own, population, renderings, participants=8, judges=4, seed=number)
+    cohort = cohort_of(read_trials(folder / "one.csv", study), study)
+    aggregate = aggregate_cohort(study, cohort, alternatives=False)
+    three = best_mid_worst(study, aggregate.surface, search_points(study.space, 0), known=0.95)
+    renderings = sets_table(study, three, np.asarray(aggregate.individuals.x), cohort.names)
+    judged = validation_table(study, population, renderings, participants=8, judges=4, seed=number)
     prefix = f"{name}: "
     sets.append(renderings.assign(set_id=prefix + renderings["set_id"], material=name))
     for column in ("set_a", "set_b", "preferred"):
@@ -76,12 +75,12 @@ pd.concat(compared).to_csv(folder / "validation.csv", index=False)
 
 # %% [markdown]
 # ## The report
-# The same as `hilbo report FOLDER --out results`.
+# The same as `hilbo report FOLDER --out results --no-compare`.
 
 # %%
 out = folder / "results"
 out.mkdir()
-content = write_study(read_folder(folder), out)
+content = write_study(read_folder(folder), out, comparison=False)
 for claim in content["hypotheses"]:
     print(claim["number"], claim["verdict"])
     for item in claim["evidence"]:
