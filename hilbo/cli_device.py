@@ -6,7 +6,6 @@ command.
 """
 
 import json
-import os
 import sys
 import time
 from pathlib import Path
@@ -14,16 +13,18 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.console import Force, Json, Seed, fail, progress
+from hilbo import cli_measure
+from hilbo.console import Force, Json, fail
 from hilbo.device_options import Chosen, Line, chosen_set, opened, sets_of, takes
+from hilbo.device_results import check_free, finish, write_table
 from hilbo.device_words import decoded, said, set_words
 from hilbo.errors import InputError
 
 __all__ = ["app"]
 
 app = typer.Typer(no_args_is_help=True, help="A rendering device: connect, send sets, feel, measure.")
-
-_FOAM = (-2.89, 5.70, 5.89, 0.203, 101)  # what lies under a simulated device that characterises
+for name, command in cli_measure.COMMANDS.items():
+    app.command(name)(command)
 
 Seconds = Annotated[float | None, typer.Option(help="End after so many seconds of the device's time.")]
 
@@ -35,7 +36,7 @@ def ports(as_json: Json = False) -> None:
 
     found = list_ports()
     words = "\n".join(f"{port.name}  {port.description}" for port in found) or "There is no serial port."
-    _finish([port._asdict() for port in found], words, as_json)
+    finish([port._asdict() for port in found], words, as_json)
 
 
 @app.command()
@@ -59,7 +60,7 @@ def hello(line: Line, as_json: Json = False) -> None:
     limits = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in content["limits"].items())
     words = "\n".join(f"{name:26} {said(name, value)}" for name, value in about.items())
     now = set_words(found) if found else "none"
-    _finish(
+    finish(
         content,
         f"{words}\ncan                        {', '.join(can)}\nlimits  {limits}\nin force  {now}",
         as_json,
@@ -75,7 +76,7 @@ def set_(chosen: Chosen, line: Line, as_json: Json = False) -> None:
         raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --name.")
     with opened(line) as device:
         found = device.send(**wanted)
-    _finish(found._asdict(), f"in force: {set_words(found)}", as_json)
+    finish(found._asdict(), f"in force: {set_words(found)}", as_json)
 
 
 @app.command()
@@ -88,7 +89,7 @@ def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: Json = F
     with opened(line) as device:
         _begin(device, wanted)
         content = watch(device, seconds, "rendering; Ctrl-C stops")
-    _finish(content, "", as_json)
+    finish(content, "", as_json)
     if content["state"] in ("HOLD", "ESTOP"):
         fail(f"The device has gone to {content['state']} by itself; find out why, then clear it.", 1)
 
@@ -114,7 +115,7 @@ def clear(line: Line, as_json: Json = False) -> None:
     with opened(line) as device:
         device.clear()
         state = device.state().name
-    _finish({"state": state}, f"the device is {state}", as_json)
+    finish({"state": state}, f"the device is {state}", as_json)
 
 
 @app.command()
@@ -125,7 +126,7 @@ def monitor(line: Line, seconds: Seconds = None, as_json: Json = False) -> None:
 
     with opened(line) as device:
         content = watch(device, seconds)
-    _finish(content, "", as_json)
+    finish(content, "", as_json)
 
 
 @app.command()
@@ -140,7 +141,7 @@ def record(
     as_json: Json = False,
 ) -> None:
     """Telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags."""
-    _check_free(out, force)
+    check_free(out, force)
     wanted = chosen_set(chosen, line)
     with opened(line) as device:
         if render:
@@ -148,9 +149,9 @@ def record(
         device.samples(0.0)
         table = device.telemetry(seconds)
         state, counts = device.state().name, device.counts()
-    _write(table, out)
+    write_table(table, out)
     content = {"file": str(out), "samples": len(table), "state": state, "counts": counts._asdict()}
-    _finish(content, f"{out}: {len(table)} samples", as_json)
+    finish(content, f"{out}: {len(table)} samples", as_json)
 
 
 @app.command()
@@ -175,34 +176,7 @@ def decode(
         else:
             rows.append({"byte": place, "seq": seq, "message": name_of(type(message)), "fields": asdict(message)})
     words = "\n".join(decoded(row) for row in rows)
-    _finish(
-        json.loads(json.dumps(rows, default=lambda value: value.hex())), words or "The file has no frames.", as_json
-    )
-
-
-@app.command()
-@takes(line=Line)
-def selftest(
-    line: Line,
-    echoes: Annotated[int, typer.Option(min=1, help="Round trips.")] = 300,
-    as_json: Json = False,
-) -> None:
-    """Loopback, latency, and whether the device lets go when the host falls silent."""
-    from hilbo import device_tests
-
-    with progress() as say, opened(line, finger="none") as device:
-        found = device_tests.selftest(device, say, echoes)
-        hold = device.device.hold_ticks
-    good = found.echoes == found.asked and found.watchdog_ticks <= found.watchdog_limit and found.force_after_N == 0
-    words = (
-        f"loopback   {found.echoes} of {found.asked} came back whole\n"
-        f"latency    median {found.median_ms:.2f} ms, 99 % below {found.p99_ms:.2f} ms, {found.retries} retries\n"
-        f"watchdog   HOLD {found.watchdog_ticks} ticks after the last heartbeat (at most {found.watchdog_limit}),"
-        f" force {abs(found.force_after_N):g} N {hold} ticks later"
-    )
-    _finish(found._asdict() | {"passed": good}, words, as_json)
-    if not good:
-        fail("The device has not passed; do not use it with people.", 1)
+    finish(json.loads(json.dumps(rows, default=lambda value: value.hex())), words or "The file has no frames.", as_json)
 
 
 @app.command()
@@ -219,58 +193,7 @@ def feel(
     wanted = sets_of(sets, line)
     with opened(line) as device:
         content = device_screen.feel(device, wanted, seconds)
-    _finish(content, "", as_json)
-
-
-@app.command("measure-damping")
-@takes(line=Line)
-def measure_damping(line: Line, seed: Seed = 0, as_json: Json = False) -> None:
-    """Damping b and Coulomb friction of the free device, with 95 % intervals. It moves by itself."""
-    from hilbo import device_tests
-
-    with progress() as say, opened(line, rate="lockstep", finger="none") as device:
-        found = device_tests.measure_damping(device, say, seed)
-        reported = device.device.damping_N_s_per_m
-    rows = (("damping", "N.s/m"), ("coulomb", "N"), ("mass", "kg"), ("constant", "N"))
-    content = {name: getattr(found, name)._asdict() | {"unit": unit} for name, unit in rows}
-    words = [
-        f"{n:9} {getattr(found, n).value:9.5f}  {getattr(found, n).lower:9.5f} to {getattr(found, n).upper:9.5f}  {u}"
-        for n, u in rows
-    ]
-    believed = found.damping.lower
-    words.append(f"The device reports {reported:.4g} N.s/m; plan studies with at most {min(believed, reported):.4g}.")
-    if reported > found.damping.upper:
-        print("hilbo: the device reports more damping than it has; mend its configuration.", file=sys.stderr)
-    rest = {"residual_N": found.residual, "sweeps": found.sweeps, "periods": found.periods, "reported": reported}
-    _finish(content | rest, "\n".join(words), as_json)
-
-
-@app.command()
-@takes(line=Line)
-def characterise(
-    out: Annotated[Path, typer.Argument(help="CSV file to write, for `hilbo identify`.", show_default=False)],
-    line: Line,
-    repeats: Annotated[int, typer.Option(min=1, help="Repeats of each test.")] = 16,
-    depth: Annotated[float, typer.Option(help="Depth of the relaxation test, mm.")] = 5.0,
-    load: Annotated[float, typer.Option(help="Force of the creep test, N.")] = 3.0,
-    after: Annotated[float, typer.Option(help="Force of the recovery, N.")] = 0.5,
-    hold: Annotated[float, typer.Option(help="How long each is held, s.")] = 3.0,
-    rest: Annotated[float, typer.Option(help="Recovery before each test, s.")] = 2.0,
-    seed: Seed = 0,
-    force: Force = False,
-    as_json: Json = False,
-) -> None:
-    """Relaxation and creep of a material at position 0, pressed by the device itself."""
-    from hilbo import device_tests
-
-    _check_free(out, force)
-    with progress() as say, opened(line, rate="lockstep", material=_FOAM, noise=0.02) as device:
-        numbers = {"repeats": repeats, "depth": depth, "force": load, "after": after, "hold": hold, "rest": rest}
-        table = device_tests.characterise(device, say, **numbers, seed=seed)
-        damping = device.device.damping_N_s_per_m
-    _write(table, out)
-    content = {"file": str(out), "samples": len(table), "repeats": repeats, "damping": damping}
-    _finish(content, f"{out}: now  hilbo identify {out} --out results --damping {damping:.6g}", as_json)
+    finish(content, "", as_json)
 
 
 @app.command()
@@ -311,28 +234,4 @@ def _at_once(line, name, as_json) -> None:
             link.request(getattr(protocol, name)())
         finally:
             link.close()
-    _finish({"done": name.lower()}, "done", as_json)
-
-
-def _check_free(out: Path, force: bool) -> None:
-    if out.exists() and not (force and out.is_file()):
-        raise InputError(f"{out}: exists already; choose another file, or add --force to replace it.")
-    if not out.resolve().parent.is_dir():
-        raise InputError(f"{out}: there is no folder {out.resolve().parent}; make it, or choose another file.")
-
-
-def _write(table, out: Path) -> None:
-    """Whole or not at all."""
-    part = out.with_name(f".{out.name}.part")
-    try:
-        table.to_csv(part, index=False)
-        os.replace(part, out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another file.") from error
-
-
-def _finish(content, words, as_json) -> None:
-    if as_json:
-        print(json.dumps(content, indent=2, allow_nan=False, default=float))
-    elif words:
-        print(words)
+    finish({"done": name.lower()}, "done", as_json)

@@ -7,7 +7,10 @@ autoregression of order 0 to 8 (Yule-Walker, BIC). With its spectrum the varianc
 
 and the profile of coordinate j is cut where the cost has risen by t²·V_jj / (A⁻¹)_jj, which is the classical cut where
 residuals are white. Without this correction 3,000 samples a curve promise digits that are not there.
-The bootstrap resamples whole repeats, so it also sees what differs from one repeat to the next.
+What differs from one repeat to the next and stays within it, such as where an encoder rounds a held position to, leaves
+no residual at all: it moves the estimate. With 5 repeats or more V is therefore scaled until each V_jj is no less than
+what the influences u_ck of the repeats on the estimate scatter by, Σ_c var_k(u_ck)/R_c. The bootstrap resamples whole
+repeats, and sees that too.
 
 References: Bates & Watts (1988), Nonlinear Regression Analysis, chapter 6 (profiles); Rotnitzky & Jewell (1990),
 Biometrika 77:485 (scaled likelihood ratios under correlation); Efron & Tibshirani (1993), An Introduction to the
@@ -104,8 +107,19 @@ def _spread(found, quantile):
     inverse = jnp.diagonal(rows, axis1=0, axis2=1).T
     covariance = inverse @ meat @ inverse.T
     freedom = jnp.maximum(effective - q.size, 1)
-    cut = _student(quantile, freedom) ** 2 * jnp.diag(covariance) / jnp.diag(inverse)
+    wider, own = _across(found, slopes, jnp.diag(covariance), freedom)
+    covariance = wider[:, None] * covariance * wider[None, :]
+    cut = _student(quantile, own) ** 2 * jnp.diag(covariance) / jnp.diag(inverse)
     return Spread(covariance, inverse, cut, freedom)
+
+
+def _across(found, slopes, variance, freedom):
+    """How many times wider the repeats scatter than residuals tell, at least 1; and its degrees of freedom."""
+    if min(w.size for w in found.weights) < FEWEST_REPEATS:
+        return jnp.ones_like(variance), jnp.broadcast_to(freedom, variance.shape)
+    more = sum(_variance_of_mean(u, 0) for u in _influences(found, slopes)) / variance
+    few = float(sum(w.size - 1 for w in found.weights))
+    return jnp.sqrt(jnp.maximum(more, 1)), jnp.where(more > 1, few, freedom)
 
 
 def profile_intervals(found: Fit, quantile: float = 1.959964) -> Intervals:
@@ -227,7 +241,7 @@ def _bootstrap(found, key, resamples, quantile, exact):
     draws = tuple(
         jax.random.randint(k, (resamples, w.size), 0, w.size) for k, w in zip(keys, found.weights, strict=True)
     )
-    influences = _influences(found)
+    influences = _influences(found, jax.jacfwd(lambda x: _parts(found, x))(found.q))
     moved = sum(jnp.mean(u[d], axis=1) - jnp.mean(u, axis=0)[None, :] for u, d in zip(influences, draws, strict=True))
     errors = jnp.sqrt(sum(_variance_of_mean(u[d], 1) for u, d in zip(influences, draws, strict=True)))
     own = jnp.sqrt(sum(_variance_of_mean(u, 0) for u in influences))
@@ -246,9 +260,8 @@ def _variance_of_mean(values, axis):
     return jnp.var(values, axis=axis, ddof=1) / values.shape[axis]
 
 
-def _influences(found):
+def _influences(found, slopes):
     """For each curve, (R, p): how far each repeat alone pulls the estimate."""
-    slopes = jax.jacfwd(lambda x: _parts(found, x))(found.q)
     inverse = _inverse(found.solution.normal, _free(found))
     pulls = []
     for curve, J in zip(found.curves, slopes, strict=True):

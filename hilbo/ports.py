@@ -16,7 +16,7 @@ __all__ = ["BAUD", "POLL", "Port", "PortInfo", "SerialPort", "SocketPort", "list
 BAUD = 1_000_000
 """Line rate (baud) where none is given; a pseudo-terminal and a USB device have none of their own."""
 POLL = 0.05  # s
-_STUCK = 2.0  # s, until a line that takes no bytes is given up
+_STUCK = 10.0  # s, until a line that takes no bytes is given up
 _NO_PYSERIAL = "Serial ports need pyserial; install it with: pip install 'hilbo[hardware]'."
 _BUSY = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}
 

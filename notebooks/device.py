@@ -1,7 +1,8 @@
 # %% [markdown]
 # # A set on a device: send it, press it, look at force and position
 # The device is simulated here: the firmware's own code, with an actuator, an encoder and a finger, in a process beside
-# this one. With a real device, put its port in place of "sim".
+# this one. Its time is ours ("lockstep"): it passes while we wait for telemetry, as fast as it can. With a real device,
+# put its port in place of "sim", and leave the options out.
 
 # %%
 import jax
@@ -17,7 +18,7 @@ from hilbo.hardware_bridge import Renderer
 from hilbo.protocol import SampleFlag
 from hilbo.viscoelastic import FOSLS
 
-device = Renderer.open("sim", options={"finger": "none"})
+device = Renderer.open("sim", options={"finger": "none", "rate": "lockstep"})
 said = device.device
 print(
     f"damping {said.damping_N_s_per_m:.3f} N.s/m, at most {said.force_limit_N:g} N, {said.tick_rate_Hz} ticks a second"
@@ -68,7 +69,8 @@ print(f"largest step of force {steps.max():.3f} N, slew limit {said.slew_limit_N
 
 # %% [markdown]
 # ## Stop
-# Before anything that keeps Python busy for long: without heartbeats for a quarter of a second the device lets go.
+# A real device gets its heartbeats from a process beside this one, so that whatever comes next may take its time; it
+# lets go when this one ends or hangs. Nobody feels anything any more here, and so it is stopped.
 
 # %%
 device.stop()

@@ -18,8 +18,9 @@ import numpy as np
 import pytest
 
 __all__ = [
-    "CAUSES", "CONFIG", "CORE", "DOCUMENT", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES", "TYPES", "Device",
-    "build", "cobs", "compiler", "decode", "frame", "library", "pack", "parameters", "schema", "unpack",
+    "CAUSES", "CONFIG", "CORE", "DOCUMENT", "EXPONENTIALS", "FIRMWARE", "FLAGS", "NAMES", "REASONS", "STATES",
+    "TYPES", "Device", "build", "cobs", "compiler", "decode", "frame", "full_set", "library",
+    "pack", "parameters", "schema", "unpack",
 ]  # fmt: skip
 
 FIRMWARE = Path(__file__).parents[1] / "firmware"
@@ -302,3 +303,22 @@ def parameters(model: dict, set_id: int = 1) -> bytes:
         tick_rate_Hz=model.get("rate", 1000), K0_N_per_mm=model["K0"], K1_N_per_mm=model["K1"],
         B1_N_s_alpha_per_mm=model["B1"], alpha=model["alpha"], force_limit_N=model.get("force_limit", 30.0),
     )  # fmt: skip
+
+
+EXPONENTIALS = [
+    (0.16150905, 0.9044945),
+    (0.19177684, 0.52692366),
+    (0.16125424, 0.23115093),
+    (0.12465648, 0.0905768),
+    (0.09473704, 0.033717748),
+    (0.07124848, 0.012141097),
+    (0.05358717, 0.0042446544),
+    (0.041970227, 0.0014005903),
+    (0.038842943, 0.0003679924),
+    (0.06041753, 2.3818455e-05),
+]
+"""Weight and loss of the host's ten exponentials for alpha = 0.3 (another test makes them anew)."""
+
+
+def full_set(**changed) -> dict:
+    return {"K0": 0.44, "K1": 1.0, "B1": 3.0, "alpha": 0.3, "states": list(EXPONENTIALS)} | changed

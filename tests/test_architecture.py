@@ -124,9 +124,12 @@ MAY_IMPORT = MATHS | {
     "page": {"config", "report_people"},
     "hardware_bridge": {"ports", "handshake", "staging", "telemetry", "simulator"},
     "device_options": {"console", "hardware_bridge", "set_tables", "config", "viscoelastic"},
-    "cli_device": {"device_options", "device_tests", "device_screen", "device_words"},
+    "device_results": set(),
+    "cli_measure": {"device_options", "device_results", "device_tests"},
+    "cli_device": {"cli_measure", "device_options", "device_results", "device_tests", "device_screen", "device_words"},
 }
-MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "cli_material", "cli_session", "device_options", "cli_device"}
+_COMMANDS = {"cli_material", "cli_session", "cli_measure", "cli_device"}
+MAY_IMPORT["report"] = set(MAY_IMPORT) - {"console", "device_options"} - _COMMANDS
 MAY_IMPORT["report_population"] = {"report", "report_people", "page", "batch_optimum"}
 MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["report_material"] = {"report", "page", "plotting_mechanics", "characterise"}
@@ -147,6 +150,7 @@ WITHOUT_JAX = {
     "telemetry",
     "device_tests",
     "device_screen",
+    "cli_measure",
     "cli_device",
 }
 OUTSIDE_WORLD = {"os", "io", "sys", "time", "datetime", "pathlib", "logging", "random", "socket", "subprocess"}

@@ -124,6 +124,8 @@ SANITIZED = [
     "test_firmware_frames.py::test_any_bytes_leave_the_device_safe",
     "test_firmware_frames.py::test_a_conversation_cut_after_every_byte",
     "test_firmware_protocol.py",
+    "test_firmware_sets.py",
+    "test_firmware_telemetry.py",
     "test_firmware_safety.py",
 ]
 

@@ -9,9 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from helpers_firmware import CORE, build, library
+from helpers_firmware import CORE, EXPONENTIALS, build, library
 from scipy.stats import qmc
-from test_firmware_protocol import EXPONENTIALS
 
 from hilbo import viscoelastic
 from hilbo.exponentials import exponentials

@@ -40,7 +40,7 @@ FAULTS = [
     Fault("equilibrium at the position itself", "hb_renderer.c", "renderer->rest_share * x_mm;", "x_mm;", "switching"),
     Fault("slowest exponentials drop small changes", "hb_renderer.c", "rest = change - (next - mean);", "rest = 0.0F;",
           "renderer"),
-    Fault("loss may grow", "hb_renderer.c", "loss <= slower", "loss <= 1.0F", "protocol"),
+    Fault("loss may grow", "hb_renderer.c", "loss <= slower", "loss <= 1.0F", "sets"),
     Fault("signs of C(-1) exchanged", "hb_passivity.c", "i % 2U == 1U", "i % 2U == 0U", "passivity"),
     Fault("damping too small by 0.2 %", "hb_passivity.c", "500.0F *", "499.0F *", "passivity"),
     Fault("damping not compared", "hb_staging.c", "!(renderer->minimum_damping_N_s_per_m <=",
@@ -81,8 +81,8 @@ FAULTS = [
     Fault("a refused set stays staged", "hb_staging.c",
           "    device->staging = (uint8_t)HB_EMPTY;\n    enum hb_reason reason = check_numbers",
           "    enum hb_reason reason = check_numbers",
-          "protocol"),
-    Fault("COMMIT by id alone", "hb_staging.c", " && confirmation->crc == device->crc[bank]", "", "protocol"),
+          "sets"),
+    Fault("COMMIT by id alone", "hb_staging.c", " && confirmation->crc == device->crc[bank]", "", "sets"),
     Fault("START for another start of the device", "hb_motion.c",
           "    if (confirmation.boot_id != device->boot_id) {\n        return HB_NACK_BOOT_ID;\n    }\n    reply",
           "    reply", "protocol"),
@@ -95,7 +95,7 @@ FAULTS = [
           "device->answered = false;", "protocol"),
     Fault("anybody's heartbeat", "hb_requests.c", " && hb_unpack_boot_id(frame->payload) == device->boot_id) {", ") {",
           "protocol"),
-    Fault("telemetry fills the buffer", "hb_line.c", "(2U * HB_MAX_FRAME)", "0U", "protocol"),
+    Fault("telemetry fills the buffer", "hb_line.c", "(2U * HB_MAX_FRAME)", "0U", "telemetry"),
 ]  # fmt: skip
 
 
