@@ -200,7 +200,7 @@ def _communicating(gp, trials, inference) -> tuple[Posterior, Posterior]:
     def beside(shared, each):
         return jnp.concatenate([jnp.broadcast_to(shared[None], (people, *shared.shape)), each], axis=1)
 
-    grown = Trials(beside(common.x, trials.x), beside(common.q, trials.q), beside(common.mask, own))
+    grown = jax.vmap(Trials)(beside(common.x, trials.x), beside(common.q, trials.q), beside(common.mask, own))
     alone = jax.tree.map(lambda leaf: leaf[None], common)
     shared = jax.tree.map(lambda leaf: leaf[0], _experts(gp, alone, inference))
     return _experts(gp, grown, inference), shared

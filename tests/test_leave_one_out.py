@@ -62,7 +62,7 @@ def test_nobody_predicts_themselves():
     trials = cohort()
     found, maps = leave_one_out(GP, trials, "bcm")
     assert found.probabilities.shape == (20, 3) and found.person.tolist() == np.repeat(np.arange(4), 5).tolist()
-    turned = Trials(trials.x, trials.q.at[2].set(2 - trials.q[2]), trials.mask)
+    turned = jax.vmap(Trials)(trials.x, trials.q.at[2].set(2 - trials.q[2]), trials.mask)
     other, _ = leave_one_out(GP, turned, "bcm")
     mine = found.person == 2
     np.testing.assert_allclose(other.probabilities[mine], found.probabilities[mine], rtol=1e-12)

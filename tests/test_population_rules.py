@@ -84,7 +84,7 @@ def test_an_even_choice_of_people():
 
 def test_one_category_only_still_gives_a_map():
     trials = cohort()
-    same = Trials(trials.x, jnp.full_like(trials.q, 2), trials.mask)
+    same = jax.vmap(Trials)(trials.x, jnp.full_like(trials.q, 2), trials.mask)
     for rule in ("bcm", "pooled"):
         mean, variance = rule_map(GP, same, rule).predict(X)
         assert bool(jnp.all(mean > 0)) and bool(jnp.all(variance > 0))
