@@ -207,7 +207,7 @@ def _round(study, points, blocks, task, inference, crew, by):
     return jax.lax.with_sharding_constraint(spread(study, points, blocks), crew.everywhere)
 
 
-def _block(study, points, trials, modes, task, inference, platform, by):
+def _block(study, points, trials, modes, task, inference, platform, by=("bcm", 1.0)):
     if task in ("sums", "jets"):
         say = _sums_of if task == "sums" else _jets_of
         experts = _each(lambda person: _expert(study, inference, *person), (trials, modes), platform)

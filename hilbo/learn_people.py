@@ -56,9 +56,10 @@ def learn_people(
     count = float(jnp.sum(answers.counts))
     begin = {name: value for name, value in _coordinates(gp, share).items() if name in _fields(learn)}
     flat, rebuild = jax.flatten_util.ravel_pytree(begin)
+    held = jnp.asarray(share, flat.dtype)  # an array: another number is no other function to compile
 
     def cost(z):
-        value, slope, good = _cost(jnp.asarray(z, flat.dtype), rebuild, gp, share, answers)
+        value, slope, good = _cost(jnp.asarray(z, flat.dtype), rebuild, gp, held, answers)
         if not good:  # no mode, no evidence: the line search is to turn back
             return _REFUSED, np.zeros(len(z))
         return float(value) / count, np.asarray(slope, float) / count
@@ -68,8 +69,8 @@ def learn_people(
     options = {"maxiter": max_steps, "ftol": tolerance, "gtol": 1e-6}
     found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     best = jnp.asarray(found.x, flat.dtype)
-    value, _, good = _cost(best, rebuild, gp, share, answers)
-    model, part = _model(rebuild(best), gp, share)
+    value, _, good = _cost(best, rebuild, gp, held, answers)
+    model, part = _model(rebuild(best), gp, held)
     return LearntPeople(model, part, -value, int(found.nit), jnp.asarray(bool(found.success) and bool(good)))
 
 

@@ -192,16 +192,15 @@ def _communicating(gp, trials, inference) -> tuple[Posterior, Posterior]:
             ' "rbcm".'
         )
     chosen = np.unique(np.linspace(0, len(row) - 1, size).round().astype(int))
-    common = Trials(
-        trials.x[person[chosen], row[chosen]], trials.q[person[chosen], row[chosen]], jnp.ones(len(chosen), bool)
-    )
+    at = person[chosen], row[chosen]
+    common = Trials(trials.x[at], trials.q[at], jnp.ones(len(chosen), bool))
     people = mask.shape[0]
     own = trials.mask & ~jnp.asarray(_at(mask.shape, *at))  # nobody's answer counts twice
 
     def beside(shared, each):
         return jnp.concatenate([jnp.broadcast_to(shared[None], (people, *shared.shape)), each], axis=1)
 
-    grown = Trials(beside(common.x, trials.x), beside(common.q, trials.q), beside(common.mask, own))
+    grown = jax.vmap(Trials)(beside(common.x, trials.x), beside(common.q, trials.q), beside(common.mask, own))
     alone = jax.tree.map(lambda leaf: leaf[None], common)
     shared = jax.tree.map(lambda leaf: leaf[0], _experts(gp, alone, inference))
     return _experts(gp, grown, inference), shared

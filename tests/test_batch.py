@@ -1,5 +1,6 @@
 """Populations merged block by block, against the same people's posteriors held all at once."""
 
+import dataclasses
 import functools
 
 import equinox as eqx
@@ -13,6 +14,7 @@ from hilbo import distributed
 from hilbo.batch import Sums, _block, block_size, jets, population_of, refit, sums
 from hilbo.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.config import Study
+from hilbo.errors import InputError
 from hilbo.session import search_points
 from hilbo.study import aggregate_cohort, cohort_of, fit_cohort, population
 
@@ -71,9 +73,29 @@ def test_the_merged_map_is_that_of_the_posteriors_held_at_once():
         expected = population(posteriors(), jnp.asarray(candidates()), rule)
         np.testing.assert_allclose(found[0], expected[0], atol=1e-12)
         np.testing.assert_allclose(found[1], expected[1], atol=1e-13)
+    for rule in ("poe", "gpoe"):  # from bcm's sums
+        found = fitted().sums.merge(1.3, PEOPLE, rule)
+        for a, b in zip(found, population(posteriors(), jnp.asarray(candidates()), rule), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-12)
     certificate = posteriors().certificate
     assert fitted().certificate["converged"].all()
     np.testing.assert_array_equal(fitted().certificate["iterations"], certificate.iterations)
+
+
+@pytest.mark.parametrize(("rule", "share"), [("hierarchical", 0.6), ("rbcm", 1.0)])
+def test_other_rules_are_sums_of_their_own(rule, share):
+    streamed = dataclasses.replace(fitted().population, rule=rule, share=share)
+    found = sums(streamed, candidates()).merge(1.3, PEOPLE, rule, share)
+    part = jnp.asarray(share) if rule == "hierarchical" else None
+    for a, b in zip(found, population(posteriors(), jnp.asarray(candidates()), rule, part), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_rules_that_are_no_sum_are_refused():
+    for rule in ("pooled", "grbcm"):
+        study = dataclasses.replace(STUDY, rule=rule)
+        with pytest.raises(InputError, match=f'"{rule}" needs all answers at once and cannot be streamed'):
+            aggregate_population(study, cohort(), distributed.alone())
 
 
 def test_posteriors_made_again_from_their_modes_say_the_same():
