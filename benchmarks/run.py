@@ -39,7 +39,7 @@ LIMITS = (
     "- pooled, EP: a sweep is a factor, as many solves as answers, the joint covariance, and Newton's matrix for all",
     "  cavity variances with its own factor: about ten times what a step towards Laplace's mode takes. Fewer than five",
     "  sweeps after Laplace's mode, or a way that never forms the joint covariance, would be needed for less.",
-    "- hyperparameters: derivatives of the terms up to the fourth, and the bookkeeping of small matrices. EP's evidence",
+    "- hyperparameters: derivatives of the terms up to the fourth, and much work on small matrices. EP's evidence",
     "  is still differentiated automatically.",
 )
 
