@@ -97,11 +97,12 @@ def _searched(terms, covariance, root, begun, max_steps, changed):
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
     basin = jnp.full_like(largest, _BASIN)
-    begin = _Search(*begun, largest, jnp.zeros_like(largest), largest, basin, count, count)
+    mean, variance = begun
+    begin = _Search(mean, variance, largest, jnp.zeros_like(largest), largest, basin, count, count)
 
     def unfinished(search):
         # One step at least: Laplace's mode may be the fixed point, but only to the digits of its own variances.
-        done = (search.residual <= search.tolerance) & (search.steps > 1)
+        done = (search.residual <= search.tolerance) & ((search.steps > 1) | (search.residual == 0.0))
         return (search.steps < max_steps) & ~done & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
