@@ -31,6 +31,18 @@ NAMES = {
     "hyperparameters": "hyperparameters (theta, noise) of 24 people by evidence, 4 starts each",
 }
 
+LIMITS = (
+    "",
+    "What stands between a row and its floor:",
+    "",
+    "- live step, session: the polishing, whose length depends on how many walls it meets, and some Python.",
+    "- pooled, EP: a sweep is a factor, as many solves as answers, the joint covariance, and Newton's matrix for all",
+    "  cavity variances with its own factor: about ten times what a step towards Laplace's mode takes. Fewer than five",
+    "  sweeps after Laplace's mode, or a way that never forms the joint covariance, would be needed for less.",
+    "- hyperparameters: derivatives of the terms up to the fourth, and much work on small matrices. EP's evidence",
+    "  is still differentiated automatically.",
+)
+
 
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -388,7 +400,7 @@ def floor_text(run):
     for key, which, what, floor in rows:
         took, name = tasks[key]["median"][which], ("Laplace", "EP")[which]
         lines.append(f"| {key} | {name} | {what} | {1e3 * floor:.2f} | {1e3 * took:.2f} | {took / floor:.1f} |")
-    lines += ["", f"A call of a function that does nothing takes {1e6 * cost['dispatch']:.1f} us."]
+    lines += ["", f"A call of a function that does nothing takes {1e6 * cost['dispatch']:.1f} us.", *LIMITS]
     return "\n".join(lines) + "\n"
 
 

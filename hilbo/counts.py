@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
-from hilbo.gaussian import Certificate, GaussianPosterior
+from hilbo.gaussian import Certificate, GaussianPosterior, evidence_tolerance
 from hilbo.kernels import RBF, gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
@@ -86,6 +86,11 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
     resolution = jnp.finfo(prior.dtype).eps * largest * prior.shape[0] ** 0.5
     value = _log_evidence(gp.likelihood, answers.counts, mode, system)
     tolerance = _tolerance(gp.likelihood, share, covariance, answers.counts, mode)
+    # One step more would change the evidence by so much; what is left is of the size of that change or smaller.
+    last = _step(gp.likelihood, share, covariance, answers.counts, mode)
+    beyond = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta)[2])
+    error = jnp.abs(_log_evidence(gp.likelihood, answers.counts, last, beyond) - value)
+    allowed = evidence_tolerance(value)
     certificate = Certificate(
         residual=residual,
         tolerance=tolerance,
@@ -94,7 +99,9 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
         condition=system.condition,
         smallest_variance=smallest,
         variance_resolution=resolution,
-        converged=(residual <= tolerance) & jnp.isfinite(value),
+        evidence_error=error,
+        evidence_tolerance=allowed,
+        converged=(residual <= tolerance) & jnp.isfinite(value) & (error <= allowed),
     )
     inverse = system.factor.T @ system.factor
     latent = GaussianPosterior(shared @ weights, weights, system.factor, inverse, value, certificate)

@@ -24,7 +24,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hilbo.ep import Tilted, coupling, fixed_point, gaussian, inverse_of, settled, sites_of
+from hilbo.ep import fixed_point, gaussian, inverse_of, settled
+from hilbo.ep_search import Tilted, coupling, sites_of
 from hilbo.gaussian import GaussianPosterior
 from hilbo.linalg import cholesky
 

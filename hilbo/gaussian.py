@@ -19,6 +19,7 @@ __all__ = [
     "Certificate",
     "GaussianPosterior",
     "certify",
+    "evidence_tolerance",
     "factor",
     "factorise",
     "inverse_and_log_determinant",
@@ -99,7 +100,7 @@ def certify(
     curvature, *beside = jax.vmap(curvature_at)(jnp.stack([mode, mode - off, mode + off]))
     change = jnp.maximum(jnp.abs(beside[0] - curvature), jnp.abs(beside[1] - curvature))
     error = 0.5 * jnp.sum(curvature * off**2) + 0.5 * jnp.sum(jnp.abs(variance) * change)
-    allowed = _NATS + epsilon**0.5 * jnp.abs(log_evidence)
+    allowed = evidence_tolerance(log_evidence)
     smallest = jnp.min(jnp.where(curvature > 0, variance, largest))
     resolution = epsilon * largest * weights.shape[0] ** 0.5
     found = (search["residual"] <= search["tolerance"]) & jnp.all(jnp.abs(apart) <= epsilon**0.25 * sd)
@@ -112,6 +113,11 @@ def certify(
         evidence_tolerance=allowed,
         converged=found & sure & (smallest >= resolution),
     )
+
+
+def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:
+    """How far off a log evidence may be: 0.02 + eps^(1/2) |log evidence|."""
+    return _NATS + jnp.finfo(log_evidence.dtype).eps ** 0.5 * jnp.abs(log_evidence)
 
 
 def still(terms: Terms) -> Terms:

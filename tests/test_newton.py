@@ -8,7 +8,7 @@ import pytest
 from jaxopt import ProjectedGradient
 from jaxopt.projection import projection_box
 
-from hilbo.newton import TrustRegionNewton
+from hilbo.newton import TrustRegionNewton, arrives
 
 
 def rosenbrock(y, _):
@@ -100,3 +100,34 @@ def test_a_step_that_a_wall_turns_uphill_is_refused_and_shortened(seed):
     centre, start = rng.uniform(-0.3, 1.3, 2), rng.uniform(size=2)
     found, radius = climbed(jnp.asarray(start), jnp.asarray(centre), jnp.asarray(matrix))
     assert bool(found) and float(radius) < 1e6
+
+
+def test_a_search_on_its_way_to_a_known_end_stops():
+    def solve(known):
+        options = {"known": jnp.asarray(known)}
+        return optx.minimise(
+            rosenbrock, TrustRegionNewton(), jnp.array([-1.2, 1.0]), options=options, max_steps=60, throw=False
+        )
+
+    nothing, other, there = (solve([end]) for end in ([np.nan] * 2, [2.0, 4.0], [1.0, 1.0]))
+    assert not bool(arrives(nothing.value, nothing.state.move, jnp.full((1, 2), jnp.nan)))
+    assert int(nothing.stats["num_steps"]) == int(other.stats["num_steps"]) > int(there.stats["num_steps"])
+    assert bool(arrives(there.value, there.state.move, jnp.ones((1, 2))))
+
+
+def test_an_expansion_of_ones_own_replaces_differentiation():
+    def expand(y, last, aux):
+        return rosenbrock(y, None), jax.grad(rosenbrock)(y, None), jax.hessian(rosenbrock)(y, None), aux + 1
+
+    start, solver = jnp.array([-1.2, 1.0]), TrustRegionNewton(atol=1e-9)
+    solution = optx.minimise(
+        lambda y, _: (rosenbrock(y, None), jnp.asarray(0)),
+        solver,
+        start,
+        has_aux=True,
+        options={"expand": expand},
+        max_steps=60,
+        throw=False,
+    )
+    np.testing.assert_allclose(solution.value, [1.0, 1.0], atol=1e-6)
+    assert 0 < int(solution.aux) <= int(solution.stats["num_steps"])  # counted where a step was taken
