@@ -45,9 +45,7 @@ def participant(hub: Any) -> dict[str, Any]:
     seen, session, stage = participant_view(hub.state), hub.state.study.session, hub.runner.stage
     trial, screen = seen["trial"], seen["screen"]
     step = _step(hub, trial) if screen == "trial" and stage == "step" else None
-    asking = (
-        screen == "trial" and trial["felt"] and (stage == "answer" or (step and step["index"] + 1 == step["count"]))
-    )
+    asking = screen == "trial" and trial["felt"] and (stage == "answer" or _last_of_one(hub, step))
     title, message, phase = _words(screen, stage, session.text)
     if step is not None and trial is not None:
         title, message, phase = trial["steps"][step["index"]]["text"], "", "step"
@@ -79,6 +77,11 @@ def _words(screen, stage, text):
     heads = {"wait": "wait", "ready": "ready", "rest": "rest", "paused": "paused", "done": "done", "ended": "ended"}
     title, stop, message = text(heads[screen]).partition(". ")
     return title + stop.strip(), message, screen
+
+
+def _last_of_one(hub, step) -> bool:
+    """Whether the only rendering is being felt: it may be answered meanwhile; two are compared when both are felt."""
+    return step is not None and step["index"] + 1 == step["count"] and len(hub.state.pending.renderings) == 1
 
 
 def _step(hub, trial):

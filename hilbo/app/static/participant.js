@@ -50,8 +50,9 @@ function draw() {
   at("progress").setAttribute("aria-valuenow", bar ? bar.done : 0);
   at("progress").setAttribute("aria-valuemax", bar ? bar.of : 1);
   drawSteps();
-  put("title", waiting ? words("saving") : q ? q.text : view.title || "");
-  put("message", waiting || q ? "" : view.message || "");
+  const feeling = q && view.step;      // what to feel stays the title, and the question is there already
+  put("title", waiting ? words("saving") : q && !feeling ? q.text : view.title || "");
+  put("message", waiting ? "" : feeling ? q.text : q ? "" : view.message || "");
   show("clock", !waiting && !over && !!view.step && view.step.seconds > 0);
   drawOptions(q);
   drawButton("go", !waiting && !over && view.may.begin && !q, words("begin"));
