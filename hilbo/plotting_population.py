@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
@@ -72,7 +73,7 @@ def coverage_figure(
         axes = figure.subplots()
         if len(parameters) == 1:
             ratio = np.sqrt(np.asarray(predict(side[:, None])[1]) / prior)
-            along = np.asarray(parameters[0].to_physical(side))
+            along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
             axes.plot(along, ratio, color=BLUE)
             axes.fill_between(along, 0, 1, where=ratio > known, hatch="///", facecolor="none", edgecolor=GREY)
             axes.set(ylabel="sd of the map over the prior's", ylim=(0, 1.05))
@@ -83,7 +84,7 @@ def coverage_figure(
             ratio = np.sqrt(np.asarray(predict(flat)[1]) / prior).reshape(_CELLS, _CELLS)
             feasible = np.asarray(study.space.feasible(flat)).reshape(_CELLS, _CELLS)
             ratio = np.where(feasible, ratio, np.nan)
-            sides = [np.asarray(p.to_physical(side)) for p in parameters[:2]]
+            sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
             shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud")
             axes.contourf(*sides, ratio.T, levels=[known, 10.0], hatches=["///"], colors="none")
             figure.colorbar(shown, ax=axes, label="sd of the map over the prior's")

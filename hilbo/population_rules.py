@@ -192,9 +192,8 @@ def _communicating(gp, trials, inference) -> tuple[Posterior, Posterior]:
             ' "rbcm".'
         )
     chosen = np.unique(np.linspace(0, len(row) - 1, size).round().astype(int))
-    common = Trials(
-        trials.x[person[chosen], row[chosen]], trials.q[person[chosen], row[chosen]], jnp.ones(len(chosen), bool)
-    )
+    at = person[chosen], row[chosen]
+    common = Trials(trials.x[at], trials.q[at], jnp.ones(len(chosen), bool))
     people = mask.shape[0]
     own = trials.mask & ~jnp.asarray(_at(mask.shape, *at))  # nobody's answer counts twice
 

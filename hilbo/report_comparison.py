@@ -48,6 +48,6 @@ def comparison_table(content: dict[str, Any]) -> pd.DataFrame:
         row = {"rule": rule} | {name: found.get(name) for name in _COLUMNS}
         row |= {"covered": found.get("covered"), "optimum_sd": found.get("optimum_sd")} | found.get("optimum", {})
         influence = found.get("influence") or {}
-        row["most_influential"] = max(influence, key=influence.get) if influence else None
+        row["most_influential"] = max(influence, key=lambda name: influence[name]) if influence else None
         rows.append(row | {"refused": found.get("refused")})
     return pd.DataFrame(rows)

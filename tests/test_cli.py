@@ -58,7 +58,9 @@ def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 4
     assert "http://" not in page and "https://" not in page
-    assert len(pd.read_csv(out / "optima.csv")) == 7
+    assert len(pd.read_csv(out / "optima.csv")) == 8
+    assert content["rule"] == "bcm" and 0 < content["heterogeneity"]["share"] < 1
+    assert any(words.startswith("People differ") for words in content["warnings"])
     assert content["other_inference"]["inference"] == "ep" and 0 <= content["other_inference"]["nrmse"] < 0.5
     assert "With expectation propagation instead, the optimum would move by" in page
     before = (out / "result.json").read_bytes()
@@ -126,6 +128,12 @@ def test_a_bad_table_writes_nothing(capsys, monkeypatch, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
 
 
+def test_unknown_rules_are_refused(capsys, monkeypatch, tmp_path):
+    code, _, stderr = run(capsys, monkeypatch, "aggregate", *VIDEO, "--rule", "median", "--out", tmp_path / "out")
+    assert code == 2 and '--rule is "median"; it must be one of bcm, hierarchical' in stderr
+    assert not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("arguments", [["aggregate"], ["simulate", "--preset", "nobody", "--out", "x"], ["fly"]])
 def test_bad_usage_ends_with_2(capsys, monkeypatch, tmp_path, arguments):
     monkeypatch.chdir(tmp_path)
@@ -158,7 +166,7 @@ def test_simulate_keeps_what_it_simulated(capsys, monkeypatch, tmp_path):
     assert (out / "study.toml").read_text() == text
     assert pd.read_csv(out / "truth.csv")["source"].tolist() == ["population", "individual:P01", "individual:P02"]
     content = json.loads((out / "result.json").read_text())
-    assert set(content["truth"]["nrmse"]) == {"aggregate", "mean_of_optima", "average", "pooled", "ep"}
+    assert set(content["truth"]["nrmse"]) == {"aggregate", "mean_of_optima", "average", "hierarchical", "pooled", "ep"}
     again = ["aggregate", out / "trials.csv", "--study", out / "study.toml", "--out", tmp_path / "again", "--json"]
     code, stdout, _ = run(capsys, monkeypatch, *again)
     assert code == 0

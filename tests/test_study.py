@@ -139,7 +139,8 @@ def test_the_optimum_is_where_the_map_is_highest(cohort):
     mean, _ = population(found.posteriors, many)
     assert float(found.optimum.mean) >= float(mean.max())
     assert bool(STUDY.space.feasible(found.optimum.x))
-    assert set(found.alternatives) == {"average", "pooled", "ep"}
+    assert set(found.alternatives) == {"average", "hierarchical", "pooled", "ep"}
+    assert found.share is not None and 0 < float(found.share.mean) < 1
     merged, own = progress(STUDY, cohort, 0, [5, 9])
     np.testing.assert_allclose(merged[-1], found.optimum.x, atol=1e-4)
     np.testing.assert_allclose(own[-1], found.individuals.x, atol=1e-3)
