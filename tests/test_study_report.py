@@ -20,6 +20,8 @@ from hilbo.analysis import analyse, limits_of, settled
 from hilbo.errors import InputError
 from hilbo.hypotheses import Evidence, Hypothesis
 from hilbo.inference_data import groups, predictive_shares, write_groups
+from hilbo.report_figures import comparison_figures
+from hilbo.report_study import _comparison
 from hilbo.report_validation import p_words, safest, slug, validate
 from hilbo.sensitivity import tolerance_ends
 from hilbo.simulate import PRESETS
@@ -313,3 +315,36 @@ def test_a_report_of_two_materials(capsys, monkeypatch, tmp_path):
     assert page.count("data:image/png;base64,") == 2 * 9 + 1 and "http://" not in page
     assert "Hypothesis 4" in page and "fair, good, excellent" in page
     assert run(capsys, monkeypatch, "report", folder, "--out", out, "--force", "--exclude", "mood > 1")[0] == 2
+
+
+def test_the_comparison_of_rules_is_shown():
+    """From the content of `comparison.compare`: a row for each rule, refused ones too, and two figures."""
+    scores = {
+        "negative_log_density": 1.1,
+        "negative_log_density_error": 0.1,
+        "central_95": 0.94,
+        "central_95_error": 0.01,
+    }
+    bins = [{"predicted": 0.1, "observed": 0.2}, {"predicted": 0.8, "observed": 0.7}]
+    found = scores | {
+        "method": "by points",
+        "z2": 1.2,
+        "covered": 0.5,
+        "optimum_sd": 0.2,
+        "optimum": {"u": 0.4, "v": 12.0},
+    }
+    found |= {"influence": {"A": 0.1, "B": 0.3}, "reliability": bins}
+    content = {
+        "rules": {"bcm": found, "hierarchical": found, "pooled": {"refused": "too many"}},
+        "recommendation": "Use bcm.",
+    }
+    shown = _comparison(content)
+    head, rows = shown["table"]
+    assert (
+        shown["words"] == "Use bcm."
+        and head[0] == "rule"
+        and [row[0] for row in rows] == ["bcm", "hierarchical", "pooled"]
+    )
+    assert "too many" in rows[2] and "–" in rows[2]
+    figures = comparison_figures(content)
+    assert set(figures) == {"comparison", "reliability"} and len(figures["comparison"][0].axes) == 2
