@@ -17,8 +17,8 @@ Rasmussen & Williams' (3.65) without its differences of large terms, and without
 
 * Coordinates as in `laplace`: eta = R w, R the eigenvector root of K, and only I + R'TR >= 1 is factorised. K may be
   singular (the same stimulus asked twice); nothing is added to it.
-* The search begins at Laplace's mode, which is near, and with S = K - K C K, which needs no root. Where it does not end
-  below the tolerance it begins anew with R and from the prior; and where S has lost digits it goes on with R.
+* The search begins at Laplace's mode, which is near, or at `start`, and with S = K - K C K, which needs no root. Where
+  it does not end below the tolerance it begins anew with R and from the prior; where S lost digits it goes on with R.
 * For given v the means are the maximum of a concave function, so that only v is in need of a careful search. Far from
   the fixed point damped parallel updates, near it Newton's steps in (m, v), the mean eliminated: n unknowns. A Newton
   step that does not halve the mismatch sends the search back to updates, which are damped more the longer they take.

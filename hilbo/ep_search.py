@@ -63,12 +63,14 @@ def find(terms, covariance, start, max_steps):
 
     def quick(arrays, covariance, start):
         terms = eqx.combine(arrays, rest)
-        near = jnp.zeros_like(covariance[0]) if start is None else start
-        eta = plain_mode(_AtPoints(terms), covariance, near, _QUICK_STEPS).eta
-        begun = _begin(terms, covariance, None, _AtPoints(terms)(eta)[1])
         none = jnp.zeros_like(covariance[0, 0])
-        found = _searched(terms, covariance, None, begun, min(max_steps, _QUICK_STEPS), none)
-        mean, variance, end = found
+        spent = jnp.zeros((), jnp.int32)
+        if start is None:
+            mode = plain_mode(_AtPoints(terms), covariance, jnp.zeros_like(covariance[0]), _QUICK_STEPS)
+            start, spent = _AtPoints(terms)(mode.eta)[1], mode.steps.astype(jnp.int32) - 1
+        begun = _begin(terms, covariance, None, start)
+        mean, variance, end = _searched(terms, covariance, None, begun, min(max_steps, _QUICK_STEPS), none)
+        found = mean, variance, end._replace(iterations=end.iterations + spent)
         met = end.residual <= end.tolerance
         _, _, precision = terms(mean, variance)
         # s = K - KCK errs by eps K, and the cavity's variance by this share:
@@ -78,8 +80,11 @@ def find(terms, covariance, start, max_steps):
             prior = _begin(terms, covariance, root, None)
             return jax.tree.map(lambda a, b: jnp.where(met, a, b), (mean, variance), prior)
 
-        done = met & (blur <= 0.1 * end.tolerance)
-        return jax.lax.cond(done, lambda: found, lambda: with_root(terms, covariance, anew))
+        def further():
+            mean, variance, last = with_root(terms, covariance, anew)
+            return mean, variance, last._replace(iterations=last.iterations + jnp.where(met, found[2].iterations, 0))
+
+        return jax.lax.cond(met & (blur <= 0.1 * end.tolerance), lambda: found, further)
 
     return one_at_a_time(quick, safe)(arrays, covariance, start)
 
