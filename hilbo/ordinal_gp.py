@@ -315,6 +315,10 @@ def _unresolved(certificate: Certificate) -> Bool[Array, ""]:
     return certificate.smallest_variance < certificate.variance_resolution
 
 
+def _vague(certificate: Certificate) -> Bool[Array, ""]:
+    return certificate.evidence_error > certificate.evidence_tolerance
+
+
 def _checked(posterior: Posterior, sought: str) -> Posterior:
     certificate = posterior.certificate
     if isinstance(certificate.converged, jax.core.Tracer):
@@ -335,7 +339,12 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
                 " too small a part of the prior's for this precision to tell; use a larger noise, float64, or"
                 " throw=False to look at the certificate."
             )
-        if found and isinstance(certificate, Certificate):
+        if found and not bool(jnp.isfinite(posterior.log_evidence)):
+            raise InferenceError(
+                f"the {sought} was not found: its log evidence is not finite, though its residual is"
+                f" {float(certificate.residual):.3g}; check that the thresholds rise."
+            )
+        if found and isinstance(certificate, Certificate) and bool(_vague(certificate)):
             raise InferenceError(
                 f"the {sought} was found (residual {float(certificate.residual):.3g}), but not closely enough for its"
                 f" evidence, which may be off by {float(certificate.evidence_error):.3g}; use a larger noise, float64,"

@@ -260,7 +260,7 @@ def test_conflicting_repeats_at_tiny_noise(noise):
 def test_a_failed_fit_says_so():
     data = separated()
     gp = OrdinalGP(RBF(data.theta, data.variance), OrdinalProbit((0.5, -0.5), 0.5))  # out of order: NaN
-    with pytest.raises(InferenceError, match=r"expectation propagation was not found: its residual is"):
+    with pytest.raises(InferenceError, match=r"expectation propagation was not found: its log evidence is not finite"):
         fit(gp, answers(data), inference="ep")
     assert not fit(gp, answers(data), inference="ep", throw=False).certificate.converged
     kernel, full = model(data).kernel, answers(data)

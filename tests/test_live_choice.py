@@ -27,6 +27,13 @@ def asked(state, chooser, at=0.0):
     return state.after(live.propose(state, chooser, at))
 
 
+def felt(state):
+    for step in range(len(live.steps_of(state, state.pending))):
+        for on in (True, False):
+            state = state.after(live.present(state, state.pending.id, step, on, 0.5))
+    return state
+
+
 def told(state, response, at=1.0):
     return state.after(live.answer(state, state.pending.id, f"c{state.seq}", {"class_a": response}, at, felt=False))
 
@@ -71,6 +78,7 @@ def test_a_rendering_voided_twice_is_replaced_by_a_feasible_one_apart(chooser, c
     state = asked(state, chooser)
     point = state.pending.renderings["a"]
     for again in range(2):
+        state = felt(state)
         state = state.after(live.void(state, state.pending.id, "noise", 1.0))
         state = asked(state, chooser)
         assert (state.pending.renderings["a"] == point) == (again == 0)
