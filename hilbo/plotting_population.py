@@ -72,7 +72,7 @@ def coverage_figure(
         figure = Figure(figsize=(4.2, 3.2), layout="constrained")
         axes = figure.subplots()
         if len(parameters) == 1:
-            ratio = np.sqrt(np.asarray(predict(side[:, None])[1]) / prior)
+            ratio = np.sqrt(np.asarray(predict(jnp.asarray(side[:, None]))[1]) / prior)
             along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
             axes.plot(along, ratio, color=BLUE)
             axes.fill_between(along, 0, 1, where=ratio > known, hatch="///", facecolor="none", edgecolor=GREY)
@@ -81,7 +81,7 @@ def coverage_figure(
             grid = np.tile(np.asarray(at), (_CELLS, _CELLS, 1))
             grid[..., 0], grid[..., 1] = np.meshgrid(side, side, indexing="ij")
             flat = grid.reshape(-1, len(parameters))
-            ratio = np.sqrt(np.asarray(predict(flat)[1]) / prior).reshape(_CELLS, _CELLS)
+            ratio = np.sqrt(np.asarray(predict(jnp.asarray(flat))[1]) / prior).reshape(_CELLS, _CELLS)
             feasible = np.asarray(study.space.feasible(flat)).reshape(_CELLS, _CELLS)
             ratio = np.where(feasible, ratio, np.nan)
             sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
