@@ -158,7 +158,7 @@ def _columns(figure, handles):
 
 def _hatch(axes, study, surface, best, third, values):
     """Hatch what is feasible and of which the map knows less than `UNKNOWN`."""
-    spread = grid_slice(study, lambda x: (jnp.sqrt(surface(x)[1]), None), best, third)
+    spread = grid_slice(study, lambda x: (jnp.sqrt(surface(x)[1]), surface(x)[1]), best, third)
     limit = UNKNOWN * np.sqrt(float(study.gp.kernel.diagonal(jnp.asarray(best))))
     unknown = np.where(np.isnan(values), 0.0, np.where(spread > limit, 1.0, 0.0))
     if unknown.any():

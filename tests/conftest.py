@@ -1,5 +1,6 @@
 """What every test runs under: float64, strict promotion, shapes and types checked at every call of hilbo."""
 
+import gc
 import itertools
 import os
 from pathlib import Path
@@ -27,7 +28,19 @@ settings.register_profile("fixed", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None, max_examples=500, print_blob=True)
 settings.load_profile("fixed")
 
+MANY_MAPPINGS = 15_000
 REQUIRE_ALL = os.environ.get("HILBO_REQUIRE_ALL", "") not in ("", "0")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_mappings():
+    """Compiled functions are let go after a file that left many: each is mapped into memory several times, and a process
+    that passes the kernel's limit (vm.max_map_count, 65,530) is ended by a segmentation fault while it compiles."""
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPPINGS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.fixture
