@@ -34,8 +34,8 @@ REQUIRE_ALL = os.environ.get("HILBO_REQUIRE_ALL", "") not in ("", "0")
 
 @pytest.fixture(scope="module", autouse=True)
 def _few_mappings():
-    """Compiled functions are let go after a file that left many: each is mapped into memory several times, and a process
-    that passes the kernel's limit (vm.max_map_count, 65,530) is ended by a segmentation fault while it compiles."""
+    """Compiled functions are let go after a file that left many: each is mapped into memory several times, and a
+    process that passes the kernel's limit (vm.max_map_count, 65,530) ends by a segmentation fault while it compiles."""
     yield
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPPINGS:
