@@ -121,7 +121,7 @@ def make_plan(
         "phase": phase,
         "source": source,
         "materials": names,
-        "complete_at": f"multiples of {size} participants",
+        "complete_at": "any number of participants" if size == 1 else f"multiples of {size} participants",
         "complete": len(participants) % size == 0,
         "participants": people,
     }
