@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple
 import typer
 
 from hilbo.console import Json, Seed, fail, progress, start
-from hilbo.device_options import sim_options, takes
+from hilbo.device_options import Baud, Sim, Where, sim_options, takes
 from hilbo.errors import InputError
 
 __all__ = ["doctor", "live", "session"]
@@ -26,11 +26,9 @@ _EXTRA = "Live sessions need starlette, uvicorn and segno; install them with: pi
 class Device(NamedTuple):
     """Which device."""
 
-    device: Annotated[str, typer.Option("--device", help='"sim", a serial port, or socket://host:port.')] = "sim"
-    baud: Annotated[int, typer.Option(min=1, help="Line rate of a serial port.")] = 1_000_000
-    sim: Annotated[
-        list[str] | None, typer.Option("--sim", help="KEY=VALUE of the simulated device, such as finger=sine; repeat.")
-    ] = None
+    device: Where = "sim"
+    baud: Baud = 1_000_000
+    sim: Sim = None
 
     def open(self, damping: float | None) -> Any:
         """A connected `Renderer` of a device that has at least this damping (N·s/m)."""

@@ -18,7 +18,25 @@ import typer
 from hilbo.console import fail
 from hilbo.errors import InputError
 
-__all__ = ["Chosen", "Line", "chosen_set", "opened", "sets_of", "sim_options", "simulator", "takes"]
+__all__ = [
+    "Baud",
+    "Chosen",
+    "Line",
+    "Sim",
+    "Where",
+    "chosen_set",
+    "opened",
+    "sets_of",
+    "sim_options",
+    "simulator",
+    "takes",
+]
+
+Where = Annotated[str, typer.Option("--device", help='"sim", a serial port, or socket://host:port.')]
+Baud = Annotated[int, typer.Option(min=1, help="Line rate of a serial port.")]
+Sim = Annotated[
+    list[str] | None, typer.Option("--sim", help="KEY=VALUE of the simulated device, such as finger=sine; repeat.")
+]
 
 _Path = Path | None
 _Number = float | None
@@ -27,11 +45,9 @@ _Number = float | None
 class Line(NamedTuple):
     """Which device, and what is counted on."""
 
-    device: Annotated[str, typer.Option("--device", help='"sim", a serial port, or socket://host:port.')] = "sim"
-    baud: Annotated[int, typer.Option(min=1, help="Line rate of a serial port.")] = 1_000_000
-    sim: Annotated[
-        list[str] | None, typer.Option("--sim", help="KEY=VALUE of the simulated device, such as finger=sine; repeat.")
-    ] = None
+    device: Where = "sim"
+    baud: Baud = 1_000_000
+    sim: Sim = None
     study: Annotated[_Path, typer.Option("--study", help="Its damping must not exceed the device's.")] = None
     damping: Annotated[_Number, typer.Option(help="Damping that is counted on, N.s/m; else the study's.")] = None
     patience: Annotated[_Number, typer.Option(min=0.001, help="How long an answer may take, s; 0.1 on a line.")] = None

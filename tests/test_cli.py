@@ -9,18 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
-
-from hilbo import cli
+from commands import run
 
 VIDEO = ["hilbo/data/video_quality.csv", "--study", "hilbo/data/video_quality.toml"]
-
-
-def run(capsys, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["hilbo", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    captured = capsys.readouterr()
-    return stopped.value.code or 0, captured.out, captured.err
 
 
 HELP = """

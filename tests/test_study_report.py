@@ -1,7 +1,6 @@
 """`hilbo validate` and `hilbo report`: what they write, what they say of poor data, and bad folders in one sentence."""
 
 import json
-import sys
 from pathlib import Path
 
 import arviz as az
@@ -15,7 +14,7 @@ import xarray as xr
 from test_statistics import study as paper_counts
 from test_validation import plain
 
-from hilbo import Trials, cli
+from hilbo import Trials
 from hilbo.analysis import analyse, limits_of, settled
 from hilbo.errors import InputError
 from hilbo.hypotheses import Evidence, Hypothesis
@@ -32,14 +31,6 @@ from hilbo.validation import Sets, tolerance
 
 STUDY = Path("hilbo/data/paper.toml").read_text()
 HEAD = "participant,trial,response,K1,B1,alpha\n"
-
-
-def run(capsys, monkeypatch, *arguments):
-    monkeypatch.setattr(sys, "argv", ["hilbo", *map(str, arguments)])
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    captured = capsys.readouterr()
-    return stopped.value.code or 0, captured.out, captured.err
 
 
 def crowd(answers):
