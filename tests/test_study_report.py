@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from commands import run
 from test_statistics import study as paper_counts
 from test_validation import plain
 
