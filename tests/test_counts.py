@@ -32,7 +32,8 @@ def test_counts_count_every_answer():
     assert float(found.counts.sum()) == mask.sum() and found.x.shape == (7, 2)
     for person, point, category in ((0, 2, 1), (3, 5, 0)):
         same = (np.asarray(trials.x[person]) == np.asarray(found.x[point])).all(axis=1) & mask[person]
-        assert found.counts[person, point, category] == (np.asarray(trials.q[person])[same] == category).sum()
+        answered = (np.asarray(trials.q[person])[same] == category).sum()
+        assert float(found.counts[person, point, category]) == answered
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
