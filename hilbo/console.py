@@ -19,6 +19,7 @@ from typing import Annotated, Any, NoReturn, Protocol
 
 import typer
 
+from hilbo.compiling import set_flags
 from hilbo.errors import InputError
 
 __all__ = ["PARTS", "Force", "Json", "Out", "Say", "Seed", "fail", "finish", "progress", "results", "start"]
@@ -38,6 +39,7 @@ def start(devices: int | None = None) -> None:
 
     `devices`: as how many devices the CPU is to count.
     """
+    set_flags()
     import jax
 
     jax.config.update("jax_enable_x64", True)

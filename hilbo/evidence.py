@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hilbo.gaussian import factorise
+from hilbo.gaussian import evidence_error, evidence_tolerance, factorise
 from hilbo.laplace import Terms, find_mode
 from hilbo.linalg import solve_lower
 
@@ -89,7 +89,11 @@ def laplace_evidence(
     largest = jnp.max(jnp.diagonal(matrix))
     smallest = jnp.min(jnp.where(curvature > 0, post.variance, largest))
     resolved = smallest >= jnp.finfo(value.dtype).eps * largest * found.eta.size**0.5
-    certified = (found.residual <= found.tolerance) & jnp.isfinite(value) & resolved
+    error = evidence_error(
+        matrix, found.eta, weights, lambda y: post.inverse @ y, post.variance, lambda eta: terms(own)(eta)[2]
+    )
+    sure = jnp.isfinite(value) & (error <= evidence_tolerance(value))
+    certified = (found.residual <= found.tolerance) & sure & resolved
     return Evidence(value, gradient, hessian, weights, paths.weights, certified)
 
 

@@ -19,6 +19,7 @@ __all__ = [
     "Certificate",
     "GaussianPosterior",
     "certify",
+    "evidence_error",
     "evidence_tolerance",
     "factor",
     "factorise",
@@ -51,7 +52,7 @@ class Certificate(eqx.Module):
     variance_resolution: Float[Array, ""]
     """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
     evidence_error: Float[Array, ""]
-    """What the distance from the exact mode, and the rounding of K a, do to the log evidence, to first order."""
+    """What the distance from the exact mode, and the rounding of K and K a, do to the log evidence, to first order."""
     evidence_tolerance: Float[Array, ""]
     """0.02 + eps^(1/2) |log evidence|: evidences that are nearer than that decide nothing."""
     converged: Bool[Array, ""]
@@ -84,26 +85,17 @@ def certify(
     """The certificate of the posterior with these `weights` a and this `factor` V; `search` says how it was found.
 
     K a, which predictions use, and the mode are equal but for rounding, and may differ by eps^(1/4) prior standard
-    deviations. To first order the mode is off by d = P (K a - mode), P = (I + KW)^-1 = I - K C, beside the rounding
-    P eps |K| |a| + eps |mode|. The log posterior being stationary, the sums in the log evidence move by at most
-    sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior variances, dW the change of the
-    curvatures within d. Where the noise is far below the prior's standard deviation, these notice what a residual in
-    units of the latter cannot.
+    deviations.
     """
     epsilon, prior = jnp.finfo(weights.dtype).eps, jnp.diagonal(covariance)
     largest, sd = jnp.max(prior), jnp.sqrt(prior)
     variance = prior - jnp.sum((factor @ covariance) ** 2, axis=0)
-    apart = mode - covariance @ weights
-    rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
-    steps = jnp.stack([apart, rounding], axis=1)
-    off = jnp.sum(jnp.abs(steps - covariance @ (factor.T @ (factor @ steps))), axis=1) + epsilon * jnp.abs(mode)
-    curvature, *beside = jax.vmap(curvature_at)(jnp.stack([mode, mode - off, mode + off]))
-    change = jnp.maximum(jnp.abs(beside[0] - curvature), jnp.abs(beside[1] - curvature))
-    error = 0.5 * jnp.sum(curvature * off**2) + 0.5 * jnp.sum(jnp.abs(variance) * change)
+    error = evidence_error(covariance, mode, weights, lambda y: factor.T @ (factor @ y), variance, curvature_at)
     allowed = evidence_tolerance(log_evidence)
-    smallest = jnp.min(jnp.where(curvature > 0, variance, largest))
+    smallest = jnp.min(jnp.where(curvature_at(mode) > 0, variance, largest))
     resolution = epsilon * largest * weights.shape[0] ** 0.5
-    found = (search["residual"] <= search["tolerance"]) & jnp.all(jnp.abs(apart) <= epsilon**0.25 * sd)
+    apart = jnp.abs(mode - covariance @ weights)
+    found = (search["residual"] <= search["tolerance"]) & jnp.all(apart <= epsilon**0.25 * sd)
     sure = jnp.isfinite(log_evidence) & (error <= allowed)
     return Certificate(
         **search,
@@ -113,6 +105,33 @@ def certify(
         evidence_tolerance=allowed,
         converged=found & sure & (smallest >= resolution),
     )
+
+
+def evidence_error(
+    covariance: Float[Array, "n n"],
+    mode: Float[Array, " n"],
+    weights: Float[Array, " n"],
+    explain: Callable[[Float[Array, "n k"]], Float[Array, "n k"]],
+    variance: Float[Array, " n"],
+    curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+) -> Float[Array, ""]:
+    """How far off Laplace's log evidence may be at this `mode`, with `weights` a; `explain` multiplies by C.
+
+    To first order the mode is off by d = P (K a - mode), P = (I + KW)^-1 = I - K C, beside the rounding
+    P eps |K| |a| + eps |mode|. The log posterior being stationary, the sums in the log evidence move by at most
+    sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior variances, dW the change of the
+    curvatures within d. Where the noise is far below the prior's standard deviation, these notice what a residual in
+    units of the latter cannot. And the elements of K are off by eps K, in directions that differ: a'K a / 2 by the
+    root of the sum of squares of eps a_i K_ij a_j / 2.
+    """
+    epsilon = jnp.finfo(weights.dtype).eps
+    rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
+    steps = jnp.stack([mode - covariance @ weights, rounding], axis=1)
+    off = jnp.sum(jnp.abs(steps - covariance @ explain(steps)), axis=1) + epsilon * jnp.abs(mode)
+    curvature, below, above = jax.vmap(curvature_at)(jnp.stack([mode, mode - off, mode + off]))
+    change = jnp.maximum(jnp.abs(below - curvature), jnp.abs(above - curvature))
+    formed = epsilon * jnp.sqrt(weights**2 @ covariance**2 @ weights**2)
+    return 0.5 * (jnp.sum(curvature * off**2) + jnp.sum(jnp.abs(variance) * change) + formed)
 
 
 def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:

@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from hilbo import acquisition
+from hilbo.compiling import compiler_options
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.kernels import gram
@@ -204,7 +205,7 @@ class _Step:
 def _compiled(structure, leaves):
     fixed = jax.tree.unflatten(structure, leaves)
 
-    @jax.jit
+    @functools.partial(jax.jit, compiler_options=compiler_options())
     def step(arrays, points, answers, count):
         study, plan = eqx.combine(arrays, fixed)
         trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)

@@ -23,6 +23,10 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 install_import_hook("hilbo", "beartype.beartype")  # stays for the whole run: hilbo is imported by the tests
 
+from hilbo.compiling import set_flags  # noqa: E402
+
+set_flags()  # as hilbo's commands are compiled
+
 # The same examples in every run; pytest --hypothesis-profile=search draws new ones.
 settings.register_profile("fixed", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None, max_examples=500, print_blob=True)

@@ -62,7 +62,7 @@ MATHS = {
     "space_filling": set(),
     "search_space": {"viscoelastic", "passivity", "space_filling"},
     "search_lattice": {"lattice", "search_space", "space_filling"},
-    "session": {"config", "ordinal_gp", "acquisition", "lattice", "search_lattice"},
+    "session": {"compiling", "config", "ordinal_gp", "acquisition", "lattice", "search_lattice"},
     "simulate": {"session"},
     "validation": {"study", "config", "acquisition"},
     "ordered_logit": set(),
@@ -77,6 +77,7 @@ MATHS = {
 # What each module may import of hilbo, and with it what that one may import. Modules to come have their place already.
 MAY_IMPORT = MATHS | {
     "errors": set(),
+    "compiling": set(),
     "frames": set(),
     "messages": set(),
     "reasons": set(),
@@ -122,7 +123,7 @@ MAY_IMPORT = MATHS | {
     "inference_data": {"study", "kernels"},
     "study_folder": {"study", "validation_table"},
     "power": {"study", "simulate"},
-    "console": set(),
+    "console": {"compiling"},
     "cli_material": {"console", "characterise", "material_tables", "report_material"},
     "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm", "population_rules"},
     "rule_words": {"config", "hierarchical"},
