@@ -19,6 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.linalg import eigh
@@ -125,6 +126,7 @@ def maximise(
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
     starts: int = 3,
     steps: int = 50,
+    gain: ArrayLike = 0.0,
 ) -> Choice:
     """The best of the candidates and of `starts` polished ones.
 
@@ -138,6 +140,7 @@ def maximise(
     - `allowed`: which points may be chosen at all, e.g. none too near to earlier ones.
     - `starts`, `steps`: how many candidates, at least 0.1 apart, are polished, and at most how many Newton steps each
       may take; 0 starts means no polishing.
+    - `gain`: polishing ends where its next step promises less than that.
     """
     if allowed is not None:
         values = jnp.where(jax.vmap(allowed)(candidates), values, -jnp.inf)
@@ -151,6 +154,7 @@ def maximise(
         feasible=feasible,
         allowed=allowed,
         steps=steps if starts else 0,
+        gain=gain,
     )
     return eqx.tree_at(lambda c: c.candidate, found, rows[found.candidate])
 
@@ -165,12 +169,13 @@ def climb(
     feasible: Callable[[Float[Array, " d"]], Bool[Array, ""]],
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
     steps: int = 50,
+    gain: ArrayLike = 0.0,
 ) -> Choice:
     """The best of the usable starts and of where Newton's method leads from them; arguments as in [`maximise`][].
 
-    The search goes through the unit cube itself. Only where that ends outside the feasible set does another follow in
-    the optimiser's coordinates, from the wall beside that end or from the start, whichever is better: there walls are
-    flat, but the function inside is bent wherever the wall is.
+    The search goes through the unit cube itself. Only where that ends outside the feasible set, on a hill higher than
+    what was found before, does another follow in the optimiser's coordinates, from the wall beside that end or from the
+    start, whichever is better: there walls are flat, but the function inside is bent wherever the wall is.
     One start after the other: each stops when it is done, where a batch would wait for its slowest.
     """
 
@@ -180,23 +185,27 @@ def climb(
     def along_the_wall(x, outside):
         aside = from_box(jnp.clip(to_box(outside), 0.0, 1.0))
         begin = jnp.where(score(aside) > score(x), aside, x)
-        w, value = _polish(lambda w: score(from_box(w)), to_box(begin), steps)
+        w, value = _polish(lambda w: score(from_box(w)), to_box(begin), steps, gain)
         end = from_box(w)
         return end, jnp.where(may_end(end), value, -jnp.inf)
 
-    def one(_, start):
+    def one(highest, start):
         x, may = start
         begun = jnp.where(may, score(x), -jnp.inf)
         if steps == 0:
-            return None, (x, begun, begun)
-        straight, height = _polish(score, x, steps)
+            return highest, (x, begun, begun)
+        straight, height = _polish(score, x, steps, gain)
         w = to_box(straight)
         inside = jnp.all((w >= 0.0) & (w <= 1.0)) & may_end(straight)
-        end, value = jax.lax.cond(inside, lambda: (straight, height), lambda: along_the_wall(x, straight))
-        risen = may & (value > begun)
-        return None, (jnp.where(risen, end, x), jnp.where(risen, value, begun), begun)
+        end, value = jax.lax.cond(
+            inside | (height <= highest), lambda: (straight, height), lambda: along_the_wall(x, straight)
+        )
+        risen = may & (value > begun) & (inside | (height > highest))
+        end, value = jnp.where(risen, end, x), jnp.where(risen, value, begun)
+        return jnp.maximum(highest, value), (end, value, begun)
 
-    _, (ends, values, begun) = jax.lax.scan(one, None, (starts, usable))
+    lowest = jnp.full((), -jnp.inf, starts.dtype)
+    _, (ends, values, begun) = jax.lax.scan(one, lowest, (starts, usable))
     best, first = jnp.argmax(values), jnp.argmax(begun)
     return Choice(ends[best], values[best], first, begun[first])
 
@@ -212,11 +221,11 @@ def spread(values: Float[Array, " m"], candidates: Float[Array, "m d"], count: i
     return jax.lax.scan(pick, values, None, length=count)[1]
 
 
-def _polish(score, begin, steps):
+def _polish(score, begin, steps, gain):
     """Newton's method within the unit cube from `begin`: where it ends, and the score there."""
     solution = optx.minimise(
         lambda w, _: -score(w),
-        TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION),
+        TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION, gain=gain),
         begin,
         options={"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)},
         max_steps=steps,

@@ -44,6 +44,7 @@ class _State(eqx.Module):
     promised: Float[Array, ""]  # and by how much it lowers the quadratic model
     radius: Float[Array, ""]
     pressing: Float[Array, ""]  # largest component of the gradient that no wall holds
+    ahead: Float[Array, ""]  # by how much the model falls within a radius of 1, whatever the radius is
 
 
 class TrustRegionNewton(optx.AbstractMinimiser):
@@ -55,15 +56,17 @@ class TrustRegionNewton(optx.AbstractMinimiser):
       besides, in place of automatic differentiation;
     - "known": ends (k, p) of other searches, NaN where there is none. A search whose next step goes to one ends.
 
-    Ends where no free component of the gradient is above `atol`, or where the radius is below `resolution` (a kink of
-    the function, or its rounding); `state.here` is the expansion at the end. A start at which the function is not
-    finite is where it ends.
+    Ends where no free component of the gradient is above `atol`, where the quadratic model falls by less than `gain`
+    within a radius of 1 (a plateau, on which a gradient may take long to vanish), or where the trust radius is below
+    `resolution` (a kink of the function, or its rounding); `state.here` is the expansion at the end. A start at which
+    the function is not finite is where it ends.
     """
 
     rtol: float = 0.0
     atol: float = 1e-6
     norm: Callable = optx.max_norm
     resolution: float = 1e-12
+    gain: float | Float[Array, ""] = 0.0
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         """Nowhere yet: the first step evaluates the start."""
@@ -73,7 +76,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         aux = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
         here = _Expansion(infinite[0], infinite, jnp.zeros((flat.size, flat.size), flat.dtype), aux)
         zero = jnp.zeros_like(flat[0])
-        return _State(here, jnp.zeros_like(flat), zero, zero + _FIRST_RADIUS, infinite[0])
+        return _State(here, jnp.zeros_like(flat), zero, zero + _FIRST_RADIUS, infinite[0], infinite[0])
 
     def step(self, fn, y, args, options, state, tags):
         """Evaluate the step decided on before, take it or not, and decide on the next."""
@@ -98,7 +101,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
     def terminate(self, fn, y, args, options, state, tags):
         """Stationary within the box, or stuck, or on the way to a known end."""
         del fn, args, tags
-        ended = (state.pressing <= self.atol) | (state.radius < self.resolution)
+        ended = (state.pressing <= self.atol) | (state.ahead < self.gain) | (state.radius < self.resolution)
         known = options.get("known")
         return (ended if known is None else ended | arrives(y, state.move, known)), optx.RESULTS.successful
 
@@ -125,7 +128,7 @@ def _expand(function, at):
 
 
 def _plan(here, at, radius, lower, upper):
-    """The next step, what the quadratic model promises of it, the radius, and the gradient's free part."""
+    """The state from the next step on: that step, what the quadratic model promises of it, and so on."""
     held = jnp.zeros(at.shape, bool)
     if lower is not None:
         held |= (at <= lower) & (here.gradient >= 0)
@@ -135,7 +138,8 @@ def _plan(here, at, radius, lower, upper):
     hessian = jnp.where(held[:, None] | held[None, :], jnp.eye(at.size, dtype=at.dtype), here.hessian)
     eigenvalues, vectors = eigh(hessian)
     turned = gradient @ vectors
-    stiffness = jnp.abs(eigenvalues) + jnp.linalg.norm(turned) / radius
+    steepness = jnp.linalg.norm(turned)
+    stiffness = jnp.abs(eigenvalues) + steepness / radius
     # No gradient, no step; only then may the stiffness be 0.
     move = -vectors @ (turned / jnp.where(stiffness > 0, stiffness, 1.0))
     ahead = at + move
@@ -143,4 +147,6 @@ def _plan(here, at, radius, lower, upper):
     ahead = ahead if upper is None else jnp.minimum(ahead, upper)
     move = ahead - at
     promised = -(gradient @ move + 0.5 * move @ hessian @ move)
-    return move, promised, radius, jnp.max(jnp.abs(gradient))
+    slow = jnp.abs(eigenvalues) + steepness
+    fall = 0.5 * jnp.sum(turned**2 / jnp.where(slow > 0, slow, 1.0))
+    return move, promised, radius, jnp.max(jnp.abs(gradient)), fall

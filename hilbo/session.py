@@ -43,7 +43,8 @@ __all__ = [
 
 CANDIDATES = 4096
 """Points inside the feasible set among which a function is maximised before polishing; a quarter more on its walls."""
-_BEST, _STARTS = 256, 3  # screened points among which the starts of the polishing are sought, and starts
+_BEST, _STARTS = 256, 4  # screened points among which the starts of the polishing are sought, and starts
+_GAIN, _IN_UNITS_OF_F = 1e-7, ("ucb", "mean")  # of the prior's sd: less is no reason to polish on
 _JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
 
 
@@ -96,6 +97,8 @@ def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
         return score(mean[0], variance[0])
 
     space = {"from_box": study.space.from_box, "to_box": study.space.to_box, "feasible": study.space.feasible}
+    if study.selection.acquisition in _IN_UNITS_OF_F:
+        space["gain"] = _GAIN * jnp.sqrt(study.gp.kernel.variance)
     short = posterior.astype(jnp.float32)
     known = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
     if plan.lattice is None:

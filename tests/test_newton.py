@@ -115,6 +115,34 @@ def test_a_search_on_its_way_to_a_known_end_stops():
     assert bool(arrives(there.value, there.state.move, jnp.ones((1, 2))))
 
 
+def plateau(y, _):
+    """A shallow bowl of degree four, on whose floor Newton's steps shorten by a third only, and a steep one."""
+    return 1e-3 * y[0] ** 4 + jnp.abs(y[1] - 0.3)
+
+
+def test_a_search_ends_on_a_plateau_but_not_on_a_slope_that_a_kink_makes_long():
+    def solve(gain):
+        solver = TrustRegionNewton(atol=1e-14, resolution=1e-9, gain=gain)
+        return optx.minimise(plateau, solver, jnp.array([0.5, 0.9]), max_steps=200, throw=False)
+
+    to_the_end, early = solve(0.0), solve(1e-7)
+    assert int(early.stats["num_steps"]) <= int(to_the_end.stats["num_steps"])
+    np.testing.assert_allclose(plateau(early.value, None), 0.0, atol=1e-4)  # the kink was followed all the same
+
+    flat = [
+        optx.minimise(
+            lambda y, _: 1e-3 * y[0] ** 4,
+            TrustRegionNewton(atol=1e-14, gain=gain),
+            jnp.array([0.5]),
+            max_steps=200,
+            throw=False,
+        )
+        for gain in (0.0, 1e-7)
+    ]
+    many, few = (int(solution.stats["num_steps"]) for solution in flat)
+    assert few < many / 2 and float(1e-3 * flat[1].value[0] ** 4) < 1e-6
+
+
 def test_an_expansion_of_ones_own_replaces_differentiation():
     def expand(y, last, aux):
         return rosenbrock(y, None), jax.grad(rosenbrock)(y, None), jax.hessian(rosenbrock)(y, None), aux + 1
