@@ -89,9 +89,8 @@ def laplace_evidence(
     largest = jnp.max(jnp.diagonal(matrix))
     smallest = jnp.min(jnp.where(curvature > 0, post.variance, largest))
     resolved = smallest >= jnp.finfo(value.dtype).eps * largest * found.eta.size**0.5
-    error = evidence_error(
-        matrix, found.eta, weights, lambda y: post.inverse @ y, post.variance, lambda eta: terms(own)(eta)[2]
-    )
+    explained = post.variance, lambda y: post.inverse @ y
+    error = evidence_error(matrix, found.eta, weights, curvature, explained, lambda eta: terms(own)(eta)[2])
     sure = jnp.isfinite(value) & (error <= evidence_tolerance(value))
     certified = (found.residual <= found.tolerance) & sure & resolved
     return Evidence(value, gradient, hessian, weights, paths.weights, certified)

@@ -77,12 +77,14 @@ def certify(
     covariance: Float[Array, "n n"],
     mode: Float[Array, " n"],
     weights: Float[Array, " n"],
+    curvature: Float[Array, " n"],
     factor: Float[Array, "n n"],
     curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
     log_evidence: Float[Array, ""],
     **search: Any,
 ) -> Certificate:
-    """The certificate of the posterior with these `weights` a and this `factor` V; `search` says how it was found.
+    """The certificate of the posterior with these `weights` a, this `curvature` W and `factor` V; `search` says how it
+    was found.
 
     K a, which predictions use, and the mode are equal but for rounding, and may differ by eps^(1/4) prior standard
     deviations.
@@ -90,9 +92,10 @@ def certify(
     epsilon, prior = jnp.finfo(weights.dtype).eps, jnp.diagonal(covariance)
     largest, sd = jnp.max(prior), jnp.sqrt(prior)
     variance = prior - jnp.sum((factor @ covariance) ** 2, axis=0)
-    error = evidence_error(covariance, mode, weights, lambda y: factor.T @ (factor @ y), variance, curvature_at)
+    post = variance, lambda y: factor.T @ (factor @ y)
+    error = evidence_error(covariance, mode, weights, curvature, post, curvature_at)
     allowed = evidence_tolerance(log_evidence)
-    smallest = jnp.min(jnp.where(curvature_at(mode) > 0, variance, largest))
+    smallest = jnp.min(jnp.where(curvature > 0, variance, largest))
     resolution = epsilon * largest * weights.shape[0] ** 0.5
     apart = jnp.abs(mode - covariance @ weights)
     found = (search["residual"] <= search["tolerance"]) & jnp.all(apart <= epsilon**0.25 * sd)
@@ -111,11 +114,13 @@ def evidence_error(
     covariance: Float[Array, "n n"],
     mode: Float[Array, " n"],
     weights: Float[Array, " n"],
-    explain: Callable[[Float[Array, "n k"]], Float[Array, "n k"]],
-    variance: Float[Array, " n"],
+    curvature: Float[Array, " n"],
+    posterior: tuple[Float[Array, " n"], Callable[[Float[Array, "n k"]], Float[Array, "n k"]]],
     curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
 ) -> Float[Array, ""]:
-    """How far off Laplace's log evidence may be at this `mode`, with `weights` a; `explain` multiplies by C.
+    """How far off Laplace's log evidence may be at this `mode`, with `weights` a and `curvature` W there.
+
+    `posterior`: variances, and what multiplies by C.
 
     To first order the mode is off by d = P (K a - mode), P = (I + KW)^-1 = I - K C, beside the rounding
     P eps |K| |a| + eps |mode|. The log posterior being stationary, the sums in the log evidence move by at most
@@ -124,11 +129,11 @@ def evidence_error(
     units of the latter cannot. And the elements of K are off by eps K, in directions that differ: a'K a / 2 by the
     root of the sum of squares of eps a_i K_ij a_j / 2.
     """
-    epsilon = jnp.finfo(weights.dtype).eps
+    epsilon, (variance, explain) = jnp.finfo(weights.dtype).eps, posterior
     rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
     steps = jnp.stack([mode - covariance @ weights, rounding], axis=1)
     off = jnp.sum(jnp.abs(steps - covariance @ explain(steps)), axis=1) + epsilon * jnp.abs(mode)
-    curvature, below, above = jax.vmap(curvature_at)(jnp.stack([mode, mode - off, mode + off]))
+    below, above = jax.vmap(curvature_at)(jnp.stack([mode - off, mode + off]))
     change = jnp.maximum(jnp.abs(below - curvature), jnp.abs(above - curvature))
     formed = epsilon * jnp.sqrt(weights**2 @ covariance**2 @ weights**2)
     return 0.5 * (jnp.sum(curvature * off**2) + jnp.sum(jnp.abs(variance) * change) + formed)

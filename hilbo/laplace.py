@@ -90,7 +90,7 @@ def laplace(
     log_evidence = jnp.sum(values) - 0.5 * gradient @ mode - 0.5 * log_determinant
     certificate = certify(
         fixed[0],
-        *jax.lax.stop_gradient((mode, gradient)),
+        *jax.lax.stop_gradient((mode, gradient, curvature)),
         root,
         lambda eta: still(terms)(eta)[2],
         jax.lax.stop_gradient(log_evidence),

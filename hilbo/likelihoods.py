@@ -147,10 +147,12 @@ def _truncated(f, lower, upper, noise) -> _Truncated:
     product = jnp.where(bounded, width * jnp.where(bounded, middle, 0.0), jnp.inf)
     narrow = (width <= _NARROW_WIDTH) & (product <= _NARROW_PRODUCT)
     wide_width, wide_product = jnp.where(narrow, 1.0, width), jnp.where(narrow, 1.0, product)
+    far_out = _Edges(jnp.abs(sum(low)), jnp.abs(sum(high)))
+    excess = _Edges(*excess_hazard(jnp.stack(far_out)))  # once for both: it is most of the work
     regimes = (
         _narrow(middle, jnp.where(narrow, width, 1.0), jnp.where(narrow, product, 0.0)),
-        _tail(sum(low), sum(high), wide_width, wide_product),
-        _centre(low, sum(high), wide_width, wide_product),
+        _tail(far_out, excess, wide_width, wide_product),
+        _centre(low, far_out, excess, wide_width, wide_product),
     )
     in_tail = low.short + low.rest >= 0
     chosen = [narrow, ~narrow & in_tail]
@@ -205,6 +207,13 @@ def _choose(conditions, values):
     return jnp.where(conditions[0], values[0], jnp.where(conditions[1], values[1], values[2]))
 
 
+class _Edges(NamedTuple):
+    """Something at each of the edges, whose sizes are what the tail and the centre go by."""
+
+    low: Array
+    high: Array
+
+
 class _Standard(NamedTuple):
     """A standardised edge to twice the working precision: short is a multiple of 1/16 (or infinite), rest small."""
 
@@ -250,10 +259,9 @@ def _narrow(middle, width, product):
     )
 
 
-def _tail(low, high, width, product):
+def _tail(edges, excesses, width, product):
     """0 <= low: p = Q(low) (1 - R), with E = phi(high) / phi(low) and R = Q(high) / Q(low)."""
-    low = jnp.abs(low)  # the other regime's argument, kept finite
-    excess, excess_high = excess_hazard(low), excess_hazard(jnp.abs(high))
+    (low, high), (excess, excess_high) = edges, excesses
     hazard = low + excess
     bounded = ~jnp.isinf(high)
     falloff = jnp.exp(-product)
@@ -269,14 +277,13 @@ def _tail(low, high, width, product):
     )
 
 
-def _centre(low, high, width, product):
+def _centre(low, edges, excesses, width, product):
     """low < 0 <= high, -low <= high: the mass outside is a sum of tails, so log p = log1p(-outside) is precise."""
     short, rest = jnp.abs(low.short), jnp.where(low.short < 0, -low.rest, low.rest)
     density = jnp.exp(-0.5 * short**2) * jnp.exp(-rest * (short + 0.5 * rest) - HALF_LOG_2PI)
-    nearest, farthest = jnp.abs(short + rest), jnp.abs(high)
-    bounded = ~jnp.isinf(high)
-    hazard = nearest + excess_hazard(nearest)
-    hazard_high = jnp.where(bounded, farthest, 1.0) + excess_hazard(farthest)
+    bounded = ~jnp.isinf(edges.high)
+    hazard = edges.low + excesses.low
+    hazard_high = jnp.where(bounded, edges.high, 1.0) + excesses.high
     falloff = jnp.exp(-product)  # density(high) / density(low): relative, so that neither underflows before its time
     outside = density / hazard * (1.0 + falloff * hazard / hazard_high)
     near = density / (1.0 - outside)
