@@ -77,6 +77,7 @@ def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
         fixed[0],
         middle + cavity * weights,
         weights,
+        fixed[1],
         root,
         lambda eta: terms(eta - cavity * weights, cavity)[2],
         jax.lax.stop_gradient(log_evidence),
