@@ -5,8 +5,7 @@ Versions of jaxlib that this has not been tried with are told nothing. Processor
 """
 
 import os
-
-import jaxlib
+from importlib.metadata import version
 
 __all__ = ["compiler_options", "set_flags"]
 
@@ -27,4 +26,4 @@ def set_flags() -> None:
 
 
 def _known():
-    return tuple(map(int, jaxlib.__version__.split(".")[:2])) <= _TRIED
+    return tuple(map(int, version("jaxlib").split(".")[:2])) <= _TRIED
