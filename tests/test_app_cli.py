@@ -1,5 +1,6 @@
 """`hilbo session` refuses in one sentence, before anything is begun; `hilbo doctor` says what to mend."""
 
+import contextlib
 import hashlib
 import json
 import socket
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
+from commands import run
 from live_server import DATA, study_of
 from msgspec import to_builtins
 
@@ -19,6 +21,7 @@ from hilbo.cli import app
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import Renderer
 from hilbo.people_table import add_person
+from hilbo.simulator import Simulator
 from hilbo.study_plan import header_for, make_plan, plan_hash
 from hilbo.warm_start import read_warm_start
 
@@ -144,6 +147,44 @@ def test_a_warm_start_that_is_refused_leaves_no_log(tmp_path):
     with pytest.raises(InputError, match="nothing is chosen"):
         opened(planned, lambda _: None, lambda _: None)
     assert not list(tmp_path.rglob("*.jsonl"))
+
+
+def test_a_device_that_cannot_be_used_is_one_sentence_and_leaves_no_log(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study = study_of(tmp_path)
+    logs = tmp_path / "logs"
+    place = (tmp_path / "study.toml", "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run")
+    with (
+        contextlib.closing(Simulator(finger="none")) as simulator,
+        Renderer.open(simulator.port, patience=10.0),
+        socket.create_server(("127.0.0.1", 0)) as silent,
+    ):
+        cases = [
+            (("--device", tmp_path / "ttyACM0"), 2, "ttyACM0"),
+            (("--device", simulator.port), 2, "another program"),
+            (("--device", f"socket://127.0.0.1:{silent.getsockname()[1]}"), 1, "answer"),
+            (("--sim", "damping=0.05"), 2, "damping"),
+            (("--device", tmp_path / "none", "--warm-start", a_map(study, tmp_path / "map.nc")), 2, "none"),
+        ]
+        for arguments, code, word in cases:
+            found, out, err = run(capsys, monkeypatch, "session", *place, *arguments)
+            assert (found, out) == (code, ""), err
+            assert word in err.splitlines()[-1]
+            assert err.splitlines()[-1].startswith("hilbo: ")
+            assert "Traceback" not in err
+            assert not list(logs.glob("*.jsonl"))
+
+
+def test_a_session_that_was_begun_keeps_its_log_when_the_device_is_not_there(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    _, log = opened(Wanted(file, "P01", logs=logs, dry_run=True), lambda _: None, lambda _: None)
+    log.close()
+    before = log.path.read_bytes()
+    place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run", "--resume")
+    assert run(capsys, monkeypatch, "session", *place, "--device", tmp_path / "ttyACM0")[0] == 2
+    assert log.path.read_bytes() == before
 
 
 def test_links_are_for_this_computer_unless_the_network_is_asked_for(monkeypatch):

@@ -20,7 +20,7 @@ from hilbo.people_table import check_consent, read_people
 from hilbo.study_plan import header_for, planned_header
 from hilbo.warm_start import read_warm_start
 
-__all__ = ["Wanted", "opened"]
+__all__ = ["Wanted", "let_go", "opened"]
 
 
 class Wanted(NamedTuple):
@@ -51,6 +51,13 @@ def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable
     log, chooser = (_resumed if wanted.resume else _begun)(wanted, study)
     damping = max(_damping(study, block.material) for block in log.state.header.blocks)
     return Hub(log, chooser, lambda: connect(damping), tag=_tag(log.state.header), maps=Maps), log
+
+
+def let_go(log: EventLog, resumed: bool = False) -> None:
+    """Close a log. A new one in which nothing has happened is removed, so that the same command may begin it."""
+    log.close()
+    if not resumed and log.state.seq == 0:
+        log.path.unlink(missing_ok=True)
 
 
 def _damping(study, material) -> float:
