@@ -81,27 +81,28 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
 
 
 def delete_participant(folder: str | os.PathLike, participant: str) -> dict[str, int]:
-    """Remove one participant from everything below a folder: their logs, and their rows of every CSV and netCDF table
-    (and in sets tables their own sets). File -> rows or logs removed. Raises InputError if nothing is there, or one of
-    their sessions is running.
+    """Remove one participant from everything below a folder: their logs, their keys, and their rows of every CSV and
+    netCDF table (and in sets tables their own sets). File -> rows or files removed. Raises InputError if nothing is
+    there, or one of their sessions is running.
 
     A plan made in advance keeps the id, and logs of others keep sets that were read from this person's map.
     """
     root = Path(folder)
-    logs = [path for sub in _folders(root) for path in log_paths(sub) if read_log(path)[0].participant == participant]
+    whose = {path: read_log(path)[0].participant for sub in _folders(root) for path in log_paths(sub)}
+    logs = [path for path, person in whose.items() if person == participant]
     for path in logs:
         if in_use(path):
             raise InputError(f"{path}: is being written; end the session first.")
     changed: dict[str, int] = {}
+    for path in [*logs, *_keys(root, participant, set(whose.values()))]:
+        path.unlink()
+        changed[str(path)] = 1
     for path in sorted(root.rglob("*.csv")):
         if count := _without(path, participant):
             changed[str(path)] = count
     for path in sorted(root.rglob("*.nc")):
         if count := _netcdf_without(path, participant):
             changed[str(path)] = count
-    for path in logs:
-        path.unlink()
-        changed[str(path)] = 1
     if not changed:
         raise InputError(f'{folder}: holds nothing of participant "{participant}"; check id and folder.')
     return changed
@@ -109,6 +110,15 @@ def delete_participant(folder: str | os.PathLike, participant: str) -> dict[str,
 
 def _folders(root):
     return sorted({root, *(path.parent for path in root.rglob("*.session.jsonl"))})
+
+
+def _keys(root, participant, people):
+    """The files of keys of one participant's sessions, .ID-SESSION.keys; not those of somebody whose id begins so."""
+    longer = tuple(f".{person}-" for person in people if person.startswith(f"{participant}-"))
+    found = (path for end in ("*.keys", "*.keys.part") for path in root.rglob(end))
+    return sorted(
+        path for path in found if path.name.startswith(f".{participant}-") and not path.name.startswith(longer)
+    )
 
 
 def _check(row, place):
@@ -169,21 +179,26 @@ def _without(path, participant):
 
 
 def _netcdf_without(path, participant):
-    """As `_without`, for a file that `hilbo.log_tables.netcdf` wrote."""
+    """As `_without`, for a netCDF file with a dimension `participant`, or with a `participant` of every `obs_id`."""
     import xarray as xr
 
     try:
         with xr.open_datatree(path, engine="h5netcdf") as opened:
-            tree = opened.load()
+            groups = {node.path: node.to_dataset(inherit=False).load() for node in opened.subtree}
     except (OSError, ValueError):
         return 0
-    if "constant_data" not in tree.children or "participant" not in tree["constant_data"]:
-        return 0
-    keep = tree["constant_data"]["participant"].values != participant
-    gone = int((~keep).sum())
+    keep = {}
+    for group in groups.values():
+        if "participant" in group and group["participant"].dims in (("participant",), ("obs_id",)):
+            keep[group["participant"].dims[0]] = group["participant"].values != participant
+    gone = max((int((~kept).sum()) for kept in keep.values()), default=0)
     if gone:
-        groups = {name: tree[name].to_dataset().isel(obs_id=keep) for name in ("observed_data", "constant_data")}
+        here = {name: {dim: kept for dim, kept in keep.items() if dim in g.dims} for name, g in groups.items()}
+        tree = xr.DataTree.from_dict({name: group.isel(here[name]).drop_encoding() for name, group in groups.items()})
         made = path.with_name(f".{path.name}-new")
-        xr.DataTree.from_dict(groups).to_netcdf(made, engine="h5netcdf")
-        os.replace(made, path)
+        try:
+            tree.to_netcdf(made, engine="h5netcdf")
+            os.replace(made, path)
+        finally:
+            made.unlink(missing_ok=True)
     return gone
