@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.console import Force, Json, Seed, progress, results, start
+from hilbo.console import Force, Json, Seed, progress, remark, results, start
 from hilbo.errors import InputError
 
 __all__ = ["app_participants", "export", "plan"]
@@ -87,7 +87,7 @@ def export(
     chosen = Study.load(study)
     with results(out, force) as folder, progress() as say:
         say("reading logs")
-        sessions = log_tables.read_sessions(logs, chosen)
+        sessions = log_tables.read_sessions(logs, chosen, remark)
         say("writing tables")
         log_tables.psych_ds(sessions, folder, chosen)
         log_tables.netcdf(sessions, folder / "trials.nc", chosen)
@@ -152,7 +152,7 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
             raise InputError("plan: a validation reads the map itself; give --trials, the answers it was made from.")
         say(f"the map of {material or study.name}")
         if trials.is_dir():
-            table = read_log_trials(trials, study, material or None)
+            table = read_log_trials(trials, study, material or None, note=remark)
         else:
             table = read_trials(trials, here, material or None)
         found[material] = plan_sets.validation_sets(here, result, cohort_of(table, here), source, people)

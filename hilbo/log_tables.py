@@ -57,15 +57,24 @@ _WORDS = {
 }
 
 
-def read_sessions(folder: str | os.PathLike, study: Study) -> list[LiveSession]:
-    """Every session in a folder. Raises InputError if there is none, or a log is damaged or of another study."""
+def read_sessions(
+    folder: str | os.PathLike, study: Study, note: Callable[[str], Any] = lambda sentence: None
+) -> list[LiveSession]:
+    """Every session in a folder but dry runs; `note` is told of those. Raises InputError if there is none, or a log is
+    damaged or of another study."""
     paths = log_paths(folder)
     if not paths:
         raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
-    found = []
+    found, dry = [], 0
     for path in paths:
         header, events, _ = read_log(path, study)
-        found.append(LiveSession.fold(study, header, events))
+        dry += header.dry_run
+        if not header.dry_run:
+            found.append(LiveSession.fold(study, header, events))
+    if not found:
+        raise InputError(f"{folder}: holds nothing but dry runs, in which nobody took part.")
+    if dry:
+        note(f"{folder}: {'1 dry run is' if dry == 1 else f'{dry} dry runs are'} left out.")
     return found
 
 
@@ -145,9 +154,10 @@ def read_log_trials(
     *,
     others: bool = True,
     say: Callable[[int], None] = lambda rows: None,
+    note: Callable[[str], Any] = lambda sentence: None,
 ) -> pd.DataFrame:
     """As `hilbo.tables.read_trials`, from a folder of session logs; `study` is the whole one, of all materials."""
-    table = trials_table(read_sessions(folder, study))
+    table = trials_table(read_sessions(folder, study, note))
     if table.empty:
         raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
     chosen = study.material(material) if material and study.materials else study

@@ -19,6 +19,7 @@ from hilbo.app.opening import Wanted, opened
 from hilbo.app.rehearsal import example_sets
 from hilbo.cli import app
 from hilbo.errors import InputError
+from hilbo.event_log import read_log
 from hilbo.hardware_bridge import Renderer
 from hilbo.people_table import add_person
 from hilbo.simulator import Simulator
@@ -185,6 +186,24 @@ def test_a_session_that_was_begun_keeps_its_log_when_the_device_is_not_there(tmp
     place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run", "--resume")
     assert run(capsys, monkeypatch, "session", *place, "--device", tmp_path / "ttyACM0")[0] == 2
     assert log.path.read_bytes() == before
+
+
+def test_a_dry_run_stays_one_and_a_session_with_a_person_too(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    logs.mkdir()
+    add_person(logs / "participants.csv", PERSON)
+    place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--device", tmp_path / "ttyACM0")
+    for session, dry, word in (("1", True, "begun as a dry run"), ("2", False, "leave --dry-run out")):
+        wanted = Wanted(file, "P01", session, logs=logs, dry_run=dry)
+        _, log = opened(wanted, lambda _: None, lambda _: None)
+        log.close()
+        assert read_log(log.path)[0].dry_run == dry
+        other = () if dry else ("--dry-run",)
+        assert word in refused(*place, "--session", session, "--resume", *other)
+        assert "another hilbo" not in refused(*place, "--session", session, "--resume", *other)
+        opened(wanted._replace(resume=True), lambda _: None, lambda _: None)[1].close()
 
 
 def test_links_are_for_this_computer_unless_the_network_is_asked_for(monkeypatch):

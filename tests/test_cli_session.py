@@ -97,7 +97,7 @@ def felt(point):
     return "close" if apart < 0.2 else "similar" if apart < 0.4 else "different"
 
 
-def logs_of(folder, study, people, trials):
+def logs_of(folder, study, people, trials, **facts):
     """Sessions whose renderings a fake chooser found, and whose answers follow one rule."""
     folder.mkdir()
     for person in people:
@@ -105,7 +105,7 @@ def logs_of(folder, study, people, trials):
         blocks = (Block("optimisation", trials),)
         seed = int(person[1:])
         driver.header = msgspec.structs.replace(
-            driver.header, study=study.hash, participant=person, blocks=blocks, sets={}, seed=seed
+            driver.header, study=study.hash, participant=person, blocks=blocks, sets={}, seed=seed, **facts
         )
         driver.state = type(driver.state).start(study, driver.header)
         driver.values = lambda trial, number: {"class_a": felt(trial.renderings["a"])}
@@ -114,6 +114,18 @@ def logs_of(folder, study, people, trials):
         with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
             for event in driver.events:
                 log.append(event)
+
+
+def test_an_export_says_how_many_dry_runs_it_leaves_out(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=3))
+    study = Study.load("study.toml")
+    logs_of(tmp_path / "logs", study, ["P01"], 3)
+    logs_of(tmp_path / "dry", study, ["P09"], 3, dry_run=True)
+    for path in (tmp_path / "dry").iterdir():
+        path.rename(tmp_path / "logs" / path.name)
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables")
+    assert code == 0 and "hilbo: logs: 1 dry run is left out." in err
+    assert not any("P09" in path.read_text() for path in (tmp_path / "tables").rglob("*.csv"))
 
 
 @pytest.mark.deep

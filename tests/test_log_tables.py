@@ -21,11 +21,11 @@ from hilbo.tables import read_trials
 from hilbo.validation_table import read_sets, read_validation
 
 
-def write(folder, person, kind, session, doings=()):
+def write(folder, person, kind, session, doings=(), **facts):
     import msgspec
 
     driver = Driver(kind)
-    driver.header = msgspec.structs.replace(driver.header, participant=person, session=session)
+    driver.header = msgspec.structs.replace(driver.header, participant=person, session=session, **facts)
     driver.state = type(driver.state).start(STUDY, driver.header)
     driver.step()
     for doing in doings:
@@ -177,6 +177,18 @@ def test_a_deletion_that_cannot_be_ended_begins_with_the_logs(folder, monkeypatc
     assert not list(folder.glob("P02*"))
     monkeypatch.setattr(os, "replace", real)
     assert delete_participant(tmp_path, "P02") == {str(people): 1}
+
+
+def test_dry_runs_are_nobodys_answers(folder, tmp_path):
+    before, heard = read_log_trials(folder, STUDY), []
+    for session in ("1", "2"):
+        write(folder, "test", "optimisation", session, dry_run=True)
+    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY, note=heard.append), before)
+    assert heard == [f"{folder}: 2 dry runs are left out."]
+    assert {state.header.participant for state in read_sessions(folder, STUDY)} == {"P01", "P02", "P03"}
+    write(tmp_path / "dry", "test", "optimisation", "1", dry_run=True)
+    with pytest.raises(InputError, match="holds nothing but dry runs"):
+        read_sessions(tmp_path / "dry", STUDY)
 
 
 def test_folders_without_answers_are_refused(tmp_path):

@@ -82,6 +82,12 @@ def _resumed(wanted, study) -> tuple[EventLog, LiveChooser]:
     header = _header(wanted._replace(dry_run=True), study)  # consent was looked for when it began
     log = EventLog.resume(wanted.logs / log_name(header), study)
     try:
+        if log.state.header.dry_run and not wanted.dry_run:
+            raise InputError(f"{log.path}: was begun as a dry run; choose another --session, or add --dry-run.")
+        if wanted.dry_run and not log.state.header.dry_run:
+            raise InputError(
+                f"{log.path}: was begun with a participant; leave --dry-run out, or choose another --session."
+            )
         return log, LiveChooser(log.state, _warm_starts(wanted, study, log.state.header))
     except BaseException:
         log.close()
@@ -91,7 +97,9 @@ def _resumed(wanted, study) -> tuple[EventLog, LiveChooser]:
 def _header(wanted, study) -> Header:
     number = study.session.protocol_number
     facts: dict[str, Any] = {"protocol_number": number, "versions": _versions()}
-    if not wanted.dry_run:
+    if wanted.dry_run:
+        facts["dry_run"] = True
+    else:
         people = read_people(wanted.people or wanted.logs / "participants.csv")
         facts["consent"] = check_consent(people, wanted.participant, number)["consent_time"]
     if wanted.plan is None:
