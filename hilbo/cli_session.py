@@ -90,7 +90,9 @@ def export(
         sessions = log_tables.read_sessions(logs, chosen, remark)
         say("writing tables")
         log_tables.psych_ds(sessions, folder, chosen)
-        log_tables.netcdf(sessions, folder / "trials.nc", chosen)
+        singles = log_tables.netcdf(sessions, folder / "trials.nc", chosen)
+        if not singles and log_tables.validation_table(sessions).empty:
+            raise InputError(f"{logs}: its sessions hold no answers that count yet; there is nothing to export.")
 
 
 @app_participants.command("add")

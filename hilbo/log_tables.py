@@ -208,16 +208,17 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: Study) -> lis
     return [*written, path]
 
 
-def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> None:
-    """The answers that count as groups of a netCDF file: observed_data has the categories and constant_data what they
-    are about, along `obs_id`; attributes name the study. xarray reads it as a DataTree, ArviZ as InferenceData."""
+def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> bool:
+    """The answers to single renderings that count as groups of a netCDF file: observed_data has the categories and
+    constant_data what they are about, along `obs_id`; attributes name the study. xarray reads it as a DataTree, ArviZ
+    as InferenceData. False, and no file, where there are none."""
     import numpy as np
     import xarray as xr
 
     table = trials_table(sessions)
     table = table[(table["voided"] == 0) & (table["phase"] != "warm-up")] if len(table) else table
     if table.empty:
-        raise InputError("export: there are no answers that count yet; netCDF needs one.")
+        return False
     rows = {"obs_id": np.arange(len(table))}
     ranks = {label: i for i, label in enumerate(study.responses)}
     observed = xr.Dataset({"category": ("obs_id", table["response"].map(ranks).to_numpy(int))}, rows)
@@ -234,6 +235,7 @@ def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> None:
     groups = {"observed_data": observed, "constant_data": constant}
     tree = xr.DataTree.from_dict({name: group.assign_attrs(attributes) for name, group in groups.items()})
     tree.to_netcdf(path, engine="h5netcdf")
+    return True
 
 
 def _place(state, trial: Trial):
@@ -250,7 +252,7 @@ def _place(state, trial: Trial):
 def _times(trial: Trial):
     answered = trial.answered or {}
     return {
-        "response_time": answered.get("browser", {}).get("response_time"),
+        "response_time": answered.get("browser", {}).get("response_s"),
         "answered_at": answered.get("time"),
     }
 

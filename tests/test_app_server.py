@@ -14,6 +14,7 @@ from live_server import PATIENCE, Live, refused
 
 from hilbo.app.hub import COMMANDS, PRESSES
 from hilbo.live_records import Block, Planned
+from hilbo.log_tables import validation_table
 
 
 @pytest.fixture
@@ -170,6 +171,7 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
         assert {event.data["client"] for event in answers} == {"me"}
         assert answers[0].data["browser"]["response_s"] == 0.0125
         assert live.replayed() == live.hub.state
+        assert validation_table([live.replayed()])["response_time"].tolist() == [0.0125] * 12
         check_order(live.events())
         state = live.hub.state
     listening.join(PATIENCE)

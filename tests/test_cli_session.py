@@ -11,6 +11,7 @@ from hilbo import Study, cli
 from hilbo.event_log import EventLog, log_name
 from hilbo.live_session import Block
 from hilbo.study_plan import planned_header
+from hilbo.validation_table import read_sets, read_validation
 
 TOML = """\
 schema = 1
@@ -97,6 +98,21 @@ def felt(point):
     return "close" if apart < 0.2 else "similar" if apart < 0.4 else "different"
 
 
+def validation_log(folder, study, answered=True):
+    """A session of comparisons and nothing else."""
+    folder.mkdir()
+    driver = Driver("validation")
+    blocks = driver.header.blocks[1:]
+    driver.header = msgspec.structs.replace(driver.header, study=study.hash, blocks=blocks)
+    driver.state = type(driver.state).start(study, driver.header)
+    driver.step()
+    if answered:
+        driver.finish()
+    with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
+        for event in driver.events:
+            log.append(event)
+
+
 def logs_of(folder, study, people, trials, **facts):
     """Sessions whose renderings a fake chooser found, and whose answers follow one rule."""
     folder.mkdir()
@@ -126,6 +142,21 @@ def test_an_export_says_how_many_dry_runs_it_leaves_out(hilbo, tmp_path):
     code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables")
     assert code == 0 and "hilbo: logs: 1 dry run is left out." in err
     assert not any("P09" in path.read_text() for path in (tmp_path / "tables").rglob("*.csv"))
+
+
+def test_a_folder_of_comparisons_alone_is_exported(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=3))
+    study = Study.load("study.toml")
+    validation_log(tmp_path / "logs", study)
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables")
+    assert code == 0, err
+    data = tmp_path / "tables" / "data"
+    assert len(read_validation(data / "study-plain_table-validation_data.csv", study.responses)) == 6
+    assert set(read_sets(data / "study-plain_table-sets_data.csv", ("u", "v")).index) == set("DEF")
+    assert not (tmp_path / "tables" / "trials.nc").exists()
+    validation_log(tmp_path / "begun", study, answered=False)
+    code, _, err = hilbo("export", "begun", "--study", "study.toml", "--out", "none")
+    assert code == 2 and "no answers that count" in err and not (tmp_path / "none").exists()
 
 
 @pytest.mark.deep
