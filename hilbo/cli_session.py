@@ -176,7 +176,9 @@ def _by_material(materials, given) -> dict[str, Path]:
 def _reissued(path, study, text):
     from hilbo.study_plan import check_plan, reissue
 
-    old, _, new = text.partition("=")
+    old, equals, new = text.partition("=")
+    if not equals:
+        raise InputError(f'--reissue is "{text}"; write OLD=NEW.')
     try:
         plan = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -25,7 +25,9 @@ from hilbo.errors import InputError
 __all__ = ["PARTS", "Force", "Json", "Out", "Say", "Seed", "fail", "finish", "progress", "remark", "results", "start"]
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
-Seed = Annotated[int, typer.Option("--seed", help="Decides candidates, and in simulations everything random.")]
+Seed = Annotated[
+    int, typer.Option("--seed", min=0, max=2**31 - 1, help="Decides candidates, and in simulations everything random.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
 

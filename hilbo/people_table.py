@@ -15,7 +15,7 @@ from pathlib import Path
 from hilbo.errors import InputError
 from hilbo.event_log import in_use, log_paths, read_log
 
-__all__ = ["COLUMNS", "add_person", "check_consent", "delete_participant", "read_people"]
+__all__ = ["COLUMNS", "add_person", "check_consent", "check_id", "delete_participant", "read_people"]
 
 COLUMNS = ("participant", "consent_time", "protocol_number", "age", "handedness")
 _NEEDED = ("participant", "consent_time", "protocol_number")
@@ -51,15 +51,27 @@ def read_people(path: str | os.PathLike) -> People:
 
 
 def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
-    """Add a row, and write the table anew, whole or not at all. Raises InputError."""
+    """Add a row, and write the table anew, whole or not at all; with its folder. Raises InputError."""
     people = read_people(path) if Path(path).exists() else {}
     found = {key: str(value).strip() for key, value in row.items()}
     _check(found, str(path))
     if found["participant"] in people:
         raise InputError(f"{path}: participant {found['participant']} stands there already; choose another id.")
     people[found["participant"]] = found
-    _write(Path(path), people)
+    try:
+        _write(Path(path), people)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place.") from error
     return people
+
+
+def check_id(participant: str, place: str) -> None:
+    """Refuse what is no pseudonymous id; `place` says where it stands."""
+    if not _ID.fullmatch(participant):
+        raise InputError(
+            f'{place}: participant is "{participant}"; an id has up to 32 letters, digits, "_", "-", "." and is'
+            " nobody's name."
+        )
 
 
 def check_consent(people: People, participant: str, protocol_number: str = "") -> dict[str, str]:
@@ -122,11 +134,7 @@ def _keys(root, participant, people):
 
 
 def _check(row, place):
-    if not _ID.fullmatch(row.get("participant", "")):
-        raise InputError(
-            f'{place}: participant is "{row.get("participant", "")}"; an id has up to 32 letters, digits, "_", "-", "."'
-            " and is nobody's name."
-        )
+    check_id(row.get("participant", ""), place)
     if row.get("consent_time"):
         try:
             datetime.datetime.fromisoformat(row["consent_time"])
@@ -143,6 +151,7 @@ def _check(row, place):
 def _write(path, people):
     columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
     rows = [[row.get(column, "") for column in columns] for row in people.values()]
+    path.parent.mkdir(parents=True, exist_ok=True)
     _replace(path, [columns, *rows])
 
 

@@ -13,6 +13,7 @@ import pytest
 from live_server import PATIENCE, Live, refused
 
 from hilbo.app.hub import COMMANDS, PRESSES
+from hilbo.app.robot import Client
 from hilbo.live_records import Block, Planned
 from hilbo.log_tables import validation_table
 
@@ -93,6 +94,17 @@ def test_a_page_without_a_key_gets_nothing_but_the_way_in(quiet):
     assert caught.value.code == 401
     with refused(401):
         quiet.participant.post("/api/join", {"token": "again"})
+
+
+def test_a_link_opened_on_a_full_disk_can_be_opened_again(live):
+    link = live.command("invite")["link"]
+    token = link.partition("#")[2]
+    (live.folder / "keys.part").mkdir()  # nothing can be written there
+    with refused(503):
+        live.participant.post("/api/join", {"token": token})
+    assert live.view()["phase"]
+    (live.folder / "keys.part").rmdir()
+    assert Client(link).get("/api/participant")["phase"]
 
 
 def test_what_is_not_understood_is_refused_and_harms_nothing(quiet):

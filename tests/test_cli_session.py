@@ -62,6 +62,16 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
     assert hilbo("plan", "study.toml", "--reissue", "P02=P09")[0] == 0
     changed = json.loads((tmp_path / "plan.json").read_text())
     assert planned_header(changed, study, "P09").seed == planned_header(plan, study, "P02").seed
+    for again, sentence in (
+        ("P01", "write OLD=NEW"),
+        ("P01=", 'participant is ""'),
+        ("P01=P 10", 'participant is "P 10"'),
+        ("P02=P10", "has been reissued to P09"),
+    ):
+        code, _, err = hilbo("plan", "study.toml", "--reissue", again)
+        assert code == 2 and sentence in err
+        assert json.loads((tmp_path / "plan.json").read_text()) == changed
+    assert hilbo("plan", "study.toml", "--reissue", "P09=P10")[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -75,6 +85,11 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
         (("--names", "P1,P1"), "each once"),
         (("--names", "P1", "--material", "foam"), "materials.foam is not in the study"),
         (("--reissue", "P1=P2"), "is no plan that can be read"),
+        (("--reissue", "P1"), '--reissue is "P1"; write OLD=NEW'),
+        (("--names", "P01,P02,"), 'participant is ""; an id has'),
+        (("--names", "P 1"), 'participant is "P 1"; an id has'),
+        (("--participants", 2, "--seed", -1), "--seed"),
+        (("--participants", 2, "--seed", 2**31), "--seed"),
     ],
 )
 def test_a_wrong_plan_is_one_sentence(hilbo, tmp_path, arguments, sentence):
@@ -89,6 +104,11 @@ def test_participants_are_listed_and_deleted(hilbo, tmp_path):
     assert hilbo("participants", "add", "participants.csv", "P01", *consent)[0] == 2
     code, _, err = hilbo("participants", "delete", ".", "P01")
     assert code == 2 and "add --yes" in err and "P01" in (tmp_path / "participants.csv").read_text()
+    assert hilbo("participants", "add", "new/logs/participants.csv", "P02", *consent)[0] == 0
+    assert "P02" in (tmp_path / "new" / "logs" / "participants.csv").read_text()
+    (tmp_path / "file").write_text("")
+    code, _, err = hilbo("participants", "add", "file/participants.csv", "P01", *consent)
+    assert code == 2 and err.startswith("hilbo: file/participants.csv: cannot be written")
     assert hilbo("participants", "delete", ".", "P01", "--yes")[0] == 0
     assert "P01" not in (tmp_path / "participants.csv").read_text()
 

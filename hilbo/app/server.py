@@ -112,7 +112,10 @@ def _join(hub, gate):
             message = messages.read(messages.Join, await _body(request))
         except InputError as error:
             return _error(400, str(error))
-        found = gate.redeem(message.token)
+        try:
+            found = gate.redeem(message.token)
+        except InputError as error:
+            return _error(503, str(error))
         if found is None:
             return _error(401, "This link has been used, or is not of this session; ask for a new one.")
         role, key = found
