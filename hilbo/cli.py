@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from hilbo import cli_device, cli_live, cli_material, cli_session, cli_study
-from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, results, start
+from hilbo.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, remark, results, start
 from hilbo.errors import InputError
 
 __all__ = ["app", "main"]
@@ -193,7 +193,7 @@ def _read(trials, study, material, say):
     if trials.is_dir():
         from hilbo.log_tables import read_log_trials
 
-        table = read_log_trials(trials, whole, material, others=False)
+        table = read_log_trials(trials, whole, material, others=False, note=remark)
     else:
         table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
     return chosen, cohort_of(table, chosen)

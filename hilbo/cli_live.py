@@ -13,7 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from hilbo.console import Json, Seed, fail, progress, start
+from hilbo.console import Json, Seed, progress, start
 from hilbo.device_options import Baud, Sim, Where, sim_options, takes
 from hilbo.errors import InputError
 
@@ -83,31 +83,26 @@ def session(
         with progress() as say:
             say("loading")
             start()
-            from hilbo.app.opening import Wanted, opened
+            from hilbo.app.opening import Wanted, let_go, opened
 
             wanted = Wanted(
                 study, participant, name, seed, served.logs, plan, material, resume, people, warm_start, dry_run
             )
             hub, log = opened(wanted, line.open, say)
-        held.callback(log.close)
+        held.callback(let_go, log, resume)
         hub.gap = served.gap
         _serve(hub, place, served, as_json)
 
 
 def _serve(hub, place, served, as_json) -> None:
     from hilbo.app import serve
-    from hilbo.app.server import application
-    from hilbo.link import DeviceError
 
     def invite():
         link = place.link("participant")
         return {"link": link, "qr": serve.qr_image(link)}
 
     hub.invite = invite
-    try:
-        serve.serve(place, application(hub, place.gate), lambda _: _started(hub, place, served, as_json))
-    except DeviceError as error:
-        fail(str(error), 1)
+    serve.serve(place, hub, lambda _: _started(hub, place, served, as_json))
 
 
 def _started(hub, place, served, as_json) -> None:

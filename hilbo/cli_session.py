@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.console import Force, Json, Seed, progress, results, start
+from hilbo.console import Force, Json, Seed, progress, remark, results, start
 from hilbo.errors import InputError
 
 __all__ = ["app_participants", "export", "plan"]
@@ -87,10 +87,12 @@ def export(
     chosen = Study.load(study)
     with results(out, force) as folder, progress() as say:
         say("reading logs")
-        sessions = log_tables.read_sessions(logs, chosen)
+        sessions = log_tables.read_sessions(logs, chosen, remark)
         say("writing tables")
         log_tables.psych_ds(sessions, folder, chosen)
-        log_tables.netcdf(sessions, folder / "trials.nc", chosen)
+        singles = log_tables.netcdf(sessions, folder / "trials.nc", chosen)
+        if not singles and log_tables.validation_table(sessions).empty:
+            raise InputError(f"{logs}: its sessions hold no answers that count yet; there is nothing to export.")
 
 
 @app_participants.command("add")
@@ -152,7 +154,7 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
             raise InputError("plan: a validation reads the map itself; give --trials, the answers it was made from.")
         say(f"the map of {material or study.name}")
         if trials.is_dir():
-            table = read_log_trials(trials, study, material or None)
+            table = read_log_trials(trials, study, material or None, note=remark)
         else:
             table = read_trials(trials, here, material or None)
         found[material] = plan_sets.validation_sets(here, result, cohort_of(table, here), source, people)
@@ -174,7 +176,9 @@ def _by_material(materials, given) -> dict[str, Path]:
 def _reissued(path, study, text):
     from hilbo.study_plan import check_plan, reissue
 
-    old, _, new = text.partition("=")
+    old, equals, new = text.partition("=")
+    if not equals:
+        raise InputError(f'--reissue is "{text}"; write OLD=NEW.')
     try:
         plan = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -22,10 +22,12 @@ import typer
 from hilbo.compiling import set_flags
 from hilbo.errors import InputError
 
-__all__ = ["PARTS", "Force", "Json", "Out", "Say", "Seed", "fail", "finish", "progress", "results", "start"]
+__all__ = ["PARTS", "Force", "Json", "Out", "Say", "Seed", "fail", "finish", "progress", "remark", "results", "start"]
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
-Seed = Annotated[int, typer.Option("--seed", help="Decides candidates, and in simulations everything random.")]
+Seed = Annotated[
+    int, typer.Option("--seed", min=0, max=2**31 - 1, help="Decides candidates, and in simulations everything random.")
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
 
@@ -170,7 +172,7 @@ class _Pace:
 def finish(content: dict[str, Any], out: Path, as_json: bool) -> None:
     """The last words of a command: warnings, then result.json or the way to the report."""
     for warning in content.get("warnings", []):
-        print(f"hilbo: {warning}", file=sys.stderr)
+        remark(warning)
     if as_json:
         with (out / "result.json").open(encoding="utf-8") as file:
             shutil.copyfileobj(file, sys.stdout)
@@ -178,7 +180,12 @@ def finish(content: dict[str, Any], out: Path, as_json: bool) -> None:
         print(f"{out / 'report.html'}", file=sys.stderr)
 
 
+def remark(sentence: str) -> None:
+    """One sentence on stderr."""
+    print(f"hilbo: {sentence}", file=sys.stderr)
+
+
 def fail(sentence: str, code: int) -> NoReturn:
     """One sentence on stderr, and the end."""
-    print(f"hilbo: {sentence}", file=sys.stderr)
+    remark(sentence)
     sys.exit(code)

@@ -30,7 +30,7 @@ from hilbo.ordinal_gp import Trials, fit
 from hilbo.session import Session, search_points
 from hilbo.warm_start import WarmStart, warm_point
 
-__all__ = ["APART", "LiveChooser"]
+__all__ = ["APART", "LiveChooser", "told_of"]
 
 APART = 0.05
 """Least distance in the unit cube from a rendering that was voided twice."""
@@ -134,6 +134,11 @@ class LiveChooser:
         return _explained(study, found, by, terms)
 
 
+def told_of(warm: Mapping[str | None, WarmStart]) -> str | None:
+    """What a header says of a session's warm starts, one for each material; None where there are none."""
+    return ",".join(f"{name or ''}={warm[name].source}" for name in sorted(warm, key=str)) or None
+
+
 def _key(state, block) -> _Key:
     names = state.study.space.names
     history = tuple(
@@ -145,7 +150,7 @@ def _key(state, block) -> _Key:
 
 def _checked_warm(state, warm):
     """The warm starts, which must be those of the header: the next trial is to be the same after a resume."""
-    told = ",".join(f"{name or ''}={warm[name].source}" for name in sorted(warm, key=str)) or None
+    told = told_of(warm)
     if told != state.header.warm_start:
         raise InputError(
             f"the session's warm start is {state.header.warm_start or 'none'}, not {told or 'none'}; give the maps that"

@@ -72,6 +72,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     consent: str | None = None
     protocol_number: str = ""
     versions: dict[str, str] = {}
+    dry_run: bool = False
 
 
 class Need(msgspec.Struct, frozen=True):

@@ -57,15 +57,24 @@ _WORDS = {
 }
 
 
-def read_sessions(folder: str | os.PathLike, study: Study) -> list[LiveSession]:
-    """Every session in a folder. Raises InputError if there is none, or a log is damaged or of another study."""
+def read_sessions(
+    folder: str | os.PathLike, study: Study, note: Callable[[str], Any] = lambda sentence: None
+) -> list[LiveSession]:
+    """Every session in a folder but dry runs; `note` is told of those. Raises InputError if there is none, or a log is
+    damaged or of another study."""
     paths = log_paths(folder)
     if not paths:
         raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
-    found = []
+    found, dry = [], 0
     for path in paths:
         header, events, _ = read_log(path, study)
-        found.append(LiveSession.fold(study, header, events))
+        dry += header.dry_run
+        if not header.dry_run:
+            found.append(LiveSession.fold(study, header, events))
+    if not found:
+        raise InputError(f"{folder}: holds nothing but dry runs, in which nobody took part.")
+    if dry:
+        note(f"{folder}: {'1 dry run is' if dry == 1 else f'{dry} dry runs are'} left out.")
     return found
 
 
@@ -145,9 +154,10 @@ def read_log_trials(
     *,
     others: bool = True,
     say: Callable[[int], None] = lambda rows: None,
+    note: Callable[[str], Any] = lambda sentence: None,
 ) -> pd.DataFrame:
     """As `hilbo.tables.read_trials`, from a folder of session logs; `study` is the whole one, of all materials."""
-    table = trials_table(read_sessions(folder, study))
+    table = trials_table(read_sessions(folder, study, note))
     if table.empty:
         raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
     chosen = study.material(material) if material and study.materials else study
@@ -198,16 +208,17 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: Study) -> lis
     return [*written, path]
 
 
-def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> None:
-    """The answers that count as groups of a netCDF file: observed_data has the categories and constant_data what they
-    are about, along `obs_id`; attributes name the study. xarray reads it as a DataTree, ArviZ as InferenceData."""
+def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> bool:
+    """The answers to single renderings that count as groups of a netCDF file: observed_data has the categories and
+    constant_data what they are about, along `obs_id`; attributes name the study. xarray reads it as a DataTree, ArviZ
+    as InferenceData. False, and no file, where there are none."""
     import numpy as np
     import xarray as xr
 
     table = trials_table(sessions)
     table = table[(table["voided"] == 0) & (table["phase"] != "warm-up")] if len(table) else table
     if table.empty:
-        raise InputError("export: there are no answers that count yet; netCDF needs one.")
+        return False
     rows = {"obs_id": np.arange(len(table))}
     ranks = {label: i for i, label in enumerate(study.responses)}
     observed = xr.Dataset({"category": ("obs_id", table["response"].map(ranks).to_numpy(int))}, rows)
@@ -224,6 +235,7 @@ def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> None:
     groups = {"observed_data": observed, "constant_data": constant}
     tree = xr.DataTree.from_dict({name: group.assign_attrs(attributes) for name, group in groups.items()})
     tree.to_netcdf(path, engine="h5netcdf")
+    return True
 
 
 def _place(state, trial: Trial):
@@ -240,7 +252,7 @@ def _place(state, trial: Trial):
 def _times(trial: Trial):
     answered = trial.answered or {}
     return {
-        "response_time": answered.get("browser", {}).get("response_time"),
+        "response_time": answered.get("browser", {}).get("response_s"),
         "answered_at": answered.get("time"),
     }
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from hilbo.errors import InputError
 from hilbo.event_log import in_use, log_paths, read_log
 
-__all__ = ["COLUMNS", "add_person", "check_consent", "delete_participant", "read_people"]
+__all__ = ["COLUMNS", "add_person", "check_consent", "check_id", "delete_participant", "read_people"]
 
 COLUMNS = ("participant", "consent_time", "protocol_number", "age", "handedness")
 _NEEDED = ("participant", "consent_time", "protocol_number")
@@ -51,15 +51,27 @@ def read_people(path: str | os.PathLike) -> People:
 
 
 def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
-    """Add a row, and write the table anew, whole or not at all. Raises InputError."""
+    """Add a row, and write the table anew, whole or not at all; with its folder. Raises InputError."""
     people = read_people(path) if Path(path).exists() else {}
     found = {key: str(value).strip() for key, value in row.items()}
     _check(found, str(path))
     if found["participant"] in people:
         raise InputError(f"{path}: participant {found['participant']} stands there already; choose another id.")
     people[found["participant"]] = found
-    _write(Path(path), people)
+    try:
+        _write(Path(path), people)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place.") from error
     return people
+
+
+def check_id(participant: str, place: str) -> None:
+    """Refuse what is no pseudonymous id; `place` says where it stands."""
+    if not _ID.fullmatch(participant):
+        raise InputError(
+            f'{place}: participant is "{participant}"; an id has up to 32 letters, digits, "_", "-", "." and is'
+            " nobody's name."
+        )
 
 
 def check_consent(people: People, participant: str, protocol_number: str = "") -> dict[str, str]:
@@ -81,27 +93,28 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
 
 
 def delete_participant(folder: str | os.PathLike, participant: str) -> dict[str, int]:
-    """Remove one participant from everything below a folder: their logs, and their rows of every CSV and netCDF table
-    (and in sets tables their own sets). File -> rows or logs removed. Raises InputError if nothing is there, or one of
-    their sessions is running.
+    """Remove one participant from everything below a folder: their logs, their keys, and their rows of every CSV and
+    netCDF table (and in sets tables their own sets). File -> rows or files removed. Raises InputError if nothing is
+    there, or one of their sessions is running.
 
     A plan made in advance keeps the id, and logs of others keep sets that were read from this person's map.
     """
     root = Path(folder)
-    logs = [path for sub in _folders(root) for path in log_paths(sub) if read_log(path)[0].participant == participant]
+    whose = {path: read_log(path)[0].participant for sub in _folders(root) for path in log_paths(sub)}
+    logs = [path for path, person in whose.items() if person == participant]
     for path in logs:
         if in_use(path):
             raise InputError(f"{path}: is being written; end the session first.")
     changed: dict[str, int] = {}
+    for path in [*logs, *_keys(root, participant, set(whose.values()))]:
+        path.unlink()
+        changed[str(path)] = 1
     for path in sorted(root.rglob("*.csv")):
         if count := _without(path, participant):
             changed[str(path)] = count
     for path in sorted(root.rglob("*.nc")):
         if count := _netcdf_without(path, participant):
             changed[str(path)] = count
-    for path in logs:
-        path.unlink()
-        changed[str(path)] = 1
     if not changed:
         raise InputError(f'{folder}: holds nothing of participant "{participant}"; check id and folder.')
     return changed
@@ -111,12 +124,17 @@ def _folders(root):
     return sorted({root, *(path.parent for path in root.rglob("*.session.jsonl"))})
 
 
+def _keys(root, participant, people):
+    """The files of keys of one participant's sessions, .ID-SESSION.keys; not those of somebody whose id begins so."""
+    longer = tuple(f".{person}-" for person in people if person.startswith(f"{participant}-"))
+    found = (path for end in ("*.keys", "*.keys.part") for path in root.rglob(end))
+    return sorted(
+        path for path in found if path.name.startswith(f".{participant}-") and not path.name.startswith(longer)
+    )
+
+
 def _check(row, place):
-    if not _ID.fullmatch(row.get("participant", "")):
-        raise InputError(
-            f'{place}: participant is "{row.get("participant", "")}"; an id has up to 32 letters, digits, "_", "-", "."'
-            " and is nobody's name."
-        )
+    check_id(row.get("participant", ""), place)
     if row.get("consent_time"):
         try:
             datetime.datetime.fromisoformat(row["consent_time"])
@@ -133,6 +151,7 @@ def _check(row, place):
 def _write(path, people):
     columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
     rows = [[row.get(column, "") for column in columns] for row in people.values()]
+    path.parent.mkdir(parents=True, exist_ok=True)
     _replace(path, [columns, *rows])
 
 
@@ -169,21 +188,26 @@ def _without(path, participant):
 
 
 def _netcdf_without(path, participant):
-    """As `_without`, for a file that `hilbo.log_tables.netcdf` wrote."""
+    """As `_without`, for a netCDF file with a dimension `participant`, or with a `participant` of every `obs_id`."""
     import xarray as xr
 
     try:
         with xr.open_datatree(path, engine="h5netcdf") as opened:
-            tree = opened.load()
+            groups = {node.path: node.to_dataset(inherit=False).load() for node in opened.subtree}
     except (OSError, ValueError):
         return 0
-    if "constant_data" not in tree.children or "participant" not in tree["constant_data"]:
-        return 0
-    keep = tree["constant_data"]["participant"].values != participant
-    gone = int((~keep).sum())
+    keep = {}
+    for group in groups.values():
+        if "participant" in group and group["participant"].dims in (("participant",), ("obs_id",)):
+            keep[group["participant"].dims[0]] = group["participant"].values != participant
+    gone = max((int((~kept).sum()) for kept in keep.values()), default=0)
     if gone:
-        groups = {name: tree[name].to_dataset().isel(obs_id=keep) for name in ("observed_data", "constant_data")}
+        here = {name: {dim: kept for dim, kept in keep.items() if dim in g.dims} for name, g in groups.items()}
+        tree = xr.DataTree.from_dict({name: group.isel(here[name]).drop_encoding() for name, group in groups.items()})
         made = path.with_name(f".{path.name}-new")
-        xr.DataTree.from_dict(groups).to_netcdf(made, engine="h5netcdf")
-        os.replace(made, path)
+        try:
+            tree.to_netcdf(made, engine="h5netcdf")
+            os.replace(made, path)
+        finally:
+            made.unlink(missing_ok=True)
     return gone

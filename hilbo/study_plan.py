@@ -20,6 +20,7 @@ from hilbo.config import Study
 from hilbo.counterbalance import block_size, comparisons, orders
 from hilbo.errors import InputError
 from hilbo.live_records import Block, Header, Planned
+from hilbo.people_table import check_id
 from hilbo.trial_protocols import Phase, protocol
 
 __all__ = [
@@ -105,6 +106,8 @@ def make_plan(
     """
     if len(set(participants)) < len(participants) or not participants:
         raise InputError("plan: participants must be named, each once.")
+    for person in participants:
+        check_id(person, "plan")
     names: list[str | None] = list(materials or study.materials) or [None]
     sequence = orders(len(names), len(participants), seed)
     people = []
@@ -164,10 +167,15 @@ def check_plan(plan: Mapping[str, Any], study: Study) -> None:
 
 
 def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
-    """The plan in which somebody new has the row (order, seed, sets) of a participant who dropped out."""
+    """The plan in which somebody new has the row (order, seed, sets) of a participant who dropped out. A row is given
+    away once. Raises InputError."""
+    check_id(new, "plan")
     rows = [row["participant"] for row in plan["participants"]]
     if dropped not in rows or new in rows:
         raise InputError(f'plan: "{dropped}" must be in the plan and "{new}" must not.')
+    given = {row.get("reissued_from"): row["participant"] for row in plan["participants"]}
+    if dropped in given:
+        raise InputError(f'plan: the row of "{dropped}" has been reissued to {given[dropped]}; reissue that one.')
     if plan["source"] == "individual":
         raise InputError(f'plan: the sets of "{dropped}" are their own; nobody else can be validated with them.')
     row = plan["participants"][rows.index(dropped)]

@@ -12,7 +12,6 @@ from hilbo.app import serve
 from hilbo.app.hub import Hub
 from hilbo.app.rehearsal import example_sets, fast_study
 from hilbo.app.robot import Client
-from hilbo.app.server import application
 from hilbo.config import Study
 from hilbo.event_log import EventLog, read_log
 from hilbo.hardware_bridge import Renderer
@@ -74,7 +73,7 @@ class Live:
             ready.set()
 
         try:
-            serve.serve(self.place, application(self.hub, self.place.gate), started)
+            serve.serve(self.place, self.hub, started)
         except BaseException as error:
             self.failed.append(error)
             ready.set()

@@ -1,18 +1,30 @@
 """`hilbo session` refuses in one sentence, before anything is begun; `hilbo doctor` says what to mend."""
 
+import contextlib
+import hashlib
 import json
 import socket
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
+import xarray as xr
+from commands import run
 from live_server import DATA, study_of
+from msgspec import to_builtins
 
-from hilbo import doctor
+from hilbo import doctor, live_session
 from hilbo.app import serve
 from hilbo.app.opening import Wanted, opened
+from hilbo.app.rehearsal import example_sets
 from hilbo.cli import app
 from hilbo.errors import InputError
+from hilbo.event_log import read_log
 from hilbo.hardware_bridge import Renderer
 from hilbo.people_table import add_person
+from hilbo.simulator import Simulator
+from hilbo.study_plan import header_for, make_plan, plan_hash
+from hilbo.warm_start import read_warm_start
 
 PERSON = {"participant": "P01", "consent_time": "2026-03-02T10:00", "protocol_number": "7", "age": "", "handedness": ""}
 
@@ -74,6 +86,124 @@ def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_
     log.close()
     assert again.tag == hub.tag
     assert again.state == hub.state
+
+
+def a_map(study, path):
+    """The map.nc of a population that likes one corner."""
+    sides = [np.linspace(0.0, 1.0, 4)] * study.space.dim
+    unit = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
+    names = study.space.names
+    coords = {p.name: np.asarray(p.to_physical(jnp.asarray(sides[0]))) for p in study.space.parameters}
+    values = {"mean": 2.0 - unit.sum(axis=-1), "variance": np.full(unit.shape[:-1], 0.1)}
+    xr.Dataset({name: (names, value) for name, value in values.items()}, coords).to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+def begun(wanted):
+    """Log, first two proposals."""
+    hub, log = opened(wanted, lambda _: None, lambda _: None)
+    with log:
+        state, found = log.state, []
+        for number, response in enumerate(("different", "close"), 1):
+            event = live_session.propose(state, hub.chooser, 0.0)
+            found.append(event.data)
+            state = state.after(event)
+            answer = live_session.answer(state, number, "c", {"class_a": response}, 1.0, felt=False)
+            assert answer is not None
+            state = state.after(answer)
+    return log, found
+
+
+def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_path):
+    study = study_of(tmp_path)
+    file, logs = a_map(study, tmp_path / "map.nc"), tmp_path / "logs"
+    header = header_for(study, "P01", seed=7, warm=False)
+    plan = {"schema": 1, "study": study.hash, "participants": [{"participant": "P01", "header": to_builtins(header)}]}
+    (tmp_path / "plan.json").write_text(json.dumps(plan | {"hash": plan_hash(plan)}))
+    wanted = Wanted(
+        tmp_path / "study.toml", "P01", logs=logs, plan=tmp_path / "plan.json", warm_start=file, dry_run=True
+    )
+    log, first = begun(wanted)
+    assert log.state.header.seed == 7
+    assert log.state.header.warm_start == f"={hashlib.sha256(file.read_bytes()).hexdigest()[:16]}"
+    assert [data["choice"]["by"] for data in first] == ["map", "map"]
+    again = wanted._replace(resume=True, seed=3)
+    assert begun(again)[1] == first
+    with pytest.raises(InputError, match="give the maps that it was begun with"):
+        opened(again._replace(warm_start=None), lambda _: None, lambda _: None)
+    candidates = read_warm_start(file, study, 7).points
+    first_unit = study.space.to_unit(np.array([first[0]["renderings"]["a"][n] for n in study.space.names]))
+    assert float(jnp.min(jnp.max(jnp.abs(candidates - first_unit[None, :]), axis=1))) < 1e-9
+
+
+def test_a_warm_start_that_is_refused_leaves_no_log(tmp_path):
+    study = study_of(tmp_path)
+    logs = tmp_path / "logs"
+    wanted = Wanted(tmp_path / "study.toml", "P01", logs=logs, warm_start=tmp_path / "none.nc", dry_run=True)
+    with pytest.raises(InputError, match="is no map"):
+        opened(wanted, lambda _: None, lambda _: None)
+    plan = make_plan(study, ["P01"], 0, "validation", sets={"": example_sets(study)}, source="aggregate")
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    planned = wanted._replace(plan=tmp_path / "plan.json", warm_start=a_map(study, tmp_path / "map.nc"))
+    with pytest.raises(InputError, match="nothing is chosen"):
+        opened(planned, lambda _: None, lambda _: None)
+    assert not list(tmp_path.rglob("*.jsonl"))
+
+
+def test_a_device_that_cannot_be_used_is_one_sentence_and_leaves_no_log(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study = study_of(tmp_path)
+    logs = tmp_path / "logs"
+    place = (tmp_path / "study.toml", "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run")
+    with (
+        contextlib.closing(Simulator(finger="none")) as simulator,
+        Renderer.open(simulator.port, patience=10.0),
+        socket.create_server(("127.0.0.1", 0)) as silent,
+    ):
+        cases = [
+            (("--device", tmp_path / "ttyACM0"), 2, "ttyACM0"),
+            (("--device", simulator.port), 2, "another program"),
+            (("--device", f"socket://127.0.0.1:{silent.getsockname()[1]}"), 1, "answer"),
+            (("--sim", "damping=0.05"), 2, "damping"),
+            (("--device", tmp_path / "none", "--warm-start", a_map(study, tmp_path / "map.nc")), 2, "none"),
+        ]
+        for arguments, code, word in cases:
+            found, out, err = run(capsys, monkeypatch, "session", *place, *arguments)
+            assert (found, out) == (code, ""), err
+            assert word in err.splitlines()[-1]
+            assert err.splitlines()[-1].startswith("hilbo: ")
+            assert "Traceback" not in err
+            assert not list(logs.glob("*.jsonl"))
+
+
+def test_a_session_that_was_begun_keeps_its_log_when_the_device_is_not_there(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    _, log = opened(Wanted(file, "P01", logs=logs, dry_run=True), lambda _: None, lambda _: None)
+    log.close()
+    before = log.path.read_bytes()
+    place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run", "--resume")
+    assert run(capsys, monkeypatch, "session", *place, "--device", tmp_path / "ttyACM0")[0] == 2
+    assert log.path.read_bytes() == before
+
+
+def test_a_dry_run_stays_one_and_a_session_with_a_person_too(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    logs.mkdir()
+    add_person(logs / "participants.csv", PERSON)
+    place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--device", tmp_path / "ttyACM0")
+    for session, dry, word in (("1", True, "begun as a dry run"), ("2", False, "leave --dry-run out")):
+        wanted = Wanted(file, "P01", session, logs=logs, dry_run=dry)
+        _, log = opened(wanted, lambda _: None, lambda _: None)
+        log.close()
+        assert read_log(log.path)[0].dry_run == dry
+        other = () if dry else ("--dry-run",)
+        assert word in refused(*place, "--session", session, "--resume", *other)
+        assert "another hilbo" not in refused(*place, "--session", session, "--resume", *other)
+        opened(wanted._replace(resume=True), lambda _: None, lambda _: None)[1].close()
 
 
 def test_links_are_for_this_computer_unless_the_network_is_asked_for(monkeypatch):

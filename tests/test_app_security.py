@@ -5,6 +5,7 @@ import stat
 import pytest
 
 from hilbo.app.security import Gate, lan_addresses
+from hilbo.errors import InputError
 
 HERE = "127.0.0.1:8642"
 
@@ -52,6 +53,20 @@ def test_keys_outlive_the_server_and_only_their_owner_may_read_them(gate, tmp_pa
     again = Gate([HERE], tmp_path / "keys")
     assert again.admits("experimenter", key)
     assert again.redeem(token) is None
+
+
+def test_a_link_that_could_not_be_opened_is_still_good_and_the_first_browser_stays(gate, tmp_path):
+    _, first = gate.redeem(gate.invite("participant"))
+    token = gate.invite("participant")
+    (tmp_path / "keys.part").mkdir()  # nothing can be written there
+    with pytest.raises(InputError, match="make room"):
+        gate.redeem(token)
+    assert gate.admits("participant", first)
+    (tmp_path / "keys.part").rmdir()
+    _, second = gate.redeem(token)
+    assert gate.admits("participant", second)
+    assert not gate.admits("participant", first)
+    assert gate.redeem(token) is None
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{", '{"experimenter": 1}', "\0"])

@@ -13,7 +13,9 @@ import pytest
 from live_server import PATIENCE, Live, refused
 
 from hilbo.app.hub import COMMANDS, PRESSES
+from hilbo.app.robot import Client
 from hilbo.live_records import Block, Planned
+from hilbo.log_tables import validation_table
 
 
 @pytest.fixture
@@ -94,6 +96,17 @@ def test_a_page_without_a_key_gets_nothing_but_the_way_in(quiet):
         quiet.participant.post("/api/join", {"token": "again"})
 
 
+def test_a_link_opened_on_a_full_disk_can_be_opened_again(live):
+    link = live.command("invite")["link"]
+    token = link.partition("#")[2]
+    (live.folder / "keys.part").mkdir()  # nothing can be written there
+    with refused(503):
+        live.participant.post("/api/join", {"token": token})
+    assert live.view()["phase"]
+    (live.folder / "keys.part").rmdir()
+    assert Client(link).get("/api/participant")["phase"]
+
+
 def test_what_is_not_understood_is_refused_and_harms_nothing(quiet):
     view = quiet.until(lambda view: view["trial"])
     rng, before = random.Random(0), quiet.hub.state.seq
@@ -170,6 +183,7 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
         assert {event.data["client"] for event in answers} == {"me"}
         assert answers[0].data["browser"]["response_s"] == 0.0125
         assert live.replayed() == live.hub.state
+        assert validation_table([live.replayed()])["response_time"].tolist() == [0.0125] * 12
         check_order(live.events())
         state = live.hub.state
     listening.join(PATIENCE)

@@ -108,7 +108,7 @@ MAY_IMPORT = MATHS | {
     "logged_session": {"event_log", "live_choice", "live_session"},
     "warm_start": {"session", "config"},
     "stopping": {"live_state", "session"},
-    "study_plan": {"config", "counterbalance", "live_records"},
+    "study_plan": {"config", "counterbalance", "live_records", "people_table"},
     "plan_sets": {"study", "study_plan", "validation"},
     "log_tables": {"event_log", "tables"},
     "people_table": {"event_log"},

@@ -11,6 +11,7 @@ from hilbo import Study, cli
 from hilbo.event_log import EventLog, log_name
 from hilbo.live_session import Block
 from hilbo.study_plan import planned_header
+from hilbo.validation_table import read_sets, read_validation
 
 TOML = """\
 schema = 1
@@ -61,6 +62,16 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
     assert hilbo("plan", "study.toml", "--reissue", "P02=P09")[0] == 0
     changed = json.loads((tmp_path / "plan.json").read_text())
     assert planned_header(changed, study, "P09").seed == planned_header(plan, study, "P02").seed
+    for again, sentence in (
+        ("P01", "write OLD=NEW"),
+        ("P01=", 'participant is ""'),
+        ("P01=P 10", 'participant is "P 10"'),
+        ("P02=P10", "has been reissued to P09"),
+    ):
+        code, _, err = hilbo("plan", "study.toml", "--reissue", again)
+        assert code == 2 and sentence in err
+        assert json.loads((tmp_path / "plan.json").read_text()) == changed
+    assert hilbo("plan", "study.toml", "--reissue", "P09=P10")[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -74,6 +85,11 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
         (("--names", "P1,P1"), "each once"),
         (("--names", "P1", "--material", "foam"), "materials.foam is not in the study"),
         (("--reissue", "P1=P2"), "is no plan that can be read"),
+        (("--reissue", "P1"), '--reissue is "P1"; write OLD=NEW'),
+        (("--names", "P01,P02,"), 'participant is ""; an id has'),
+        (("--names", "P 1"), 'participant is "P 1"; an id has'),
+        (("--participants", 2, "--seed", -1), "--seed"),
+        (("--participants", 2, "--seed", 2**31), "--seed"),
     ],
 )
 def test_a_wrong_plan_is_one_sentence(hilbo, tmp_path, arguments, sentence):
@@ -88,6 +104,11 @@ def test_participants_are_listed_and_deleted(hilbo, tmp_path):
     assert hilbo("participants", "add", "participants.csv", "P01", *consent)[0] == 2
     code, _, err = hilbo("participants", "delete", ".", "P01")
     assert code == 2 and "add --yes" in err and "P01" in (tmp_path / "participants.csv").read_text()
+    assert hilbo("participants", "add", "new/logs/participants.csv", "P02", *consent)[0] == 0
+    assert "P02" in (tmp_path / "new" / "logs" / "participants.csv").read_text()
+    (tmp_path / "file").write_text("")
+    code, _, err = hilbo("participants", "add", "file/participants.csv", "P01", *consent)
+    assert code == 2 and err.startswith("hilbo: file/participants.csv: cannot be written")
     assert hilbo("participants", "delete", ".", "P01", "--yes")[0] == 0
     assert "P01" not in (tmp_path / "participants.csv").read_text()
 
@@ -97,7 +118,22 @@ def felt(point):
     return "close" if apart < 0.2 else "similar" if apart < 0.4 else "different"
 
 
-def logs_of(folder, study, people, trials):
+def validation_log(folder, study, answered=True):
+    """A session of comparisons and nothing else."""
+    folder.mkdir()
+    driver = Driver("validation")
+    blocks = driver.header.blocks[1:]
+    driver.header = msgspec.structs.replace(driver.header, study=study.hash, blocks=blocks)
+    driver.state = type(driver.state).start(study, driver.header)
+    driver.step()
+    if answered:
+        driver.finish()
+    with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
+        for event in driver.events:
+            log.append(event)
+
+
+def logs_of(folder, study, people, trials, **facts):
     """Sessions whose renderings a fake chooser found, and whose answers follow one rule."""
     folder.mkdir()
     for person in people:
@@ -105,7 +141,7 @@ def logs_of(folder, study, people, trials):
         blocks = (Block("optimisation", trials),)
         seed = int(person[1:])
         driver.header = msgspec.structs.replace(
-            driver.header, study=study.hash, participant=person, blocks=blocks, sets={}, seed=seed
+            driver.header, study=study.hash, participant=person, blocks=blocks, sets={}, seed=seed, **facts
         )
         driver.state = type(driver.state).start(study, driver.header)
         driver.values = lambda trial, number: {"class_a": felt(trial.renderings["a"])}
@@ -114,6 +150,33 @@ def logs_of(folder, study, people, trials):
         with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
             for event in driver.events:
                 log.append(event)
+
+
+def test_an_export_says_how_many_dry_runs_it_leaves_out(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=3))
+    study = Study.load("study.toml")
+    logs_of(tmp_path / "logs", study, ["P01"], 3)
+    logs_of(tmp_path / "dry", study, ["P09"], 3, dry_run=True)
+    for path in (tmp_path / "dry").iterdir():
+        path.rename(tmp_path / "logs" / path.name)
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables")
+    assert code == 0 and "hilbo: logs: 1 dry run is left out." in err
+    assert not any("P09" in path.read_text() for path in (tmp_path / "tables").rglob("*.csv"))
+
+
+def test_a_folder_of_comparisons_alone_is_exported(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=3))
+    study = Study.load("study.toml")
+    validation_log(tmp_path / "logs", study)
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables")
+    assert code == 0, err
+    data = tmp_path / "tables" / "data"
+    assert len(read_validation(data / "study-plain_table-validation_data.csv", study.responses)) == 6
+    assert set(read_sets(data / "study-plain_table-sets_data.csv", ("u", "v")).index) == set("DEF")
+    assert not (tmp_path / "tables" / "trials.nc").exists()
+    validation_log(tmp_path / "begun", study, answered=False)
+    code, _, err = hilbo("export", "begun", "--study", "study.toml", "--out", "none")
+    assert code == 2 and "no answers that count" in err and not (tmp_path / "none").exists()
 
 
 @pytest.mark.deep

@@ -1,28 +1,31 @@
 """From logs to tables and back: the same bits by every way, and nothing left of somebody who was deleted."""
 
 import json
+import os
 
 import arviz
 import numpy as np
 import pandas as pd
 import pytest
 import xarray as xr
+from commands import run
 from live import STUDY, Driver
 
 from hilbo.errors import InputError
 from hilbo.event_log import EventLog, log_name
+from hilbo.inference_data import groups, write_groups
 from hilbo.log_tables import netcdf, psych_ds, read_log_trials, read_sessions, sets_table, trials_table
 from hilbo.people_table import add_person, check_consent, delete_participant, read_people
-from hilbo.study import cohort_of
+from hilbo.study import cohort_of, fit_cohort
 from hilbo.tables import read_trials
 from hilbo.validation_table import read_sets, read_validation
 
 
-def write(folder, person, kind, session, doings=()):
+def write(folder, person, kind, session, doings=(), **facts):
     import msgspec
 
     driver = Driver(kind)
-    driver.header = msgspec.structs.replace(driver.header, participant=person, session=session)
+    driver.header = msgspec.structs.replace(driver.header, participant=person, session=session, **facts)
     driver.state = type(driver.state).start(STUDY, driver.header)
     driver.step()
     for doing in doings:
@@ -123,6 +126,71 @@ def test_one_participant_is_deleted_from_everything(folder, tmp_path):
         delete_participant(tmp_path, "P01")
 
 
+def test_a_participant_is_deleted_from_a_report_and_nothing_else_of_it_is(folder, capsys, monkeypatch, tmp_path):
+    cohort = cohort_of(read_log_trials(folder, STUDY), STUDY)
+    assert cohort.names == ("P01", "P02")
+    path = tmp_path / "report" / "inference.nc"
+    path.parent.mkdir()
+    write_groups(groups(STUDY, cohort, fit_cohort(STUDY, cohort), draws=5), path)
+    for name in ("P01", "P02"):
+        (folder / f".{name}-1.keys").write_text("{}")
+    with xr.open_datatree(path, engine="h5netcdf") as opened:
+        before = opened.load()
+    code, _, err = run(capsys, monkeypatch, "participants", "delete", tmp_path, "P02", "--yes")
+    assert code == 0, err
+    assert not list(tmp_path.rglob("P02_*")) and not (folder / ".P02-1.keys").exists()
+    assert (folder / ".P01-1.keys").exists()
+    with xr.open_datatree(path, engine="h5netcdf") as opened:
+        after = opened.load()
+    assert set(after.children) == set(before.children) == {
+        "posterior", "posterior_predictive", "log_likelihood", "observed_data", "constant_data"
+    }  # fmt: skip
+    for name, group in before.children.items():
+        xr.testing.assert_identical(after[name].to_dataset(), group.to_dataset().sel(participant=["P01"]))
+    assert arviz.from_netcdf(str(path)).posterior["participant"].values.tolist() == ["P01"]
+    assert run(capsys, monkeypatch, "participants", "delete", tmp_path, "P01", "--yes")[0] == 0
+    with xr.open_datatree(path, engine="h5netcdf") as opened:
+        assert opened["posterior"]["f"].sizes["participant"] == 0
+    assert b"P01" not in path.read_bytes()
+    assert run(capsys, monkeypatch, "participants", "delete", tmp_path, "P01", "--yes")[0] == 2
+
+
+def test_keys_of_somebody_whose_id_begins_alike_stay(folder):
+    write(folder, "P02-b", "optimisation", "1")
+    for name in (".P02-1", ".P02-b-1"):
+        (folder / f"{name}.keys").write_text("{}")
+    delete_participant(folder, "P02")
+    assert [path.name for path in folder.glob("*.keys")] == [".P02-b-1.keys"]
+
+
+def test_a_deletion_that_cannot_be_ended_begins_with_the_logs(folder, monkeypatch, tmp_path):
+    people = tmp_path / "participants.csv"
+    add_person(people, {"participant": "P02", "consent_time": "2026-05-04T10:00", "protocol_number": "7"})
+    real = os.replace
+
+    def full(source, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match="space"):
+        delete_participant(tmp_path, "P02")
+    assert not list(folder.glob("P02*"))
+    monkeypatch.setattr(os, "replace", real)
+    assert delete_participant(tmp_path, "P02") == {str(people): 1}
+
+
+def test_dry_runs_are_nobodys_answers(folder, tmp_path):
+    before, heard = read_log_trials(folder, STUDY), []
+    for session in ("1", "2"):
+        write(folder, "test", "optimisation", session, dry_run=True)
+    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY, note=heard.append), before)
+    assert heard == [f"{folder}: 2 dry runs are left out."]
+    assert {state.header.participant for state in read_sessions(folder, STUDY)} == {"P01", "P02", "P03"}
+    write(tmp_path / "dry", "test", "optimisation", "1", dry_run=True)
+    with pytest.raises(InputError, match="holds nothing but dry runs"):
+        read_sessions(tmp_path / "dry", STUDY)
+
+
 def test_folders_without_answers_are_refused(tmp_path):
     with pytest.raises(InputError, match="holds no session logs"):
         read_log_trials(tmp_path, STUDY)
@@ -130,8 +198,8 @@ def test_folders_without_answers_are_refused(tmp_path):
     EventLog.create(tmp_path / log_name(driver.header), STUDY, driver.header).close()
     with pytest.raises(InputError, match="hold no answers yet"):
         read_log_trials(tmp_path, STUDY)
-    with pytest.raises(InputError, match="no answers that count"):
-        netcdf(read_sessions(tmp_path, STUDY), tmp_path / "x.nc", STUDY)
+    assert not netcdf(read_sessions(tmp_path, STUDY), tmp_path / "x.nc", STUDY)
+    assert not (tmp_path / "x.nc").exists()
 
 
 def test_one_name_for_two_sets_is_refused(folder):

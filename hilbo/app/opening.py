@@ -14,13 +14,13 @@ from hilbo.app.slices import Maps
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.event_log import EventLog, log_name
-from hilbo.live_choice import LiveChooser
-from hilbo.live_session import Header
+from hilbo.live_choice import LiveChooser, told_of
+from hilbo.live_session import Header, LiveSession
 from hilbo.people_table import check_consent, read_people
 from hilbo.study_plan import header_for, planned_header
 from hilbo.warm_start import read_warm_start
 
-__all__ = ["Wanted", "opened"]
+__all__ = ["Wanted", "let_go", "opened"]
 
 
 class Wanted(NamedTuple):
@@ -45,42 +45,63 @@ def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable
     mechanics = study.space.mechanics
     if mechanics is None:
         raise InputError(f"{wanted.study}: has no [renderer], and a device nothing to render.")
-    log = _log(wanted, study)
-    try:
-        say("preparing what chooses")
-        chooser = LiveChooser(log.state, _warm_starts(wanted, log.state))
-        import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
-    except BaseException:
-        log.close()
-        raise
+    say("preparing what chooses")
+    import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
+
+    log, chooser = (_resumed if wanted.resume else _begun)(wanted, study)
     damping = max(_damping(study, block.material) for block in log.state.header.blocks)
     return Hub(log, chooser, lambda: connect(damping), tag=_tag(log.state.header), maps=Maps), log
+
+
+def let_go(log: EventLog, resumed: bool = False) -> None:
+    """Close a log. A new one in which nothing has happened is removed, so that the same command may begin it."""
+    log.close()
+    if not resumed and log.state.seq == 0:
+        log.path.unlink(missing_ok=True)
 
 
 def _damping(study, material) -> float:
     return float((study if material is None else study.material(material)).space.mechanics.damping)
 
 
-def _log(wanted, study) -> EventLog:
-    if wanted.resume:  # consent was looked for when it began
-        return EventLog.resume(wanted.logs / log_name(_header(wanted._replace(dry_run=True), study)), study)
+def _begun(wanted, study) -> tuple[EventLog, LiveChooser]:
+    """A new log, last of all: what is refused leaves none behind."""
     header = _header(wanted, study)
     path = wanted.logs / log_name(header)
     if path.exists():
         raise InputError(
             f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
         )
-    return EventLog.create(path, study, header)
+    warm = _warm_starts(wanted, study, header)
+    header = msgspec.structs.replace(header, warm_start=told_of(warm))
+    chooser = LiveChooser(LiveSession.start(study, header), warm)
+    return EventLog.create(path, study, header), chooser
+
+
+def _resumed(wanted, study) -> tuple[EventLog, LiveChooser]:
+    header = _header(wanted._replace(dry_run=True), study)  # consent was looked for when it began
+    log = EventLog.resume(wanted.logs / log_name(header), study)
+    try:
+        if log.state.header.dry_run and not wanted.dry_run:
+            raise InputError(f"{log.path}: was begun as a dry run; choose another --session, or add --dry-run.")
+        if wanted.dry_run and not log.state.header.dry_run:
+            raise InputError(
+                f"{log.path}: was begun with a participant; leave --dry-run out, or choose another --session."
+            )
+        return log, LiveChooser(log.state, _warm_starts(wanted, study, log.state.header))
+    except BaseException:
+        log.close()
+        raise
 
 
 def _header(wanted, study) -> Header:
     number = study.session.protocol_number
     facts: dict[str, Any] = {"protocol_number": number, "versions": _versions()}
-    if not wanted.dry_run:
+    if wanted.dry_run:
+        facts["dry_run"] = True
+    else:
         people = read_people(wanted.people or wanted.logs / "participants.csv")
         facts["consent"] = check_consent(people, wanted.participant, number)["consent_time"]
-    if wanted.warm_start is not None:
-        facts["warm_start"] = _map(wanted, study, wanted.material).source
     if wanted.plan is None:
         place = (wanted.participant, wanted.session, wanted.seed)
         return header_for(study, *place, materials=(wanted.material,), **facts)
@@ -96,15 +117,17 @@ def _header(wanted, study) -> Header:
         raise InputError(f"{wanted.plan}: {error}") from error
 
 
-def _map(wanted, study, material):
-    return read_warm_start(wanted.warm_start, study if material is None else study.material(material), wanted.seed)
-
-
-def _warm_starts(wanted, state) -> dict[str | None, Any] | None:
+def _warm_starts(wanted, study, header) -> dict[str | None, Any]:
+    """Material -> what its choices begin with. The candidates are those of the session's seed, not of the command's."""
     if wanted.warm_start is None:
-        return None
-    materials = {block.material for block in state.header.blocks if not block.trials}
-    return {name: _map(wanted, state.study, name) for name in materials}
+        return {}
+    materials = {block.material for block in header.blocks if not block.trials}
+    if not materials:
+        raise InputError("--warm-start: in this session nothing is chosen, all is planned; leave it out.")
+    return {
+        name: read_warm_start(wanted.warm_start, study if name is None else study.material(name), header.seed)
+        for name in materials
+    }
 
 
 def _versions() -> dict[str, str]:

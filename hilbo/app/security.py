@@ -48,14 +48,17 @@ class Gate:
     def redeem(self, token: str) -> tuple[Role, str] | None:
         """The role of a token and a new key for it, None if it is unknown or used.
 
-        The key replaces the one before: a participant's second browser ends the first.
+        The key replaces the one before: a participant's second browser ends the first. Raises `InputError` if it cannot
+        be kept; the token is still good then, and the key before too.
         """
-        role = self._tokens.pop(_digest(token), None)
+        role = self._tokens.get(_digest(token))
         if role is None:
             return None
         key = secrets.token_urlsafe(_BYTES)
-        self._keys[role] = _digest(key)
-        self._keep()
+        keys: dict[Role, str] = {**self._keys, role: _digest(key)}
+        self._keep(keys)
+        self._keys = keys
+        del self._tokens[_digest(token)]
         return role, key
 
     def admits(self, role: Role, key: str | None) -> bool:
@@ -76,13 +79,13 @@ class Gate:
             return "The request does not say which page it comes from; a program sends its key in Authorization."
         return None
 
-    def _keep(self) -> None:
+    def _keep(self, keys: dict[Role, str]) -> None:
         if self._file is None:
             return
         part = self._file.with_name(f"{self._file.name}.part")
         try:
             with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
-                json.dump(self._keys, file)
+                json.dump(keys, file)
             part.replace(self._file)
         except OSError as error:
             raise InputError(f"{self._file}: cannot be written ({error.strerror}); make room for it.") from error

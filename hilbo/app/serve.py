@@ -62,26 +62,43 @@ def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> P
     return Place(listening, addresses, keys)
 
 
-def serve(place: Place, application: Any, started: Callable[[Callable[[], None]], Any]) -> None:
-    """Answers until Ctrl-C or SIGTERM, or until what `started` was given, once the hub was open, is called."""
+def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) -> None:
+    """Opens the hub, answers until Ctrl-C or SIGTERM, or until what `started` was given is called, and closes the hub.
+
+    Raises what keeps the hub from opening, `InputError` or `DeviceError`; nobody has been answered then.
+    """
     import uvicorn
 
+    from hilbo.app.server import application
+
     config = uvicorn.Config(
-        application, log_level="warning", access_log=False, lifespan="on", timeout_graceful_shutdown=_LINGER,
-        server_header=False, ws="none",
+        application(hub, place.gate), log_level="warning", access_log=False, lifespan="off", server_header=False,
+        timeout_graceful_shutdown=_LINGER, ws="none",
     )  # fmt: skip
     server = uvicorn.Server(config)
-    before = server.startup
+    listen, hang_up = server.startup, server.shutdown
 
+    # Not as ASGI's lifespan, which swallows what the hub raises.
     async def startup(sockets=None):
-        await before(sockets=sockets)
+        try:
+            await hub.open()
+            await listen(sockets=sockets)
+        except BaseException:
+            await hub.close()
+            raise
         if not server.should_exit:
             started(stop)
+
+    async def shutdown(sockets=None):
+        try:
+            await hang_up(sockets=sockets)
+        finally:
+            await hub.close()
 
     def stop() -> None:
         server.should_exit = True
 
-    server.startup = startup  # type: ignore[method-assign]
+    server.startup, server.shutdown = startup, shutdown  # type: ignore[method-assign]
     try:
         server.run(sockets=[place.socket])
     finally:

@@ -13,7 +13,6 @@ event loop only waits here: files, device and arithmetic have threads of their o
 """
 
 import asyncio
-import contextlib
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, get_args
@@ -71,7 +70,7 @@ class _Guard:
 
 
 def application(hub: Hub, gate: Gate) -> Starlette:
-    """The server of one session."""
+    """The server of one session, whose hub is open."""
     guarded = _for(hub, gate)
     routes = [
         Route("/", _page("join.html")),
@@ -88,19 +87,7 @@ def application(hub: Hub, gate: Gate) -> Starlette:
     routes += [Route(f"/api/participant/{n}", guarded("participant", _press), methods=["POST"]) for n in PRESSES]
     routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
     routes += [Mount("/static", StaticFiles(directory=_STATIC))]
-    return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)], lifespan=_lifespan(hub))
-
-
-def _lifespan(hub):
-    @contextlib.asynccontextmanager
-    async def lifespan(_app: Starlette) -> AsyncIterator[None]:
-        await hub.open()
-        try:
-            yield
-        finally:
-            await hub.close()
-
-    return lifespan
+    return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)])
 
 
 def _page(name):
@@ -125,7 +112,10 @@ def _join(hub, gate):
             message = messages.read(messages.Join, await _body(request))
         except InputError as error:
             return _error(400, str(error))
-        found = gate.redeem(message.token)
+        try:
+            found = gate.redeem(message.token)
+        except InputError as error:
+            return _error(503, str(error))
         if found is None:
             return _error(401, "This link has been used, or is not of this session; ask for a new one.")
         role, key = found
