@@ -33,10 +33,17 @@ def study_of(folder: Path, seconds: float = 0.02) -> Study:
 
 
 class Live:
-    """`with Live(folder) as live:` - a session of comparisons, its hub, and a client for each role."""
+    """`with Live(folder) as live:` - a session of comparisons, its hub, and a client for each role.
 
-    def __init__(self, folder: Path, *, blocks=None, seconds: float = 0.02, repeats: int = 4, device="sim"):
-        self.folder, self.device = folder, device
+    Without `warm` it goes on compiling until `warmed` is set.
+    """
+
+    def __init__(
+        self, folder: Path, *, blocks=None, seconds: float = 0.02, repeats: int = 4, device="sim", warm: bool = True
+    ):
+        self.folder, self.device, self.warmed = folder, device, threading.Event()
+        if warm:
+            self.warmed.set()
         self.study = study_of(folder, seconds)
         self.blocks = blocks or (Block("validation", 3 * repeats, PAIRS * repeats),)
         self.path = folder / "P01_1.session.jsonl"
@@ -58,7 +65,10 @@ class Live:
             EventLog.resume(self.path, self.study) if resumed else EventLog.create(self.path, self.study, self.header())
         )
         self.place = serve.bound(0, keys=self.folder / "keys")
-        self.hub = Hub(self.log, LiveChooser(self.log.state), self.connect, tag="tag", gap=0.0)
+        chooser = LiveChooser(self.log.state)
+        compiled = chooser.warm
+        chooser.warm = lambda: (self.warmed.wait(PATIENCE), compiled())
+        self.hub = Hub(self.log, chooser, self.connect, tag="tag", gap=0.0)
         self.hub.invite = lambda: {"link": self.place.link("participant"), "qr": ""}
         ready = threading.Event()
         self.thread = threading.Thread(target=self._serve, args=(ready,))
@@ -80,6 +90,7 @@ class Live:
             ready.set()
 
     def __exit__(self, *_) -> None:
+        self.warmed.set()
         self.stop()
         self.thread.join(PATIENCE)
         self.log.close()

@@ -169,7 +169,7 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
         assert [event.data["id"] for event in answers] == list(range(1, 13))
         assert {event.data["client"] for event in answers} == {"me"}
         assert answers[0].data["browser"]["response_s"] == 0.0125
-        assert live.replayed() == live.hub.state
+        live.until(lambda _: live.replayed() == live.hub.state)
         check_order(live.events())
         state = live.hub.state
     listening.join(PATIENCE)
@@ -253,7 +253,7 @@ def test_every_command_is_an_event_and_replayed(live):
         live.command("undo")
     kinds = [event.kind for event in live.events()]
     assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= set(kinds)
-    assert live.replayed() == live.hub.state
+    live.until(lambda _: live.replayed() == live.hub.state)
     assert live.hub.state.notes[0][1] == "yawned"
 
 
@@ -287,7 +287,7 @@ def test_a_device_that_is_gone_voids_the_trial_and_comes_back(live):
     found = live.answer(live.question())
     assert not found["again"]
     assert live.hub.state.trials[pending.id].renderings == pending.renderings
-    assert live.replayed() == live.hub.state
+    live.until(lambda _: live.replayed() == live.hub.state)
 
 
 def test_an_emergency_stop_holds_everything_until_it_is_cleared(live):

@@ -111,7 +111,7 @@ def test_every_button_of_the_experimenter_is_an_event(pages):
     participant.window.wait_for_selector("body[data-phase=ended]")
     kinds = {event.kind for event in live.events()}
     assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= kinds
-    assert live.replayed() == live.hub.state
+    live.until(lambda _: live.replayed() == live.hub.state)
 
 
 def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):

@@ -70,9 +70,12 @@ class Rig:
         self._jobs.put((lambda: job(self._ready()), found))
         return found
 
-    def load(self, wanted: dict[str, Any], stop: threading.Event | None = None) -> Future:
-        """The set in force once nobody presses: `Loaded`; None if `stop` was set before that."""
-        return self.do(lambda device: self._load(device, wanted, stop or self._ending))
+    def load(self, wanted: dict[str, Any], stop: threading.Event, may_push: Callable[[], bool]) -> Future:
+        """The set in force once nobody presses: `Loaded`; None if `stop` was set before that.
+
+        While `may_push()`, a handle that was left pressed is pushed back by the set that is in force.
+        """
+        return self.do(lambda device: self._load(device, wanted, stop, may_push))
 
     def render(self) -> Future:
         """The set in force, from now on; nothing where it is rendered already."""
@@ -100,16 +103,17 @@ class Rig:
         if self.snapshot.state != "RUNNING":
             device.start()
 
-    def _load(self, device, wanted, stop):
+    def _load(self, device, wanted, stop, may_push):
         patient = time.monotonic() + _PUSHED
         while True:
             self._see(self._look())
             if not self.snapshot.contact:
                 break
-            if time.monotonic() > patient and self.snapshot.state == "STOPPED" and device.in_force() is not None:
-                device.start()  # nothing but the last set's force brings a handle back that was left pressed
             if stop.wait(_NEAR) or self._ending.is_set():
                 return None
+            resting = time.monotonic() > patient and self.snapshot.state == "STOPPED"
+            if resting and may_push() and device.in_force() is not None:
+                device.start()  # nothing but the last set's force brings a handle back that was left pressed
         begun = time.perf_counter()
         found = device.send(**wanted)
         return Loaded(found, time.perf_counter() - begun)

@@ -1,0 +1,87 @@
+"""When the device of a live session moves and when it rests: a simulated device of its own, and the real server."""
+
+import contextlib
+import time
+
+from live_server import Live
+
+from hilbo.hardware_bridge import Renderer
+from hilbo.simulator import Simulator
+
+SET = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
+
+
+@contextlib.contextmanager
+def left_pressed(set_first=True):
+    """A device whose set in force is an earlier session's, and whose handle a hand holds down; its process."""
+    simulator = Simulator(finger="rest")
+    try:
+        if set_first:
+            with Renderer.open(simulator.port, patience=10.0) as device:
+                device.send(**SET)
+        simulator.tell("finger hold")
+        yield simulator
+    finally:
+        simulator.close()
+
+
+def watched(live):
+    """Every state that the device is seen in from now on."""
+    seen, own = [], live.hub.rig._changed
+
+    def changed(snapshot):
+        seen.append(snapshot.state)
+        own(snapshot)
+
+    live.hub.rig._changed = changed
+    return seen
+
+
+def pressed(live):
+    live.until(lambda _: live.hub.rig.snapshot.contact)
+
+
+def test_a_pressed_device_rests_until_begin_and_again_in_a_break(tmp_path):
+    with left_pressed() as simulator, Live(tmp_path, device=simulator.port) as live:
+        seen = watched(live)
+        live.until(lambda view: view["may"]["begin"])
+        pressed(live)
+        time.sleep(2.0)  # twice as long as it waits before it pushes a handle back
+        assert set(seen) <= {"STOPPED"}
+        live.begin()
+        live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
+        live.participant.post("/api/participant/break", {})
+        live.until(lambda _: live.hub.rig.snapshot.state == "STOPPED")
+        del seen[:]
+        time.sleep(1.5)
+        assert "RUNNING" not in seen
+
+
+def test_a_pressed_device_rests_while_something_is_still_compiled(tmp_path):
+    with left_pressed() as simulator, Live(tmp_path, device=simulator.port, warm=False) as live:
+        seen = watched(live)
+        live.participant.post("/api/participant/begin", {})
+        pressed(live)
+        time.sleep(2.0)
+        assert set(seen) <= {"STOPPED"}
+        live.warmed.set()
+        live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
+
+
+def test_a_stop_that_failed_is_said_and_sent_again(tmp_path, monkeypatch):
+    with left_pressed() as simulator, Live(tmp_path, device=simulator.port) as live:
+        live.begin()
+        live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
+        device, refused = live.hub.rig.device, []
+        own = device.stop
+
+        def stop():
+            if not refused:
+                refused.append("once")
+                raise RuntimeError("the line hummed")
+            own()
+
+        monkeypatch.setattr(device, "stop", stop)
+        live.command("pause")
+        live.until(lambda view: view["alert"] == "the line hummed", live.whole)
+        live.until(lambda _: live.hub.rig.snapshot.state == "STOPPED")
