@@ -85,3 +85,37 @@ def test_a_stop_that_failed_is_said_and_sent_again(tmp_path, monkeypatch):
         live.command("pause")
         live.until(lambda view: view["alert"] == "the line hummed", live.whole)
         live.until(lambda _: live.hub.rig.snapshot.state == "STOPPED")
+
+
+def felt_again(live, pending, condition):
+    """The trial was void, with a device event; nothing goes on by itself, and after Begin it is asked again."""
+    voided = live.until(lambda v: v["whole"]["trials"][pending.id - 1]["voided"], live.whole)["whole"]["trials"]
+    assert voided[pending.id - 1]["voided"]["by"] == "rule"
+    assert condition in voided[pending.id - 1]["voided"]["reason"]
+    live.until(lambda v: v["device"]["state"] != "lost" and v["phase"] in ("hello", "trouble"), live.whole)
+    assert live.hub.rig.snapshot.state in ("STOPPED", "HOLD")
+    if "clear" in live.whole()["may"]:
+        live.command("clear")
+    live.begin()
+    live.answer()
+    assert live.hub.state.trials[pending.id].renderings == pending.renderings
+
+
+def test_a_device_that_lost_its_power_voids_the_trial_and_waits_for_begin(tmp_path):
+    with Live(tmp_path) as live:
+        live.begin()
+        live.answer()
+        live.question()
+        pending = live.hub.state.pending
+        live.hub.rig.device.simulator.tell("restart")
+        felt_again(live, pending, "restarted")
+        assert [e.data["condition"] for e in live.events("device")] == ["ready", "lost", "ready"]
+
+
+def test_heartbeats_that_ended_void_the_trial_and_the_hold_can_be_cleared(tmp_path):
+    with Live(tmp_path) as live:
+        live.begin()
+        live.question()
+        pending = live.hub.state.pending
+        live.hub.rig.device.link._heart.process.kill()
+        felt_again(live, pending, "heartbeats")

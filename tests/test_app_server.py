@@ -284,6 +284,7 @@ def test_a_device_that_is_gone_voids_the_trial_and_comes_back(live):
     voided = view["whole"]["trials"][pending.id - 1]["voided"]
     assert voided["by"] == "rule"
     assert "device" in voided["reason"]
+    live.begin()  # nothing goes on by itself
     found = live.answer(live.question())
     assert not found["again"]
     assert live.hub.state.trials[pending.id].renderings == pending.renderings

@@ -302,10 +302,12 @@ class Hub:
         if changed:
             reason = seen.lost or (held_because(seen.hold_reason) if condition != "ready" else "")
             facts = {"reason": reason, "counters": seen.counters}
+            self.begun = self.begun and condition != "lost"  # a device that comes back does not go on by itself
             with contextlib.suppress(InputError, LogError):
                 await self.commit(lambda state, at: live_session.device(state, condition, at, **facts))
             if condition == "lost":
                 self.runner.forget()
+                self.runner.restart()
             self.runner.wake()
         self.publish()
 

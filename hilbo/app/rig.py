@@ -1,8 +1,9 @@
 """The device of a session, in a thread of its own: one job after the other, its state looked at ten times a second.
 
 Nothing here knows of trials or answers. A job gives a `Future`; whatever the device or the line does wrong is the job's
-`DeviceError`, and the snapshot that everybody may read says `lost` with the sentence. A lost device is tried again once
-a second; it comes back stopped. Sets go over to the device out of contact only: a job waits until nobody presses.
+`DeviceError`, and the snapshot that everybody may read says `lost` with the sentence; so it does of a device that has
+restarted, or hears no heartbeats. A lost device is tried again once a second; it comes back stopped. Sets go over to
+the device out of contact only: a job waits until nobody presses.
 """
 
 import contextlib
@@ -163,6 +164,8 @@ class Rig:
 
     def _look(self) -> Snapshot:
         found = self.device.status()
+        if self.device.link.restarted or self.device.link.faint:  # which answer this question all the same
+            self.device.limits()  # and no other: `DeviceError` with what has happened
         state = State(found.state).name if found.state in State._value2member_map_ else f"state {found.state}"
         counters = {name: getattr(found, name) for name in COUNTERS}
         force, position = (v if math.isfinite(v) else 0.0 for v in (found.force_N, found.position_mm))
