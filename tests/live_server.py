@@ -27,9 +27,13 @@ PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts
 PAIRS = (Planned("best", "mid"), Planned("worst", "best", "b"), Planned("mid", "worst"))
 
 
-def study_of(folder: Path, seconds: float = 0.02) -> Study:
-    """The paper's study, its steps as short as can be."""
-    return Study.load(fast_study(DATA, folder / "study.toml", seconds, 2))
+def study_of(folder: Path, seconds: float = 0.02, warm_up: str = "") -> Study:
+    """The paper's study, its steps as short as can be; `warm_up` replaces the steps of that phase."""
+    file = fast_study(DATA, folder / "study.toml", seconds, 2)
+    head, own, rest = file.read_text().partition("[session.warm_up]\n")
+    if warm_up:
+        file.write_text(head + own + warm_up + rest[rest.index("\n") :])
+    return Study.load(file)
 
 
 class Live:
@@ -39,12 +43,20 @@ class Live:
     """
 
     def __init__(
-        self, folder: Path, *, blocks=None, seconds: float = 0.02, repeats: int = 4, device="sim", warm: bool = True
+        self,
+        folder: Path,
+        *,
+        blocks=None,
+        seconds: float = 0.02,
+        repeats: int = 4,
+        device="sim",
+        warm: bool = True,
+        warm_up="",
     ):
         self.folder, self.device, self.warmed = folder, device, threading.Event()
         if warm:
             self.warmed.set()
-        self.study = study_of(folder, seconds)
+        self.study = study_of(folder, seconds, warm_up)
         self.blocks = blocks or (Block("validation", 3 * repeats, PAIRS * repeats),)
         self.path = folder / "P01_1.session.jsonl"
         self.failed: list[BaseException] = []

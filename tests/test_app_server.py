@@ -336,6 +336,23 @@ def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
         assert live.events("repeat")
 
 
+SHORT_THEN_LONG = 'steps = [{show = "reference", seconds = 0.02}, {show = "a", seconds = 30}]'
+
+
+def test_a_rendering_that_a_break_cut_off_is_felt_again_before_it_is_asked_about(tmp_path):
+    with Live(tmp_path, blocks=(Block("warm-up", 1, (Planned("best"),)),), warm_up=SHORT_THEN_LONG) as live:
+        live.begin()
+        live.until(lambda view: view["step"] and view["step"]["show"] == "a")
+        live.participant.post("/api/participant/break", {})
+        live.until(lambda view: view["phase"] == "paused")
+        live.command("resume")
+        view = live.until(lambda view: view["step"] or view["questions"])
+        assert view["step"]["show"] == "reference"
+        live.until(lambda view: view["step"] and view["step"]["show"] == "a")
+        shown = [(e.data["show"], e.data["on"]) for e in live.events("stimulus")]
+        assert shown == [("reference", True), ("reference", False), ("a", True)] * 2
+
+
 def test_the_newest_window_of_a_participant_is_the_one_that_counts(live):
     live.begin()
     first, second = live.hub.watchers.add("participant", "one"), live.hub.watchers.add("participant", "two")

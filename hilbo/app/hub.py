@@ -334,6 +334,6 @@ class Hub:
         pending, self.begun = self.state.pending, False
         with contextlib.suppress(InputError, LogError):
             await self.commit(lambda state, at: live_session.note(state, why, at))
-            if pending is not None and pending.step is not None and pending.felt != frozenset(pending.renderings):
+            if pending is not None and pending.unfinished:
                 await self.commit(live_session.repeat)
         self.runner.restart()

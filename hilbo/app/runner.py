@@ -124,7 +124,9 @@ class Runner:
 
     async def _present(self, trial: Trial, stop: threading.Event) -> None:
         hub = self.hub
-        if trial.felt == frozenset(trial.renderings):  # all felt already: after a break, or a restart of the server
+        if (
+            trial.step is not None and not trial.unfinished
+        ):  # all felt already: after a break, or a restart of the server
             self._look_ahead()
             self._at("answer")
             return
