@@ -114,6 +114,23 @@ def test_every_button_of_the_experimenter_is_an_event(pages):
     live.until(lambda _: live.replayed() == live.hub.state)
 
 
+@pytest.mark.parametrize("way", ["key", "button"])
+def test_the_emergency_stop_is_in_reach_while_something_is_asked(pages, way):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    experimenter.wait_for_selector("[data-command=abort]:enabled")
+    experimenter.click("[data-command=abort]")
+    experimenter.wait_for_selector("#sure[open]")
+    if way == "key":
+        experimenter.keyboard.press("Escape")
+        experimenter.keyboard.press("Escape")
+    else:
+        experimenter.click("#sure .stop")
+    until(experimenter, "view.device.state === 'estop'")
+    until(experimenter, "!document.getElementById('sure').open")
+    assert live.events("abort") == []
+
+
 def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     live, participant, _ = pages
     window = participant.window

@@ -242,4 +242,5 @@ def _next_side(steps, i) -> str | None:
 
 def _looked_at(done) -> None:
     """Its exception counts as seen, also where nobody waits for it."""
-    done.cancelled() or done.exception()
+    if not done.cancelled():
+        done.exception()

@@ -29,7 +29,7 @@ function draw() {
   drawDevice(); drawAlert(view.alert || ""); drawAnswers(); drawLog();
   put("watch", view.participant_here ? "Connected." : "Not connected.");
   for (const b of document.querySelectorAll("[data-command]")) b.disabled = !view.may.includes(b.dataset.command);
-  at("estop").disabled = !view.may.includes("estop");
+  for (const b of document.querySelectorAll(".stop")) b.disabled = !view.may.includes("estop");
   if (view.map_version !== mapOf) { mapOf = view.map_version; loadMap(); }
 }
 
@@ -117,9 +117,12 @@ for (const b of document.querySelectorAll("[data-command]")) {
     if (why !== null) command(b.dataset.command, why ? { reason: why } : {});
   });
 }
-at("estop").addEventListener("click", () => command("estop"));
-document.addEventListener("keydown", (e) => {
-  if (e.key !== "Escape" || at("sure").open) return;
+for (const b of document.querySelectorAll(".stop")) {      // in the dialog too, which leaves nothing else in reach
+  b.addEventListener("click", () => { command("estop"); at("sure").close("no"); });
+}
+at("sure-no").addEventListener("click", () => at("sure").close("no"));
+document.addEventListener("keydown", (e) => {              // the first one closes a dialog, and counts
+  if (e.key !== "Escape") return;
   if (performance.now() - lastEscape < 1000) command("estop");
   lastEscape = performance.now();
 });
