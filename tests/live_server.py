@@ -159,13 +159,18 @@ class Live:
         header, events, _ = read_log(self.path, self.study)
         return LiveSession.fold(self.study, header, events)
 
+    def replays(self) -> None:
+        """Waits until the log alone gives the state; the session may go on meanwhile."""
+        self.until(lambda _: self.replayed() == self.hub.state, lambda: "the log gives another state")
+
 
 @contextlib.contextmanager
-def refused(status: int):
-    """What is done within must be answered with this status, and one sentence."""
+def refused(status: int, words: str = ""):
+    """What is done within must be answered with this status, and one sentence; `words` are in it."""
     with pytest.raises(urllib.error.HTTPError) as caught:
         yield
     with caught.value as error:
         text = error.read().decode()
     assert caught.value.code == status, text
     assert '"error"' in text
+    assert words in text

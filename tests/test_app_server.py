@@ -169,7 +169,7 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
         assert [event.data["id"] for event in answers] == list(range(1, 13))
         assert {event.data["client"] for event in answers} == {"me"}
         assert answers[0].data["browser"]["response_s"] == 0.0125
-        live.until(lambda _: live.replayed() == live.hub.state)
+        live.replays()
         check_order(live.events())
         state = live.hub.state
     listening.join(PATIENCE)
@@ -253,8 +253,30 @@ def test_every_command_is_an_event_and_replayed(live):
         live.command("undo")
     kinds = [event.kind for event in live.events()]
     assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= set(kinds)
-    live.until(lambda _: live.replayed() == live.hub.state)
+    live.replays()
     assert live.hub.state.notes[0][1] == "yawned"
+
+
+def test_void_and_undo_mean_the_trial_that_their_sender_saw(live):
+    live.begin()
+    live.answer()
+    view = live.until(lambda v: v["means"]["void"] and v["means"]["void"]["trial"] == 2, live.whole)
+    assert view["means"] == {"void": {"trial": 2, "name": "V2"}, "undo": {"trial": 1, "name": "V1"}}
+    live.answer()
+    live.until(lambda v: v["means"]["undo"]["trial"] == 2 and v["means"]["void"]["trial"] == 3, live.whole)
+    before = live.hub.state.trials[:2]
+    for what, trial, now in (("void", 2, "V3"), ("undo", 1, "V2"), ("void", 99, "V3")):
+        with refused(409, f"Meanwhile {now} has come"):
+            live.command(what, trial=trial, reason="noise")
+    assert live.hub.state.trials[:2] == before
+    with refused(400):
+        live.command("void", trial="2")
+    live.command("undo", trial=2, reason="slipped")
+    assert live.hub.state.trials[1].status == "undone"
+    assert live.events("undo")[0].data == {"id": 2, "reason": "slipped"}
+    again = live.until(lambda v: v["means"]["void"]["trial"] > 3, live.whole)["means"]["void"]["trial"]
+    live.command("void", trial=again, reason="noise")
+    assert live.hub.state.trials[again - 1].status == "void"
 
 
 def test_the_server_ends_and_goes_on_with_the_same_trial(tmp_path):
@@ -288,7 +310,7 @@ def test_a_device_that_is_gone_voids_the_trial_and_comes_back(live):
     found = live.answer(live.question())
     assert not found["again"]
     assert live.hub.state.trials[pending.id].renderings == pending.renderings
-    live.until(lambda _: live.replayed() == live.hub.state)
+    live.replays()
 
 
 def test_an_emergency_stop_holds_everything_until_it_is_cleared(live):

@@ -82,6 +82,13 @@ def until_logged(live, window, count):
         window.wait_for_timeout(50)
 
 
+def until_event(live, window, kind):
+    end = time.monotonic() + PATIENCE
+    while not live.events(kind):
+        assert time.monotonic() < end
+        window.wait_for_timeout(50)
+
+
 def until_answered(participant, count):
     end = time.monotonic() + PATIENCE
     while participant.answered < count:
@@ -111,7 +118,7 @@ def test_every_button_of_the_experimenter_is_an_event(pages):
     participant.window.wait_for_selector("body[data-phase=ended]")
     kinds = {event.kind for event in live.events()}
     assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= kinds
-    live.until(lambda _: live.replayed() == live.hub.state)
+    live.replays()
 
 
 @pytest.mark.parametrize("way", ["key", "button"])
@@ -129,6 +136,30 @@ def test_the_emergency_stop_is_in_reach_while_something_is_asked(pages, way):
     until(experimenter, "view.device.state === 'estop'")
     until(experimenter, "!document.getElementById('sure').open")
     assert live.events("abort") == []
+
+
+def test_a_dialog_names_its_trial_and_never_hits_another(pages):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    until(experimenter, "view.means.void && view.means.void.trial === 2")
+    experimenter.click("[data-command=void]")
+    assert "V2" in experimenter.inner_text("#sure-text")
+    until_answered(participant, 2)
+    until(experimenter, "view.means.void.trial === 3")
+    experimenter.fill("#sure-why", "noise")
+    experimenter.keyboard.press("Enter")  # means Yes
+    until(experimenter, "!document.getElementById('sure').open")
+    until(experimenter, "document.getElementById('alert').textContent.includes('Meanwhile V3 has come')")
+    assert [trial.status for trial in live.hub.state.trials[:2]] == ["answered", "answered"]
+    experimenter.click("[data-command=undo]")
+    assert "V2" in experimenter.inner_text("#sure-text")
+    experimenter.click("#sure-no")
+    until(experimenter, "!document.getElementById('sure').open")
+    experimenter.click("[data-command=undo]")
+    experimenter.fill("#sure-why", "slipped")
+    experimenter.keyboard.press("Enter")
+    until_event(live, experimenter, "undo")
+    assert live.events("undo")[0].data == {"id": 2, "reason": "slipped"}
 
 
 def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):

@@ -216,26 +216,18 @@ class Hub:
             if not message.text.strip():
                 raise InputError("The note is empty; write something.")
             return lambda state, at: live_session.note(state, message.text.strip(), at)
-        if what == "void":
-            return lambda state, at: live_session.void(state, self._last(state), message.reason, at)
+        if what in ("void", "undo"):
+            return lambda state, at: _taken(state, what, message, at)
         if what == "abort":
             return lambda state, at: live_session.abort(state, message.reason, at)
         if what == "pause":
             return lambda state, at: live_session.pause(state, "experimenter", at)
-        if what == "resume":
-            self.begun = True
-            return live_session.resume if self.state.paused is not None else live_session.go_on
-        return {"repeat": live_session.repeat, "undo": live_session.undo}[what]
+        return self._goes_on if what == "resume" else live_session.repeat
 
-    @staticmethod
-    def _last(state) -> int:
-        """The trial that a person means: the one being felt, or the newest answered one."""
-        if state.pending is not None and state.pending.step is not None:
-            return state.pending.id
-        given = [t.id for t in state.trials if t.status == "answered"]
-        if not given:
-            raise RefusedError("nothing", "There is no trial to void yet.")
-        return given[-1]
+    def _goes_on(self, state, at):
+        event = (live_session.resume if state.paused is not None else live_session.go_on)(state, at)
+        self.begun = True
+        return event
 
     async def _estop(self):
         assert self.rig is not None
@@ -337,3 +329,15 @@ class Hub:
             if pending is not None and pending.unfinished:
                 await self.commit(live_session.repeat)
         self.runner.restart()
+
+
+def _taken(state, what, message, at):
+    """A trial made void, or an answer taken back: that of the trial which the sender saw, or none."""
+    trial = live_session.voidable(state) if what == "void" else live_session.last_answered(state)
+    if trial is None:
+        raise RefusedError("nothing", f"There is no trial to {what} yet.")
+    if message.trial not in (None, trial.id):
+        raise RefusedError("old-trial", f"Meanwhile {views.place_of(trial)} has come; look again.")
+    if what == "void":
+        return live_session.void(state, trial.id, message.reason, at)
+    return live_session.undo(state, at, message.reason)
