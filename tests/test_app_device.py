@@ -1,9 +1,10 @@
 """When the device of a live session moves and when it rests: a simulated device of its own, and the real server."""
 
 import contextlib
+import os
 import time
 
-from live_server import Live
+from live_server import Live, refused
 
 from hilbo.hardware_bridge import Renderer
 from hilbo.simulator import Simulator
@@ -119,3 +120,59 @@ def test_heartbeats_that_ended_void_the_trial_and_the_hold_can_be_cleared(tmp_pa
         pending = live.hub.state.pending
         live.hub.rig.device.link._heart.process.kill()
         felt_again(live, pending, "heartbeats")
+
+
+@contextlib.contextmanager
+def full_disk(live, monkeypatch, kind=b""):
+    """Events of a kind cannot be written, as long as this lasts; gives how many tried."""
+    real, tried = os.write, []
+
+    def full(file, data):
+        if file == live.log._file and b'"kind":"' + kind in bytes(data):
+            tried.append(bytes(data))
+            raise OSError(28, "No space left on device")
+        return real(file, data)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", full)
+        yield tried
+
+
+def test_a_hold_while_the_disk_is_full_voids_its_trial_as_soon_as_there_is_room(tmp_path, monkeypatch):
+    with Live(tmp_path) as live:
+        live.begin()
+        view = live.question()
+        live.until(lambda v: v["phase"] == "answer")
+        with full_disk(live, monkeypatch) as tried:
+            live.hub.rig.device.simulator.tell("bad 5")
+            live.until(lambda v: "clear" in v["may"] and tried, live.whole)
+            live.command("clear")
+            live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+            assert live.hub.state.trials[0].status == "pending"
+        live.until(lambda v: v["whole"]["trials"][0]["status"] == "void", live.whole)
+        with refused(409):
+            live.answer(view)
+        assert [e.data["condition"] for e in live.events("device")] == ["ready", "hold", "ready"]
+        live.answer()
+
+
+def test_an_answer_that_comes_before_the_hold_can_be_written_does_not_count(tmp_path, monkeypatch):
+    with Live(tmp_path) as live:
+        live.begin()
+        view = live.question()
+        live.until(lambda v: v["phase"] == "answer")
+        with full_disk(live, monkeypatch, b"device") as tried:
+            live.hub.rig.device.simulator.tell("bad 5")
+            live.until(lambda v: "clear" in v["may"] and tried, live.whole)
+            live.answer(view)
+        live.until(lambda v: v["whole"]["trials"][0]["status"] == "void", live.whole)
+
+
+def test_what_is_in_force_is_in_the_log_before_it_is_felt_on_a_full_disk_too(tmp_path, monkeypatch):
+    with Live(tmp_path) as live:
+        with full_disk(live, monkeypatch, b"sent") as tried:
+            live.begin()
+            live.until(lambda _: len(tried) > 1)
+        live.question()
+        kinds = [(e.kind, e.data.get("side") or e.data.get("show")) for e in live.events() if e.data.get("id") == 1]
+        assert kinds.index(("sent", "a")) < kinds.index(("stimulus", "a"))

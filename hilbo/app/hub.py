@@ -80,13 +80,14 @@ class Hub:
         self._map: tuple[str, Any] | None = None
         self._drawing = ThreadPoolExecutor(1, "hilbo-map")
         self._device_was = ""
+        self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what the device did, not yet on the disk
         self.runner = Runner(self)
 
     # Life.
 
     async def open(self) -> None:
         """Connect to the device, and begin. Raises `InputError` or `DeviceError`."""
-        self._lock, self._loop = asyncio.Lock(), asyncio.get_running_loop()
+        self._lock, self._saying, self._loop = asyncio.Lock(), asyncio.Lock(), asyncio.get_running_loop()
         rig = await self._loop.run_in_executor(self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed))
         self.rig = rig
         self.warm = self._loop.run_in_executor(self.compute, self._warm)
@@ -288,23 +289,35 @@ class Hub:
         task.add_done_callback(self._tasks.remove)
 
     async def _device_changed(self, seen: Snapshot) -> None:
-        """What the device does unasked is an event where it matters to a trial."""
+        """What the device does unasked is an event where it matters to a trial: the one that was pending then."""
         condition = "lost" if seen.lost else _STOPPED.get(seen.state, "ready")
-        changed, self._device_was = condition != self._device_was, condition
-        if changed:
+        if condition != self._device_was:
+            self._device_was = condition
             reason = seen.lost or (held_because(seen.hold_reason) if condition != "ready" else "")
-            facts = {"reason": reason, "counters": seen.counters}
+            trial = self.state.pending.id if self.state.pending is not None else None
+            facts = {"trial": trial, "reason": reason, "counters": seen.counters}
+            self._unsaid.append(lambda state, at: live_session.device(state, condition, at, **facts))
             self.begun = self.begun and condition != "lost"  # a device that comes back does not go on by itself
-            with contextlib.suppress(InputError, LogError):
-                await self.commit(lambda state, at: live_session.device(state, condition, at, **facts))
+            await self._say()
             if condition == "lost":
                 self.runner.forget()
                 self.runner.restart()
             self.runner.wake()
         self.publish()
 
+    async def _say(self) -> None:
+        """What the device did, in the log in its order; what does not fit on the disk waits until there is room."""
+        async with self._saying:
+            while self._unsaid:
+                with contextlib.suppress(InputError):
+                    try:
+                        await self.commit(self._unsaid[0])
+                    except LogError:
+                        return
+                self._unsaid.popleft()
+
     async def _watch_time(self) -> None:
-        """A laptop that slept, and a page that was closed."""
+        """A laptop that slept, a page that was closed, and what the device did that is not in the log yet."""
         wall, steady = time.time(), time.monotonic()
         while True:
             await asyncio.sleep(_LATER)
@@ -313,6 +326,7 @@ class Hub:
             wall, steady = now, mono
             if slept > _JUMP:
                 await self._interrupted(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
+            await self._say()
             if self.watchers.participant_here or not self.begun:
                 self._absent = None
             elif self._absent is None:

@@ -180,13 +180,14 @@ class Runner:
         hub = self.hub
         if side is None or self._in_force == (trial.id, trial.presentation, side):
             return
+        self._in_force = None  # nobody knows which, until this one is known to be
         loaded = await asyncio.wrap_future(hub.rig.load(self._wanted(trial, side), stop, self._may_push))
         if loaded is None:
             raise asyncio.CancelledError
         facts = {"in_force": loaded.in_force._asdict(), "serial_s": loaded.serial_s}
         self._note_times(loaded)
-        self._in_force = (trial.id, trial.presentation, side)
         await hub.commit(lambda state, at: live_session.sent(state, trial.id, side, at, **facts), mine=True)
+        self._in_force = (trial.id, trial.presentation, side)
 
     def _wanted(self, trial: Trial, side: str) -> dict[str, Any]:
         """What `Renderer.send` takes."""
