@@ -8,19 +8,23 @@ from pathlib import Path
 
 import pytest
 
+from hilbo import protocol
 from hilbo.app import serve
 from hilbo.app.hub import Hub
 from hilbo.app.rehearsal import example_sets, fast_study
 from hilbo.app.robot import Client
 from hilbo.app.server import application
 from hilbo.config import Study
+from hilbo.errors import InputError
 from hilbo.event_log import EventLog, read_log
-from hilbo.hardware_bridge import Renderer
+from hilbo.hardware_bridge import Renderer, State
+from hilbo.link import Link
 from hilbo.live_choice import LiveChooser
 from hilbo.live_records import Block, Header, Planned
 from hilbo.live_state import LiveSession
+from hilbo.ports import BAUD, open_port
 
-__all__ = ["DATA", "PATIENCE", "Live", "refused", "study_of"]
+__all__ = ["DATA", "PATIENCE", "Live", "refused", "study_of", "until_held"]
 
 DATA = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts a time
@@ -174,3 +178,18 @@ def refused(status: int, words: str = ""):
     assert caught.value.code == status, text
     assert '"error"' in text
     assert words in text
+
+
+def until_held(port: str) -> None:
+    """Waits until a device that nobody talks to any more is in HOLD."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        assert time.monotonic() < end
+        with contextlib.suppress(InputError):  # whoever sent heartbeats may still be dying
+            link = Link(open_port(port, BAUD), patience=5.0)
+            try:
+                if link.request(protocol.GetStatus()).state == State.HOLD:
+                    return
+            finally:
+                link.close()
+        time.sleep(0.02)

@@ -4,7 +4,7 @@ import contextlib
 import os
 import time
 
-from live_server import Live, refused
+from live_server import Live, refused, until_held
 
 from hilbo.hardware_bridge import Renderer
 from hilbo.simulator import Simulator
@@ -176,3 +176,47 @@ def test_what_is_in_force_is_in_the_log_before_it_is_felt_on_a_full_disk_too(tmp
         live.question()
         kinds = [(e.kind, e.data.get("side") or e.data.get("show")) for e in live.events() if e.data.get("id") == 1]
         assert kinds.index(("sent", "a")) < kinds.index(("stimulus", "a"))
+
+
+def let_go_as_if_killed(rig):
+    """The line is closed and heartbeats end, and nobody says stop, as when a process dies."""
+    rig._ending.set()
+    rig._jobs.put(None)
+    rig._thread.join()
+    rig.device.link.close()
+
+
+def test_a_killed_server_goes_on_with_the_same_trial_on_a_device_that_held_meanwhile(tmp_path):
+    with left_pressed(set_first=False) as simulator:
+        simulator.tell("finger none")
+        with Live(tmp_path, device=simulator.port) as live:
+            live.begin()
+            view = live.question()
+            live.until(lambda v: v["phase"] == "answer")
+            assert live.hub.rig.snapshot.state == "RUNNING"
+            rig = live.hub.rig
+            rig.close = lambda: let_go_as_if_killed(rig)
+        until_held(simulator.port)
+        with Live(tmp_path, device=simulator.port) as live:
+            assert live.hub.rig.snapshot.state == "HOLD"
+            assert [e.data["condition"] for e in live.events("device")] == ["ready", "stopped"]
+            assert not live.answer(view)["again"]  # which was kept by the browser
+            live.command("clear")
+            live.begin()
+            live.answer()
+            assert [t.status for t in live.hub.state.trials[:2]] == ["answered", "answered"]
+            assert [e.data["condition"] for e in live.events("device")] == ["ready", "stopped", "ready"]
+
+
+def test_a_device_that_held_for_another_reason_voids_the_trial_also_at_the_start(tmp_path):
+    with left_pressed(set_first=False) as simulator:
+        simulator.tell("finger none")
+        with Live(tmp_path, device=simulator.port) as live:
+            live.begin()
+            live.question()
+            live.until(lambda v: v["phase"] == "answer")
+            rig = live.hub.rig
+            rig.close = lambda: (let_go_as_if_killed(rig), simulator.tell("bad 5"))
+        until_held(simulator.port)
+        with Live(tmp_path, device=simulator.port) as live:
+            live.until(lambda v: v["whole"]["trials"][0]["status"] == "void", live.whole)

@@ -25,7 +25,7 @@ from hilbo.app.watchers import Watchers
 from hilbo.errors import InputError
 from hilbo.event_log import LogError
 from hilbo.live_session import LiveSession, RefusedError
-from hilbo.reasons import held_because
+from hilbo.reasons import HoldReason, held_because
 
 __all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
 
@@ -91,7 +91,7 @@ class Hub:
         rig = await self._loop.run_in_executor(self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed))
         self.rig = rig
         self.warm = self._loop.run_in_executor(self.compute, self._warm)
-        await self._device_changed(rig.snapshot)
+        await self._device_changed(rig.snapshot, opening=True)
         self._tasks = [asyncio.create_task(self._watch_time())]
         self.runner.restart()
 
@@ -288,15 +288,20 @@ class Hub:
         self._tasks.append(task)
         task.add_done_callback(self._tasks.remove)
 
-    async def _device_changed(self, seen: Snapshot) -> None:
-        """What the device does unasked is an event where it matters to a trial: the one that was pending then."""
+    async def _device_changed(self, seen: Snapshot, *, opening: bool = False) -> None:
+        """What the device does unasked is an event where it matters to a trial: the one that was pending then.
+
+        A device that held because the server before this one was killed has done what it should, and voids nothing.
+        """
         condition = "lost" if seen.lost else _STOPPED.get(seen.state, "ready")
         if condition != self._device_was:
             self._device_was = condition
             reason = seen.lost or (held_because(seen.hold_reason) if condition != "ready" else "")
             trial = self.state.pending.id if self.state.pending is not None else None
             facts = {"trial": trial, "reason": reason, "counters": seen.counters}
-            self._unsaid.append(lambda state, at: live_session.device(state, condition, at, **facts))
+            killed = opening and condition == "hold" and seen.hold_reason == HoldReason.WATCHDOG
+            says = "stopped" if killed else condition
+            self._unsaid.append(lambda state, at: live_session.device(state, says, at, **facts))
             self.begun = self.begun and condition != "lost"  # a device that comes back does not go on by itself
             await self._say()
             if condition == "lost":
