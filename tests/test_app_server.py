@@ -6,12 +6,14 @@ import json
 import os
 import random
 import threading
+import time
 import urllib.request
 from pathlib import Path
 
 import pytest
 from live_server import PATIENCE, Live, refused
 
+from hilbo.app import watchers
 from hilbo.app.hub import COMMANDS, PRESSES
 from hilbo.live_records import Block, Planned
 
@@ -407,3 +409,41 @@ def test_the_documents_name_every_address():
     text = (Path(__file__).parents[1] / "docs" / "live.md").read_text(encoding="utf-8")
     for name in (*PRESSES, *COMMANDS, "answer", "events", "join"):
         assert f"`{name}`" in text or f"/{name}" in text, name
+
+
+class Page:
+    """A participant's window without a browser: a cookie, a stream, and signs of life as long as it is told to."""
+
+    def __init__(self, live):
+        self.live, self.origin = live, live.participant.address
+        token = live.place.link("participant").partition("/#")[2]
+        request = urllib.request.Request(self.origin + "/api/join", data=json.dumps({"token": token}).encode())
+        with urllib.request.urlopen(request, timeout=PATIENCE) as reply:
+            self.cookie = reply.headers["Set-Cookie"].partition(";")[0]
+        self.stream = ask(live, "/api/participant/events?page=one", Cookie=self.cookie)
+
+    def post(self, name):
+        headers = {"Cookie": self.cookie, "Origin": self.origin, "X-Hilbo-Page": "one"}
+        ask(self.live, f"/api/participant/{name}", data=b"{}", **headers).close()
+
+
+def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tmp_path, monkeypatch):
+    monkeypatch.setattr(watchers, "_SILENT", 0.0)  # no program counts
+    with Live(tmp_path, seconds=60.0) as live:
+        page = Page(live)
+        live.until(lambda v: v["phase"] == "hello", live.whole)
+        page.post("begin")
+        live.until(lambda v: v["phase"] == "step", live.whole)
+        end = time.monotonic() + 5.0  # longer than a page may be silent
+        while time.monotonic() < end:
+            page.post("here")
+            time.sleep(0.5)
+        view = live.whole()
+        assert view["participant_here"]
+        assert view["phase"] == "step"
+        live.until(lambda v: not v["participant_here"], live.whole)  # nothing is closed, and nothing comes any more
+        live.until(lambda v: v["phase"] == "hello", live.whole)
+        assert live.events("repeat")
+        page.post("here")
+        assert live.whole()["participant_here"]
+        page.stream.close()

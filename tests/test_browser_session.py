@@ -192,6 +192,22 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     assert len(live.events("answer")) == count + 1
 
 
+def test_a_page_whose_signs_of_life_do_not_arrive_says_so_and_comes_back(pages):
+    live, participant, experimenter = pages
+    window = participant.window
+    until_answered(participant, 1)
+    until(experimenter, "view.participant_here")
+    window.route("**/api/participant/here", lambda route: route.abort())
+    window.wait_for_selector("#line:visible")
+    until(experimenter, "!view.participant_here")
+    until(experimenter, "view.phase === 'hello' || view.phase === 'answer'")
+    window.unroute("**/api/participant/here")
+    window.wait_for_selector("#line", state="hidden")
+    until(experimenter, "view.participant_here")
+    until_answered(participant, 2)
+    assert live.hub.watchers.participant_here
+
+
 def test_the_pages_load_nothing_from_elsewhere_and_names_reach_a_screen_reader(pages):
     _, participant, _ = pages
     window = participant.window

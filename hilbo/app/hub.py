@@ -29,7 +29,7 @@ from hilbo.reasons import HoldReason, held_because
 
 __all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
 
-PRESSES = ("begin", "break", "more")
+PRESSES = ("begin", "break", "more", "here")
 COMMANDS = ("pause", "resume", "repeat", "undo", "void", "abort", "note", "estop", "clear", "invite")
 _STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
 _LATER = 1.0  # s between two looks at the clock
@@ -181,10 +181,12 @@ class Hub:
         return {"accepted": message.trial, "again": event is None}
 
     async def press(self, what: str, message: Press, page: str | None) -> None:
-        """A participant's button. Raises `NotNowError`."""
+        """A participant's button, or their page's sign of life. Raises `NotNowError`."""
         self._check_page(page)
         try:
-            if what == "break":
+            if what == "here":
+                self.watchers.alive(page)
+            elif what == "break":
                 await self.commit(lambda state, at: live_session.pause(state, "participant", at))
             elif what == "more":
                 await self.commit(live_session.more)
@@ -323,7 +325,7 @@ class Hub:
 
     async def _watch_time(self) -> None:
         """A laptop that slept, a page that was closed, and what the device did that is not in the log yet."""
-        wall, steady = time.time(), time.monotonic()
+        wall, steady, here = time.time(), time.monotonic(), False
         while True:
             await asyncio.sleep(_LATER)
             now, mono = time.time(), time.monotonic()
@@ -332,7 +334,10 @@ class Hub:
             if slept > _JUMP:
                 await self._interrupted(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
             await self._say()
-            if self.watchers.participant_here or not self.begun:
+            here, before = self.watchers.participant_here, here
+            if here != before:
+                self.publish()
+            if here or not self.begun:
                 self._absent = None
             elif self._absent is None:
                 self._absent = mono

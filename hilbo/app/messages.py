@@ -42,7 +42,7 @@ class Answer(_Message, frozen=True):
 
 
 class Press(_Message, frozen=True):
-    """A participant's begin, break, or wish for more; `trial` is the one that was on the page."""
+    """A participant's begin, break, wish for more, or sign of life; `trial` is the one that was on the page."""
 
     trial: _Id | None = None
 
