@@ -111,6 +111,11 @@ class Trial:
         return self.data["renderings"]
 
     @property
+    def unfinished(self) -> bool:
+        """Whether it has begun and not all of it has been felt to its end: then it has to begin again."""
+        return self.step is not None and (self.on in self.renderings or self.felt != frozenset(self.renderings))
+
+    @property
     def sets(self) -> dict[str, str]:
         """Side -> name of its set, for planned trials."""
         return self.data.get("sets", {})

@@ -29,6 +29,7 @@ __all__ = [
     "answer",
     "device",
     "go_on",
+    "last_answered",
     "more",
     "note",
     "pause",
@@ -40,6 +41,7 @@ __all__ = [
     "sent",
     "undo",
     "void",
+    "voidable",
 ]
 
 
@@ -124,14 +126,13 @@ def answer(
     return _event(state, "answer", at, id=trial, client=client, values=dict(values), browser=_times(browser))
 
 
-def undo(state: LiveSession, at: float) -> Event:
+def undo(state: LiveSession, at: float, reason: str = "") -> Event:
     """Take the last answer back; its rendering is asked again."""
     _running(state)
-    given = [t for t in state.trials if t.status == "answered"]
-    if not given:
+    last = last_answered(state)
+    if last is None:
         raise RefusedError("nothing", "there is no answer to undo.")
-    last = max(given, key=lambda t: t.answered["seq"] if t.answered else 0)
-    return _event(state, "undo", at, id=last.id)
+    return _event(state, "undo", at, id=last.id, reason=reason)
 
 
 def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
@@ -229,6 +230,19 @@ def steps_of(state: LiveSession, trial: Trial) -> list[tuple[str, float]]:
     steps = protocol(state.study.session, state.header.blocks[trial.block].phase).steps
     other = {"a": "b", "b": "a"} if trial.first == "b" else {}
     return [(other.get(step.show, step.show), step.seconds) for step in steps]
+
+
+def last_answered(state: LiveSession) -> Trial | None:
+    """The trial whose answer came last, of those that count: what `undo` takes back."""
+    given = [t for t in state.trials if t.status == "answered"]
+    return max(given, key=lambda t: t.answered["seq"] if t.answered else 0, default=None)
+
+
+def voidable(state: LiveSession) -> Trial | None:
+    """The trial that a person means who wants one void: the one being felt, or the newest answered one."""
+    if state.pending is not None and state.pending.step is not None:
+        return state.pending
+    return next((t for t in reversed(state.trials) if t.status == "answered"), None)
 
 
 def _number(state, phase, material):

@@ -5,7 +5,8 @@ events themselves: a fold computes no fit.
 
 Rules: a trial in which the device holds, stops or is lost after it began is void, and its rendering is asked again; a
 rendering voided twice is not proposed again. A repeated, voided, undone or interrupted presentation starts from its
-first step. Whatever changes the answers drops a proposal that was made from the old ones.
+first step, and so does one that a pause cut off. Whatever changes the answers drops a proposal that was made from the
+old ones.
 """
 
 from collections.abc import Iterable, Mapping
@@ -197,7 +198,8 @@ def _stimulus(state, event):
     trial, show = state.trial(event.data["id"]), event.data["show"]
     if not event.data["on"]:
         return state.with_trial(trial.id, on=None)
-    felt = trial.felt | ({show} & set(trial.renderings))
+    before = trial.felt if event.data["step"] > 0 else frozenset()  # the first step begins everything anew
+    felt = before | ({show} & set(trial.renderings))
     return state.with_trial(trial.id, step=event.data["step"], on=show, felt=felt)
 
 
@@ -249,7 +251,7 @@ def _restored(state, event):
 
 def _paused(state, event):
     trial = state.pending
-    if trial is not None and trial.step is not None and trial.felt != frozenset(trial.renderings):
+    if trial is not None and trial.unfinished:
         state = state.with_trial(trial.id, **_again(trial))
     return replace(state, paused=event.data["by"])
 

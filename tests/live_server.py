@@ -8,35 +8,58 @@ from pathlib import Path
 
 import pytest
 
+from hilbo import protocol
 from hilbo.app import serve
 from hilbo.app.hub import Hub
 from hilbo.app.rehearsal import example_sets, fast_study
 from hilbo.app.robot import Client
 from hilbo.config import Study
+from hilbo.errors import InputError
 from hilbo.event_log import EventLog, read_log
-from hilbo.hardware_bridge import Renderer
+from hilbo.hardware_bridge import Renderer, State
+from hilbo.link import Link
 from hilbo.live_choice import LiveChooser
 from hilbo.live_records import Block, Header, Planned
 from hilbo.live_state import LiveSession
+from hilbo.ports import BAUD, open_port
 
-__all__ = ["DATA", "PATIENCE", "Live", "refused", "study_of"]
+__all__ = ["DATA", "PATIENCE", "Live", "refused", "study_of", "until_held"]
 
 DATA = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts a time
 PAIRS = (Planned("best", "mid"), Planned("worst", "best", "b"), Planned("mid", "worst"))
 
 
-def study_of(folder: Path, seconds: float = 0.02) -> Study:
-    """The paper's study, its steps as short as can be."""
-    return Study.load(fast_study(DATA, folder / "study.toml", seconds, 2))
+def study_of(folder: Path, seconds: float = 0.02, warm_up: str = "") -> Study:
+    """The paper's study, its steps as short as can be; `warm_up` replaces the steps of that phase."""
+    file = fast_study(DATA, folder / "study.toml", seconds, 2)
+    head, own, rest = file.read_text().partition("[session.warm_up]\n")
+    if warm_up:
+        file.write_text(head + own + warm_up + rest[rest.index("\n") :])
+    return Study.load(file)
 
 
 class Live:
-    """`with Live(folder) as live:` - a session of comparisons, its hub, and a client for each role."""
+    """`with Live(folder) as live:` - a session of comparisons, its hub, and a client for each role.
 
-    def __init__(self, folder: Path, *, blocks=None, seconds: float = 0.02, repeats: int = 4, device="sim"):
-        self.folder, self.device = folder, device
-        self.study = study_of(folder, seconds)
+    Without `warm` it goes on compiling until `warmed` is set.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        blocks=None,
+        seconds: float = 0.02,
+        repeats: int = 4,
+        device="sim",
+        warm: bool = True,
+        warm_up="",
+    ):
+        self.folder, self.device, self.warmed = folder, device, threading.Event()
+        if warm:
+            self.warmed.set()
+        self.study = study_of(folder, seconds, warm_up)
         self.blocks = blocks or (Block("validation", 3 * repeats, PAIRS * repeats),)
         self.path = folder / "P01_1.session.jsonl"
         self.failed: list[BaseException] = []
@@ -57,7 +80,10 @@ class Live:
             EventLog.resume(self.path, self.study) if resumed else EventLog.create(self.path, self.study, self.header())
         )
         self.place = serve.bound(0, keys=self.folder / "keys")
-        self.hub = Hub(self.log, LiveChooser(self.log.state), self.connect, tag="tag", gap=0.0)
+        chooser = LiveChooser(self.log.state)
+        compiled = chooser.warm
+        chooser.warm = lambda: (self.warmed.wait(PATIENCE), compiled())
+        self.hub = Hub(self.log, chooser, self.connect, tag="tag", gap=0.0)
         self.hub.invite = lambda: {"link": self.place.link("participant"), "qr": ""}
         ready = threading.Event()
         self.thread = threading.Thread(target=self._serve, args=(ready,))
@@ -79,6 +105,7 @@ class Live:
             ready.set()
 
     def __exit__(self, *_) -> None:
+        self.warmed.set()
         self.stop()
         self.thread.join(PATIENCE)
         self.log.close()
@@ -135,13 +162,33 @@ class Live:
         header, events, _ = read_log(self.path, self.study)
         return LiveSession.fold(self.study, header, events)
 
+    def replays(self) -> None:
+        """Waits until the log alone gives the state; the session may go on meanwhile."""
+        self.until(lambda _: self.replayed() == self.hub.state, lambda: "the log gives another state")
+
 
 @contextlib.contextmanager
-def refused(status: int):
-    """What is done within must be answered with this status, and one sentence."""
+def refused(status: int, words: str = ""):
+    """What is done within must be answered with this status, and one sentence; `words` are in it."""
     with pytest.raises(urllib.error.HTTPError) as caught:
         yield
     with caught.value as error:
         text = error.read().decode()
     assert caught.value.code == status, text
     assert '"error"' in text
+    assert words in text
+
+
+def until_held(port: str) -> None:
+    """Waits until a device that nobody talks to any more is in HOLD."""
+    end = time.monotonic() + PATIENCE
+    while True:
+        assert time.monotonic() < end
+        with contextlib.suppress(InputError):  # whoever sent heartbeats may still be dying
+            link = Link(open_port(port, BAUD), patience=5.0)
+            try:
+                if link.request(protocol.GetStatus()).state == State.HOLD:
+                    return
+            finally:
+                link.close()
+        time.sleep(0.02)

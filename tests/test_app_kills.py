@@ -3,6 +3,7 @@
 `HILBO_KILLS=200 pytest tests/test_app_kills.py` kills so often; by default a few times, for the sake of the clock.
 """
 
+import contextlib
 import json
 import multiprocessing
 import os
@@ -15,12 +16,13 @@ import urllib.error
 from pathlib import Path
 
 import pytest
-from live_server import DATA, PATIENCE
+from live_server import DATA, PATIENCE, until_held
 
 from hilbo.app.rehearsal import example_sets, fast_study
 from hilbo.app.robot import Client
 from hilbo.config import Study
 from hilbo.event_log import read_log
+from hilbo.simulator import Simulator
 from hilbo.study_plan import make_plan
 
 KILLS = int(os.environ.get("HILBO_KILLS", "8"))
@@ -221,3 +223,40 @@ def test_killed_servers_lose_and_double_nothing(tmp_path, phase, share):
         arguments += ["--plan", str(tmp_path / "plan.json")]
     logs = [finished(study, tmp_path / name, arguments, n, 0.8) for name, n in (("killed", kills), ("whole", 0))]
     assert essence(logs[0]) == essence(logs[1])
+
+
+def test_a_kill_while_a_device_of_its_own_renders_loses_not_even_the_click(tmp_path):
+    file = fast_study(DATA, tmp_path / "study.toml", 0.05, 2)
+    study = Study.load(file)
+    plan = make_plan(study, ["P01"], 0, "validation", sets={"": example_sets(study)}, source="aggregate")
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    with contextlib.closing(Simulator(finger="none")) as device:
+        arguments = [str(file), "--participant", "P01", "--plan", str(tmp_path / "plan.json"), "--device", device.port]
+        session = Session(tmp_path / "killed", arguments)
+        session.start()
+        session.until(session.ready)
+        experimenter = Client(json.loads(session.out.read_text())["experimenter"])
+
+        def asked():
+            view = session.client.get("/api/participant")
+            if view["may"]["begin"]:
+                session.client.post("/api/participant/begin", {})
+            if view["phase"] == "answer":
+                session.waiting = session.answer_to(view)  # clicked, and kept by the browser
+            return session.waiting
+
+        session.until(asked)
+        session.kill()
+        until_held(device.port)
+        session.start()
+        session.until(session.ready)
+        clicked = session.waiting
+        assert not session.client.post("/api/participant/answer", clicked)["again"]
+        session.waiting = None
+        experimenter.post("/api/experimenter/clear", {})
+        session.until(asked)
+        assert session.waiting["trial"] != clicked["trial"]
+        session.kill()
+    events = session.log(study)
+    assert [e.data["condition"] for e in events if e.kind == "device"] == ["ready", "stopped", "ready"]
+    assert [e.data["id"] for e in events if e.kind == "answer"] == [1]

@@ -6,12 +6,14 @@ import json
 import os
 import random
 import threading
+import time
 import urllib.request
 from pathlib import Path
 
 import pytest
 from live_server import PATIENCE, Live, refused
 
+from hilbo.app import watchers
 from hilbo.app.hub import COMMANDS, PRESSES
 from hilbo.app.robot import Client
 from hilbo.live_records import Block, Planned
@@ -182,7 +184,7 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
         assert [event.data["id"] for event in answers] == list(range(1, 13))
         assert {event.data["client"] for event in answers} == {"me"}
         assert answers[0].data["browser"]["response_s"] == 0.0125
-        assert live.replayed() == live.hub.state
+        live.replays()
         assert validation_table([live.replayed()])["response_time"].tolist() == [0.0125] * 12
         check_order(live.events())
         state = live.hub.state
@@ -267,8 +269,30 @@ def test_every_command_is_an_event_and_replayed(live):
         live.command("undo")
     kinds = [event.kind for event in live.events()]
     assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= set(kinds)
-    assert live.replayed() == live.hub.state
+    live.replays()
     assert live.hub.state.notes[0][1] == "yawned"
+
+
+def test_void_and_undo_mean_the_trial_that_their_sender_saw(live):
+    live.begin()
+    live.answer()
+    view = live.until(lambda v: v["means"]["void"] and v["means"]["void"]["trial"] == 2, live.whole)
+    assert view["means"] == {"void": {"trial": 2, "name": "V2"}, "undo": {"trial": 1, "name": "V1"}}
+    live.answer()
+    live.until(lambda v: v["means"]["undo"]["trial"] == 2 and v["means"]["void"]["trial"] == 3, live.whole)
+    before = live.hub.state.trials[:2]
+    for what, trial, now in (("void", 2, "V3"), ("undo", 1, "V2"), ("void", 99, "V3")):
+        with refused(409, f"Meanwhile {now} has come"):
+            live.command(what, trial=trial, reason="noise")
+    assert live.hub.state.trials[:2] == before
+    with refused(400):
+        live.command("void", trial="2")
+    live.command("undo", trial=2, reason="slipped")
+    assert live.hub.state.trials[1].status == "undone"
+    assert live.events("undo")[0].data == {"id": 2, "reason": "slipped"}
+    again = live.until(lambda v: v["means"]["void"]["trial"] > 3, live.whole)["means"]["void"]["trial"]
+    live.command("void", trial=again, reason="noise")
+    assert live.hub.state.trials[again - 1].status == "void"
 
 
 def test_the_server_ends_and_goes_on_with_the_same_trial(tmp_path):
@@ -298,10 +322,11 @@ def test_a_device_that_is_gone_voids_the_trial_and_comes_back(live):
     voided = view["whole"]["trials"][pending.id - 1]["voided"]
     assert voided["by"] == "rule"
     assert "device" in voided["reason"]
+    live.begin()  # nothing goes on by itself
     found = live.answer(live.question())
     assert not found["again"]
     assert live.hub.state.trials[pending.id].renderings == pending.renderings
-    assert live.replayed() == live.hub.state
+    live.replays()
 
 
 def test_an_emergency_stop_holds_everything_until_it_is_cleared(live):
@@ -349,6 +374,23 @@ def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
         assert live.events("repeat")
 
 
+SHORT_THEN_LONG = 'steps = [{show = "reference", seconds = 0.02}, {show = "a", seconds = 30}]'
+
+
+def test_a_rendering_that_a_break_cut_off_is_felt_again_before_it_is_asked_about(tmp_path):
+    with Live(tmp_path, blocks=(Block("warm-up", 1, (Planned("best"),)),), warm_up=SHORT_THEN_LONG) as live:
+        live.begin()
+        live.until(lambda view: view["step"] and view["step"]["show"] == "a")
+        live.participant.post("/api/participant/break", {})
+        live.until(lambda view: view["phase"] == "paused")
+        live.command("resume")
+        view = live.until(lambda view: view["step"] or view["questions"])
+        assert view["step"]["show"] == "reference"
+        live.until(lambda view: view["step"] and view["step"]["show"] == "a")
+        shown = [(e.data["show"], e.data["on"]) for e in live.events("stimulus")]
+        assert shown == [("reference", True), ("reference", False), ("a", True)] * 2
+
+
 def test_the_newest_window_of_a_participant_is_the_one_that_counts(live):
     live.begin()
     first, second = live.hub.watchers.add("participant", "one"), live.hub.watchers.add("participant", "two")
@@ -381,3 +423,41 @@ def test_the_documents_name_every_address():
     text = (Path(__file__).parents[1] / "docs" / "live.md").read_text(encoding="utf-8")
     for name in (*PRESSES, *COMMANDS, "answer", "events", "join"):
         assert f"`{name}`" in text or f"/{name}" in text, name
+
+
+class Page:
+    """A participant's window without a browser: a cookie, a stream, and signs of life as long as it is told to."""
+
+    def __init__(self, live):
+        self.live, self.origin = live, live.participant.address
+        token = live.place.link("participant").partition("/#")[2]
+        request = urllib.request.Request(self.origin + "/api/join", data=json.dumps({"token": token}).encode())
+        with urllib.request.urlopen(request, timeout=PATIENCE) as reply:
+            self.cookie = reply.headers["Set-Cookie"].partition(";")[0]
+        self.stream = ask(live, "/api/participant/events?page=one", Cookie=self.cookie)
+
+    def post(self, name):
+        headers = {"Cookie": self.cookie, "Origin": self.origin, "X-Hilbo-Page": "one"}
+        ask(self.live, f"/api/participant/{name}", data=b"{}", **headers).close()
+
+
+def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tmp_path, monkeypatch):
+    monkeypatch.setattr(watchers, "_SILENT", 0.0)  # no program counts
+    with Live(tmp_path, seconds=60.0) as live:
+        page = Page(live)
+        live.until(lambda v: v["phase"] == "hello", live.whole)
+        page.post("begin")
+        live.until(lambda v: v["phase"] == "step", live.whole)
+        end = time.monotonic() + 5.0  # longer than a page may be silent
+        while time.monotonic() < end:
+            page.post("here")
+            time.sleep(0.5)
+        view = live.whole()
+        assert view["participant_here"]
+        assert view["phase"] == "step"
+        live.until(lambda v: not v["participant_here"], live.whole)  # nothing is closed, and nothing comes any more
+        live.until(lambda v: v["phase"] == "hello", live.whole)
+        assert live.events("repeat")
+        page.post("here")
+        assert live.whole()["participant_here"]
+        page.stream.close()

@@ -82,6 +82,13 @@ def until_logged(live, window, count):
         window.wait_for_timeout(50)
 
 
+def until_event(live, window, kind):
+    end = time.monotonic() + PATIENCE
+    while not live.events(kind):
+        assert time.monotonic() < end
+        window.wait_for_timeout(50)
+
+
 def until_answered(participant, count):
     end = time.monotonic() + PATIENCE
     while participant.answered < count:
@@ -111,7 +118,48 @@ def test_every_button_of_the_experimenter_is_an_event(pages):
     participant.window.wait_for_selector("body[data-phase=ended]")
     kinds = {event.kind for event in live.events()}
     assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= kinds
-    assert live.replayed() == live.hub.state
+    live.replays()
+
+
+@pytest.mark.parametrize("way", ["key", "button"])
+def test_the_emergency_stop_is_in_reach_while_something_is_asked(pages, way):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    experimenter.wait_for_selector("[data-command=abort]:enabled")
+    experimenter.click("[data-command=abort]")
+    experimenter.wait_for_selector("#sure[open]")
+    if way == "key":
+        experimenter.keyboard.press("Escape")
+        experimenter.keyboard.press("Escape")
+    else:
+        experimenter.click("#sure .stop")
+    until(experimenter, "view.device.state === 'estop'")
+    until(experimenter, "!document.getElementById('sure').open")
+    assert live.events("abort") == []
+
+
+def test_a_dialog_names_its_trial_and_never_hits_another(pages):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    until(experimenter, "view.means.void && view.means.void.trial === 2")
+    experimenter.click("[data-command=void]")
+    assert "V2" in experimenter.inner_text("#sure-text")
+    until_answered(participant, 2)
+    until(experimenter, "view.means.void.trial === 3")
+    experimenter.fill("#sure-why", "noise")
+    experimenter.keyboard.press("Enter")  # means Yes
+    until(experimenter, "!document.getElementById('sure').open")
+    until(experimenter, "document.getElementById('alert').textContent.includes('Meanwhile V3 has come')")
+    assert [trial.status for trial in live.hub.state.trials[:2]] == ["answered", "answered"]
+    experimenter.click("[data-command=undo]")
+    assert "V2" in experimenter.inner_text("#sure-text")
+    experimenter.click("#sure-no")
+    until(experimenter, "!document.getElementById('sure').open")
+    experimenter.click("[data-command=undo]")
+    experimenter.fill("#sure-why", "slipped")
+    experimenter.keyboard.press("Enter")
+    until_event(live, experimenter, "undo")
+    assert live.events("undo")[0].data == {"id": 2, "reason": "slipped"}
 
 
 def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
@@ -142,6 +190,22 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     window.unroute("**/api/participant/answer")
     until(window, "localStorage.getItem('hilbo.answer') === null")
     assert len(live.events("answer")) == count + 1
+
+
+def test_a_page_whose_signs_of_life_do_not_arrive_says_so_and_comes_back(pages):
+    live, participant, experimenter = pages
+    window = participant.window
+    until_answered(participant, 1)
+    until(experimenter, "view.participant_here")
+    window.route("**/api/participant/here", lambda route: route.abort())
+    window.wait_for_selector("#line:visible")
+    until(experimenter, "!view.participant_here")
+    until(experimenter, "view.phase === 'hello' || view.phase === 'answer'")
+    window.unroute("**/api/participant/here")
+    window.wait_for_selector("#line", state="hidden")
+    until(experimenter, "view.participant_here")
+    until_answered(participant, 2)
+    assert live.hub.watchers.participant_here
 
 
 def test_the_pages_load_nothing_from_elsewhere_and_names_reach_a_screen_reader(pages):

@@ -170,6 +170,26 @@ def test_a_pause_in_mid_trial_begins_the_trial_again():
     assert (again.id, again.presentation, again.step, again.felt) == (trial.id, 2, None, frozenset())
 
 
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_a_rendering_that_was_cut_off_by_a_pause_has_not_been_felt(steps):
+    driver = to_first_answerable("validation")
+    trial = driver.state.pending
+    for step in range(steps):
+        driver.log(live.present(driver.state, trial.id, step, True, 1.0))
+        if step + 1 < steps:
+            driver.log(live.present(driver.state, trial.id, step, False, 1.0))
+    assert driver.state.pending.unfinished
+    driver.do("pause", 0)
+    again = driver.state.pending
+    assert (again.presentation, again.step, again.felt) == (2, None, frozenset())
+    driver.do("resume", 0)
+    driver.feel(again)
+    assert not driver.state.pending.unfinished
+    driver.do("pause", 0)
+    driver.do("resume", 0)
+    assert driver.state.pending.presentation == 2  # felt whole: only the answer is missing
+
+
 def test_an_answered_trial_can_be_repeated_and_does_not_count():
     driver = to_first_answerable()
     trial = driver.state.pending

@@ -25,11 +25,11 @@ from hilbo.app.watchers import Watchers
 from hilbo.errors import InputError
 from hilbo.event_log import LogError
 from hilbo.live_session import LiveSession, RefusedError
-from hilbo.reasons import held_because
+from hilbo.reasons import HoldReason, held_because
 
 __all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
 
-PRESSES = ("begin", "break", "more")
+PRESSES = ("begin", "break", "more", "here")
 COMMANDS = ("pause", "resume", "repeat", "undo", "void", "abort", "note", "estop", "clear", "invite")
 _STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
 _LATER = 1.0  # s between two looks at the clock
@@ -80,17 +80,18 @@ class Hub:
         self._map: tuple[str, Any] | None = None
         self._drawing = ThreadPoolExecutor(1, "hilbo-map")
         self._device_was = ""
+        self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what the device did, not yet on the disk
         self.runner = Runner(self)
 
     # Life.
 
     async def open(self) -> None:
         """Connect to the device, and begin. Raises `InputError` or `DeviceError`."""
-        self._lock, self._loop = asyncio.Lock(), asyncio.get_running_loop()
+        self._lock, self._saying, self._loop = asyncio.Lock(), asyncio.Lock(), asyncio.get_running_loop()
         rig = await self._loop.run_in_executor(self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed))
         self.rig = rig
         self.warm = self._loop.run_in_executor(self.compute, self._warm)
-        await self._device_changed(rig.snapshot)
+        await self._device_changed(rig.snapshot, opening=True)
         self._tasks = [asyncio.create_task(self._watch_time())]
         self.runner.restart()
 
@@ -180,10 +181,12 @@ class Hub:
         return {"accepted": message.trial, "again": event is None}
 
     async def press(self, what: str, message: Press, page: str | None) -> None:
-        """A participant's button. Raises `NotNowError`."""
+        """A participant's button, or their page's sign of life. Raises `NotNowError`."""
         self._check_page(page)
         try:
-            if what == "break":
+            if what == "here":
+                self.watchers.alive(page)
+            elif what == "break":
                 await self.commit(lambda state, at: live_session.pause(state, "participant", at))
             elif what == "more":
                 await self.commit(live_session.more)
@@ -216,26 +219,18 @@ class Hub:
             if not message.text.strip():
                 raise InputError("The note is empty; write something.")
             return lambda state, at: live_session.note(state, message.text.strip(), at)
-        if what == "void":
-            return lambda state, at: live_session.void(state, self._last(state), message.reason, at)
+        if what in ("void", "undo"):
+            return lambda state, at: _taken(state, what, message, at)
         if what == "abort":
             return lambda state, at: live_session.abort(state, message.reason, at)
         if what == "pause":
             return lambda state, at: live_session.pause(state, "experimenter", at)
-        if what == "resume":
-            self.begun = True
-            return live_session.resume if self.state.paused is not None else live_session.go_on
-        return {"repeat": live_session.repeat, "undo": live_session.undo}[what]
+        return self._goes_on if what == "resume" else live_session.repeat
 
-    @staticmethod
-    def _last(state) -> int:
-        """The trial that a person means: the one being felt, or the newest answered one."""
-        if state.pending is not None and state.pending.step is not None:
-            return state.pending.id
-        given = [t.id for t in state.trials if t.status == "answered"]
-        if not given:
-            raise RefusedError("nothing", "There is no trial to void yet.")
-        return given[-1]
+    def _goes_on(self, state, at):
+        event = (live_session.resume if state.paused is not None else live_session.go_on)(state, at)
+        self.begun = True
+        return event
 
     async def _estop(self):
         assert self.rig is not None
@@ -295,23 +290,42 @@ class Hub:
         self._tasks.append(task)
         task.add_done_callback(self._tasks.remove)
 
-    async def _device_changed(self, seen: Snapshot) -> None:
-        """What the device does unasked is an event where it matters to a trial."""
+    async def _device_changed(self, seen: Snapshot, *, opening: bool = False) -> None:
+        """What the device does unasked is an event where it matters to a trial: the one that was pending then.
+
+        A device that held because the server before this one was killed has done what it should, and voids nothing.
+        """
         condition = "lost" if seen.lost else _STOPPED.get(seen.state, "ready")
-        changed, self._device_was = condition != self._device_was, condition
-        if changed:
+        if condition != self._device_was:
+            self._device_was = condition
             reason = seen.lost or (held_because(seen.hold_reason) if condition != "ready" else "")
-            facts = {"reason": reason, "counters": seen.counters}
-            with contextlib.suppress(InputError, LogError):
-                await self.commit(lambda state, at: live_session.device(state, condition, at, **facts))
+            trial = self.state.pending.id if self.state.pending is not None else None
+            facts = {"trial": trial, "reason": reason, "counters": seen.counters}
+            killed = opening and condition == "hold" and seen.hold_reason == HoldReason.WATCHDOG
+            says = "stopped" if killed else condition
+            self._unsaid.append(lambda state, at: live_session.device(state, says, at, **facts))
+            self.begun = self.begun and condition != "lost"  # a device that comes back does not go on by itself
+            await self._say()
             if condition == "lost":
                 self.runner.forget()
+                self.runner.restart()
             self.runner.wake()
         self.publish()
 
+    async def _say(self) -> None:
+        """What the device did, in the log in its order; what does not fit on the disk waits until there is room."""
+        async with self._saying:
+            while self._unsaid:
+                with contextlib.suppress(InputError):
+                    try:
+                        await self.commit(self._unsaid[0])
+                    except LogError:
+                        return
+                self._unsaid.popleft()
+
     async def _watch_time(self) -> None:
-        """A laptop that slept, and a page that was closed."""
-        wall, steady = time.time(), time.monotonic()
+        """A laptop that slept, a page that was closed, and what the device did that is not in the log yet."""
+        wall, steady, here = time.time(), time.monotonic(), False
         while True:
             await asyncio.sleep(_LATER)
             now, mono = time.time(), time.monotonic()
@@ -319,7 +333,11 @@ class Hub:
             wall, steady = now, mono
             if slept > _JUMP:
                 await self._interrupted(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
-            if self.watchers.participant_here or not self.begun:
+            await self._say()
+            here, before = self.watchers.participant_here, here
+            if here != before:
+                self.publish()
+            if here or not self.begun:
                 self._absent = None
             elif self._absent is None:
                 self._absent = mono
@@ -332,6 +350,18 @@ class Hub:
         pending, self.begun = self.state.pending, False
         with contextlib.suppress(InputError, LogError):
             await self.commit(lambda state, at: live_session.note(state, why, at))
-            if pending is not None and pending.step is not None and pending.felt != frozenset(pending.renderings):
+            if pending is not None and pending.unfinished:
                 await self.commit(live_session.repeat)
         self.runner.restart()
+
+
+def _taken(state, what, message, at):
+    """A trial made void, or an answer taken back: that of the trial which the sender saw, or none."""
+    trial = live_session.voidable(state) if what == "void" else live_session.last_answered(state)
+    if trial is None:
+        raise RefusedError("nothing", f"There is no trial to {what} yet.")
+    if message.trial not in (None, trial.id):
+        raise RefusedError("old-trial", f"Meanwhile {views.place_of(trial)} has come; look again.")
+    if what == "void":
+        return live_session.void(state, trial.id, message.reason, at)
+    return live_session.undo(state, at, message.reason)

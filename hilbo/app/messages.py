@@ -15,6 +15,7 @@ LARGEST = 16_384  # bytes of a message
 
 _Id = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
 _Text = Annotated[str, msgspec.Meta(max_length=2000)]
+_Number = Annotated[int, msgspec.Meta(ge=1, le=2**31)]
 _Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
 
 
@@ -41,16 +42,17 @@ class Answer(_Message, frozen=True):
 
 
 class Press(_Message, frozen=True):
-    """A participant's begin, break, or wish for more; `trial` is the one that was on the page."""
+    """A participant's begin, break, wish for more, or sign of life; `trial` is the one that was on the page."""
 
     trial: _Id | None = None
 
 
 class Command(_Message, frozen=True):
-    """An experimenter's command."""
+    """An experimenter's command. `trial`: the one that it is about, so that it never hits another (void, undo)."""
 
     reason: _Text = ""
     text: _Text = ""
+    trial: _Number | None = None
 
 
 def read(kind: type, body: bytes) -> Any:

@@ -1,8 +1,9 @@
 """The device of a session, in a thread of its own: one job after the other, its state looked at ten times a second.
 
 Nothing here knows of trials or answers. A job gives a `Future`; whatever the device or the line does wrong is the job's
-`DeviceError`, and the snapshot that everybody may read says `lost` with the sentence. A lost device is tried again once
-a second; it comes back stopped. Sets go over to the device out of contact only: a job waits until nobody presses.
+`DeviceError`, and the snapshot that everybody may read says `lost` with the sentence; so it does of a device that has
+restarted, or hears no heartbeats. A lost device is tried again once a second; it comes back stopped. Sets go over to
+the device out of contact only: a job waits until nobody presses.
 """
 
 import contextlib
@@ -70,9 +71,12 @@ class Rig:
         self._jobs.put((lambda: job(self._ready()), found))
         return found
 
-    def load(self, wanted: dict[str, Any], stop: threading.Event | None = None) -> Future:
-        """The set in force once nobody presses: `Loaded`; None if `stop` was set before that."""
-        return self.do(lambda device: self._load(device, wanted, stop or self._ending))
+    def load(self, wanted: dict[str, Any], stop: threading.Event, may_push: Callable[[], bool]) -> Future:
+        """The set in force once nobody presses: `Loaded`; None if `stop` was set before that.
+
+        While `may_push()`, a handle that was left pressed is pushed back by the set that is in force.
+        """
+        return self.do(lambda device: self._load(device, wanted, stop, may_push))
 
     def render(self) -> Future:
         """The set in force, from now on; nothing where it is rendered already."""
@@ -100,16 +104,17 @@ class Rig:
         if self.snapshot.state != "RUNNING":
             device.start()
 
-    def _load(self, device, wanted, stop):
+    def _load(self, device, wanted, stop, may_push):
         patient = time.monotonic() + _PUSHED
         while True:
             self._see(self._look())
             if not self.snapshot.contact:
                 break
-            if time.monotonic() > patient and self.snapshot.state == "STOPPED" and device.in_force() is not None:
-                device.start()  # nothing but the last set's force brings a handle back that was left pressed
             if stop.wait(_NEAR) or self._ending.is_set():
                 return None
+            resting = time.monotonic() > patient and self.snapshot.state == "STOPPED"
+            if resting and may_push() and device.in_force() is not None:
+                device.start()  # nothing but the last set's force brings a handle back that was left pressed
         begun = time.perf_counter()
         found = device.send(**wanted)
         return Loaded(found, time.perf_counter() - begun)
@@ -159,6 +164,8 @@ class Rig:
 
     def _look(self) -> Snapshot:
         found = self.device.status()
+        if self.device.link.restarted or self.device.link.faint:  # which answer this question all the same
+            self.device.limits()  # and no other: `DeviceError` with what has happened
         state = State(found.state).name if found.state in State._value2member_map_ else f"state {found.state}"
         counters = {name: getattr(found, name) for name in COUNTERS}
         force, position = (v if math.isfinite(v) else 0.0 for v in (found.force_N, found.position_mm))

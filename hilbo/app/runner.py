@@ -3,8 +3,9 @@
 One task at a time, begun anew whenever an event changes what is to be felt (an answer, a break, an undo, a HOLD …).
 Sets go over to the device out of contact only, while the participant feels the reference or nothing. The renderer runs
 from the first rendering to the next break or end: what is in force pushes the handle back when the hand leaves it, and
-is then changed. While the participant feels, the next proposal is
-made ready for every possible answer, so that after the answer it is only looked up.
+is then changed. It never starts before Begin, nor while something is compiled; whenever nobody is to feel anything it
+is told to stop, whatever it was doing. While the participant feels, the next proposal is made ready for every possible
+answer, so that after the answer it is only looked up.
 """
 
 import asyncio
@@ -15,7 +16,6 @@ from concurrent.futures import Future
 from typing import Any
 
 from hilbo import live_session
-from hilbo.hardware_bridge import DeviceError
 from hilbo.live_session import RefusedError, Trial
 
 __all__ = ["Runner"]
@@ -37,7 +37,6 @@ class Runner:
         self._stop = threading.Event()
         self._in_force: tuple[int, int, str] | None = None
         self._wake = asyncio.Event()
-        self._rendering = False
         self._ahead: Future | None = None
         self.fits_after = 0  # fits that a participant had to wait for
         self._mechanics: dict[str | None, Any] = {}
@@ -72,9 +71,9 @@ class Runner:
     async def _run(self, stop: threading.Event) -> None:
         """Until there is nothing to do before somebody does something."""
         hub = self.hub
-        if hub.state.screen not in ("wait", "trial") or not hub.begun:
-            await self._halt()
         try:
+            if hub.state.screen not in ("wait", "trial") or not hub.begun:
+                await self._halt()
             while hub.state.screen in ("wait", "trial"):
                 if hub.state.screen == "wait":
                     self._at("choosing")
@@ -125,7 +124,9 @@ class Runner:
 
     async def _present(self, trial: Trial, stop: threading.Event) -> None:
         hub = self.hub
-        if trial.felt == frozenset(trial.renderings):  # all felt already: after a break, or a restart of the server
+        if (
+            trial.step is not None and not trial.unfinished
+        ):  # all felt already: after a break, or a restart of the server
             self._look_ahead()
             self._at("answer")
             return
@@ -155,7 +156,6 @@ class Runner:
     async def _step(self, trial, i, show, seconds) -> None:
         rig, commit = self.hub.rig, self.hub.commit
         if show in trial.renderings:
-            self._rendering = True
             await asyncio.wrap_future(rig.render())
         await commit(lambda state, at: live_session.present(state, trial.id, i, True, at), mine=True)
         self._at("step", i, seconds)
@@ -172,7 +172,7 @@ class Runner:
     def _loading(self, trial, side, stop) -> asyncio.Task:
         """`_load`, going on beside what the participant feels."""
         task = asyncio.ensure_future(self._load(trial, side, stop))
-        task.add_done_callback(lambda done: done.cancelled() or done.exception())  # also where nobody waits for it
+        task.add_done_callback(_looked_at)
         return task
 
     async def _load(self, trial: Trial, side: str | None, stop: threading.Event) -> None:
@@ -180,13 +180,14 @@ class Runner:
         hub = self.hub
         if side is None or self._in_force == (trial.id, trial.presentation, side):
             return
-        loaded = await asyncio.wrap_future(hub.rig.load(self._wanted(trial, side), stop))
+        self._in_force = None  # nobody knows which, until this one is known to be
+        loaded = await asyncio.wrap_future(hub.rig.load(self._wanted(trial, side), stop, self._may_push))
         if loaded is None:
             raise asyncio.CancelledError
         facts = {"in_force": loaded.in_force._asdict(), "serial_s": loaded.serial_s}
         self._note_times(loaded)
-        self._in_force = (trial.id, trial.presentation, side)
         await hub.commit(lambda state, at: live_session.sent(state, trial.id, side, at, **facts), mine=True)
+        self._in_force = (trial.id, trial.presentation, side)
 
     def _wanted(self, trial: Trial, side: str) -> dict[str, Any]:
         """What `Renderer.send` takes."""
@@ -218,12 +219,16 @@ class Runner:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), _LATER)
 
+    def _may_push(self) -> bool:
+        """Whether the device may move by itself: somebody sits there who has pressed Begin, and everything is ready."""
+        hub = self.hub
+        return hub.begun and hub.warm.done() and hub.watchers.participant_here
+
     async def _halt(self) -> None:
-        """The renderer rests while nobody is to feel anything."""
-        if self._rendering:
-            self._rendering = False
-            with contextlib.suppress(DeviceError, ValueError):  # a device that is lost stops by itself
-                await asyncio.wrap_future(self.hub.rig.do(lambda device: device.stop()))
+        """The renderer rests while nobody is to feel anything; where it cannot be told, it is tried again."""
+        told = asyncio.wrap_future(self.hub.rig.do(lambda device: device.stop()))
+        told.add_done_callback(_looked_at)
+        await asyncio.shield(told)  # told even if this is left
 
     def _look_ahead(self) -> None:
         """In the choosing's thread, while somebody feels: what comes next after each possible answer."""
@@ -234,3 +239,9 @@ class Runner:
 
 def _next_side(steps, i) -> str | None:
     return next((show for show, _ in steps[i:] if show in ("a", "b")), None)
+
+
+def _looked_at(done) -> None:
+    """Its exception counts as seen, also where nobody waits for it."""
+    if not done.cancelled():
+        done.exception()

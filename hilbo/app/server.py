@@ -5,7 +5,7 @@
     GET  /participant            the page; so /experimenter
     GET  /api/participant        the view; so /api/experimenter, and /api/experimenter/map
     GET  /api/participant/events the same as server-sent events, at every change
-    POST /api/participant/…      answer, begin, break, more
+    POST /api/participant/…      answer, begin, break, more, here
     POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite
 
 Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 409 not now, 413 too large. The

@@ -9,10 +9,10 @@ import time
 from datetime import datetime
 from typing import Any
 
-from hilbo.live_session import LiveSession
+from hilbo.live_session import LiveSession, Trial, last_answered, voidable
 from hilbo.live_views import experimenter_view, participant_view
 
-__all__ = ["experimenter", "map_version", "participant", "seconds_of", "trial_name"]
+__all__ = ["experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
 
 _TEXTS = {
     "page_title": "title", "more": "another", "break": "break", "saving": "sent", "disconnected": "offline",
@@ -126,6 +126,7 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "log": [_log_line(event) for event in list(hub.recent)[:60]],
         "alert": hub.alert or (runner.trouble if runner.stage == "trouble" else None),
         "may": _may(hub),
+        "means": {"void": _meant(voidable(state)), "undo": _meant(last_answered(state))},
         "map_version": map_version(state) + ("" if hub.draws else " later"),
         "participant_here": hub.watchers.participant_here,
         "all_delays": hub.delays[-1000:],
@@ -206,6 +207,15 @@ def _may(hub):
     return [*found, "abort"]
 
 
+def _meant(trial):
+    return None if trial is None else {"trial": trial.id, "name": place_of(trial)}
+
+
+def place_of(trial: Trial) -> str:
+    """What a trial is called on the experimenter's page: the letter of its phase and its number."""
+    return trial.data["phase"][0].upper() + str(trial.number)
+
+
 def _table(state: LiveSession):
     names = list(state.study.space.names)
     chosen = any(not trial.sets for trial in state.trials)
@@ -214,7 +224,7 @@ def _table(state: LiveSession):
     for trial in reversed(state.trials):
         kind = "now" if trial.status == "pending" else "" if trial.status == "answered" else "voided"
         answer = " ".join((trial.values or {}).values())
-        place = trial.data["phase"][0].upper() + str(trial.number)
+        place = place_of(trial)
         if trial.sets:
             cells = [place, " / ".join(trial.sets.values()), *[""] * (width - 1), answer or trial.status]
         else:

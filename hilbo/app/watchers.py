@@ -12,14 +12,15 @@ from hilbo.app.security import Role
 __all__ = ["Watcher", "Watchers"]
 
 _SILENT = 10.0  # s without a word from a program in the participant's place until it counts as gone
+_QUIET = 3.0  # s without a sign of life from a participant's page, which gives one every second
 
 
 class Watcher:
     """Somebody who looks at a role's view. `news` is set when there is a newer one; `ended` when it looks no more,
-    because of `why`."""
+    because of `why`. `seen` is when it last gave a sign of life, monotonic."""
 
     def __init__(self, role: Role, page: str):
-        self.role, self.page = role, page
+        self.role, self.page, self.seen = role, page, time.monotonic()
         self.news = asyncio.Event()
         self.ended = False
         self.why = ""
@@ -69,14 +70,22 @@ class Watchers:
         """A program asks in the participant's place."""
         self._asked = time.monotonic()
 
+    def alive(self, page: str | None) -> None:
+        """A participant's page is there: an open stream alone says nothing of a network that went silently."""
+        for watcher in self._all:
+            if watcher.role == "participant" and watcher.page == page:
+                watcher.seen = time.monotonic()
+
     @property
     def participant_here(self) -> bool:
-        """Whether a participant's page is open, or a program in its place has asked for something lately."""
-        return self._newest() is not None or time.monotonic() - self._asked < _SILENT
+        """Whether a participant's page is open and has said so lately, or a program in its place has asked lately."""
+        now, newest = time.monotonic(), self._newest()
+        return (newest is not None and now - newest.seen < _QUIET) or now - self._asked < _SILENT
 
     def counts(self, page: str | None) -> bool:
         """Whether a participant's window is the newest; a program, which has none, always counts."""
-        return page is None or self._newest() in (None, page)
+        newest = self._newest()
+        return page is None or newest is None or newest.page == page
 
-    def _newest(self) -> str | None:
-        return next((w.page for w in reversed(self._all) if w.role == "participant" and not w.ended), None)
+    def _newest(self) -> Watcher | None:
+        return next((w for w in reversed(self._all) if w.role == "participant" and not w.ended), None)

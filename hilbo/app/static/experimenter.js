@@ -29,7 +29,7 @@ function draw() {
   drawDevice(); drawAlert(view.alert || ""); drawAnswers(); drawLog();
   put("watch", view.participant_here ? "Connected." : "Not connected.");
   for (const b of document.querySelectorAll("[data-command]")) b.disabled = !view.may.includes(b.dataset.command);
-  at("estop").disabled = !view.may.includes("estop");
+  for (const b of document.querySelectorAll(".stop")) b.disabled = !view.may.includes("estop");
   if (view.map_version !== mapOf) { mapOf = view.map_version; loadMap(); }
 }
 
@@ -96,30 +96,34 @@ async function command(name, more = {}) {
   }
 }
 
-const SURE = { abort: "End the session here? What has been answered stays; nothing more is asked.",
-               void: "Void this trial? Its answer, if there is one, is not used; it stays in the log.",
-               undo: "Take the last answer back? The trial is asked again." };
+const SURE = { abort: () => "End the session here? What has been answered stays; nothing more is asked.",
+               void: (name) => `Void trial ${name}? Its answer, if there is one, is not used; it stays in the log.`,
+               undo: (name) => `Take the answer to trial ${name} back? The trial is asked again.` };
 
+// What to send along: the trial that was meant when it was asked, and the reason; null for "Go back".
 function sure(name) {
-  if (!SURE[name]) return Promise.resolve("");
-  const box = at("sure");
+  if (!SURE[name]) return Promise.resolve({});
+  const box = at("sure"), meant = view.means[name];
   at("sure-why").value = "";
-  put("sure-text", SURE[name]);
+  put("sure-text", SURE[name](meant ? meant.name : ""));
   box.returnValue = "no";
   box.showModal();
-  return new Promise((done) => box.addEventListener("close",
-    () => done(box.returnValue === "yes" ? at("sure-why").value : null), { once: true }));
+  return new Promise((done) => box.addEventListener("close", () => done(box.returnValue !== "yes" ? null
+    : { reason: at("sure-why").value, ...(meant ? { trial: meant.trial } : {}) }), { once: true }));
 }
 
 for (const b of document.querySelectorAll("[data-command]")) {
   b.addEventListener("click", async () => {
-    const why = await sure(b.dataset.command);
-    if (why !== null) command(b.dataset.command, why ? { reason: why } : {});
+    const more = await sure(b.dataset.command);
+    if (more) command(b.dataset.command, more);
   });
 }
-at("estop").addEventListener("click", () => command("estop"));
-document.addEventListener("keydown", (e) => {
-  if (e.key !== "Escape" || at("sure").open) return;
+for (const b of document.querySelectorAll(".stop")) {      // in the dialog too, which leaves nothing else in reach
+  b.addEventListener("click", () => { command("estop"); at("sure").close("no"); });
+}
+at("sure-no").addEventListener("click", () => at("sure").close("no"));
+document.addEventListener("keydown", (e) => {              // the first one closes a dialog, and counts
+  if (e.key !== "Escape") return;
   if (performance.now() - lastEscape < 1000) command("estop");
   lastEscape = performance.now();
 });

@@ -16,6 +16,7 @@ let answers = {}, asked = 0;         // of the question that is on the page
 let shownAt = 0, stepEnds = 0;       // performance.now()
 let trial = null;                    // id of the trial on the page
 let sending = false, connected = false, over = false;
+let source = null, calling = false, silent = false;   // the stream of views; a sign of life under way; none got through
 
 function words(name) { return (view && view.texts && view.texts[name]) || ""; }
 function put(id, text) { const e = at(id); if (e.textContent !== text) e.textContent = text; }
@@ -150,7 +151,8 @@ function ended(news) {
 }
 
 function listen() {
-  const source = new EventSource(`/api/participant/events?page=${page}`);
+  if (source) source.close();
+  source = new EventSource(`/api/participant/events?page=${page}`);
   source.onopen = () => { connected = true; draw(); hand(); };
   source.addEventListener("view", (e) => { connected = true; receive(JSON.parse(e.data)); });
   source.addEventListener("moved", (e) => { source.close(); ended(JSON.parse(e.data)); });
@@ -158,6 +160,20 @@ function listen() {
     connected = false; draw();
     if (source.readyState === EventSource.CLOSED && !over) setTimeout(listen, 1500);   // refused while it restarts
   };
+}
+
+// A sign of life every second, since an open stream says nothing of a network that went silently, to either side.
+async function here() {
+  if (over || calling) return;
+  calling = true;
+  try {
+    await fetch("/api/participant/here", {
+      method: "POST", headers: { "Content-Type": "application/json", "X-Hilbo-Page": page }, body: "{}",
+      signal: AbortSignal.timeout(2500),
+    });
+    if (silent && !over) { silent = false; listen(); }
+  } catch { silent = true; connected = false; source.close(); draw(); }
+  calling = false;
 }
 
 function tick() {
@@ -180,5 +196,6 @@ at("go").addEventListener("click", () => press("begin"));
 at("more").addEventListener("click", () => press("more"));
 at("break").addEventListener("click", () => press("break"));
 setInterval(() => { if (kept()) hand(); }, 3000);
+setInterval(here, 1000);
 listen();
 tick();
