@@ -20,9 +20,10 @@ from hilbo.analysis import analyse, limits_of, settled
 from hilbo.errors import InputError
 from hilbo.hypotheses import Evidence, Hypothesis
 from hilbo.inference_data import groups, predictive_shares, write_groups
+from hilbo.paper_tables import aggregate_comparisons
 from hilbo.report_figures import comparison_figures
 from hilbo.report_study import _comparison
-from hilbo.report_validation import p_words, safest, slug, validate
+from hilbo.report_validation import p_words, safest, slug, validate, validation_figures
 from hilbo.sensitivity import tolerance_ends
 from hilbo.simulate import PRESETS
 from hilbo.simulate_validation import sets_table, validation_table
@@ -272,6 +273,45 @@ def test_materials_have_their_own_references(tmp_path):
     strict = read_folder(folder, "trials < 5").materials[0]
     with pytest.raises(InputError, match="leaves out all 1"):
         analyse(strict.study, strict.cohort)
+
+
+VALIDATION = "participant,trial,set_a,set_b,class_a,class_b,preferred\n"
+
+
+def test_two_validation_tables_are_read_as_one(tmp_path):
+    row = "{},1,aggregate,individual:B,close,different,{}\n"
+    first, second = (VALIDATION + row.format(*cells) for cells in (("A", "a"), ("B", "b")))
+    folder = folder_with(tmp_path, trials__csv=HEAD + ROW, **{"validation-1__csv": first, "validation-2__csv": second})
+    (material,) = read_folder(folder).materials
+    found = validate(material.validation, bootstrap=False)
+    assert found.people["wins"].tolist() == [1, 0] and found.comparisons == 2
+    twice = aggregate_comparisons(
+        pd.concat([material.validation] * 2), {"aggregate": "aggregate", "individual:B": "individual:B"}
+    )
+    assert len(twice) == 4
+
+
+def test_a_pair_that_was_only_tied_is_drawn():
+    rows = [("A", 1, "best", "mid", "close", "similar", "tie"), ("A", 2, "mid", "worst", "similar", "different", "a")]
+    rows += [("B", 1, "mid", "worst", "similar", "different", "b")]
+    table = pd.DataFrame(rows, columns=VALIDATION.strip().split(","))
+    assert set(validation_figures(validate(table, bootstrap=False))) == {"validation"}
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("validation", VALIDATION + "A,1,best,mid,close,similar,a\n"),
+        ("sets", "set_id,source,K1,B1,alpha\nsysid,sysid,5,6,0.2\n"),
+        ("truth", "source,K1,B1,alpha\npopulation,5,6,0.2\n"),
+        ("truth", "source,material,K1,B1,alpha\npopulation,soft,5,6,0.2\npopulation,,5,6,0.2\n"),
+    ],
+)
+def test_what_is_of_no_material_is_not_taken_for_all(tmp_path, file, text):
+    trials = "material," + HEAD + "soft,A,1,close,5,6,0.2\nhard,A,1,different,4,6,0.2\n"
+    folder = folder_with(tmp_path, trials__csv=trials, **{f"{file}__csv": text})
+    with pytest.raises(InputError, match=f"{file}.csv: rows without a material.*this study has soft, hard"):
+        read_folder(folder)
 
 
 @pytest.mark.deep
