@@ -178,7 +178,7 @@ def _read(study, aggregate, seed):
         aggregate,
         {
             name: (
-                tolerance(study, aggregate.surface, x, name),
+                tolerance(study, aggregate.newcomer, x, name),
                 tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share),
             )
             for name in study.space.names
@@ -188,7 +188,8 @@ def _read(study, aggregate, seed):
 
 def _sets(study, aggregate, seed):
     try:
-        return best_mid_worst(study, aggregate.surface, search_points(study.space, seed)), ()
+        points = search_points(study.space, seed)
+        return best_mid_worst(study, aggregate.surface, points, prior=aggregate.map.map_prior), ()
     except InputError as error:
         return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
 

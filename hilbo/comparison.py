@@ -3,8 +3,8 @@
 For each rule: the predictive density, calibration and reliability with each person left out (`leave_one_out`); its
 optimum; how the optimum is spread, by joint draws of the map (of bcm, hierarchical and pooled, whose joint posterior is
 known) and by a bootstrap over people (of the rules that merge people point by point); what each person moves; how it
-agrees with one model of all answers; and how much of the space the answers cover, map's over prior's standard
-deviation. And, once, how people differ, with a recommendation in words.
+agrees with one model of all answers; and how much of the space the answers cover, the map's standard deviation over
+what it is without answers. And, once, how people differ, with a recommendation in words.
 """
 
 import math
@@ -28,7 +28,7 @@ from hilbo.study import Cohort, fit_cohort, map_optimum, nrmse
 __all__ = ["KNOWN", "compare", "recommendation"]
 
 KNOWN = 0.8
-"""Where the map's standard deviation is below so much of the prior's, the answers are said to cover the space."""
+"""Where the map's standard deviation is below so much of what it is without answers, these cover the space."""
 
 _POINTS = 400  # at which joint draws and bootstrap seek the optimum
 _DRAWS = 2000
@@ -77,14 +77,13 @@ def _one(study, cohort, rule, posteriors, share, found, pooled, candidates, x, s
     )
     best = map_optimum(study, found, candidates)
     mean, variance = found.predict(x)
-    prior = study.gp.kernel.variance
     moved = influence(found, maps, x)
     return calibration(left, seed) | {
         "method": found.method,
         "reliability": reliability(left),
         "optimum": _parameters(study, best.x),
         "optimum_sd": float(best.sd),
-        "covered": float(jnp.mean(jnp.sqrt(variance / prior) < KNOWN)),
+        "covered": float(jnp.mean(jnp.sqrt(variance / found.map_prior) < KNOWN)),
         "influence": dict(zip(cohort.names, moved.tolist(), strict=True)),
         "agreement_with_pooled": None if isinstance(pooled, str) else _agreement(mean, pooled.predict(x)[0]),
         "from_pooled": None

@@ -61,10 +61,22 @@ class RuleMap(eqx.Module):
         share = self.share if self.rule == "hierarchical" else None
         return aggregation.aggregate(self.rule, means, explained, self.prior, share=share)  # type: ignore[arg-type]
 
+    @property
+    def apart(self) -> Float[Array, ""]:
+        """Variance of one person's function about the map's: only the hierarchical model says that people differ."""
+        return (1.0 - self.share) * self.prior
+
+    @property
+    def map_prior(self) -> Float[Array, ""]:
+        """Variance of the map where nobody answered, against which its own tells what the answers say."""
+        if self.rule in ("poe", "average"):
+            return self.prior / jax.tree.leaves(self.experts)[0].shape[0]
+        return self.share * self.prior
+
     def newcomer(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new person's function: only the hierarchical model says that people differ."""
+        """Mean and variance (m,) of a new person's function, of which answers are foretold."""
         mean, variance = self.predict(x)
-        return mean, variance + (1.0 - self.share) * self.prior
+        return mean, variance + self.apart
 
 
 def rule_map(

@@ -38,10 +38,12 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
             f' "{top}" by then. Lines are medians, bands hold the middle half of the people.',
         ),
         "map": (
-            plotting_study.sets_on_map(study, found.aggregate.surface, found.sets, best, cohort),
+            plotting_study.sets_on_map(
+                study, found.aggregate.surface, found.sets, best, cohort, found.aggregate.map.map_prior
+            ),
             "The population map and its best, mid and worst sets (paper, figure 6a)",
             f"Brighter: higher {study.attribute}. Hatched: hardly sampled, the map's sd there is above"
-            f" {100 * plotting_study.UNKNOWN:.0f} % of the prior's. Dots: what was asked near the slice, and"
+            f" {100 * plotting_study.UNKNOWN:.0f} % of what it is without answers. Dots: what was asked near the slice, and"
             f" may lie in its white.{white}",
         ),
         "maps-after": (

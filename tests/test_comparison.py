@@ -24,6 +24,7 @@ def test_everything_is_compared_and_written(tmp_path):
         assert set(found["influence"]) == {"P0", "P1", "P2", "P3"}
         assert set(found["optimum"]) == {"p0", "p1"}
     assert content["rules"]["pooled"]["agreement_with_pooled"] == pytest.approx(1.0)
+    assert content["rules"]["poe"]["covered"] < 1 and content["rules"]["average"]["covered"] < 1
     for rule in ("bcm", "hierarchical", "pooled"):
         low, middle, high = content["rules"][rule]["optimum_by_draws"]["p0"]
         assert 1 <= low <= middle <= high <= 10
