@@ -119,8 +119,8 @@ def optima_from(
         chosen = slice(i * _STARTS, (i + 1) * _STARTS)
         usable = [optimum for optimum, may in zip(reached[chosen], feasible[chosen], strict=True) if may]
         top = rows[rule][0]
-        there = (part[top] for part in maps[rule])
-        candidate = _optimum(population.study, candidates[top], *there, _apart(population, rule))
+        mean, variance = (part[top] for part in maps[rule])
+        candidate = _optimum(population.study, candidates[top], mean, variance, _apart(population, rule))
         best[rule] = max([candidate, *usable], key=lambda optimum: float(optimum.mean))
     return best
 

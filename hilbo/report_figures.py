@@ -43,8 +43,8 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
             ),
             "The population map and its best, mid and worst sets (paper, figure 6a)",
             f"Brighter: higher {study.attribute}. Hatched: hardly sampled, the map's sd there is above"
-            f" {100 * plotting_study.UNKNOWN:.0f} % of what it is without answers. Dots: what was asked near the slice, and"
-            f" may lie in its white.{white}",
+            f" {100 * plotting_study.UNKNOWN:.0f} % of what it is without answers. Dots: what was asked near the"
+            f" slice, and may lie in its white.{white}",
         ),
         "maps-after": (
             plotting.maps_beside(
