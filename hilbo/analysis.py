@@ -14,11 +14,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from hilbo.aggregation import RULES
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.hyperparameters import Learned, maximise_shared_evidence
 from hilbo.people import excluded, measure_people
+from hilbo.population_rules import point_rule
+from hilbo.rule_words import in_place
 from hilbo.sensitivity import Ends, tolerance_ends
 from hilbo.session import search_points
 from hilbo.study import Aggregate, Cohort, aggregate_cohort, nrmse, progress
@@ -94,7 +95,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     learned, optimised = _optimised(study, cohort, seed)
     say("reading the maps")
     sets, words = _sets(study, aggregate, seed)
-    limits = (*limits_of(study, cohort), *words)
+    limits = (*limits_of(study, cohort), *words, *_substitute(aggregate))
     if bool(learned.runaway) or not bool(learned.converged):
         limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
     return Analysis(
@@ -171,8 +172,7 @@ def _learn(study, trials):
 def _read(study, aggregate, seed):
     """Tolerance intervals through the map's optimum, along every parameter."""
     x = aggregate.optimum.x
-    rule = study.rule if study.rule in RULES else "bcm"  # others merge all answers at once, not person by person
-    share = aggregate.map.share if rule == "hierarchical" else None
+    rule, share = point_rule(study.rule, aggregate.map.share)
     return Reading(
         study,
         aggregate,
@@ -192,6 +192,17 @@ def _sets(study, aggregate, seed):
         return best_mid_worst(study, aggregate.surface, points, prior=aggregate.map.map_prior), ()
     except InputError as error:
         return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
+
+
+def _substitute(aggregate):
+    """A sentence where what stands beside the map is merged otherwise."""
+    how = in_place(aggregate.map)
+    if how:
+        yield (
+            f"The map is merged by the rule {aggregate.map.rule} from all answers at once; maps of fewer trials, and"
+            f" those of people drawn again for the ends of tolerance intervals, are merged {how}, so that their last"
+            " optimum need not be the map's."
+        )
 
 
 def moved_by_evidence(found: Analysis) -> float:

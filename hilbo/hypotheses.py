@@ -15,6 +15,7 @@ import numpy as np
 from hilbo.analysis import Analysis, settled
 from hilbo.report import misses
 from hilbo.report_validation import Validated, safest
+from hilbo.rule_words import in_place
 
 __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
@@ -185,17 +186,20 @@ def _convergence(results):
         yield Evidence("open", "It takes several participants and trials to say.")
         return
     first = settled(counts, merged, _NEAR)
+    how = in_place(found.aggregate.map)
+    how = f" (merged {how})" if how else ""
     if first is None:
         yield Evidence(
-            "against", f"The population optimum still moved by more than {100 * _NEAR:.0f} % before the last trial."
+            "against",
+            f"The population optimum{how} still moved by more than {100 * _NEAR:.0f} % before the last trial.",
         )
         return
     at = int(np.searchsorted(counts, first))
     open_ = int((own[at] > _NEAR).sum())
     yield Evidence(
         _side(open_ > 0),
-        f"From trial {first} on the population optimum stayed within {100 * _NEAR:.0f} % (NRMSE) of its final place;"
-        f" {open_} of {people} individual optima were further from theirs then.",
+        f"From trial {first} on the population optimum{how} stayed within {100 * _NEAR:.0f} % (NRMSE) of its final"
+        f" place; {open_} of {people} individual optima were further from theirs then.",
     )
     if results.reference is not None:
         miss = [
@@ -204,7 +208,8 @@ def _convergence(results):
         ]
         yield Evidence(
             _side(miss[0] <= miss[1] + _NEAR),
-            f"It was then {100 * miss[0]:.1f} % from {results.reference_name}, and {100 * miss[1]:.1f} % in the end.",
+            f"It was then {100 * miss[0]:.1f} % from {results.reference_name}, and {100 * miss[1]:.1f} % in the"
+            f" end{how}.",
         )
 
 

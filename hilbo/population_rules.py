@@ -26,7 +26,7 @@ from hilbo.errors import InputError
 from hilbo.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 
-__all__ = ["ALL_RULES", "AnyRule", "RuleMap", "even_choice", "rule_map", "share_of"]
+__all__ = ["ALL_RULES", "AnyRule", "RuleMap", "even_choice", "point_rule", "rule_map", "share_of"]
 
 AnyRule = Literal[aggregation.Rule, "grbcm", "pooled"]
 ALL_RULES: tuple[AnyRule, ...] = (*get_args(aggregation.Rule), "grbcm", "pooled")
@@ -77,6 +77,14 @@ class RuleMap(eqx.Module):
         """Mean and variance (m,) of a new person's function, of which answers are foretold."""
         mean, variance = self.predict(x)
         return mean, variance + self.apart
+
+
+def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[aggregation.Rule, Float[Array, ""] | None]:
+    """By which rule, and with which share, everybody's posteriors are merged point by point in place of a map: by the
+    same rule, or by bcm where the rule takes all answers at once."""
+    if rule not in aggregation.RULES:
+        return "bcm", None
+    return rule, share if rule == "hierarchical" else None  # type: ignore[return-value]
 
 
 def rule_map(

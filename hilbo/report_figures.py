@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from hilbo.analysis import Analysis
-from hilbo.study import fit_cohort
+from hilbo.rule_words import in_place
 from hilbo.study_folder import Material
 
 __all__ = ["comparison_figures", "study_figures"]
@@ -23,6 +23,8 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
     white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
     who, after = plotting_study.typical_person(found), _after(progress.counts)
     rows = np.searchsorted(progress.counts, after)
+    how = in_place(found.aggregate.map)
+    how = f" These maps are merged {how}." if how else ""
     references = {} if material.reference is None else {material.reference_name: material.reference}
     figures: Figures = {
         "progression": (
@@ -47,17 +49,16 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
             f" slice, and may lie in its white.{white}",
         ),
         "maps-after": (
-            plotting.maps_beside(
-                study, {f"{n} trials": fit_cohort(study, cohort.first(n)) for n in after}, progress.merged[rows]
-            ),
+            plotting.slices_after(study, cohort, progress.merged[rows], after, found.aggregate.map),
             "The population map after fewer trials (paper, figure 7a)",
-            f"From everybody's first answers only, each through its own optimum, the star.{white}",
+            f"From everybody's first answers only, each through its own optimum, the star.{white}{how}",
         ),
         "population-convergence": (
             plotting_study.population_convergence(progress, references),
             "Convergence of the population optimum (paper, figure 7b)",
             "How far the optimum of the map from everybody's first trials is from the optimum of the whole map"
-            + (f", and from {material.reference_name}." if references else "."),
+            + (f", and from {material.reference_name}." if references else ".")
+            + how,
         ),
         "classes": (
             plotting_study.class_regions(

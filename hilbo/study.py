@@ -24,7 +24,7 @@ from hilbo.config import Inference, Study
 from hilbo.errors import InputError
 from hilbo.hierarchical import Share
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
-from hilbo.population_rules import RuleMap, rule_map, share_of
+from hilbo.population_rules import RuleMap, point_rule, rule_map, share_of
 from hilbo.session import best_point, search_points
 
 __all__ = [
@@ -318,8 +318,8 @@ def progress(
     """
     counts = range(1, int(cohort.counts().max()) + 1) if prefixes is None else prefixes
     candidates = search_points(study.space, seed)
-    rule = study.rule if study.rule in aggregation.RULES else "bcm"
-    share = share_of(study.gp, cohort.trials, study.inference).mean if rule == "hierarchical" else None
+    share = share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
+    rule, share = point_rule(study.rule, share)
     return _progress(study, cohort.trials, candidates, jnp.asarray(list(counts)), rule, share)
 
 

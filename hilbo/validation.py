@@ -3,9 +3,9 @@
 A map is anything that predicts, `predict(x) -> mean, variance` of the latent score at points (m, d) of the unit cube.
 
 *Best* is the feasible maximum of the mean. *Worst* is the deepest local minimum of the mean in the feasible set at
-which the map knows something: sd <= `known` times what it is where nobody answered. *Mid* is the candidate whose mean is
-nearest to the middle of the two, among those at least `apart` from both, and equally known. All three follow from the
-map alone (paper, section VI-C).
+which the map knows something: sd <= `known` times what it is where nobody answered. *Mid* is the candidate whose mean
+is nearest to the middle of the two, among those at least `apart` from both, and equally known. All three follow from
+the map alone (paper, section VI-C).
 
 The *tolerance interval* of a parameter is the connected feasible interval through the optimum on which the highest
 answer is the most probable one of what `predict` is about, a new person's function (paper, section VII-C). Along any

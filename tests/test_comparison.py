@@ -1,5 +1,6 @@
 """Every rule on one cohort as data, its figures, and what it recommends."""
 
+import dataclasses
 import json
 
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from hilbo.report_comparison import write_comparison
 
 @pytest.mark.deep
 def test_everything_is_compared_and_written(tmp_path):
-    study = plain_study(2)
+    study = dataclasses.replace(plain_study(2), rule="poe")
     content = write_comparison(study, answered(study, people=4), tmp_path)
     assert json.loads((tmp_path / "comparison.json").read_text()) == content
     assert set(content["rules"]) == set(ALL_RULES)

@@ -1,6 +1,7 @@
 """A new person's answers are foretold from the map and from how people differ about it; what a map knows is told by
 its own variance without answers."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import jax
@@ -13,7 +14,8 @@ from test_validation import plain
 from hilbo import Trials, analysis, plotting_study
 from hilbo.aggregation import RULES
 from hilbo.batch_optimum import _apart, _optimum
-from hilbo.population_rules import RuleMap
+from hilbo.population_rules import RuleMap, point_rule
+from hilbo.rule_words import in_place
 from hilbo.sensitivity import _inside
 from hilbo.study import Cohort, fit_cohort, map_optimum, population
 
@@ -26,12 +28,12 @@ def posteriors():
     """Three people of four answers, and the same who said nothing."""
     rng = np.random.default_rng(0)
     x, q = rng.uniform(size=(PEOPLE, 4, 2)), rng.integers(0, 3, (PEOPLE, 4))
-    return {said: _fitted(x, q, np.full((PEOPLE, 4), said)) for said in (True, False)}
+    return {said: fit_cohort(STUDY, _cohort(x, q, np.full((PEOPLE, 4), said))) for said in (True, False)}
 
 
-def _fitted(x, q, mask):
+def _cohort(x, q, mask):
     trials = jax.vmap(Trials)(jnp.asarray(x), jnp.asarray(q, jnp.int32), jnp.asarray(mask))
-    return fit_cohort(STUDY, Cohort(trials, x, ("A", "B", "C")))
+    return Cohort(trials, x, ("A", "B", "C"))
 
 
 def of_rule(rule, experts):
@@ -81,6 +83,41 @@ def test_draws_of_tolerance_intervals_are_a_new_persons(posteriors):
     )
     np.testing.assert_array_equal(inside, expected)
     assert (expected != sure).any()
+
+
+def test_what_stands_in_place_of_a_map_is_said(posteriors):
+    """Of a rule that takes all answers at once, maps of fewer trials and of other people are merged otherwise."""
+    for rule in ("bcm", "average", "hierarchical"):
+        assert in_place(of_rule(rule, posteriors[True])) == "" and not list(_substitute(of_rule(rule, None)))
+    one = jax.tree.map(lambda leaf: leaf[0], posteriors[True])  # any posterior will do
+    for rule, how in (("hierarchical", "by the rule hierarchical point by point"), ("pooled", "by bcm")):
+        whole = RuleMap(rule, "exact", None, one, jnp.asarray(SHARE), jnp.asarray(1.0))
+        (words,) = _substitute(whole)
+        assert in_place(whole) == how and f"are merged {how}" in words and f"by the rule {rule} from" in words
+    share = jnp.asarray(SHARE)
+    assert point_rule("hierarchical", share) == ("hierarchical", share)
+    assert point_rule("bcm", share) == ("bcm", None) and point_rule("pooled", share) == ("bcm", None)
+
+
+def _substitute(found):
+    return analysis._substitute(SimpleNamespace(map=found))
+
+
+def test_maps_of_fewer_trials_are_merged_as_their_stars(monkeypatch):
+    from hilbo import plotting
+
+    def drawn(maps):
+        for of in maps.values():
+            of(None)
+        return plotting.Figure()
+
+    study = dataclasses.replace(STUDY, rule="hierarchical")
+    asked, cohort = [], _cohort(np.zeros((PEOPLE, 4, 2)), np.zeros((PEOPLE, 4)), np.ones((PEOPLE, 4), bool))
+    monkeypatch.setattr(plotting, "fit_cohort", lambda study, some: int(some.counts().max()))
+    monkeypatch.setattr(plotting, "population", lambda count, x, rule, share: asked.append((count, rule, float(share))))
+    monkeypatch.setattr(plotting, "maps_beside", lambda study, maps, optima: drawn(maps))
+    plotting.slices_after(study, cohort, np.zeros((2, 2)), [2, 4], of_rule("hierarchical", None))
+    assert asked == [(2, "hierarchical", SHARE), (4, "hierarchical", SHARE)]
 
 
 def test_readings_are_of_new_people(monkeypatch):
