@@ -93,6 +93,20 @@ def test_what_one_comparison_can_say():
     assert np.isposinf(rows.at["Best", "estimate"]) and np.isfinite(rows.at["Best", "low"])
 
 
+@pytest.mark.parametrize(("people", "few"), [(9, True), (14, False)])
+def test_what_is_shown_is_what_the_warning_says_to_report(people, few):
+    """Of few clusters the wider of the clustered and the wild bootstrap interval, as the table's own warning has it."""
+    answers = paper_counts(np.random.default_rng(1))
+    names = answers["participant"].unique()[:people]
+    table = validate(answers[answers["participant"].isin(names)]).regressions()["II"]
+    assert any("wild bootstrap interval" in words for words in table.warnings) == few
+    kinds = table.table[few | ~table.table["errors"].str.startswith("wild")]
+    widest = (kinds["high"] - kinds["low"]).groupby(kinds["term"]).max()
+    rows = safest(table).set_index("term")
+    np.testing.assert_array_equal(rows["high"] - rows["low"], widest[rows.index])
+    assert rows["errors"].str.startswith("wild").any() == few
+
+
 def test_ties_are_kept_apart():
     found = validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
     assert found.people["ties"].sum() == 20 and found.people["wins"].sum() == 279
