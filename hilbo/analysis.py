@@ -39,11 +39,22 @@ class Progress(NamedTuple):
     counts: Int[np.ndarray, " p"]
     merged: Float[np.ndarray, "p d"]
     own: Float[np.ndarray, "p M d"]
+    ends: Int[np.ndarray, " M"]
+    """How many answers each person gave."""
 
     def to_end(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
-        """NRMSE of the population's and of everybody's running optimum to the final one."""
+        """NRMSE of the population's and of everybody's running optimum to the final one; a person's is NaN beyond their
+        last answer, where it cannot move."""
         merged = np.sqrt(np.mean((self.merged - self.merged[-1]) ** 2, axis=1))
-        return merged, np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
+        own = np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
+        return merged, np.where(self.counts[:, None] <= self.ends[None, :], own, np.nan)
+
+    def settled(self, within: float) -> list[int | None]:
+        """Of everybody the trial from which their own optimum stayed within this NRMSE of its final place; None where
+        that cannot be said."""
+        _, own = self.to_end()
+        lasts = np.searchsorted(self.counts, self.ends, side="right")
+        return [settled(self.counts[:k], own[:k, j], within) for j, k in enumerate(lasts)]
 
 
 class Reading(NamedTuple):
@@ -104,7 +115,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
         _read(study, aggregate, seed),
         _read(optimised[0], optimised[1], seed),
         learned,
-        Progress(counts, merged, own),
+        Progress(counts, merged, own, cohort.counts()),
         sets,
         people,
         left,
@@ -150,8 +161,10 @@ def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], with
 
 
 def _counts(cohort):
-    longest = int(cohort.counts().max())
+    ends = cohort.counts()
+    longest = int(ends.max())
     counts = [
+        *ends[ends > 0],
         *np.linspace(1, longest, min(longest, _LONGEST)).round().astype(int),
         *(n for n in (5, 15, 25) if n <= longest),
     ]

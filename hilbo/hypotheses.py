@@ -88,15 +88,15 @@ def _side(good: bool) -> Side:
 
 def _individuals(results):
     found, study = results.found, results.found.study
-    counts, (_, own) = found.progress.counts, found.progress.to_end()
+    counts = found.progress.counts
     top, people = study.responses[-1], len(found.cohort.names)
     if len(counts) > 2:
-        when = [settled(counts, own[:, j], _NEAR) for j in range(people)]
-        known = [n for n in when if n is not None]
+        known = [n for n in found.progress.settled(_NEAR) if n is not None]
         yield Evidence(
             _side(len(known) > people / 2),
             f"{len(known)} of {people} individual optima stayed within {100 * _NEAR:.0f} % (NRMSE) of their final place"
-            f" before the last trial{f', the median of these from trial {np.median(known):.0f} on' if known else ''}.",
+            " before their last trial"
+            f"{f', the median of these from trial {np.median(known):.0f} on' if known else ''} (for: more than half).",
         )
     answers = np.asarray(found.cohort.trials.q) == len(study.responses) - 1
     mask = np.asarray(found.cohort.trials.mask)
@@ -195,11 +195,11 @@ def _convergence(results):
         )
         return
     at = int(np.searchsorted(counts, first))
-    open_ = int((own[at] > _NEAR).sum())
+    answering, open_ = int(np.isfinite(own[at]).sum()), int((own[at] > _NEAR).sum())
     yield Evidence(
         _side(open_ > 0),
         f"From trial {first} on the population optimum{how} stayed within {100 * _NEAR:.0f} % (NRMSE) of its final"
-        f" place; {open_} of {people} individual optima were further from theirs then.",
+        f" place; {open_} of {answering} individual optima that could still move were further from theirs then.",
     )
     if results.reference is not None:
         miss = [

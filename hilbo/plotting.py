@@ -147,6 +147,8 @@ def progress_figure(
     reference = population_optima[-1] if truth is None else truth
     target = individual[-1] if truth is None else np.broadcast_to(truth, individual.shape[1:])
     own = np.sqrt(np.mean((individual - target) ** 2, axis=2))
+    if truth is None:  # beyond a person's last answer nothing can move
+        own = np.where(trials[:, None] <= cohort.counts()[None, :], own, np.nan)
     merged = np.sqrt(np.mean((population_optima - reference) ** 2, axis=1))
     top = np.cumsum(np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask), axis=1)[
         :, trials - 1
@@ -343,7 +345,7 @@ def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:
 
 
 def band(axes, trials, values, colour: str, label: str) -> None:
-    """Median over the first axis of `values` as a line, quartiles as a band."""
-    low, middle, high = np.percentile(values, [25, 50, 75], axis=0)
+    """Median over the first axis of `values` as a line, quartiles as a band; NaN is left out."""
+    low, middle, high = np.nanpercentile(values, [25, 50, 75], axis=0)
     axes.fill_between(trials, low, high, color=colour, alpha=0.25, linewidth=0)
     axes.plot(trials, middle, color=colour, label=label)

@@ -37,7 +37,8 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
             plotting_study.individual_convergence(study, cohort, progress),
             "Convergence of the individuals (paper, figure 5)",
             "Left: each participant's running optimum against their final one. Right: how often they had answered"
-            f' "{top}" by then. Lines are medians, bands hold the middle half of the people.',
+            f' "{top}" by then. Lines are medians, bands hold the middle half of the people; on the left, of'
+            " those who gave as many answers.",
         ),
         "map": (
             plotting_study.sets_on_map(

@@ -163,14 +163,15 @@ def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
 
 def convergence_table(found: Analysis) -> pd.DataFrame:
     """After each number of trials: NRMSE of the population's running optimum to its last, and of the individuals'
-    (median, quartiles), and answers in the highest category so far (paper, figures 5 and 7b)."""
+    (median, quartiles, of those who gave as many answers), and answers in the highest category so far (paper, figures 5
+    and 7b)."""
     study, counts = found.study, found.progress.counts
     merged, own = found.progress.to_end()
     top = np.asarray((found.cohort.trials.q == len(study.responses) - 1) & found.cohort.trials.mask)
     so_far = np.cumsum(top, axis=1)[:, counts - 1]
     table = pd.DataFrame({"trials": counts, "population": merged})
     for name, values in (("individuals", own.T), ("top_answers", so_far)):
-        table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.percentile(values, [25, 50, 75], axis=0).T
+        table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.nanpercentile(values, [25, 50, 75], axis=0).T
     return table
 
 

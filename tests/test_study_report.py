@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import arviz as az
 import equinox as eqx
@@ -16,11 +17,13 @@ from test_statistics import study as paper_counts
 from test_validation import plain
 
 from hilbo import Trials
-from hilbo.analysis import analyse, limits_of, settled
+from hilbo.analysis import Progress, _counts, analyse, limits_of, settled
 from hilbo.errors import InputError
-from hilbo.hypotheses import Evidence, Hypothesis
+from hilbo.hypotheses import Evidence, Hypothesis, _convergence
 from hilbo.inference_data import groups, predictive_shares, write_groups
 from hilbo.paper_tables import aggregate_comparisons
+from hilbo.plotting_study import individual_convergence
+from hilbo.population_rules import RuleMap
 from hilbo.report_figures import comparison_figures
 from hilbo.report_study import _comparison
 from hilbo.report_validation import p_words, safest, slug, validate, validation_figures
@@ -135,6 +138,27 @@ def test_limits_are_named():
 )
 def test_when_an_optimum_has_settled(errors, expected):
     assert settled(np.arange(1, 6), np.array(errors, float)) == expected
+
+
+def test_who_stopped_early_has_not_converged_for_that():
+    """One moves until the end, one stays from trial 2 on, and one stops after a trial or two, still moving."""
+    ways = np.array([[0, 1, 2, 3, 4, 5], [0, 5, 5, 5, 5, 5], [0, 5, 5, 5, 5, 5]]).T / 10
+    progress = Progress(np.arange(1, 7), ways[:, 1:2], ways[:, :, None], np.array([6, 6, 2]))
+    assert progress.settled(0.05) == [None, 2, None]
+    assert np.isnan(progress.to_end()[1][2:, 2]).all() and np.isfinite(progress.to_end()[1][:, :2]).all()
+    assert set(_counts(crowd([HILL, HILL[:4], HILL[:7]]))) >= {4, 5, 7, 9}
+    (line,) = individual_convergence(plain(), crowd([HILL, HILL, HILL[:2]]), progress).axes[0].lines
+    np.testing.assert_allclose(line.get_ydata(), [50, 0, 15, 10, 5, 0], atol=1e-12)
+    one = jnp.ones(())
+    aggregate = SimpleNamespace(map=RuleMap("bcm", "by points", None, None, one, one))
+    for end, words in ((2, "1 of 3 individual optima"), (1, "1 of 2 individual optima")):
+        found = SimpleNamespace(
+            progress=progress._replace(ends=np.array([6, 6, end])),
+            cohort=SimpleNamespace(names=("A", "B", "C")),
+            aggregate=aggregate,
+        )
+        (item,) = _convergence(SimpleNamespace(found=found, reference=None))
+        assert item.side == "for" and words in item.text
 
 
 def test_verdicts_count_what_can_be_said():
