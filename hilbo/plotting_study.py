@@ -287,7 +287,7 @@ def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.4, 1.2 + 0.15 * max(len(people), 4)), layout="constrained")
         panels = figure.subplots(1, 3, sharey=True)
-        words = ("agreement of repeats", "lapse rate", "drift of the latent score")
+        words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
         for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
             value, low, high = (people[f"{measure}{end}"].to_numpy(float) for end in ("", "_low", "_high"))
             known = np.isfinite(value)

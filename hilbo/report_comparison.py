@@ -19,6 +19,9 @@ __all__ = ["comparison_table", "write_comparison"]
 _COLUMNS = ("method", "negative_log_density", "negative_log_density_error", "central_95", "central_95_error", "z2")
 
 
+_CAPTION = "Errors are by person; the share of the rule hierarchical is learnt from everybody."
+
+
 def write_comparison(study: Study, cohort: Cohort, folder: Path, seed: int = 0) -> dict[str, Any]:
     """Write the comparison of all rules; returns the content of comparison.json."""
     from hilbo import plotting_population as plotting
@@ -32,7 +35,7 @@ def write_comparison(study: Study, cohort: Cohort, folder: Path, seed: int = 0) 
     best = np.array([content["rules"][rule]["optimum"][name] for name in study.space.names])
     at = np.asarray(study.space.to_unit(best))
     figures = {
-        "comparison": (plotting.rules_figure(content), "Every rule, each person left out", "Errors are by person."),
+        "comparison": (plotting.rules_figure(content), "Every rule, each person left out", _CAPTION),
         "reliability": (plotting.reliability_figure(content), "Reliability", "On the line: as often as predicted."),
         "coverage": (
             plotting.coverage_figure(study, found.predict, at, float(found.map_prior), KNOWN),
