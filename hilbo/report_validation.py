@@ -169,8 +169,8 @@ def validation_figures(found: Validated) -> dict[str, tuple[Any, str, str]]:
         figures["aggregate-best"] = (
             plotting.aggregate_best_figure(found.people, found.overall),
             "Aggregate-best against individual-best",
-            "How often the population's set was preferred to individuals' own, by each participant and by all; dashed:"
-            " no preference.",
+            "How often the population's set was preferred to individuals' own, by each participant and by all (ties"
+            " left out); dashed: no preference.",
         )
     return figures
 

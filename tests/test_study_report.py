@@ -19,13 +19,13 @@ from test_validation import plain
 from hilbo import Trials
 from hilbo.analysis import Progress, _counts, analyse, limits_of, settled
 from hilbo.errors import InputError
-from hilbo.hypotheses import Evidence, Hypothesis, _convergence
+from hilbo.hypotheses import Evidence, Hypothesis, _convergence, _materials
 from hilbo.inference_data import groups, predictive_shares, write_groups
 from hilbo.paper_tables import aggregate_comparisons
 from hilbo.plotting_study import individual_convergence
 from hilbo.population_rules import RuleMap
 from hilbo.report_figures import comparison_figures
-from hilbo.report_study import _comparison
+from hilbo.report_study import _comparison, _shown, _tolerances
 from hilbo.report_validation import p_words, safest, slug, validate, validation_figures
 from hilbo.sensitivity import tolerance_ends
 from hilbo.simulate import PRESETS
@@ -158,7 +158,33 @@ def test_who_stopped_early_has_not_converged_for_that():
             aggregate=aggregate,
         )
         (item,) = _convergence(SimpleNamespace(found=found, reference=None))
-        assert item.side == "for" and words in item.text
+        assert item.side == "for" and words in item.text and "(for: one at least)" in item.text
+
+
+def test_other_materials_are_the_others():
+    """H1 to H3 are of the first material, and its figures are no evidence for H4."""
+    study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
+    optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.9, 0.5]]))
+    found = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
+    parts = {"found": found, "reference_name": "the truth"}
+    first, second, third = (
+        SimpleNamespace(name=name, validated=asked, reference=reference, **parts)
+        for name, asked, reference in (("A", None, np.zeros(2)), ("B", validated, np.full(2, 0.5)), ("C", None, None))
+    )
+    items = list(_materials([first, second, third]))
+    assert [item.text[0] for item in items] == ["B", "B", "C"] and [i.side for i in items] == ["for", "for", "open"]
+    assert items[0].text.endswith("(for: nearer than that).")
+    assert "76.6 % of the decided comparisons (20 ties;" in items[1].text
+    assert [item.side for item in _materials([first])] == ["open"]
+
+
+def test_measures_have_the_digits_that_answers_give():
+    head, rows = _shown(pd.DataFrame({"lapse_low": [0.12345], "trials": [25], "drift_high": [np.inf]}), digits=2)
+    assert (head, rows) == (["lapse low", "trials", "drift high"], [["0.12", "25", "∞"]])
+    row = dict(hyperparameters="fixed", parameter="u", draws_without=0.0, low_end="range", high_end="range")
+    row |= dict(low=1.0, high=12.346, low_from=1.0, low_to=1.2346, high_from=1.1, high_to=12.346)
+    _, ((*_, low, ends, _),) = _tolerances(pd.DataFrame([row]))
+    assert (low, ends) == ("12.35 (range)", "1.1 to 12")
 
 
 def test_verdicts_count_what_can_be_said():
