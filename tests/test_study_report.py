@@ -1,5 +1,6 @@
 """`hilbo validate` and `hilbo report`: what they write, what they say of poor data, and bad folders in one sentence."""
 
+import dataclasses
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -130,7 +131,11 @@ def test_limits_are_named():
     assert found[0].startswith("Fewer than 5 answers were given by P1")
     assert "between 2 and 9" in found[1] and 'P2 ("different")' in found[2]
     assert "plans 25 trials; nobody has given more than 9" in found[3]
-    assert limits_of(study, crowd([HILL]))[0].startswith("P0 is the only participant")
+    assert limits_of(study, crowd([HILL]))[0].startswith(
+        "P0 is the only participant: the population map is that person's own,"
+    )
+    shrunk = limits_of(dataclasses.replace(study, rule="rbcm"), crowd([HILL]))[0]
+    assert "own, shrunk towards the prior, and nothing" in shrunk
 
 
 @pytest.mark.parametrize(
