@@ -148,20 +148,23 @@ def main():
 
 
 def table(rows, true_share, chosen):
-    done = {level: len(found) for level, found in rows.items()}
+    done = min(len(found) for found in rows.values())
+    several = done > 1  # one study has no quartiles, and no coverage
     lines = [
-        f"Made by `python benchmarks/rules.py FOLDER --seeds {min(done.values())}"
-        f" --share-answers {chosen.share_answers} --write`: {min(done.values())} studies of {PEOPLE} x 25 at each level"
-        " of differences between people (0: all the same, 1: the preset `paper`).",
+        f"Made by `python benchmarks/rules.py FOLDER --seeds {done}"
+        f" --share-answers {chosen.share_answers} --write`: {done} {'studies' if several else 'study'} of {PEOPLE} x 25"
+        " at each level of differences between people (0: all the same, 1: the preset `paper`).",
         "",
-        "| NRMSE to the truth in %, median [quartiles] | " + " | ".join(f"{level:g}" for level in LEVELS) + " |",
+        f"| NRMSE to the truth in %{', median [quartiles]' if several else ''} | "
+        + " | ".join(f"{level:g}" for level in LEVELS)
+        + " |",
         "|---|" + "---:|" * len(LEVELS),
     ]
     for name in (*NAMES, "individuals", "mean of optima"):
         cells = []
         for level in LEVELS:
             q = 100 * np.percentile([row[f"miss {name}"] for row in rows[level]], [25, 50, 75])
-            cells.append(f"{q[1]:.1f} [{q[0]:.1f}, {q[2]:.1f}]")
+            cells.append(f"{q[1]:.1f} [{q[0]:.1f}, {q[2]:.1f}]" if several else f"{q[1]:.1f}")
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     lines += ["", "| true map within the 95 % interval, % | " + " | ".join(f"{v:g}" for v in LEVELS) + " |"]
     lines.append("|---|" + "---:|" * len(LEVELS))
@@ -172,7 +175,9 @@ def table(rows, true_share, chosen):
     lines.append("|---|" + "---:|" * len(LEVELS))
     lines.append("| true | " + " | ".join(f"{true_share[level]:.2f}" for level in LEVELS) + " |")
     mean = [f"{np.mean([row['share'] for row in rows[level]]):.2f}" for level in LEVELS]
-    lines.append("| learnt, mean over studies | " + " | ".join(mean) + " |")
+    lines.append(f"| learnt{', mean over studies' if several else ''} | " + " | ".join(mean) + " |")
+    if not several:
+        return "\n".join(lines) + "\n"
     held = [100 * np.mean([row["low"] <= true_share[v] <= row["high"] for row in rows[v]]) for v in LEVELS]
     lines.append("| true within the 95 % interval, % | " + " | ".join(f"{v:.0f}" for v in held) + " |")
     return "\n".join(lines) + "\n"

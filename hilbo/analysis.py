@@ -14,11 +14,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
-from hilbo.aggregation import RULES
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.hyperparameters import Learned, maximise_shared_evidence
 from hilbo.people import excluded, measure_people
+from hilbo.population_rules import point_rule
+from hilbo.rule_words import in_place
 from hilbo.sensitivity import Ends, tolerance_ends
 from hilbo.session import search_points
 from hilbo.study import Aggregate, Cohort, aggregate_cohort, nrmse, progress
@@ -38,11 +39,22 @@ class Progress(NamedTuple):
     counts: Int[np.ndarray, " p"]
     merged: Float[np.ndarray, "p d"]
     own: Float[np.ndarray, "p M d"]
+    ends: Int[np.ndarray, " M"]
+    """How many answers each person gave."""
 
     def to_end(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
-        """NRMSE of the population's and of everybody's running optimum to the final one."""
+        """NRMSE of the population's and of everybody's running optimum to the final one; a person's is NaN beyond their
+        last answer, where it cannot move."""
         merged = np.sqrt(np.mean((self.merged - self.merged[-1]) ** 2, axis=1))
-        return merged, np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
+        own = np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
+        return merged, np.where(self.counts[:, None] <= self.ends[None, :], own, np.nan)
+
+    def settled(self, within: float) -> list[int | None]:
+        """Of everybody the trial from which their own optimum stayed within this NRMSE of its final place; None where
+        that cannot be said."""
+        _, own = self.to_end()
+        lasts = np.searchsorted(self.counts, self.ends, side="right")
+        return [settled(self.counts[:k], own[:k, j], within) for j, k in enumerate(lasts)]
 
 
 class Reading(NamedTuple):
@@ -94,7 +106,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     learned, optimised = _optimised(study, cohort, seed)
     say("reading the maps")
     sets, words = _sets(study, aggregate, seed)
-    limits = (*limits_of(study, cohort), *words)
+    limits = (*limits_of(study, cohort), *words, *_substitute(aggregate))
     if bool(learned.runaway) or not bool(learned.converged):
         limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
     return Analysis(
@@ -103,7 +115,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
         _read(study, aggregate, seed),
         _read(optimised[0], optimised[1], seed),
         learned,
-        Progress(counts, merged, own),
+        Progress(counts, merged, own, cohort.counts()),
         sets,
         people,
         left,
@@ -115,9 +127,10 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     """What these answers cannot say, in sentences."""
     counts, found = cohort.counts(), []
     if len(cohort.names) == 1:
+        map_ = "is that person's own, shrunk towards the prior" if study.rule == "rbcm" else "is that person's own"
         found.append(
-            f"{cohort.names[0]} is the only participant: the population map is that person's own, and nothing is"
-            " known of how people differ."
+            f"{cohort.names[0]} is the only participant: the population map {map_}, and nothing is known of how people"
+            " differ."
         )
     few = [name for name, count in zip(cohort.names, counts, strict=True) if count < 5]
     if few:
@@ -149,8 +162,10 @@ def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], with
 
 
 def _counts(cohort):
-    longest = int(cohort.counts().max())
+    ends = cohort.counts()
+    longest = int(ends.max())
     counts = [
+        *ends[ends > 0],
         *np.linspace(1, longest, min(longest, _LONGEST)).round().astype(int),
         *(n for n in (5, 15, 25) if n <= longest),
     ]
@@ -171,14 +186,13 @@ def _learn(study, trials):
 def _read(study, aggregate, seed):
     """Tolerance intervals through the map's optimum, along every parameter."""
     x = aggregate.optimum.x
-    rule = study.rule if study.rule in RULES else "bcm"  # others merge all answers at once, not person by person
-    share = aggregate.map.share if rule == "hierarchical" else None
+    rule, share = point_rule(study.rule, aggregate.map.share)
     return Reading(
         study,
         aggregate,
         {
             name: (
-                tolerance(study, aggregate.surface, x, name),
+                tolerance(study, aggregate.newcomer, x, name),
                 tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share),
             )
             for name in study.space.names
@@ -188,9 +202,21 @@ def _read(study, aggregate, seed):
 
 def _sets(study, aggregate, seed):
     try:
-        return best_mid_worst(study, aggregate.surface, search_points(study.space, seed)), ()
+        points = search_points(study.space, seed)
+        return best_mid_worst(study, aggregate.surface, points, prior=aggregate.map.map_prior), ()
     except InputError as error:
         return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
+
+
+def _substitute(aggregate):
+    """A sentence where what stands beside the map is merged otherwise."""
+    how = in_place(aggregate.map)
+    if how:
+        yield (
+            f"The map is merged by the rule {aggregate.map.rule} from all answers at once; maps of fewer trials, and"
+            f" those of people drawn again for the ends of tolerance intervals, are merged {how}, so that their last"
+            " optimum need not be the map's."
+        )
 
 
 def moved_by_evidence(found: Analysis) -> float:

@@ -119,7 +119,8 @@ def optima_from(
         chosen = slice(i * _STARTS, (i + 1) * _STARTS)
         usable = [optimum for optimum, may in zip(reached[chosen], feasible[chosen], strict=True) if may]
         top = rows[rule][0]
-        candidate = _optimum(population.study, candidates[top], *(part[top] for part in maps[rule]))
+        mean, variance = (part[top] for part in maps[rule])
+        candidate = _optimum(population.study, candidates[top], mean, variance, _apart(population, rule))
         best[rule] = max([candidate, *usable], key=lambda optimum: float(optimum.mean))
     return best
 
@@ -130,9 +131,16 @@ def _feasible(study, x):
 
 
 @eqx.filter_jit
-def _optimum(study, x, mean, variance):
+def _optimum(study, x, mean, variance, apart):
     mean, variance = jnp.asarray(mean), jnp.asarray(variance)
-    return Optimum(jnp.asarray(x), mean, jnp.sqrt(variance), study.gp.likelihood.class_probabilities(mean, variance))
+    chances = study.gp.likelihood.class_probabilities(mean, variance + apart)
+    return Optimum(jnp.asarray(x), mean, jnp.sqrt(variance), chances)
+
+
+def _apart(population, rule):
+    """Variance of one person's function about the map's, as `RuleMap.apart`."""
+    prior = np.asarray(population.study.gp.kernel.variance)
+    return prior * np.asarray(1.0 - population.share if rule == "hierarchical" else 0.0, prior.dtype)
 
 
 def _spread(values, candidates):
@@ -186,7 +194,7 @@ def optimum_near(
         if bool(jnp.all(finished | (jnp.max(jnp.abs(state.move), axis=1) <= tolerance))):
             break
     x, mean, variance = last if tolerance else state.here.aux
-    return [_optimum(study, x[i], mean[i], variance[i]) for i in range(asked)]
+    return [_optimum(study, x[i], mean[i], variance[i], _apart(population, rules[i])) for i in range(asked)]
 
 
 _SOLVER = TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION)

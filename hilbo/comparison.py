@@ -3,11 +3,12 @@
 For each rule: the predictive density, calibration and reliability with each person left out (`leave_one_out`); its
 optimum; how the optimum is spread, by joint draws of the map (of bcm, hierarchical and pooled, whose joint posterior is
 known) and by a bootstrap over people (of the rules that merge people point by point); what each person moves; how it
-agrees with one model of all answers; and how much of the space the answers cover, map's over prior's standard
-deviation. And, once, how people differ, with a recommendation in words.
+agrees with one model of all answers; and how much of the space the answers cover, the map's standard deviation over
+what it is without answers. And, once, how people differ, with a recommendation in words.
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -19,7 +20,7 @@ from hilbo.aggregation import RULES, aggregate
 from hilbo.errors import InputError
 from hilbo.hierarchical import Share
 from hilbo.joint import joint_map, posterior_map
-from hilbo.leave_one_out import calibration, influence, leave_one_out, reliability
+from hilbo.leave_one_out import LeftOut, calibration, clustered, influence, leave_one_out, reliability
 from hilbo.population_rules import ALL_RULES, RuleMap, rule_map, share_of
 from hilbo.rule_words import share_content
 from hilbo.session import search_points
@@ -28,14 +29,15 @@ from hilbo.study import Cohort, fit_cohort, map_optimum, nrmse
 __all__ = ["KNOWN", "compare", "recommendation"]
 
 KNOWN = 0.8
-"""Where the map's standard deviation is below so much of the prior's, the answers are said to cover the space."""
+"""Where the map's standard deviation is below so much of what it is without answers, these cover the space."""
 
 _POINTS = 400  # at which joint draws and bootstrap seek the optimum
 _DRAWS = 2000
 
 
 def compare(study: Any, cohort: Cohort, seed: int = 0) -> dict[str, Any]:
-    """All rules side by side; the study's hyperparameters. What a rule cannot do stands there as its reason.
+    """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say. What a rule
+    cannot do stands there as its reason.
 
     Raises InputError for fewer than three people with answers: two must be left when one is left out.
     """
@@ -51,14 +53,19 @@ def compare(study: Any, cohort: Cohort, seed: int = 0) -> dict[str, Any]:
     share = share_of(study.gp, cohort.trials, study.inference)
     pooled = _map(study, cohort, "pooled", posteriors, share)
     rules: dict[str, Any] = {}
+    left: dict[str, LeftOut] = {}
     for rule in ALL_RULES:
         found = _map(study, cohort, rule, posteriors, share)
         if isinstance(found, str):
             rules[rule] = {"refused": found}
             continue
-        rules[rule] = _one(study, cohort, rule, posteriors, share, found, pooled, candidates, x, seed)
+        left[rule], maps = leave_one_out(
+            study.gp, cohort.trials, rule, share=share.mean, posteriors=posteriors, inference=study.inference
+        )
+        rules[rule] = calibration(left[rule], seed) | {"reliability": reliability(left[rule])}
+        rules[rule] |= _one(study, cohort, posteriors, found, maps, pooled, candidates, x, seed)
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
-    return content | {"rules": rules, "recommendation": recommendation(rules, share, len(answered))}
+    return content | {"rules": rules, "recommendation": recommendation(left, rules, share, len(answered))}
 
 
 def _map(study, cohort, rule, posteriors, share) -> RuleMap | str:
@@ -71,20 +78,15 @@ def _map(study, cohort, rule, posteriors, share) -> RuleMap | str:
         return str(error)
 
 
-def _one(study, cohort, rule, posteriors, share, found, pooled, candidates, x, seed):
-    left, maps = leave_one_out(
-        study.gp, cohort.trials, rule, share=share.mean, posteriors=posteriors, inference=study.inference
-    )
+def _one(study, cohort, posteriors, found, maps, pooled, candidates, x, seed):
     best = map_optimum(study, found, candidates)
     mean, variance = found.predict(x)
-    prior = study.gp.kernel.variance
     moved = influence(found, maps, x)
-    return calibration(left, seed) | {
+    return {
         "method": found.method,
-        "reliability": reliability(left),
         "optimum": _parameters(study, best.x),
         "optimum_sd": float(best.sd),
-        "covered": float(jnp.mean(jnp.sqrt(variance / prior) < KNOWN)),
+        "covered": float(jnp.mean(jnp.sqrt(variance / found.map_prior) < KNOWN)),
         "influence": dict(zip(cohort.names, moved.tolist(), strict=True)),
         "agreement_with_pooled": None if isinstance(pooled, str) else _agreement(mean, pooled.predict(x)[0]),
         "from_pooled": None
@@ -144,8 +146,12 @@ def _parameters(study, x: Float[Array, " d"]) -> dict[str, float]:
     return dict(zip(study.space.names, np.asarray(study.space.to_physical(np.asarray(x))).tolist(), strict=True))
 
 
-def recommendation(rules: dict[str, Any], share: Share, people: int) -> str:
-    """Which rule to use, and why, in a few sentences."""
+def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Share, people: int) -> str:
+    """Which rule to use, and why, in a few sentences; `left`: what each rule foretold of everybody's answers.
+
+    Two rules are near if the difference of their costs, answer by answer, is within two of its errors by person: people
+    are foretold well or badly by all rules alike, which the error of one rule's mean cost would take for doubt.
+    """
     scored = {rule: found for rule, found in rules.items() if "negative_log_density" in found}
     best = min(scored, key=lambda rule: scored[rule]["negative_log_density"])
     low, high = (float(end) for end in share.interval)
@@ -161,8 +167,8 @@ def recommendation(rules: dict[str, Any], share: Share, people: int) -> str:
     own = scored.get("hierarchical")
     chosen = best
     if own is not None:
-        gap = own["negative_log_density"] - scored[best]["negative_log_density"]
-        near = not math.isfinite(own["negative_log_density_error"]) or gap <= own["negative_log_density_error"]
+        gap, error = clustered(left["hierarchical"].cost - left[best].cost, left[best].person)
+        near = not math.isfinite(error) or gap <= 2 * error
         if near and (differ > 3 or best == "hierarchical"):
             chosen = "hierarchical"
         elif near and differ < 0 and "bcm" in scored:

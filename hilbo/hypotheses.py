@@ -15,6 +15,7 @@ import numpy as np
 from hilbo.analysis import Analysis, settled
 from hilbo.report import misses
 from hilbo.report_validation import Validated, safest
+from hilbo.rule_words import in_place
 
 __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
@@ -59,22 +60,23 @@ class Hypothesis(NamedTuple):
 
 
 def hypotheses(results: Sequence[Results]) -> list[Hypothesis]:
-    """H1 to H3 by the first material, each material by H4."""
+    """H1 to H3 by the first material, H4 by the others."""
     first = results[0]
+    whose = f" (Of {first.name}.)" if len(results) > 1 else ""
     return [
         Hypothesis(
             "H1",
-            "The parameters can be found for individuals by Bayesian optimisation with qualitative answers.",
+            "The parameters can be found for individuals by Bayesian optimisation with qualitative answers." + whose,
             tuple(_individuals(first)),
         ),
         Hypothesis(
             "H2",
-            "Individuals' maps can be merged into one whose optimum people in general find realistic.",
+            "Individuals' maps can be merged into one whose optimum people in general find realistic." + whose,
             tuple(_population(first)),
         ),
         Hypothesis(
             "H3",
-            "Individuals need not have converged for the merged map to have its optimum in the right place.",
+            "Individuals need not have converged for the merged map to have its optimum in the right place." + whose,
             tuple(_convergence(first)),
         ),
         Hypothesis("H4", "The same holds for materials of other mechanical properties.", tuple(_materials(results))),
@@ -87,15 +89,15 @@ def _side(good: bool) -> Side:
 
 def _individuals(results):
     found, study = results.found, results.found.study
-    counts, (_, own) = found.progress.counts, found.progress.to_end()
+    counts = found.progress.counts
     top, people = study.responses[-1], len(found.cohort.names)
     if len(counts) > 2:
-        when = [settled(counts, own[:, j], _NEAR) for j in range(people)]
-        known = [n for n in when if n is not None]
+        known = [n for n in found.progress.settled(_NEAR) if n is not None]
         yield Evidence(
             _side(len(known) > people / 2),
             f"{len(known)} of {people} individual optima stayed within {100 * _NEAR:.0f} % (NRMSE) of their final place"
-            f" before the last trial{f', the median of these from trial {np.median(known):.0f} on' if known else ''}.",
+            " before their last trial"
+            f"{f', the median of these from trial {np.median(known):.0f} on' if known else ''} (for: more than half).",
         )
     answers = np.asarray(found.cohort.trials.q) == len(study.responses) - 1
     mask = np.asarray(found.cohort.trials.mask)
@@ -110,14 +112,14 @@ def _individuals(results):
     yield Evidence(
         _side(late > early) if longest >= 6 else "open",
         f'Of {longest} trials, {totals.mean():.2f}{spread} were answered "{top}"; in the first third of the session'
-        f" {100 * early:.0f} % of the answers, in the last third {100 * late:.0f} %.",
+        f" {100 * early:.0f} % of the answers, in the last third {100 * late:.0f} % (for: more than in the first).",
     )
     chances = np.asarray(found.aggregate.individuals.class_probabilities)
     likeliest = int((chances.argmax(axis=1) == chances.shape[1] - 1).sum())
     yield Evidence(
         _side(likeliest > people / 2),
         f'At their own optimum "{top}" is the likeliest answer for {likeliest} of {people} participants (median'
-        f" probability {100 * np.median(chances[:, -1]):.0f} %).",
+        f" probability {100 * np.median(chances[:, -1]):.0f} %; for: more than half of them).",
     )
 
 
@@ -133,12 +135,13 @@ def _population(results):
             _side(bool(ours < middle and ours < mean)),
             f"From {results.reference_name} the population optimum is {100 * ours:.1f} % away (NRMSE), the individual"
             f" optima {100 * middle:.0f} % (median; quartiles {100 * low:.0f} and {100 * high:.0f} %), their mean"
-            f" {100 * mean:.1f} %.",
+            f" {100 * mean:.1f} % (for: nearer than both the median and the mean).",
         )
     p = float(best.class_probabilities[-1])
     yield Evidence(
         _side(int(np.argmax(np.asarray(best.class_probabilities))) == len(study.responses) - 1),
-        f'At the population optimum the map gives "{study.responses[-1]}" a probability of {100 * p:.0f} %.',
+        f'At the population optimum the map gives "{study.responses[-1]}" a probability of {100 * p:.0f} % (for: the'
+        " likeliest answer).",
     )
     if results.validated is None:
         yield Evidence("open", "No validation session asked people again.")
@@ -185,17 +188,21 @@ def _convergence(results):
         yield Evidence("open", "It takes several participants and trials to say.")
         return
     first = settled(counts, merged, _NEAR)
+    how = in_place(found.aggregate.map)
+    how = f" (merged {how})" if how else ""
     if first is None:
         yield Evidence(
-            "against", f"The population optimum still moved by more than {100 * _NEAR:.0f} % before the last trial."
+            "against",
+            f"The population optimum{how} still moved by more than {100 * _NEAR:.0f} % before the last trial.",
         )
         return
     at = int(np.searchsorted(counts, first))
-    open_ = int((own[at] > _NEAR).sum())
+    answering, open_ = int(np.isfinite(own[at]).sum()), int((own[at] > _NEAR).sum())
     yield Evidence(
         _side(open_ > 0),
-        f"From trial {first} on the population optimum stayed within {100 * _NEAR:.0f} % (NRMSE) of its final place;"
-        f" {open_} of {people} individual optima were further from theirs then.",
+        f"From trial {first} on the population optimum{how} stayed within {100 * _NEAR:.0f} % (NRMSE) of its final"
+        f" place; {open_} of {answering} individual optima that could still move were further from theirs then"
+        " (for: one at least).",
     )
     if results.reference is not None:
         miss = [
@@ -204,31 +211,42 @@ def _convergence(results):
         ]
         yield Evidence(
             _side(miss[0] <= miss[1] + _NEAR),
-            f"It was then {100 * miss[0]:.1f} % from {results.reference_name}, and {100 * miss[1]:.1f} % in the end.",
+            f"It was then {100 * miss[0]:.1f} % from {results.reference_name}, and {100 * miss[1]:.1f} % in the"
+            f" end{how} (for: at most {100 * _NEAR:.0f} % more).",
         )
 
 
 def _materials(results):
     if len(results) < 2:
         yield Evidence("open", "One material was studied.")
+    for one in results[1:]:
+        items = [*_near(one), *([] if one.validated is None else _preferred(one.name, one.validated))]
+        words = f"{one.name}: there is no reference, and no decided comparison of the map's set with individuals'."
+        yield from items or [Evidence("open", words)]
+
+
+def _near(one):
+    if one.reference is None:
         return
-    for one in results:
-        found = one.found
-        if one.reference is not None:
-            ours = float(misses(found.study, found.aggregate.optimum.x, one.reference)[0])
-            own = float(np.median(misses(found.study, found.aggregate.individuals.x, one.reference)[0]))
-            yield Evidence(
-                _side(ours < own),
-                f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference_name}, the median"
-                f" individual one {100 * own:.0f} %.",
-            )
-        table = None if one.validated is None else one.validated.regressions().get("IV")
-        if table is not None and one.validated is not None and one.validated.overall is not None:
-            row = safest(table).set_index("term").loc["Aggregate-Best"]
-            side: Side = "for" if row["low"] > 0 else "against" if row["high"] < 0 else "open"
-            yield Evidence(
-                side,
-                f"{one.name}: the aggregate's set was preferred in {100 * one.validated.overall['rate'].iloc[0]:.1f} %"
-                f" of the comparisons (table IV: {row['estimate']:.2f}, 95 % interval {row['low']:.2f} to"
-                f" {row['high']:.2f}).",
-            )
+    found = one.found
+    ours = float(misses(found.study, found.aggregate.optimum.x, one.reference)[0])
+    own = float(np.median(misses(found.study, found.aggregate.individuals.x, one.reference)[0]))
+    yield Evidence(
+        _side(ours < own),
+        f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference_name}, the median individual one"
+        f" {100 * own:.0f} % (for: nearer than that).",
+    )
+
+
+def _preferred(name, validated):
+    table = validated.regressions().get("IV")
+    if table is None or validated.overall is None:
+        return
+    row = safest(table).set_index("term").loc["Aggregate-Best"]
+    side: Side = "for" if row["low"] > 0 else "against" if row["high"] < 0 else "open"
+    yield Evidence(
+        side,
+        f"{name}: the aggregate's set was preferred in {100 * validated.overall['rate'].iloc[0]:.1f} % of the decided"
+        f" comparisons ({int(validated.people['ties'].sum())} ties; table IV: {row['estimate']:.2f}, 95 % interval"
+        f" {row['low']:.2f} to {row['high']:.2f}).",
+    )

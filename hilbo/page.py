@@ -49,6 +49,7 @@ def results_page(study: Study, content: dict[str, Any], pictures: list[dict[str,
         noise=f"{float(gp.likelihood.noise):g}",
         thresholds=", ".join(f"{float(t):g}" for t in gp.likelihood.thresholds),
         search=_search_words(study),
+        rule=content["rule"],
         method=_METHODS[study.inference],
         certificate=_CERTIFICATES[study.inference].format(worst=f"{worst:.1e}"),
         other=_other_words(study, content),
@@ -205,9 +206,9 @@ def robustness_page(study: Study, content: dict[str, Any], pictures: list[dict[s
     return template("robustness.html").render(
         title=f"{study.name}: robustness to the hyperparameters",
         lead="The optima were found twice: under the study's fixed hyperparameters, and under those by maximum evidence"
-        f" with weak priors ({whose}; learnt: {', '.join(learned['parameters'])}). The population optimum moved by"
-        f" {100 * content['nrmse']:.1f} % of the search ranges (NRMSE),"
-        f" {'which is 3 % or more: it is not robust' if content['flagged'] else 'less than 3 %: it is robust'}.",
+        f" with weak priors ({whose}; learnt: {', '.join(learned['parameters'])}). People were merged point by point by"
+        f" the rule {content['rule']}. The population optimum moved by {100 * content['nrmse']:.1f} % of the search"
+        f" ranges (NRMSE), {_ROBUST[content['flagged']]}.",
         warnings=content["warnings"],
         flagged=_flagged_words([p["participant"] for p in content["participants"] if p["flagged"]]),
         figures=pictures,
@@ -224,6 +225,9 @@ def robustness_page(study: Study, content: dict[str, Any], pictures: list[dict[s
         people=[[p["participant"], f"{100 * p['nrmse']:.1f} %", _remark(p)] for p in content["participants"]],
         versions=", ".join(f"{k} {v}" for k, v in versions.items()),
     )
+
+
+_ROBUST = {True: "which is 3 % or more: it is not robust", False: "less than 3 %: it is robust"}
 
 
 def _flagged_words(names):

@@ -121,8 +121,8 @@ def aggregate_comparisons(table: pd.DataFrame, sources: Mapping[str, str]) -> pd
     `preferred` ("Aggregate-Best", "individual" or "tie"). `sources`: set -> source, as in a sets table."""
     left, right = (table[side].map(lambda name: source_kind(sources[name])) for side in ("set_a", "set_b"))
     mixed = ((left == "aggregate") & (right == "individual")) | ((left == "individual") & (right == "aggregate"))
-    rows = table[mixed & (table["preferred"] != NONE)]
-    first = (left[rows.index] == "aggregate").to_numpy()
+    keep = mixed & (table["preferred"] != NONE)
+    rows, first = table[keep], (left[keep] == "aggregate").to_numpy()
     ours, theirs = (np.where(first == swap, rows["set_a"], rows["set_b"]) for swap in (True, False))
     preferred = rows["preferred"].to_numpy()
     words = np.where(preferred == ours, _OURS, np.where(preferred == TIE, TIE, _THEIRS))

@@ -12,11 +12,11 @@ expectation propagation, C = (K + 1/W)^-1 and a = C's weights, leaving answer i 
 so that no fit is repeated. Here the model's prior has a constant of variance 4 k added: the level of a person's answers
 is their own affair, and an answer far from all others is expected to be like them, not like the prior's mean. The lapse
 rate l is the share of answers that are any category at random, P(q_i) = (1 - l) p_i(q_i) + l / C; drift d is a shift of
-the latent score from the first trial to the last (negative: stricter), p_i(q) with m_i + d (s_i - 1/2), s_i being the
-share of the session that is over. Noise beyond the model's looks like lapses: a rate says how much of the answers the
-person's own model cannot tell from chance. Both are maximum likelihood over these left-out probabilities, with
-intervals where twice the log likelihood falls by less than 3.84. Those are approximate, since answers left out one at a
-time are not independent: docs/report.md has their coverage.
+the latent score from the first trial to the last, in prior standard deviations (negative: stricter), p_i(q) with
+m_i + d (s_i - 1/2), s_i being the share of the session that is over. Noise beyond the model's looks like lapses: a rate
+says how much of the answers the person's own model cannot tell from chance. Both are maximum likelihood over these
+left-out probabilities, with intervals where twice the log likelihood falls by less than 3.84. Those are approximate,
+since answers left out one at a time are not independent; `benchmarks/coverage_people.py` measures how often they hold.
 
 An exclusion rule, "trials < 10 or lapse_low > 0.3", speaks of a person's own answers only, and is applied before
 anything is merged.
@@ -84,7 +84,8 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
     """
     model = OrdinalGP(_Levelled(gp.kernel), gp.likelihood)
     mean, variance, probabilities = (np.asarray(part) for part in _left_out(model, trials))
-    rows = []
+    scale, rows = float(np.sqrt(gp.kernel.variance)), []
+    scaled = OrdinalProbit(gp.likelihood.thresholds / scale, gp.likelihood.noise / scale)
     for j, name in enumerate(names):
         mask = np.asarray(trials.mask[j])
         x, q = np.asarray(trials.x[j])[mask], np.asarray(trials.q[j])[mask]
@@ -92,7 +93,7 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
         row |= _consistency(x, q, near)
         given = probabilities[j][mask][np.arange(len(q)), q]
         row |= _named("lapse", lapse(given, probabilities.shape[-1]))
-        row |= _named("drift", drift(gp.likelihood, mean[j][mask], variance[j][mask], q))
+        row |= _named("drift", drift(scaled, mean[j][mask] / scale, variance[j][mask] / scale**2, q))
         rows.append(row | {"surprise": float(-np.log(given).mean()) if len(q) else np.nan})
     return pd.DataFrame(rows, columns=["participant", *MEASURES])
 
@@ -151,7 +152,8 @@ def drift(
     variance: Float[np.ndarray, " n"],
     q: np.ndarray,
 ) -> tuple[float, float, float]:
-    """Shift of the latent score from the first trial to the last, and its 95 % interval; from left-out moments (n,)."""
+    """Shift of the latent score from the first trial to the last, and its 95 % interval; from left-out moments (n,), in
+    their unit and the likelihood's; sought within 6 of them."""
     if len(q) < 2:
         return np.nan, -np.inf, np.inf
     progress = np.linspace(-0.5, 0.5, len(q))

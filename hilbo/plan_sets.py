@@ -72,7 +72,7 @@ def validation_sets(
     _check_same(study, result, np.asarray(found.optimum.x))
     points = search_points(study.space, seed)
     if source == "aggregate":
-        return _named(study, best_mid_worst(study, found.surface, points).x, "")
+        return _named(study, best_mid_worst(study, found.surface, points, prior=found.map.map_prior).x, "")
     sets: NamedSets = {}
     for person in participants:
         row = cohort.names.index(person)

@@ -4,7 +4,9 @@ A figure is a function from results to a matplotlib `Figure`; nothing is shown o
 the Okabe-Ito colours, which people with colour-blindness can tell apart. Axes are in physical units.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib as mpl
@@ -18,6 +20,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
 from hilbo.config import Study
 from hilbo.ordinal_gp import Posterior
+from hilbo.population_rules import RuleMap, point_rule
 from hilbo.study import Cohort, fit_cohort, population
 
 __all__ = [
@@ -64,7 +67,7 @@ def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohor
 
     The first two parameters span the slices; there is one at the optimum's value of the third, and one on either side.
     Further parameters stay at the optimum. With one parameter, the map is a curve with its standard deviation.
-    `posteriors`: everybody's, or a function that gives the map's mean and variance at points (m, d).
+    `posteriors`: everybody's, merged by bcm, or a function that gives the map's mean and variance at points (m, d).
     """
     if study.space.dim == 1:
         return _map_curve(study, posteriors, optimum, cohort)
@@ -83,13 +86,26 @@ def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohor
     return figure
 
 
-def slices_after(study: Study, cohort: Cohort, optima: Float[np.ndarray, "k d"], counts: Sequence[int]) -> Figure:
-    """The population map after the first `counts` trials of everybody, each at its own optimum (the star)."""
-    return maps_beside(study, {f"{n} trials": fit_cohort(study, cohort.first(n)) for n in counts}, optima)
+def slices_after(
+    study: Study, cohort: Cohort, optima: Float[np.ndarray, "k d"], counts: Sequence[int], found: RuleMap
+) -> Figure:
+    """The population map after the first `counts` trials of everybody, each at its own optimum (the star), merged as
+    `study.progress` does where all answers give the map `found`."""
+    rule, share = point_rule(study.rule, found.share)
+
+    def after(count):
+        return partial(population, fit_cohort(study, cohort.first(count)), rule=rule, share=share)
+
+    return maps_beside(study, {f"{n} trials": after(n) for n in counts}, optima)
 
 
-def maps_beside(study: Study, maps: Mapping[str, Posterior], optima: Float[np.ndarray, "k d"]) -> Figure:
-    """Named population maps side by side, each sliced through its own optimum (the star), on one colour scale."""
+def maps_beside(
+    study: Study, maps: Mapping[str, Posterior | Callable[..., Any]], optima: Float[np.ndarray, "k d"]
+) -> Figure:
+    """Named population maps side by side, each sliced through its own optimum (the star), on one colour scale.
+
+    A map is everybody's posteriors, merged by bcm, or a function as of `map_slices`.
+    """
     if study.space.dim == 1:
         return _curves_beside(study, maps, optima)
     thirds = [float(x[2]) if study.space.dim > 2 else None for x in optima]
@@ -131,6 +147,8 @@ def progress_figure(
     reference = population_optima[-1] if truth is None else truth
     target = individual[-1] if truth is None else np.broadcast_to(truth, individual.shape[1:])
     own = np.sqrt(np.mean((individual - target) ** 2, axis=2))
+    if truth is None:  # beyond a person's last answer nothing can move
+        own = np.where(trials[:, None] <= cohort.counts()[None, :], own, np.nan)
     merged = np.sqrt(np.mean((population_optima - reference) ** 2, axis=1))
     top = np.cumsum(np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask), axis=1)[
         :, trials - 1
@@ -228,7 +246,7 @@ def grid_slice(study, posteriors, optimum, third):
 
 
 def _map(posteriors, x) -> tuple[ArrayLike, ArrayLike]:
-    """Mean and variance of a population's map, or of a function that gives them."""
+    """Mean and variance of a population's map by bcm, or of a function that gives them."""
     return population(posteriors, x) if isinstance(posteriors, Posterior) else posteriors(x)
 
 
@@ -327,7 +345,7 @@ def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:
 
 
 def band(axes, trials, values, colour: str, label: str) -> None:
-    """Median over the first axis of `values` as a line, quartiles as a band."""
-    low, middle, high = np.percentile(values, [25, 50, 75], axis=0)
+    """Median over the first axis of `values` as a line, quartiles as a band; NaN is left out."""
+    low, middle, high = np.nanpercentile(values, [25, 50, 75], axis=0)
     axes.fill_between(trials, low, high, color=colour, alpha=0.25, linewidth=0)
     axes.plot(trials, middle, color=colour, label=label)

@@ -61,13 +61,12 @@ def reliability_figure(content: dict[str, Any], rules: tuple[str, ...] = ("bcm",
 
 
 def coverage_figure(
-    study: Study, predict: Callable[..., Any], at: Float[np.ndarray, " d"], known: float = 0.8
+    study: Study, predict: Callable[..., Any], at: Float[np.ndarray, " d"], prior: float, known: float = 0.8
 ) -> Figure:
-    """The map's standard deviation over the prior's, on the slice of the first two parameters through `at`; hatched
-    where it is above `known`: nobody's answers say much there."""
+    """The map's standard deviation over what it is without answers (of variance `prior`), on the slice of the first two
+    parameters through `at`; hatched where it is above `known`: nobody's answers say much there."""
     parameters = study.space.parameters
     side = np.linspace(0.0, 1.0, _CELLS)
-    prior = float(study.gp.kernel.variance)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.2, 3.2), layout="constrained")
         axes = figure.subplots()
@@ -76,7 +75,7 @@ def coverage_figure(
             along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
             axes.plot(along, ratio, color=BLUE)
             axes.fill_between(along, 0, 1, where=ratio > known, hatch="///", facecolor="none", edgecolor=GREY)
-            axes.set(ylabel="sd of the map over the prior's", ylim=(0, 1.05))
+            axes.set(ylabel="sd of the map, over that without answers", ylim=(0, 1.05))
         else:
             grid = np.tile(np.asarray(at), (_CELLS, _CELLS, 1))
             grid[..., 0], grid[..., 1] = np.meshgrid(side, side, indexing="ij")
@@ -87,7 +86,7 @@ def coverage_figure(
             sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
             shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud")
             axes.contourf(*sides, ratio.T, levels=[known, 10.0], hatches=["///"], colors="none")
-            figure.colorbar(shown, ax=axes, label="sd of the map over the prior's")
+            figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
             for axis, p in zip((axes.set_xscale, axes.set_yscale), parameters[:2], strict=True):
                 axis(p.scale)
             axes.set_ylabel(_head(parameters[1]))

@@ -1,6 +1,7 @@
 """The figure of `hilbo power`: errors against trials, one line for each number of participants."""
 
 import matplotlib as mpl
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
@@ -34,7 +35,9 @@ def power_figure(summary: pd.DataFrame, error: float) -> Figure:
             left.plot(at, 100 * rows["optimum_median"], label=label, **look)
             left.vlines(at + shift * (i - 1), 100 * rows["optimum_low"], 100 * rows["optimum_high"], color=colour,
                         linewidth=0.8, alpha=0.7)  # fmt: skip
-            middle.errorbar(at, 100 * rows["reached"], yerr=100 * rows["reached_se"], capsize=2, **look)
+            below, above = rows["reached"] - rows["reached_low"], rows["reached_high"] - rows["reached"]
+            bars = 100 * np.maximum([below, above], 0.0)  # 0 and 1 end their own intervals, to rounding
+            middle.errorbar(at, 100 * rows["reached"], yerr=bars, capsize=2, **look)
             right.plot(at, rows["map_median"], **look)
         left.axhline(100 * error, color=GREY, linewidth=0.8)
         left.set(ylabel="error of the optimum, NRMSE (%)", ylim=(0, None))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 import pandas as pd
+from jax.typing import ArrayLike
 from jaxtyping import Float
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
@@ -52,7 +53,7 @@ __all__ = [
 ]
 
 UNKNOWN = 0.8
-"""Share of the prior's standard deviation above which a map is drawn as not sampled."""
+"""Share of its standard deviation without answers above which a map is drawn as not sampled."""
 _MARKS = {"best": ("*", 170, GREEN), "mid": ("D", 45, ORANGE), "worst": ("X", 80, RED)}
 _CELLS = 101
 
@@ -125,8 +126,13 @@ def population_convergence(progress: Progress, references: Mapping[str, Float[np
     return figure
 
 
-def sets_on_map(study: Study, surface, sets: Sets | None, best: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
-    """The population map through its best, mid and worst sets; hatched where it is not sampled. Paper, figure 6a."""
+def sets_on_map(
+    study: Study, surface, sets: Sets | None, best: Float[np.ndarray, " d"], cohort: Cohort, prior: ArrayLike
+) -> Figure:
+    """The population map through its best, mid and worst sets; hatched where it is not sampled. Paper, figure 6a.
+
+    `prior`: the map's variance where nobody answered (`RuleMap.map_prior`).
+    """
     points: dict[str, Any] = {"best": best}
     if sets is not None:
         points = dict(zip(_MARKS, np.asarray(sets.x), strict=True))
@@ -137,7 +143,7 @@ def sets_on_map(study: Study, surface, sets: Sets | None, best: Float[np.ndarray
     figure, panels, draw = map_panels(study, grids)
     for axes, (name, third), values in zip(panels, thirds.items(), grids, strict=True):
         draw(axes, values)
-        _hatch(axes, study, surface, best, third, values)
+        _hatch(axes, study, surface, best, third, values, prior)
         mark_trials(axes, study, cohort, third)
         for shown in points if third is None else [name]:
             _mark(axes, study, shown, points[shown])
@@ -156,10 +162,10 @@ def _columns(figure, handles):
     return max(1, min(len(handles), int(figure.get_figwidth() / 1.25)))
 
 
-def _hatch(axes, study, surface, best, third, values):
+def _hatch(axes, study, surface, best, third, values, prior):
     """Hatch what is feasible and of which the map knows less than `UNKNOWN`."""
     spread = grid_slice(study, lambda x: (jnp.sqrt(surface(x)[1]), surface(x)[1]), best, third)
-    limit = UNKNOWN * np.sqrt(float(study.gp.kernel.diagonal(jnp.asarray(best))))
+    limit = UNKNOWN * np.sqrt(float(prior))
     unknown = np.where(np.isnan(values), 0.0, np.where(spread > limit, 1.0, 0.0))
     if unknown.any():
         with mpl.rc_context({"hatch.linewidth": 0.5, "hatch.color": "white"}):
@@ -270,7 +276,7 @@ def _class_curves(axes, reading, shades):
 
 
 def _probabilities(reading, x):
-    mean, variance = reading.aggregate.surface(x)
+    mean, variance = reading.aggregate.newcomer(x)
     return jax.vmap(reading.study.gp.likelihood.class_probabilities)(mean, variance)
 
 
@@ -281,7 +287,7 @@ def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.4, 1.2 + 0.15 * max(len(people), 4)), layout="constrained")
         panels = figure.subplots(1, 3, sharey=True)
-        words = ("agreement of repeats", "lapse rate", "drift of the latent score")
+        words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
         for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
             value, low, high = (people[f"{measure}{end}"].to_numpy(float) for end in ("", "_low", "_high"))
             known = np.isfinite(value)

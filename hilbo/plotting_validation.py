@@ -58,7 +58,7 @@ def preference_rows(preferences: pd.DataFrame) -> pd.DataFrame:
 
 def _widest(rows):
     """The widest interval among Wilson's and the clustered ones, or where all agreed that of the people."""
-    if "errors" not in rows:
+    if "errors" not in rows or rows["errors"].isna().all():  # a pair that was only ever tied
         return rows.iloc[0]
     people = rows[rows["errors"].str.startswith("exact, of")]
     if len(people):

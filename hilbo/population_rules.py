@@ -26,7 +26,7 @@ from hilbo.errors import InputError
 from hilbo.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 
-__all__ = ["ALL_RULES", "AnyRule", "RuleMap", "even_choice", "rule_map", "share_of"]
+__all__ = ["ALL_RULES", "AnyRule", "RuleMap", "even_choice", "point_rule", "rule_map", "share_of"]
 
 AnyRule = Literal[aggregation.Rule, "grbcm", "pooled"]
 ALL_RULES: tuple[AnyRule, ...] = (*get_args(aggregation.Rule), "grbcm", "pooled")
@@ -61,10 +61,30 @@ class RuleMap(eqx.Module):
         share = self.share if self.rule == "hierarchical" else None
         return aggregation.aggregate(self.rule, means, explained, self.prior, share=share)  # type: ignore[arg-type]
 
+    @property
+    def apart(self) -> Float[Array, ""]:
+        """Variance of one person's function about the map's: only the hierarchical model says that people differ."""
+        return (1.0 - self.share) * self.prior
+
+    @property
+    def map_prior(self) -> Float[Array, ""]:
+        """Variance of the map where nobody answered, against which its own tells what the answers say."""
+        if self.rule in ("poe", "average"):
+            return self.prior / jax.tree.leaves(self.experts)[0].shape[0]
+        return self.share * self.prior
+
     def newcomer(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new person's function: only the hierarchical model says that people differ."""
+        """Mean and variance (m,) of a new person's function, of which answers are foretold."""
         mean, variance = self.predict(x)
-        return mean, variance + (1.0 - self.share) * self.prior
+        return mean, variance + self.apart
+
+
+def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[aggregation.Rule, Float[Array, ""] | None]:
+    """By which rule, and with which share, everybody's posteriors are merged point by point in place of a map: by the
+    same rule, or by bcm where the rule takes all answers at once."""
+    if rule not in aggregation.RULES:
+        return "bcm", None
+    return rule, share if rule == "hierarchical" else None  # type: ignore[return-value]
 
 
 def rule_map(

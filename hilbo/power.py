@@ -26,6 +26,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 from scipy.special import ndtr
+from scipy.stats import binomtest
 
 from hilbo.config import Study
 from hilbo.errors import InputError
@@ -71,7 +72,13 @@ def simulate_power(
 
     `jobs`: processes, by default as many as there are cores; each calls `begin` first (float64, a cache).
     `say` is told how many studies are done.
+    Raises `InputError` for a number of people that the study's rule cannot merge.
     """
+    if study.rule == "hierarchical" and min(plan.participants) < 2:
+        raise InputError(
+            'power: the rule "hierarchical" learns how people differ and needs two of them; ask for 2 participants or'
+            " more, or use another rule."
+        )
     jobs = min(cores() if jobs is None else jobs, plan.studies)
     content = study.content
     blocks: dict[int, pd.DataFrame] = {}
@@ -176,16 +183,17 @@ def top_probability(persons: Person, categories: int, x: Float[np.ndarray, "m d"
 
 def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:
     """For every (m, t): median and quartiles of both errors, and the share of studies whose optimum misses by `error`
-    or less, with its standard error; columns end in `_median`, `_low`, `_high`; `reached`, `reached_se`."""
+    or less, with its 95 % interval (Wilson); columns end in `_median`, `_low`, `_high`; `reached`."""
     groups = errors.groupby(["participants", "trials"])
     table = pd.DataFrame({
         f"{name}_{word}": groups[name].quantile(q)
         for name in ("optimum", "map")
         for word, q in (("median", 0.5), ("low", 0.25), ("high", 0.75))
     })  # fmt: skip
-    table["reached"] = groups["optimum"].apply(lambda values: float((values <= error).mean()))
-    count = groups.size()
-    table["reached_se"] = np.sqrt(table["reached"] * (1 - table["reached"]) / count)
+    within, count = groups["optimum"].apply(lambda values: int((values <= error).sum())), groups.size()
+    table["reached"] = within / count
+    ends = [binomtest(k, n).proportion_ci(method="wilson") for k, n in zip(within, count, strict=True)]
+    table["reached_low"], table["reached_high"] = [e.low for e in ends], [e.high for e in ends]
     table["studies"] = count
     return table.reset_index()
 

@@ -25,7 +25,7 @@ from hilbo.batch_optimum import Merged
 from hilbo.config import Study
 from hilbo.page import results_page
 from hilbo.report_people import People, as_json, people_of
-from hilbo.rule_words import heterogeneity, rule_warnings
+from hilbo.rule_words import heterogeneity, in_place, rule_warnings
 from hilbo.study import Aggregate, Optimum, nrmse, other_inference, progress
 
 __all__ = [
@@ -283,19 +283,20 @@ def _figures(study, aggregate, seed, truth):
     best = np.asarray(aggregate.optimum.x)
     marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
     marks |= {} if truth is None else {"truth": truth}
-    captions = _captions(study, truth)
+    how = in_place(aggregate.map)
+    captions = _captions(study, truth, f" These maps are merged {how}." if how else "")
     found = {
         "map": plotting.map_slices(study, aggregate.surface, best, cohort),
         "progress": plotting.progress_figure(study, cohort, merged, own, truth, counts),
-        "slices": plotting.slices_after(study, cohort, merged[np.searchsorted(counts, after)], after),
+        "slices": plotting.slices_after(study, cohort, merged[np.searchsorted(counts, after)], after, aggregate.map),
     }
     if study.space.dim > 1:
         found["optima"] = plotting.optima_scatter(study, np.asarray(aggregate.individuals.x), marks)
     return {name: (figure, *captions[name]) for name, figure in found.items()}
 
 
-def _captions(study, truth):
-    """Title and caption of each figure: what is to be seen, and how to read it."""
+def _captions(study, truth, how=""):
+    """Title and caption of each figure: what is to be seen, and how to read it; `how`: the maps of fewer trials."""
     top, names = study.responses[-1], study.space.names
     white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
     third = ""
@@ -318,12 +319,12 @@ def _captions(study, truth):
             "Progress of the optimum",
             f"Left: how far the optimum after so many trials is from {settled}, in per cent of the search ranges, for"
             f" the individuals and for the population map.{dashed} Right: how often people had answered"
-            f' "{top}" by then. Bands hold the middle half of the people.',
+            f' "{top}" by then. Bands hold the middle half of the people.{how}',
         ),
         "slices": (
             "The population map after fewer trials",
             "The map from everybody's first answers only, each through its own optimum, the star; if the star and the"
-            f" bright region stay where they are, further trials only refine them.{white}{rest}",
+            f" bright region stay where they are, further trials only refine them.{white}{rest}{how}",
         ),
         "optima": (
             "Individual optima",

@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
@@ -18,6 +19,9 @@ __all__ = ["comparison_table", "write_comparison"]
 _COLUMNS = ("method", "negative_log_density", "negative_log_density_error", "central_95", "central_95_error", "z2")
 
 
+_CAPTION = "Errors are by person; the share of the rule hierarchical is learnt from everybody."
+
+
 def write_comparison(study: Study, cohort: Cohort, folder: Path, seed: int = 0) -> dict[str, Any]:
     """Write the comparison of all rules; returns the content of comparison.json."""
     from hilbo import plotting_population as plotting
@@ -25,16 +29,19 @@ def write_comparison(study: Study, cohort: Cohort, folder: Path, seed: int = 0) 
     content = compare(study, cohort, seed)
     (folder / "comparison.json").write_text(as_json(content))
     comparison_table(content).to_csv(folder / "comparison.csv", index=False)
-    found = rule_map(study.gp, cohort.trials, "bcm", inference=study.inference)
-    best = np.array([content["rules"]["bcm"]["optimum"][name] for name in study.space.names])
+    rule = study.rule if "optimum" in content["rules"][study.rule] else "bcm"
+    share = jnp.asarray(content["share"]["share"])
+    found = rule_map(study.gp, cohort.trials, rule, share=share, inference=study.inference)
+    best = np.array([content["rules"][rule]["optimum"][name] for name in study.space.names])
     at = np.asarray(study.space.to_unit(best))
     figures = {
-        "comparison": (plotting.rules_figure(content), "Every rule, each person left out", "Errors are by person."),
+        "comparison": (plotting.rules_figure(content), "Every rule, each person left out", _CAPTION),
         "reliability": (plotting.reliability_figure(content), "Reliability", "On the line: as often as predicted."),
         "coverage": (
-            plotting.coverage_figure(study, found.predict, at, KNOWN),
+            plotting.coverage_figure(study, found.predict, at, float(found.map_prior), KNOWN),
             "What the answers cover",
-            f"Hatched: the map's standard deviation is more than {KNOWN:g} of the prior's.",
+            f"By the rule {rule}; hatched: the map's standard deviation is more than {KNOWN:g} of what it is without"
+            " answers.",
         ),
     }
     save_figures(figures, folder)

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from hilbo.analysis import Analysis
-from hilbo.study import fit_cohort
+from hilbo.rule_words import in_place
 from hilbo.study_folder import Material
 
 __all__ = ["comparison_figures", "study_figures"]
@@ -23,6 +23,8 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
     white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
     who, after = plotting_study.typical_person(found), _after(progress.counts)
     rows = np.searchsorted(progress.counts, after)
+    how = in_place(found.aggregate.map)
+    how = f" These maps are merged {how}." if how else ""
     references = {} if material.reference is None else {material.reference_name: material.reference}
     figures: Figures = {
         "progression": (
@@ -35,27 +37,29 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
             plotting_study.individual_convergence(study, cohort, progress),
             "Convergence of the individuals (paper, figure 5)",
             "Left: each participant's running optimum against their final one. Right: how often they had answered"
-            f' "{top}" by then. Lines are medians, bands hold the middle half of the people.',
+            f' "{top}" by then. Lines are medians, bands hold the middle half of the people; on the left, of'
+            " those who gave as many answers.",
         ),
         "map": (
-            plotting_study.sets_on_map(study, found.aggregate.surface, found.sets, best, cohort),
+            plotting_study.sets_on_map(
+                study, found.aggregate.surface, found.sets, best, cohort, found.aggregate.map.map_prior
+            ),
             "The population map and its best, mid and worst sets (paper, figure 6a)",
             f"Brighter: higher {study.attribute}. Hatched: hardly sampled, the map's sd there is above"
-            f" {100 * plotting_study.UNKNOWN:.0f} % of the prior's. Dots: what was asked near the slice, and"
-            f" may lie in its white.{white}",
+            f" {100 * plotting_study.UNKNOWN:.0f} % of what it is without answers. Dots: what was asked near the"
+            f" slice, and may lie in its white.{white}",
         ),
         "maps-after": (
-            plotting.maps_beside(
-                study, {f"{n} trials": fit_cohort(study, cohort.first(n)) for n in after}, progress.merged[rows]
-            ),
+            plotting.slices_after(study, cohort, progress.merged[rows], after, found.aggregate.map),
             "The population map after fewer trials (paper, figure 7a)",
-            f"From everybody's first answers only, each through its own optimum, the star.{white}",
+            f"From everybody's first answers only, each through its own optimum, the star.{white}{how}",
         ),
         "population-convergence": (
             plotting_study.population_convergence(progress, references),
             "Convergence of the population optimum (paper, figure 7b)",
             "How far the optimum of the map from everybody's first trials is from the optimum of the whole map"
-            + (f", and from {material.reference_name}." if references else "."),
+            + (f", and from {material.reference_name}." if references else ".")
+            + how,
         ),
         "classes": (
             plotting_study.class_regions(

@@ -16,9 +16,11 @@ _CHANCE = 0.8  # share of studies that must be within the error to call a design
 
 
 def enough(summary: pd.DataFrame, chance: float = _CHANCE) -> pd.DataFrame:
-    """For every number of participants the fewest trials with which at least `chance` of the studies are within the
-    error; NaN if none of those simulated."""
-    good = summary[summary["reached"] >= chance].groupby("participants")["trials"].min()
+    """For every number of participants the fewest trials from which on at least `chance` of the studies are within the
+    error, with all larger numbers simulated too; NaN if the largest does not reach it."""
+    longest_first = summary.sort_values("trials", ascending=False)
+    holds = (longest_first["reached"] >= chance).groupby(longest_first["participants"]).cummin()
+    good = longest_first[holds].groupby("participants")["trials"].min()
     return good.reindex(sorted(summary["participants"].unique())).rename("trials").reset_index()
 
 
@@ -37,8 +39,8 @@ def write_power(
     figure = plotting_power.power_figure(summary, error)
     caption = (
         "Left: how far the population optimum is from the truth, in per cent of the search ranges: median and quartiles"
-        f" over {plan.studies} simulated studies. Middle: in how many of them it is within {100 * error:g} % (bars: the"
-        " share's standard error). Right: root mean square error of the map's probability of the highest answer."
+        f" over {plan.studies} simulated studies. Middle: in how many of them it is within {100 * error:g} % (bars: 95"
+        " % intervals). Right: root mean square error of the map's probability of the highest answer."
     )
     pictures = save_figures({"power": (figure, "Participants and trials", caption)}, folder)
     content = {
@@ -59,9 +61,12 @@ def write_power(
 
 
 def _page(study, summary, plan, error, cost, pictures, content):
+    ends = zip(summary["reached"], summary["reached_low"], summary["reached_high"], strict=True)
+    shares = [f"{100 * share:.0f} % ({100 * low:.0f} to {100 * high:.0f})" for share, low, high in ends]
+    summary = summary.assign(share=shares)
     blocks = [
         ("Error of the optimum, median in % of the search ranges", "optimum_median", lambda v: f"{100 * v:.1f}"),
-        (f"Share of studies within {100 * error:g} %", "reached", lambda v: f"{100 * v:.0f} %"),
+        (f"Share of studies within {100 * error:g} %, with its 95 % interval", "share", str),
         ("Error of the map, median", "map_median", lambda v: f"{v:.3f}"),
     ]
     tables = []

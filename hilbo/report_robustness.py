@@ -1,6 +1,5 @@
 """Results of the robustness check: result.json, both population maps, figures, and a page that explains itself."""
 
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from hilbo.config import Study
 from hilbo.page import robustness_page
 from hilbo.report import as_json, map_dataset, optimum_content, save_figures, versions
 from hilbo.robustness import LIMIT, Robustness
-from hilbo.study import Cohort, population
+from hilbo.study import Cohort
 
 __all__ = ["robustness_result", "write_robustness"]
 
@@ -24,19 +23,12 @@ def write_robustness(study: Study, cohort: Cohort, found: Robustness, folder: Pa
     """Write the folder of `hilbo robustness`; returns the content of result.json."""
     content = robustness_result(study, cohort, found, seed)
     (folder / "result.json").write_text(as_json(content))
-    maps = [
-        map_dataset(study, partial(_surface, posteriors), found.fixed.x)
-        for posteriors in (found.posteriors, found.posteriors_learnt)
-    ]
+    maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x)), found.fixed.x) for of in found.maps()]
     both = xr.concat(maps, xr.DataArray(["fixed", "by evidence"], dims="hyperparameters", name="hyperparameters"))
     both.to_netcdf(folder / "map.nc", engine="h5netcdf")
     pictures = save_figures(_figures(study, cohort, found), folder)
     (folder / "report.html").write_text(robustness_page(study, content, pictures), encoding="utf-8")
     return content
-
-
-def _surface(posteriors, x):
-    return population(posteriors, jnp.asarray(x))
 
 
 def _figures(study, cohort, found):
@@ -46,7 +38,7 @@ def _figures(study, cohort, found):
     limit = f"{100 * LIMIT:.0f} %"
     maps = plotting.maps_beside(
         study,
-        {"fixed hyperparameters": found.posteriors, "by maximum evidence": found.posteriors_learnt},
+        dict(zip(("fixed hyperparameters", "by maximum evidence"), found.maps(), strict=True)),
         np.stack([found.fixed.x, found.optimised.x]),
     )
     moves = plotting.moved_optima(cohort.names, found.individual_nrmse, float(found.nrmse), LIMIT)
@@ -87,6 +79,7 @@ def robustness_result(study: Study, cohort: Cohort, found: Robustness, seed: int
         "optimised": optimum_content(study, found.optimised),
         "nrmse": float(found.nrmse),
         "flagged": bool(found.flagged),
+        "rule": found.rule,
         "participants": rows,
         "learned": {
             "parameters": list(learned.learn),

@@ -30,6 +30,7 @@ from hilbo.study_folder import Material, StudyFolder
 
 __all__ = ["convergence_table", "table_1", "tolerance_table", "write_study"]
 
+_DIGITS = 2  # of measures of people and of ends of intervals, which a few dozen answers decide
 _FEWEST = 3  # people for a comparison of rules: each is left out in turn
 
 
@@ -163,14 +164,15 @@ def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
 
 def convergence_table(found: Analysis) -> pd.DataFrame:
     """After each number of trials: NRMSE of the population's running optimum to its last, and of the individuals'
-    (median, quartiles), and answers in the highest category so far (paper, figures 5 and 7b)."""
+    (median, quartiles, of those who gave as many answers), and answers in the highest category so far (paper, figures 5
+    and 7b)."""
     study, counts = found.study, found.progress.counts
     merged, own = found.progress.to_end()
     top = np.asarray((found.cohort.trials.q == len(study.responses) - 1) & found.cohort.trials.mask)
     so_far = np.cumsum(top, axis=1)[:, counts - 1]
     table = pd.DataFrame({"trials": counts, "population": merged})
     for name, values in (("individuals", own.T), ("top_answers", so_far)):
-        table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.percentile(values, [25, 50, 75], axis=0).T
+        table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.nanpercentile(values, [25, 50, 75], axis=0).T
     return table
 
 
@@ -242,7 +244,7 @@ def _section(material, found, validated, tables, pictures: list[dict[str, str]],
         "table_1": _shown(tables["table_I"], _words_of_table_1(material)),
         "passivity": _shown(tables["passivity"].dropna(axis=1, how="all"), {"p_top": f'P("{study.responses[-1]}")'}),
         "tolerance": _tolerances(tables["tolerance"]),
-        "people": _shown(tables["people"].drop(columns=["categories", "left_out"])),
+        "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
         "robust": "Under the hyperparameters of maximum evidence the optimum moves by"
         f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges." + _without(found),
         "comparison": None if compared is None else _comparison(compared),
@@ -289,11 +291,13 @@ def _words_of_table_1(material):
     }
 
 
-def _shown(table: pd.DataFrame, heads: Mapping[str, str] | None = None) -> tuple[list[str], list[list[str]]]:
-    """Head and cells of a table on the page."""
+def _shown(
+    table: pd.DataFrame, heads: Mapping[str, str] | None = None, digits: int = 4
+) -> tuple[list[str], list[list[str]]]:
+    """Head and cells of a table on the page, numbers with so many digits."""
     heads = {} if heads is None else heads
     head = [heads.get(str(name), str(name).replace("_", " ")) for name in table.columns]
-    return head, [[_cell(value) for value in row] for row in table.itertuples(index=False)]
+    return head, [[_cell(value, digits) for value in row] for row in table.itertuples(index=False)]
 
 
 def _tolerances(table):
@@ -301,7 +305,10 @@ def _tolerances(table):
     rows = []
     for row in table.to_dict("records"):
         ends = [
-            [f"{_cell(row[end])} ({row[f'{end}_end']})", f"{_cell(row[f'{end}_from'])} to {_cell(row[f'{end}_to'])}"]
+            [
+                f"{_cell(row[end])} ({row[f'{end}_end']})",
+                " to ".join(_cell(row[f"{end}_{at}"], _DIGITS) for at in ("from", "to")),
+            ]
             if np.isfinite(row[end])
             else ["–", "–"]
             for end in ("low", "high")
@@ -312,11 +319,11 @@ def _tolerances(table):
     return ["hyperparameters", "parameter", "from", "95 % of draws", "to", "95 % of draws", "no interval"], rows
 
 
-def _cell(value):
+def _cell(value, digits=4):
     if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
         return "–" if value is None or np.isnan(value) else ("∞" if value > 0 else "−∞")
     if isinstance(value, float | np.floating):
-        return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
+        return np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
     return str(value)
 
 

@@ -3,8 +3,8 @@
 `validate` computes one material; `write_validation` makes the folder of `hilbo validate` with one section for each
 material: result.json, the tables as CSV, the figures, and one page. `hilbo report` uses the same parts.
 
-Of every coefficient the page shows the widest of the iid and clustered intervals, which docs/statistics.md finds the
-safest; all kinds of error are in the CSV tables.
+Of every coefficient the page shows the widest of the iid, clustered and (up to 12 clusters) wild bootstrap intervals,
+which docs/statistics.md finds the safest; all kinds of error are in the CSV tables.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from hilbo.config import Study
 from hilbo.page import template
 from hilbo.paper_tables import PaperTables, aggregate_comparisons, paper_tables, set_sources
 from hilbo.preferences import rate
-from hilbo.regression import Regression
+from hilbo.regression import FEW_CLUSTERS, Regression
 from hilbo.report import as_json, save_figures, versions
 from hilbo.tables import read_cells
 from hilbo.validation_table import RESPONSES, TIE, check_validation, of_material, read_sets, read_validation
@@ -100,10 +100,12 @@ def _person(name, rows):
 
 
 def safest(table: Regression) -> pd.DataFrame:
-    """Of every coefficient the row with the widest interval among iid and clustered errors, or its profile."""
+    """Of every coefficient the row with the widest interval among iid and clustered errors, of few clusters among the
+    wild bootstrap too; or its profile."""
+    few = min(table.clusters.values(), default=FEW_CLUSTERS + 1) <= FEW_CLUSTERS
     rows = []
     for _, mine in table.table.groupby("term", sort=False):
-        plain = mine[~mine["errors"].str.startswith("wild")]
+        plain = mine if few else mine[~mine["errors"].str.startswith("wild")]
         width = (plain["high"] - plain["low"]).where(np.isfinite(plain["std_error"]), -1.0)
         separated = plain["errors"] == "profile likelihood"
         rows.append(plain[separated].iloc[0] if separated.any() else plain.loc[width.idxmax()])
@@ -167,8 +169,8 @@ def validation_figures(found: Validated) -> dict[str, tuple[Any, str, str]]:
         figures["aggregate-best"] = (
             plotting.aggregate_best_figure(found.people, found.overall),
             "Aggregate-best against individual-best",
-            "How often the population's set was preferred to individuals' own, by each participant and by all; dashed:"
-            " no preference.",
+            "How often the population's set was preferred to individuals' own, by each participant and by all (ties"
+            " left out); dashed: no preference.",
         )
     return figures
 

@@ -2,21 +2,25 @@
 
 The population optimum and everybody's own are found twice, under the study's fixed hyperparameters and under learnt
 ones (shared by all, or each person's own), and compared in units of the search ranges (NRMSE). Besides, the derivative
-of the population optimum with respect to each hyperparameter says which of them it leans on.
+of the population optimum with respect to each hyperparameter says which of them it leans on. People are merged by the
+study's rule, point by point; the share of the hierarchical rule is learnt anew, and held for the derivative.
 Paper, section IV-3: less than 3 %.
 """
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from hilbo.aggregation import Rule
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.hyperparameters import Learned, maximise_evidence, maximise_shared_evidence, optimum_sensitivity
 from hilbo.ordinal_gp import Posterior, fit
+from hilbo.population_rules import point_rule, share_of
 from hilbo.session import search_points
 from hilbo.study import Cohort, Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
 
@@ -45,6 +49,16 @@ class Robustness(eqx.Module):
     sensitivity: dict[str, Float[Array, "..."]]
     """d(population optimum, unit cube) / d(log theta, log noise, first threshold, log gaps) at the fixed values."""
     shared: bool = eqx.field(static=True)
+    rule: Rule = eqx.field(static=True)
+    """By which people were merged, point by point: the study's, or bcm where that takes all answers at once."""
+    shares: tuple[Float[Array, ""] | None, Float[Array, ""] | None]
+    """Of the hierarchical rule, under the fixed and under the learnt hyperparameters."""
+
+    def maps(self) -> tuple[partial, partial]:
+        """The population maps under the fixed and under the learnt hyperparameters: functions of points (m, d)."""
+        both = zip((self.posteriors, self.posteriors_learnt), self.shares, strict=True)
+        fixed, learnt = (partial(population, posteriors, rule=self.rule, share=share) for posteriors, share in both)
+        return fixed, learnt
 
     @property
     def flagged(self) -> Bool[Array, ""]:
@@ -82,7 +96,12 @@ def robustness(
     else:
         study_learnt = study
         again = fit_cohort(study, cohort, learned.gp)
-    fixed, optimised = (population_optimum(s, p, candidates) for s, p in ((study, posteriors), (study_learnt, again)))
+    rule, share = point_rule(study.rule, _share(study, cohort))
+    shares = share, None if share is None else _share(study_learnt, cohort)
+    fixed, optimised = (
+        population_optimum(s, p, candidates, rule, share)
+        for s, p, share in zip((study, study_learnt), (posteriors, again), shares, strict=True)
+    )
     before, after = (individual_optima(s, p, candidates) for s, p in ((study, posteriors), (study_learnt, again)))
     return Robustness(
         learned=learned,
@@ -94,9 +113,16 @@ def robustness(
         posteriors_learnt=again,
         nrmse=nrmse(optimised.x, fixed.x),
         individual_nrmse=jnp.sqrt(jnp.mean((after.x - before.x) ** 2, axis=1)),
-        sensitivity=_sensitivity(study, cohort.trials, fixed.x, tuple(learn)),
+        sensitivity=_sensitivity(study, cohort.trials, fixed.x, tuple(learn), rule, share),
         shared=shared,
+        rule=rule,
+        shares=shares,
     )
+
+
+def _share(study, cohort):
+    """What people have in common, where the study's rule asks for it."""
+    return share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
 
 
 @eqx.filter_jit
@@ -108,11 +134,11 @@ def _learn(study, trials, learn, shared, weak_priors):
 
 
 @eqx.filter_jit
-def _sensitivity(study, trials, x, learn):
+def _sensitivity(study, trials, x, learn, rule, share):
     def refit(gp):
         return jax.vmap(lambda t: fit(gp, t, inference=study.inference, throw=False))(trials)
 
     def height(w, posteriors):
-        return population(posteriors, study.space.from_box(w)[None, :])[0][0]
+        return population(posteriors, study.space.from_box(w)[None, :], rule, share)[0][0]
 
     return optimum_sensitivity(height, refit, study.space.to_box(x), study.gp, study.space.from_box, learn)

@@ -6,10 +6,12 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from hilbo.aggregation import RULES
 from hilbo.config import Study
 from hilbo.hierarchical import Share
+from hilbo.population_rules import RuleMap
 
-__all__ = ["heterogeneity", "rule_warnings", "share_content"]
+__all__ = ["heterogeneity", "in_place", "rule_warnings", "share_content"]
 
 _ALIKE = ("bcm", "poe", "gpoe", "rbcm", "grbcm", "pooled")  # rules that take people to share one function
 _SURE = 3.0  # log Bayes factor, about 20 to 1
@@ -30,6 +32,13 @@ def share_content(share: Share) -> dict[str, Any]:
         "log_bayes_factor_that_people_differ": float(share.against_one),
         "converged": bool(share.converged),
     }
+
+
+def in_place(found: RuleMap) -> str:
+    """How maps of fewer trials, or of people drawn again, are merged where that is not as the map is; else nothing."""
+    if found.rule not in RULES:
+        return "by bcm"
+    return "" if found.method == "by points" else f"by the rule {found.rule} point by point"
 
 
 def rule_warnings(study: Study, aggregate: Any) -> list[str]:

@@ -79,7 +79,8 @@ def _inside(study, means, explained, prior, rows, rule, share):
 
     def one(chosen):
         mean, variance = aggregate(rule, means[chosen], explained[chosen], prior, share=share)
-        p = jax.vmap(study.gp.likelihood.class_probabilities)(mean, variance)
+        apart = jnp.zeros_like(prior) if share is None else (1.0 - share) * prior  # a new person about the map
+        p = jax.vmap(study.gp.likelihood.class_probabilities)(mean, variance + apart)
         return p[:, -1] > jnp.max(p[:, :-1], axis=1)
 
     return jax.lax.map(one, rows)

@@ -24,7 +24,7 @@ from hilbo.config import Inference, Study
 from hilbo.errors import InputError
 from hilbo.hierarchical import Share
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
-from hilbo.population_rules import RuleMap, rule_map, share_of
+from hilbo.population_rules import RuleMap, point_rule, rule_map, share_of
 from hilbo.session import best_point, search_points
 
 __all__ = [
@@ -84,7 +84,10 @@ class Cohort(eqx.Module):
 
 
 class Optimum(eqx.Module):
-    """A point of the unit cube at which a map is largest, and the map there; leading axes for several."""
+    """A point of the unit cube at which a map is largest, and the map there; leading axes for several.
+
+    Of a population, `mean` and `sd` are the map's own, and the class probabilities those of a new person's answer.
+    """
 
     x: Float[Array, "*s d"]
     mean: Float[Array, "*s"]
@@ -119,6 +122,12 @@ class Aggregate(eqx.Module):
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube."""
         return _predict(self.map, jnp.asarray(x))
+
+    def newcomer(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of a new person's function at points of the unit cube: what answers are foretold
+        from. By the hierarchical rule it differs from the map, which is the function that people share."""
+        mean, variance = self.surface(x)
+        return mean, variance + self.map.apart
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"]:
@@ -202,16 +211,18 @@ def population_optimum(
     share: Float[Array, ""] | None = None,
 ) -> Optimum:
     """Where the population map's mean is largest in the feasible set."""
-    return _optimum(study, lambda x: population(posteriors, x, rule, share), candidates)
+    apart = 0.0 if share is None else (1.0 - share) * study.gp.kernel.variance
+    return _optimum(study, lambda x: population(posteriors, x, rule, share), candidates, apart)
 
 
 @eqx.filter_jit
 def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
     """Where a rule's map has its largest mean in the feasible set."""
-    return _optimum(study, lambda x: _predict(found, x), candidates)
+    return _optimum(study, lambda x: _predict(found, x), candidates, found.apart)
 
 
-def _optimum(study: Study, predict: Callable, candidates) -> Optimum:
+def _optimum(study: Study, predict: Callable, candidates, apart) -> Optimum:
+    """`apart`: variance of one person's function about the map's."""
     choice = acquisition.maximise(
         predict(candidates)[0],
         candidates,
@@ -222,7 +233,7 @@ def _optimum(study: Study, predict: Callable, candidates) -> Optimum:
         steps=300,
     )
     mean, variance = predict(choice.x[None, :])
-    probabilities = study.gp.likelihood.class_probabilities(mean[0], variance[0])
+    probabilities = study.gp.likelihood.class_probabilities(mean[0], variance[0] + apart)
     return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
 
 
@@ -307,8 +318,8 @@ def progress(
     """
     counts = range(1, int(cohort.counts().max()) + 1) if prefixes is None else prefixes
     candidates = search_points(study.space, seed)
-    rule = study.rule if study.rule in aggregation.RULES else "bcm"
-    share = share_of(study.gp, cohort.trials, study.inference).mean if rule == "hierarchical" else None
+    share = share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
+    rule, share = point_rule(study.rule, share)
     return _progress(study, cohort.trials, candidates, jnp.asarray(list(counts)), rule, share)
 
 

@@ -63,8 +63,10 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     sets_path, truth_path = folder / "sets.csv", folder / "truth.csv"
     sets = read_sets(sets_path, study.space.names) if sets_path.exists() else None
     truth = _truth(truth_path, study) if truth_path.exists() else None
-    compared = pd.concat(validation) if validation else None
+    compared = pd.concat(validation, ignore_index=True) if validation else None
     names = _names(study, trials)
+    told = {folder / "validation.csv": compared, sets_path: _of(sets, "sysid"), truth_path: _of(truth, "population")}
+    _told_apart(names, told)
     materials = [_material(name, study, trials, compared, sets, truth) for name in names]
     return StudyFolder(study, materials, sets, _limits(materials, compared, sets))
 
@@ -111,6 +113,21 @@ def _names(study, paths):
     return ordered
 
 
+def _of(table, source):
+    """A sets table's rows of one source."""
+    return None if table is None else table[table["source"] == source]
+
+
+def _told_apart(names, tables):
+    """Every row of these tables must name its material where there are several, or where another row does."""
+    for path, table in tables.items():
+        if table is None or table.empty or ("material" not in table and len(names) == 1):
+            continue
+        if "material" not in table or table["material"].isna().any() or (table["material"] == "").any():
+            of = f"; this study has {', '.join(names)}" if len(names) > 1 else ""
+            raise InputError(f'{path}: rows without a material; name it in a column "material" in every row{of}.')
+
+
 def _material(name, study, paths, compared, sets, truth):
     own = study.material(name) if name in study.materials else study
     tables = []
@@ -153,9 +170,9 @@ def _truth(path, study):
 def _reference(study, name, sets, truth):
     """What the optimum is held against: the sets table's system identification, else the simulation's truth."""
     for table, source, words in ((sets, "sysid", "system identification"), (truth, "population", "the truth")):
-        if table is None:
+        rows = _of(table, source)
+        if rows is None:
             continue
-        rows = table[table["source"] == source]
         rows = rows[rows["material"] == name] if name and "material" in rows else rows
         if len(rows) == 1 and np.isfinite(rows[list(study.space.names)].to_numpy(float)).all():
             physical = rows[list(study.space.names)].to_numpy(float)[0]

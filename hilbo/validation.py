@@ -3,14 +3,15 @@
 A map is anything that predicts, `predict(x) -> mean, variance` of the latent score at points (m, d) of the unit cube.
 
 *Best* is the feasible maximum of the mean. *Worst* is the deepest local minimum of the mean in the feasible set at
-which the map knows something: sd <= `known` times the prior's. *Mid* is the candidate whose mean is nearest to the
-middle of the two, among those at least `apart` from both, and equally known. All three follow from the map alone
-(paper, section VI-C).
+which the map knows something: sd <= `known` times what it is where nobody answered. *Mid* is the candidate whose mean
+is nearest to the middle of the two, among those at least `apart` from both, and equally known. All three follow from
+the map alone (paper, section VI-C).
 
 The *tolerance interval* of a parameter is the connected feasible interval through the optimum on which the highest
-answer is the most probable one (paper, section VII-C). Along any parameter but K1 the slice stays passive: K1 is held
-where it is passive, and on the passive boundary where it is not, the closest passive point; along K1 the interval ends,
-one-sided, where the boundary cuts it. Each end says what it is: another answer, the passive boundary, or the range.
+answer is the most probable one of what `predict` is about, a new person's function (paper, section VII-C). Along any
+parameter but K1 the slice stays passive: K1 is held where it is passive, and on the passive boundary where it is not,
+the closest passive point; along K1 the interval ends, one-sided, where the boundary cuts it. Each end says what it is:
+another answer, the passive boundary, or the range.
 """
 
 from collections.abc import Callable
@@ -20,6 +21,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition
@@ -62,16 +64,18 @@ def best_mid_worst(
     *,
     known: float = 0.8,
     apart: float = 0.2,
+    prior: ArrayLike | None = None,
 ) -> Sets:
     """The three renderings of a validation session; see the module. Deterministic: the map and the candidates decide.
 
     **Arguments:** `candidates`, feasible points (`session.search_points`); `known`, the largest sd of worst and mid in
-    units of the prior's; `apart`, the least distance of mid from both, in the unit cube. Raises InputError if the map
-    knows nothing well enough, or has nothing in between.
+    units of the prior's; `apart`, the least distance of mid from both, in the unit cube; `prior`, the map's variance
+    where nobody answered (`RuleMap.map_prior`), one person's if it is not given. Raises InputError if the map knows
+    nothing well enough, or has nothing in between.
     """
     candidates = jnp.asarray(candidates)
     mean, sd = _at(predict, candidates)
-    limit = known * jnp.sqrt(study.gp.kernel.diagonal(candidates[0]))
+    limit = known * jnp.sqrt(study.gp.kernel.diagonal(candidates[0]) if prior is None else prior)
     best = _optimum(study, predict, candidates, mean)
     minima = _minima(study, predict, candidates, jnp.where(sd <= limit, mean, jnp.inf))
     depth, doubt = _at(predict, minima)

@@ -119,14 +119,14 @@ MAY_IMPORT = MATHS | {
     "validation_table": {"tables"},
     "preferences": {"statistics", "validation_table"},
     "paper_tables": {"preferences"},
-    "analysis": {"study", "validation", "sensitivity", "people", "hyperparameters"},
+    "analysis": {"study", "validation", "sensitivity", "people", "hyperparameters", "rule_words"},
     "inference_data": {"study", "kernels"},
     "study_folder": {"study", "validation_table"},
     "power": {"study", "simulate"},
     "console": {"compiling"},
     "cli_material": {"console", "characterise", "material_tables", "report_material"},
     "study": {"tables", "session", "simulate", "ordinal_gp", "hyperparameters", "bcm", "population_rules"},
-    "rule_words": {"config", "hierarchical"},
+    "rule_words": {"config", "population_rules"},
     "comparison": {"study", "session", "joint", "leave_one_out", "rule_words"},
     "plotting_population": {"plotting"},
     "event_log": {"live_state"},
@@ -155,7 +155,7 @@ MAY_IMPORT["report_robustness"] = {"report"}
 MAY_IMPORT["simulate_validation"] = {"report", "simulate", "validation"}
 MAY_IMPORT["report_validation"] = {"report", "page", "paper_tables", "plotting_validation"}
 MAY_IMPORT["report_power"] = {"report", "page", "power", "plotting_power"}
-MAY_IMPORT["report_figures"] = {"analysis", "study_folder", "plotting_study", "plotting_population"}
+MAY_IMPORT["report_figures"] = {"analysis", "study_folder", "plotting_study", "plotting_population", "rule_words"}
 MAY_IMPORT["hypotheses"] = {"analysis", "report_validation"}
 MAY_IMPORT["report_study"] = {
     "hypotheses",

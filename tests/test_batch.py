@@ -16,7 +16,7 @@ from hilbo.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.session import search_points
-from hilbo.study import aggregate_cohort, cohort_of, fit_cohort, population
+from hilbo.study import aggregate_cohort, cohort_of, fit_cohort, population, population_optimum
 
 PEOPLE, TRIALS = 37, 6
 
@@ -149,6 +149,15 @@ def test_a_search_that_may_end_early_reads_the_map_off_its_last_expansion():
     (found,) = optimum_near(fitted().population, near, ("bcm",), tolerance=0.003)
     np.testing.assert_allclose(found.x, exact.x, atol=1e-4)
     assert float(found.mean) == pytest.approx(float(exact.mean), abs=1e-6)
+
+
+@pytest.mark.deep
+def test_a_streamed_optimum_foretells_a_new_person():
+    streamed = dataclasses.replace(fitted().population, rule="hierarchical", share=0.6)
+    found = optima_from(streamed, candidates(), sums(streamed, candidates()), ("hierarchical", "average"))
+    for rule, share in (("hierarchical", jnp.asarray(0.6)), ("average", None)):
+        small = population_optimum(STUDY, posteriors(), jnp.asarray(candidates()), rule, share)
+        np.testing.assert_allclose(found[rule].class_probabilities, small.class_probabilities, atol=1e-6)
 
 
 @pytest.mark.deep

@@ -72,7 +72,7 @@ def test_robustness_writes_its_check(capsys, monkeypatch, tmp_path):
     assert content["learned"]["parameters"] == ["theta", "noise"]
     assert np.isfinite(content["nrmse"])
     page = (out / "report.html").read_text()
-    assert "robust" in page and page.count("data:image/png;base64,") == 2
+    assert "robust" in page and "by the rule bcm" in page and page.count("data:image/png;base64,") == 2
     assert all((out / f"{name}.{kind}").stat().st_size for name in ("maps", "moves") for kind in ("png", "svg"))
     data = xr.load_dataset(out / "map.nc", engine="h5netcdf")
     assert data["hyperparameters"].values.tolist() == ["fixed", "by evidence"]

@@ -1,5 +1,7 @@
 """Maximum evidence against SciPy on the independent reference, the model's freedoms, and derivatives of an optimum."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,7 +16,7 @@ from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.robustness import robustness
-from hilbo.study import Cohort, fit_cohort, population_optimum
+from hilbo.study import Cohort, fit_cohort, population, population_optimum
 
 
 def problem(make=noisy):
@@ -83,6 +85,20 @@ def test_robustness_compares_optima(checked):
     assert found.individual_nrmse.shape == (3,)
     assert bool(found.flagged) == (float(found.nrmse) >= 0.03)
     assert found.learned.learn == ("theta", "noise", "thresholds")
+
+
+@pytest.mark.deep
+def test_robustness_is_that_of_the_studys_rule(checked):
+    study, cohort, found = checked
+    assert found.rule == "bcm" and found.shares == (None, None)
+    other = robustness(dataclasses.replace(study, rule="hierarchical"), cohort)
+    fixed, learnt = (float(share) for share in other.shares)
+    assert 0 < fixed < 1 and 0 < learnt < 1 and fixed != learnt
+    heights = population(found.posteriors, other.fixed.x[None, :], "hierarchical", other.shares[0])[0]
+    assert float(other.fixed.mean) == pytest.approx(float(heights[0]), rel=1e-10)
+    assert float(jnp.abs(other.fixed.mean - found.fixed.mean)) > 1e-3
+    for of, optimum in zip(other.maps(), (other.fixed, other.optimised), strict=True):
+        assert float(of(optimum.x[None, :])[0][0]) == pytest.approx(float(optimum.mean), rel=1e-10)
 
 
 @pytest.mark.deep

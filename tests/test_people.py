@@ -8,7 +8,7 @@ from datasets import SMALL
 from helpers import answers, model
 from scipy.stats import binomtest, norm
 
-from hilbo import Trials, fit
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.errors import InputError
 from hilbo.kernels import gram
 from hilbo.people import drift, excluded, lapse, left_out, measure_people, repeats
@@ -57,6 +57,24 @@ def test_consistency_counts_pairs(getkey):
     assert row["chance"] == pytest.approx((4 + 1 + 1) / 16)
     ends = binomtest(1, 2).proportion_ci()
     assert (row["consistency_low"], row["consistency_high"]) == (ends.low, ends.high)
+
+
+def test_measures_do_not_depend_on_the_unit_of_the_score():
+    """The same answers under a model in which the latent score is three times as large."""
+    x, q = np.array([[0.2] * 3, [0.3] * 3, [0.2] * 3, [0.5] * 3]), np.array([2, 1, 1, 0])
+    trials = jax.tree.map(lambda leaf: leaf[None], Trials.from_arrays(x, q))
+    square, wide = jnp.asarray(9.0), jnp.asarray(3.0)
+    one = model(CASE)
+    other = OrdinalGP(
+        RBF(one.kernel.theta, square * one.kernel.variance),
+        OrdinalProbit(wide * one.likelihood.thresholds, wide * one.likelihood.noise),
+    )
+    rows = [
+        measure_people(gp, trials, ("A",))[["lapse", "surprise", "drift", "drift_low", "drift_high"]]
+        for gp in (one, other)
+    ]
+    assert -6 < rows[0]["drift"][0] < 0
+    np.testing.assert_allclose(rows[1], rows[0], atol=1e-4)
 
 
 def test_the_lapse_rate_of_a_known_mixture():

@@ -1,5 +1,6 @@
 """Simulated studies for planning: truths in closed form, prefixes that are studies of their own, and bad plans."""
 
+import dataclasses
 import json
 import sys
 
@@ -11,8 +12,9 @@ import pytest
 
 from hilbo import Study, cli
 from hilbo.errors import InputError
+from hilbo.plotting_power import power_figure
 from hilbo.power import Plan, one_study, power_table, simulate_power, summarise, top_probability
-from hilbo.report_power import enough
+from hilbo.report_power import enough, write_power
 from hilbo.simulate import PRESETS, people
 
 
@@ -42,6 +44,30 @@ def test_summaries_of_errors_that_are_known():
     assert power_table(table, "reached").to_numpy().tolist() == [[0.6, 0.6], [1.0, 1.0]]
     assert power_table(table, "map_median").loc[2, 20] == pytest.approx(0.2)
     assert enough(table)["trials"].tolist()[1] == 10 and np.isnan(enough(table)["trials"][0])
+    n, z = 5, 1.959963984540054  # all five within: Wilson's interval ends at 1 / (1 + z^2 / n)
+    np.testing.assert_allclose(table[["reached_low", "reached_high"]].iloc[2], [1 / (1 + z**2 / n), 1.0])
+    assert len(power_figure(table, 0.2).axes) == 3
+
+
+def test_the_page_says_how_sure_a_share_is(tmp_path):
+    rows = [(s, 2, t, 0.1 * s, 0.01 * t) for s in range(5) for t in (10, 20)]
+    errors = pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
+    cost = {"preset": "paper", "seconds": 1.0, "jobs": 1}
+    content = write_power(study(), errors, Plan((2,), (10, 20), 5, 0), 0.25, cost, tmp_path)
+    assert "60 % (23 to 88)" in (tmp_path / "report.html").read_text()
+    assert content["summary"][0]["reached_low"] == pytest.approx(0.2307, abs=1e-4)
+
+
+def test_enough_is_what_larger_numbers_hold_too():
+    reached = {2: [0.9, 0.7, 0.8, 0.85], 3: [0.7, 0.9, 0.9, 0.79], 4: [0.8, 0.8, 0.8, 0.8]}
+    rows = [(m, 10 + 5 * i, share) for m, shares in reached.items() for i, share in enumerate(shares)]
+    found = enough(pd.DataFrame(rows, columns=["participants", "trials", "reached"]))
+    np.testing.assert_array_equal(found["trials"], [20, np.nan, 10])
+
+
+def test_one_person_cannot_differ():
+    with pytest.raises(InputError, match="ask for 2 participants or more"):
+        simulate_power(dataclasses.replace(study(), rule="hierarchical"), PRESETS["paper"], Plan((1, 3), (5,), 2, 0))
 
 
 @pytest.mark.parametrize("plan", [((), (5,), 4), ((3, 3), (5,), 4), ((0,), (5,), 4), ((3,), (5,), 1)])

@@ -177,7 +177,10 @@ def test_a_failed_certificate_is_said_in_one_sentence():
     from hilbo.page import results_page
     from hilbo.report_people import people_of
 
-    assert content["warnings"][0] in results_page(study, content, [], people_of(study, failed))
+    page = results_page(study, content, [], people_of(study, failed))
+    assert content["warnings"][0] in page and "committee" in page
+    other = results_page(study, content | {"rule": "hierarchical"}, [], people_of(study, failed))
+    assert "committee" not in other and "by the rule <code>hierarchical</code>" in other
 
 
 def test_many_participants_are_written_as_few():

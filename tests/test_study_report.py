@@ -1,7 +1,9 @@
 """`hilbo validate` and `hilbo report`: what they write, what they say of poor data, and bad folders in one sentence."""
 
+import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import arviz as az
 import equinox as eqx
@@ -16,13 +18,16 @@ from test_statistics import study as paper_counts
 from test_validation import plain
 
 from hilbo import Trials
-from hilbo.analysis import analyse, limits_of, settled
+from hilbo.analysis import Progress, _counts, analyse, limits_of, settled
 from hilbo.errors import InputError
-from hilbo.hypotheses import Evidence, Hypothesis
+from hilbo.hypotheses import Evidence, Hypothesis, _convergence, _materials
 from hilbo.inference_data import groups, predictive_shares, write_groups
+from hilbo.paper_tables import aggregate_comparisons
+from hilbo.plotting_study import individual_convergence
+from hilbo.population_rules import RuleMap
 from hilbo.report_figures import comparison_figures
-from hilbo.report_study import _comparison
-from hilbo.report_validation import p_words, safest, slug, validate
+from hilbo.report_study import _comparison, _shown, _tolerances
+from hilbo.report_validation import p_words, safest, slug, validate, validation_figures
 from hilbo.sensitivity import tolerance_ends
 from hilbo.simulate import PRESETS
 from hilbo.simulate_validation import sets_table, validation_table
@@ -92,6 +97,20 @@ def test_what_one_comparison_can_say():
     assert np.isposinf(rows.at["Best", "estimate"]) and np.isfinite(rows.at["Best", "low"])
 
 
+@pytest.mark.parametrize(("people", "few"), [(9, True), (14, False)])
+def test_what_is_shown_is_what_the_warning_says_to_report(people, few):
+    """Of few clusters the wider of the clustered and the wild bootstrap interval, as the table's own warning has it."""
+    answers = paper_counts(np.random.default_rng(1))
+    names = answers["participant"].unique()[:people]
+    table = validate(answers[answers["participant"].isin(names)]).regressions()["II"]
+    assert any("wild bootstrap interval" in words for words in table.warnings) == few
+    kinds = table.table[few | ~table.table["errors"].str.startswith("wild")]
+    widest = (kinds["high"] - kinds["low"]).groupby(kinds["term"]).max()
+    rows = safest(table).set_index("term")
+    np.testing.assert_array_equal(rows["high"] - rows["low"], widest[rows.index])
+    assert rows["errors"].str.startswith("wild").any() == few
+
+
 def test_ties_are_kept_apart():
     found = validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
     assert found.people["ties"].sum() == 20 and found.people["wins"].sum() == 279
@@ -112,7 +131,11 @@ def test_limits_are_named():
     assert found[0].startswith("Fewer than 5 answers were given by P1")
     assert "between 2 and 9" in found[1] and 'P2 ("different")' in found[2]
     assert "plans 25 trials; nobody has given more than 9" in found[3]
-    assert limits_of(study, crowd([HILL]))[0].startswith("P0 is the only participant")
+    assert limits_of(study, crowd([HILL]))[0].startswith(
+        "P0 is the only participant: the population map is that person's own,"
+    )
+    shrunk = limits_of(dataclasses.replace(study, rule="rbcm"), crowd([HILL]))[0]
+    assert "own, shrunk towards the prior, and nothing" in shrunk
 
 
 @pytest.mark.parametrize(
@@ -120,6 +143,53 @@ def test_limits_are_named():
 )
 def test_when_an_optimum_has_settled(errors, expected):
     assert settled(np.arange(1, 6), np.array(errors, float)) == expected
+
+
+def test_who_stopped_early_has_not_converged_for_that():
+    """One moves until the end, one stays from trial 2 on, and one stops after a trial or two, still moving."""
+    ways = np.array([[0, 1, 2, 3, 4, 5], [0, 5, 5, 5, 5, 5], [0, 5, 5, 5, 5, 5]]).T / 10
+    progress = Progress(np.arange(1, 7), ways[:, 1:2], ways[:, :, None], np.array([6, 6, 2]))
+    assert progress.settled(0.05) == [None, 2, None]
+    assert np.isnan(progress.to_end()[1][2:, 2]).all() and np.isfinite(progress.to_end()[1][:, :2]).all()
+    assert set(_counts(crowd([HILL, HILL[:4], HILL[:7]]))) >= {4, 5, 7, 9}
+    (line,) = individual_convergence(plain(), crowd([HILL, HILL, HILL[:2]]), progress).axes[0].lines
+    np.testing.assert_allclose(line.get_ydata(), [50, 0, 15, 10, 5, 0], atol=1e-12)
+    one = jnp.ones(())
+    aggregate = SimpleNamespace(map=RuleMap("bcm", "by points", None, None, one, one))
+    for end, words in ((2, "1 of 3 individual optima"), (1, "1 of 2 individual optima")):
+        found = SimpleNamespace(
+            progress=progress._replace(ends=np.array([6, 6, end])),
+            cohort=SimpleNamespace(names=("A", "B", "C")),
+            aggregate=aggregate,
+        )
+        (item,) = _convergence(SimpleNamespace(found=found, reference=None))
+        assert item.side == "for" and words in item.text and "(for: one at least)" in item.text
+
+
+def test_other_materials_are_the_others():
+    """H1 to H3 are of the first material, and its figures are no evidence for H4."""
+    study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
+    optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.9, 0.5]]))
+    found = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
+    parts = {"found": found, "reference_name": "the truth"}
+    first, second, third = (
+        SimpleNamespace(name=name, validated=asked, reference=reference, **parts)
+        for name, asked, reference in (("A", None, np.zeros(2)), ("B", validated, np.full(2, 0.5)), ("C", None, None))
+    )
+    items = list(_materials([first, second, third]))
+    assert [item.text[0] for item in items] == ["B", "B", "C"] and [i.side for i in items] == ["for", "for", "open"]
+    assert items[0].text.endswith("(for: nearer than that).")
+    assert "76.6 % of the decided comparisons (20 ties;" in items[1].text
+    assert [item.side for item in _materials([first])] == ["open"]
+
+
+def test_measures_have_the_digits_that_answers_give():
+    head, rows = _shown(pd.DataFrame({"lapse_low": [0.12345], "trials": [25], "drift_high": [np.inf]}), digits=2)
+    assert (head, rows) == (["lapse low", "trials", "drift high"], [["0.12", "25", "∞"]])
+    row = dict(hyperparameters="fixed", parameter="u", draws_without=0.0, low_end="range", high_end="range")
+    row |= dict(low=1.0, high=12.346, low_from=1.0, low_to=1.2346, high_from=1.1, high_to=12.346)
+    _, ((*_, low, ends, _),) = _tolerances(pd.DataFrame([row]))
+    assert (low, ends) == ("12.35 (range)", "1.1 to 12")
 
 
 def test_verdicts_count_what_can_be_said():
@@ -272,6 +342,45 @@ def test_materials_have_their_own_references(tmp_path):
     strict = read_folder(folder, "trials < 5").materials[0]
     with pytest.raises(InputError, match="leaves out all 1"):
         analyse(strict.study, strict.cohort)
+
+
+VALIDATION = "participant,trial,set_a,set_b,class_a,class_b,preferred\n"
+
+
+def test_two_validation_tables_are_read_as_one(tmp_path):
+    row = "{},1,aggregate,individual:B,close,different,{}\n"
+    first, second = (VALIDATION + row.format(*cells) for cells in (("A", "a"), ("B", "b")))
+    folder = folder_with(tmp_path, trials__csv=HEAD + ROW, **{"validation-1__csv": first, "validation-2__csv": second})
+    (material,) = read_folder(folder).materials
+    found = validate(material.validation, bootstrap=False)
+    assert found.people["wins"].tolist() == [1, 0] and found.comparisons == 2
+    twice = aggregate_comparisons(
+        pd.concat([material.validation] * 2), {"aggregate": "aggregate", "individual:B": "individual:B"}
+    )
+    assert len(twice) == 4
+
+
+def test_a_pair_that_was_only_tied_is_drawn():
+    rows = [("A", 1, "best", "mid", "close", "similar", "tie"), ("A", 2, "mid", "worst", "similar", "different", "a")]
+    rows += [("B", 1, "mid", "worst", "similar", "different", "b")]
+    table = pd.DataFrame(rows, columns=VALIDATION.strip().split(","))
+    assert set(validation_figures(validate(table, bootstrap=False))) == {"validation"}
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("validation", VALIDATION + "A,1,best,mid,close,similar,a\n"),
+        ("sets", "set_id,source,K1,B1,alpha\nsysid,sysid,5,6,0.2\n"),
+        ("truth", "source,K1,B1,alpha\npopulation,5,6,0.2\n"),
+        ("truth", "source,material,K1,B1,alpha\npopulation,soft,5,6,0.2\npopulation,,5,6,0.2\n"),
+    ],
+)
+def test_what_is_of_no_material_is_not_taken_for_all(tmp_path, file, text):
+    trials = "material," + HEAD + "soft,A,1,close,5,6,0.2\nhard,A,1,different,4,6,0.2\n"
+    folder = folder_with(tmp_path, trials__csv=trials, **{f"{file}__csv": text})
+    with pytest.raises(InputError, match=f"{file}.csv: rows without a material.*this study has soft, hard"):
+        read_folder(folder)
 
 
 @pytest.mark.deep

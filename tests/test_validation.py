@@ -64,6 +64,8 @@ def test_a_corner_that_nobody_knows_is_not_the_worst():
     assert np.linalg.norm(best_mid_worst(study, hill, points).x[2] - 0.5) < 0.05
     everywhere = jnp.concatenate([points, jnp.asarray(study.space.walls(512, 0))])
     np.testing.assert_allclose(best_mid_worst(study, hill, everywhere, known=1.0).x[2], [1.0, 1.0], atol=1e-9)
+    # As known is a point whose sd of 0.95 is half of what the map says without answers.
+    np.testing.assert_allclose(best_mid_worst(study, hill, everywhere, prior=4.0).x[2], [1.0, 1.0], atol=1e-9)
 
 
 def test_maps_that_know_too_little_are_refused():
