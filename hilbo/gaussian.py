@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.linalg import cholesky, eigh, solve_lower
@@ -32,6 +33,7 @@ __all__ = [
 
 Terms = TypeVar("Terms")
 _NATS = 0.02  # of a log evidence, which nobody reads more closely
+_WAYS = np.array([3.0, 5.0, 7.0, 11.0])  # to multiply by and to divide by, which rounds
 
 
 class Certificate(eqx.Module):
@@ -126,8 +128,8 @@ def evidence_error(
     P eps |K| |a| + eps |mode|. The log posterior being stationary, the sums in the log evidence move by at most
     sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior variances, dW the change of the
     curvatures within d. Where the noise is far below the prior's standard deviation, these notice what a residual in
-    units of the latter cannot. And the elements of K are off by eps K, in directions that differ: a'K a / 2 by the
-    root of the sum of squares of eps a_i K_ij a_j / 2.
+    units of the latter cannot. And the elements of K are rounded, equal ones in the same way: what that does to
+    a'K a / 2 is seen from rounding them once more, in several ways.
     """
     epsilon, (variance, explain) = jnp.finfo(weights.dtype).eps, posterior
     rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
@@ -135,7 +137,9 @@ def evidence_error(
     off = jnp.sum(jnp.abs(steps - covariance @ explain(steps)), axis=1) + epsilon * jnp.abs(mode)
     below, above = jax.vmap(curvature_at)(jnp.stack([mode - off, mode + off]))
     change = jnp.maximum(jnp.abs(below - curvature), jnp.abs(above - curvature))
-    formed = epsilon * jnp.sqrt(weights**2 @ covariance**2 @ weights**2)
+    again = covariance[None, :, :] * _WAYS.astype(weights.dtype)[:, None, None]
+    rounded = again / _WAYS.astype(weights.dtype)[:, None, None] - covariance[None, :, :]
+    formed = jnp.linalg.norm(jnp.einsum("i,kij,j->k", weights, rounded, weights))
     return 0.5 * (jnp.sum(curvature * off**2) + jnp.sum(jnp.abs(variance) * change) + formed)
 
 
