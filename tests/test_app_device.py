@@ -59,14 +59,17 @@ def test_a_pressed_device_rests_until_begin_and_again_in_a_break(tmp_path):
 
 
 def test_a_pressed_device_rests_while_something_is_still_compiled(tmp_path):
-    with left_pressed() as simulator, Live(tmp_path, device=simulator.port, warm=False) as live:
-        seen = watched(live)
-        live.participant.post("/api/participant/begin", {})
-        pressed(live)
-        time.sleep(2.0)
-        assert set(seen) <= {"STOPPED"}
-        live.warmed.set()
-        live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
+    with left_pressed() as simulator:
+        with Live(tmp_path, device=simulator.port) as live:
+            live.until(lambda _: live.events("propose"))
+        with Live(tmp_path, device=simulator.port, warm=False) as live:  # which has its trial already
+            seen = watched(live)
+            live.participant.post("/api/participant/begin", {})
+            pressed(live)
+            time.sleep(2.0)
+            assert set(seen) <= {"STOPPED"}
+            live.warmed.set()
+            live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
 
 
 def test_a_stop_that_failed_is_said_and_sent_again(tmp_path, monkeypatch):

@@ -458,6 +458,12 @@ def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tm
         live.until(lambda v: not v["participant_here"], live.whole)  # nothing is closed, and nothing comes any more
         live.until(lambda v: v["phase"] == "hello", live.whole)
         assert live.events("repeat")
+        live.command("pause")
+        live.command("resume")  # by the experimenter, with nobody there
+        live.until(lambda v: v["phase"] == "hello", live.whole)
         page.post("here")
         assert live.whole()["participant_here"]
+        live.command("pause")
+        live.command("resume")
+        live.until(lambda v: v["phase"] == "step", live.whole)
         page.stream.close()

@@ -1,6 +1,7 @@
 """Whole sessions in headless Chromium: real server, real pages, the firmware's own core as the device."""
 
 import json
+import os
 import subprocess
 import time
 
@@ -8,7 +9,7 @@ import pytest
 from live_server import DATA, PATIENCE, Live
 
 from hilbo.app import rehearsal
-from hilbo.app.robot import Participant, browser, find_browser
+from hilbo.app.robot import Client, Participant, browser, find_browser
 from hilbo.config import Study
 from hilbo.event_log import EventLog, read_log
 
@@ -160,6 +161,43 @@ def test_a_dialog_names_its_trial_and_never_hits_another(pages):
     experimenter.keyboard.press("Enter")
     until_event(live, experimenter, "undo")
     assert live.events("undo")[0].data == {"id": 2, "reason": "slipped"}
+
+
+def test_the_experimenter_reads_a_refusal_and_keeps_a_note_that_was_not_written(pages, monkeypatch):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    real = os.write
+
+    def full(file, data):
+        if file == live.log._file and b'"kind":"note"' in bytes(data):
+            raise OSError(28, "No space left on device")
+        return real(file, data)
+
+    monkeypatch.setattr(os, "write", full)
+    experimenter.fill("#note-text", "yawned")
+    experimenter.keyboard.press("Enter")
+    until(experimenter, "!document.getElementById('alert').hidden")
+    monkeypatch.setattr(os, "write", real)
+    assert "space" in experimenter.inner_text("#alert")
+    assert experimenter.input_value("#note-text") == "yawned"
+    experimenter.evaluate("command('resume').then(() => { said.until += 1e6; })")  # however slow this computer is
+    until(experimenter, "document.getElementById('alert').textContent.includes('nothing to go on to')")
+    until_answered(participant, 2)  # many views later
+    assert "nothing to go on to" in experimenter.inner_text("#alert")
+    experimenter.click("#note button")
+    until_event(live, experimenter, "note")
+    until(experimenter, "document.getElementById('note-text').value === ''")
+    until(experimenter, "document.getElementById('alert').hidden")
+
+
+def test_a_page_of_the_experimenter_that_was_replaced_says_so_and_asks_no_more(pages):
+    live, _, experimenter = pages
+    Client(live.place.links()["experimenter"])  # a newer link is opened elsewhere
+    until(experimenter, "document.getElementById('alert').textContent.includes('newer link')")
+    asked: list[str] = []
+    experimenter.on("request", lambda request: asked.append(request.url))
+    experimenter.wait_for_timeout(3000)
+    assert asked == []
 
 
 def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):

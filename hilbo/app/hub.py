@@ -229,7 +229,7 @@ class Hub:
 
     def _goes_on(self, state, at):
         event = (live_session.resume if state.paused is not None else live_session.go_on)(state, at)
-        self.begun = True
+        self.begun = self.watchers.participant_here  # who comes later presses Begin
         return event
 
     async def _estop(self):

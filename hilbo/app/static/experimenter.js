@@ -3,7 +3,9 @@
 
 const at = (id) => document.getElementById(id);
 const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent = text; };
+const SAID = 10000;                  // ms that a refusal stays on the page
 let view = null, mapOf = null, lastEscape = 0;
+let said = { text: "", until: 0 };   // what this page has to say itself, beside the server's alert
 
 function number(value, digits = 4) {
   if (value === null || value === undefined) return "–";
@@ -26,7 +28,7 @@ function draw() {
   document.title = `${view.who} – ${view.phase_words}`;
   document.body.dataset.phase = view.phase;
   list("trial", view.trial); list("trust", view.trust);
-  drawDevice(); drawAlert(view.alert || ""); drawAnswers(); drawLog();
+  drawDevice(); drawAlert(); drawAnswers(); drawLog();
   put("watch", view.participant_here ? "Connected." : "Not connected.");
   for (const b of document.querySelectorAll("[data-command]")) b.disabled = !view.may.includes(b.dataset.command);
   for (const b of document.querySelectorAll(".stop")) b.disabled = !view.may.includes("estop");
@@ -41,7 +43,16 @@ function drawDevice() {
   at("clear").hidden = !view.may.includes("clear");
 }
 
-function drawAlert(text) { at("alert").hidden = !text; put("alert", text); }
+function drawAlert() {
+  const own = performance.now() < said.until ? said.text : "", text = [own, view && view.alert].filter(Boolean).join(" ");
+  at("alert").hidden = !text; put("alert", text);
+}
+
+function say(text, milliseconds = SAID) {
+  said = { text, until: performance.now() + milliseconds };
+  drawAlert();
+  if (text && milliseconds < Infinity) setTimeout(drawAlert, milliseconds + 50);
+}
 
 function drawAnswers() {
   const t = view.table;
@@ -82,16 +93,17 @@ async function loadMap() {
   } catch { mapOf = null; }
 }
 
+// What the server says to a command; null if it was refused, or nobody answers.
 async function command(name, more = {}) {
   try {
     const reply = await fetch(`/api/experimenter/${name}`, {
       method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(more),
     });
     const news = await reply.json();
-    if (!reply.ok) drawAlert(news.error);
-    return news;
+    say(reply.ok ? "" : news.error);
+    return reply.ok ? news : null;
   } catch {
-    drawAlert("The server does not answer; look at the terminal it was started in.");
+    say("The server does not answer; look at the terminal it was started in.");
     return null;
   }
 }
@@ -134,7 +146,7 @@ at("note").addEventListener("submit", async (e) => {
 });
 at("invite").addEventListener("click", async () => {
   const found = await command("invite");
-  if (!found || !found.link) return;
+  if (!found) return;
   put("link-text", found.link);
   at("qr").src = found.qr;
   at("link").hidden = false;
@@ -142,9 +154,15 @@ at("invite").addEventListener("click", async () => {
 
 function listen() {
   const source = new EventSource("/api/experimenter/events");
+  source.onopen = () => say("");
   source.addEventListener("view", (e) => { view = JSON.parse(e.data); draw(); });
+  source.addEventListener("moved", () => {
+    source.close();
+    say("A newer link of the experimenter has been opened; this page is no longer part of the session.", Infinity);
+    for (const b of document.querySelectorAll("button")) b.disabled = true;
+  });
   source.onerror = () => {
-    drawAlert("The connection to the server is gone; it is being restored.");
+    say("The connection to the server is gone; it is being restored.", Infinity);
     if (source.readyState === EventSource.CLOSED) setTimeout(listen, 1500);
   };
 }
