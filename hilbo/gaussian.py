@@ -32,7 +32,7 @@ __all__ = [
 
 
 Terms = TypeVar("Terms")
-_NATS = 0.02  # of a log evidence, which nobody reads more closely
+_NATS, _SHARE = 0.02, 1e-5  # of a log evidence, which nobody reads more closely
 _WAYS = np.array([3.0, 5.0, 7.0, 11.0])  # to multiply by and to divide by, which rounds
 
 
@@ -56,7 +56,7 @@ class Certificate(eqx.Module):
     evidence_error: Float[Array, ""]
     """What the distance from the exact mode, and the rounding of K and K a, do to the log evidence, to first order."""
     evidence_tolerance: Float[Array, ""]
-    """0.02 + eps^(1/2) |log evidence|: evidences that are nearer than that decide nothing."""
+    """0.02 + max(eps^(1/2), 1e-5) |log evidence|: evidences that are nearer than that decide nothing."""
     converged: Bool[Array, ""]
     """residual <= tolerance, evidence_error <= evidence_tolerance, no variance below its resolution, all finite."""
 
@@ -144,8 +144,8 @@ def evidence_error(
 
 
 def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:
-    """How far off a log evidence may be: 0.02 + eps^(1/2) |log evidence|."""
-    return _NATS + jnp.finfo(log_evidence.dtype).eps ** 0.5 * jnp.abs(log_evidence)
+    """How far off a log evidence may be: 0.02 + max(eps^(1/2), 1e-5) |log evidence|."""
+    return _NATS + max(float(jnp.finfo(log_evidence.dtype).eps) ** 0.5, _SHARE) * jnp.abs(log_evidence)
 
 
 def still(terms: Terms) -> Terms:
