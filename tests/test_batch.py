@@ -67,6 +67,7 @@ def posteriors(inference="laplace"):
     return fit_cohort(STUDY, cohort(), inference=inference)
 
 
+@pytest.mark.deep
 def test_the_merged_map_is_that_of_the_posteriors_held_at_once():
     for rule in ("bcm", "average"):
         found = fitted().sums.merge(1.3, PEOPLE, rule)

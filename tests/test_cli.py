@@ -60,6 +60,7 @@ def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
     assert "--force" in stderr
 
 
+@pytest.mark.deep
 def test_robustness_writes_its_check(capsys, monkeypatch, tmp_path):
     table = pd.read_csv(VIDEO[0], dtype=str)
     table[table["participant"].isin(["V01", "V02"])].to_csv(tmp_path / "two.csv", index=False)

@@ -72,6 +72,7 @@ def test_points_at_which_nobody_answered_change_nothing():
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
+@pytest.mark.deep
 def test_people_who_do_not_differ_are_one_person():
     counts = counts_of(cohort(), 3)
     one, other = fit_counts(GP, jnp.ones(()), counts), fit_counts(GP, jnp.asarray(0.4), one_person(counts))

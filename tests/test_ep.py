@@ -170,6 +170,7 @@ def test_padded_equals_unpadded(make):
     assert_same(bare, fit(model(data), rubbish, inference="ep"))
 
 
+@pytest.mark.deep
 def test_a_batch_equals_a_loop():
     data = [make() for make in (separated, near_separable, repeated, repeated_19)]
     gp, trials = model(data[0]), [answers(each) for each in data]
@@ -215,6 +216,7 @@ def test_a_warm_start_changes_the_steps_and_not_the_result(make):
     assert_same(by_ep(data, start=jnp.where(cold.trials.mask, wild, 0.0)), cold, rtol=1e-10)
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("make", [separated, repeated, near_separable])
 def test_float32_against_float64(make):
     data, x = make(), make().x_new.astype(np.float32)

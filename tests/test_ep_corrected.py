@@ -88,6 +88,7 @@ def test_no_answers_and_one_answer_are_expectation_propagation():
     np.testing.assert_allclose(found.log_evidence, expected.log_evidence, rtol=1e-14)
 
 
+@pytest.mark.deep
 def test_a_batch_equals_a_loop():
     data = [make() for make in (separated, near_separable, repeated)]
     gp, trials = model(data[0]), [answers(each) for each in data]
@@ -122,6 +123,7 @@ def difference(along, *data):
     return (4 * slope(1e-3) - slope(2e-3)) / 3
 
 
+@pytest.mark.deep
 def test_derivative_along_a_direction():
     along, data = jnp.asarray([1.0, -0.5, 0.03, 0.2, -0.1]), near_separable()
     args = answers(data), jnp.asarray(data.x_new)

@@ -109,6 +109,7 @@ def test_one_person_says_nothing_of_the_share():
     np.testing.assert_allclose(found.interval, [0.025, 0.975], atol=1e-3)
 
 
+@pytest.mark.deep
 def test_the_curve_is_the_evidence_between_its_nodes():
     trials = of_people(simulated(6, 10, 0.6))
     found = learn_share(GP, trials)

@@ -195,6 +195,7 @@ def probit_terms(a, b, z, noise):
     )
 
 
+@pytest.mark.deep
 def test_a_preference_is_a_term_on_a_difference():
     x = np.random.default_rng(5).random((9, 2))
     kernel, likelihood, noise = RBF(8.0, 1.4), OrdinalProbit((-0.5, 0.5), 0.5), 0.6

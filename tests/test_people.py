@@ -16,6 +16,7 @@ from hilbo.people import drift, excluded, lapse, left_out, measure_people, repea
 CASE = SMALL[0]()
 
 
+@pytest.mark.deep
 def test_leaving_an_answer_out_is_dropping_its_site():
     """The Gaussian of all sites but one, by dense algebra; and nearly EP's own fit without that answer."""
     data = CASE

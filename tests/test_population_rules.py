@@ -56,6 +56,7 @@ def test_few_answers_are_merged_exactly_and_many_by_points():
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
+@pytest.mark.deep
 def test_grbcm_shares_answers_and_counts_none_twice():
     found = rule_map(GP, cohort(), "grbcm")
     assert found.experts is not None and found.shared is not None

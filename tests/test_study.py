@@ -133,6 +133,7 @@ def test_prefixes_and_subsets(cohort):
         cohort.of(["P9"])
 
 
+@pytest.mark.deep
 def test_the_optimum_is_where_the_map_is_highest(cohort):
     found = aggregate_cohort(STUDY, cohort)
     many = jnp.asarray(STUDY.space.candidates(8192, 9))
