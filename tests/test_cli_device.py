@@ -267,13 +267,9 @@ def test_a_device_that_stays_serves_one_command_after_another(device, staying):
 
 
 def test_simulate_names_its_port_and_ends_with_ctrl_c(device):
-    stays = subprocess.Popen(
-        [*HILBO, "simulate"],
-        stdout=subprocess.PIPE,
-        text=True,
-        env=ENVIRONMENT,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # which tests in the background ignore
-    )
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # tests in a shell's background ignore it
+    stays = subprocess.Popen([*HILBO, "simulate"], stdout=subprocess.PIPE, text=True, env=ENVIRONMENT)
+    signal.signal(signal.SIGINT, before)
     port = stays.stdout.readline().strip()
     assert device("hello", "--device", port, "--patience", 60)[0] == 0
     stays.send_signal(signal.SIGINT)
