@@ -35,7 +35,7 @@ LIMITS = (
     "",
     "What stands between a row and its floor:",
     "",
-    "- live step, session: the likelihood's terms in each Newton step, the screening, polishing at walls, and some Python.",
+    "- live step, session: the likelihood's terms in each Newton step, screening, polishing at walls, some Python.",
     "- pooled, EP: a sweep is a factor, as many solves as answers, the joint covariance, and Newton's matrix for all",
     "  cavity variances with its own factor: about ten times what a step towards Laplace's mode takes. Fewer than five",
     "  sweeps after Laplace's mode, or a way that never forms the joint covariance, would be needed for less.",
