@@ -140,7 +140,7 @@ def maximise(
     - `allowed`: which points may be chosen at all, e.g. none too near to earlier ones.
     - `starts`, `steps`: how many candidates, at least 0.1 apart, are polished, and at most how many Newton steps each
       may take; 0 starts means no polishing.
-    - `gain`: polishing ends where its next step promises less than that.
+    - `gain`: polishing ends where the score could rise by less than that within the cube (`TrustRegionNewton`).
     """
     if allowed is not None:
         values = jnp.where(jax.vmap(allowed)(candidates), values, -jnp.inf)

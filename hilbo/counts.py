@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
-from hilbo.gaussian import Certificate, GaussianPosterior, evidence_tolerance
+from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
 from hilbo.kernels import RBF, gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
@@ -90,7 +90,8 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
     last = _step(gp.likelihood, share, covariance, answers.counts, mode)
     beyond = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta)[2])
     error = jnp.abs(_log_evidence(gp.likelihood, answers.counts, last, beyond) - value)
-    allowed = evidence_tolerance(value)
+    every = jnp.concatenate([share**0.5 * weights[None, :], (1.0 - share) ** 0.5 * mode.weights])
+    rounding = evidence_rounding(covariance, every)
     certificate = Certificate(
         residual=residual,
         tolerance=tolerance,
@@ -100,8 +101,9 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
         smallest_variance=smallest,
         variance_resolution=resolution,
         evidence_error=error,
-        evidence_tolerance=allowed,
-        converged=(residual <= tolerance) & jnp.isfinite(value) & (error <= allowed),
+        evidence_tolerance=evidence_tolerance(value),
+        evidence_rounding=rounding,
+        converged=(residual <= tolerance) & evidence_known(value, error, rounding),
     )
     inverse = system.factor.T @ system.factor
     latent = GaussianPosterior(shared @ weights, weights, system.factor, inverse, value, certificate)

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hilbo.gaussian import evidence_error, evidence_tolerance, factorise
+from hilbo.gaussian import evidence_error, evidence_known, evidence_rounding, factorise
 from hilbo.laplace import Terms, find_mode
 from hilbo.linalg import solve_lower
 
@@ -91,7 +91,7 @@ def laplace_evidence(
     resolved = smallest >= jnp.finfo(value.dtype).eps * largest * found.eta.size**0.5
     explained = post.variance, lambda y: post.inverse @ y
     error = evidence_error(matrix, found.eta, weights, curvature, explained, lambda eta: terms(own)(eta)[2])
-    sure = jnp.isfinite(value) & (error <= evidence_tolerance(value))
+    sure = evidence_known(value, error, evidence_rounding(matrix, weights[None, :]))
     certified = (found.residual <= found.tolerance) & sure & resolved
     return Evidence(value, gradient, hessian, weights, paths.weights, certified)
 

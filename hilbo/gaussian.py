@@ -21,6 +21,8 @@ __all__ = [
     "GaussianPosterior",
     "certify",
     "evidence_error",
+    "evidence_known",
+    "evidence_rounding",
     "evidence_tolerance",
     "factor",
     "factorise",
@@ -54,11 +56,14 @@ class Certificate(eqx.Module):
     variance_resolution: Float[Array, ""]
     """Rounding error to expect in a posterior variance: eps * largest prior variance * sqrt(n)."""
     evidence_error: Float[Array, ""]
-    """What the distance from the exact mode, and the rounding of K and K a, do to the log evidence, to first order."""
+    """What the distance from the exact mode, and the rounding of K a, do to the log evidence, to first order."""
     evidence_tolerance: Float[Array, ""]
-    """0.02 + max(eps^(1/2), 1e-5) |log evidence|: evidences that are nearer than that decide nothing."""
+    """0.02 + eps^(1/2) |log evidence|: evidences that are nearer than that decide nothing."""
+    evidence_rounding: Float[Array, ""]
+    """What the rounding of K itself does to the log evidence."""
     converged: Bool[Array, ""]
-    """residual <= tolerance, evidence_error <= evidence_tolerance, no variance below its resolution, all finite."""
+    """residual <= tolerance, evidence_error <= evidence_tolerance, evidence_error + evidence_rounding <= 0.02 +
+    max(eps^(1/2), 1e-5) |log evidence|, no variance below its resolution, all finite."""
 
 
 class GaussianPosterior(eqx.Module):
@@ -96,18 +101,19 @@ def certify(
     variance = prior - jnp.sum((factor @ covariance) ** 2, axis=0)
     post = variance, lambda y: factor.T @ (factor @ y)
     error = evidence_error(covariance, mode, weights, curvature, post, curvature_at)
-    allowed = evidence_tolerance(log_evidence)
+    rounding = evidence_rounding(covariance, weights[None, :])
     smallest = jnp.min(jnp.where(curvature > 0, variance, largest))
     resolution = epsilon * largest * weights.shape[0] ** 0.5
     apart = jnp.abs(mode - covariance @ weights)
     found = (search["residual"] <= search["tolerance"]) & jnp.all(apart <= epsilon**0.25 * sd)
-    sure = jnp.isfinite(log_evidence) & (error <= allowed)
+    sure = evidence_known(log_evidence, error, rounding)
     return Certificate(
         **search,
         smallest_variance=smallest,
         variance_resolution=resolution,
         evidence_error=error,
-        evidence_tolerance=allowed,
+        evidence_tolerance=evidence_tolerance(log_evidence),
+        evidence_rounding=rounding,
         converged=found & sure & (smallest >= resolution),
     )
 
@@ -128,8 +134,7 @@ def evidence_error(
     P eps |K| |a| + eps |mode|. The log posterior being stationary, the sums in the log evidence move by at most
     sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior variances, dW the change of the
     curvatures within d. Where the noise is far below the prior's standard deviation, these notice what a residual in
-    units of the latter cannot. And the elements of K are rounded, equal ones in the same way: what that does to
-    a'K a / 2 is seen from rounding them once more, in several ways.
+    units of the latter cannot.
     """
     epsilon, (variance, explain) = jnp.finfo(weights.dtype).eps, posterior
     rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
@@ -137,15 +142,30 @@ def evidence_error(
     off = jnp.sum(jnp.abs(steps - covariance @ explain(steps)), axis=1) + epsilon * jnp.abs(mode)
     below, above = jax.vmap(curvature_at)(jnp.stack([mode - off, mode + off]))
     change = jnp.maximum(jnp.abs(below - curvature), jnp.abs(above - curvature))
-    again = covariance[None, :, :] * _WAYS.astype(weights.dtype)[:, None, None]
-    rounded = again / _WAYS.astype(weights.dtype)[:, None, None] - covariance[None, :, :]
-    formed = jnp.linalg.norm(jnp.einsum("i,kij,j->k", weights, rounded, weights))
-    return 0.5 * (jnp.sum(curvature * off**2) + jnp.sum(jnp.abs(variance) * change) + formed)
+    return 0.5 * (jnp.sum(curvature * off**2) + jnp.sum(jnp.abs(variance) * change))
+
+
+def evidence_rounding(covariance: Float[Array, "n n"], weights: Float[Array, "k n"]) -> Float[Array, ""]:
+    """What the rounding of K does to the sum of a'K a / 2 over the rows a of `weights`.
+
+    Equal elements of K are rounded in the same way, so that answers which contradict each other at one place lose
+    nothing. So K is rounded once more, in several ways, and the differences are what is counted.
+    """
+    ways = jnp.asarray(_WAYS, weights.dtype)[:, None, None]
+    rounded = covariance[None, :, :] * ways / ways - covariance[None, :, :]
+    return 0.5 * jnp.linalg.norm(jnp.einsum("ki,wij,kj->w", weights, rounded, weights))
+
+
+def evidence_known(value: Float[Array, ""], error: Float[Array, ""], rounding: Float[Array, ""]) -> Bool[Array, ""]:
+    """Whether a log evidence with this `error` and `rounding` is finite and close enough (see [`Certificate`][])."""
+    share = max(float(jnp.finfo(value.dtype).eps) ** 0.5, _SHARE)
+    near = error + rounding <= _NATS + share * jnp.abs(value)
+    return jnp.isfinite(value) & (error <= evidence_tolerance(value)) & near
 
 
 def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:
-    """How far off a log evidence may be: 0.02 + max(eps^(1/2), 1e-5) |log evidence|."""
-    return _NATS + max(float(jnp.finfo(log_evidence.dtype).eps) ** 0.5, _SHARE) * jnp.abs(log_evidence)
+    """How far off the search may leave a log evidence: 0.02 + eps^(1/2) |log evidence|."""
+    return _NATS + jnp.finfo(log_evidence.dtype).eps ** 0.5 * jnp.abs(log_evidence)
 
 
 def still(terms: Terms) -> Terms:

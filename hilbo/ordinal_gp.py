@@ -25,7 +25,7 @@ from hilbo.ep import ep
 from hilbo.ep_corrected import ep_corrected
 from hilbo.errors import InputError
 from hilbo.exact import ExactPosterior, SamplingCertificate, exact
-from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained
+from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, mean_and_explained
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
@@ -315,8 +315,9 @@ def _unresolved(certificate: Certificate) -> Bool[Array, ""]:
     return certificate.smallest_variance < certificate.variance_resolution
 
 
-def _vague(certificate: Certificate) -> Bool[Array, ""]:
-    return certificate.evidence_error > certificate.evidence_tolerance
+def _vague(posterior: Posterior) -> Bool[Array, ""]:
+    certificate = posterior.certificate
+    return ~evidence_known(posterior.log_evidence, certificate.evidence_error, certificate.evidence_rounding)
 
 
 def _checked(posterior: Posterior, sought: str) -> Posterior:
@@ -344,11 +345,11 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
                 f"the {sought} was not found: its log evidence is not finite, though its residual is"
                 f" {float(certificate.residual):.3g}; check that the thresholds rise."
             )
-        if found and isinstance(certificate, Certificate) and bool(_vague(certificate)):
+        if found and isinstance(certificate, Certificate) and bool(_vague(posterior)):
             raise InferenceError(
                 f"the {sought} was found (residual {float(certificate.residual):.3g}), but not closely enough for its"
-                f" evidence, which may be off by {float(certificate.evidence_error):.3g}; use a larger noise, float64,"
-                " or throw=False to look at the certificate."
+                f" evidence, which may be off by {float(certificate.evidence_error + certificate.evidence_rounding):.3g};"
+                " use a larger noise, float64, or throw=False to look at the certificate."
             )
         raise InferenceError(
             f"the {sought} was not found: its residual is {float(certificate.residual):.3g} after"
