@@ -363,7 +363,7 @@ def test_a_full_disk_keeps_the_answer_unacknowledged_and_nothing_is_lost(live, m
 
 def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
     with Live(tmp_path, seconds=60.0) as live:  # it sleeps in the first step
-        import hilbo.app.hub as module
+        import hilbo.app.interruptions as module
 
         live.begin()
         live.until(lambda v: v["phase"] == "step")
