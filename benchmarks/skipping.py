@@ -25,6 +25,7 @@ def tasks():
     """(name, without, with, error, bound, test)."""
     import jax
     import jax.numpy as jnp
+    from run_tasks import data
 
     from hilbo import lattice
     from hilbo.acquisition import UCB
@@ -33,7 +34,7 @@ def tasks():
     from hilbo.ordinal_gp import OrdinalTerms, fit
     from hilbo.search_lattice import lattice_of
 
-    study, candidates, _, _, one, trials = run.data()
+    study, candidates, _, _, one, trials = data()
     points, score = jnp.asarray(candidates), UCB(0.7)
     posterior = jax.jit(lambda data: fit(study.gp, data, throw=False))(one)
     short, short_points = posterior.astype(jnp.float32), points.astype(jnp.float32)
@@ -153,12 +154,14 @@ def main():
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
     run.limit_cores(1)
+    from run_tasks import once
+
     rows, notes = tasks()
     lines = []
     for name, without, with_it, error, bound, test in rows:
         for function in (without, with_it):
-            run.once(function)
-        times = [[run.once(f) for f in (without, with_it)] for _ in range(chosen.rounds)]
+            once(function)
+        times = [[once(f) for f in (without, with_it)] for _ in range(chosen.rounds)]
         a, b = 1e6 * np.min(times, axis=0)
         lines.append(f"| {name} | {a:.0f} | {b:.0f} | {100 * (1 - b / a):.0f} % | {error:.0e} | {bound} | {test} |")
     text = HEAD.format(rounds=chosen.rounds) + "\n".join([*lines, *notes]) + "\n"

@@ -165,7 +165,7 @@ def _end(found, around, j, sign):
     def fixed(distance, start):
         value = q[j] + sign * distance
         lower, upper = (jnp.where(own, value, bound) for bound in (found.lower, found.upper))
-        solution = least_squares(
+        return least_squares(
             lambda x: residuals(found.model, found.curves, found.weights, x),
             start,
             lower,
@@ -173,29 +173,13 @@ def _end(found, around, j, sign):
             max_steps=40,
             enough=_ENOUGH,
         )
-        return solution
 
     def step(state: _Search) -> _Search:
         distance = jnp.minimum(state.place, room)
         start = jnp.where(own, q + sign * distance, state.q)  # beside the best point known to be inside
         solution = fixed(distance, start)
         rise = solution.cost - found.solution.cost
-        root = jnp.sqrt(jnp.maximum(rise, 0) / cut)
-        outside = root > 1
-        inner, inner_root = _pick(outside, (state.inside, state.inside_root), (distance, root))
-        outer, outer_root = _pick(outside, (distance, root), (state.outside, state.outside_root))
-        chord = inner + (outer - inner) * (1 - inner_root) / (outer_root - inner_root)
-        growth = jnp.maximum(1 / jnp.maximum(root, 1 / _FARTHEST), 1 + _IMPATIENCE * state.steps.astype(q.dtype))
-        away = distance * growth
-        unbounded = ~outside & (distance >= room)
-        met = (jnp.abs(root - 1) < _CLOSE) | (outer - inner <= _CLOSE * inner)
-        done = unbounded | met
-        place = jnp.where(done, distance, jnp.where(jnp.isfinite(outer), chord, away))
-        lower = solution.cost < state.lowest  # false for NaN
-        lowest, lowest_q = _pick(lower, (solution.cost, solution.q), (state.lowest, state.lowest_q))
-        steps = state.steps + 1
-        kept = jnp.where(outside, jnp.where(state.steps == 0, q, state.q), solution.q)
-        return _Search(place, inner, inner_root, outer, outer_root, kept, lowest, lowest_q, steps, done, unbounded)
+        return _narrowed(state, distance, jnp.sqrt(jnp.maximum(rise, 0) / cut), solution, q, distance >= room)
 
     zero, infinite = jnp.zeros_like(cut), jnp.full_like(cut, jnp.inf)
     guess = jnp.sqrt(cut * row[j])
@@ -203,6 +187,25 @@ def _end(found, around, j, sign):
     bad = ~jnp.isfinite(guess)
     first = _Search(guess, zero, zero, infinite, infinite, start, infinite, q, jnp.asarray(0), bad, jnp.zeros_like(bad))
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < _SEARCH_STEPS), step, first)
+
+
+def _narrowed(state: _Search, distance, root, solution, q, at_wall) -> _Search:
+    """The next state after a look at `distance` from the estimate q, where rise over cut has the root `root`."""
+    outside = root > 1
+    inner, inner_root = _pick(outside, (state.inside, state.inside_root), (distance, root))
+    outer, outer_root = _pick(outside, (distance, root), (state.outside, state.outside_root))
+    chord = inner + (outer - inner) * (1 - inner_root) / (outer_root - inner_root)
+    growth = jnp.maximum(1 / jnp.maximum(root, 1 / _FARTHEST), 1 + _IMPATIENCE * state.steps.astype(q.dtype))
+    away = distance * growth
+    unbounded = ~outside & at_wall
+    met = (jnp.abs(root - 1) < _CLOSE) | (outer - inner <= _CLOSE * inner)
+    done = unbounded | met
+    place = jnp.where(done, distance, jnp.where(jnp.isfinite(outer), chord, away))
+    lower = solution.cost < state.lowest  # false for NaN
+    lowest, lowest_q = _pick(lower, (solution.cost, solution.q), (state.lowest, state.lowest_q))
+    steps = state.steps + 1
+    kept = jnp.where(outside, jnp.where(state.steps == 0, q, state.q), solution.q)
+    return _Search(place, inner, inner_root, outer, outer_root, kept, lowest, lowest_q, steps, done, unbounded)
 
 
 def _pick(condition, yes, no):

@@ -72,22 +72,8 @@ def least_squares(
         return r @ r, rows @ r, rows @ rows.T
 
     def step(state: _State) -> _State:
-        direction = _direction(state, lower, upper)
-        q = jnp.clip(state.q + direction, lower, upper)
-        moved = q - state.q
-        cost, gradient, normal = evaluate(q)
-        better = cost < state.cost
-        gain = -(2 * state.gradient + state.normal @ moved) @ moved  # predicted
-        # A step that was cut off may promise nothing: then the damping grows until it goes downhill along the box.
-        settled = ((gain >= 0) & (gain <= least * state.cost)) | jnp.all(jnp.abs(moved) <= tiny * jnp.abs(state.q))
-        trust = (state.cost - cost) / gain  # 1 where the model is right
-        eased = state.damping * jnp.clip(1 - (2 * trust - 1) ** 3, 0.1, 2.0)
-        damping = jnp.where(better, eased, jnp.maximum(state.growth * state.damping, eps))
-        growth = jnp.where(better, 2, 2 * state.growth)
-        reached = (settled & (state.damping < 1)) | (damping > _STALLED)
-        tried = _State(q, cost, gradient, normal, damping, growth, state.steps + 1, reached)
-        stayed = state._replace(damping=damping, growth=growth, steps=state.steps + 1, done=reached)
-        return jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, stayed)
+        q = jnp.clip(state.q + _direction(state, lower, upper), lower, upper)
+        return _judged(state, q, evaluate(q), tiny, least)
 
     cost, gradient, normal = evaluate(start)
     damping, growth = (jnp.asarray(value, start.dtype) for value in (_FIRST_DAMPING, 2))
@@ -95,6 +81,24 @@ def least_squares(
     last = jax.lax.while_loop(lambda state: ~state.done & (state.steps < max_steps), step, first)
     ended = last.done & jnp.isfinite(last.cost)
     return Solution(last.q, last.cost, last.normal, last.gradient, last.steps, ended)
+
+
+def _judged(state: _State, q, there, tiny, least) -> _State:
+    """The step to q taken or not; `there`: cost, gradient and normal matrix at q."""
+    cost, gradient, normal = there
+    moved = q - state.q
+    better = cost < state.cost
+    gain = -(2 * state.gradient + state.normal @ moved) @ moved  # predicted
+    # A step that was cut off may promise nothing: then the damping grows until it goes downhill along the box.
+    settled = ((gain >= 0) & (gain <= least * state.cost)) | jnp.all(jnp.abs(moved) <= tiny * jnp.abs(state.q))
+    trust = (state.cost - cost) / gain  # 1 where the model is right
+    eased = state.damping * jnp.clip(1 - (2 * trust - 1) ** 3, 0.1, 2.0)
+    damping = jnp.where(better, eased, jnp.maximum(state.growth * state.damping, jnp.finfo(q.dtype).eps))
+    growth = jnp.where(better, 2, 2 * state.growth)
+    reached = (settled & (state.damping < 1)) | (damping > _STALLED)
+    tried = _State(q, cost, gradient, normal, damping, growth, state.steps + 1, reached)
+    stayed = state._replace(damping=damping, growth=growth, steps=state.steps + 1, done=reached)
+    return jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, stayed)
 
 
 def _direction(state, lower, upper):

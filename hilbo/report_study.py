@@ -66,7 +66,15 @@ def write_study(
         contents[material.name] = content
         sections.append(section)
     claims = hypotheses(results)
-    content = {
+    content = _content(folder, contents, claims, seed)
+    (out / "result.json").write_text(as_json(content), encoding="utf-8")
+    say("the page")
+    (out / "report.html").write_text(_page(folder, sections, claims, content), encoding="utf-8")
+    return content
+
+
+def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
+    return {
         "materials": contents,
         "hypotheses": [
             {"number": h.number, "verdict": h.verdict, "evidence": [e._asdict() for e in h.evidence]} for h in claims
@@ -77,10 +85,6 @@ def write_study(
         "warnings": [w for one in contents.values() for w in one["warnings"]],
         "limits": list(folder.limits),
     }
-    (out / "result.json").write_text(as_json(content), encoding="utf-8")
-    say("the page")
-    (out / "report.html").write_text(_page(folder, sections, claims, content), encoding="utf-8")
-    return content
 
 
 def _validated(material: Material, folder: StudyFolder, seed, say) -> Validated | None:

@@ -4,6 +4,7 @@ import contextlib
 import threading
 import time
 import urllib.error
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ from hilbo.live_records import Block, Header, Planned
 from hilbo.live_state import LiveSession
 from hilbo.ports import BAUD, open_port
 
-__all__ = ["DATA", "PATIENCE", "Live", "refused", "study_of", "until_held"]
+__all__ = ["DATA", "PATIENCE", "Live", "ask", "refused", "study_of", "until_held"]
 
 DATA = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts a time
@@ -165,6 +166,12 @@ class Live:
     def replays(self) -> None:
         """Waits until the log alone gives the state; the session may go on meanwhile."""
         self.until(lambda _: self.replayed() == self.hub.state, lambda: "the log gives another state")
+
+
+def ask(live, path, *, data=None, **headers):
+    """A bare request."""
+    address = live.participant.address + path
+    return urllib.request.urlopen(urllib.request.Request(address, data=data, headers=headers), timeout=PATIENCE)
 
 
 @contextlib.contextmanager

@@ -1,4 +1,4 @@
-"""`hilbo validate` and `hilbo report`: what they write, what they say of poor data, and bad folders in one sentence."""
+"""`hilbo report`: what it says of poor data and of the hypotheses, its tables, its figures and its page."""
 
 import dataclasses
 import json
@@ -18,25 +18,17 @@ from test_statistics import study as paper_counts
 from test_validation import plain
 
 from hilbo import Trials
-from hilbo.analysis import Progress, _counts, analyse, limits_of, settled
-from hilbo.errors import InputError
+from hilbo.analysis import Progress, _counts, limits_of, settled
 from hilbo.hypotheses import Evidence, Hypothesis, _convergence, _materials
 from hilbo.inference_data import groups, predictive_shares, write_groups
-from hilbo.paper_tables import aggregate_comparisons
 from hilbo.plotting_study import individual_convergence
 from hilbo.population_rules import RuleMap
 from hilbo.report_figures import comparison_figures
 from hilbo.report_study import _comparison, _shown, _tolerances
-from hilbo.report_validation import p_words, safest, slug, validate, validation_figures
+from hilbo.report_validation import validate
 from hilbo.sensitivity import tolerance_ends
-from hilbo.simulate import PRESETS
-from hilbo.simulate_validation import sets_table, validation_table
 from hilbo.study import Cohort, fit_cohort, population
-from hilbo.study_folder import read_folder
-from hilbo.validation import Sets, tolerance
-
-STUDY = Path("hilbo/data/paper.toml").read_text()
-HEAD = "participant,trial,response,K1,B1,alpha\n"
+from hilbo.validation import tolerance
 
 
 def crowd(answers):
@@ -52,77 +44,6 @@ def crowd(answers):
 
 
 HILL = [(u, v, 2 - (abs(u - 0.4) > 0.2) - (abs(v - 0.5) > 0.25)) for u in (0.1, 0.4, 0.7) for v in (0.1, 0.5, 0.9)]
-
-
-# hilbo validate
-
-
-def test_validate_writes_the_papers_tables(capsys, monkeypatch, tmp_path):
-    table, out = tmp_path / "validation.csv", tmp_path / "results"
-    paper_counts(np.random.default_rng(1)).to_csv(table, index=False)
-    arguments = ["validate", table, "--study", "hilbo/data/paper.toml", "--out", out]
-    code, stdout, stderr = run(capsys, monkeypatch, *arguments, "--json")
-    assert (code, json.loads(stdout)) == (0, json.loads((out / "result.json").read_text()))
-    (foam,) = json.loads(stdout)["materials"]
-    assert (foam["material"], foam["participants"], foam["comparisons"]) == ("foam", 28, 624)
-    assert foam["confusion"]["best"] == {"close": 147, "similar": 11, "different": 2}
-    found = {number: {row["term"]: row["estimate"] for row in t["rows"]} for number, t in foam["tables"].items()}
-    printed = (found["II"]["Intercept"], found["III"]["Best"], found["III"]["Worst"], found["IV"]["Aggregate-Best"])
-    assert [round(v, 4) for v in printed] == [-2.5123, -4.1431, 2.9738, 0.9773]
-    page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 2 and "http" not in page
-    assert all(text in page for text in ("-2.5123", "4.9378", "-4.1431", "2.9738", "0.9773", "report the larger"))
-    assert pd.read_csv(out / "aggregate_best_people.csv")["wins"].sum() == 279
-    assert run(capsys, monkeypatch, *arguments)[0] == 2  # nothing is overwritten
-    assert "below the iid ones" in stderr
-
-
-def test_validate_refuses_in_one_sentence(capsys, monkeypatch, tmp_path):
-    table = tmp_path / "validation.csv"
-    table.write_text("participant,trial,set_a,set_b,class_a,class_b,preferred\nA,1,best,mid,splendid,similar,a\n")
-    code, _, stderr = run(
-        capsys, monkeypatch, "validate", table, "--study", "hilbo/data/paper.toml", "--out", tmp_path / "o"
-    )
-    assert code == 2 and 'validation.csv:2: class_a is "splendid"' in stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["validation.csv"]
-
-
-def test_what_one_comparison_can_say():
-    columns = ["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"]
-    table = pd.DataFrame([("A", 1, "best", "mid", "close", "different", "a")], columns=columns)
-    found = validate(table)
-    assert found.overall is None and found.people is None
-    assert any("Table III is missing" in text for text in found.tables.limits)
-    rows = safest(found.regressions()["II"]).set_index("term")
-    assert np.isposinf(rows.at["Best", "estimate"]) and np.isfinite(rows.at["Best", "low"])
-
-
-@pytest.mark.parametrize(("people", "few"), [(9, True), (14, False)])
-def test_what_is_shown_is_what_the_warning_says_to_report(people, few):
-    """Of few clusters the wider of the clustered and the wild bootstrap interval, as the table's own warning has it."""
-    answers = paper_counts(np.random.default_rng(1))
-    names = answers["participant"].unique()[:people]
-    table = validate(answers[answers["participant"].isin(names)]).regressions()["II"]
-    assert any("wild bootstrap interval" in words for words in table.warnings) == few
-    kinds = table.table[few | ~table.table["errors"].str.startswith("wild")]
-    widest = (kinds["high"] - kinds["low"]).groupby(kinds["term"]).max()
-    rows = safest(table).set_index("term")
-    np.testing.assert_array_equal(rows["high"] - rows["low"], widest[rows.index])
-    assert rows["errors"].str.startswith("wild").any() == few
-
-
-def test_ties_are_kept_apart():
-    found = validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
-    assert found.people["ties"].sum() == 20 and found.people["wins"].sum() == 279
-    assert found.overall["rate"].iloc[0] == pytest.approx(279 / 364)
-
-
-def test_words():
-    assert [p_words(p) for p in (0.0004, 0.0312, np.nan)] == ["< 0.001", "0.031", "–"]
-    assert slug("Medium (soft) silicone") == "medium-soft-silicone"
-
-
-# What poor data can say
 
 
 def test_limits_are_named():
@@ -249,138 +170,6 @@ def posteriors_at(posteriors):
         return posterior.predict(posterior.trials.x)
 
     return tuple(np.asarray(part) for part in jax.lax.map(one, posteriors))
-
-
-def test_simulated_judges_prefer_what_is_nearer():
-    from hilbo import Study
-
-    study = Study.load("hilbo/data/paper.toml")
-    truth = np.array([5.70, 5.89, 0.203])
-    near = study.space.to_unit(truth)
-    x = jnp.stack([jnp.asarray(near), jnp.asarray(near) + 0.1, jnp.array([0.05, 0.95, 0.9])])
-    sets = sets_table(study, Sets(x, jnp.zeros(3), jnp.ones(3)), np.asarray(x)[2:], ("P01",))
-    assert sets["set_id"].tolist() == ["best", "mid", "worst", "own-P01"] and sets["N"].eq(101).all()
-    found = validate(validation_table(study, PRESETS["paper"], sets, seed=3), sets.set_index("set_id"), bootstrap=False)
-    rates = found.tables.preferences.drop_duplicates(["set", "over"]).set_index(["set", "over"])["rate"]
-    assert rates["best", "worst"] > 0.8 and rates["mid", "worst"] > 0.8 and found.comparisons == 20 * 12 + 8 * 2
-
-
-# Folders
-
-
-def folder_with(tmp_path, **files):
-    folder = tmp_path / "folder"
-    folder.mkdir()
-    for name, text in ({"study.toml": STUDY} | {k.replace("__", "."): v for k, v in files.items()}).items():
-        (folder / name).write_text(text)
-    return folder
-
-
-ROW = "A,1,close,5,6,0.2\n"
-BAD = {
-    "no trials": ({}, "holds no trials.csv"),
-    "the same answer twice": ({"trials__csv": HEAD + ROW, "trials-2__csv": HEAD + ROW}, "is in two trial tables"),
-    "another parameter": (
-        {"trials__csv": "participant,trial,response,K1,B1\nA,1,close,5,6\n"},
-        'column "alpha" is missing',
-    ),
-    "another answer": ({"trials__csv": HEAD + "A,1,superb,5,6,0.2\n"}, 'response is "superb"'),
-    "half of the materials": (
-        {"trials__csv": HEAD + ROW, "trials-2__csv": "material," + HEAD + "foam,B,1,close,5,6,0.2\n"},
-        "some rows name a material",
-    ),
-    "two truths": (
-        {"trials__csv": HEAD + ROW, "truth__csv": "source,K1,B1,alpha\npopulation,5,6,0.2\npopulation,5,6,0.3\n"},
-        'there are 2 sets of source "population"',
-    ),
-}
-
-
-@pytest.mark.parametrize("what", BAD)
-def test_bad_folders_are_refused_in_one_sentence(capsys, monkeypatch, tmp_path, what):
-    files, words = BAD[what]
-    code, _, stderr = run(capsys, monkeypatch, "report", folder_with(tmp_path, **files), "--out", tmp_path / "out")
-    assert code == 2 and words in stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
-
-
-def test_the_report_never_replaces_what_it_reads(capsys, monkeypatch, tmp_path):
-    folder = folder_with(tmp_path, trials__csv=HEAD + ROW)
-    for out in (folder, tmp_path):
-        code, _, stderr = run(capsys, monkeypatch, "report", folder, "--out", out, "--force")
-        assert code == 2 and "holds the folder that is read" in stderr
-    code, _, stderr = run(capsys, monkeypatch, "report", tmp_path / "none", "--out", tmp_path / "out")
-    assert code == 2 and "is no folder" in stderr
-    other = folder_with(tmp_path / "folder", trials__csv=HEAD + ROW)
-    code, _, stderr = run(
-        capsys,
-        monkeypatch,
-        "validate",
-        folder / "trials.csv",
-        "--study",
-        folder / "study.toml",
-        "--out",
-        other,
-        "--force",
-    )
-    assert code == 2 and "is not a result of hilbo's" in stderr  # data without a result beside it
-
-
-def test_materials_have_their_own_references(tmp_path):
-    text = STUDY + "\n[materials.soft.renderer]\nK_eff = 0.3\n"
-    trials = "material," + HEAD + "soft,A,1,close,5,6,0.2\nhard,A,1,different,4,6,0.2\n"
-    with pytest.raises(InputError, match='material "hard" is not in the study file'):
-        read_folder(folder_with(tmp_path, study__toml=text, trials__csv=trials))
-    folder = tmp_path / "folder"
-    (folder / "study.toml").write_text(text + "[materials.hard]\n")
-    (folder / "truth.csv").write_text("source,material,K1,B1,alpha\npopulation,soft,5,6,0.2\npopulation,hard,8,6,0.2\n")
-    found = read_folder(folder)
-    assert [m.name for m in found.materials] == ["soft", "hard"] and len(found.limits) == 1
-    soft, hard = found.materials
-    assert soft.study.space.mechanics.K_eff == 0.3 and hard.study.space.mechanics.K_eff == 0.44
-    np.testing.assert_allclose([m.reference[0] for m in (soft, hard)], [4 / 31, 7 / 31])
-    strict = read_folder(folder, "trials < 5").materials[0]
-    with pytest.raises(InputError, match="leaves out all 1"):
-        analyse(strict.study, strict.cohort)
-
-
-VALIDATION = "participant,trial,set_a,set_b,class_a,class_b,preferred\n"
-
-
-def test_two_validation_tables_are_read_as_one(tmp_path):
-    row = "{},1,aggregate,individual:B,close,different,{}\n"
-    first, second = (VALIDATION + row.format(*cells) for cells in (("A", "a"), ("B", "b")))
-    folder = folder_with(tmp_path, trials__csv=HEAD + ROW, **{"validation-1__csv": first, "validation-2__csv": second})
-    (material,) = read_folder(folder).materials
-    found = validate(material.validation, bootstrap=False)
-    assert found.people["wins"].tolist() == [1, 0] and found.comparisons == 2
-    twice = aggregate_comparisons(
-        pd.concat([material.validation] * 2), {"aggregate": "aggregate", "individual:B": "individual:B"}
-    )
-    assert len(twice) == 4
-
-
-def test_a_pair_that_was_only_tied_is_drawn():
-    rows = [("A", 1, "best", "mid", "close", "similar", "tie"), ("A", 2, "mid", "worst", "similar", "different", "a")]
-    rows += [("B", 1, "mid", "worst", "similar", "different", "b")]
-    table = pd.DataFrame(rows, columns=VALIDATION.strip().split(","))
-    assert set(validation_figures(validate(table, bootstrap=False))) == {"validation"}
-
-
-@pytest.mark.parametrize(
-    ("file", "text"),
-    [
-        ("validation", VALIDATION + "A,1,best,mid,close,similar,a\n"),
-        ("sets", "set_id,source,K1,B1,alpha\nsysid,sysid,5,6,0.2\n"),
-        ("truth", "source,K1,B1,alpha\npopulation,5,6,0.2\n"),
-        ("truth", "source,material,K1,B1,alpha\npopulation,soft,5,6,0.2\npopulation,,5,6,0.2\n"),
-    ],
-)
-def test_what_is_of_no_material_is_not_taken_for_all(tmp_path, file, text):
-    trials = "material," + HEAD + "soft,A,1,close,5,6,0.2\nhard,A,1,different,4,6,0.2\n"
-    folder = folder_with(tmp_path, trials__csv=trials, **{f"{file}__csv": text})
-    with pytest.raises(InputError, match=f"{file}.csv: rows without a material.*this study has soft, hard"):
-        read_folder(folder)
 
 
 @pytest.mark.deep

@@ -4,11 +4,10 @@
 
 Events are made one after the other, and one counts only when it is on the disk: then the state moves on, the sender is
 told, and the next proposal is made. Four threads work beside the event loop: the disk's, the device's (`rig`), the
-choosing's, and the server's own. What a participant does next is in `runner`.
+choosing's, and the server's own. What a participant does next is in `runner`, what comes between in `interruptions`.
 """
 
 import asyncio
-import contextlib
 import time
 from collections import deque
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from typing import Any
 
 from hilbo import live_session
 from hilbo.app import views
+from hilbo.app.interruptions import Interruptions
 from hilbo.app.messages import Answer, Command, Press
 from hilbo.app.rig import Rig, Snapshot
 from hilbo.app.runner import Runner
@@ -25,16 +25,11 @@ from hilbo.app.watchers import Watchers
 from hilbo.errors import InputError
 from hilbo.event_log import LogError
 from hilbo.live_session import LiveSession, RefusedError
-from hilbo.reasons import HoldReason, held_because
 
 __all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
 
 PRESSES = ("begin", "break", "more", "here")
 COMMANDS = ("pause", "resume", "repeat", "undo", "void", "abort", "note", "estop", "clear", "invite")
-_STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
-_LATER = 1.0  # s between two looks at the clock
-_JUMP = 3.0  # s by which the clock, or the wait for it, may be off before somebody must have closed the laptop
-_GONE = 3.0  # s without a participant's page until a trial that is being felt is begun again
 
 
 class NotNowError(InputError):
@@ -74,25 +69,20 @@ class Hub:
         self._disk = ThreadPoolExecutor(1, "hilbo-disk")
         self.compute = ThreadPoolExecutor(1, "hilbo-choice")
         self._lock: asyncio.Lock | None = None
-        self._tasks: list[asyncio.Task] = []
-        self._absent: float | None = None
         self._came = 0.0
         self._map: tuple[str, Any] | None = None
         self._drawing = ThreadPoolExecutor(1, "hilbo-map")
-        self._device_was = ""
-        self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what the device did, not yet on the disk
-        self.runner = Runner(self)
+        self.runner, self._interruptions = Runner(self), Interruptions(self)
 
     # Life.
 
     async def open(self) -> None:
         """Connect to the device, and begin. Raises `InputError` or `DeviceError`."""
-        self._lock, self._saying, self._loop = asyncio.Lock(), asyncio.Lock(), asyncio.get_running_loop()
+        self._lock, self._loop = asyncio.Lock(), asyncio.get_running_loop()
         rig = await self._loop.run_in_executor(self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed))
         self.rig = rig
         self.warm = self._loop.run_in_executor(self.compute, self._warm)
-        await self._device_changed(rig.snapshot, opening=True)
-        self._tasks = [asyncio.create_task(self._watch_time())]
+        await self._interruptions.begin(rig.snapshot)
         self.runner.restart()
 
     def _warm(self) -> None:
@@ -106,8 +96,7 @@ class Hub:
 
     async def close(self) -> None:
         """Stop the device, let go of everything."""
-        for task in self._tasks:
-            task.cancel()
+        self._interruptions.end()
         self.runner.cancel()
         self.watchers.end_all()
         if self.rig is not None:
@@ -277,82 +266,13 @@ class Hub:
             raise NotNowError("This trial is not of this session.")
         return int(trial), int(presentation)
 
-    # The device, and time.
+    # What the rig's thread tells.
 
     def _from_rig(self, seen: Snapshot) -> None:
-        self._loop.call_soon_threadsafe(lambda: self._spawn(self._device_changed(seen)))
+        self._loop.call_soon_threadsafe(self._interruptions.device_changed, seen)
 
     def _noticed(self, sentence: str) -> None:
         self._loop.call_soon_threadsafe(self.publish)
-
-    def _spawn(self, work) -> None:
-        task = asyncio.ensure_future(work)
-        self._tasks.append(task)
-        task.add_done_callback(self._tasks.remove)
-
-    async def _device_changed(self, seen: Snapshot, *, opening: bool = False) -> None:
-        """What the device does unasked is an event where it matters to a trial: the one that was pending then.
-
-        A device that held because the server before this one was killed has done what it should, and voids nothing.
-        """
-        condition = "lost" if seen.lost else _STOPPED.get(seen.state, "ready")
-        if condition != self._device_was:
-            self._device_was = condition
-            reason = seen.lost or (held_because(seen.hold_reason) if condition != "ready" else "")
-            trial = self.state.pending.id if self.state.pending is not None else None
-            facts = {"trial": trial, "reason": reason, "counters": seen.counters}
-            killed = opening and condition == "hold" and seen.hold_reason == HoldReason.WATCHDOG
-            says = "stopped" if killed else condition
-            self._unsaid.append(lambda state, at: live_session.device(state, says, at, **facts))
-            self.begun = self.begun and condition != "lost"  # a device that comes back does not go on by itself
-            await self._say()
-            if condition == "lost":
-                self.runner.forget()
-                self.runner.restart()
-            self.runner.wake()
-        self.publish()
-
-    async def _say(self) -> None:
-        """What the device did, in the log in its order; what does not fit on the disk waits until there is room."""
-        async with self._saying:
-            while self._unsaid:
-                with contextlib.suppress(InputError):
-                    try:
-                        await self.commit(self._unsaid[0])
-                    except LogError:
-                        return
-                self._unsaid.popleft()
-
-    async def _watch_time(self) -> None:
-        """A laptop that slept, a page that was closed, and what the device did that is not in the log yet."""
-        wall, steady, here = time.time(), time.monotonic(), False
-        while True:
-            await asyncio.sleep(_LATER)
-            now, mono = time.time(), time.monotonic()
-            slept = max(abs((now - wall) - (mono - steady)), mono - steady - _LATER)
-            wall, steady = now, mono
-            if slept > _JUMP:
-                await self._interrupted(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
-            await self._say()
-            here, before = self.watchers.participant_here, here
-            if here != before:
-                self.publish()
-            if here or not self.begun:
-                self._absent = None
-            elif self._absent is None:
-                self._absent = mono
-            elif mono - self._absent > _GONE:
-                self._absent = None
-                await self._interrupted("The participant's page is closed.")
-
-    async def _interrupted(self, why: str) -> None:
-        """What was being felt is felt again from its beginning, once somebody presses Begin."""
-        pending, self.begun = self.state.pending, False
-        with contextlib.suppress(InputError, LogError):
-            await self.commit(lambda state, at: live_session.note(state, why, at))
-            if pending is not None and pending.unfinished:
-                await self.commit(live_session.repeat)
-        self.runner.restart()
 
 
 def _taken(state, what, message, at):

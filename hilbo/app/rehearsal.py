@@ -190,38 +190,13 @@ def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
     def watch():
         return experimenter.evaluate("fetch('/api/experimenter').then(r => r.json())")
 
-    pressing = [False]
-
-    def feel(on):
-        if on and not pressing[0]:
-            finger.tell("finger sine")
-        elif pressing[0] and not on:
-            _let_go(finger, watch)
-        pressing[0] = on
-
     window = program.new_context(viewport={"width": 1280, "height": 800}).new_page()
     mishaps: list[str] = []
     for page in (window, experimenter):
         page.on("pageerror", lambda error: mishaps.append(str(error)))
-    participant = Participant(window, links["participant"], watch, decide, feel)
-    taken, cleared, begun = set(), 0, time.monotonic()
-    while True:
-        phase = participant.phase
-        question = window.is_visible("#options")
-        mark = (phase, question, window.inner_text("#title") if question else "")
-        if mark not in taken and len(taken) < 12 and phase != "wait":
-            taken.add(mark)
-            screenshots(window, screens, f"participant-{len(taken)}-{phase}{'-question' if question else ''}")
-        before = participant.answered
-        phase = participant.act()
-        if participant.answered > before:
-            say(f"{participant.answered} answers")
-            if participant.answered in (1, 3, 8):
-                screenshots(experimenter, screens, f"experimenter-{participant.answered}")
-        if phase in ("done", "ended"):
-            break
-        cleared += phase == "wait" and _cleared(experimenter)
-        time.sleep(0.02)
+    participant = Participant(window, links["participant"], watch, decide, _presser(finger, watch))
+    begun = time.monotonic()
+    cleared = _lead(participant, window, experimenter, screens, say)
     view = watch()
     screenshots(experimenter, screens, "experimenter-end")
     screenshots(window, screens, "participant-end")
@@ -236,12 +211,49 @@ def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
     }
 
 
+def _lead(participant, window, experimenter, screens, say) -> int:
+    """The participant acts until the session ends, with screenshots of what is new; how many HOLDs were cleared."""
+    taken, cleared = set(), 0
+    while True:
+        phase = participant.phase
+        question = window.is_visible("#options")
+        mark = (phase, question, window.inner_text("#title") if question else "")
+        if mark not in taken and len(taken) < 12 and phase != "wait":
+            taken.add(mark)
+            screenshots(window, screens, f"participant-{len(taken)}-{phase}{'-question' if question else ''}")
+        before = participant.answered
+        phase = participant.act()
+        if participant.answered > before:
+            say(f"{participant.answered} answers")
+            if participant.answered in (1, 3, 8):
+                screenshots(experimenter, screens, f"experimenter-{participant.answered}")
+        if phase in ("done", "ended"):
+            return cleared
+        cleared += phase == "wait" and _cleared(experimenter)
+        time.sleep(0.02)
+
+
 def _cleared(experimenter) -> bool:
     """A device that held on a busy computer is let go again, as the experimenter would."""
     if not experimenter.is_visible("#clear"):
         return False
     experimenter.evaluate("command('clear')")
     return True
+
+
+def _presser(finger, watch) -> Callable[[bool], None]:
+    """Has the finger press while something is felt, and leave the handle after that."""
+    pressing = False
+
+    def feel(on):
+        nonlocal pressing
+        if on and not pressing:
+            finger.tell("finger sine")
+        elif pressing and not on:
+            _let_go(finger, watch)
+        pressing = on
+
+    return feel
 
 
 def _let_go(finger, watch) -> None:

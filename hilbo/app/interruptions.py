@@ -1,0 +1,131 @@
+"""What interrupts a session though nobody asked for it: its device, a laptop that slept, a participant who is gone.
+
+    device, clocks, signs of life --> event in the log --> the runner begins anew
+
+What a device does (lost, HOLD, E-STOP, ready again) and when is the rig's to see; what that means for the trial that is
+pending is said here. Nothing that was interrupted goes on by itself: the participant presses Begin.
+"""
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from hilbo import live_session
+from hilbo.app.rig import Snapshot
+from hilbo.errors import InputError
+from hilbo.event_log import LogError
+from hilbo.live_session import LiveSession
+from hilbo.reasons import HoldReason, held_because
+
+__all__ = ["Interruptions"]
+
+_STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
+_LATER = 1.0  # s between two looks at the clock
+_JUMP = 3.0  # s by which the clock, or the wait for it, may be off before somebody must have closed the laptop
+_GONE = 3.0  # s without a participant's page until a trial that is being felt is begun again
+
+
+class Interruptions:
+    """Those of a `Hub`, from `begin` to `end`."""
+
+    def __init__(self, hub: Any):
+        self.hub = hub
+        self._condition = ""  # the device's, when it was last seen
+        self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what it did, not yet on the disk
+        self._saying = asyncio.Lock()
+        self._tasks: list[asyncio.Task] = []
+
+    async def begin(self, seen: Snapshot) -> None:
+        """Say how the device was found, and watch the time from now on."""
+        await self._device_changed(seen, opening=True)
+        self._spawn(self._watch_time())
+
+    def end(self) -> None:
+        """Watch no more."""
+        for task in self._tasks:
+            task.cancel()
+
+    def device_changed(self, seen: Snapshot) -> None:
+        """What the device did unasked is an event where it matters to a trial: the one that was pending then."""
+        self._spawn(self._device_changed(seen))
+
+    def _spawn(self, work) -> None:
+        task = asyncio.ensure_future(work)
+        self._tasks.append(task)
+        task.add_done_callback(self._tasks.remove)
+
+    async def _device_changed(self, seen: Snapshot, *, opening: bool = False) -> None:
+        hub, condition = self.hub, _condition_of(seen)
+        if condition != self._condition:
+            self._condition = condition
+            self._unsaid.append(_told(seen, condition, hub.state.pending, opening))
+            hub.begun = hub.begun and condition != "lost"  # a device that comes back does not go on by itself
+            await self._say()
+            if condition == "lost":
+                hub.runner.forget()
+                hub.runner.restart()
+            hub.runner.wake()
+        hub.publish()
+
+    async def _say(self) -> None:
+        """What the device did, in the log in its order; what does not fit on the disk waits until there is room."""
+        async with self._saying:
+            while self._unsaid:
+                with contextlib.suppress(InputError):
+                    try:
+                        await self.hub.commit(self._unsaid[0])
+                    except LogError:
+                        return
+                self._unsaid.popleft()
+
+    async def _watch_time(self) -> None:
+        """A laptop that slept, a page that was closed, and what the device did that is not in the log yet."""
+        hub, here, absent = self.hub, False, None
+        wall, steady = time.time(), time.monotonic()
+        while True:
+            await asyncio.sleep(_LATER)
+            now, mono = time.time(), time.monotonic()
+            slept = max(abs((now - wall) - (mono - steady)), mono - steady - _LATER)
+            wall, steady = now, mono
+            if slept > _JUMP:
+                await self._interrupt(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
+            await self._say()
+            here, before = hub.watchers.participant_here, here
+            if here != before:
+                hub.publish()
+            if here or not hub.begun:
+                absent = None
+            elif absent is None:
+                absent = mono
+            elif mono - absent > _GONE:
+                absent = None
+                await self._interrupt("The participant's page is closed.")
+
+    async def _interrupt(self, why: str) -> None:
+        """What was being felt is felt again from its beginning, once somebody presses Begin."""
+        hub = self.hub
+        pending, hub.begun = hub.state.pending, False
+        with contextlib.suppress(InputError, LogError):
+            await hub.commit(lambda state, at: live_session.note(state, why, at))
+            if pending is not None and pending.unfinished:
+                await hub.commit(live_session.repeat)
+        hub.runner.restart()
+
+
+def _condition_of(seen: Snapshot) -> str:
+    return "lost" if seen.lost else _STOPPED.get(seen.state, "ready")
+
+
+def _told(seen: Snapshot, condition: str, pending: Any, opening: bool) -> Callable[[LiveSession, float], Any]:
+    """Makes the event of what the device did to the trial that is pending now.
+
+    A device that held because the server before this one was killed has done what it should, and voids nothing.
+    """
+    reason = seen.lost or (held_because(seen.hold_reason) if condition != "ready" else "")
+    facts = {"trial": None if pending is None else pending.id, "reason": reason, "counters": seen.counters}
+    killed = opening and condition == "hold" and seen.hold_reason == HoldReason.WATCHDOG
+    says = "stopped" if killed else condition
+    return lambda state, at: live_session.device(state, says, at, **facts)
