@@ -346,10 +346,11 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
                 f" {float(certificate.residual):.3g}; check that the thresholds rise."
             )
         if found and isinstance(certificate, Certificate) and bool(_vague(posterior)):
+            off = float(certificate.evidence_error + certificate.evidence_rounding)
             raise InferenceError(
                 f"the {sought} was found (residual {float(certificate.residual):.3g}), but not closely enough for its"
-                f" evidence, which may be off by {float(certificate.evidence_error + certificate.evidence_rounding):.3g};"
-                " use a larger noise, float64, or throw=False to look at the certificate."
+                f" evidence, which may be off by {off:.3g}; use a larger noise, float64, or throw=False to look at the"
+                " certificate."
             )
         raise InferenceError(
             f"the {sought} was not found: its residual is {float(certificate.residual):.3g} after"
