@@ -30,7 +30,7 @@ def tasks():
     from hilbo import lattice
     from hilbo.acquisition import UCB
     from hilbo.kernels import gram
-    from hilbo.laplace import _plain_mode, _whitened_mode
+    from hilbo.laplace import _whitened_mode, plain_mode
     from hilbo.ordinal_gp import OrdinalTerms, fit
     from hilbo.search_lattice import lattice_of
 
@@ -53,7 +53,7 @@ def tasks():
     terms = OrdinalTerms(study.gp.likelihood, one.q, one.mask)
     covariance = gram(study.gp.kernel, one.x, one.x)
     zeros = jnp.zeros(25)
-    plain = jax.jit(lambda k, start: _plain_mode(terms, k, start, 20))
+    plain = jax.jit(lambda k, start: plain_mode(terms, k, start, 20))
     whitened = jax.jit(lambda k, start: _whitened_mode(terms, k, start, 200))
     before = jax.jit(lambda data: fit(study.gp, data, throw=False))(one.first(24)).latent.weights
     cold_mode, warm_mode = plain(covariance, zeros), plain(covariance, before)
