@@ -30,7 +30,7 @@ from scipy.stats import binomtest
 
 from hilbo.config import Study
 from hilbo.errors import InputError
-from hilbo.population_rules import rule_map
+from hilbo.population_rules import LARGEST_POOL, rule_map
 from hilbo.session import search_points
 from hilbo.simulate import Person, Population, people, simulate_study
 from hilbo.study import Cohort, fit_cohort, map_optimum
@@ -72,12 +72,19 @@ def simulate_power(
 
     `jobs`: processes, by default as many as there are cores; each calls `begin` first (float64, a cache).
     `say` is told how many studies are done.
-    Raises `InputError` for a number of people that the study's rule cannot merge.
+    Raises `InputError` for numbers of people or of answers that the study's rule cannot merge.
     """
     if study.rule == "hierarchical" and min(plan.participants) < 2:
         raise InputError(
             'power: the rule "hierarchical" learns how people differ and needs two of them; ask for 2 participants or'
             " more, or use another rule."
+        )
+    answers = max(plan.participants) * max(plan.trials)
+    if study.rule == "pooled" and answers > LARGEST_POOL:
+        raise InputError(
+            f'power: the rule "pooled" fits one model to all answers, at most {LARGEST_POOL:,}, and'
+            f" {max(plan.participants)} participants with {max(plan.trials)} trials give {answers:,}; ask for fewer, or"
+            " use another rule."
         )
     jobs = min(cores() if jobs is None else jobs, plan.studies)
     content = study.content

@@ -70,6 +70,11 @@ def test_one_person_cannot_differ():
         simulate_power(dataclasses.replace(study(), rule="hierarchical"), PRESETS["paper"], Plan((1, 3), (5,), 2, 0))
 
 
+def test_more_answers_than_one_model_takes_are_refused_before_anything_is_simulated():
+    with pytest.raises(InputError, match="at most 1,500, and 61 participants with 25 trials give 1,525"):
+        simulate_power(dataclasses.replace(study(), rule="pooled"), PRESETS["paper"], Plan((2, 61), (5, 25), 2, 0))
+
+
 @pytest.mark.parametrize("plan", [((), (5,), 4), ((3, 3), (5,), 4), ((0,), (5,), 4), ((3,), (5,), 1)])
 def test_plans_that_say_nothing_are_refused(plan):
     with pytest.raises(InputError, match="power: "):
