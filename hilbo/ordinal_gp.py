@@ -315,9 +315,8 @@ def _unresolved(certificate: Certificate) -> Bool[Array, ""]:
     return certificate.smallest_variance < certificate.variance_resolution
 
 
-def _vague(posterior: Posterior) -> Bool[Array, ""]:
-    certificate = posterior.certificate
-    return ~evidence_known(posterior.log_evidence, certificate.evidence_error, certificate.evidence_rounding)
+def _vague(certificate: Certificate, log_evidence: Float[Array, ""]) -> Bool[Array, ""]:
+    return ~evidence_known(log_evidence, certificate.evidence_error, certificate.evidence_rounding)
 
 
 def _checked(posterior: Posterior, sought: str) -> Posterior:
@@ -345,7 +344,7 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
                 f"the {sought} was not found: its log evidence is not finite, though its residual is"
                 f" {float(certificate.residual):.3g}; check that the thresholds rise."
             )
-        if found and isinstance(certificate, Certificate) and bool(_vague(posterior)):
+        if found and isinstance(certificate, Certificate) and bool(_vague(certificate, posterior.log_evidence)):
             off = float(certificate.evidence_error + certificate.evidence_rounding)
             raise InferenceError(
                 f"the {sought} was found (residual {float(certificate.residual):.3g}), but not closely enough for its"
