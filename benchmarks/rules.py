@@ -202,7 +202,7 @@ def figure(rows):
     right.axhline(95, color="black", linewidth=0.6)
     for axes in (left, right):
         axes.set_xticks(at, [f"{level:g}" for level in LEVELS])
-        axes.set_xlabel("differences between people (1: the preset)")
+    drawn.supxlabel("differences between people (1: the preset)", fontsize="medium")
     left.set(ylabel="NRMSE of the optimum, median (%)", ylim=(0, None))
     right.set(ylabel="true map within the 95 % interval (%)", ylim=(0, 102))
     drawn.legend(loc="outside right upper", frameon=False, fontsize=7)
