@@ -13,10 +13,11 @@ so that no fit is repeated. Here the model's prior has a constant of variance 4 
 is their own affair, and an answer far from all others is expected to be like them, not like the prior's mean. The lapse
 rate l is the share of answers that are any category at random, P(q_i) = (1 - l) p_i(q_i) + l / C; drift d is a shift of
 the latent score from the first trial to the last, in prior standard deviations (negative: stricter), p_i(q) with
-m_i + d (s_i - 1/2), s_i being the share of the session that is over. Noise beyond the model's looks like lapses: a rate
-says how much of the answers the person's own model cannot tell from chance. Both are maximum likelihood over these
-left-out probabilities, with intervals where twice the log likelihood falls by less than 3.84. Those are approximate,
-since answers left out one at a time are not independent; `benchmarks/coverage_people.py` measures how often they hold.
+m_i + d (s_i - 1/2), s_i being the share of the session that is over, at whatever lapse rate is likeliest then. Noise
+beyond the model's looks like lapses: a rate says how much of the answers the person's own model cannot tell from
+chance. Both are maximum likelihood over these left-out probabilities, with intervals where twice the log likelihood
+falls by less than 3.84. Those are approximate, since answers left out one at a time are not independent;
+`benchmarks/coverage_people.py` measures how often they hold.
 
 An exclusion rule, "trials < 10 or lapse_low > 0.3", speaks of a person's own answers only, and is applied before
 anything is merged.
@@ -62,6 +63,7 @@ MEASURES = (
 _NEAR = 0.02  # of the search ranges (NRMSE): the same rendering to a finger
 _LEVEL = 4.0  # prior variances
 _DRIFT = 6.0  # prior standard deviations: further the search does not go
+_RATES = np.geomspace(1e-3, 0.999, 100)  # lapse rates under which a drift is judged
 _RULE = re.compile(r"^\s*(\w+)\s*(<=|>=|<|>)\s*([-+0-9.eE]+)\s*$")
 
 
@@ -153,16 +155,19 @@ def drift(
     q: np.ndarray,
 ) -> tuple[float, float, float]:
     """Shift of the latent score from the first trial to the last, and its 95 % interval; from left-out moments (n,), in
-    their unit and the likelihood's; sought within 6 of them."""
+    their unit and the likelihood's; sought within 6 of them. At each shift the likeliest of a hundred lapse rates counts,
+    since guesses are no sign of a firm criterion."""
     if len(q) < 2:
         return np.nan, -np.inf, np.inf
     progress = np.linspace(-0.5, 0.5, len(q))
     edges = np.concatenate([[-np.inf], np.asarray(likelihood.thresholds, float), [np.inf]])
     width = np.sqrt(float(likelihood.noise) ** 2 + variance)
+    attentive, guess = np.log1p(-_RATES)[:, None], np.log(_RATES / likelihood.categories)[:, None]
 
     def log_likelihood(shift):
         centre = mean + shift * progress
-        return float(np.sum(_log_between((edges[q] - centre) / width, (edges[q + 1] - centre) / width)))
+        said = _log_between((edges[q] - centre) / width, (edges[q + 1] - centre) / width)
+        return float(np.sum(np.logaddexp(attentive + said, guess), axis=1).max())
 
     best, low, high = _profile(log_likelihood, -_DRIFT, _DRIFT)
     return best, -np.inf if low <= -_DRIFT else low, np.inf if high >= _DRIFT else high
