@@ -155,8 +155,8 @@ def drift(
     q: np.ndarray,
 ) -> tuple[float, float, float]:
     """Shift of the latent score from the first trial to the last, and its 95 % interval; from left-out moments (n,), in
-    their unit and the likelihood's; sought within 6 of them. At each shift the likeliest of a hundred lapse rates counts,
-    since guesses are no sign of a firm criterion."""
+    their unit and the likelihood's; sought within 6 of them. At each shift the likeliest of a hundred lapse rates
+    counts, since guesses are no sign of a firm criterion."""
     if len(q) < 2:
         return np.nan, -np.inf, np.inf
     progress = np.linspace(-0.5, 0.5, len(q))

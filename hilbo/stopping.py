@@ -68,17 +68,18 @@ def trust(
 
 @eqx.filter_jit
 def _trust(study, data: Trials, following: Float[Array, " d"], candidates):
-    posterior = fit(study.gp, data, inference=study.inference, throw=False)
-    now = best_point(study, posterior, candidates).x
-    probabilities = posterior.class_probabilities(jnp.stack([now, following]))
-
     def after(category):
-        more = data.append(following, category)
-        there = best_point(study, fit(study.gp, more, inference=study.inference, throw=False), candidates).x
-        return jnp.sqrt(jnp.mean((there - now) ** 2))
+        """The best rendering after one more answer, none if it is -1; and class probabilities there and at the next."""
+        more = data.append(following, jnp.maximum(category, 0))
+        given = jax.tree.map(lambda before, after: jnp.where(category < 0, before, after), data, more)
+        posterior = fit(study.gp, given, inference=study.inference, throw=False)
+        best = best_point(study, posterior, candidates).x
+        return best, posterior.class_probabilities(jnp.stack([best, following]))
 
-    moved = jax.lax.map(after, jnp.arange(len(study.responses), dtype=data.q.dtype))
-    return now, probabilities[0, -1], jnp.sum(probabilities[1] * moved)
+    # One loop for both, because compiling a fit and a search takes longer than all of them.
+    bests, probabilities = jax.lax.map(after, jnp.arange(-1, len(study.responses), dtype=data.q.dtype))
+    moved = jnp.sqrt(jnp.mean((bests[1:] - bests[:1]) ** 2, axis=1))
+    return bests[0], probabilities[0, 0, -1], jnp.sum(probabilities[0, 1] * moved)
 
 
 def trust_of(state: LiveSession, block: int) -> Trust | None:
