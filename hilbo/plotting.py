@@ -168,6 +168,8 @@ def progress_figure(
         band(right, trials, top, GREEN, "median, quartiles")
         right.set(xlabel="trials of each participant", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
         right.legend(frameon=False, loc="upper left")
+        for axes in (left, right):
+            axes.xaxis.get_major_locator().set_params(integer=True)
     return figure
 
 

@@ -105,6 +105,8 @@ def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> 
         band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
         right.set(xlabel="trials", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
         right.legend(frameon=False, loc="upper left")
+        for axes in (left, right):
+            axes.xaxis.get_major_locator().set_params(integer=True)
     return figure
 
 
