@@ -26,12 +26,12 @@ from hilbo.errors import InputError
 from hilbo.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 
-__all__ = ["ALL_RULES", "LARGEST_POOL", "AnyRule", "RuleMap", "even_choice", "point_rule", "rule_map", "share_of"]
+__all__ = ["ALL_RULES", "LARGEST_EXACT", "AnyRule", "RuleMap", "even_choice", "point_rule", "rule_map", "share_of"]
 
 AnyRule = Literal[aggregation.Rule, "grbcm", "pooled"]
 ALL_RULES: tuple[AnyRule, ...] = (*get_args(aggregation.Rule), "grbcm", "pooled")
 
-LARGEST_POOL = 1500
+LARGEST_EXACT = 1500
 """Answers, or latent values, up to which the exact models are used: they are cubic in their number."""
 _SHARE = 600  # answers from which the share is learnt
 
@@ -96,7 +96,7 @@ def rule_map(
     posteriors: Posterior | None = None,
     share: Float[Array, ""] | None = None,
     inference: str = "laplace",
-    largest: int = LARGEST_POOL,
+    largest: int = LARGEST_EXACT,
 ) -> RuleMap:
     """The map by a rule of `ALL_RULES` from stacked trials (M, n).
 

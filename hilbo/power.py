@@ -30,7 +30,7 @@ from scipy.stats import binomtest
 
 from hilbo.config import Study
 from hilbo.errors import InputError
-from hilbo.population_rules import LARGEST_POOL, rule_map
+from hilbo.population_rules import LARGEST_EXACT, rule_map
 from hilbo.session import search_points
 from hilbo.simulate import Person, Population, people, simulate_study
 from hilbo.study import Cohort, fit_cohort, map_optimum
@@ -80,9 +80,9 @@ def simulate_power(
             " more, or use another rule."
         )
     answers = max(plan.participants) * max(plan.trials)
-    if study.rule == "pooled" and answers > LARGEST_POOL:
+    if study.rule == "pooled" and answers > LARGEST_EXACT:
         raise InputError(
-            f'power: the rule "pooled" fits one model to all answers, at most {LARGEST_POOL:,}, and'
+            f'power: the rule "pooled" fits one model to all answers, at most {LARGEST_EXACT:,}, and'
             f" {max(plan.participants)} participants with {max(plan.trials)} trials give {answers:,}; ask for fewer, or"
             " use another rule."
         )
