@@ -176,7 +176,8 @@ def climb(
     The search goes through the unit cube itself. Only where that ends outside the feasible set, on a hill higher than
     what was found before, does another follow in the optimiser's coordinates, from the wall beside that end or from the
     start, whichever is better: there walls are flat, but the function inside is bent wherever the wall is.
-    One start after the other: each stops when it is done, where a batch would wait for its slowest.
+    One start after the other: each stops when it is done, where a batch would wait for its slowest, or on the way to
+    where an earlier one ended: once a hill stands out, most good starts are on its slopes.
     """
 
     def may_end(x):
@@ -185,16 +186,16 @@ def climb(
     def along_the_wall(x, outside):
         aside = from_box(jnp.clip(to_box(outside), 0.0, 1.0))
         begin = jnp.where(score(aside) > score(x), aside, x)
-        w, value = _polish(lambda w: score(from_box(w)), to_box(begin), steps, gain)
+        w, value = _polish(lambda w: score(from_box(w)), to_box(begin), steps, gain, {})
         end = from_box(w)
         return end, jnp.where(may_end(end), value, -jnp.inf)
 
-    def one(highest, start):
-        x, may = start
+    def one(state, start):
+        (highest, known), (x, may, index) = state, start
         begun = jnp.where(may, score(x), -jnp.inf)
         if steps == 0:
-            return highest, (x, begun, begun)
-        straight, height = _polish(score, x, steps, gain)
+            return state, (x, begun, begun)
+        straight, height = _polish(score, x, steps, gain, {"known": known})
         w = to_box(straight)
         inside = jnp.all((w >= 0.0) & (w <= 1.0)) & may_end(straight)
         end, value = jax.lax.cond(
@@ -202,10 +203,10 @@ def climb(
         )
         risen = may & (value > begun) & (inside | (height > highest))
         end, value = jnp.where(risen, end, x), jnp.where(risen, value, begun)
-        return jnp.maximum(highest, value), (end, value, begun)
+        return (jnp.maximum(highest, value), known.at[index].set(straight)), (end, value, begun)
 
-    lowest = jnp.full((), -jnp.inf, starts.dtype)
-    _, (ends, values, begun) = jax.lax.scan(one, lowest, (starts, usable))
+    nothing = jnp.full((), -jnp.inf, starts.dtype), jnp.full_like(starts, jnp.nan)
+    _, (ends, values, begun) = jax.lax.scan(one, nothing, (starts, usable, jnp.arange(len(starts))))
     best, first = jnp.argmax(values), jnp.argmax(begun)
     return Choice(ends[best], values[best], first, begun[first])
 
@@ -221,13 +222,13 @@ def spread(values: Float[Array, " m"], candidates: Float[Array, "m d"], count: i
     return jax.lax.scan(pick, values, None, length=count)[1]
 
 
-def _polish(score, begin, steps, gain):
+def _polish(score, begin, steps, gain, known):
     """Newton's method within the unit cube from `begin`: where it ends, and the score there."""
     solution = optx.minimise(
         lambda w, _: -score(w),
         TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION, gain=gain),
         begin,
-        options={"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)},
+        options={"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)} | known,
         max_steps=steps,
         throw=False,
     )

@@ -9,11 +9,15 @@ A variance is computed only where it may matter. A score is at most what it woul
 and the prior's (`optimistic`), so that columns whose bound is below a value already found cannot hold the maximum;
 columns are taken in the order of their bounds, `_BATCH` at a time, until the next bound is below the best value.
 The maximum over the lattice is the same as if every variance had been computed, to the rounding of the numbers.
+
+A maximum between nodes is higher than they are. Where nothing was asked, a score is as high as its bound, and flat: no
+climb leads anywhere, yet a thousand such nodes may be above those beside a small hill that data raise. So other points
+than the highest are ranked by *hope*, the value and a share of what it lacks to the bound.
 """
 
 import math
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -22,11 +26,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.kernels import RBF, gram
 
-__all__ = ["Lattice", "OptimisticScore", "nodes_for", "screen", "screen_points"]
+__all__ = ["Lattice", "OptimisticScore", "Screened", "nodes_for", "screen", "screen_points"]
 
-_BATCH = 48  # columns
+_BATCH = 32  # columns
 _PER_LENGTH = 3.0  # nodes per length scale,
 _FEWEST, _MOST = 12, 32  # and per coordinate
+_PROMISE = 0.2  # the share; with 0 and 0.4 some hills are missed (docs/design.md)
 _SLACK = 16.0  # rounding errors of a mean, in units of eps times the sum of its terms' sizes
 
 
@@ -76,6 +81,18 @@ def nodes_for(theta: float) -> int:
     return min(max(1 + math.ceil(_PER_LENGTH * math.sqrt(2.0 * theta)), _FEWEST), _MOST)
 
 
+class Screened(NamedTuple):
+    """The highest value; and points (1 + c + p, d) from which to search on, with their hopes (1 + c + p,).
+
+    First the highest point itself, with hope infinity; then the most hopeful one of each column, -inf for columns that
+    cannot hold the maximum; then the extra points. Where nothing may be asked, all are -inf.
+    """
+
+    value: Float[Array, ""]
+    hopes: Float[Array, " s"]
+    points: Float[Array, "s d"]
+
+
 def screen(
     kernel: RBF,
     x: Float[Array, "n d"],
@@ -84,50 +101,97 @@ def screen(
     lattice: Lattice,
     score: OptimisticScore,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
-) -> tuple[Float[Array, " s"], Float[Array, "s d"]]:
-    """The best value of each column and those of the extra points (c + p,), and where they are (c + p, d); -inf for
-    columns that cannot hold the maximum.
+) -> Screened:
+    """The maximum over a lattice, and where else to look.
 
     **Arguments:** the `kernel`, asked points `x` (n, d), `weights` and `factor` of a posterior; `allowed`: which
     points may be chosen at all, e.g. none too near to earlier ones.
     """
-    prior = kernel.diagonal(x[0])
-    down, across, ends = _factors(kernel, x, lattice)
-    usable = jnp.concatenate([lattice.inside, lattice.present])
+    usable, may = jnp.concatenate([lattice.inside, lattice.present]), jnp.ones(lattice.extra.shape[:1], bool)
     if allowed is not None:
         row, column = jnp.indices(usable.shape)
         usable &= jax.vmap(jax.vmap(allowed))(lattice.points(row, column))
-    at_ends = (across[:, None, :] * ends).reshape(x.shape[0], -1)
-    mean = jnp.concatenate([(weights[:, None] * down).T @ across, (weights @ at_ends).reshape(-1, across.shape[1])])
-    slack = _SLACK * jnp.finfo(mean.dtype).eps * jnp.sum(jnp.abs(weights)) * prior
-    bounds = jnp.max(jnp.where(usable, score.optimistic(mean + slack, prior), -jnp.inf), axis=0)
-    value_of = _Values(prior, jnp.concatenate([factor, weights[None, :]]), score)
+        may = jax.vmap(allowed)(lattice.extra)
+    values = _Values(kernel.diagonal(x[0]), factor, weights, score)
+    columns = _Columns(*_factors(kernel, x, lattice), usable, values)
+    beside = jax.lax.optimization_barrier(lattice.extra.astype(x.dtype))
+    others, others_hopes = (jnp.where(may, part, -jnp.inf) for part in values(gram(kernel, x, beside)))
+    found = _best_first(columns, jnp.max(others, initial=-jnp.inf))
+    at_top = lattice.points(*found.top)
+    if lattice.extra.shape[0]:
+        at_top = jnp.where(found.top[0] < 0, lattice.extra[jnp.argmax(others)], at_top)
+    first = jnp.where(found.highest > -jnp.inf, jnp.inf, found.highest)
+    at_rows = lattice.points(found.rows, jnp.arange(usable.shape[1]))
+    return Screened(
+        found.highest,
+        jnp.concatenate([first[None], found.hopes, others_hopes]),
+        jnp.concatenate([at_top[None, :], at_rows, lattice.extra]),
+    )
 
-    def evaluate(state):
-        bounds, best, row = state
-        _, chosen = jax.lax.top_k(bounds, batch)
-        u = across[:, chosen]
-        cross = jnp.concatenate([down[:, :, None] * u[:, None, :], ends[:, :, chosen] * u[:, None, :]], axis=1)
-        value = value_of(cross.reshape(x.shape[0], -1)).reshape(-1, batch)
-        value = jnp.where(usable[:, chosen], value, -jnp.inf)
-        return (
-            bounds.at[chosen].set(-jnp.inf),
-            best.at[chosen].set(jnp.max(value, axis=0)),
-            row.at[chosen].set(jnp.argmax(value, axis=0).astype(row.dtype)),
+
+class _Found(NamedTuple):
+    bounds: Float[Array, " c"]  # of columns without variances
+    highest: Float[Array, ""]  # value yet,
+    top: tuple[Int[Array, ""], Int[Array, ""]]  # and its row and column; row -1: none of a column
+    hopes: Float[Array, " c"]  # the largest of each column with variances, -inf for others,
+    rows: Int[Array, " c"]  # and where it is
+
+
+def _best_first(columns, highest) -> _Found:
+    """Columns get variances, the largest bounds first, while they may hold a value above the `highest` yet."""
+
+    def step(found):
+        _, chosen = jax.lax.top_k(found.bounds, min(_BATCH, found.bounds.shape[0]))
+        value, hope = columns.evaluate(chosen)
+        best = jnp.max(value, axis=0)
+        column = jnp.argmax(best)
+        higher = best[column] > found.highest
+        here = _first_largest(value[:, column]), chosen[column]
+        return _Found(
+            found.bounds.at[chosen].set(-jnp.inf),
+            jnp.where(higher, best[column], found.highest),
+            tuple(jnp.where(higher, new, old) for new, old in zip(here, found.top, strict=True)),
+            found.hopes.at[chosen].set(jnp.max(hope, axis=0)),
+            found.rows.at[chosen].set(_first_largest(hope)),
         )
 
-    others = value_of(gram(kernel, x, lattice.extra.astype(x.dtype)))
-    if allowed is not None:
-        others = jnp.where(jax.vmap(allowed)(lattice.extra), others, -jnp.inf)
-    highest = jnp.max(others, initial=-jnp.inf)
-    batch = min(_BATCH, bounds.shape[0])
-    nothing = jnp.full_like(bounds, -jnp.inf)
-    first = evaluate((bounds, nothing, jnp.zeros(bounds.shape, jnp.int32)))
-    _, best, row = jax.lax.while_loop(
-        lambda state: jnp.max(state[0]) > jnp.maximum(jnp.max(state[1]), highest), evaluate, first
-    )
-    at_best = lattice.points(row, jnp.arange(bounds.shape[0]))
-    return jnp.concatenate([best, others]), jnp.concatenate([at_best, lattice.extra])
+    bounds, none = columns.bounds(), jnp.asarray(-1, jnp.int32)
+    begun = _Found(bounds, highest, (none, none), jnp.full_like(bounds, -jnp.inf), jnp.zeros(bounds.shape, jnp.int32))
+    return jax.lax.while_loop(lambda found: jnp.max(found.bounds) > found.highest, step, begun)
+
+
+def _first_largest(values):
+    """`argmax` down the first axis; XLA makes faster code of a maximum and a minimum than of one `argmax`."""
+    last = values.shape[0] - 1
+    index = jnp.arange(last + 1, dtype=jnp.int32).reshape(-1, *[1] * (values.ndim - 1))
+    return jnp.min(jnp.where(values == jnp.max(values, axis=0, keepdims=True), index, last), axis=0)
+
+
+class _Columns(eqx.Module):
+    """Prior covariances of asked points and nodes, as factors along and across columns and at their ends; which nodes
+    and ends may be chosen; scores."""
+
+    down: Float[Array, "g n"]
+    across: Float[Array, "n c"]
+    ends: Float[Array, "n e c"]
+    usable: Bool[Array, "r c"]
+    values: "_Values"
+
+    def bounds(self) -> Float[Array, " c"]:
+        """What no score in a column exceeds."""
+        weights = self.values.weights
+        at_nodes = (self.down * weights[None, :]) @ self.across
+        at_ends = weights @ (self.across[:, None, :] * self.ends).reshape(len(weights), -1)
+        mean = jnp.concatenate([at_nodes, at_ends.reshape(-1, self.across.shape[1])])
+        return jnp.max(jnp.where(self.usable, self.values.bound(mean), -jnp.inf), axis=0)
+
+    def evaluate(self, chosen: Int[Array, " b"]) -> tuple[Float[Array, "r b"], Float[Array, "r b"]]:
+        """Values and hopes of some columns."""
+        across = self.across[:, chosen][:, None, :]
+        cross = jnp.concatenate([self.down.T[:, :, None] * across, self.ends[:, :, chosen] * across], axis=1)
+        found = self.values(cross.reshape(len(cross), -1))
+        value, hope = (jnp.where(self.usable[:, chosen], part.reshape(-1, len(chosen)), -jnp.inf) for part in found)
+        return value, hope
 
 
 def screen_points(
@@ -140,19 +204,17 @@ def screen_points(
     batch: int = 512,
 ) -> Float[Array, " m"]:
     """Values (m,) of a score at any points, -inf at those that cannot hold the maximum and got no variance."""
-    prior = kernel.diagonal(x[0])
-    mean = gram(kernel, points, x) @ weights
-    slack = _SLACK * jnp.finfo(mean.dtype).eps * jnp.sum(jnp.abs(weights)) * prior
-    value_of = _Values(prior, jnp.concatenate([factor, weights[None, :]]), score)
+    value_of = _Values(kernel.diagonal(x[0]), factor, weights, score)
 
     def evaluate(state):
         bounds, values = state
         _, chosen = jax.lax.top_k(bounds, min(batch, bounds.shape[0]))
-        found = value_of(gram(kernel, x, points[chosen]))
+        found, _ = value_of(gram(kernel, x, points[chosen]))
         # A point that comes twice, because all bounds are used up, keeps its value.
         return bounds.at[chosen].set(-jnp.inf), values.at[chosen].set(found)
 
-    first = evaluate((score.optimistic(mean + slack, prior), jnp.full_like(mean, -jnp.inf)))
+    bounds = value_of.bound(gram(kernel, points, x) @ weights)
+    first = evaluate((bounds, jnp.full_like(bounds, -jnp.inf)))
     return jax.lax.while_loop(lambda state: jnp.max(state[0]) > jnp.max(state[1]), evaluate, first)[1]
 
 
@@ -160,24 +222,35 @@ class _Values(eqx.Module):
     """A score where the prior covariances with the asked points are the columns of `cross`."""
 
     prior: Float[Array, ""]
-    product: Float[Array, "r n"]
+    factor: Float[Array, "n n"]
+    weights: Float[Array, " n"]
     score: OptimisticScore
 
-    def __call__(self, cross):
-        both = self.product @ jax.lax.optimization_barrier(cross)
-        left = self.prior - jnp.sum(both[:-1] ** 2, axis=0)
+    def bound(self, mean: Float[Array, "..."]) -> Float[Array, "..."]:
+        """What no score exceeds where the posterior mean is `mean`, but for its rounding."""
+        slack = _SLACK * jnp.finfo(mean.dtype).eps * jnp.sum(jnp.abs(self.weights)) * self.prior
+        return self.score.optimistic(mean + slack, self.prior)
+
+    def __call__(self, cross: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Values and hopes."""
+        product = jnp.concatenate([self.factor, self.weights[None, :]]) @ jax.lax.optimization_barrier(cross)
+        mean, left = product[-1], self.prior - jnp.sum(product[:-1] ** 2, axis=0)
         # Rounding may leave less than nothing of a variance, and these numbers only rank; what is none ranks last.
-        value = self.score(both[-1], jnp.where(left > 0, left, 0.0))
-        return jnp.where(value > -jnp.inf, value, -jnp.inf)
+        value = self.score(mean, jnp.where(left > 0, left, 0.0))
+        known = value > -jnp.inf
+        hope = value + _PROMISE * (self.score.optimistic(mean, self.prior) - value)
+        return jnp.where(known, value, -jnp.inf), jnp.where(known, hope, -jnp.inf)
 
 
 def _factors(kernel, x, lattice):
-    """Covariances as products: (n, g) along the columns, (n, c) across them, and (n, e, c) at their ends."""
+    """Covariances as products: (g, n) along the columns, (n, c) across them, and (n, e, c) at their ends."""
     nodes, ends = lattice.nodes.astype(x.dtype), lattice.ends.astype(x.dtype)
-    factors = [kernel.along(i, x[:, i], nodes) for i in range(lattice.dim)]
     across = kernel.diagonal(x[0]) * jnp.ones_like(x[:, :1])
-    for i, factor in enumerate(factors):
+    for i in range(lattice.dim):
         if i != lattice.along:
-            across = (across[:, :, None] * factor[:, None, :]).reshape(x.shape[0], -1)
-    at_ends = kernel.along(lattice.along, x[:, lattice.along], ends.reshape(-1))
-    return factors[lattice.along], across, at_ends.reshape(x.shape[0], *ends.shape)
+            # The barrier keeps XLA from walking through the product by its flat index, one number at a time.
+            product = across[:, :, None] * kernel.along(i, x[:, i], nodes)[:, None, :]
+            across = jax.lax.optimization_barrier(product).reshape(x.shape[0], -1)
+    at = x[:, lattice.along]
+    at_ends = kernel.along(lattice.along, at, ends.reshape(-1))
+    return kernel.along(lattice.along, nodes, at), across, at_ends.reshape(x.shape[0], *ends.shape)

@@ -35,15 +35,15 @@ def one_at_a_time(function: Callable, together: Callable | None = None) -> Calla
 
 @one_at_a_time
 def eigh(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Eigenvalues, increasing, and eigenvectors (columns) of a symmetric matrix."""
-    eigenvalues, vectors = jnp.linalg.eigh(matrix)
+    """Eigenvalues, increasing, and eigenvectors (columns) of a symmetric matrix, of which the lower half is read."""
+    vectors, eigenvalues = jax.lax.linalg.eigh(matrix, symmetrize_input=False)
     return eigenvalues, vectors
 
 
 @one_at_a_time
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    """Lower Cholesky factor of a positive definite matrix."""
-    return jnp.linalg.cholesky(matrix)
+    """Lower Cholesky factor of a positive definite matrix, of which the lower half is read."""
+    return jax.lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 
 @one_at_a_time

@@ -43,7 +43,7 @@ __all__ = [
 
 CANDIDATES = 4096
 """Points inside the feasible set among which a function is maximised before polishing; a quarter more on its walls."""
-_BEST, _STARTS = 256, 4  # screened points among which the starts of the polishing are sought, and starts
+_STARTS = 4  # of the polishing, on the lattice
 _GAIN, _IN_UNITS_OF_F = 1e-7, ("ucb", "mean")  # of the prior's sd: less is no reason to polish on
 _JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
 
@@ -108,10 +108,10 @@ def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
         else:  # which may rule out all points that were not skipped
             values = score(*short.predict(points.astype(jnp.float32)))
         return acquisition.maximise(values, points, score_at, **space, allowed=allowed)
-    values, points = screen(*known, plan.lattice, score, allowed)
-    values, best = jax.lax.top_k(values, min(_BEST, values.shape[0]))
-    rows = best[acquisition.spread(values, points[best], _STARTS)]
-    return acquisition.climb(points[rows], values[rows] > -jnp.inf, score_at, **space, allowed=allowed)
+    found = screen(*known, plan.lattice, score, allowed)
+    rows = acquisition.spread(found.hopes, found.points, _STARTS)
+    usable = found.hopes[rows] > -jnp.inf
+    return acquisition.climb(found.points[rows], usable, score_at, **space, allowed=allowed)
 
 
 def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
@@ -158,13 +158,16 @@ def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capac
 
     Rows beyond n are put in the middle of the box before the change of coordinates, so that it compiles once.
     """
-    middle = np.array([(p.low + p.high) / 2 for p in study.space.parameters])
-    padded, categories = _padded(points, answers, capacity, middle)
+    padded, categories = _padded(points, answers, _padding(study, capacity))
     return Trials(_to_unit(study.space, padded), jnp.asarray(categories), jnp.arange(capacity) < len(points))
 
 
-def _padded(points, answers, capacity, middle):
-    padded, categories = np.tile(middle, (capacity, 1)), np.zeros(capacity, np.int32)
+def _padding(study, capacity):
+    return np.tile([(p.low + p.high) / 2 for p in study.space.parameters], (capacity, 1))
+
+
+def _padded(points, answers, padding):
+    padded, categories = padding.copy(), np.zeros(len(padding), np.int32)
     padded[: len(points)], categories[: len(answers)] = points, answers
     return padded, categories
 
@@ -182,16 +185,18 @@ def _to_physical(space, unit):
 class _Step:
     """What is compiled once for a study and a design: from answers to the next point, in physical units.
 
-    Everything but the answers is bound, so that a call costs no look at the study.
+    Everything but the answers is bound, so that a call costs no look at the study: JAX gets its arrays as one flat
+    tuple, because walking through the records costs more than the fit where caches are cold.
     """
 
     def __init__(self, study, plan):
-        arrays, fixed = eqx.partition((study, plan), eqx.is_array)
-        leaves, structure = jax.tree.flatten(fixed)
-        self.arrays, self.compiled = arrays, _compiled(structure, tuple(leaves))
+        leaves, structure = jax.tree.flatten((study, plan))
+        self.arrays = tuple(leaf for leaf in leaves if eqx.is_array(leaf))
+        fixed = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+        self.compiled = _compiled(structure, fixed)
         self.initial = np.asarray(_to_physical(study.space, plan.initial))
         self.capacity, self.responses, self.names = study.selection.trials, study.responses, study.space.names
-        self.middle = np.array([(p.low + p.high) / 2 for p in study.space.parameters])
+        self.padding = _padding(study, self.capacity)
 
     def __call__(self, points, answers):
         """The next point, as numbers that survive a round trip through text; None when all trials are answered."""
@@ -200,17 +205,16 @@ class _Step:
             return None
         if count < len(self.initial):
             return self.initial[count]
-        padded, categories = _padded(points, answers, self.capacity, self.middle)
+        padded, categories = _padded(points, answers, self.padding)
         return np.asarray(self.compiled(self.arrays, padded, categories, np.int32(count)))
 
 
 @functools.lru_cache(maxsize=32)
-def _compiled(structure, leaves):
-    fixed = jax.tree.unflatten(structure, leaves)
-
+def _compiled(structure, fixed):
     @functools.partial(jax.jit, compiler_options=compiler_options())
     def step(arrays, points, answers, count):
-        study, plan = eqx.combine(arrays, fixed)
+        given = iter(arrays)
+        study, plan = jax.tree.unflatten(structure, [next(given) if leaf is None else leaf for leaf in fixed])
         trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)
         return study.space.to_physical(next_point(study, plan, trials, count))
 

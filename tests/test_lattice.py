@@ -48,20 +48,37 @@ def every_point(found):
 @pytest.mark.parametrize("score", SCORES, ids=lambda s: type(s).__name__)
 def test_the_maximum_over_the_lattice_is_found_with_few_variances(space, score):
     found, fitted = lattice_of(space, 16), posterior(space.dim)
-    values, points = lattice.screen(*known(fitted), found, score)
+    highest, hopes, points = lattice.screen(*known(fitted), found, score)
     everything = score(*fitted.predict(every_point(found)))
-    best = jnp.argmax(values)
-    np.testing.assert_allclose(values[best], jnp.max(everything), rtol=1e-11)
-    mean, variance = fitted.predict(points[best][None, :])
-    np.testing.assert_allclose(score(mean[0], variance[0]), values[best], rtol=1e-9)
+    assert jnp.argmax(hopes) == 0 and hopes[0] == jnp.inf
+    np.testing.assert_allclose(highest, jnp.max(everything), rtol=1e-11)
+    mean, variance = fitted.predict(points[:1])
+    np.testing.assert_allclose(score(mean[0], variance[0]), highest, rtol=1e-9)
+
+
+@each_space
+@pytest.mark.parametrize("score", SCORES, ids=lambda s: type(s).__name__)
+def test_a_column_is_known_by_its_most_hopeful_point(space, score):
+    found, fitted = lattice_of(space, 12), posterior(space.dim)
+    _, hopes, points = lattice.screen(*known(fitted), found, score)
+    mean, variance = fitted.predict(points[1:])
+    value, bound = score(mean, variance), score.optimistic(mean, jnp.asarray(1.0))
+    searched = hopes[1:] > -jnp.inf
+    np.testing.assert_allclose(hopes[1:][searched], (0.8 * value + 0.2 * bound)[searched], rtol=1e-9, atol=1e-12)
+    usable = jnp.concatenate([found.inside, found.present])
+    everywhere = fitted.predict(found.points(*map(jnp.asarray, np.indices(usable.shape))).reshape(-1, space.dim))
+    every_hope = 0.8 * score(*everywhere) + 0.2 * score.optimistic(everywhere[0], jnp.asarray(1.0))
+    largest = jnp.max(jnp.where(usable, every_hope.reshape(usable.shape), -jnp.inf), axis=0)
+    columns = searched[: usable.shape[1]]
+    np.testing.assert_allclose(hopes[1:][: usable.shape[1]][columns], largest[columns], rtol=1e-9, atol=1e-12)
 
 
 def test_most_columns_get_no_variance():
     space = SPACES["mechanics"]
     found = lattice_of(space, 24)
-    values, _ = lattice.screen(*known(posterior(3)), found, SCORES[0])
+    hopes = lattice.screen(*known(posterior(3)), found, SCORES[0]).hopes
     columns = found.inside.shape[1]
-    assert jnp.sum(values[:columns] > -jnp.inf) <= 2 * 48 < columns / 5
+    assert jnp.sum(hopes[1 : 1 + columns] > -jnp.inf) <= 96 < columns / 5
 
 
 @pytest.mark.parametrize("score", SCORES, ids=lambda s: type(s).__name__)
@@ -107,10 +124,15 @@ def test_points_of_the_lattice_are_feasible_and_meet_the_wall(space):
 def test_a_smallest_distance_is_kept():
     space, fitted = SPACES["mechanics"], posterior(3)
     found = lattice_of(space, 12)
-    free, where = lattice.screen(*known(fitted), found, SCORES[0])
-    best = where[jnp.argmax(free)]
-    values, points = lattice.screen(*known(fitted), found, SCORES[0], lambda x: jnp.sum((x - best) ** 2) >= 0.3**2)
-    assert jnp.linalg.norm(points[jnp.argmax(values)] - best) >= 0.3
+    best = lattice.screen(*known(fitted), found, SCORES[0]).points[0]
+    _, hopes, points = lattice.screen(*known(fitted), found, SCORES[0], lambda x: jnp.sum((x - best) ** 2) >= 0.3**2)
+    assert jnp.all(jnp.linalg.norm(points[hopes > -jnp.inf] - best[None, :], axis=1) >= 0.3)
+
+
+def test_nothing_to_choose_is_no_start():
+    found = lattice_of(SPACES["mechanics"], 12)
+    highest, hopes, _ = lattice.screen(*known(posterior(3)), found, SCORES[0], lambda x: jnp.sum(x) < 0)
+    assert highest == -jnp.inf and jnp.all(hopes == -jnp.inf)
 
 
 def test_nodes_follow_the_length_scale():

@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 from hilbo import Session, Study
+from hilbo.acquisition import UCB
 from hilbo.errors import InputError
-from hilbo.session import physical_trials
+from hilbo.ordinal_gp import Trials, fit
+from hilbo.session import design, next_point, physical_trials
 
 PAPER = "hilbo/data/paper.toml"
 
@@ -137,3 +139,20 @@ def test_a_smallest_distance_keeps_trials_apart(study):
 
 def test_the_study_is_a_pytree_of_its_model_alone(study):
     assert len(eqx.filter(study, eqx.is_array).gp.likelihood.thresholds) == 2
+
+
+def test_a_small_hill_is_found_beside_a_wide_plateau(study):
+    """Where nothing is known UCB is 0.7; nodes of the lattice beside this hill are lower, its top is higher."""
+    x = np.array(
+        """
+        .238 .693 .457  .096 .571 .205  .005 .178 .990  .438 .878 .046  .081 .283 .508
+        .078 .560 .169  .075 .558 .163  .148 .545 .239  .000 .647 .170  .079 .471 .077
+    """.split(),
+        float,
+    ).reshape(-1, 3)
+    trials = Trials.from_arrays(x, np.array([0, 2, 0, 0, 0, 2, 1, 0, 0, 0]), study.selection.trials)
+    chosen = next_point(study, design(study, 0), trials, len(x))
+    hill = jnp.array([0.181, 0.666, 0.110])
+    at_choice, at_hill = UCB(0.7)(*fit(study.gp, trials).predict(jnp.stack([chosen, hill])))
+    assert study.space.feasible(hill) and at_hill > 0.701
+    assert at_choice > at_hill
