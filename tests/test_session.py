@@ -143,13 +143,14 @@ def test_the_study_is_a_pytree_of_its_model_alone(study):
 
 def test_a_small_hill_is_found_beside_a_wide_plateau(study):
     """Where nothing is known UCB is 0.7; nodes of the lattice beside this hill are lower, its top is higher."""
-    x = np.array(
-        """
-        .238 .693 .457  .096 .571 .205  .005 .178 .990  .438 .878 .046  .081 .283 .508
-        .078 .560 .169  .075 .558 .163  .148 .545 .239  .000 .647 .170  .079 .471 .077
-    """.split(),
-        float,
-    ).reshape(-1, 3)
+    x = np.stack(
+        [
+            [0.238, 0.096, 0.005, 0.438, 0.081, 0.078, 0.075, 0.148, 0.000, 0.079],
+            [0.693, 0.571, 0.178, 0.878, 0.283, 0.560, 0.558, 0.545, 0.647, 0.471],
+            [0.457, 0.205, 0.990, 0.046, 0.508, 0.169, 0.163, 0.239, 0.170, 0.077],
+        ],
+        axis=1,
+    )
     trials = Trials.from_arrays(x, np.array([0, 2, 0, 0, 0, 2, 1, 0, 0, 0]), study.selection.trials)
     chosen = next_point(study, design(study, 0), trials, len(x))
     hill = jnp.array([0.181, 0.666, 0.110])
