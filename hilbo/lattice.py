@@ -146,11 +146,11 @@ def _best_first(columns, highest) -> _Found:
         best = jnp.max(value, axis=0)
         column = jnp.argmax(best)
         higher = best[column] > found.highest
-        here = _first_largest(value[:, column]), chosen[column]
+        row, at = found.top
         return _Found(
             found.bounds.at[chosen].set(-jnp.inf),
             jnp.where(higher, best[column], found.highest),
-            tuple(jnp.where(higher, new, old) for new, old in zip(here, found.top, strict=True)),
+            (jnp.where(higher, _first_largest(value[:, column]), row), jnp.where(higher, chosen[column], at)),
             found.hopes.at[chosen].set(jnp.max(hope, axis=0)),
             found.rows.at[chosen].set(_first_largest(hope)),
         )

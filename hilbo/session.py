@@ -13,6 +13,7 @@ log, of a table, on another day) gives the same points bit for bit.
 import functools
 import threading
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 
 import equinox as eqx
 import jax
@@ -221,7 +222,8 @@ def _compiled(structure, fixed):
     return step
 
 
-class Session(eqx.Module):
+@dataclass(frozen=True, eq=False)
+class Session:
     """A participant's answers so far and the rendering to ask next; made by `start`, `tell` and `replay`.
 
     `points` (n, d) are in physical units, `answers` (n,) categories from 0; `proposal` (d,) is the next point, None
@@ -233,8 +235,8 @@ class Session(eqx.Module):
     points: np.ndarray
     answers: np.ndarray
     proposal: np.ndarray | None
-    seed: int = eqx.field(static=True)
-    step: _Step = eqx.field(static=True, repr=False)
+    seed: int
+    step: _Step = field(repr=False)
 
     @classmethod
     def start(cls, study: Study, seed: int = 0) -> "Session":
@@ -286,7 +288,7 @@ class Session(eqx.Module):
         shown = _asked(self) if at is None else np.array([at[name] for name in step.names])
         points = np.concatenate([self.points, shown[None, :]])
         answers = np.append(self.answers, step.responses.index(response))
-        return _following(self, points, answers, step(points, answers))
+        return replace(self, points=points, answers=answers, proposal=step(points, answers))
 
     def posterior(self) -> Posterior:
         """The participant's posterior after the answers so far."""
@@ -298,24 +300,12 @@ class Session(eqx.Module):
         return dict(zip(self.study.space.names, np.asarray(physical).tolist(), strict=True))
 
 
-# Functions, because equinox wraps a record's method anew at each use, which takes 30 us.
-
-
 def _asked(session) -> np.ndarray:
     if session.proposal is None:
         raise InputError(
             f"Session: all {len(session.answers)} trials of the study are answered; nothing is left to ask."
         )
     return session.proposal
-
-
-def _following(session, points, answers, proposal) -> Session:
-    """A copy with other answers. The record's own constructor would go through the whole study again."""
-    following = object.__new__(Session)
-    kept = {name: getattr(session, name) for name in ("study", "plan", "seed", "step")}
-    for name, value in (kept | {"points": points, "answers": answers, "proposal": proposal}).items():
-        object.__setattr__(following, name, value)
-    return following
 
 
 @eqx.filter_jit
