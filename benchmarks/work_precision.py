@@ -158,6 +158,7 @@ def measure(sizes):
         for name in METHODS:
             results[name, n] = np.array(errors[name]), float(np.median(seconds[name]))
         floors[n] = np.max(floor, axis=0)
+        jax.clear_caches()  # as many compiled functions as all sizes need are more memory maps than Linux gives
         print(f"n = {n} done", file=sys.stderr)
     return results, floors
 
