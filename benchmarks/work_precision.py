@@ -278,7 +278,7 @@ reference's posterior, the point has that the method would ask next. "exact, N":
 
 "ep_corrected" costs a little more than EP and errs no more than `exact` with thousands of samples, at a small part of
 its price.
-Float32 changes none of the errors and saves up to half the time at 100 answers ([precision.md](precision.md)).
+Float32 changes none of the errors and saves a third of the time of `exact` ([precision.md](precision.md)).
 
 ## By kind of data
 
