@@ -303,7 +303,8 @@ What is left with `exact` is the committee's own approximation, that people are 
 
 UCB maximised over the passive set of the preset `paper`, in 24 states of 5 to 25 answers: how much less than the best
 known (65,536 points inside and 16,384 on the walls, 24 of them polished), and the time of a choice. Candidates are
-inside the set plus a quarter more on its walls; "polished" are that many of the best. Sessions of two or three parameters screen a lattice instead.
+inside the set plus a quarter more on its walls; "polished" are that many of the best. Sessions of two
+or three parameters screen a lattice instead.
 
 {optimum}
 """
