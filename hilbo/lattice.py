@@ -114,8 +114,8 @@ def screen(
         may = jax.vmap(allowed)(lattice.extra)
     values = _Values(kernel.diagonal(x[0]), factor, weights, score)
     columns = _Columns(*_factors(kernel, x, lattice), usable, values)
-    beside = jax.lax.optimization_barrier(lattice.extra.astype(x.dtype))
-    others, others_hopes = (jnp.where(may, part, -jnp.inf) for part in values(gram(kernel, x, beside)))
+    beside = values(gram(kernel, x, lattice.extra.astype(x.dtype)))
+    others, others_hopes = (jnp.where(may, part, -jnp.inf) for part in beside)
     found = _best_first(columns, jnp.max(others, initial=-jnp.inf))
     at_top = lattice.points(*found.top)
     if lattice.extra.shape[0]:
@@ -248,9 +248,7 @@ def _factors(kernel, x, lattice):
     across = kernel.diagonal(x[0]) * jnp.ones_like(x[:, :1])
     for i in range(lattice.dim):
         if i != lattice.along:
-            # The barrier keeps XLA from walking through the product by its flat index, one number at a time.
-            product = across[:, :, None] * kernel.along(i, x[:, i], nodes)[:, None, :]
-            across = jax.lax.optimization_barrier(product).reshape(x.shape[0], -1)
+            across = (across[:, :, None] * kernel.along(i, x[:, i], nodes)[:, None, :]).reshape(x.shape[0], -1)
     at = x[:, lattice.along]
     at_ends = kernel.along(lattice.along, at, ends.reshape(-1))
     return kernel.along(lattice.along, nodes, at), across, at_ends.reshape(x.shape[0], *ends.shape)
