@@ -123,12 +123,13 @@ evidence_hessian = jax.jit(jax.jacfwd(jax.grad(evidence)))
 
 
 def differences(fn, h):
-    """Jacobian by central differences, extrapolated from two steps."""
+    """Jacobian by central differences, extrapolated from three steps. With steps this long the values' rounding, 1e-13,
+    costs 1e-10 of a slope; ten times shorter ones left up to 4e-9."""
     columns = []
     for j, value in enumerate(np.asarray(h)):
-        step = 1e-3 * abs(value)
-        coarse, fine = ((fn(h.at[j].add(s)) - fn(h.at[j].add(-s))) / (2 * s) for s in (step, step / 2))
-        columns.append((4 * fine - coarse) / 3)
+        steps = (step * abs(value) for step in (0.016, 0.008, 0.004))
+        coarse, middle, fine = ((fn(h.at[j].add(s)) - fn(h.at[j].add(-s))) / (2 * s) for s in steps)
+        columns.append((coarse - 20 * middle + 64 * fine) / 45)
     return np.stack(columns, axis=-1)
 
 
