@@ -282,4 +282,5 @@ def _newton_state(terms, root, v):
         residual=jnp.linalg.norm(uphill),
         tolerance=jnp.clip(4.0 * epsilon * jnp.linalg.norm(summed), epsilon ** (2 / 3), epsilon**0.25),
     )
-    return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v)
+    # The values are rounded, and so is R v, to which they answer by their slopes: at little noise that is far more.
+    return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v + jnp.abs(slope) @ (magnitude @ jnp.abs(v)))

@@ -291,3 +291,13 @@ def test_a_category_that_the_model_lacks_is_named():
     trials = Trials.from_arrays(np.full((2, 3), 0.5), np.array([1, 3]))
     with pytest.raises(InputError, match="an answer has category 3, but the likelihood has 2 thresholds and so"):
         fit(gp, trials)
+
+
+@pytest.mark.parametrize(("seed", "theta", "noise"), [(13, 0.1, 1e-3), (19, 0.1, 3e-3), (19, 0.03, 3e-4)])
+def test_the_rounding_of_the_log_posterior_stops_no_search(seed, theta, noise):
+    """Where the noise is small, eta's rounding times the slopes is what the log posterior is rounded by."""
+    x = np.random.default_rng(seed).random((25, 3))
+    away = np.linalg.norm(x - 0.2, axis=1)
+    trials = Trials.from_arrays(x, (away < 0.6).astype(int) + (away < 0.3), 25)
+    certificate = fit(OrdinalGP(RBF(theta, 1.0), OrdinalProbit((-0.5, 0.5), noise)), trials).certificate
+    assert certificate.residual <= certificate.tolerance and certificate.iterations <= 60
