@@ -24,8 +24,8 @@ LIMITS = (
     "- pooled, EP: a sweep is a factor, as many solves as answers, the joint covariance, and Newton's matrix for all",
     "  cavity variances with its own factor: about ten times what a step towards Laplace's mode takes. Fewer than five",
     "  sweeps after Laplace's mode, or a way that never forms the joint covariance, would be needed for less.",
-    "- hyperparameters: derivatives of the terms up to the fourth, and much work on small matrices. EP's evidence",
-    "  is still differentiated automatically.",
+    "- hyperparameters: derivatives of the terms up to the fourth, and many LAPACK calls on small matrices: 3 to 9 us",
+    "  each at 25 answers. EP's evidences rise towards noise 0 for 15 of the 24, which takes longer.",
 )
 
 

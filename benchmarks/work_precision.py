@@ -32,7 +32,7 @@ from hilbo import RBF, OrdinalGP, OrdinalProbit, Study, Trials, fit  # noqa: E40
 from hilbo.ep import ep  # noqa: E402
 from hilbo.exact import exact  # noqa: E402
 from hilbo.kernels import gram  # noqa: E402
-from hilbo.ordinal_gp import Posterior, _TiltedTerms  # noqa: E402
+from hilbo.ordinal_gp import Posterior, TiltedTerms  # noqa: E402
 from hilbo.study import cohort_of  # noqa: E402
 from hilbo.tables import read_trials  # noqa: E402
 
@@ -85,7 +85,7 @@ def approximate(inference: str):
 
 def few_steps(steps: int):
     def run(gp, trials):
-        terms = _TiltedTerms(gp.likelihood, trials.q, trials.mask)
+        terms = TiltedTerms(gp.likelihood, trials.q, trials.mask)
         return Posterior(gp, trials, ep(gram(gp.kernel, trials.x, trials.x), terms, max_steps=steps))
 
     return run

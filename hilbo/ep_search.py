@@ -9,13 +9,13 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.gaussian import factorise, square_root
 from hilbo.laplace import plain_mode
 from hilbo.linalg import cholesky, one_at_a_time, solve_lower
 
-__all__ = ["Found", "Joint", "Tilted", "coupling", "find", "joint_of", "sites_of"]
+__all__ = ["Cavities", "Found", "Joint", "Tilted", "coupling", "find", "joint_of", "residual_of", "sites_of", "solve"]
 
 Tilted = Callable[
     [Float[Array, " n"], Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
@@ -26,10 +26,23 @@ _QUICK_STEPS = 20
 _BASIN = 3.0  # a mismatch, in posterior sds, below which Newton's step is tried
 
 
+class Cavities(NamedTuple):
+    """Means and variances; a start that is none has a variance that is no positive number."""
+
+    mean: Float[Array, " n"]
+    variance: Float[Array, " n"]
+
+    @property
+    def known(self) -> Bool[Array, ""]:
+        """Whether it is a start."""
+        return jnp.all((self.variance > 0) & jnp.isfinite(self.variance) & jnp.isfinite(self.mean))
+
+
 class Found(NamedTuple):
     """How the search ended; `changed` is what the square root dropped, 0 where none was needed."""
 
     residual: Float[Array, ""]
+    """Infinite where a hasty search ended by a step that should leave none; then `residual_of` is to measure it."""
     tolerance: Float[Array, ""]
     iterations: Int[Array, ""]
     changed: Float[Array, ""]
@@ -41,13 +54,16 @@ class _Search(eqx.Module):
     residual: Float[Array, ""]
     tolerance: Float[Array, ""]
     mismatch: Float[Array, ""]  # before a Newton step, infinite before an update
+    ahead: Float[Array, ""]  # what the step should leave of it
     basin: Float[Array, ""]
     updates: Int[Array, ""]
     steps: Int[Array, ""]
 
 
-def find(terms, covariance, start, max_steps):
-    """Cavity means and variances, and how they were found.
+def find(terms, covariance, start, max_steps, hasty=False):
+    """Cavity means and variances, and how they were found. `start`: weights, or cavities, or nothing.
+
+    A `hasty` search spares the sweep that would only see that the last step of Newton's was the last.
 
     Under `vmap` one problem after the other on CPUs, each stopping when it is done; elsewhere all at once with a root.
     """
@@ -55,23 +71,20 @@ def find(terms, covariance, start, max_steps):
 
     def with_root(terms, covariance, begin):
         root, changed = square_root(covariance)
-        return _searched(terms, covariance, root, begin(root), max_steps, changed)
+        return _searched(terms, covariance, root, begin(root), max_steps, changed, jnp.asarray(False))
 
-    def safe(arrays, covariance, start):
+    def safe(arrays, covariance, start, hasty):
+        del hasty
         terms = eqx.combine(arrays, rest)
         return with_root(terms, covariance, lambda root: _begin(terms, covariance, root, start))
 
-    def quick(arrays, covariance, start):
+    def quick(arrays, covariance, start, hasty):
         terms = eqx.combine(arrays, rest)
         none = jnp.zeros_like(covariance[0, 0])
-        spent = jnp.zeros((), jnp.int32)
-        if start is None:
-            mode = plain_mode(_AtPoints(terms), covariance, jnp.zeros_like(covariance[0]), _QUICK_STEPS)
-            start, spent = _AtPoints(terms)(mode.eta)[1], mode.steps.astype(jnp.int32) - 1
-        begun = _begin(terms, covariance, None, start)
-        mean, variance, end = _searched(terms, covariance, None, begun, min(max_steps, _QUICK_STEPS), none)
+        begun, spent = _first(terms, covariance, start)
+        mean, variance, end = _searched(terms, covariance, None, begun, min(max_steps, _QUICK_STEPS), none, hasty)
         found = mean, variance, end._replace(iterations=end.iterations + spent)
-        met = end.residual <= end.tolerance
+        met = (end.residual <= end.tolerance) | jnp.isinf(end.residual)
         _, _, precision = terms(mean, variance)
         # s = K - KCK errs by eps K, and the cavity's variance by this share:
         blur = jnp.finfo(none.dtype).eps * jnp.max(jnp.diagonal(covariance) * precision * (1.0 + precision * variance))
@@ -86,7 +99,7 @@ def find(terms, covariance, start, max_steps):
 
         return jax.lax.cond(met & (blur <= 0.1 * end.tolerance), lambda: found, further)
 
-    return one_at_a_time(quick, safe)(arrays, covariance, start)
+    return one_at_a_time(quick, safe)(arrays, covariance, start, jnp.asarray(hasty))
 
 
 class _AtPoints(eqx.Module):
@@ -98,20 +111,40 @@ class _AtPoints(eqx.Module):
         return self.terms(eta, jnp.zeros_like(eta))
 
 
-def _searched(terms, covariance, root, begun, max_steps, changed):
+def _searched(terms, covariance, root, begun, max_steps, changed, hasty):
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
     basin = jnp.full_like(largest, _BASIN)
     mean, variance = begun
-    begin = _Search(mean, variance, largest, jnp.zeros_like(largest), largest, basin, count, count)
+    begin = _Search(mean, variance, largest, jnp.zeros_like(largest), largest, largest, basin, count, count)
+
+    def unseen(search):
+        return hasty & (search.ahead <= 0.1 * search.tolerance)
 
     def unfinished(search):
         # One step at least: Laplace's mode may be the fixed point, but only to the digits of its own variances.
         done = (search.residual <= search.tolerance) & ((search.steps > 1) | (search.residual == 0.0))
-        return (search.steps < max_steps) & ~done & ~jnp.isnan(search.mismatch)
+        return (search.steps < max_steps) & ~done & ~unseen(search) & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
-    return end.mean, end.variance, Found(end.residual, end.tolerance, end.steps, changed)
+    residual = jnp.where(unseen(end) & (end.residual > end.tolerance), jnp.inf, end.residual)
+    return end.mean, end.variance, Found(residual, end.tolerance, end.steps, changed)
+
+
+def _first(terms, covariance, start):
+    """Where the search without a root begins, at Laplace's mode if nothing is known, and the steps that took."""
+
+    def from_mode():
+        mode = plain_mode(_AtPoints(terms), covariance, jnp.zeros_like(covariance[0]), _QUICK_STEPS)
+        begun = _begin(terms, covariance, None, _AtPoints(terms)(mode.eta)[1])
+        return begun, mode.steps.astype(jnp.int32) - 1
+
+    nothing = jnp.zeros((), jnp.int32)
+    if start is None:
+        return from_mode()
+    if isinstance(start, Cavities):
+        return jax.lax.cond(start.known, lambda: (tuple(start), nothing), from_mode)
+    return _begin(terms, covariance, None, start), nothing
 
 
 def _begin(terms, covariance, root, start):
@@ -119,6 +152,9 @@ def _begin(terms, covariance, root, start):
     prior = jnp.diagonal(covariance)
     if start is None:
         return jnp.zeros_like(prior), prior
+    if isinstance(start, Cavities):
+        known = start.known
+        return jnp.where(known, start.mean, 0.0), jnp.where(known, start.variance, prior)
     mean = covariance @ start
     _, _, precision = terms(mean, jnp.zeros_like(mean))
     posterior = joint_of(covariance, root, precision)
@@ -192,6 +228,8 @@ def _advance(terms, covariance, root, search):
         residual=residual,
         tolerance=tolerance,
         mismatch=jnp.where(newton | jnp.isnan(mismatch), mismatch, jnp.inf),
+        # Newton's steps square it, times what the last ones showed.
+        ahead=jnp.where(newton, mismatch**2 * jnp.maximum(1.0, mismatch / search.mismatch**2), jnp.inf),
         basin=basin,
         updates=search.updates + jnp.where(newton, 0, 1),
         steps=search.steps + 1,
@@ -217,6 +255,19 @@ def _mismatch(covariance, root, search, sites, posterior, means):
     return residuals[worse], tolerances[worse], mismatch
 
 
+def residual_of(covariance, cavities, weights, precision, posterior):
+    """What the search would see at these cavities; `posterior`: its variances, and what multiplies by C.
+
+    With P = I - K C the means differ by P (K a - m - v a), and the cavities' variances should be s / (1 - t s).
+    """
+    variance, explain = posterior
+    tilted = cavities.mean + cavities.variance * weights
+    gap = covariance @ weights - tilted
+    apart = jnp.abs(gap - covariance @ explain(gap)) / jnp.sqrt(jnp.diagonal(covariance))
+    stretched = jnp.abs(jnp.log(variance / ((1.0 - precision * variance) * cavities.variance)))
+    return jnp.max(jnp.where(precision > 0, jnp.maximum(apart, stretched), 0.0))
+
+
 # --- how cavities move together
 
 
@@ -227,7 +278,7 @@ def _newton_step(sites, posterior, variance, apart, wider):
     """
     follow, spread, matrix = coupling(sites, posterior, variance)
     free = (1.0 + variance * sites.precision) * apart
-    dv = _solve(matrix, wider - spread @ (sites.precision_m * free))
+    dv = solve(matrix, wider - spread @ (sites.precision_m * free))
     return free + follow @ dv, dv
 
 
@@ -246,5 +297,6 @@ def coupling(sites, posterior, variance):
 
 
 @one_at_a_time
-def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+def solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """X with `matrix` X = `right`, by elimination."""
     return jnp.linalg.solve(matrix, right)

@@ -27,28 +27,67 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.gaussian import evidence_error, evidence_known, evidence_rounding, factorise
 from hilbo.laplace import Terms, find_mode
 from hilbo.linalg import solve_lower
 
-__all__ = ["Evidence", "laplace_evidence"]
+__all__ = ["Conditioned", "Evidence", "certified", "conditioned", "laplace_evidence"]
 
 
 _STEPS = 200
 
 
 class Evidence(NamedTuple):
-    """Log evidence in hyperparameters x, its derivatives, and where it was found."""
+    """Log evidence in p hyperparameters x, its derivatives, and where it was found."""
 
     value: Float[Array, ""]
     gradient: Float[Array, " p"]
     hessian: Float[Array, "p p"]
-    weights: Float[Array, " n"]
-    moved: Float[Array, "n p"]
-    """Derivatives of the weights."""
+    place: PyTree[Float[Array, " n"]]
+    """Laplace's weights, or means and log variances of EP's cavities; the next ones are sought near them."""
+    moved: PyTree[Float[Array, "n p"]]
+    """Derivatives of `place`."""
     certified: Bool[Array, ""]
+
+
+class Conditioned(NamedTuple):
+    """A prior K after answers with curvatures W: what is left of it, and what explains the rest."""
+
+    inverse: Float[Array, "n n"]  # C
+    transfer: Float[Array, "n n"]  # T
+    covariance: Float[Array, "n n"]  # S
+    variance: Float[Array, " n"]
+    log_determinant: Float[Array, ""]
+
+
+def conditioned(matrix: Float[Array, "n n"], curvature: Float[Array, " n"]) -> Conditioned:
+    """C = (K + 1/W)^-1, T = I - C K, S = (K^-1 + W)^-1 with its diagonal, and log|I + KW|."""
+    root, _, lower = factorise(matrix, curvature)
+    factor = solve_lower(lower, jnp.diag(root))
+    through = factor @ matrix
+    covariance = matrix - through.T @ through
+    transfer = jnp.eye(root.size, dtype=root.dtype) - factor.T @ through
+    log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
+    return Conditioned(factor.T @ factor, transfer, covariance, jnp.diagonal(covariance), log_determinant)
+
+
+def certified(
+    value: Float[Array, ""],
+    matrix: Float[Array, "n n"],
+    found: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]],
+    post: Conditioned,
+    curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+) -> Bool[Array, ""]:
+    """Whether the evidence is known and no variance is below its rounding; `found`: mode, weights and curvatures."""
+    eta, weights, curvature = found
+    largest = jnp.max(jnp.diagonal(matrix))
+    smallest = jnp.min(jnp.where(curvature > 0, post.variance, largest))
+    resolved = smallest >= jnp.finfo(value.dtype).eps * largest * eta.size**0.5
+    explained = post.variance, lambda y: post.inverse @ y
+    error = evidence_error(matrix, eta, weights, curvature, explained, curvature_at)
+    return evidence_known(value, error, evidence_rounding(matrix, weights[None, :])) & resolved
 
 
 def laplace_evidence(
@@ -63,9 +102,10 @@ def laplace_evidence(
     `start`: weights near which the mode is sought; where that fails it is sought anew.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
-    found = find_mode(terms(own), matrix, start, _STEPS)
-    values, weights, curvature = terms(own)(found.eta)
-    post = _posterior(matrix, curvature)
+    here = terms(own)
+    found = find_mode(here, matrix, start, _STEPS)
+    values, weights, curvature = here(found.eta)
+    post = conditioned(matrix, curvature)
     paths = _paths(terms, own, found.eta, post, slopes, (matrix, weights, curvature))
 
     bent = matrix @ paths.adjoint
@@ -86,32 +126,8 @@ def laplace_evidence(
     hessian = second + _bilinear(matrix, post, slopes, paths)
     hessian = hessian.at[own.size :, own.size :].add(jax.jacfwd(jax.jacfwd(paired))(shape))
     value = jnp.sum(values) - 0.5 * weights @ found.eta - 0.5 * post.log_determinant
-    largest = jnp.max(jnp.diagonal(matrix))
-    smallest = jnp.min(jnp.where(curvature > 0, post.variance, largest))
-    resolved = smallest >= jnp.finfo(value.dtype).eps * largest * found.eta.size**0.5
-    explained = post.variance, lambda y: post.inverse @ y
-    error = evidence_error(matrix, found.eta, weights, curvature, explained, lambda eta: terms(own)(eta)[2])
-    sure = evidence_known(value, error, evidence_rounding(matrix, weights[None, :]))
-    certified = (found.residual <= found.tolerance) & sure & resolved
-    return Evidence(value, gradient, hessian, weights, paths.weights, certified)
-
-
-class _Joint(NamedTuple):
-    inverse: Float[Array, "n n"]  # C
-    transfer: Float[Array, "n n"]  # T
-    covariance: Float[Array, "n n"]  # S
-    variance: Float[Array, " n"]
-    log_determinant: Float[Array, ""]
-
-
-def _posterior(matrix, curvature):
-    root, _, lower = factorise(matrix, curvature)
-    factor = solve_lower(lower, jnp.diag(root))
-    through = factor @ matrix
-    covariance = matrix - through.T @ through
-    transfer = jnp.eye(root.size, dtype=root.dtype) - factor.T @ through
-    log_determinant = 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))
-    return _Joint(factor.T @ factor, transfer, covariance, jnp.diagonal(covariance), log_determinant)
+    sure = certified(value, matrix, (found.eta, weights, curvature), post, lambda eta: here(eta)[2])
+    return Evidence(value, gradient, hessian, weights, paths.weights, (found.residual <= found.tolerance) & sure)
 
 
 class _Paths(NamedTuple):

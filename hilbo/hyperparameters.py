@@ -10,39 +10,33 @@ threshold sd 1 in units of the prior's standard deviation. Few ordinal answers o
 maximum (theta to 0 or infinity); the result then says so instead of printing digits.
 
 The search is Newton's method with a trust radius, which takes 6 to 20 steps, a quasi-Newton one 30 to 100.
-Laplace's evidence has its gradient and Hessian in closed form (`hilbo.evidence`), and its modes are sought from where
-the last ones point; EP's is differentiated automatically. Of several starts, those that go where an earlier one ended
+The evidences by Laplace's method and by EP have gradients and Hessians in closed form (`hilbo.evidence`,
+`hilbo.ep_evidence`), and modes and cavities are sought from where the last ones point; the evidence by corrected EP is
+differentiated automatically. Of several starts, those that go where an earlier one ended
 stop there.
 Reference: Rasmussen & Williams (2006), section 5.5.1; paper, section IV-3 (robustness check).
 """
 
 from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.errors import InputError
-from hilbo.evidence import Evidence, laplace_evidence
-from hilbo.kernels import gram
+from hilbo.hyper_coordinates import Coordinates, Learnable, coordinates_of, model_at
+from hilbo.hyper_cost import evidence_cost
 from hilbo.linalg import eigh, one_at_a_time
 from hilbo.newton import TrustRegionNewton, arrives
-from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, OrdinalTerms, Trials, fit
+from hilbo.ordinal_gp import OrdinalGP, Trials
 
-__all__ = ["Learnable", "Learned", "log_prior", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
-
-Learnable = Literal["theta", "variance", "noise", "thresholds"]
-Coordinates = dict[str, Float[Array, "..."]]
+__all__ = ["Learned", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
 
 _RUNAWAY = 6.9  # a factor of 1000: that far from where the search began there is no maximum to speak of
 _FLAT = 1e-3  # curvature of the log evidence: less leaves a hyperparameter open by a factor exp(30) either way
-_PRIOR_SD = {"theta": 1.5, "variance": 1.0, "noise": 1.0, "first": 1.0, "gaps": 1.0}
-_OWN = ("first", "gaps", "noise")  # coordinates of the likelihood; in a sorted record they come before the kernel's
-_FIELDS = {"theta": ("theta",), "variance": ("variance",), "noise": ("noise",), "thresholds": ("first", "gaps")}
 
 
 class Learned(eqx.Module):
@@ -99,14 +93,6 @@ def maximise_shared_evidence(
     return _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference)
 
 
-def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Float[Array, ""]:
-    """Log density of the weak priors at `gp`, up to a constant; `centre` is where they are centred."""
-    here, there = _coordinates(gp, learn), _coordinates(centre, learn)
-    scale = dict.fromkeys(here, 1.0) | {"first": jnp.sqrt(centre.kernel.variance)}
-    parts = [jnp.sum(((here[k] - there[k]) / (_PRIOR_SD[k] * scale[k])) ** 2) for k in here]
-    return -0.5 * jnp.sum(jnp.stack(parts))
-
-
 def _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference):
     learn = _checked(learn)
     if inference == "exact":
@@ -127,118 +113,60 @@ class _Search(NamedTuple):
 
 
 def _searched(gp, trials, options):
-    # Per answer the cost has curvatures near 1, so that the first step, down the bare gradient, is a sensible one.
-    answers = jnp.sum(trials.mask, dtype=gp.likelihood.noise.dtype) + 1.0
-    objective = _closed if options.inference == "laplace" else _differentiated
-    fn, expand = objective(gp, trials, options, answers)
+    expand, nothing = evidence_cost(gp, trials, options.learn, options.weak_priors, options.inference)
 
-    def ended(known, start):
+    def cost(coordinates, _):
+        """The search asks this for shapes alone."""
+        value, _, _, seen = expand(coordinates, nothing)
+        return value, seen
+
+    def ended(carry, start):
+        known, last = carry
+        begun = expand(start, last)
         solution = optx.minimise(
-            fn,
+            cost,
             TrustRegionNewton(),
             start,
             has_aux=True,
             max_steps=options.max_steps,
             throw=False,
-            options=expand | {"known": known},
+            options={"expand": expand, "begun": begun, "known": known},
         )
-        evidence, certified = solution.aux[:2]
         # An evidence without its certificate is no evidence: such an end never wins. Nor one that is known already.
         end, joined = solution.state.here, arrives(solution.value, solution.state.move, known)
+        certified = end.aux.certified
         value = jnp.where(certified & jnp.isfinite(end.value) & ~joined, end.value, jnp.inf)
         done = (solution.result == optx.RESULTS.successful) & certified
-        flat = eigh(end.hessian)[0][0] * answers < _FLAT
-        found = jnp.where(done & ~joined, ravel_pytree(solution.value)[0], jnp.nan)
+        found = jnp.where(done & ~joined, end.aux.at, jnp.nan)
         known = jnp.concatenate([known[1:], found[None, :]])
-        return known, (solution.value, value, evidence, done, flat, jnp.asarray(solution.stats["num_steps"]))
+        steps = jnp.asarray(solution.stats["num_steps"]) + 1
+        return (known, begun[-1]), _End(solution.value, value, end.aux.log_evidence, steps, done, _flat(end, trials))
 
-    begin = _coordinates(gp, options.learn)
-    # One search after the other: each stops when it is done, or on its way to where an earlier one ended.
-    unknown = jnp.full((options.starts, ravel_pytree(begin)[0].size), jnp.nan, answers.dtype)
-    _, (ends, values, evidences, done, flat, steps) = jax.lax.scan(ended, unknown, _spread(begin, options.starts))
-    best = jnp.argmin(values)
-    chosen = jax.tree.map(lambda leaf: leaf[best], ends)
-    moved = [jnp.max(jnp.abs(chosen[k] - begin[k])) for k in chosen if k != "first" and chosen[k].size]
-    runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | flat[best]
-    return Learned(_model(chosen, gp), evidences[best], steps[best], done[best], runaway, options.learn)
-
-
-def _differentiated(gp, trials, options, answers):
-    """The cost, by automatic differentiation."""
-
-    def cost(coordinates, _):
-        model = _model(coordinates, gp)
-        evidence, certified = _evidence(model, trials, options.inference)
-        prior = log_prior(model, gp, options.learn) if options.weak_priors else jnp.zeros_like(evidence)
-        return -(evidence + prior) / answers, (evidence, certified)
-
-    return cost, {}
+    begin = coordinates_of(gp, options.learn)
+    # One search after the other: each stops when it is done, or on its way to where an earlier one ended; and its first
+    # evidence is sought from the one before's.
+    unknown = jnp.full((options.starts, nothing.at.size), jnp.nan, nothing.at.dtype)
+    _, ends = jax.lax.scan(ended, (unknown, nothing), _spread(begin, options.starts))
+    own_first = (jnp.arange(options.starts) + (options.starts - 1) // 2) % options.starts
+    best = own_first[jnp.argmin(ends.value[own_first])]
+    end = jax.tree.map(lambda leaf: leaf[best], ends)
+    moved = [jnp.max(jnp.abs(end.at[k] - begin[k])) for k in begin if k != "first" and begin[k].size]
+    runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | end.flat
+    return Learned(model_at(end.at, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
 
 
-def _closed(gp, trials, options, answers):
-    """The cost with Laplace's evidence, by its closed derivatives; the modes are sought from the last ones."""
-
-    def prior(coordinates):
-        return log_prior(_model(coordinates, gp), gp, options.learn)
-
-    def expand(coordinates, last, aux):
-        flat, restore = ravel_pytree(coordinates)
-        ahead = flat - ravel_pytree(last)[0]
-        _, _, weights, moved = aux
-        found = _people(gp, trials, coordinates, weights + moved @ ahead)
-        value, gradient, hessian = (jnp.sum(part, axis=0) for part in found[:3])
-        evidence = value
-        if options.weak_priors:
-            value, gradient = value + prior(coordinates), gradient + jax.grad(lambda at: prior(restore(at)))(flat)
-            hessian = hessian + jax.hessian(lambda at: prior(restore(at)))(flat)
-        kept = evidence, jnp.all(found.certified), found.weights, found.moved
-        return -value / answers, -gradient / answers, -hessian / answers, kept
-
-    def cost(coordinates, _):
-        nothing = jnp.zeros(trials.q.shape, answers.dtype)
-        count = ravel_pytree(coordinates)[0].size
-        kept = jnp.zeros_like(answers), jnp.zeros((), bool), nothing, jnp.zeros((*nothing.shape, count), answers.dtype)
-        value, _, _, kept = expand(coordinates, coordinates, kept)
-        return value, kept
-
-    return cost, {"expand": expand}
+class _End(NamedTuple):
+    at: Coordinates
+    value: Float[Array, ""]
+    log_evidence: Float[Array, ""]
+    steps: Int[Array, ""]
+    done: Bool[Array, ""]
+    flat: Bool[Array, ""]
 
 
-@one_at_a_time
-def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: Float[Array, " n"]) -> Evidence:
-    """One person's evidence by Laplace's method, expanded in the coordinates, which are in alphabetical order.
-
-    `start`: weights near which the mode is sought.
-    """
-    own = {name: value for name, value in coordinates.items() if name in _OWN}
-    shape = {name: value for name, value in coordinates.items() if name not in _OWN}
-    (flat_own, restore_own), (flat_shape, restore_shape) = ravel_pytree(own), ravel_pytree(shape)
-
-    def covariance(at):
-        return gram(_model(own | restore_shape(at), gp).kernel, trials.x, trials.x)
-
-    def terms(at):
-        return OrdinalTerms(_model(restore_own(at) | shape, gp).likelihood, trials.q, trials.mask)
-
-    return laplace_evidence(covariance, terms, flat_own.astype(start.dtype), flat_shape.astype(start.dtype), start)
-
-
-def _people(gp, trials, coordinates, starts):
-    if starts.shape[0] > 1:
-        return jax.vmap(person_evidence, in_axes=(None, None, 0, 0))(gp, coordinates, trials, starts)
-    alone = person_evidence(gp, coordinates, jax.tree.map(lambda leaf: leaf[0], trials), starts[0])
-    return jax.tree.map(lambda leaf: leaf[None], alone)
-
-
-def _evidence(gp, trials, inference):
-    """Summed log evidence of stacked trials, and whether every certificate holds."""
-
-    def one(person):
-        posterior = fit(gp, person, inference=inference, throw=False)
-        return posterior.log_evidence, posterior.certificate.converged
-
-    evidences, converged = jax.vmap(one)(trials)
-    return jnp.sum(evidences), jnp.all(converged)
+def _flat(end, trials):
+    answers = jnp.sum(trials.mask, dtype=end.value.dtype) + 1.0
+    return eigh(end.hessian)[0][0] * answers < _FLAT
 
 
 def _checked(learn):
@@ -255,33 +183,9 @@ def _checked(learn):
     return learn
 
 
-def _coordinates(gp: OrdinalGP, learn: Sequence[str]) -> Coordinates:
-    thresholds = gp.likelihood.thresholds
-    every = {
-        "theta": jnp.log(gp.kernel.theta),
-        "variance": jnp.log(gp.kernel.variance),
-        "noise": jnp.log(gp.likelihood.noise),
-        "first": thresholds[0],
-        "gaps": jnp.log(jnp.diff(thresholds)),
-    }
-    return {field: every[field] for name in learn for field in _FIELDS[name]}
-
-
-def _model(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
-    """The model at these coordinates; what they do not mention is as in `gp`."""
-    held = {"theta": gp.kernel.theta, "variance": gp.kernel.variance, "noise": gp.likelihood.noise}
-    positive = held | {k: jnp.exp(coordinates[k]) for k in held if k in coordinates}
-    thresholds = gp.likelihood.thresholds
-    if "first" in coordinates:
-        steps = jnp.concatenate([coordinates["first"][None], jnp.exp(coordinates["gaps"])])
-        thresholds = jnp.cumsum(steps)
-    return OrdinalGP(RBF(positive["theta"], positive["variance"]), OrdinalProbit(thresholds, positive["noise"]))
-
-
 def _spread(begin: Coordinates, starts: int) -> Coordinates:
-    """Starting points: the model itself, then theta (and noise, the other way) by alternating powers of 2."""
-    index = jnp.arange(starts)
-    power = jnp.where(index % 2 == 1, (index + 1) // 2, -(index // 2)).astype(begin[next(iter(begin))].dtype)
+    """Starting points in a row: theta (and noise, the other way) by rising powers of 2, the model itself amid them."""
+    power = (jnp.arange(starts) - (starts - 1) // 2).astype(begin[next(iter(begin))].dtype)
     step = {"theta": 1.4, "noise": -0.7}  # 4 and 1/2, as logarithms
     return {
         name: value[None] + (step.get(name, 0.0) * power).reshape(-1, *(1,) * value.ndim)
@@ -305,13 +209,13 @@ def optimum_sensitivity(
     **Arguments:** `height` of the map at box coordinates, given what `refit` makes of a model; its maximum `w`; the
     model; and `from_box`, to the unit cube.
     """
-    coordinates = _coordinates(gp, learn)
+    coordinates = coordinates_of(gp, learn)
     # Forward over forward: forward over reverse drops custom derivative rules inside a scan (docs/design.md).
     slope = jax.jacfwd(height)
     free = (w > 1e-6) & (w < 1.0 - 1e-6)
     hessian = jax.jacfwd(slope)(w, refit(gp))
     held = jnp.where(free[:, None] & free[None, :], hessian, -jnp.eye(w.shape[0], dtype=w.dtype))
-    mixed = jax.jacfwd(lambda c: jnp.where(free, slope(w, refit(_model(c, gp))), 0.0))(coordinates)
+    mixed = jax.jacfwd(lambda c: jnp.where(free, slope(w, refit(model_at(c, gp))), 0.0))(coordinates)
     to_unit = jax.jacfwd(from_box)(w)
 
     def moved(block):

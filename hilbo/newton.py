@@ -12,6 +12,7 @@ References: Nocedal & Wright (2006), chapter 4; Bertsekas (1982), SIAM J. Contro
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,14 +23,14 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.linalg import eigh
 
-__all__ = ["TrustRegionNewton", "arrives"]
+__all__ = ["Expansion", "TrustRegionNewton", "arrives", "expanded"]
 
 _FIRST_RADIUS = 1.0
 _SAME = 1e-2  # points so near to each other lie below the same minimum: of functions of logarithms, that is
 _ENOUGH, _GOOD = 1e-4, 0.75  # shares of the promised fall: to take a step, and to trust the model further
 
 
-class _Expansion(eqx.Module):
+class Expansion(NamedTuple):
     """Value, gradient and Hessian at a point, and what the function returned besides."""
 
     value: Float[Array, ""]
@@ -38,8 +39,22 @@ class _Expansion(eqx.Module):
     aux: PyTree
 
 
+def expanded(
+    function: Callable[[Float[Array, " p"]], tuple[Float[Array, ""], PyTree]], at: Float[Array, " p"]
+) -> Expansion:
+    """The expansion of a function of value and aux by automatic differentiation."""
+
+    def slope(at):
+        value, pull, aux = jax.vjp(function, at, has_aux=True)
+        (gradient,) = pull(jnp.ones_like(value))
+        return gradient, (value, gradient, aux)
+
+    hessian, (value, gradient, aux) = jax.jacfwd(slope, has_aux=True)(at)
+    return Expansion(value, gradient, hessian, aux)
+
+
 class _State(eqx.Module):
-    here: _Expansion
+    here: Expansion
     move: Float[Array, " p"]  # the next step,
     promised: Float[Array, ""]  # and by how much it lowers the quadratic model
     radius: Float[Array, ""]
@@ -51,9 +66,10 @@ class TrustRegionNewton(optx.AbstractMinimiser):
     """For `optimistix.minimise`. `options` may hold
 
     - "lower" and "upper": bounds, each like the variables;
-    - "expand": a function of the variables, those of the best point so far, and what the function returned there
-      besides its value; it gives value, gradient (p,) and Hessian (p, p) in the variables as one vector, and that
+    - "expand": a function of the variables and of what the function returned besides its value at the best point so
+      far; it gives value, gradient (p,) and Hessian (p, p) in the variables as one vector, and that
       besides, in place of automatic differentiation;
+    - "begun": what "expand" gave at the start, which then is not evaluated again;
     - "known": ends (k, p) of other searches, NaN where there is none. A search whose next step goes to one ends.
 
     Ends where no free component of the gradient is above `atol`, where the quadratic model falls by less than `gain`
@@ -69,12 +85,15 @@ class TrustRegionNewton(optx.AbstractMinimiser):
     gain: float | Float[Array, ""] = 0.0
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        """Nowhere yet: the first step evaluates the start."""
-        del fn, args, options, f_struct, tags
+        """At the start, if its expansion is given; else nowhere yet, and the first step evaluates the start."""
+        del fn, args, f_struct, tags
         flat, _ = ravel_pytree(y)
+        if "begun" in options:
+            here = Expansion(*options["begun"])
+            return _State(here, *_plan(here, flat, jnp.full_like(flat[0], _FIRST_RADIUS), *_bounds(options)))
         infinite = jnp.full_like(flat, jnp.inf)
         aux = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
-        here = _Expansion(infinite[0], infinite, jnp.zeros((flat.size, flat.size), flat.dtype), aux)
+        here = Expansion(infinite[0], infinite, jnp.zeros((flat.size, flat.size), flat.dtype), aux)
         zero = jnp.zeros_like(flat[0])
         return _State(here, jnp.zeros_like(flat), zero, zero + _FIRST_RADIUS, infinite[0], infinite[0])
 
@@ -85,9 +104,9 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         ahead = flat + state.move
         expand = options.get("expand")
         there = (
-            _expand(lambda at: fn(restore(at), args), ahead)
+            expanded(lambda at: fn(restore(at), args), ahead)
             if expand is None
-            else _Expansion(*expand(restore(ahead), restore(flat), state.here.aux))
+            else Expansion(*expand(restore(ahead), state.here.aux))
         )
         achieved = state.here.value - there.value
         taken = achieved > _ENOUGH * state.promised  # never if it is not a number
@@ -95,8 +114,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         radius = state.radius * jnp.where(good, 2.0, jnp.where(taken, 1.0, 0.25))
         here = jax.tree.map(lambda new, old: jnp.where(taken, new, old), there, state.here)
         flat = jnp.where(taken, ahead, flat)
-        bounds = (ravel_pytree(options[side])[0] if side in options else None for side in ("lower", "upper"))
-        return restore(flat), _State(here, *_plan(here, flat, radius, *bounds)), here.aux
+        return restore(flat), _State(here, *_plan(here, flat, radius, *_bounds(options))), here.aux
 
     def terminate(self, fn, y, args, options, state, tags):
         """Stationary within the box, or stuck, or on the way to a known end."""
@@ -117,14 +135,8 @@ def arrives(y: PyTree, move: Float[Array, " p"], known: Float[Array, "k p"]) -> 
     return jnp.any(jnp.max(jnp.abs(known - ahead[None, :]), axis=1) < _SAME)
 
 
-def _expand(function, at):
-    def slope(at):
-        value, pull, aux = jax.vjp(function, at, has_aux=True)
-        (gradient,) = pull(jnp.ones_like(value))
-        return gradient, (value, gradient, aux)
-
-    hessian, (value, gradient, aux) = jax.jacfwd(slope, has_aux=True)(at)
-    return _Expansion(value, gradient, hessian, aux)
+def _bounds(options):
+    return (ravel_pytree(options[side])[0] if side in options else None for side in ("lower", "upper"))
 
 
 def _plan(here, at, radius, lower, upper):

@@ -135,7 +135,7 @@ class OrdinalTerms(eqx.Module):
         return value, slope, curvature
 
 
-class _TiltedTerms(eqx.Module):
+class TiltedTerms(eqx.Module):
     """The same answers averaged over cavities, for expectation propagation."""
 
     likelihood: OrdinalProbit
@@ -296,7 +296,7 @@ def fit(
 def _fit(gp, trials, start, inference):
     covariance = gram(gp.kernel, trials.x, trials.x)
     if inference in ("ep", "ep_corrected"):
-        tilted = _TiltedTerms(gp.likelihood, trials.q, trials.mask)
+        tilted = TiltedTerms(gp.likelihood, trials.q, trials.mask)
         return Posterior(gp, trials, (ep if inference == "ep" else ep_corrected)(covariance, tilted, start=start))
     if inference == "exact":
         return Posterior(gp, trials, _exactly(gp.likelihood, trials, covariance))

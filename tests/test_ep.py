@@ -267,6 +267,6 @@ def test_a_failed_fit_says_so():
         fit(gp, answers(data), inference="ep")
     assert not fit(gp, answers(data), inference="ep", throw=False).certificate.converged
     kernel, full = model(data).kernel, answers(data)
-    terms = ordinal_gp._TiltedTerms(model(data).likelihood, full.q, full.mask)
+    terms = ordinal_gp.TiltedTerms(model(data).likelihood, full.q, full.mask)
     stopped = ep(gram(kernel, full.x, full.x), terms, max_steps=2).certificate
     assert stopped.iterations == 2 and not stopped.converged and stopped.residual > stopped.tolerance

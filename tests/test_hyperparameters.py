@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from hilbo import hyperparameters as hyper
 from hilbo.config import Study
 from hilbo.errors import InputError
+from hilbo.hyper_coordinates import log_prior
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.robustness import robustness
 from hilbo.study import Cohort, fit_cohort, population, population_optimum
@@ -60,9 +61,9 @@ def test_the_scale_freedom_is_real_and_refused():
 def test_the_prior_is_largest_at_its_centre():
     _, gp, _ = problem()
     every = ("theta", "noise", "thresholds")
-    assert float(hyper.log_prior(gp, gp, every)) == 0.0
+    assert float(log_prior(gp, gp, every)) == 0.0
     away = eqx.tree_at(lambda g: g.likelihood.noise, gp, gp.likelihood.noise * np.e)
-    assert float(hyper.log_prior(away, gp, every)) == pytest.approx(-0.5)
+    assert float(log_prior(away, gp, every)) == pytest.approx(-0.5)
 
 
 @pytest.fixture(scope="module")

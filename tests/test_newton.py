@@ -144,7 +144,7 @@ def test_a_search_ends_on_a_plateau_but_not_on_a_slope_that_a_kink_makes_long():
 
 
 def test_an_expansion_of_ones_own_replaces_differentiation():
-    def expand(y, last, aux):
+    def expand(y, aux):
         return rosenbrock(y, None), jax.grad(rosenbrock)(y, None), jax.hessian(rosenbrock)(y, None), aux + 1
 
     start, solver = jnp.array([-1.2, 1.0]), TrustRegionNewton(atol=1e-9)

@@ -1,0 +1,53 @@
+"""Hyperparameters as unconstrained coordinates: the logarithms of theta, variance and noise, the first threshold, the
+logarithms of the gaps between thresholds; and weak priors on them.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
+
+__all__ = ["OF_THE_LIKELIHOOD", "Coordinates", "Learnable", "coordinates_of", "log_prior", "model_at"]
+
+Learnable = Literal["theta", "variance", "noise", "thresholds"]
+Coordinates = dict[str, Float[Array, "..."]]
+
+OF_THE_LIKELIHOOD = ("first", "gaps", "noise")
+"""Its coordinates; in a sorted record they come before the kernel's."""
+
+_PRIOR_SD = {"theta": 1.5, "variance": 1.0, "noise": 1.0, "first": 1.0, "gaps": 1.0}
+_FIELDS = {"theta": ("theta",), "variance": ("variance",), "noise": ("noise",), "thresholds": ("first", "gaps")}
+
+
+def coordinates_of(gp: OrdinalGP, learn: Sequence[str]) -> Coordinates:
+    thresholds = gp.likelihood.thresholds
+    every = {
+        "theta": jnp.log(gp.kernel.theta),
+        "variance": jnp.log(gp.kernel.variance),
+        "noise": jnp.log(gp.likelihood.noise),
+        "first": thresholds[0],
+        "gaps": jnp.log(jnp.diff(thresholds)),
+    }
+    return {field: every[field] for name in learn for field in _FIELDS[name]}
+
+
+def model_at(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
+    """The model at these coordinates; what they do not mention is as in `gp`."""
+    held = {"theta": gp.kernel.theta, "variance": gp.kernel.variance, "noise": gp.likelihood.noise}
+    positive = held | {k: jnp.exp(coordinates[k]) for k in held if k in coordinates}
+    thresholds = gp.likelihood.thresholds
+    if "first" in coordinates:
+        steps = jnp.concatenate([coordinates["first"][None], jnp.exp(coordinates["gaps"])])
+        thresholds = jnp.cumsum(steps)
+    return OrdinalGP(RBF(positive["theta"], positive["variance"]), OrdinalProbit(thresholds, positive["noise"]))
+
+
+def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Float[Array, ""]:
+    """Log density of the weak priors at `gp`, up to a constant; `centre` is where they are centred."""
+    here, there = coordinates_of(gp, learn), coordinates_of(centre, learn)
+    scale = dict.fromkeys(here, 1.0) | {"first": jnp.sqrt(centre.kernel.variance)}
+    parts = [jnp.sum(((here[k] - there[k]) / (_PRIOR_SD[k] * scale[k])) ** 2) for k in here]
+    return -0.5 * jnp.sum(jnp.stack(parts))
