@@ -49,7 +49,7 @@ def limit_cores(cores):
 
 def measured_elsewhere(cores, rounds):
     command = [sys.executable, "-W", "ignore", __file__, "--json", "--cores", str(cores), "--rounds", str(rounds)]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+    return json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.splitlines()[-1])
 
 
 def measure(rounds):

@@ -24,7 +24,9 @@ def one_at_a_time(function: Callable, together: Callable | None = None) -> Calla
 
     @mapped.def_vmap
     def rule(size, in_batched, *args):
-        whole = jax.tree.map(lambda a, b: a if b else jnp.broadcast_to(a, (size, *a.shape)), args, tuple(in_batched))
+        whole = jax.tree.map(
+            lambda a, b: a if b else jnp.broadcast_to(a, (size, *jnp.shape(a))), args, tuple(in_batched)
+        )
         out = jax.lax.platform_dependent(
             *whole, cpu=lambda *stacked: jax.lax.map(lambda row: mapped(*row), stacked), default=batched
         )
