@@ -44,8 +44,8 @@ def ep_evidence(
     """The expansion in x = (own, shape): the terms depend on `own`, the covariance on `shape`.
 
     `start`: means and log variances of cavities near which the fixed point is sought, as is the result's `place`; where
-    that fails, or where a variance is none, it is sought anew. Logarithms, because moved along their derivatives
-    they save a quarter of the steps that variances take.
+    that fails, or where a variance is none, it is sought anew. Logarithms, because moved along their derivatives they
+    save a quarter of the steps that variances take.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
     here = terms(own)

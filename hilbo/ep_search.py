@@ -84,7 +84,7 @@ def find(terms, covariance, start, max_steps, hasty=False):
         begun, spent = _first(terms, covariance, start)
         mean, variance, end = _searched(terms, covariance, None, begun, min(max_steps, _QUICK_STEPS), none, hasty)
         found = mean, variance, end._replace(iterations=end.iterations + spent)
-        met = (end.residual <= end.tolerance) | jnp.isinf(end.residual)
+        met = (end.residual <= end.tolerance) | (hasty & jnp.isinf(end.residual))
         _, _, precision = terms(mean, variance)
         # s = K - KCK errs by eps K, and the cavity's variance by this share:
         blur = jnp.finfo(none.dtype).eps * jnp.max(jnp.diagonal(covariance) * precision * (1.0 + precision * variance))
