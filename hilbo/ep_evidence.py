@@ -16,7 +16,7 @@ Newton's steps. With A_j and T_j the changes of a and t in all,
     + a'K_k A_j - p_k'T_j / 2 + [a'K_kj a - tr(C K_kj) + tr(C K_k C K_j)] / 2;
 
 the bracket of v_j is d2L/dx dv, by the heat equation dL/dv = (a^2 + da/dm) / 2 with da/dm = -t / (1 + v t). The moved
-cavities are where the fixed point of the next hyperparameters is sought: two steps away instead of ten.
+cavities are where the fixed point of the next hyperparameters is sought: three steps away instead of ten.
 """
 
 from collections.abc import Callable

@@ -16,10 +16,10 @@ from hilbo.evidence import Evidence, laplace_evidence
 from hilbo.hyper_coordinates import OF_THE_LIKELIHOOD, Coordinates, coordinates_of, log_prior, model_at
 from hilbo.kernels import gram
 from hilbo.linalg import one_at_a_time
-from hilbo.newton import expanded
+from hilbo.newton import Expansion, expanded
 from hilbo.ordinal_gp import OrdinalGP, OrdinalTerms, TiltedTerms, Trials, fit
 
-__all__ = ["Seen", "evidence_cost", "person_ep_evidence", "person_evidence"]
+__all__ = ["Seen", "divisor", "evidence_cost", "person_ep_evidence", "person_evidence"]
 
 
 class Seen(NamedTuple):
@@ -32,18 +32,14 @@ class Seen(NamedTuple):
     moved: PyTree[Float[Array, "M n p"]]
 
 
-Expand = Callable[[Coordinates, Seen], tuple[Float[Array, ""], Float[Array, " p"], Float[Array, "p p"], Seen]]
-
-
 def evidence_cost(
     gp: OrdinalGP, trials: Trials, learn: tuple[str, ...], weak_priors: bool, inference: str
-) -> tuple[Expand, Seen]:
-    """The cost of stacked `trials` with gradient, Hessian and what was seen, from coordinates and what was seen before;
-    and what that is at first: nothing."""
+) -> tuple[Callable[[Coordinates, Seen], Expansion], Seen]:
+    """The expansion of the cost of stacked `trials`, from coordinates and what was seen before, with what is seen
+    there; and what was seen at first: nothing."""
     begin = ravel_pytree(coordinates_of(gp, learn))[0]
     zero = jnp.zeros((), begin.dtype)
-    # Per answer the cost has curvatures near 1, so that the first step, down the bare gradient, is a sensible one.
-    answers = jnp.sum(trials.mask, dtype=begin.dtype) + 1.0
+    answers = divisor(trials)
     evidence = _differentiated if inference == "ep_corrected" else _closed
 
     def expand(coordinates, last):
@@ -52,10 +48,16 @@ def evidence_cost(
             flat, restore = ravel_pytree(coordinates)
             prior = expanded(lambda at: (log_prior(model_at(restore(at), gp), gp, learn), None), flat)
             value, gradient, hessian = value + prior.value, gradient + prior.gradient, hessian + prior.hessian
-        return -value / answers, -gradient / answers, -hessian / answers, seen
+        return Expansion(-value / answers, -gradient / answers, -hessian / answers, seen)
 
     place, moved = _unknown(trials, begin, inference)
     return expand, Seen(zero, jnp.zeros((), bool), begin, place, moved)
+
+
+def divisor(trials: Trials) -> Float[Array, ""]:
+    """What the evidence is divided by: answers, so that curvatures are near 1 and the first step, which is down the
+    bare gradient, is a sensible one. One more, because there may be none."""
+    return jnp.sum(trials.mask, dtype=trials.x.dtype) + 1.0
 
 
 def _unknown(trials, begin, inference):

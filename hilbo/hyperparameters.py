@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.errors import InputError
 from hilbo.hyper_coordinates import Coordinates, Learnable, coordinates_of, model_at
-from hilbo.hyper_cost import evidence_cost
+from hilbo.hyper_cost import divisor, evidence_cost
 from hilbo.linalg import eigh, one_at_a_time
 from hilbo.newton import TrustRegionNewton, arrives
 from hilbo.ordinal_gp import OrdinalGP, Trials
@@ -117,8 +117,8 @@ def _searched(gp, trials, options):
 
     def cost(coordinates, _):
         """The search asks this for shapes alone."""
-        value, _, _, seen = expand(coordinates, nothing)
-        return value, seen
+        there = expand(coordinates, nothing)
+        return there.value, there.aux
 
     def ended(carry, start):
         known, last = carry
@@ -140,15 +140,16 @@ def _searched(gp, trials, options):
         found = jnp.where(done & ~joined, end.aux.at, jnp.nan)
         known = jnp.concatenate([known[1:], found[None, :]])
         steps = jnp.asarray(solution.stats["num_steps"]) + 1
-        return (known, begun[-1]), _End(solution.value, value, end.aux.log_evidence, steps, done, _flat(end, trials))
+        return (known, begun.aux), _End(solution.value, value, end.aux.log_evidence, steps, done, _flat(end, trials))
 
     begin = coordinates_of(gp, options.learn)
     # One search after the other: each stops when it is done, or on its way to where an earlier one ended; and its first
     # evidence is sought from the one before's.
     unknown = jnp.full((options.starts, nothing.at.size), jnp.nan, nothing.at.dtype)
     _, ends = jax.lax.scan(ended, (unknown, nothing), _spread(begin, options.starts))
-    own_first = (jnp.arange(options.starts) + (options.starts - 1) // 2) % options.starts
-    best = own_first[jnp.argmin(ends.value[own_first])]
+    best = jnp.argmin(ends.value)
+    # Where no search ended well, it is the one from the model itself that is shown.
+    best = jnp.where(jnp.isfinite(ends.value[best]), best, _own(options.starts))
     end = jax.tree.map(lambda leaf: leaf[best], ends)
     moved = [jnp.max(jnp.abs(end.at[k] - begin[k])) for k in begin if k != "first" and begin[k].size]
     runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | end.flat
@@ -165,8 +166,7 @@ class _End(NamedTuple):
 
 
 def _flat(end, trials):
-    answers = jnp.sum(trials.mask, dtype=end.value.dtype) + 1.0
-    return eigh(end.hessian)[0][0] * answers < _FLAT
+    return eigh(end.hessian)[0][0] * divisor(trials) < _FLAT
 
 
 def _checked(learn):
@@ -183,9 +183,14 @@ def _checked(learn):
     return learn
 
 
+def _own(starts):
+    """Which of the starting points is the model itself."""
+    return (starts - 1) // 2
+
+
 def _spread(begin: Coordinates, starts: int) -> Coordinates:
     """Starting points in a row: theta (and noise, the other way) by rising powers of 2, the model itself amid them."""
-    power = (jnp.arange(starts) - (starts - 1) // 2).astype(begin[next(iter(begin))].dtype)
+    power = (jnp.arange(starts) - _own(starts)).astype(begin[next(iter(begin))].dtype)
     step = {"theta": 1.4, "noise": -0.7}  # 4 and 1/2, as logarithms
     return {
         name: value[None] + (step.get(name, 0.0) * power).reshape(-1, *(1,) * value.ndim)

@@ -66,9 +66,8 @@ class TrustRegionNewton(optx.AbstractMinimiser):
     """For `optimistix.minimise`. `options` may hold
 
     - "lower" and "upper": bounds, each like the variables;
-    - "expand": a function of the variables and of what the function returned besides its value at the best point so
-      far; it gives value, gradient (p,) and Hessian (p, p) in the variables as one vector, and that
-      besides, in place of automatic differentiation;
+    - "expand": a function of the variables, and of what the function returned besides its value at the best point so
+      far, that gives an [`Expansion`][] in the variables as one vector, in place of automatic differentiation;
     - "begun": what "expand" gave at the start, which then is not evaluated again;
     - "known": ends (k, p) of other searches, NaN where there is none. A search whose next step goes to one ends.
 
@@ -89,7 +88,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         del fn, args, f_struct, tags
         flat, _ = ravel_pytree(y)
         if "begun" in options:
-            here = Expansion(*options["begun"])
+            here = options["begun"]
             return _State(here, *_plan(here, flat, jnp.full_like(flat[0], _FIRST_RADIUS), *_bounds(options)))
         infinite = jnp.full_like(flat, jnp.inf)
         aux = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
@@ -106,7 +105,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         there = (
             expanded(lambda at: fn(restore(at), args), ahead)
             if expand is None
-            else Expansion(*expand(restore(ahead), state.here.aux))
+            else expand(restore(ahead), state.here.aux)
         )
         achieved = state.here.value - there.value
         taken = achieved > _ENOUGH * state.promised  # never if it is not a number

@@ -8,7 +8,7 @@ import pytest
 from jaxopt import ProjectedGradient
 from jaxopt.projection import projection_box
 
-from hilbo.newton import TrustRegionNewton, arrives
+from hilbo.newton import Expansion, TrustRegionNewton, arrives
 
 
 def rosenbrock(y, _):
@@ -145,17 +145,24 @@ def test_a_search_ends_on_a_plateau_but_not_on_a_slope_that_a_kink_makes_long():
 
 def test_an_expansion_of_ones_own_replaces_differentiation():
     def expand(y, aux):
-        return rosenbrock(y, None), jax.grad(rosenbrock)(y, None), jax.hessian(rosenbrock)(y, None), aux + 1
+        derivatives = jax.grad(rosenbrock)(y, None), jax.hessian(rosenbrock)(y, None)
+        return Expansion(rosenbrock(y, None), *derivatives, aux + 1)
 
-    start, solver = jnp.array([-1.2, 1.0]), TrustRegionNewton(atol=1e-9)
-    solution = optx.minimise(
-        lambda y, _: (rosenbrock(y, None), jnp.asarray(0)),
-        solver,
-        start,
-        has_aux=True,
-        options={"expand": expand},
-        max_steps=60,
-        throw=False,
-    )
+    def solved(**options):
+        return optx.minimise(
+            lambda y, _: (rosenbrock(y, None), jnp.asarray(0)),
+            TrustRegionNewton(atol=1e-9),
+            start,
+            has_aux=True,
+            options={"expand": expand} | options,
+            max_steps=60,
+            throw=False,
+        )
+
+    start = jnp.array([-1.2, 1.0])
+    solution, begun = solved(), solved(begun=expand(start, jnp.asarray(0)))
     np.testing.assert_allclose(solution.value, [1.0, 1.0], atol=1e-6)
     assert 0 < int(solution.aux) <= int(solution.stats["num_steps"])  # counted where a step was taken
+    # With the start's expansion given, the same way by one evaluation less.
+    np.testing.assert_array_equal(begun.value, solution.value)
+    assert int(begun.stats["num_steps"]) == int(solution.stats["num_steps"]) - 1
