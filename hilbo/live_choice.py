@@ -27,7 +27,7 @@ from hilbo.errors import InputError
 from hilbo.live_records import Need
 from hilbo.live_state import LiveSession
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.session import Session, search_points
+from hilbo.session import Session, physical_trials, search_points
 from hilbo.warm_start import WarmStart, warm_point
 
 __all__ = ["APART", "LiveChooser", "told_of"]
@@ -130,7 +130,9 @@ class LiveChooser:
             found, by = session.step(points, answers), study.selection.acquisition
             if _near(study, found, gone):
                 found, by = _apart(study, session, points, answers, gone), "ucb, apart"
-        terms = _terms(study, *_padded(study, points, answers), np.int32(len(history)), np.asarray(found))
+        trials = physical_trials(study, points, answers, study.selection.trials)
+        posterior = fit(study.gp, trials, inference=study.inference, throw=False)
+        terms = _terms(study, posterior, np.asarray(found))
         return _explained(study, found, by, terms)
 
 
@@ -207,10 +209,8 @@ def _padded(study, points, answers):
 
 
 @eqx.filter_jit
-def _terms(study, points, answers, count, x):
+def _terms(study, posterior, x):
     """Mean, variance and class probabilities at x, the certificate of the fit, and what the space says of x."""
-    trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)
-    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
     unit = study.space.to_unit(x)
     mean, variance = posterior.predict(unit[None, :])
     values = dict(zip(study.space.names, x, strict=True))

@@ -18,7 +18,9 @@ from dataclasses import dataclass, field, replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from hilbo import acquisition
@@ -80,14 +82,19 @@ def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
     )
 
 
-def next_point(study: Study, plan: Design, trials: Trials, trial: Int[Array, ""] | int) -> Float[Array, " d"]:
-    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition; traceable."""
+def next_point(
+    study: Study, plan: Design, trials: Trials, trial: Int[Array, ""] | int, weight: ArrayLike | None = None
+) -> Float[Array, " d"]:
+    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition; traceable.
+
+    `weight`: of the standard deviation in UCB, if it is not to be the study's.
+    """
     posterior = fit(study.gp, trials, inference=study.inference, throw=False)
     if study.selection.acquisition == "thompson":
         return _thompson_point(posterior, plan, trial)
     distance = study.selection.minimum_distance
     allowed = (lambda x: _far_from(trials, x, distance)) if distance else None
-    return _highest(study, plan, posterior, _score(study, posterior), allowed).x
+    return _highest(study, plan, posterior, _score(study, posterior, weight), allowed).x
 
 
 def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
@@ -127,10 +134,10 @@ def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d
     )
 
 
-def _score(study, posterior):
+def _score(study, posterior, weight):
     kind = study.selection.acquisition
     if kind == "ucb":
-        return acquisition.UCB(study.selection.weight)
+        return acquisition.UCB(study.selection.weight if weight is None else weight)
     if kind == "log_ei":
         trials = posterior.trials
         return acquisition.LogEI(jnp.max(jnp.where(trials.mask, posterior.mean(trials.x), -jnp.inf)))
@@ -191,12 +198,13 @@ class _Step:
     """
 
     def __init__(self, study, plan):
-        leaves, structure = jax.tree.flatten((study, plan))
-        self.arrays = tuple(leaf for leaf in leaves if eqx.is_array(leaf))
-        fixed = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
-        self.compiled = _compiled(structure, fixed)
+        self.arrays, self.compiled = _program(study, plan)
+        # Where the mean is largest, the UCB of weight 0 is: in most studies the same program.
+        plain = msgspec.structs.replace(study.selection, acquisition="ucb", minimum_distance=None)
+        self._of_the_mean = _program(replace(study, selection=plain), plan)[1]
+        self.weight, self.capacity = np.float64(study.selection.weight), study.selection.trials
         self.initial = np.asarray(_to_physical(study.space, plan.initial))
-        self.capacity, self.responses, self.names = study.selection.trials, study.responses, study.space.names
+        self.responses, self.names = study.responses, study.space.names
         self.padding = _padding(study, self.capacity)
 
     def __call__(self, points, answers):
@@ -206,18 +214,36 @@ class _Step:
             return None
         if count < len(self.initial):
             return self.initial[count]
+        return self._found(self.compiled, points, answers, self.weight)
+
+    def best(self, points, answers):
+        """Where the posterior mean is largest."""
+        return self._found(self._of_the_mean, points, answers, np.float64(0.0))
+
+    def warm(self):
+        """Compile what chooses."""
+        self._found(self.compiled, self.padding[:0], (), self.weight)
+
+    def _found(self, program, points, answers, weight):
         padded, categories = _padded(points, answers, self.padding)
-        return np.asarray(self.compiled(self.arrays, padded, categories, np.int32(count)))
+        return np.asarray(program(self.arrays, padded, categories, np.int32(len(answers)), weight))
+
+
+def _program(study, plan):
+    """The arrays of a study and a design, and what is compiled for all that differ in nothing else."""
+    leaves, structure = jax.tree.flatten((study, plan))
+    fixed = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+    return tuple(leaf for leaf in leaves if eqx.is_array(leaf)), _compiled(structure, fixed)
 
 
 @functools.lru_cache(maxsize=32)
 def _compiled(structure, fixed):
     @functools.partial(jax.jit, compiler_options=compiler_options())
-    def step(arrays, points, answers, count):
+    def step(arrays, points, answers, count, weight):
         given = iter(arrays)
         study, plan = jax.tree.unflatten(structure, [next(given) if leaf is None else leaf for leaf in fixed])
         trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)
-        return study.space.to_physical(next_point(study, plan, trials, count))
+        return study.space.to_physical(next_point(study, plan, trials, count, weight))
 
     return step
 
@@ -266,10 +292,7 @@ class Session:
 
     def warm(self) -> threading.Thread:
         """Compile the step that chooses points, in a thread: while the first, given points are answered."""
-        nothing = np.zeros((self.step.capacity, self.study.space.dim)), np.zeros(self.step.capacity, np.int32)
-        thread = threading.Thread(
-            target=self.step.compiled, args=(self.step.arrays, *nothing, np.int32(0)), daemon=True
-        )
+        thread = threading.Thread(target=self.step.warm, daemon=True)
         thread.start()
         return thread
 
@@ -296,8 +319,8 @@ class Session:
 
     def best(self) -> dict[str, float]:
         """The rendering with the largest posterior mean: parameter -> value in physical units."""
-        physical = _best_physical(self.study, self.plan, self.posterior())
-        return dict(zip(self.study.space.names, np.asarray(physical).tolist(), strict=True))
+        self.posterior()  # which refuses answers that cannot be fitted
+        return dict(zip(self.step.names, self.step.best(self.points, self.answers).tolist(), strict=True))
 
 
 def _asked(session) -> np.ndarray:
@@ -306,8 +329,3 @@ def _asked(session) -> np.ndarray:
             f"Session: all {len(session.answers)} trials of the study are answered; nothing is left to ask."
         )
     return session.proposal
-
-
-@eqx.filter_jit
-def _best_physical(study, plan, posterior):
-    return study.space.to_physical(_highest(study, plan, posterior, acquisition.Mean()).x)

@@ -14,15 +14,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from hilbo.config import Study
 from hilbo.live_state import LiveSession
-from hilbo.ordinal_gp import Trials, fit
-from hilbo.session import best_point, physical_trials, search_points
+from hilbo.ordinal_gp import fit
+from hilbo.session import Session, physical_trials
 from hilbo.trial_protocols import protocol
 
 __all__ = ["Consistency", "Trust", "consistency", "minutes_left", "trust", "trust_of"]
@@ -56,30 +54,34 @@ def trust(
     seed: int,
 ) -> Trust:
     """From the answered renderings (physical units), their categories, and the rendering that comes next."""
-    capacity = study.selection.trials + 1
-    data = physical_trials(study, points, np.asarray(answers, int), capacity)
-    candidates = search_points(study.space, seed)
-    following = points[-1] if upcoming is None else upcoming
-    best, top, movement = _trust(study, data, study.space.to_unit(following), candidates)
-    physical = np.asarray(study.space.to_physical(best)).tolist()
-    named = dict(zip(study.space.names, physical, strict=True))
-    return Trust(named, float(top), None if upcoming is None else float(movement))
+    find, categories = Session.start(study, seed).step.best, np.asarray(answers, int)
+    best = find(points, categories)
+    following = best if upcoming is None else upcoming
+    posterior = fit(
+        study.gp,
+        physical_trials(study, points, categories, study.selection.trials),
+        inference=study.inference,
+        throw=False,
+    )
+    top, chances = np.asarray(_chances(study, posterior, np.stack([best, following])))
+    named = dict(zip(study.space.names, best.tolist(), strict=True))
+    if upcoming is None:
+        return Trust(named, float(top[-1]), None)
+    more = np.concatenate([points, upcoming[None]])
+    bests = [best, *(find(more, np.append(categories, one)) for one in range(len(study.responses)))]
+    units = np.asarray(_units(study, np.stack(bests)))
+    moved = np.sqrt(np.mean((units[1:] - units[0]) ** 2, axis=1))
+    return Trust(named, float(top[-1]), float(chances @ moved))
 
 
 @eqx.filter_jit
-def _trust(study, data: Trials, following: Float[Array, " d"], candidates):
-    def after(category):
-        """The best rendering after one more answer, none if it is -1; and class probabilities there and at the next."""
-        more = data.append(following, jnp.maximum(category, 0))
-        given = jax.tree.map(lambda before, after: jnp.where(category < 0, before, after), data, more)
-        posterior = fit(study.gp, given, inference=study.inference, throw=False)
-        best = best_point(study, posterior, candidates).x
-        return best, posterior.class_probabilities(jnp.stack([best, following]))
+def _chances(study, posterior, physical):
+    return posterior.class_probabilities(study.space.to_unit(physical))
 
-    # One loop for both, because compiling a fit and a search takes longer than all of them.
-    bests, probabilities = jax.lax.map(after, jnp.arange(-1, len(study.responses), dtype=data.q.dtype))
-    moved = jnp.sqrt(jnp.mean((bests[1:] - bests[:1]) ** 2, axis=1))
-    return bests[0], probabilities[0, 0, -1], jnp.sum(probabilities[0, 1] * moved)
+
+@eqx.filter_jit
+def _units(study, physical):
+    return study.space.to_unit(physical)
 
 
 def trust_of(state: LiveSession, block: int) -> Trust | None:
@@ -93,7 +95,8 @@ def trust_of(state: LiveSession, block: int) -> Trust | None:
     def point(trial):
         return [trial.renderings["a"][name] for name in study.space.names]
 
-    asked = state.pending if state.pending is not None and state.pending.block == block else None
+    # The answer to a repeat does not count, and moves nothing.
+    asked = next((t for t in [state.pending] if t is not None and t.block == block and t.repeats is None), None)
     upcoming = None if asked is None else np.array(point(asked))
     answers = [study.responses.index(trial.values["class_a"]) for trial in answered if trial.values is not None]
     return trust(study, np.array([point(trial) for trial in answered]), answers, upcoming, state.header.seed)

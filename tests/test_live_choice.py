@@ -137,6 +137,8 @@ def test_pace_and_consistency(chooser):
     assert minutes_left(state) == pytest.approx(2 * 20 / 60)
     assert consistency(state).pairs == 0
     state = asked(state.after(live.repeat(state, 1.0, 3)), chooser)
+    found = trust_of(state, 0)
+    assert found is not None and found.movement is None  # the answer to a repeat moves nothing
     state = told(state, "similar")
     assert consistency(state).__dict__ == {"pairs": 1, "alike": 0, "distance": 1.0}  # "similar" after "close"
 

@@ -45,7 +45,9 @@ def finished(study):
 def test_a_whole_session_compiles_once(study, finished):
     compiled = finished[0].step.compiled
     assert compiled._cache_size() == 1
-    assert run(study, seed=4)[0].step.compiled is compiled
+    again = run(study, seed=4)[0]
+    assert again.step.compiled is compiled
+    again.best()
     assert compiled._cache_size() == 1
 
 
@@ -96,6 +98,17 @@ def test_the_best_point_is_feasible_and_better_than_every_asked_one(study, finis
     posterior = session.posterior()
     assert bool(study.space.feasible(best))
     assert float(posterior.mean(best[None])[0]) >= float(posterior.mean(session.trials.x).max()) - 1e-6
+
+
+def test_the_best_point_is_the_means_whatever_chooses_trials(study, finished):
+    """Not the acquisition's, and as near to earlier trials as it likes to be."""
+    session, _ = finished
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["selection"] |= {"acquisition": "log_ei", "minimum_distance": 0.2}
+    other = Session.start(Study.from_dict(raw), seed=3)
+    for point, answered in zip(session.points, session.answers, strict=True):
+        other = other.tell(study.responses[answered], at=dict(zip(study.space.names, point.tolist(), strict=True)))
+    assert other.best() == pytest.approx(session.best(), rel=1e-4)
 
 
 def test_states_are_immutable(study):

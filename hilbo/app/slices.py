@@ -11,29 +11,28 @@ import numpy as np
 from hilbo import stopping
 from hilbo.live_session import LiveSession
 from hilbo.ordinal_gp import fit
-from hilbo.session import physical_trials, search_points
+from hilbo.session import Session, physical_trials
 
 __all__ = ["Maps"]
 
 _SIDE = 33
-_CANDIDATES = 1024
 
 
 class Maps:
     """Makes the slices of a session's map, material by material."""
 
     def __init__(self, state: LiveSession):
-        self._studies: dict[str | None, Any] = {}
+        self._sessions: dict[str | None, Session] = {}
         for block in state.header.blocks:
             if not block.trials:
                 study = state.study if block.material is None else state.study.material(block.material)
-                self._studies[block.material] = study, search_points(study.space, state.header.seed, _CANDIDATES)
+                self._sessions[block.material] = Session.start(study, state.header.seed)
 
     def warm(self, state: LiveSession) -> None:
         """Compile what `slices` needs."""
-        for material in self._studies:
+        for material, session in self._sessions.items():
             self._found(state, material, [])
-            study = self._studies[material][0]
+            study = session.study
             middle = np.array([[(p.low + p.high) / 2 for p in study.space.parameters]])
             stopping.trust(study, middle, [0], middle[0], state.header.seed)
 
@@ -69,12 +68,14 @@ class Maps:
         return self._found(state, material, answered)
 
     def _found(self, state, material, answered):
-        study, candidates = self._studies[material]
+        session = self._sessions[material]
+        study = session.study
         names = study.space.names
         points = np.array([[t.renderings["a"][n] for n in names] for t in answered]).reshape(-1, len(names))
         answers = np.array([study.responses.index(t.values["class_a"]) for t in answered], int)
         trials = physical_trials(study, points, answers, study.selection.trials)
-        best, mean, feasible = jax.device_get(_slices(study, trials, candidates))
+        posterior = fit(study.gp, trials, inference=study.inference, throw=False)
+        best, mean, feasible = jax.device_get(_slices(study, posterior, session.step.best(points, answers)))
         marks = np.asarray(trials.x)[: len(answered)]
         levels = answers / (len(study.responses) - 1)
         now = self._now(state, study)
@@ -118,10 +119,9 @@ def _slice(study, best, mean, feasible, pair, marks, levels, now):
 
 
 @eqx.filter_jit
-def _slices(study, trials, candidates):
-    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
-    best = candidates[jnp.argmax(posterior.mean(candidates))]
-    axis = jnp.linspace(0.0, 1.0, _SIDE, dtype=candidates.dtype)
+def _slices(study, posterior, physical):
+    best = study.space.to_unit(physical)
+    axis = jnp.linspace(0.0, 1.0, _SIDE, dtype=best.dtype)
     up, across = jnp.meshgrid(axis, axis, indexing="ij")
     grids = [
         jnp.broadcast_to(best, (_SIDE * _SIDE, best.shape[0])).at[:, i].set(across.ravel()).at[:, j].set(up.ravel())
