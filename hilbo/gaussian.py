@@ -28,6 +28,7 @@ __all__ = [
     "factorise",
     "inverse_and_log_determinant",
     "mean_and_explained",
+    "shortfall",
     "square_root",
     "still",
 ]
@@ -166,6 +167,31 @@ def evidence_known(value: Float[Array, ""], error: Float[Array, ""], rounding: F
 def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:
     """How far off the search may leave a log evidence: 0.02 + eps^(1/2) |log evidence|."""
     return _NATS + jnp.finfo(log_evidence.dtype).eps ** 0.5 * jnp.abs(log_evidence)
+
+
+def shortfall(certificate: Any, log_evidence: Float[Array, ""]) -> str:
+    """What a certificate that does not hold says, in words, and what may help. A sampled posterior's has a residual,
+    and says no by that alone."""
+    away, residual = "use a larger noise, float64", f"{float(certificate.residual):.3g}"
+    if not bool(certificate.residual <= certificate.tolerance):
+        steps, tolerance = int(certificate.iterations), float(certificate.tolerance)
+        return (
+            f"not found: its residual is {residual} after {steps} steps and should be at most {tolerance:.3g}; {away}"
+        )
+    if not bool(jnp.isfinite(log_evidence)):
+        return (
+            f"not found: its log evidence is not finite, though its residual is {residual}; check that the thresholds"
+            " rise"
+        )
+    found = f"found (residual {residual}), but"
+    if bool(certificate.smallest_variance < certificate.variance_resolution):
+        return (
+            f"{found} the answers leave a variance too small a part of the prior's for this precision to tell; {away}"
+        )
+    error, rounding = certificate.evidence_error, certificate.evidence_rounding
+    if not bool(evidence_known(log_evidence, error, rounding)):
+        return f"{found} not closely enough for its evidence, which may be off by {float(error + rounding):.3g}; {away}"
+    return f"{found} not closely enough for the mean, which comes out differently in another order of sums; {away}"
 
 
 def still(terms: Terms) -> Terms:

@@ -25,7 +25,7 @@ from hilbo.ep import ep
 from hilbo.ep_corrected import ep_corrected
 from hilbo.errors import InputError
 from hilbo.exact import ExactPosterior, SamplingCertificate, exact
-from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, mean_and_explained
+from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained, shortfall
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
@@ -311,14 +311,6 @@ def _exactly(likelihood, trials, covariance):
     return exact(jax.random.key(0), covariance, edges[trials.q], edges[trials.q + 1], noise, trials.mask)
 
 
-def _unresolved(certificate: Certificate) -> Bool[Array, ""]:
-    return certificate.smallest_variance < certificate.variance_resolution
-
-
-def _vague(certificate: Certificate, log_evidence: Float[Array, ""]) -> Bool[Array, ""]:
-    return ~evidence_known(log_evidence, certificate.evidence_error, certificate.evidence_rounding)
-
-
 def _checked(posterior: Posterior, sought: str) -> Posterior:
     certificate = posterior.certificate
     if isinstance(certificate.converged, jax.core.Tracer):
@@ -332,28 +324,6 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
                 f"fit: an answer has category {highest}, but the likelihood has {categories - 1} thresholds and so the"
                 f" categories 0 to {categories - 1}; check the answers or the thresholds."
             )
-        found = bool(certificate.residual <= certificate.tolerance)
-        if found and isinstance(certificate, Certificate) and bool(_unresolved(certificate)):
-            raise InferenceError(
-                f"the {sought} was found (residual {float(certificate.residual):.3g}), but the answers leave a variance"
-                " too small a part of the prior's for this precision to tell; use a larger noise, float64, or"
-                " throw=False to look at the certificate."
-            )
-        if found and not bool(jnp.isfinite(posterior.log_evidence)):
-            raise InferenceError(
-                f"the {sought} was not found: its log evidence is not finite, though its residual is"
-                f" {float(certificate.residual):.3g}; check that the thresholds rise."
-            )
-        if found and isinstance(certificate, Certificate) and bool(_vague(certificate, posterior.log_evidence)):
-            off = float(certificate.evidence_error + certificate.evidence_rounding)
-            raise InferenceError(
-                f"the {sought} was found (residual {float(certificate.residual):.3g}), but not closely enough for its"
-                f" evidence, which may be off by {off:.3g}; use a larger noise, float64, or throw=False to look at the"
-                " certificate."
-            )
-        raise InferenceError(
-            f"the {sought} was not found: its residual is {float(certificate.residual):.3g} after"
-            f" {int(certificate.iterations)} steps and should be at most {float(certificate.tolerance):.3g}; use a"
-            " larger noise, float64, or throw=False to look at the certificate."
-        )
+        words = shortfall(certificate, posterior.log_evidence)
+        raise InferenceError(f"the {sought} was {words}, or throw=False to look at the certificate.")
     return posterior

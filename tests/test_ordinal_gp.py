@@ -1,5 +1,6 @@
 """The model of one participant: gradients against 40 digits, padding, batches, dtypes, and what it refuses."""
 
+import dataclasses
 from functools import cache
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from reference_laplace import mpmath_laplace
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit, ordinal_gp
 from hilbo.errors import InputError
+from hilbo.gaussian import shortfall
 from hilbo.ordinal_gp import InferenceError
 
 CAPACITY = 25
@@ -284,6 +286,23 @@ def test_a_failed_fit_says_so():
     with pytest.raises(Exception, match="read the certificate") as caught:
         jax.block_until_ready(eqx.filter_jit(lambda t: fit(gp, t).log_evidence)(answers(data)))
     assert not isinstance(caught.value, InferenceError)
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"residual": 1.0}, "not found: its residual is 1 after"),
+        ({"smallest_variance": 0.0}, "but the answers leave a variance too small"),
+        ({"evidence_error": 7.0}, "not closely enough for its evidence, which may be off by 7"),
+        ({}, "not closely enough for the mean"),
+    ],
+)
+def test_the_figure_that_failed_is_the_one_that_is_named(changed, words):
+    posterior = fit(model(separated()), answers(separated()))
+    figures = {name: jnp.asarray(value) for name, value in changed.items()}
+    certificate = dataclasses.replace(posterior.certificate, **figures)
+    assert words in shortfall(certificate, posterior.log_evidence)
+    assert "its log evidence is not finite" in shortfall(posterior.certificate, jnp.asarray(jnp.nan))
 
 
 def test_a_category_that_the_model_lacks_is_named():
