@@ -44,10 +44,10 @@ def compare(study, trials):
     import jax
     import jax.numpy as jnp
 
-    from hilbo import acquisition, session
+    from hilbo import acquisition, trial_choice
     from hilbo.ordinal_gp import fit
 
-    space, plan = study.space, session.design(study, 0)
+    space, plan = study.space, trial_choice.design(study, 0)
     many = jnp.asarray(space.candidates(POINTS, 0))
     every = jnp.concatenate([many, jnp.asarray(space.walls(WALLS, 0))])
     score = acquisition.UCB(study.selection.weight)
@@ -62,7 +62,7 @@ def compare(study, trials):
                 mean, variance = posterior.predict(x[None, :])
                 return score(mean[0], variance[0])
 
-            own = session.next_point(study, plan, data, 0)
+            own = trial_choice.next_point(study, plan, data, 0)
             values = score(*posterior.predict(every))
             inside = values[:POINTS]
             polished = acquisition.maximise(inside, many, at, **box, starts=1)

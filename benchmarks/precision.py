@@ -26,7 +26,7 @@ from helpers import answers, model  # noqa: E402
 from hilbo import Study, acquisition, bcm, fit, passivity, viscoelastic  # noqa: E402
 from hilbo.errors import InputError  # noqa: E402
 from hilbo.hyperparameters import maximise_evidence  # noqa: E402
-from hilbo.session import best_point, search_points  # noqa: E402
+from hilbo.trial_choice import best_point, search_points  # noqa: E402
 from hilbo.viscoelastic import FOSLS  # noqa: E402
 
 __all__ = ["main"]

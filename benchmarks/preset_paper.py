@@ -48,7 +48,7 @@ def main():
 
     jax.config.update("jax_enable_x64", True)
     from hilbo.config import Study
-    from hilbo.session import search_points
+    from hilbo.trial_choice import search_points
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     candidates = search_points(study.space, 0)

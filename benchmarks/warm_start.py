@@ -21,9 +21,9 @@ import numpy as np
 
 from hilbo import Study
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.session import design, next_point, search_points
 from hilbo.simulate import PRESETS, Person, people, simulate_study
 from hilbo.study import population
+from hilbo.trial_choice import design, next_point, search_points
 from hilbo.warm_start import warm_point, warm_start
 
 TRIALS = 25

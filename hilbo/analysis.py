@@ -21,8 +21,8 @@ from hilbo.people import excluded, measure_people
 from hilbo.population_rules import point_rule
 from hilbo.rule_words import in_place
 from hilbo.sensitivity import Ends, tolerance_ends
-from hilbo.session import search_points
 from hilbo.study import Aggregate, Cohort, aggregate_cohort, nrmse, progress
+from hilbo.trial_choice import search_points
 from hilbo.validation import Sets, Tolerance, best_mid_worst, tolerance
 
 __all__ = ["Analysis", "Progress", "Reading", "analyse", "limits_of", "moved_by_evidence", "settled"]

@@ -24,8 +24,8 @@ from hilbo.errors import InputError
 from hilbo.hierarchical import Share
 from hilbo.newton import TrustRegionNewton
 from hilbo.population_rules import share_of
-from hilbo.session import search_points
 from hilbo.study import Cohort, Optimum, Rule, other_inference
+from hilbo.trial_choice import search_points
 
 __all__ = ["Merged", "aggregate_population", "optima_from", "optimum_near"]
 

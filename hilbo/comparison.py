@@ -23,8 +23,8 @@ from hilbo.joint import joint_map, posterior_map
 from hilbo.leave_one_out import LeftOut, calibration, clustered, influence, leave_one_out, reliability
 from hilbo.population_rules import ALL_RULES, RuleMap, rule_map, share_of
 from hilbo.rule_words import share_content
-from hilbo.session import search_points
 from hilbo.study import Cohort, fit_cohort, map_optimum, nrmse
+from hilbo.trial_choice import search_points
 
 __all__ = ["KNOWN", "compare", "recommendation"]
 

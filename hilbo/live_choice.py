@@ -27,7 +27,8 @@ from hilbo.errors import InputError
 from hilbo.live_records import Need
 from hilbo.live_state import LiveSession
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.session import Session, physical_trials, search_points
+from hilbo.session import Session, physical_trials
+from hilbo.trial_choice import search_points
 from hilbo.warm_start import WarmStart, warm_point
 
 __all__ = ["APART", "LiveChooser", "told_of"]

@@ -17,9 +17,9 @@ import numpy as np
 
 from hilbo.config import Study
 from hilbo.errors import InputError
-from hilbo.session import search_points
 from hilbo.study import Cohort, aggregate_cohort
 from hilbo.study_plan import Source
+from hilbo.trial_choice import search_points
 from hilbo.validation import best_mid_worst
 
 __all__ = ["aggregate_best_sets", "check_participants", "read_result", "validation_sets"]

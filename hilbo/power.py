@@ -31,9 +31,9 @@ from scipy.stats import binomtest
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.population_rules import LARGEST_EXACT, rule_map
-from hilbo.session import search_points
 from hilbo.simulate import Person, Population, people, simulate_study
 from hilbo.study import Cohort, fit_cohort, map_optimum
+from hilbo.trial_choice import search_points
 
 __all__ = ["Plan", "cores", "one_study", "power_table", "simulate_power", "summarise", "top_probability"]
 

@@ -21,8 +21,8 @@ from hilbo.errors import InputError
 from hilbo.hyperparameters import Learned, maximise_evidence, maximise_shared_evidence, optimum_sensitivity
 from hilbo.ordinal_gp import Posterior, fit
 from hilbo.population_rules import point_rule, share_of
-from hilbo.session import search_points
 from hilbo.study import Cohort, Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
+from hilbo.trial_choice import search_points
 
 __all__ = ["LIMIT", "Robustness", "robustness"]
 

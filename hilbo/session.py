@@ -20,145 +20,14 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
-from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from hilbo import acquisition
 from hilbo.compiling import compiler_options
 from hilbo.config import Study
 from hilbo.errors import InputError
-from hilbo.kernels import gram
-from hilbo.lattice import Lattice, nodes_for, screen, screen_points
 from hilbo.ordinal_gp import Posterior, Trials, fit
-from hilbo.search_lattice import lattice_of
-from hilbo.search_space import SearchSpace
+from hilbo.trial_choice import Design, design, next_point
 
-__all__ = [
-    "CANDIDATES",
-    "Design",
-    "Session",
-    "best_point",
-    "design",
-    "next_point",
-    "physical_trials",
-    "search_points",
-]
-
-CANDIDATES = 4096
-"""Points inside the feasible set among which a function is maximised before polishing; a quarter more on its walls."""
-_STARTS = 4  # of the polishing, on the lattice
-_GAIN, _IN_UNITS_OF_F = 1e-7, ("ucb", "mean")  # of the prior's sd: less is no reason to polish on
-_JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
-
-
-class Design(eqx.Module):
-    """What a seed decides in advance: where the first trials are, and among which points the others are searched.
-
-    The latter are a lattice in two or three dimensions, whose nodes are products and cost a hundredth of other points;
-    else, and for Thompson's draws, `candidates`.
-    """
-
-    initial: Float[Array, "s d"]
-    candidates: Float[Array, "m d"] | None
-    lattice: Lattice | None
-    key: PRNGKeyArray
-
-
-def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Float[Array, "m d"]:
-    """Points of the unit cube among which to look for a maximum: `count` inside the feasible set, a quarter of that
-    on its walls, edges and corners."""
-    return jnp.concatenate([jnp.asarray(space.candidates(count, seed)), jnp.asarray(space.walls(count // 4, seed))])
-
-
-def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
-    """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
-    space, nodes = study.space, nodes_for(float(jnp.max(study.gp.kernel.theta)))
-    on_lattice = space.dim in (2, 3) and study.selection.acquisition != "thompson"
-    return Design(
-        jnp.asarray(space.latin_hypercube(study.selection.space_filling, seed)),
-        None if on_lattice else search_points(space, seed, count),
-        lattice_of(space, nodes) if on_lattice else None,
-        jax.random.key(seed),
-    )
-
-
-def next_point(
-    study: Study, plan: Design, trials: Trials, trial: Int[Array, ""] | int, weight: ArrayLike | None = None
-) -> Float[Array, " d"]:
-    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition; traceable.
-
-    `weight`: of the standard deviation in UCB, if it is not to be the study's.
-    """
-    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
-    if study.selection.acquisition == "thompson":
-        return _thompson_point(posterior, plan, trial)
-    distance = study.selection.minimum_distance
-    allowed = (lambda x: _far_from(trials, x, distance)) if distance else None
-    return _highest(study, plan, posterior, _score(study, posterior, weight), allowed).x
-
-
-def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
-    """Where a score is largest in the feasible set; screened in float32."""
-
-    def score_at(x):
-        mean, variance = posterior.predict(x[None, :])
-        return score(mean[0], variance[0])
-
-    space = {"from_box": study.space.from_box, "to_box": study.space.to_box, "feasible": study.space.feasible}
-    if study.selection.acquisition in _IN_UNITS_OF_F:
-        space["gain"] = _GAIN * jnp.sqrt(study.gp.kernel.variance)
-    short = posterior.astype(jnp.float32)
-    known = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
-    if plan.lattice is None:
-        points = plan.candidates
-        if allowed is None:
-            values = screen_points(*known, points.astype(jnp.float32), score)
-        else:  # which may rule out all points that were not skipped
-            values = score(*short.predict(points.astype(jnp.float32)))
-        return acquisition.maximise(values, points, score_at, **space, allowed=allowed)
-    found = screen(*known, plan.lattice, score, allowed)
-    rows = acquisition.spread(found.hopes, found.points, _STARTS)
-    usable = found.hopes[rows] > -jnp.inf
-    return acquisition.climb(found.points[rows], usable, score_at, **space, allowed=allowed)
-
-
-def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
-    """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
-    return acquisition.maximise(
-        posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
-        candidates,
-        lambda x: posterior.mean(x[None, :])[0],
-        from_box=study.space.from_box,
-        to_box=study.space.to_box,
-        feasible=study.space.feasible,
-    )
-
-
-def _score(study, posterior, weight):
-    kind = study.selection.acquisition
-    if kind == "ucb":
-        return acquisition.UCB(study.selection.weight if weight is None else weight)
-    if kind == "log_ei":
-        trials = posterior.trials
-        return acquisition.LogEI(jnp.max(jnp.where(trials.mask, posterior.mean(trials.x), -jnp.inf)))
-    if kind == "top_category":
-        return acquisition.TopCategory(study.gp.likelihood.thresholds[-1], study.gp.likelihood.noise)
-    return acquisition.Mean()
-
-
-def _far_from(trials, x, distance):
-    """Whether x keeps the smallest distance to every earlier trial."""
-    apart = jnp.sum((trials.x - x[None, :]) ** 2, axis=1) >= distance**2
-    return jnp.all(apart | ~trials.mask)
-
-
-def _thompson_point(posterior, plan, trial):
-    points = plan.candidates[:_JOINT_CANDIDATES]
-    cross = gram(posterior.gp.kernel, points, posterior.trials.x)
-    covariance = gram(posterior.gp.kernel, points, points) - cross @ posterior.latent.inverse @ cross.T
-    key = jax.random.fold_in(plan.key, trial)
-    row, _ = acquisition.thompson(key, cross @ posterior.latent.weights, covariance)
-    return points[row]
+__all__ = ["Session", "physical_trials"]
 
 
 def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capacity: int) -> Trials:
@@ -198,10 +67,8 @@ class _Step:
     """
 
     def __init__(self, study, plan):
+        self._study, self._plan = study, plan
         self.arrays, self.compiled = _program(study, plan)
-        # Where the mean is largest, the UCB of weight 0 is: in most studies the same program.
-        plain = msgspec.structs.replace(study.selection, acquisition="ucb", minimum_distance=None)
-        self._of_the_mean = _program(replace(study, selection=plain), plan)[1]
         self.weight, self.capacity = np.float64(study.selection.weight), study.selection.trials
         self.initial = np.asarray(_to_physical(study.space, plan.initial))
         self.responses, self.names = study.responses, study.space.names
@@ -219,6 +86,12 @@ class _Step:
     def best(self, points, answers):
         """Where the posterior mean is largest."""
         return self._found(self._of_the_mean, points, answers, np.float64(0.0))
+
+    @functools.cached_property
+    def _of_the_mean(self):
+        """The UCB of weight 0 is largest where the mean is: in most studies this is the program that chooses."""
+        plain = msgspec.structs.replace(self._study.selection, acquisition="ucb", minimum_distance=None)
+        return _program(replace(self._study, selection=plain), self._plan)[1]
 
     def warm(self):
         """Compile what chooses."""

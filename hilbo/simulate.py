@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials
-from hilbo.session import Design, design, next_point
+from hilbo.trial_choice import Design, design, next_point
 
 __all__ = ["PRESETS", "Person", "Population", "people", "simulate_study", "to_table", "truth_table"]
 

@@ -25,7 +25,7 @@ from hilbo.errors import InputError
 from hilbo.hierarchical import Share
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population_rules import RuleMap, point_rule, rule_map, share_of
-from hilbo.session import best_point, search_points
+from hilbo.trial_choice import best_point, search_points
 
 __all__ = [
     "Aggregate",

@@ -68,7 +68,7 @@ def best_mid_worst(
 ) -> Sets:
     """The three renderings of a validation session; see the module. Deterministic: the map and the candidates decide.
 
-    **Arguments:** `candidates`, feasible points (`session.search_points`); `known`, the largest sd of worst and mid in
+    **Arguments:** `candidates`, feasible points (`search_points`); `known`, the largest sd of worst and mid in
     units of the prior's; `apart`, the least distance of mid from both, in the unit cube; `prior`, the map's variance
     where nobody answered (`RuleMap.map_prior`), one person's if it is not given. Raises InputError if the map knows
     nothing well enough, or has nothing in between.

@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from hilbo.config import Study
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.session import search_points
+from hilbo.trial_choice import search_points
 
 __all__ = ["SHARE", "WarmStart", "informed", "read_warm_start", "warm_point", "warm_start"]
 

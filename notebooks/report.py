@@ -18,12 +18,12 @@ import pandas as pd
 
 from hilbo import Study
 from hilbo.report_study import write_study
-from hilbo.session import search_points
 from hilbo.simulate import PRESETS, people, simulate_study, to_table, truth_table
 from hilbo.simulate_validation import sets_table, validation_table
 from hilbo.study import aggregate_cohort, cohort_of
 from hilbo.study_folder import read_folder
 from hilbo.tables import read_trials, write_trials
+from hilbo.trial_choice import search_points
 from hilbo.validation import best_mid_worst
 
 folder = Path(tempfile.mkdtemp())

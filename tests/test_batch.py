@@ -15,8 +15,8 @@ from hilbo.batch import Sums, _block, block_size, jets, population_of, refit, su
 from hilbo.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.config import Study
 from hilbo.errors import InputError
-from hilbo.session import search_points
 from hilbo.study import aggregate_cohort, cohort_of, fit_cohort, population, population_optimum
+from hilbo.trial_choice import search_points
 
 PEOPLE, TRIALS = 37, 6
 

@@ -11,8 +11,8 @@ from hilbo.errors import InputError
 from hilbo.live_choice import APART, LiveChooser
 from hilbo.live_session import Block, LiveSession
 from hilbo.logged_session import LoggedSession
-from hilbo.session import search_points
 from hilbo.stopping import consistency, minutes_left, trust_of
+from hilbo.trial_choice import search_points
 from hilbo.warm_start import informed, warm_start
 
 ANSWERS = ("similar", "different", "close", "close", "similar", "close")

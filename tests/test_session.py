@@ -13,7 +13,8 @@ from hilbo import Session, Study
 from hilbo.acquisition import UCB
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.session import design, next_point, physical_trials
+from hilbo.session import physical_trials
+from hilbo.trial_choice import design, next_point
 
 PAPER = "hilbo/data/paper.toml"
 

@@ -8,7 +8,7 @@ import pytest
 
 from hilbo import Session, Study
 from hilbo.acquisition import UCB
-from hilbo.session import search_points
+from hilbo.trial_choice import search_points
 
 PAPER = Path("hilbo/data/paper.toml")
 deep = pytest.mark.deep

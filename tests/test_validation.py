@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from hilbo import Study, passivity
 from hilbo.errors import InputError
-from hilbo.session import search_points
+from hilbo.trial_choice import search_points
 from hilbo.validation import best_mid_worst, dominant, slice_through, tolerance
 
 PLAIN = {
