@@ -5,8 +5,9 @@
     python benchmarks/run.py --write    both of these, and what limits them, into docs/benchmarks.md
 
 The two take turns, round by round, hilbo once with Laplace and once with expectation propagation; a row is the median
-over the rounds and the ratio of medians. The live step is repeated many times, for its 99th percentile. What is timed
-is in run_tasks.py, what no program could do without in run_floors.py.
+over the rounds and the ratio of medians. The live step is repeated many times, for its 99th percentile; it and the
+session are timed in loops of their own as well. What is timed is in run_tasks.py, what no program could do without in
+run_floors.py.
 """
 
 import argparse
@@ -19,6 +20,7 @@ from pathlib import Path
 from run_document import document, floor_text, table
 
 ROOT = Path(__file__).parents[1]
+SHORT = ("live step", "session")  # so short that it matters whether caches still hold their code
 sys.path.insert(0, str(ROOT))
 
 
@@ -64,16 +66,19 @@ def measure(rounds):
         for function in (*ours, theirs):
             once(function)
         count = 40 * rounds if name == "live step" else max(rounds // 5, 3) if name == "hyperparameters" else rounds
-        times = np.array([[once(function) for function in (*ours, theirs)] for _ in range(count)])
-        found["tasks"][name] = {
-            "median": np.median(times, axis=0).tolist(),
-            "p99": np.quantile(times, 0.99, axis=0).tolist(),
-        }
-        if name == "live step":
-            alone = [[once(function) for _ in range(20 * rounds)] for function in (*ours, theirs)]
-            found["live step in loops"] = np.median(alone, axis=1).tolist()
+        found["tasks"][name] = quantiles([[once(function) for function in (*ours, theirs)] for _ in range(count)])
+        if name in SHORT:
+            loops = [[once(function) for _ in range(count)] for function in (*ours, theirs)]
+            found["tasks"][f"{name}, alone"] = quantiles(np.transpose(loops))
         print(name, found["tasks"][name], file=sys.stderr)
     return found
+
+
+def quantiles(times):
+    """Median and 99th percentile (s) of columns."""
+    import numpy as np
+
+    return {"median": np.median(times, axis=0).tolist(), "p99": np.quantile(times, 0.99, axis=0).tolist()}
 
 
 if __name__ == "__main__":
