@@ -147,9 +147,9 @@ def _searched(gp, trials, options):
     # evidence is sought from the one before's.
     unknown = jnp.full((options.starts, nothing.at.size), jnp.nan, nothing.at.dtype)
     _, ends = jax.lax.scan(ended, (unknown, nothing), _spread(begin, options.starts))
-    best = jnp.argmin(ends.value)
-    # Where no search ended well, it is the one from the model itself that is shown.
-    best = jnp.where(jnp.isfinite(ends.value[best]), best, _own(options.starts))
+    # The search from the model itself wins a tie: where there are no answers, and where no search ended well.
+    own_first = (jnp.arange(options.starts) + _own(options.starts)) % options.starts
+    best = own_first[jnp.argmin(ends.value[own_first])]
     end = jax.tree.map(lambda leaf: leaf[best], ends)
     moved = [jnp.max(jnp.abs(end.at[k] - begin[k])) for k in begin if k != "first" and begin[k].size]
     runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | end.flat

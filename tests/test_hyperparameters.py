@@ -58,6 +58,15 @@ def test_the_scale_freedom_is_real_and_refused():
     del d
 
 
+@pytest.mark.parametrize("inference", ["laplace", "ep"])
+def test_without_answers_the_model_stays(inference):
+    _, gp, trials = problem()
+    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, inference=inference))(trials.first(0))
+    assert float(learned.log_evidence) == 0.0 and bool(learned.runaway)
+    assert learned.gp.kernel.theta == pytest.approx(float(gp.kernel.theta), rel=1e-12)
+    assert learned.gp.likelihood.noise == pytest.approx(float(gp.likelihood.noise), rel=1e-12)
+
+
 def test_the_prior_is_largest_at_its_centre():
     _, gp, _ = problem()
     every = ("theta", "noise", "thresholds")
