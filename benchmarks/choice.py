@@ -22,7 +22,7 @@ def states(study, count, seed=0):
     """`count` random states: stacked trials."""
     import jax
 
-    from hilbo import simulate
+    from hilbo.simulation import simulate
 
     studies = -(-count // 400)
     found = []
@@ -44,10 +44,11 @@ def compare(study, trials):
     import jax
     import jax.numpy as jnp
 
-    from hilbo import acquisition, trial_choice
+    from hilbo import acquisition
     from hilbo.ordinal_gp import fit
+    from hilbo.session import selection
 
-    space, plan = study.space, trial_choice.design(study, 0)
+    space, plan = study.space, selection.design(study, 0)
     many = jnp.asarray(space.candidates(POINTS, 0))
     every = jnp.concatenate([many, jnp.asarray(space.walls(WALLS, 0))])
     score = acquisition.UCB(study.selection.weight)
@@ -62,7 +63,7 @@ def compare(study, trials):
                 mean, variance = posterior.predict(x[None, :])
                 return score(mean[0], variance[0])
 
-            own = trial_choice.next_point(study, plan, data, 0)
+            own = selection.next_point(study, plan, data, 0)
             values = score(*posterior.predict(every))
             inside = values[:POINTS]
             polished = acquisition.maximise(inside, many, at, **box, starts=1)
@@ -106,7 +107,7 @@ def main():
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from hilbo.config import Study
+    from hilbo.study.config import Study
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     trials, _ = states(study, chosen.states, chosen.seed)

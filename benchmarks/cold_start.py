@@ -25,12 +25,12 @@ PROCESSES = {
     "`import jax`": "import jax",
     "`import jax`, one compiled function": X64 + "import jax.numpy as jnp; jax.jit(lambda a: a @ a)(jnp.ones((3, 3)))",
     "`import hilbo`": "import hilbo",
-    "`hilbo.session` imported": X64 + "import hilbo.session",
+    "`hilbo.session.ask_tell` imported": X64 + "import hilbo.session.ask_tell",
     "study loaded": X64 + STUDY,
     "session started: the first point to show": X64 + STUDY + START,
     "first chosen point, after 5 answers": WHOLE,
-    "the same by XLA's newer code generator (`hilbo/compiling.py`)": "import hilbo.compiling\n"
-    "hilbo.compiling._TRIED = (0, 0)\n" + WHOLE,
+    "the same by XLA's newer code generator (`hilbo/numerics/compiling.py`)": "import hilbo.numerics.compiling\n"
+    "hilbo.numerics.compiling._TRIED = (0, 0)\n" + WHOLE,
 }
 CLOCK = """
 import sys, time

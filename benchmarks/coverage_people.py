@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials  # noqa: E402
 from hilbo.kernels import gram  # noqa: E402
-from hilbo.people import measure_people  # noqa: E402
+from hilbo.population.response_quality import measure_people  # noqa: E402
 
 CASES = [(25, 0.0, 0.0), (25, 0.1, 0.0), (25, 0.3, 0.0), (25, 0.0, -1.0), (25, 0.1, -1.0), (100, 0.1, -1.0)]
 START, END = "<!-- coverage -->", "<!-- end of coverage -->"

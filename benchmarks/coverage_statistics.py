@@ -22,11 +22,11 @@ from scipy.special import expit, logit
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
-from hilbo.cluster_robust import ways  # noqa: E402
-from hilbo.ordered_logit import design  # noqa: E402
-from hilbo.preferences import rate  # noqa: E402
-from hilbo.statistics import binary_logit, ordered_logit  # noqa: E402
-from hilbo.wild_bootstrap import p_value, wild  # noqa: E402
+from hilbo.statistics.cluster_robust import ways  # noqa: E402
+from hilbo.statistics.logits import binary_logit, ordered_logit  # noqa: E402
+from hilbo.statistics.ordered_logit import design  # noqa: E402
+from hilbo.statistics.preferences import rate  # noqa: E402
+from hilbo.statistics.wild_bootstrap import p_value, wild  # noqa: E402
 
 # Levels of best, mid, worst, and edges between close, similar, different: with these effects, shares like the paper's.
 LEVELS, EDGES = np.array([-4.8, 0.0, 3.4]), np.array([-2.0, 2.1])

@@ -1,4 +1,4 @@
-"""Make the table of hilbo/exponentials.py and measure its error; a minute.
+"""Make the table of hilbo/mechanics/exponentials.py and measure its error; a minute.
 
     python benchmarks/exponentials.py [--degree 8] [--states 8 10 12]
 
@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 jax.config.update("jax_enable_x64", True)
-from hilbo.exponentials import decode  # noqa: E402
+from hilbo.mechanics.exponentials import decode  # noqa: E402
 
 LONGEST = 10_000
 SAMPLES = np.unique(np.round(np.concatenate([np.arange(40), np.geomspace(40, LONGEST, 200)])))

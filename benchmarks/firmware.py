@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -27,7 +27,7 @@ from device_input import ENCODER_STEP, MACHINES, Recording, Section, emulate  # 
 from device_port import BUILD, FIRMWARE, image  # noqa: E402
 from device_wire import Type  # noqa: E402
 
-from hilbo.exponentials import exponentials  # noqa: E402
+from hilbo.mechanics.exponentials import exponentials  # noqa: E402
 from hilbo.viscoelastic import FOSLS  # noqa: E402
 
 __all__ = ["DOCS", "MEMORIES", "measure", "sizes", "stack_of", "state_bytes"]

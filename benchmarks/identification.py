@@ -60,7 +60,7 @@ def clean(parameters=TRUTH, N=101):
 
 
 def measured(parameters=TRUTH, N=101, repeats=1):
-    from hilbo.identification import Test
+    from hilbo.identification.fitting import Test
 
     curves = zip(("relaxation", "creep"), clean(parameters, N), strict=True)
     return [Test(kind, t, np.tile(out, (repeats, 1)), np.tile(put, (repeats, 1))) for kind, (t, put, out) in curves]
@@ -72,8 +72,8 @@ def study():
     import jax
     import jax.numpy as jnp
 
-    from hilbo import identification, intervals
-    from hilbo.sampled import Sampled
+    from hilbo.identification import fitting, intervals
+    from hilbo.identification.sampled import Sampled
 
     tests = measured(repeats=REPEATS)
     model = Sampled().at(tests)
@@ -85,8 +85,8 @@ def study():
     def one(data):
         key, *outputs = data
         measured = tuple(eqx.tree_at(lambda c: c.output, c, o) for c, o in zip(curves, outputs, strict=True))
-        best, costs = identification.search(model, measured, weights, starts, lower, upper)
-        found = identification.Fit(model, measured, best, lower, upper, costs, weights)
+        best, costs = fitting.search(model, measured, weights, starts, lower, upper)
+        found = fitting.Fit(model, measured, best, lower, upper, costs, weights)
         return best.q, intervals.profile_intervals(found), intervals.block_bootstrap(found, key, 1000)
 
     return jax.jit(lambda data: jax.lax.map(one, data)), tests
@@ -129,7 +129,7 @@ def coverage(chosen):
 
 def summary(folder, noise):
     """Shares of intervals that hold the truth, one-sided ones apart."""
-    from hilbo.sampled import Sampled
+    from hilbo.identification.sampled import Sampled
 
     pieces = [np.load(path) for path in sorted(folder.glob(f"{noise}-*.npz"))]
     if not pieces:
@@ -165,7 +165,7 @@ MATERIALS = {
 
 def select():
     """N-selection without noise; a filter with more taps than samples is an exact (sampled) material."""
-    from hilbo.memory_selection import select_memory
+    from hilbo.identification.memory_selection import select_memory
 
     lines = []
     for name, (parameters, N) in MATERIALS.items():
@@ -192,8 +192,8 @@ def timing(rounds=5):
     from scipy.optimize import least_squares
     from scipy.signal import lfilter
 
-    from hilbo.identification import fit
-    from hilbo.sampled import Sampled
+    from hilbo.identification.fitting import fit
+    from hilbo.identification.sampled import Sampled
 
     outputs = noisy(measured(repeats=REPEATS), "white", [0])
     tests = [type(t)(t.kind, t.time, o[0], t.input) for t, o in zip(measured(repeats=REPEATS), outputs, strict=True)]

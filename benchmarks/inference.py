@@ -2,11 +2,11 @@
 
     python benchmarks/inference.py [--write]
 
-On the six small data sets of tests/datasets.py: errors of Laplace, EP and corrected EP against `exact` with 131,072
-samples; `exact` against elliptical slice sampling and SciPy's Genz routine (tests/reference_exact.py, no code of
-hilbo), in standard errors of both; and, on three of them and over 200 keys, how often the truth is within two stated
-standard errors (three stimuli: by quadrature; otherwise by 131,072 samples, whose error is an eighth of that). A few
-minutes.
+On the six small data sets of tests/support/datasets.py: errors of Laplace, EP and corrected EP against `exact` with
+131,072 samples; `exact` against elliptical slice sampling and SciPy's Genz routine (tests/support/reference_exact.py,
+no code of hilbo), in standard errors of both; and, on three of them and over 200 keys, how often the truth is within
+two stated standard errors (three stimuli: by quadrature; otherwise by 131,072 samples, whose error is an eighth of
+that). A few minutes.
 """
 
 import os
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 jax.config.update("jax_enable_x64", True)
 
 from datasets import SIX, Dataset, near_separable, repeated, repeated_19  # noqa: E402
@@ -29,7 +29,7 @@ from helpers import answers, model  # noqa: E402
 from reference_exact import genz, quadrature, slice_sampled  # noqa: E402
 
 from hilbo import fit  # noqa: E402
-from hilbo.exact import exact  # noqa: E402
+from hilbo.inference.exact import exact  # noqa: E402
 from hilbo.kernels import gram  # noqa: E402
 from hilbo.ordinal_gp import Posterior  # noqa: E402
 

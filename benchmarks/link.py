@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-from hilbo import protocol
+from hilbo.device import protocol
 from hilbo.hardware_bridge import Renderer
 
 PAGE = Path(__file__).parents[1] / "docs" / "device.md"

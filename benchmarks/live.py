@@ -21,13 +21,13 @@ import numpy as np
 
 from hilbo.app.rehearsal import Decider, fast_study, server
 from hilbo.app.robot import Client
-from hilbo.config import Study
-from hilbo.console import start
-from hilbo.live_choice import LiveChooser
-from hilbo.live_session import answer, present, propose
-from hilbo.live_state import LiveSession
-from hilbo.session import Session
-from hilbo.study_plan import header_for
+from hilbo.cli.console import start
+from hilbo.session.actions import answer, present, propose
+from hilbo.session.ask_tell import Session
+from hilbo.session.look_ahead import LiveChooser
+from hilbo.session.plan import header_for
+from hilbo.session.state import LiveSession
+from hilbo.study.config import Study
 
 ROOT = Path(__file__).parents[1]
 PAPER = ROOT / "hilbo" / "data" / "paper.toml"

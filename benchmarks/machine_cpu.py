@@ -23,7 +23,7 @@ from scipy.stats import norm
 
 jax.config.update("jax_enable_x64", True)
 
-from hilbo.hyperparameters import maximise_evidence  # noqa: E402
+from hilbo.hyperparameters.maximum_evidence import maximise_evidence  # noqa: E402
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit  # noqa: E402
 
 ROOT = Path(__file__).parents[1]

@@ -28,11 +28,11 @@ from scipy.stats import norm
 
 jax.config.update("jax_enable_x64", True)
 
-from hilbo.aggregation import RULES, aggregate, grbcm  # noqa: E402
-from hilbo.counts import Counts, fit_counts  # noqa: E402
-from hilbo.learn_people import learn_people  # noqa: E402
-from hilbo.leave_one_out import clustered, integral_transform  # noqa: E402
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit  # noqa: E402
+from hilbo.population.counts import Counts, fit_counts  # noqa: E402
+from hilbo.population.hierarchical_evidence import learn_people  # noqa: E402
+from hilbo.population.leave_one_out import clustered, integral_transform  # noqa: E402
+from hilbo.population.pointwise import RULES, aggregate, grbcm  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 WORDS = {

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 jax.config.update("jax_enable_x64", True)
 
 from datasets import SIX  # noqa: E402
@@ -25,8 +25,9 @@ from helpers import answers, model  # noqa: E402
 
 from hilbo import Study, acquisition, bcm, fit, passivity, viscoelastic  # noqa: E402
 from hilbo.errors import InputError  # noqa: E402
-from hilbo.hyperparameters import maximise_evidence  # noqa: E402
-from hilbo.trial_choice import best_point, search_points  # noqa: E402
+from hilbo.hyperparameters.maximum_evidence import maximise_evidence  # noqa: E402
+from hilbo.search.candidates import search_points  # noqa: E402
+from hilbo.study.aggregate import best_point  # noqa: E402
 from hilbo.viscoelastic import FOSLS  # noqa: E402
 
 __all__ = ["main"]

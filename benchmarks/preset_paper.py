@@ -16,8 +16,9 @@ ROOT = Path(__file__).parents[1]
 
 def one_study(study, seed, candidates):
     """Answers and errors of one simulated study (NRMSE over K1, B1, alpha by search range)."""
-    from hilbo import simulate
-    from hilbo.study import Cohort, fit_cohort, nrmse, population_optimum, progress
+    from hilbo.simulation import simulate
+    from hilbo.study.aggregate import fit_cohort, nrmse, population_optimum, progress
+    from hilbo.study.cohort import Cohort
 
     population = simulate.PRESETS["paper"]
     truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
@@ -47,8 +48,8 @@ def main():
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from hilbo.config import Study
-    from hilbo.trial_choice import search_points
+    from hilbo.search.candidates import search_points
+    from hilbo.study.config import Study
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     candidates = search_points(study.space, 0)

@@ -27,11 +27,11 @@ jax.config.update("jax_enable_x64", True)
 
 import equinox as eqx  # noqa: E402
 
-from hilbo import simulate  # noqa: E402
-from hilbo.config import Study  # noqa: E402
 from hilbo.errors import InputError  # noqa: E402
 from hilbo.ordinal_gp import Trials, fit  # noqa: E402
-from hilbo.population_rules import ALL_RULES, rule_map, share_of  # noqa: E402
+from hilbo.population.maps import ALL_RULES, rule_map, share_of  # noqa: E402
+from hilbo.simulation import simulate  # noqa: E402
+from hilbo.study.config import Study  # noqa: E402
 
 STUDY = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
 NAMES = ("hierarchical, by points", *ALL_RULES)

@@ -19,7 +19,7 @@ PEOPLE = 24
 
 def population(level):
     """The preset with `level` times the differences between people."""
-    from hilbo.simulate import PRESETS
+    from hilbo.simulation.simulate import PRESETS
 
     preset = PRESETS["paper"]
     return dataclasses.replace(
@@ -36,7 +36,7 @@ def path_of(folder, level, seed):
 
 def simulate(study, folder, level, seed):
     """Simulate a study, unless it is there already."""
-    from hilbo.simulate import people, simulate_study
+    from hilbo.simulation.simulate import people, simulate_study
 
     path = path_of(folder, level, seed)
     if path.exists():
@@ -56,7 +56,7 @@ def main():
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from hilbo.config import Study
+    from hilbo.study.config import Study
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     chosen.folder.mkdir(parents=True, exist_ok=True)

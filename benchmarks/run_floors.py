@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from run_tasks import once
 
-from hilbo.hyperparameters import maximise_evidence
-from hilbo.linalg import cholesky, solve_lower
+from hilbo.hyperparameters.maximum_evidence import maximise_evidence
+from hilbo.numerics.linalg import cholesky, solve_lower
 from hilbo.ordinal_gp import OrdinalTerms, Trials, fit
 
 

@@ -14,12 +14,12 @@ import numpy as np
 import reference_numpy as textbook
 
 from hilbo.acquisition import UCB
-from hilbo.config import Study
-from hilbo.hyperparameters import maximise_evidence
-from hilbo.lattice import screen_points
+from hilbo.hyperparameters.maximum_evidence import maximise_evidence
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.session import Session
-from hilbo.study import fit_cohort, population
+from hilbo.search.lattice import screen_points
+from hilbo.session.ask_tell import Session
+from hilbo.study.aggregate import fit_cohort, population
+from hilbo.study.config import Study
 
 PAPER = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 

@@ -27,12 +27,12 @@ def tasks():
     import jax.numpy as jnp
     from run_tasks import data
 
-    from hilbo import lattice
     from hilbo.acquisition import UCB
     from hilbo.kernels import gram
     from hilbo.laplace import _whitened_mode, plain_mode
     from hilbo.ordinal_gp import OrdinalTerms, fit
-    from hilbo.search_lattice import lattice_of
+    from hilbo.search import lattice
+    from hilbo.search.space_lattice import lattice_of
 
     study, candidates, _, _, one, trials = data()
     points, score = jnp.asarray(candidates), UCB(0.7)

@@ -2,11 +2,11 @@
 
     python benchmarks/stress.py [--write] [--quick] [--small]
 
-The cases are tests/stress_cases.py's: 240 with 0 to 25 answers, 24 with 100, 8 with 600, the last not for `exact`,
-which is for about 100. A fit ends well if it holds its certificate, gives finite numbers and variances
-between 0 and the prior's, and, where a reference exists, agrees with it: Laplace with 25 digits (a quarter of the small
-cases), the others with quadrature (points equal or unconnected). Committees of 1 to 10,000 experts against 50 digits.
-Ten minutes on one core; --quick fits a tenth of the cases, --small those of up to 25 answers.
+The cases are tests/support/stress_cases.py's: 240 with 0 to 25 answers, 24 with 100, 8 with 600, the last not for
+`exact`, which is for about 100. A fit ends well if it holds its certificate, gives finite numbers and variances between
+0 and the prior's, and, where a reference exists, agrees with it: Laplace with 25 digits (a quarter of the small cases),
+the others with quadrature (points equal or unconnected). Committees of 1 to 10,000 experts against 50 digits. Ten
+minutes on one core; --quick fits a tenth of the cases, --small those of up to 25 answers.
 """
 
 import functools
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 
 from datasets import Dataset  # noqa: E402
 from helpers import model  # noqa: E402
@@ -205,8 +205,8 @@ def _committee(count, prior, strongest, dtype):
 
 PAGE = """# Stress
 
-Made by `python benchmarks/stress.py --write`; `tests/test_stress.py` holds a part of it, `tests/test_hostile.py` and
-`tests/test_ep.py` a full grid of 540 milder cases.
+Made by `python benchmarks/stress.py --write`; `tests/inference/test_stress.py` holds a part of it,
+`tests/inference/test_hostile.py` and `tests/inference/test_ep.py` a full grid of 540 milder cases.
 
 Noise 1e-4 to 10, theta 1e-3 to 1e5, prior variance 1e-6 to 1e6, gaps between thresholds 1e-4 to 1e2, 2 to 10
 categories, 1 to 20 dimensions, and answers ({counts}): a Latin hypercube. Answers independent of x, sensible, of one

@@ -21,10 +21,11 @@ import numpy as np
 
 from hilbo import Study
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.simulate import PRESETS, Person, people, simulate_study
-from hilbo.study import population
-from hilbo.trial_choice import design, next_point, search_points
-from hilbo.warm_start import warm_point, warm_start
+from hilbo.search.candidates import search_points
+from hilbo.session.selection import design, next_point
+from hilbo.session.warm_start import warm_point, warm_start
+from hilbo.simulation.simulate import PRESETS, Person, people, simulate_study
+from hilbo.study.aggregate import population
 
 TRIALS = 25
 

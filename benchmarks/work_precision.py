@@ -29,12 +29,12 @@ sys.path.insert(0, str(ROOT))
 
 from benchmarks import work_precision_maps as maps  # noqa: E402
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Study, Trials, fit  # noqa: E402
-from hilbo.ep import ep  # noqa: E402
-from hilbo.exact import exact  # noqa: E402
+from hilbo.inference.ep import ep  # noqa: E402
+from hilbo.inference.exact import exact  # noqa: E402
 from hilbo.kernels import gram  # noqa: E402
 from hilbo.ordinal_gp import Posterior, TiltedTerms  # noqa: E402
-from hilbo.study import cohort_of  # noqa: E402
-from hilbo.tables import read_trials  # noqa: E402
+from hilbo.study.cohort import cohort_of  # noqa: E402
+from hilbo.study.trial_table import read_trials  # noqa: E402
 
 __all__ = ["main"]
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Study, Trials, acquisition, bcm, fit
-from hilbo.trial_choice import search_points
+from hilbo.search.candidates import search_points
 
 __all__ = ["committee", "optimum"]
 

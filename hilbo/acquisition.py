@@ -22,9 +22,9 @@ import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from hilbo.linalg import eigh
-from hilbo.newton import TrustRegionNewton
-from hilbo.normal import HALF_LOG_2PI, excess_hazard
+from hilbo.numerics.linalg import eigh
+from hilbo.numerics.newton import TrustRegionNewton
+from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
 
 __all__ = ["UCB", "Choice", "LogEI", "Mean", "Score", "TopCategory", "climb", "maximise", "spread", "thompson"]
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hilbo.linalg import cholesky, eigh, solve_lower
+from hilbo.numerics.linalg import cholesky, eigh, solve_lower
 
 __all__ = [
     "Certificate",

@@ -19,16 +19,16 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Literal, SupportsFloat
 
-from hilbo import protocol
+from hilbo.device import protocol
+from hilbo.device.handshake import greet, take_over
+from hilbo.device.link import DeviceError, Link, RefusalError
+from hilbo.device.messages import Status
+from hilbo.device.parameter_sets import InForce, in_force, wanted_for
+from hilbo.device.ports import BAUD, list_ports, open_port
+from hilbo.device.reasons import Capability, NackReason, State, held_because, meaning
+from hilbo.device.staging import put_in_force
+from hilbo.device.telemetry import Counts, Samples, TelemetryBuffer
 from hilbo.errors import InputError
-from hilbo.handshake import greet, take_over
-from hilbo.link import DeviceError, Link, RefusalError
-from hilbo.messages import Status
-from hilbo.parameter_sets import InForce, in_force, wanted_for
-from hilbo.ports import BAUD, list_ports, open_port
-from hilbo.reasons import Capability, NackReason, State, held_because, meaning
-from hilbo.staging import put_in_force
-from hilbo.telemetry import Counts, Samples, TelemetryBuffer
 
 __all__ = ["Capability", "DeviceError", "InForce", "RefusalError", "Renderer", "State", "list_ports"]
 
@@ -74,7 +74,7 @@ class Renderer:
         which no device of this protocol answers.
         """
         if where == "sim":
-            from hilbo.simulator import Simulator
+            from hilbo.device.simulator import Simulator
 
             simulator = Simulator(**(options or {}))
         elif options:

@@ -36,7 +36,7 @@ from hilbo.gaussian import (
     square_root,
     still,
 )
-from hilbo.linalg import cholesky, one_at_a_time, solve_lower, solve_lower_transposed
+from hilbo.numerics.linalg import cholesky, one_at_a_time, solve_lower, solve_lower_transposed
 
 __all__ = ["Mode", "Pointwise", "Terms", "find_mode", "laplace", "plain_mode"]
 

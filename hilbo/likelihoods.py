@@ -15,7 +15,7 @@ difference). `_truncated` computes them without cancellation and its derivative 
 `jax.grad` of any order meets no floor, no clamp and no 0/0. Reflection makes l + u >= 0 for the edges l < u; then
 
 * narrow intervals: Gauss-Legendre sums of positive terms, relative to the density at the middle;
-* l >= 0, the tail: everything from the excess hazard phi(z)/Q(z) - z (`hilbo.normal`);
+* l >= 0, the tail: everything from the excess hazard phi(z)/Q(z) - z (`hilbo.numerics.normal`);
 * l < 0, the centre: log p = log1p(-(Q(-l) + Q(u))), so that a certain answer keeps all digits of its tiny log p.
 
 Reference: Chu & Ghahramani (2005), JMLR 6:1019.
@@ -31,7 +31,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from hilbo.normal import HALF_LOG_2PI, excess_hazard
+from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
 
 __all__ = ["OrdinalProbit", "confined_normal"]
 

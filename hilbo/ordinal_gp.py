@@ -21,11 +21,11 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from hilbo.ep import ep
-from hilbo.ep_corrected import ep_corrected
 from hilbo.errors import InputError
-from hilbo.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained, shortfall
+from hilbo.inference.ep import ep
+from hilbo.inference.ep_corrected import ep_corrected
+from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit

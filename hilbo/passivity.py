@@ -26,8 +26,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
-from hilbo.memory import Memory, Span, span, sums
-from hilbo.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
+from hilbo.mechanics.memory import Memory, Span, span, sums
+from hilbo.mechanics.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
 from hilbo.viscoelastic import elementwise, share
 
 __all__ = [

@@ -22,9 +22,9 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
-from hilbo.continuous import creep_compliance, relaxation_modulus
-from hilbo.fosls import FOSLS, series, share
-from hilbo.materials import (
+from hilbo.mechanics.continuous import creep_compliance, relaxation_modulus
+from hilbo.mechanics.fosls import FOSLS, series, share
+from hilbo.mechanics.materials import (
     PRESETS,
     Preset,
     creep_load,
@@ -35,8 +35,8 @@ from hilbo.materials import (
     spring,
     springpot,
 )
-from hilbo.memory import GLSums, Memory, Span, gl_coefficients, gl_sums, span, sums
-from hilbo.switching import switched_force
+from hilbo.mechanics.memory import GLSums, Memory, Span, gl_coefficients, gl_sums, span, sums
+from hilbo.mechanics.switching import switched_force
 
 __all__ = [
     "FOSLS",

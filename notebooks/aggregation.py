@@ -16,11 +16,11 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 
 from hilbo import Study
-from hilbo.comparison import compare
-from hilbo.report_comparison import comparison_table
-from hilbo.simulate import PRESETS, people, simulate_study, to_table
-from hilbo.study import Cohort, cohort_of
-from hilbo.tables import read_trials
+from hilbo.report.comparison import comparison_table
+from hilbo.simulation.simulate import PRESETS, people, simulate_study, to_table
+from hilbo.study.cohort import Cohort, cohort_of
+from hilbo.study.rule_comparison import compare
+from hilbo.study.trial_table import read_trials
 
 trials = int(os.environ.get("HILBO_NOTEBOOK_TRIALS", "10"))
 SHOWN = ["rule", "negative_log_density", "negative_log_density_error", "central_95", "z2", "optimum_sd"]

@@ -13,9 +13,9 @@ import os
 
 import numpy as np
 
+from hilbo.device.protocol import SampleFlag
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import Renderer
-from hilbo.protocol import SampleFlag
 from hilbo.viscoelastic import FOSLS
 
 device = Renderer.open("sim", options={"finger": "none", "rate": "lockstep"})

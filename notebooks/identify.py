@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 
 from hilbo import Study
-from hilbo.characterise import characterise
-from hilbo.identification import fit, nrmse
-from hilbo.material_tables import read_material
-from hilbo.report_material import renderer_block
-from hilbo.sampled import Sampled
+from hilbo.identification.characterise import characterise
+from hilbo.identification.fitting import fit, nrmse
+from hilbo.identification.material_tables import read_material
+from hilbo.identification.sampled import Sampled
+from hilbo.report.material import renderer_block
 
 material = read_material("hilbo/data/memory_foam_simulated.csv")
 for test in material.tests:
@@ -51,7 +51,7 @@ for name, estimate in result.estimates.items():
 
 # %%
 if "HILBO_NOTEBOOK_TRIALS" not in os.environ:  # the tests of the notebooks skip the slow part
-    from hilbo.memory_selection import select_memory
+    from hilbo.identification.memory_selection import select_memory
 
     for row in select_memory(material.tests):
         values = {name: round(value, 3) for name, value in row.fit.parameters().items()}

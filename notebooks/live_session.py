@@ -14,13 +14,13 @@ import time
 from pathlib import Path
 
 from hilbo.app.rehearsal import Decider
-from hilbo.config import Study
-from hilbo.event_log import EventLog, log_name
 from hilbo.hardware_bridge import Renderer
-from hilbo.live_choice import LiveChooser
-from hilbo.live_session import answer, go_on, present, propose, sent, steps_of
-from hilbo.live_views import participant_view
-from hilbo.study_plan import header_for
+from hilbo.session.actions import answer, go_on, present, propose, sent, steps_of
+from hilbo.session.event_log import EventLog, log_name
+from hilbo.session.look_ahead import LiveChooser
+from hilbo.session.plan import header_for
+from hilbo.session.views import participant_view
+from hilbo.study.config import Study
 
 # %% [markdown]
 # ## The study and its session

@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from hilbo import Study
-from hilbo.study import aggregate_cohort, cohort_of, fit_cohort, population, population_optimum
-from hilbo.tables import read_trials
+from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population, population_optimum
+from hilbo.study.cohort import cohort_of
+from hilbo.study.trial_table import read_trials
 
 study = Study.load("hilbo/data/video_quality.toml")
 cohort = cohort_of(read_trials("hilbo/data/video_quality.csv", study), study)

@@ -17,9 +17,10 @@ import numpy as np
 import pandas as pd
 
 from hilbo import Study
-from hilbo.people import excluded, measure_people
-from hilbo.study import aggregate_cohort, cohort_of, nrmse
-from hilbo.tables import read_trials, write_trials
+from hilbo.population.response_quality import excluded, measure_people
+from hilbo.study.aggregate import aggregate_cohort, nrmse
+from hilbo.study.cohort import cohort_of
+from hilbo.study.trial_table import read_trials, write_trials
 
 # %% [markdown]
 # ## Video quality

@@ -17,14 +17,15 @@ import numpy as np
 import pandas as pd
 
 from hilbo import Study
-from hilbo.report_study import write_study
-from hilbo.simulate import PRESETS, people, simulate_study, to_table, truth_table
-from hilbo.simulate_validation import sets_table, validation_table
-from hilbo.study import aggregate_cohort, cohort_of
-from hilbo.study_folder import read_folder
-from hilbo.tables import read_trials, write_trials
-from hilbo.trial_choice import search_points
-from hilbo.validation import best_mid_worst
+from hilbo.report.study import write_study
+from hilbo.search.candidates import search_points
+from hilbo.simulation.simulate import PRESETS, people, simulate_study, to_table, truth_table
+from hilbo.simulation.validation_sessions import sets_table, validation_table
+from hilbo.study.aggregate import aggregate_cohort
+from hilbo.study.cohort import cohort_of
+from hilbo.study.folder import read_folder
+from hilbo.study.map_summary import best_mid_worst
+from hilbo.study.trial_table import read_trials, write_trials
 
 folder = Path(tempfile.mkdtemp())
 participants, trials = 6, int(os.environ.get("HILBO_NOTEBOOK_TRIALS", "25"))

@@ -23,7 +23,7 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 install_import_hook("hilbo", "beartype.beartype")  # stays for the whole run: hilbo is imported by the tests
 
-from hilbo.compiling import set_flags  # noqa: E402
+from hilbo.numerics.compiling import set_flags  # noqa: E402
 
 set_flags()  # as hilbo's commands are compiled
 

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from peer import Peer
 
-from hilbo import hardware_bridge, protocol
+from hilbo import hardware_bridge
+from hilbo.device import protocol
+from hilbo.device.protocol import NackReason, Sample
+from hilbo.device.telemetry import TelemetryBuffer
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, RefusalError
-from hilbo.protocol import NackReason, Sample
-from hilbo.telemetry import TelemetryBuffer
 
 A = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
 PATIENT = {"patience": 60.0}  # where a test is not about time

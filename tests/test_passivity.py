@@ -10,7 +10,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.stats import qmc
 
-from hilbo import passivity, passivity_certificate, viscoelastic
+from hilbo import passivity, viscoelastic
+from hilbo.mechanics import passivity_certificate
 from hilbo.viscoelastic import FOSLS
 
 SETS = ((-2.89, 5.70, 5.89, 0.203), (-3.18, 5.58, 7.88, 0.176), (-5.01, 8.44, 10.28, 0.282))

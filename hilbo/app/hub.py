@@ -14,7 +14,6 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from hilbo import live_session
 from hilbo.app import views
 from hilbo.app.interruptions import Interruptions
 from hilbo.app.messages import Answer, Command, Press
@@ -23,8 +22,9 @@ from hilbo.app.runner import Runner
 from hilbo.app.security import Role
 from hilbo.app.watchers import Watchers
 from hilbo.errors import InputError
-from hilbo.event_log import LogError
-from hilbo.live_session import LiveSession, RefusedError
+from hilbo.session import actions
+from hilbo.session.actions import LiveSession, RefusedError
+from hilbo.session.event_log import LogError
 
 __all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
 
@@ -160,7 +160,7 @@ class Hub:
             if found.values is None and found.presentation != presentation:
                 raise RefusedError("old-trial", "This trial has been begun again since.")
             self._came = came
-            return live_session.answer(state, trial, message.client, message.answers, at, browser=browser)
+            return actions.answer(state, trial, message.client, message.answers, at, browser=browser)
 
         came = time.perf_counter()
         try:
@@ -176,11 +176,11 @@ class Hub:
             if what == "here":
                 self.watchers.alive(page)
             elif what == "break":
-                await self.commit(lambda state, at: live_session.pause(state, "participant", at))
+                await self.commit(lambda state, at: actions.pause(state, "participant", at))
             elif what == "more":
-                await self.commit(live_session.more)
+                await self.commit(actions.more)
             elif self.state.screen == "ready":
-                await self.commit(live_session.go_on)
+                await self.commit(actions.go_on)
             elif not self.begun:
                 self.begun = True
                 self.runner.wake()
@@ -207,17 +207,17 @@ class Hub:
         if what == "note":
             if not message.text.strip():
                 raise InputError("The note is empty; write something.")
-            return lambda state, at: live_session.note(state, message.text.strip(), at)
+            return lambda state, at: actions.note(state, message.text.strip(), at)
         if what in ("void", "undo"):
             return lambda state, at: _taken(state, what, message, at)
         if what == "abort":
-            return lambda state, at: live_session.abort(state, message.reason, at)
+            return lambda state, at: actions.abort(state, message.reason, at)
         if what == "pause":
-            return lambda state, at: live_session.pause(state, "experimenter", at)
-        return self._goes_on if what == "resume" else live_session.repeat
+            return lambda state, at: actions.pause(state, "experimenter", at)
+        return self._goes_on if what == "resume" else actions.repeat
 
     def _goes_on(self, state, at):
-        event = (live_session.resume if state.paused is not None else live_session.go_on)(state, at)
+        event = (actions.resume if state.paused is not None else actions.go_on)(state, at)
         self.begun = self.watchers.participant_here  # who comes later presses Begin
         return event
 
@@ -277,11 +277,11 @@ class Hub:
 
 def _taken(state, what, message, at):
     """A trial made void, or an answer taken back: that of the trial which the sender saw, or none."""
-    trial = live_session.voidable(state) if what == "void" else live_session.last_answered(state)
+    trial = actions.voidable(state) if what == "void" else actions.last_answered(state)
     if trial is None:
         raise RefusedError("nothing", f"There is no trial to {what} yet.")
     if message.trial not in (None, trial.id):
         raise RefusedError("old-trial", f"Meanwhile {views.place_of(trial)} has come; look again.")
     if what == "void":
-        return live_session.void(state, trial.id, message.reason, at)
-    return live_session.undo(state, at, message.reason)
+        return actions.void(state, trial.id, message.reason, at)
+    return actions.undo(state, at, message.reason)

@@ -13,12 +13,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from hilbo import live_session
 from hilbo.app.rig import Snapshot
+from hilbo.device.reasons import HoldReason, held_because
 from hilbo.errors import InputError
-from hilbo.event_log import LogError
-from hilbo.live_session import LiveSession
-from hilbo.reasons import HoldReason, held_because
+from hilbo.session import actions
+from hilbo.session.actions import LiveSession
+from hilbo.session.event_log import LogError
 
 __all__ = ["Interruptions"]
 
@@ -109,9 +109,9 @@ class Interruptions:
         hub = self.hub
         pending, hub.begun = hub.state.pending, False
         with contextlib.suppress(InputError, LogError):
-            await hub.commit(lambda state, at: live_session.note(state, why, at))
+            await hub.commit(lambda state, at: actions.note(state, why, at))
             if pending is not None and pending.unfinished:
-                await hub.commit(live_session.repeat)
+                await hub.commit(actions.repeat)
         hub.runner.restart()
 
 
@@ -128,4 +128,4 @@ def _told(seen: Snapshot, condition: str, pending: Any, opening: bool) -> Callab
     facts = {"trial": None if pending is None else pending.id, "reason": reason, "counters": seen.counters}
     killed = opening and condition == "hold" and seen.hold_reason == HoldReason.WATCHDOG
     says = "stopped" if killed else condition
-    return lambda state, at: live_session.device(state, says, at, **facts)
+    return lambda state, at: actions.device(state, says, at, **facts)

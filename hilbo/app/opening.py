@@ -11,14 +11,14 @@ import msgspec
 
 from hilbo.app.hub import Hub
 from hilbo.app.slices import Maps
-from hilbo.config import Study
 from hilbo.errors import InputError
-from hilbo.event_log import EventLog, log_name
-from hilbo.live_choice import LiveChooser, told_of
-from hilbo.live_session import Header, LiveSession
-from hilbo.people_table import check_consent, read_people
-from hilbo.study_plan import header_for, planned_header
-from hilbo.warm_start import read_warm_start
+from hilbo.session.actions import Header, LiveSession
+from hilbo.session.event_log import EventLog, log_name
+from hilbo.session.look_ahead import LiveChooser, told_of
+from hilbo.session.participants import check_consent, read_people
+from hilbo.session.plan import header_for, planned_header
+from hilbo.session.warm_start import read_warm_start
+from hilbo.study.config import Study
 
 __all__ = ["Wanted", "let_go", "opened"]
 

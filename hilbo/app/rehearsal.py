@@ -18,17 +18,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hilbo import simulate
 from hilbo.app.robot import Participant, browser, screenshots
-from hilbo.config import Study
+from hilbo.device.simulator import Simulator
 from hilbo.errors import InputError
-from hilbo.event_log import read_log
-from hilbo.simulator import Simulator
-from hilbo.study_plan import make_plan
+from hilbo.session.event_log import read_log
+from hilbo.session.plan import make_plan
+from hilbo.simulation import simulate
+from hilbo.study.config import Study
 
 __all__ = ["HILBO", "Decider", "example_sets", "fast_study", "rehearse", "server"]
 
-HILBO = [sys.executable, "-c", "from hilbo.cli import main; main()"]
+HILBO = [sys.executable, "-c", "from hilbo.cli.main import main; main()"]
 _STEPS = {
     "warm_up": ("reference", "a"),
     "optimisation": ("reference", "a"),

@@ -15,8 +15,8 @@ import time
 from concurrent.futures import Future
 from typing import Any
 
-from hilbo import live_session
-from hilbo.live_session import RefusedError, Trial
+from hilbo.session import actions
+from hilbo.session.actions import RefusedError, Trial
 
 __all__ = ["Runner"]
 
@@ -107,7 +107,7 @@ class Runner:
         state = hub.state
         loop = asyncio.get_running_loop()
         begun, fits = time.perf_counter(), getattr(hub.chooser, "fits", 0)
-        event = await loop.run_in_executor(hub.compute, live_session.propose, state, hub.chooser, time.time())
+        event = await loop.run_in_executor(hub.compute, actions.propose, state, hub.chooser, time.time())
         if "came" in self.clock:
             self.fits_after += getattr(hub.chooser, "fits", 0) - fits
 
@@ -116,7 +116,7 @@ class Runner:
                 return event
             if newest.need != state.need or newest.trials != state.trials:
                 raise RefusedError("nothing", "what is to be proposed has changed.")
-            return live_session.Event(seq=newest.seq + 1, kind=event.kind, time=at, data=event.data)
+            return actions.Event(seq=newest.seq + 1, kind=event.kind, time=at, data=event.data)
 
         self.clock["chosen"] = time.perf_counter() - begun
         await hub.commit(make, mine=True)
@@ -130,7 +130,7 @@ class Runner:
             self._look_ahead()
             self._at("answer")
             return
-        steps = live_session.steps_of(hub.state, trial)
+        steps = actions.steps_of(hub.state, trial)
         await self._device_ready()
         loading = self._loading(trial, _next_side(steps, 0), stop)
         try:
@@ -157,10 +157,10 @@ class Runner:
         rig, commit = self.hub.rig, self.hub.commit
         if show in trial.renderings:
             await asyncio.wrap_future(rig.render())
-        await commit(lambda state, at: live_session.present(state, trial.id, i, True, at), mine=True)
+        await commit(lambda state, at: actions.present(state, trial.id, i, True, at), mine=True)
         self._at("step", i, seconds)
         await asyncio.sleep(seconds)
-        await commit(lambda state, at: live_session.present(state, trial.id, i, False, at), mine=True)
+        await commit(lambda state, at: actions.present(state, trial.id, i, False, at), mine=True)
 
     async def _arrived(self, loading) -> None:
         """The set is in force; if a hand keeps it from that, it is asked to leave."""
@@ -186,7 +186,7 @@ class Runner:
             raise asyncio.CancelledError
         facts = {"in_force": loaded.in_force._asdict(), "serial_s": loaded.serial_s}
         self._note_times(loaded)
-        await hub.commit(lambda state, at: live_session.sent(state, trial.id, side, at, **facts), mine=True)
+        await hub.commit(lambda state, at: actions.sent(state, trial.id, side, at, **facts), mine=True)
         self._in_force = (trial.id, trial.presentation, side)
 
     def _wanted(self, trial: Trial, side: str) -> dict[str, Any]:

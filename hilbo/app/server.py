@@ -29,7 +29,7 @@ from hilbo.app import messages
 from hilbo.app.hub import COMMANDS, PRESSES, Hub, NotNowError
 from hilbo.app.security import COOKIES, Gate, Role
 from hilbo.errors import InputError
-from hilbo.event_log import LogError
+from hilbo.session.event_log import LogError
 
 __all__ = ["application"]
 

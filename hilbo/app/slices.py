@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hilbo import stopping
-from hilbo.live_session import LiveSession
 from hilbo.ordinal_gp import fit
-from hilbo.session import Session, physical_trials
+from hilbo.session import progress
+from hilbo.session.actions import LiveSession
+from hilbo.session.ask_tell import Session, physical_trials
 
 __all__ = ["Maps"]
 
@@ -34,25 +34,25 @@ class Maps:
             self._found(state, material, [])
             study = session.study
             middle = np.array([[(p.low + p.high) / 2 for p in study.space.parameters]])
-            stopping.trust(study, middle, [0], middle[0], state.header.seed)
+            progress.trust(study, middle, [0], middle[0], state.header.seed)
 
     def trust(self, state: LiveSession) -> list[list[str]]:
         """How far the session has come, in words: name and value."""
         rows = []
         chosen = [i for i, b in enumerate(state.header.blocks) if not b.trials and state.answers(i)]
         block = next((i for i in chosen if not state.full(i)), chosen[-1] if chosen else None)
-        found = None if block is None else stopping.trust_of(state, block)
+        found = None if block is None else progress.trust_of(state, block)
         if found is not None:
             rows.append(["Best so far", ", ".join(f"{name} {value:.3g}" for name, value in found.best.items())])
             top = state.study.responses[-1]
             rows.append([f'… would be "{top}"', f"{100 * found.top:.0f} %"])
             if found.movement is not None:
                 rows.append(["… moves with one more", f"by {100 * found.movement:.1f} % of the ranges"])
-        twice = stopping.consistency(state)
+        twice = progress.consistency(state)
         if twice.pairs:
             rows.append(["Asked twice", f"{twice.alike} of {twice.pairs} alike"])
         if state.screen not in ("done", "ended"):
-            rows.append(["Minutes left", f"{stopping.minutes_left(state):.0f}"])
+            rows.append(["Minutes left", f"{progress.minutes_left(state):.0f}"])
         return rows
 
     def slices(self, state: LiveSession) -> dict[str, Any] | None:

@@ -9,8 +9,8 @@ import time
 from datetime import datetime
 from typing import Any
 
-from hilbo.live_session import LiveSession, Trial, last_answered, voidable
-from hilbo.live_views import experimenter_view, participant_view
+from hilbo.session.actions import LiveSession, Trial, last_answered, voidable
+from hilbo.session.views import experimenter_view, participant_view
 
 __all__ = ["experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
 

@@ -1,0 +1,191 @@
+"""What every command does around its work: float64 and caches, a results folder that is whole or absent, progress.
+
+A folder is written beside its final place and moved there when it is complete, so that a failure leaves nothing behind
+and nothing is overwritten without `--force`. Progress goes to stderr, results with `--json` to stdout.
+"""
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, NoReturn, Protocol
+
+import typer
+
+from hilbo.errors import InputError
+from hilbo.numerics.compiling import set_flags
+
+__all__ = ["PARTS", "Force", "Json", "Out", "Say", "Seed", "fail", "finish", "progress", "remark", "results", "start"]
+
+Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
+Seed = Annotated[
+    int, typer.Option("--seed", min=0, max=2**31 - 1, help="Decides candidates, and in simulations everything random.")
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
+Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
+
+PARTS = ("video-quality", "simulated-memory-foam")
+_EVERY = 10.0  # s
+_MANIFEST = ".hilbo.json"
+
+
+def start(devices: int | None = None) -> None:
+    """Float64, and compiled functions kept in the user's cache folder from one command to the next.
+
+    `devices`: as how many devices the CPU is to count.
+    """
+    set_flags()
+    import jax
+
+    jax.config.update("jax_enable_x64", True)
+    if devices is not None:
+        jax.config.update("jax_num_cpu_devices", devices)
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "hilbo" / "jax"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+@contextlib.contextmanager
+def results(out: Path, force: bool) -> Iterator[Path]:
+    """A new folder that becomes `out` when everything in it is complete; with a list of what it holds, so that
+    `force` replaces nothing else later."""
+    out = out.resolve()
+    _check_free(out, force)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
+    try:
+        yield made
+        made.chmod(0o755)
+        _list_files(made)
+        if out.exists():
+            shutil.rmtree(out)
+        made.rename(out)
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+
+
+def _check_free(out: Path, force: bool) -> None:
+    """Refuse to replace anything without `force`, and with it anything that is not hilbo's."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise InputError(f"{out}: is a file; choose a folder for --out.")
+    if any(out.iterdir()) and not force:
+        raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
+    ours = _listed(out)
+    for path in sorted(path for path in out.rglob("*") if not path.is_dir()):
+        name = path.relative_to(out).as_posix()
+        if name not in ours and name != _MANIFEST:
+            raise InputError(f"{path}: is not a result of hilbo's; choose another --out, so that it is not lost.")
+        if name in ours and _digest(path) != ours[name]:
+            raise InputError(f"{path}: has been changed since hilbo wrote it; choose another --out, or delete it.")
+
+
+def _listed(folder: Path) -> dict[str, str]:
+    """The files that hilbo wrote into a folder, and what they held; none if it did not write that folder."""
+    try:
+        found = json.loads((folder / _MANIFEST).read_bytes())
+    except (OSError, ValueError):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _list_files(folder: Path) -> None:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    listed = {path.relative_to(folder).as_posix(): _digest(path) for path in files}
+    (folder / _MANIFEST).write_text(json.dumps(listed, indent=0), encoding="utf-8")
+
+
+def _digest(path: Path) -> str:
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+class Say(Protocol):
+    """Told what is being done and, where that is counted, how many are done already, and of how many."""
+
+    def __call__(self, text: str, done: int | None = None, people: int | None = None) -> None: ...
+
+
+@contextlib.contextmanager
+def progress(quiet: bool = False) -> Iterator[Say]:
+    """Says on stderr what is being done: in one changing line on a terminal, else in a line for each thing, or every
+    ten seconds for one that takes longer. `quiet`: says nothing, for the processes whose results are not written."""
+    from rich.console import Console
+
+    console, begun = Console(stderr=True, highlight=False, markup=False, soft_wrap=True), time.perf_counter()
+    console.quiet = quiet
+    with console.status("starting") as status:
+        pace = _Pace()
+
+        def say(text: str, done: int | None = None, people: int | None = None) -> None:
+            line, new = pace.line(text, done, people, time.perf_counter())
+            if console.is_terminal:
+                status.update(line)
+            elif new:
+                console.print(line)
+
+        yield say
+    console.print(f"done in {time.perf_counter() - begun:.1f} s")
+
+
+class _Pace:
+    """The words for work that goes by participants: how many are done, and how long the others will take."""
+
+    def __init__(self) -> None:
+        self.text, self.done, self.first, self.told = "", 0, (0, 0.0), -math.inf
+
+    def line(self, text: str, done: int | None, people: int | None, now: float) -> tuple[str, bool]:
+        """The line, and whether it is news where there is no line that changes."""
+        if done is None:
+            self.text = text
+            return text, True
+        if text != self.text or done < self.done:  # the first report has the compilation in it, and tells no pace
+            again = text == self.text
+            self.text, self.first, self.told = text, (done, now), self.told if again else -math.inf
+        self.done = done
+        begin, since = self.first
+        line = f"{done:,} {text}" if people is None else f"{done:,} of {people:,} {text}"
+        if people is not None and begin < done < people:
+            left = round((now - since) / (done - begin) * (people - done))
+            line += f", {left // 60}:{left % 60:02d} left"
+        if now - self.told < _EVERY:
+            return line, False
+        self.told = now
+        return line, True
+
+
+def finish(content: dict[str, Any], out: Path, as_json: bool) -> None:
+    """The last words of a command: warnings, then result.json or the way to the report."""
+    for warning in content.get("warnings", []):
+        remark(warning)
+    if as_json:
+        with (out / "result.json").open(encoding="utf-8") as file:
+            shutil.copyfileobj(file, sys.stdout)
+    else:
+        print(f"{out / 'report.html'}", file=sys.stderr)
+
+
+def remark(sentence: str) -> None:
+    """One sentence on stderr."""
+    print(f"hilbo: {sentence}", file=sys.stderr)
+
+
+def fail(sentence: str, code: int) -> NoReturn:
+    """One sentence on stderr, and the end."""
+    remark(sentence)
+    sys.exit(code)

@@ -1,0 +1,235 @@
+"""A device on the terminal: its state, its force and position as they go by, and keys that switch between sets.
+
+Shown on stderr, in place on a terminal, otherwise as a line a second. Keys come from the terminal one by one, or from
+a pipe, one after another, so that what a hand can do a script can do too.
+"""
+
+import contextlib
+import os
+import select
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.console import Console, Group
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from hilbo.device.parameter_sets import InForce, wanted_for
+from hilbo.device.reasons import SampleFlag, held_because, meaning
+from hilbo.errors import InputError
+from hilbo.hardware_bridge import DeviceError, Renderer, State
+
+__all__ = ["feel", "trace", "watch"]
+
+_PAINT = 0.1  # s
+_SHOWN = 4.0  # s of the trace
+_BARS = " ▁▂▃▄▅▆▇█"
+_KEYS = "123456789"
+_PIPED = 5  # pictures from one key of a pipe to the next
+
+
+def trace(values: Any, width: int) -> str:
+    """A row of bars from the lowest to the highest value; each bar is the largest excursion of its share."""
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values)]
+    if values.size == 0:
+        return " " * width
+    low, high = min(values.min(), 0.0), max(values.max(), 0.0)
+    parts = [part for part in np.array_split(values, min(width, values.size)) if part.size]
+    peaks = np.array([part[np.argmax(np.abs(part))] for part in parts])
+    levels = np.zeros(peaks.size) if high == low else (peaks - low) / (high - low)
+    return "".join(_BARS[round(level * (len(_BARS) - 1))] for level in levels).rjust(width)
+
+
+class _View:
+    """What is on the screen: the last status and the last seconds of telemetry."""
+
+    def __init__(self, device: Renderer, title: str):
+        self.device, self.title = device, title
+        self.words: list[str] = []
+        keep = round(_SHOWN / device.tick_s / max(1, device.divisor))
+        self.position: deque[float] = deque(maxlen=keep)
+        self.force: deque[float] = deque(maxlen=keep)
+        self.seen, self.largest_N, self.flags = 0, 0.0, 0
+        self.set: InForce | None = device.in_force()
+        self.status = device.status()
+
+    def refresh(self) -> None:
+        new = self.device.samples(0.0)
+        self.position.extend(new.position_mm)
+        self.force.extend(new.force_N)
+        self.seen += new.tick.size
+        if new.tick.size:
+            self.largest_N = max(self.largest_N, float(np.abs(new.force_N).max()))
+            self.flags |= int(np.bitwise_or.reduce(new.flags))
+        self.status = self.device.status()
+        self.words.extend(self.device.events())
+
+    def line(self) -> str:
+        s = self.status
+        state = meaning(State, s.state) + (f" ({held_because(s.hold_reason)})" if s.state >= State.HOLD else "")
+        return f"tick {s.tick}  {state}  set {s.active_id}  {s.position_mm:8.3f} mm  {s.force_N:7.3f} N"
+
+    def panel(self, width: int) -> Group:
+        width = max(20, min(width - 26, 100))
+        table = Table(box=box.SIMPLE_HEAD, show_header=False, pad_edge=False)
+        table.add_row("", self.line())
+        if self.set is not None:
+            x = self.set
+            words = f"K0 {x.K0:.4g}  K1 {x.K1:.4g}  B1 {x.B1:.4g}  alpha {x.alpha:.4g}  {x.memory} {x.length}"
+            table.add_row("set", f"{words}  needs {x.needs:.3f} N·s/m")
+        for name, values, unit in (("force", self.force, "N"), ("position", self.position, "mm")):
+            ends = f"{min(values, default=0):.2f} to {max(values, default=0):.2f} {unit}"
+            table.add_row(name, f"{trace(values, width)}  {ends}")
+        s, counts = self.status, self.device.counts()
+        marks = ", ".join(flag.name.lower() for flag in SampleFlag(self.flags) if flag.name) or "nothing"
+        table.add_row("since", f"largest force {self.largest_N:.2f} N; {marks}")
+        table.add_row(
+            "counts",
+            f"holds {s.holds}, e-stops {s.estops}, saturated {s.saturated}, slewed {s.slewed},"
+            f" overruns {s.overruns}, frames lost {s.frames_dropped}, samples lost {counts.dropped + counts.missing}",
+        )
+        return Group(Text(self.title), table, *(Text(word) for word in self.words[-4:]))
+
+    def summary(self) -> dict[str, Any]:
+        """For `--json`."""
+        s = self.status
+        names = (
+            "tick",
+            "position_mm",
+            "force_N",
+            "holds",
+            "estops",
+            "saturated",
+            "slewed",
+            "overruns",
+            "frames_dropped",
+        )
+        counts = self.device.counts()._asdict()
+        rest = {
+            "samples": self.seen,
+            "largest_force_N": self.largest_N,
+            "set": self.set._asdict() if self.set else None,
+        }
+        return {
+            "state": meaning(State, s.state),
+            **{name: getattr(s, name) for name in names},
+            **rest,
+            "counts": counts,
+        }
+
+
+def watch(device: Renderer, seconds: float | None, title: str = "Ctrl-C ends") -> dict[str, Any]:
+    """Show the device until Ctrl-C, for so many `seconds` of its time, or until it is in HOLD; returns a summary."""
+    return _show(_View(device, title), seconds, lambda _view: True)
+
+
+def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float | None) -> dict[str, Any]:
+    """Keys 1 to 9 put sets in force, space starts and stops, e is the emergency stop, c clears, q ends."""
+    if not sets or len(sets) > len(_KEYS):
+        raise InputError(f"There are {len(sets)} sets; between 1 and {len(_KEYS)} can be felt, one on each key.")
+    for values in sets.values():
+        wanted_for(device.device, **values)  # says now what is wrong, and loads what full memory needs
+    names = list(sets)
+    title = "  ".join(f"[{key}] {name}" for key, name in zip(_KEYS, names, strict=False))
+    view = _View(device, f"{title}\nspace: start or stop   e: emergency stop   c: clear   q: end")
+    felt: list[str] = []
+
+    def obey(view: _View, keys: Iterator[str]) -> bool:
+        for key in keys:
+            if key == "q":
+                return False
+            try:
+                _press(device, view, key, names, sets, felt)
+            except (DeviceError, InputError) as error:
+                view.words.append(str(error))
+                if device.link.lost:
+                    raise
+        return True
+
+    with _keyboard() as pressed:
+        content = _show(view, seconds, lambda shown: obey(shown, pressed()))
+    return content | {"felt": felt, "words": view.words}
+
+
+def _press(device, view, key, names, sets, felt) -> None:
+    if key in _KEYS[: len(names)]:
+        name = names[_KEYS.index(key)]
+        view.set = device.send(**sets[name])
+        felt.append(name)
+        view.words.append(f'"{name}" is in force')
+    elif key == " ":
+        device.start() if device.state() == State.STOPPED else device.stop()
+    elif key == "e":
+        device.estop()
+    elif key == "c":
+        device.clear()
+
+
+def _show(view, seconds, go_on: Callable[[_View], bool]) -> dict[str, Any]:
+    console = Console(stderr=True, highlight=False, markup=False)
+    first, painted = view.status.tick, 0.0
+    with contextlib.ExitStack() as stack:
+        live = stack.enter_context(Live(console=console, refresh_per_second=10)) if console.is_terminal else None
+        with contextlib.suppress(KeyboardInterrupt):
+            while True:
+                view.refresh()
+                if live is not None:
+                    live.update(view.panel(console.width))
+                elif time.monotonic() - painted >= 1:
+                    console.print(view.line())
+                    painted = time.monotonic()
+                over = seconds is not None and (view.status.tick - first) % 2**32 * view.device.tick_s >= seconds
+                if over or not go_on(view):
+                    break
+                view.device.link.pause(_PAINT)
+    if live is None:
+        for word in view.words:
+            console.print(word)
+    return view.summary()
+
+
+@contextlib.contextmanager
+def _keyboard() -> Iterator[Callable[[], Iterator[str]]]:
+    """A function that gives the keys pressed since the last call, without waiting; "q" at the end of a pipe."""
+    if not sys.stdin.isatty():
+        yield _Pipe()
+        return
+    try:
+        import termios
+        import tty
+    except ImportError as error:
+        raise DeviceError("Keys need a POSIX terminal; use WSL, or pipe the keys in.") from error
+    file = sys.stdin.fileno()
+    before = termios.tcgetattr(file)
+    tty.setcbreak(file)
+    try:
+        yield lambda: _waiting(file)
+    finally:
+        termios.tcsetattr(file, termios.TCSADRAIN, before)
+
+
+def _waiting(file) -> Iterator[str]:
+    while select.select([file], [], [], 0)[0]:
+        data = os.read(file, 1)
+        if not data:
+            return
+        yield data.decode(errors="replace")
+
+
+class _Pipe:
+    """Keys from a pipe, one every half a second."""
+
+    def __init__(self):
+        self._asked = 0
+
+    def __call__(self) -> Iterator[str]:
+        self._asked += 1
+        if self._asked % _PIPED == 1:
+            yield sys.stdin.read(1) or "q"

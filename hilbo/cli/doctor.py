@@ -1,0 +1,207 @@
+"""Is everything ready for a session? Each check says what it found and, where something is wrong, what to mend.
+
+Nothing is changed: a file of a few bytes is written and removed where logs will be, and the device is asked, stopped,
+and never started.
+"""
+
+import os
+import platform
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from hilbo.errors import InputError
+
+__all__ = ["Check", "checks"]
+
+Level = Literal["good", "note", "bad"]
+_PARTS = ("hilbo", "jax", "jaxlib", "equinox", "numpy", "starlette", "uvicorn", "pyserial")
+_OPTIONAL = {"starlette": "live", "uvicorn": "live", "pyserial": "hardware"}
+_BROWSERS = ("chromium", "google-chrome", "chromium-browser", "firefox", "msedge", "open")
+_ROOM = 200  # MB; a session's log is below one
+_SLOW = 0.5  # s for a step: a participant would notice
+
+
+class Check(NamedTuple):
+    """What was looked at, how it is, in words; and what to do, empty where nothing is to be done."""
+
+    name: str
+    level: Level
+    words: str
+    mend: str = ""
+
+
+def checks(study: Path | None, connect: Callable[[float | None], Any], folder: Path, port: int) -> Iterator[Check]:
+    """One check after the other. `connect(damping)` opens the device, logs go to `folder`, `port` is the server's."""
+    yield _versions()
+    yield _disk(folder)
+    yield _port(port)
+    yield _browser()
+    yield _serial_ports()
+    chosen = None
+    if study is not None:
+        found, chosen = _study(study)
+        yield found
+    yield _precision()
+    if chosen is not None:
+        yield _feasible(chosen)
+        yield _step(chosen)
+    yield from _device(connect, chosen)
+
+
+def _versions() -> Check:
+    found, missing = [f"Python {platform.python_version()}"], []
+    for part in _PARTS:
+        try:
+            found.append(f"{part} {metadata.version(part)}")
+        except metadata.PackageNotFoundError:
+            missing.append(part)
+    extras = sorted({_OPTIONAL[part] for part in missing if part in _OPTIONAL})
+    words = ", ".join(found) + (f"; not installed: {', '.join(missing)}" if missing else "")
+    mend = f"pip install 'hilbo[{','.join(extras)}]'" if extras else ""
+    return Check("versions", "bad" if "live" in extras else "note" if missing else "good", words, mend)
+
+
+def _disk(folder: Path) -> Check:
+    place = folder if folder.is_dir() else folder.resolve().parent
+    try:
+        with tempfile.NamedTemporaryFile(dir=place) as file:
+            begun = time.perf_counter()
+            file.write(b"hilbo\n" * 100)
+            file.flush()
+            os.fsync(file.fileno())
+            took = time.perf_counter() - begun
+        free = shutil.disk_usage(place).free / 1e6
+    except OSError as error:
+        return Check("disk", "bad", f"{place}: {error.strerror}", "choose a folder for logs that can be written")
+    words = f"{place}: {free:,.0f} MB free, a line is safe on the disk after {1000 * took:.1f} ms"
+    if free < _ROOM:
+        return Check("disk", "bad", words, f"make {_ROOM} MB of room, or choose another folder")
+    return Check("disk", "good", words)
+
+
+def _port(port: int) -> Check:
+    import socket
+
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            words = f"127.0.0.1:{port}: {error.strerror}"
+            return Check("server's port", "bad", words, "end the other program, or choose another --port")
+    return Check("server's port", "good", f"127.0.0.1:{port} is free")
+
+
+def _browser() -> Check:
+    found = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+    if found is None and sys.platform not in ("win32", "darwin"):
+        return Check("browser", "note", "none is found here", "install one, or use a tablet with --lan")
+    return Check("browser", "good", found or "the system's")
+
+
+def _serial_ports() -> Check:
+    from hilbo.device.ports import list_ports
+
+    try:
+        found = list_ports()
+    except InputError as error:
+        return Check("serial ports", "note", "pyserial is missing", str(error))
+    words = ", ".join(f"{port.name} ({port.description})" for port in found) or "none"
+    return Check("serial ports", "good" if found else "note", words, "" if found else "plug the device in")
+
+
+def _study(path: Path) -> tuple[Check, Any]:
+    from hilbo.study.config import Study
+
+    try:
+        study = Study.load(path)
+    except InputError as error:
+        return Check("study", "bad", str(error), "mend the study file"), None
+    words = f"{study.name}, {study.selection.trials} trials, hash {study.hash}"
+    return Check("study", "good", words), study
+
+
+def _precision() -> Check:
+    import jax
+    import jax.numpy as jnp
+
+    cache = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    size = sum(file.stat().st_size for file in Path(cache).glob("*")) / 1e6 if cache and Path(cache).is_dir() else 0.0
+    words = (
+        f"{jnp.zeros(()).dtype}, {jax.devices()[0].platform}; compiled functions are kept in {cache} ({size:.0f} MB)"
+    )
+    if jnp.zeros(()).dtype != jnp.float64:
+        return Check("precision and cache", "note", words, "sessions are meant for float64")
+    empty = size == 0
+    return Check(
+        "precision and cache",
+        "note" if empty else "good",
+        words,
+        "the first session compiles for a minute; run `hilbo simulate --live` once before" if empty else "",
+    )
+
+
+def _feasible(study: Any) -> Check:
+    share = study.space.volume()
+    words = f"{100 * share:.1f} % of the box can be shown passively"
+    if share < 0.02:
+        return Check("feasible set", "bad", words, "lower K1's range, or use a device with more damping")
+    return Check("feasible set", "good", words)
+
+
+def _step(study: Any) -> Check:
+    """From an answer to the next point without anything chosen in advance, compiled before."""
+    from hilbo.session.ask_tell import Session
+
+    session = Session.start(study, seed=0)
+    session.warm().join()
+    for _ in range(min(study.selection.space_filling + 1, study.selection.trials - 1)):
+        begun = time.perf_counter()
+        session = session.tell(study.responses[0])
+        took = time.perf_counter() - begun
+    words = f"{1000 * took:.0f} ms from an answer to the next point, where nothing was chosen ahead"
+    return Check(
+        "time of a step", "note" if took > _SLOW else "good", words, "close other programs" if took > _SLOW else ""
+    )
+
+
+def _device(connect: Callable[[float | None], Any], study: Any) -> Iterator[Check]:
+    from hilbo.device.link import DeviceError
+
+    mechanics = study.space.mechanics if study is not None else None
+    needs = None if mechanics is None else float(mechanics.damping)
+    try:
+        device = connect(None)
+    except (InputError, DeviceError) as error:
+        yield Check("device", "bad", str(error), "connect it, or try --device sim")
+        return
+    with device:
+        said = device.device
+        yield Check("device", "good", f"{device.link.name}: {said.tick_rate_Hz} ticks a second, {device.state().name}")
+        yield _loopback(device)
+        if needs is not None:
+            yield _damping(said.damping_N_s_per_m, needs)
+
+
+def _loopback(device: Any) -> Check:
+    count, wrong = 200, 0
+    begun = time.perf_counter()
+    for i in range(count):
+        data = bytes((i + k) % 256 for k in range(32))
+        wrong += device.echo(data) != data
+    took = (time.perf_counter() - begun) / count
+    words = f"{count} messages there and back, {wrong} wrong, {1000 * took:.1f} ms each"
+    return Check("device loopback", "bad" if wrong else "good", words, "check cable and ground" if wrong else "")
+
+
+def _damping(has: float, needs: float) -> Check:
+    words = f"the study counts on {needs:g} N·s/m, the device says {has:g}"
+    if has < needs * (1 - 1e-6):
+        return Check("damping", "bad", words, "measure it (`hilbo device measure-damping`), then lower the study's")
+    return Check("damping", "good", words)

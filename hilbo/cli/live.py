@@ -1,0 +1,195 @@
+"""The commands of a live session: `hilbo session`, `hilbo doctor`, and `hilbo simulate --live` (`live`).
+
+hilbo session study.toml --participant P07 --device /dev/ttyACM0
+hilbo session study.toml --participant P07 --device /dev/ttyACM0 --resume
+hilbo doctor study.toml --device /dev/ttyACM0
+"""
+
+import contextlib
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+
+from hilbo.cli.console import Json, Seed, progress, start
+from hilbo.cli.device_options import Baud, Sim, Where, sim_options, takes
+from hilbo.errors import InputError
+
+__all__ = ["doctor", "live", "session"]
+
+_PORT = 8642
+_EXTRA = "Live sessions need starlette, uvicorn and segno; install them with: pip install 'hilbo[live]'."
+
+
+class Device(NamedTuple):
+    """Which device."""
+
+    device: Where = "sim"
+    baud: Baud = 1_000_000
+    sim: Sim = None
+
+    def open(self, damping: float | None) -> Any:
+        """A connected `Renderer` of a device that has at least this damping (N·s/m)."""
+        from hilbo.hardware_bridge import Renderer
+
+        options = sim_options(self.sim)
+        if self.device == "sim":
+            options = {"finger": "none"} | options
+        return Renderer.open(self.device, baud=self.baud, damping=damping, options=options)
+
+
+class Served(NamedTuple):
+    """Where a session is served, and where its log goes."""
+
+    logs: Annotated[Path, typer.Option("--logs", help="Folder of the session logs.")] = Path("logs")
+    port: Annotated[int, typer.Option("--port", help="Port of the server; 0 takes any.")] = _PORT
+    lan: Annotated[bool, typer.Option("--lan", help="Reachable from the network, by one-time links.")] = False
+    gap: Annotated[float, typer.Option("--gap", min=0.0, help="Pause between two trials, s.")] = 0.7
+    browse: Annotated[bool, typer.Option("--open", help="Open the experimenter's page in this computer's browser.")] = (
+        False
+    )
+
+
+@takes(line=Device, served=Served)
+def session(
+    study: Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)],
+    line: Device,
+    served: Served,
+    participant: Annotated[str, typer.Option(help="Pseudonym of the participant.")],
+    name: Annotated[str, typer.Option("--session", help="Which of the participant's sessions.")] = "1",
+    plan: Annotated[Path | None, typer.Option(help="Plan of the study, from `hilbo plan`.")] = None,
+    material: Annotated[str | None, typer.Option(help="Which of the study's materials.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the session that has a log.")] = False,
+    people: Annotated[Path | None, typer.Option(help="participants.csv; by default the one among the logs.")] = None,
+    warm_start: Annotated[
+        Path | None, typer.Option("--warm-start", help="map.nc of a population, that selection begins with.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Nobody takes part: no consent is looked for, and the log says so.")
+    ] = False,
+    seed: Seed = 0,
+    as_json: Json = False,
+) -> None:
+    """A live session: the participant's and the experimenter's page, the device, and the log."""
+    _need_extra()
+    from hilbo.app import serve
+
+    with contextlib.ExitStack() as held:
+        file = held.enter_context(_claimed(served.logs, participant, name))
+        place = serve.bound(served.port, lan=served.lan, keys=file)
+        held.callback(place.socket.close)
+        with progress() as say:
+            say("loading")
+            start()
+            from hilbo.app.opening import Wanted, let_go, opened
+
+            wanted = Wanted(
+                study, participant, name, seed, served.logs, plan, material, resume, people, warm_start, dry_run
+            )
+            hub, log = opened(wanted, line.open, say)
+        held.callback(let_go, log, resume)
+        hub.gap = served.gap
+        _serve(hub, place, served, as_json)
+
+
+def _serve(hub, place, served, as_json) -> None:
+    from hilbo.app import serve
+
+    def invite():
+        link = place.link("participant")
+        return {"link": link, "qr": serve.qr_image(link)}
+
+    hub.invite = invite
+    serve.serve(place, hub, lambda _: _started(hub, place, served, as_json))
+
+
+def _started(hub, place, served, as_json) -> None:
+    """Links on the terminal; with --json in one line on stdout, for programs."""
+    from hilbo.app import serve
+
+    links = place.links()
+    for note in hub.rig.notes:
+        print(f"hilbo: {note}", file=sys.stderr)
+    print(f"log:          {hub.log.path}" + (f"  ({hub.log.dropped})" if hub.log.dropped else ""), file=sys.stderr)
+    for role, link in links.items():
+        print(f"{role + ':':<13} {link}", file=sys.stderr)
+    if served.lan:
+        print(serve.qr_text(links["participant"]), file=sys.stderr)
+    print("Each link opens once. Ctrl-C ends the server; --resume goes on.", file=sys.stderr, flush=True)
+    if as_json:
+        print(json.dumps(links | {"log": str(hub.log.path), "device": hub.rig.device.link.name}), flush=True)
+    if served.browse:
+        import webbrowser
+
+        webbrowser.open(links["experimenter"])
+
+
+@contextlib.contextmanager
+def _claimed(logs: Path, participant: str, name: str):
+    """The file of this session's keys; made with its folder."""
+    import re
+
+    if not re.fullmatch(r"[\w.-]{1,64}", participant):
+        raise InputError(
+            f'--participant is "{participant}"; a pseudonym is letters, digits, dot, dash and underscore, such as P07.'
+        )
+    try:
+        logs.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{logs}: cannot be made ({error.strerror}); choose another --logs.") from error
+    yield logs / f".{participant}-{re.sub(r'[^A-Za-z0-9_.-]', '-', name)}.keys"
+
+
+def _need_extra() -> None:
+    import importlib.util
+
+    if any(importlib.util.find_spec(part) is None for part in ("starlette", "uvicorn", "segno")):
+        raise InputError(_EXTRA)
+
+
+@takes(line=Device)
+def doctor(
+    line: Device,
+    study: Annotated[Path | None, typer.Argument(help="Study file (TOML).", show_default=False)] = None,
+    logs: Annotated[Path, typer.Option("--logs", help="Folder of the session logs.")] = Path("logs"),
+    port: Annotated[int, typer.Option("--port", help="Port of the server.")] = _PORT,
+    as_json: Json = False,
+) -> None:
+    """Is everything ready for a session? What is not, and how to mend it."""
+    start()
+    from hilbo.cli.doctor import checks
+
+    found = []
+    marks = {"good": "ok  ", "note": "note", "bad": "BAD "}
+    for check in checks(study, line.open, logs, port):
+        found.append(check)
+        mend = f"\n       -> {check.mend}" if check.mend else ""
+        print(f"{marks[check.level]}  {check.name}: {check.words}{mend}", file=sys.stderr, flush=True)
+    if as_json:
+        print(json.dumps([check._asdict() for check in found], indent=2))
+    if any(check.level == "bad" for check in found):
+        raise typer.Exit(1)
+
+
+def live(study: Path, out: Path, phase: str, seconds: float | None, seed: int, say: Any) -> dict[str, Any]:
+    """A whole session without people, into a new folder: `hilbo simulate --live`."""
+    _need_extra()
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: exists already; choose another --out.")
+    start()
+    from hilbo.app.rehearsal import rehearse
+    from hilbo.app.robot import find_browser
+    from hilbo.study.protocols import PHASES
+
+    if phase not in PHASES[1:]:
+        raise InputError(f'--kind is "{phase}", it must be one of {", ".join(PHASES[1:])}.')
+    if find_browser() is None:
+        raise InputError(
+            "--live needs Chromium and playwright; install them (Debian: apt install chromium; pip install"
+            " 'hilbo[browser]')."
+        )
+    return rehearse(
+        study, out, phase=phase, seconds=seconds, warm_up=None if seconds is None else 3, seed=seed, say=say
+    )

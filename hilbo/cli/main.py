@@ -1,0 +1,317 @@
+"""The command line: `hilbo aggregate | simulate | robustness | demo`, and the commands of its neighbours.
+
+The modules of this folder are the only places that parse arguments. Results go to a folder, machine-readable ones with
+`--json` to stdout, progress to stderr (`console`). Exit code 0: done, 1: failed, 2: bad usage or bad input, said in
+one sentence.
+"""
+
+import contextlib
+import shutil
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilbo.cli import device, session
+from hilbo.cli import live as cli_live
+from hilbo.cli import material as cli_material
+from hilbo.cli import study as cli_study
+from hilbo.cli.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, remark, results, start
+from hilbo.errors import InputError
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    help="From people's ordinal answers to a population optimum, for haptic rendering of viscoelastic material.",
+)
+
+_LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
+
+StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
+Table = Annotated[
+    Path, typer.Argument(help="Trial table (CSV or Parquet), or a folder of session logs.", show_default=False)
+]
+
+
+def main() -> None:
+    """Entry point: runs a command, and turns bad input into one sentence and exit code 2."""
+    try:
+        app()
+    except InputError as error:
+        fail(str(error), 2)
+    except (OSError, RuntimeError) as error:
+        fail(f"{type(error).__name__}: {error}", 1)
+
+
+@app.command()
+def aggregate(
+    trials: Table,
+    study: StudyOption,
+    out: Out,
+    seed: Seed = 0,
+    material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
+    participants: Annotated[str | None, typer.Option(help="Only these, separated by commas.")] = None,
+    first: Annotated[int | None, typer.Option(min=1, help="Only everybody's first so many trials.")] = None,
+    individuals: Annotated[bool, typer.Option(help="Seek everybody's own optimum: most of the work.")] = True,
+    rule: Annotated[str | None, typer.Option(help="How people are merged, in place of the study file's rule.")] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Besides, compare all rules: comparison.json, comparison.csv, figures.")
+    ] = False,
+    devices: Annotated[int | None, typer.Option(min=1, help="Deal people to so many cores of the CPU.")] = None,
+    distributed: Annotated[
+        bool, typer.Option("--distributed", help="One of several processes: under srun, mpirun, or as the next three.")
+    ] = False,
+    coordinator: Annotated[
+        str | None, typer.Option(envvar="JAX_COORDINATOR_ADDRESS", help="HOST:PORT of process 0.")
+    ] = None,
+    processes: Annotated[
+        int | None, typer.Option(min=1, envvar="JAX_NUM_PROCESSES", help="How many processes there are.")
+    ] = None,
+    process_id: Annotated[
+        int | None, typer.Option(min=0, envvar="JAX_PROCESS_ID", help="Which one this is, from 0.")
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Merge people's answers into one population map and find its optimum."""
+    start(devices)
+    from hilbo.study.distributed import crew, digest
+
+    with crew(distributed, coordinator, processes, process_id) as team, contextlib.ExitStack() as held:
+        say = held.enter_context(progress(quiet=not team.writes))
+        with team.agreement() as agree:
+            folder = held.enter_context(results(out, force)) if team.writes else None
+            chosen, cohort = _read(trials, study, material, say)
+            chosen = chosen if rule is None else _by_rule(chosen, rule)
+            cohort = cohort.of(participants.split(",")) if participants else cohort
+            cohort = cohort.first(first) if first else cohort
+            agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
+        if team.devices == 1 and len(cohort.names) <= _LARGE and individuals:
+            content = _aggregate(chosen, cohort, folder, seed, say)
+            if compare:
+                _compare(chosen, cohort, folder, seed, say)
+        elif compare:
+            raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
+        else:
+            content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say)
+    if team.writes:
+        finish(content, out, as_json)
+
+
+@app.command()
+def simulate(
+    out: Out,
+    preset: Annotated[str, typer.Option(help="Population that the people are drawn from.")] = "paper",
+    study: Annotated[Path | None, typer.Option("--study", help="Study file; by default the preset's own.")] = None,
+    participants: Annotated[int, typer.Option(min=1, help="How many people.")] = 24,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="One person's session instead: real server, pages and simulated device.")
+    ] = False,
+    kind: Annotated[str, typer.Option(help="With --live: optimisation, validation or aggregate-best.")] = (
+        "optimisation"
+    ),
+    seconds: Annotated[float | None, typer.Option(min=0.05, help="With --live: duration of every step.")] = None,
+) -> None:
+    """Simulate a study whose truth is known, and aggregate it; or hold one session without people."""
+    if live:
+        _simulate_live(preset, study, out, kind, seconds, seed, as_json)
+        return
+    with results(out, force) as folder, progress() as say:
+        content = _simulate(preset, study, participants, seed, folder, say)
+    finish(content, out, as_json)
+
+
+@app.command()
+def robustness(
+    trials: Table,
+    study: StudyOption,
+    out: Out,
+    seed: Seed = 0,
+    own: Annotated[
+        bool, typer.Option("--own", help="Each person's own hyperparameters instead of shared ones.")
+    ] = False,
+    learn: Annotated[
+        str, typer.Option(help="What the evidence chooses, separated by commas.")
+    ] = "theta,noise,thresholds",
+    material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
+    with results(out, force) as folder, progress() as say:
+        chosen, cohort = _read(trials, study, material, say)
+        from hilbo.report.robustness import write_robustness
+        from hilbo.study.robustness import robustness as check
+
+        say("hyperparameters by maximum evidence")
+        found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
+        say("maps, figures and report")
+        content = write_robustness(chosen, cohort, found, folder, seed)
+    finish(content, out, as_json)
+
+
+app.command()(cli_material.identify)
+app.command()(cli_material.passivity)
+app.command()(cli_study.validate)
+app.command()(cli_study.power)
+app.command()(cli_study.report)
+app.add_typer(device.app, name="device")
+app.command()(cli_live.session)
+app.command()(cli_live.doctor)
+app.command()(session.plan)
+app.command()(session.export)
+app.add_typer(session.app_participants, name="participants")
+
+
+@app.command()
+def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) -> None:
+    """Real people's answers, then a whole simulated haptic study of known truth and its report."""
+    from importlib.resources import files
+
+    data = files("hilbo") / "data"
+    with results(out, force) as folder, progress() as say:
+        for part in PARTS:
+            (folder / part).mkdir()
+        chosen, cohort = _read(Path(str(data / "video_quality.csv")), Path(str(data / "video_quality.toml")), None, say)
+        real = _aggregate(chosen, cohort, folder / PARTS[0], seed, say)
+        simulated = cli_study.simulated_report(folder / PARTS[1], seed, say)["materials"][""]
+    _print_demo(real, simulated, out)
+
+
+def _read(trials, study, material, say):
+    say("reading")
+    start()
+    from hilbo.study.cohort import cohort_of
+    from hilbo.study.config import Study
+    from hilbo.study.trial_table import read_trials
+
+    whole = Study.load(study)
+    chosen = whole.material(material) if material and whole.materials else whole
+    if trials.is_dir():
+        from hilbo.session.export import read_log_trials
+
+        table = read_log_trials(trials, whole, material, others=False, note=remark)
+    else:
+        table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
+    return chosen, cohort_of(table, chosen)
+
+
+def _by_rule(study, rule):
+    import dataclasses
+
+    from hilbo.population.maps import ALL_RULES
+
+    if rule not in ALL_RULES:
+        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
+    return dataclasses.replace(study, rule=rule)
+
+
+def _compare(study, cohort, folder, seed, say) -> None:
+    from hilbo.report.comparison import write_comparison
+
+    say("every rule, with each person left out")
+    write_comparison(study, cohort, folder, seed)
+
+
+def _aggregate(study, cohort, folder, seed, say, truth=None) -> dict[str, Any]:
+    from hilbo.report import results as report
+    from hilbo.study.aggregate import aggregate_cohort
+
+    say(f"fitting {len(cohort.names)} participants ({study.name})")
+    found = aggregate_cohort(study, cohort, seed)
+    return report.write_results(study, found, folder, seed, truth, say)
+
+
+def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -> dict[str, Any]:
+    """As `_aggregate` for a large cohort or several devices: by the whole crew, of which one process writes."""
+    from hilbo.report.large_population import population_map, write_population
+    from hilbo.study.batch_optimum import aggregate_population
+
+    merged = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
+    grid = population_map(study, merged)
+    return {} if folder is None else write_population(study, merged, grid, folder, seed, say)
+
+
+def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
+    say("simulating")
+    start()
+    from importlib.resources import files
+
+    import numpy as np
+
+    from hilbo.simulation import simulate as simulation
+    from hilbo.study.cohort import cohort_of
+    from hilbo.study.config import Study
+    from hilbo.study.trial_table import write_trials
+
+    if preset not in simulation.PRESETS:
+        raise InputError(f'--preset is "{preset}"; there are {", ".join(simulation.PRESETS)}.')
+    population = simulation.PRESETS[preset]
+    source = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if study is None else study
+    chosen = Study.load(source)
+    people = simulation.people(chosen, population, count, seed)
+    trials = simulation.simulate_study(chosen, people, seed)
+    table = simulation.to_table(chosen, trials)
+    write_trials(table, folder / "trials.csv")
+    write_trials(simulation.truth_table(chosen, population, people), folder / "truth.csv")
+    shutil.copyfile(source, folder / "study.toml")
+    truth = np.asarray(chosen.space.to_unit(np.array([population.truth[name] for name in chosen.space.names])))
+    table["category"] = table["response"].map({label: i for i, label in enumerate(chosen.responses)})
+    return _aggregate(chosen, cohort_of(table, chosen), folder, seed, say, truth)
+
+
+def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
+    import json
+    from importlib.resources import files
+
+    source = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if study is None else study
+    with progress() as say:
+        found = cli_live.live(source, out, phase, seconds, seed, say)
+    print(json.dumps(found, indent=2) if as_json else f"{found['answers']} answers in {found['seconds']} s: {out}")
+
+
+def _print_demo(real, simulated, out) -> None:
+    """The demo's last words: the real optimum in a line, the simulated misses beside the paper's."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
+    console = Console(highlight=False, soft_wrap=True)
+    best = real["optimum"]["parameters"]
+    console.print(f"\nVideo quality, {len(real['participants'])} people: the map is highest at", end=" ")
+    console.print(", ".join(f"{name} = {value:.0f}" for name, value in best.items()) + ".\n")
+    truth = simulated["truth"]
+    table = RichTable(
+        title="Simulated memory foam, 24 people x 25 trials: NRMSE to the truth, of the search ranges",
+        box=box.SIMPLE_HEAD,
+        title_justify="left",
+        pad_edge=False,
+    )
+    for head in ("", "K1, B1, alpha", "with K0", "passive by", "the paper"):
+        table.add_column(head, justify="right" if head else "left", no_wrap=True)
+
+    def row(name, key, found, paper):
+        miss, margin = truth["nrmse"][key], found["passivity_margin"]
+        passive = f"{'yes' if margin >= 0 else 'no'}, {margin:+.3f}"
+        table.add_row(name, f"{100 * miss['nrmse']:.1f} %", f"{100 * miss['nrmse_with_K0']:.1f} %", passive, paper)
+
+    row("population (BCM)", "aggregate", simulated["optimum"], "4 %, yes")
+    q, qk = truth["individuals"]["quartiles"], truth["individuals"]["with_K0"]
+    spread = [f"{100 * v[1]:.0f} % ({100 * v[0]:.0f}–{100 * v[2]:.0f})" for v in (q, qk)]
+    margins = [person["optimum"]["passivity_margin"] for person in simulated["participants"]]
+    passive = f"{sum(margin >= 0 for margin in margins)} of {len(margins)}"
+    table.add_row("individuals", *spread, passive, "24 % (13–41)")
+    row("mean of optima", "mean_of_optima", simulated["mean_of_optima"], "10.5 %, no")
+    row("mean of maps", "average", simulated["alternatives"]["average"], "")
+    console.print(table)
+    console.print("Individuals: median and quartiles. Passive by so many N.s/m of damping more than the least.")
+    top = truth["top_answers"]
+    console.print(f'"close" answers of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)\n')
+    for part in PARTS:
+        console.print(str(out / part / "report.html"))

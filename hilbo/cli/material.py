@@ -1,0 +1,150 @@
+"""The commands about materials: `hilbo identify` and `hilbo passivity`; `cli` adds them to its own."""
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilbo.cli.console import Force, Json, Out, Seed, finish, progress, results, start
+from hilbo.errors import InputError
+
+__all__ = ["identify", "passivity"]
+
+Taps = Annotated[int, typer.Option("--N", min=1, help="Past samples of the rendering.")]
+Period = Annotated[float, typer.Option("--T", help="Sampling time of the rendering, s.")]
+Memory = Annotated[str, typer.Option(help='"short" (N samples) or "full".')]
+
+
+def identify(
+    table: Annotated[Path, typer.Argument(help="Creep and relaxation tests (CSV or Parquet).", show_default=False)],
+    out: Out,
+    material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
+    taps: Taps = 101,
+    period: Period = 1e-3,
+    memory: Memory = "short",
+    damping: Annotated[float | None, typer.Option(help="Damping of your device, N.s/m.")] = None,
+    only: Annotated[str | None, typer.Option(help="Fit one kind of test alone: relaxation or creep.")] = None,
+    begin: Annotated[str, typer.Option(help='Tests begin at "rest" or in "equilibrium" with the first row.')] = "rest",
+    compare: Annotated[bool, typer.Option(help="Refit with other numbers of past samples.")] = True,
+    model: Annotated[str, typer.Option(help='For moduli: "fosls" or "fractional-maxwell".')] = "fosls",
+    weights: Annotated[str | None, typer.Option(help='For moduli: residuals over the "range", or "relative".')] = None,
+    longest: Annotated[float | None, typer.Option(help="Use only the first so many seconds.")] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Find the parameters of a material from creep and relaxation tests."""
+    _one_of("memory", memory, ("short", "full"))
+    _one_of("begin", begin, ("rest", "equilibrium"))
+    _one_of("model", model, ("fosls", "fractional-maxwell"))
+    _one_of("weights", weights, (None, "range", "relative"))
+    _positive("T", period)
+    _positive("damping", damping)
+    with results(out, force) as folder, progress() as say:
+        say("reading")
+        start()
+        from hilbo.identification import characterise, memory_selection
+        from hilbo.identification.fitting import MEASURED
+        from hilbo.identification.material_tables import read_material
+        from hilbo.report import material as report_material
+
+        found = read_material(table, material, begin=begin, only=only, longest=longest)
+        measured = found.tests[0].kind in MEASURED
+        chosen = _model(measured, model, weights, taps, period, memory)
+        choices = memory_selection.CHOICES if measured and compare else ()
+        result = characterise.characterise(found.tests, chosen, seed, choices, say)
+        say("figures and report")
+        content = report_material.identification_result(
+            table.name, found.tests, result, found.stiffness_unit, found.notes, damping
+        )
+        report_material.write_identification(found.tests, result, content, folder, damping)
+    finish(content, out, as_json)
+
+
+def _model(measured, model, weights, taps, period, memory) -> Any:
+    from hilbo.identification.moduli import Continuous, FractionalMaxwell
+    from hilbo.identification.sampled import Sampled
+
+    if measured:
+        if model != "fosls" or weights:
+            raise InputError("--model and --weights are for tables of moduli; tests with a force have the FO-SLS only.")
+        return Sampled(taps, period, memory)
+    if model == "fractional-maxwell":
+        return FractionalMaxwell(weights or "relative")
+    return Continuous(weights or "range")
+
+
+def passivity(
+    K1: Annotated[float | None, typer.Option("--K1", help="N/mm.", show_default=False)] = None,
+    B1: Annotated[float | None, typer.Option("--B1", help="N.s^alpha/mm.", show_default=False)] = None,
+    alpha: Annotated[float | None, typer.Option("--alpha", help="Order.", show_default=False)] = None,
+    K0: Annotated[float | None, typer.Option("--K0", help="N/mm; else from --K-eff.")] = None,
+    K_eff: Annotated[float | None, typer.Option("--K-eff", help="Effective stiffness H(1), N/mm.")] = None,
+    damping: Annotated[float | None, typer.Option(help="Damping b of the device, N.s/m.")] = None,
+    taps: Annotated[int | None, typer.Option("--N", min=1, help="Past samples of the rendering.")] = None,
+    period: Annotated[float | None, typer.Option("--T", help="Sampling time, s.")] = None,
+    memory: Annotated[str | None, typer.Option(help='"short" (N samples) or "full".')] = None,
+    study: Annotated[Path | None, typer.Option("--study", help="Take what is not given from its [renderer].")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for figures and a page.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Is a parameter set passive on a device, by how much, and what is the largest K1?"""
+    if K1 is None or B1 is None or alpha is None:
+        name = "K1" if K1 is None else "B1" if B1 is None else "alpha"
+        raise InputError(f"--{name} is missing; a set has --K1, --B1 and --alpha.")
+    _one_of("memory", memory, (None, "short", "full"))
+    _positive("T", period)
+    _positive("damping", damping)
+    start()
+    from hilbo.report import material as report_material
+    from hilbo.report.results import as_json as text
+    from hilbo.viscoelastic import FOSLS, K0_from_effective_stiffness
+
+    given = {"N": taps, "T": period, "memory": memory, "K_eff": K_eff, "damping": damping}
+    known = _renderer(study) | {name: value for name, value in given.items() if value is not None}
+    place = known["N"], known["T"]
+    if K0 is None:
+        _order(alpha)
+        K0 = float(K0_from_effective_stiffness(K1, B1, alpha, known["K_eff"], *place, memory=known["memory"]))
+    elif K_eff is not None:
+        raise InputError("--K0 and --K-eff are both given; one follows from the other, leave one out.")
+    model = FOSLS(K0, K1, B1, alpha, *place, memory=known["memory"])
+    content = report_material.passivity_result(model, known["damping"])
+    if out is not None:
+        with results(out, force) as folder:
+            report_material.write_passivity(model, content, folder)
+    if as_json:
+        print(text(content), end="")
+    else:
+        print(report_material.passivity_words(content))
+        if out is not None:
+            print(f"{out / 'report.html'}", file=sys.stderr)
+
+
+def _renderer(study):
+    """[renderer] of a study, or the paper's."""
+    if study is None:
+        return {"N": 101, "T": 1e-3, "memory": "short", "K_eff": 0.44, "damping": 0.95}
+    from hilbo.study.config import Study
+
+    mechanics = Study.load(study).space.mechanics
+    if mechanics is None:
+        raise InputError(f"{study}: has no [renderer], so that there is nothing to be passive.")
+    return {name: getattr(mechanics, name) for name in ("N", "T", "memory", "K_eff", "damping")}
+
+
+def _order(alpha):
+    if not 0 < alpha <= 1:
+        raise InputError(f"alpha is {alpha}, it must be above 0 and at most 1: the order of the fractional element.")
+
+
+def _one_of(name, value, known):
+    if value not in known:
+        raise InputError(f'--{name} is "{value}"; it must be {" or ".join(str(k) for k in known if k)}.')
+
+
+def _positive(name, value):
+    if value is not None and not 0 < value < float("inf"):
+        raise InputError(f"--{name} is {value}; it must be a number above 0.")

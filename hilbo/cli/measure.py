@@ -1,0 +1,95 @@
+"""What `hilbo device` measures by itself: the line, the free device's damping, a material.
+
+Results on stdout, progress on stderr, exit codes as in `device`, which gives these commands their place.
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilbo.cli.console import Force, Json, Seed, fail, progress
+from hilbo.cli.device_options import Line, opened, takes
+from hilbo.cli.device_results import check_free, finish, write_table
+
+__all__ = ["COMMANDS"]
+
+_FOAM = (-2.89, 5.70, 5.89, 0.203, 101)  # what lies under a simulated device that characterises
+
+
+@takes(line=Line)
+def selftest(
+    line: Line,
+    echoes: Annotated[int, typer.Option(min=1, help="Round trips.")] = 300,
+    as_json: Json = False,
+) -> None:
+    """Loopback, latency, and whether the device lets go when the host falls silent."""
+    from hilbo.identification import device_tests
+
+    with progress() as say, opened(line, finger="none") as device:
+        found = device_tests.selftest(device, say, echoes)
+        hold = device.device.hold_ticks
+    good = found.echoes == found.asked and found.watchdog_ticks <= found.watchdog_limit and found.force_after_N == 0
+    words = (
+        f"loopback   {found.echoes} of {found.asked} came back whole\n"
+        f"latency    median {found.median_ms:.2f} ms, 99 % below {found.p99_ms:.2f} ms, {found.retries} retries\n"
+        f"watchdog   HOLD {found.watchdog_ticks} ticks after the last heartbeat (at most {found.watchdog_limit}),"
+        f" force {abs(found.force_after_N):g} N {hold} ticks later"
+    )
+    finish(found._asdict() | {"passed": good}, words, as_json)
+    if not good:
+        fail("The device has not passed; do not use it with people.", 1)
+
+
+@takes(line=Line)
+def measure_damping(line: Line, seed: Seed = 0, as_json: Json = False) -> None:
+    """Damping b and Coulomb friction of the free device, with 95 % intervals. It moves by itself."""
+    from hilbo.identification import device_tests
+
+    with progress() as say, opened(line, rate="lockstep", finger="none") as device:
+        found = device_tests.measure_damping(device, say, seed)
+        reported = device.device.damping_N_s_per_m
+    rows = (("damping", "N.s/m"), ("coulomb", "N"), ("mass", "kg"), ("constant", "N"))
+    content = {name: getattr(found, name)._asdict() | {"unit": unit} for name, unit in rows}
+    words = [
+        f"{n:9} {getattr(found, n).value:9.5f}  {getattr(found, n).lower:9.5f} to {getattr(found, n).upper:9.5f}  {u}"
+        for n, u in rows
+    ]
+    believed = found.damping.lower
+    words.append(f"The device reports {reported:.4g} N.s/m; plan studies with at most {min(believed, reported):.4g}.")
+    if reported > found.damping.upper:
+        print("hilbo: the device reports more damping than it has; mend its configuration.", file=sys.stderr)
+    rest = {"residual_N": found.residual, "sweeps": found.sweeps, "periods": found.periods, "reported": reported}
+    finish(content | rest, "\n".join(words), as_json)
+
+
+@takes(line=Line)
+def characterise(
+    out: Annotated[Path, typer.Argument(help="CSV file to write, for `hilbo identify`.", show_default=False)],
+    line: Line,
+    repeats: Annotated[int, typer.Option(min=1, help="Repeats of each test.")] = 16,
+    depth: Annotated[float, typer.Option(help="Depth of the relaxation test, mm.")] = 5.0,
+    load: Annotated[float, typer.Option(help="Force of the creep test, N.")] = 3.0,
+    after: Annotated[float, typer.Option(help="Force of the recovery, N.")] = 0.5,
+    hold: Annotated[float, typer.Option(help="How long each is held, s.")] = 3.0,
+    rest: Annotated[float, typer.Option(help="Recovery before each test, s.")] = 2.0,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Relaxation and creep of a material at position 0, pressed by the device itself."""
+    from hilbo.identification import device_tests
+
+    check_free(out, force)
+    with progress() as say, opened(line, rate="lockstep", material=_FOAM, noise=0.02) as device:
+        numbers = {"repeats": repeats, "depth": depth, "force": load, "after": after, "hold": hold, "rest": rest}
+        table = device_tests.characterise(device, say, **numbers, seed=seed)
+        damping = device.device.damping_N_s_per_m
+    write_table(table, out)
+    content = {"file": str(out), "samples": len(table), "repeats": repeats, "damping": damping}
+    finish(content, f"{out}: now  hilbo identify {out} --out results --damping {damping:.6g}", as_json)
+
+
+COMMANDS = {"selftest": selftest, "measure-damping": measure_damping, "characterise": characterise}
+"""The commands by their names."""

@@ -1,0 +1,207 @@
+"""Commands around live sessions: `hilbo plan`, `hilbo export`, `hilbo participants`.
+
+What they write is whole or absent, and nothing is replaced without `--force`.
+"""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilbo.cli.console import Force, Json, Seed, progress, remark, results, start
+from hilbo.errors import InputError
+
+__all__ = ["app_participants", "export", "plan"]
+
+StudyFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
+app_participants = typer.Typer(no_args_is_help=True, help="The list of participants, by pseudonymous id.")
+
+
+def plan(
+    study: StudyFile,
+    out: Annotated[Path, typer.Option("--out", help="File for the plan.")] = Path("plan.json"),
+    participants: Annotated[int | None, typer.Option(min=1, help="How many people: P01, P02, ...")] = None,
+    names: Annotated[str | None, typer.Option(help="Their ids instead, separated by commas.")] = None,
+    kind: Annotated[str, typer.Option(help="optimisation, validation or aggregate-best.")] = "optimisation",
+    results_: Annotated[
+        list[str] | None, typer.Option("--from", help="result.json of the optimisation; MATERIAL=PATH for several.")
+    ] = None,
+    trials: Annotated[Path | None, typer.Option(help="For a validation: the table or logs it was made from.")] = None,
+    material: Annotated[list[str] | None, typer.Option(help="Only this material; may be repeated.")] = None,
+    source: Annotated[str, typer.Option(help="For a validation: aggregate or individual.")] = "aggregate",
+    session: Annotated[str, typer.Option(help="Label of the session in tables and names of logs.")] = "",
+    reissue: Annotated[str | None, typer.Option(help="OLD=NEW: give NEW the row of OLD in the plan --out.")] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Plan a whole study in advance: orders, seeds and validation sets, with a hash that every log will hold."""
+    start()
+    from hilbo.session.plan import make_plan
+    from hilbo.study.config import Study
+    from hilbo.study.protocols import PHASES
+
+    chosen = Study.load(study)
+    if reissue is not None:
+        _write_plan(_reissued(out, chosen, reissue), out, True, as_json)
+        return
+    if kind not in PHASES[1:]:
+        raise InputError(f'--kind is "{kind}"; it must be one of {", ".join(PHASES[1:])}.')
+    if source not in ("aggregate", "individual"):
+        raise InputError(f'--source is "{source}"; it must be aggregate or individual.')
+    materials = tuple(material or chosen.materials)
+    for name in materials:
+        chosen.material(name)  # refuses what is none
+    people = _people(participants, names, "P" if kind == "optimisation" or source == "individual" else "V")
+    _check_free(out, force)
+    with progress() as say:
+        sets = None
+        if kind != "optimisation":
+            sets = _sets(chosen, kind, _by_material(materials, results_ or []), trials, source, people, say)
+        label = session or {"optimisation": "1", "validation": "2", "aggregate-best": "3"}[kind]
+        made = make_plan(
+            chosen,
+            people,
+            seed,
+            kind,
+            materials=materials,
+            session=label,
+            sets=sets,
+            source=source if kind == "validation" else None,
+        )
+    _write_plan(made, out, force, as_json)
+
+
+def export(
+    logs: Annotated[Path, typer.Argument(help="Folder of session logs.", show_default=False)],
+    study: Annotated[Path, typer.Option("--study", help="Study file (TOML).")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the tables.")],
+    force: Force = False,
+) -> None:
+    """Tables of a folder of session logs: trials, validation and sets (Psych-DS), and netCDF for xarray and ArviZ."""
+    start()
+    from hilbo.session import export as log_tables
+    from hilbo.study.config import Study
+
+    chosen = Study.load(study)
+    with results(out, force) as folder, progress() as say:
+        say("reading logs")
+        sessions = log_tables.read_sessions(logs, chosen, remark)
+        say("writing tables")
+        log_tables.psych_ds(sessions, folder, chosen)
+        singles = log_tables.netcdf(sessions, folder / "trials.nc", chosen)
+        if not singles and log_tables.validation_table(sessions).empty:
+            raise InputError(f"{logs}: its sessions hold no answers that count yet; there is nothing to export.")
+
+
+@app_participants.command("add")
+def add(
+    table: Annotated[Path, typer.Argument(help="The list, participants.csv.")],
+    participant: Annotated[str, typer.Argument(help="Pseudonymous id.")],
+    consent_time: Annotated[str, typer.Option(help="When they agreed, ISO 8601.")],
+    protocol_number: Annotated[str, typer.Option(help="Number of the ethics approval.")],
+    age: Annotated[str, typer.Option(help="Years.")] = "",
+    handedness: Annotated[str, typer.Option(help="right, left or both.")] = "",
+) -> None:
+    """Add somebody to the list of participants."""
+    from hilbo.session.participants import add_person
+
+    row = {"participant": participant, "consent_time": consent_time, "protocol_number": protocol_number}
+    add_person(table, row | {"age": age, "handedness": handedness})
+
+
+@app_participants.command("delete")
+def delete(
+    folder: Annotated[Path, typer.Argument(help="Folder with logs, tables and exports.")],
+    participant: Annotated[str, typer.Argument(help="Pseudonymous id.")],
+    yes: Annotated[bool, typer.Option("--yes", help="Do it; without, nothing is touched.")] = False,
+) -> None:
+    """Remove one participant from the list, the logs and every exported table below a folder."""
+    from hilbo.session.participants import delete_participant
+
+    if not yes:
+        raise InputError(f"this removes everything of participant {participant} below {folder}; add --yes to do it.")
+    for path, count in delete_participant(folder, participant).items():
+        typer.echo(f"{path}: {count} removed", err=True)
+
+
+def _people(count, names, letter) -> list[str]:
+    if (count is None) == (names is None):
+        raise InputError("plan: give either --participants (how many) or --names.")
+    if names is not None:
+        return [name.strip() for name in names.split(",")]
+    width = max(2, len(str(count)))
+    return [f"{letter}{i + 1:0{width}d}" for i in range(count)]
+
+
+def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
+    """Material ("" without) -> the sets to compare."""
+    from hilbo.session import plan_sets
+    from hilbo.session.export import read_log_trials
+    from hilbo.study.cohort import cohort_of
+    from hilbo.study.trial_table import read_trials
+
+    found = {}
+    for material, path in paths.items():
+        here = study.material(material) if material else study
+        result = plan_sets.read_result(path, here)
+        if kind == "aggregate-best":
+            found[material] = plan_sets.aggregate_best_sets(here, result)
+            continue
+        plan_sets.check_participants(result, people, source)
+        if trials is None:
+            raise InputError("plan: a validation reads the map itself; give --trials, the answers it was made from.")
+        say(f"the map of {material or study.name}")
+        if trials.is_dir():
+            table = read_log_trials(trials, study, material or None, note=remark)
+        else:
+            table = read_trials(trials, here, material or None)
+        found[material] = plan_sets.validation_sets(here, result, cohort_of(table, here), source, people)
+    return found
+
+
+def _by_material(materials, given) -> dict[str, Path]:
+    if not given:
+        raise InputError("plan: give --from result.json, of which the sets are made.")
+    if len(given) == 1 and len(materials) <= 1 and "=" not in given[0]:
+        return {"".join(materials): Path(given[0])}
+    pairs = [text.partition("=") for text in given]
+    if sorted(name for name, _, _ in pairs) != sorted(materials) or not materials:
+        names = ", ".join(materials) or "none, so that one --from result.json is all"
+        raise InputError(f"plan: give --from MATERIAL=result.json once for each material ({names}).")
+    return {name: Path(path) for name, _, path in pairs}
+
+
+def _reissued(path, study, text):
+    from hilbo.session.plan import check_plan, reissue
+
+    old, equals, new = text.partition("=")
+    if not equals:
+        raise InputError(f'--reissue is "{text}"; write OLD=NEW.')
+    try:
+        plan = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: is no plan that can be read; give the one to change with --out.") from error
+    check_plan(plan, study)
+    return reissue(plan, old.strip(), new.strip())
+
+
+def _check_free(out, force):
+    if out.exists() and not force:
+        raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
+
+
+def _write_plan(plan, out, force, as_json):
+    _check_free(out, force)
+    text = json.dumps(plan, indent=1, ensure_ascii=False) + "\n"
+    made = out.with_name(f".{out.name}-new")
+    try:
+        made.write_text(text, encoding="utf-8")
+        made.replace(out)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
+    complete = "complete blocks" if plan["complete"] else f"incomplete: balance is exact at {plan['complete_at']}"
+    typer.echo(f"{out}: {len(plan['participants'])} participants, {complete}, hash {plan['hash']}", err=True)
+    if as_json:
+        typer.echo(text, nl=False)

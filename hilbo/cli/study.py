@@ -1,0 +1,140 @@
+"""The commands of a whole study: `hilbo validate`, `hilbo power` and `hilbo report`."""
+
+import shutil
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilbo.cli.console import Force, Json, Out, Seed, finish, progress, results, start
+from hilbo.errors import InputError
+
+__all__ = ["power", "report", "simulated_report", "validate"]
+
+StudyFile = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
+
+
+def validate(
+    responses: Annotated[Path, typer.Argument(help="Validation table (CSV or Parquet).", show_default=False)],
+    study: StudyFile,
+    out: Out,
+    sets: Annotated[Path | None, typer.Option(help="Sets table: what each set is, and where it is from.")] = None,
+    material: Annotated[str | None, typer.Option(help="Only this one of the table's materials.")] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """What the validation sessions say: confusion matrix, preferences, and the paper's tables II to IV."""
+    with results(out, force) as folder, progress() as say:
+        start()
+        from hilbo.report.validation import write_validation
+        from hilbo.study.config import Study
+
+        content = write_validation(Study.load(study), responses, sets, material, folder, seed, say)
+    finish(content, out, as_json)
+
+
+def power(
+    study: Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)],
+    out: Out,
+    preset: Annotated[str, typer.Option(help="Population that the people are drawn from.")] = "paper",
+    participants: Annotated[str, typer.Option(help="How many people, separated by commas.")] = "6,12,24",
+    trials: Annotated[str, typer.Option(help="How many trials each, separated by commas.")] = "10,15,20,25",
+    error: Annotated[
+        float, typer.Option(min=0, max=1, help="Wanted of the optimum: NRMSE of the search ranges.")
+    ] = 0.15,
+    studies: Annotated[int, typer.Option(min=2, help="How many studies to simulate.")] = 40,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """How many participants and trials are enough for a given error of the optimum: from simulated studies."""
+    begun = time.perf_counter()
+    with results(out, force) as folder, progress() as say:
+        start()
+        from hilbo.report.power import write_power
+        from hilbo.simulation.power import Plan, cores, simulate_power
+        from hilbo.simulation.simulate import PRESETS
+        from hilbo.study.config import Study
+
+        chosen = Study.load(study)
+        if preset not in PRESETS:
+            raise InputError(f'--preset is "{preset}"; there are {", ".join(PRESETS)}.')
+        plan = Plan(_numbers(participants, "--participants"), _numbers(trials, "--trials"), studies, seed)
+        jobs = min(jobs or cores(), studies)
+        say(f"simulating {studies} studies in {jobs} processes")
+        errors = simulate_power(
+            chosen, PRESETS[preset], plan, jobs=jobs, begin=start, say=lambda done: say("studies", done, studies)
+        )
+        cost = {"seconds": time.perf_counter() - begun, "jobs": jobs, "cores": cores(), "preset": preset}
+        content = write_power(chosen, errors, plan, error, cost, folder)
+    finish(content, out, as_json)
+
+
+def _numbers(text: str, option: str) -> tuple[int, ...]:
+    try:
+        return tuple(sorted(int(part) for part in text.split(",")))
+    except ValueError:
+        raise InputError(f'{option} is "{text}"; write whole numbers separated by commas, as in 6,12,24.') from None
+
+
+def report(
+    folder: Annotated[Path, typer.Argument(help="Folder with study.toml and trials.csv.", show_default=False)],
+    out: Out,
+    exclude: Annotated[
+        str | None, typer.Option(help='Rule that leaves people out, instead of the study\'s: "trials < 10".')
+    ] = None,
+    compare: Annotated[
+        bool, typer.Option(help="Compare all rules of aggregation, each person left out in turn.")
+    ] = True,
+    seed: Seed = 0,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """The whole results section from a folder of sessions: one page, figures and tables, in the paper's order."""
+    if out.resolve() in (folder.resolve(), *folder.resolve().parents):
+        raise InputError(f"{out}: holds the folder that is read; choose another --out.")
+    with results(out, force) as made, progress() as say:
+        start()
+        say("reading")
+        from hilbo.report.study import write_study
+        from hilbo.study.folder import read_folder
+
+        content = write_study(read_folder(folder, exclude), made, seed, say, comparison=compare)
+    finish(content, out, as_json)
+
+
+def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: int = 24) -> dict[str, Any]:
+    """A simulated study of the paper's kind with its validation sessions, as a folder that `hilbo report` reads, and
+    its report in the same folder; returns the content of result.json."""
+    from importlib.resources import files
+
+    import numpy as np
+
+    from hilbo.report.study import write_study
+    from hilbo.simulation import simulate as simulation
+    from hilbo.simulation.validation_sessions import sets_table, validation_table
+    from hilbo.study.analysis import analyse
+    from hilbo.study.config import Study
+    from hilbo.study.folder import read_folder
+    from hilbo.study.trial_table import write_trials
+
+    say("simulating")
+    source = Path(str(files("hilbo") / "data" / "paper.toml"))
+    study, population = Study.load(source), simulation.PRESETS["paper"]
+    people = simulation.people(study, population, count, seed)
+    write_trials(simulation.to_table(study, simulation.simulate_study(study, people, seed)), folder / "trials.csv")
+    write_trials(simulation.truth_table(study, population, people), folder / "truth.csv")
+    shutil.copyfile(source, folder / "study.toml")
+    (material,) = read_folder(folder).materials
+    found = analyse(material.study, material.cohort, seed, say)
+    if found.sets is not None:
+        say("simulated validation sessions")
+        own = np.asarray(found.aggregate.individuals.x)
+        sets = sets_table(study, found.sets, own, found.cohort.names)
+        sets.to_csv(folder / "sets.csv", index=False)
+        validation_table(study, population, sets, seed=seed).to_csv(folder / "validation.csv", index=False)
+    return write_study(read_folder(folder), folder, seed, say, {material.name: found}, comparison=False)

@@ -1,0 +1,71 @@
+"""The first words with a device: is it one, does it mean the same bytes, is it stopped, has it the damping it needs.
+
+Whoever comes second takes over a device at rest: one that still moves for an earlier host is told to stop first.
+"""
+
+import struct
+import time
+from typing import SupportsFloat
+
+from hilbo.device import protocol
+from hilbo.device.link import DeviceError, Link
+from hilbo.device.messages import HelloReply
+from hilbo.device.reasons import State, held_because, meaning
+from hilbo.errors import InputError
+
+__all__ = ["greet", "take_over"]
+
+_BOOT = 3.0  # s that a board may take to start when its port is opened
+_STOPPING = 2.0  # s
+
+
+def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
+    """HELLO, until a board that starts when its port is opened has started; checks what it says.
+
+    Raises `InputError` for a device with less damping than `damping` (N·s/m), `DeviceError` for one that is not of this
+    protocol.
+    """
+    give_up = time.monotonic() + _BOOT
+    while True:
+        try:
+            device = link.request(protocol.Hello())
+            break
+        except DeviceError as error:
+            if error.nack is not None or link.lost or time.monotonic() > give_up:
+                raise
+    if (device.version, device.schema) != (protocol.VERSION, protocol.SCHEMA):
+        raise DeviceError(
+            f"{link.name}: the device speaks version {device.version} of the protocol, schema {device.schema:08x}, and"
+            f" this hilbo version {protocol.VERSION}, schema {protocol.SCHEMA:08x}; install the one that belongs to it."
+        )
+    if damping is not None and _f32(float(damping)) > device.damping_N_s_per_m:
+        raise InputError(
+            f"{link.name}: the study counts on {float(damping):.6g} N.s/m of damping and the device has"
+            f" {device.damping_N_s_per_m:.6g}; plan the study with the device's damping."
+        )
+    return device
+
+
+def take_over(link: Link, device: HelloReply) -> list[str]:
+    """Make sure that the device rests, and begin the heartbeats; returns what a person should know."""
+    notes = []
+    status = link.request(protocol.GetStatus())
+    if status.state in (State.RUNNING, State.DRIVING, State.STOPPING):
+        notes.append(f"The device was {meaning(State, status.state)} for an earlier host; it has been stopped.")
+        link.request(protocol.Stop())
+        give_up = link.now() + _STOPPING
+        while status.state in (State.RUNNING, State.DRIVING, State.STOPPING):
+            if link.now() > give_up:
+                raise DeviceError(f"{link.name}: the device does not stop; switch off its motor.")
+            link.pause(0.01)
+            status = link.request(protocol.GetStatus())
+    if status.state in (State.HOLD, State.ESTOP):
+        why = held_because(status.hold_reason)
+        notes.append(f"The device is in {meaning(State, status.state)}: {why}; clear it before the next start.")
+    link.restarted = False
+    link.beat(device.boot_id)
+    return notes
+
+
+def _f32(value: float) -> float:
+    return struct.unpack("<f", struct.pack("<f", value))[0]

@@ -1,0 +1,294 @@
+"""One conversation over one line: requests with answers, heartbeats, and what comes unasked.
+
+One request is in flight at a time; without an answer the same bytes are sent again, three times in all. A thread reads
+beside the caller's, and a heart beats (`hilbo.device.heartbeat`): while a request waits, while this process computes,
+and for as long as it lives. When it dies, the device hears nothing any more and lets go. firmware/PROTOCOL.md has the
+rules and the bytes.
+"""
+
+import contextlib
+import random
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+from hilbo.device import protocol
+from hilbo.device.frames import Receiver, WireError
+from hilbo.device.heartbeat import BEAT, GRACE, HelperHeart, ThreadHeart, heart_for
+from hilbo.device.messages import Ack, Message, Nack, Notice, Status, Telemetry, code_of, name_of
+from hilbo.device.reasons import ABOUT_INPUT, NackReason, sentence
+from hilbo.errors import InputError
+
+__all__ = ["DeviceError", "Link", "RefusalError"]
+
+_ANSWER = {
+    protocol.Hello: protocol.HelloReply,
+    protocol.GetStatus: Status,
+    protocol.GetSet: protocol.Set,
+    protocol.GetLimits: protocol.Limits,
+    protocol.Echo: protocol.EchoReply,
+}
+_ALWAYS = (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop)  # are for restarted devices too
+
+
+class DeviceError(RuntimeError):
+    """The device, or the line to it, does not do what was asked; `nack` is its refusal, if that is what it was."""
+
+    def __init__(self, words: str, nack: Nack | None = None):
+        super().__init__(words)
+        self.nack = nack
+
+
+class RefusalError(InputError):
+    """The device refuses numbers that it was sent; `nack` has its reason and the numbers behind it."""
+
+    def __init__(self, words: str, nack: Nack):
+        super().__init__(words)
+        self.nack = nack
+
+
+class Link:
+    """A conversation over a `ports.Port`, from construction to `close`.
+
+    `boot_id` is the device's, once known.
+    `patience` is how long (s) an answer may take. `ticks` runs so many ticks of 1 ms of a device whose time is ours:
+    it passes in `pause` alone then, and nothing beats by a clock. Counted: `retries`, `stray` answers that fit no
+    request, `strange` frames that are no message of a device, `dropped` frames; `round_trips` has the last answers'
+    times (s).
+    """
+
+    def __init__(
+        self,
+        port: Any,
+        *,
+        patience: float = 0.1,
+        tries: int = 3,
+        capture: Callable | None = None,
+        ticks: Callable[[int], Any] | None = None,
+    ):
+        self.name, self.patience, self.tries = port.name, patience, tries
+        self.boot_id: int | None = None
+        self.lost: str | None = None
+        self.restarted = self.faint = False
+        self.retries = self.stray = self.strange = self.received = 0
+        self.round_trips: deque[float] = deque(maxlen=100_000)
+        self.notices: deque[Notice] = deque(maxlen=1000)
+        self.on_telemetry: Callable[[Telemetry], None] | None = None
+        self._port, self._capture, self._receiver = port, capture, Receiver()
+        self._ticks, self._passed = ticks, 0
+        self._seq = random.randrange(256)  # an earlier host's last request must not look like this one's first
+        self._expected: tuple[int, int, type] | None = None
+        self._answer: Message = None
+        self._asking, self._writing, self._news = threading.Lock(), threading.Lock(), threading.Condition()
+        self._closing = threading.Event()
+        self._heart: HelperHeart | ThreadHeart | None = None
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self.write(b"\0")
+        self._reader.start()
+
+    @property
+    def dropped(self) -> int:
+        """Damaged frames that arrived here."""
+        return self._receiver.dropped
+
+    def request(self, message: Message) -> Message:
+        """The answer to a request. Raises `RefusalError` or `DeviceError`, each with one sentence."""
+        with self._asking:
+            if (self.restarted or self.faint) and not self.lost and not isinstance(message, _ALWAYS):
+                raise DeviceError(self._restart_words() if self.restarted else self._faint_words())
+            self._seq = (self._seq + 1) % 256
+            try:
+                frame = protocol.encode(message, self._seq)
+            except WireError as error:
+                raise InputError(f"{error}; send numbers that fit.") from error
+            kind = type(message)
+            answer = self._ask(frame, (self._seq, code_of(kind), _ANSWER.get(kind, Ack)))
+        if answer is None:
+            raise DeviceError(self._silence_words(name_of(kind)))
+        if isinstance(answer, Nack):
+            raise self._refusal(answer, name_of(kind))
+        return answer
+
+    def _ask(self, frame, expected) -> Message:
+        with self._news:
+            self._expected, self._answer = expected, None
+        for attempt in range(self.tries):
+            begun = time.perf_counter()
+            self.retries += attempt > 0
+            self.write(frame)
+            with self._news:
+                self._news.wait_for(lambda: self._answer is not None or self.lost, self.patience)
+                if self.lost:
+                    raise DeviceError(self.lost)
+                if self._answer is not None:
+                    self.round_trips.append(time.perf_counter() - begun)
+                    self._expected = None
+                    return self._answer
+        with self._news:
+            self._expected = None
+        return None
+
+    def write(self, data: bytes) -> None:
+        """Bytes onto the line, whole frames only. Raises `DeviceError` when the line is gone."""
+        try:
+            with self._writing:  # which `close` takes too, so that no port is closed under a writer's hands
+                if self.lost:
+                    raise DeviceError(self.lost)
+                self._port.write(data)
+        except OSError as error:
+            raise DeviceError(self._lose(error)) from error
+
+    def beat(self, boot_id: int | None) -> None:
+        """From now on heartbeats for this start of the device, or with None no heartbeats."""
+        self.boot_id = boot_id
+        if self._heart is not None:
+            self._heart.close()
+            self._heart = None
+        if boot_id is not None:
+            self.heartbeat()
+            if not self.ours:
+                frame = protocol.encode(protocol.Heartbeat(boot_id=boot_id), 0)
+                try:
+                    self._heart = heart_for(self._port, frame, self._beat_here, self._fainted)
+                except OSError as error:
+                    raise DeviceError(f"The process that sends heartbeats cannot be started: {error}.") from error
+
+    @contextlib.contextmanager
+    def silence(self) -> Iterator[None]:
+        """No heartbeats within this block, to test the watchdog."""
+        boot_id = self.boot_id
+        self.beat(None)
+        try:
+            yield
+        finally:
+            self.beat(boot_id)
+
+    def heartbeat(self) -> None:
+        """One heartbeat, now, if the device is known."""
+        if self.boot_id is not None:
+            self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id), 0))
+
+    @property
+    def ours(self) -> bool:
+        """Whether the device's time is ours, and passes in `pause` alone."""
+        return self._ticks is not None
+
+    def now(self) -> float:
+        """Seconds, from anywhere on, of the clock that `pause` goes by."""
+        return self._passed / 1000 if self.ours else time.monotonic()
+
+    def pause(self, seconds: float) -> None:
+        """Let so much time pass; where it is ours, with heartbeats, until everything the device sent has been read."""
+        if self._ticks is None:
+            time.sleep(seconds)
+            return
+        until = self._passed + max(1, round(1000 * seconds))
+        while self._passed < until:
+            count = min(until - self._passed, round(1000 * BEAT))
+            self.heartbeat()
+            self._ticks(count)
+            self._passed += count
+            self.request(protocol.GetStatus())
+
+    def close(self) -> None:
+        """Ends the heartbeats and the reading, and closes the port."""
+        self._closing.set()
+        with self._news:
+            self.lost = self.lost or f"{self.name}: the connection has been closed; open it again."
+            self._news.notify_all()
+        self.beat(None)
+        if self._reader is not threading.current_thread():
+            self._reader.join()  # a port neither reads nor writes for long
+        with self._writing:
+            self._port.close()
+
+    def _beat_here(self) -> None:
+        try:
+            self.heartbeat()
+        except DeviceError as error:
+            raise OSError(str(error)) from error
+
+    def _fainted(self) -> None:
+        self.faint = True
+
+    def _read(self) -> None:
+        while not self._closing.is_set():
+            try:
+                data = self._port.read()
+            except OSError as error:
+                self._lose(error)
+                return
+            self.received += len(data)
+            if self._capture is not None and data:
+                self._capture(data)
+            for frame in self._receiver.feed(data):
+                self._take(frame)
+
+    def _take(self, frame) -> None:
+        try:
+            message = protocol.decode(frame)
+        except WireError:
+            self.strange += 1
+            return
+        if isinstance(message, Notice | Status) and self.boot_id not in (None, message.boot_id):
+            self.restarted = True
+        if isinstance(message, Telemetry):
+            if self.on_telemetry is not None:
+                self.on_telemetry(message)
+        elif isinstance(message, Notice):
+            self.notices.append(message)
+        else:
+            self._give(frame.seq, message)
+
+    def _give(self, seq, message) -> None:
+        """Hands an answer to the request that waits for it; others are counted and dropped."""
+        with self._news:
+            if self._expected is None or self._answer is not None:
+                self.stray += 1
+                return
+            wanted, request, kind = self._expected
+            acknowledges = isinstance(message, Ack | Nack) and message.request == request
+            if seq != wanted or not (acknowledges or (type(message) is kind and kind is not Ack)):
+                self.stray += 1
+                return
+            self._answer = message
+            self._news.notify_all()
+
+    def _lose(self, error) -> str:
+        with self._news:
+            if self.lost is None:
+                self.lost = (
+                    f"{self.name}: the line to the device is gone ({error}); it stops by itself, check power and cable,"
+                    " then connect again."
+                )
+            self._news.notify_all()
+            return self.lost
+
+    def _refusal(self, nack, request) -> Exception:
+        if nack.reason in (NackReason.BOOT_ID, NackReason.NO_HELLO) and request != "HELLO":
+            self.restarted = True
+            return DeviceError(self._restart_words(), nack)
+        words = sentence(nack.reason, request, nack.ticks, nack.value, nack.limit)
+        return (RefusalError if nack.reason in ABOUT_INPUT else DeviceError)(words, nack)
+
+    def _restart_words(self) -> str:
+        return (
+            f"{self.name}: the device has restarted; it is stopped and knows no set: connect again, then send the set."
+        )
+
+    def _faint_words(self) -> str:
+        return (
+            f"{self.name}: heartbeats have ended, because this program hung for {GRACE:g} s or their process was ended;"
+            " the device lets go: connect again."
+        )
+
+    def _silence_words(self, request) -> str:
+        if self.received == 0:
+            why = "nothing at all comes back; check power, cable and port"
+        elif self._receiver.dropped and self.boot_id is None:
+            why = "what comes back is not of this protocol; check the port and its baud rate"
+        else:
+            why = "check the line"
+        return f"{self.name}: {request} has had no answer in {self.tries} tries; {why}."

@@ -1,0 +1,221 @@
+"""The wire protocol: bytes in, messages out. firmware/PROTOCOL.md is the contract, this the host's half of it.
+
+Nothing here reads, writes or waits. `encode` makes a message into a frame's bytes, `Receiver` finds frames in bytes
+and counts what it drops, `decode` makes a frame into a message. Messages are in `messages`, the frame codec is in
+`frames`, the numbers with names and their sentences in `reasons`; all of them are names of this module too.
+Numbers are rounded to binary32 where they are packed.
+"""
+
+import re
+import struct
+from collections.abc import Iterator
+from dataclasses import fields
+from typing import NamedTuple, get_args, get_type_hints
+
+from hilbo.device.frames import PAYLOAD, Frame, Receiver, WireError, closed, opened
+from hilbo.device.messages import (
+    MESSAGES,
+    SCHEMA,
+    VERSION,
+    Abort,
+    Ack,
+    Clear,
+    Commit,
+    Drive,
+    Echo,
+    EchoReply,
+    Estop,
+    Exponential,
+    GetLimits,
+    GetSet,
+    GetStatus,
+    Heartbeat,
+    Hello,
+    HelloReply,
+    Limits,
+    Message,
+    Nack,
+    Notice,
+    Sample,
+    Set,
+    SetParams,
+    SetStates,
+    Start,
+    Status,
+    Stop,
+    Stream,
+    Telemetry,
+    code_of,
+    name_of,
+)
+from hilbo.device.reasons import (
+    Capability,
+    HoldReason,
+    Memory,
+    NackReason,
+    SampleFlag,
+    Staging,
+    State,
+    sentence,
+)
+
+__all__ = [
+    "MESSAGES",
+    "SCHEMA",
+    "VERSION",
+    "Abort",
+    "Ack",
+    "Capability",
+    "Clear",
+    "Commit",
+    "Drive",
+    "Echo",
+    "EchoReply",
+    "Estop",
+    "Exponential",
+    "Frame",
+    "GetLimits",
+    "GetSet",
+    "GetStatus",
+    "Heartbeat",
+    "Hello",
+    "HelloReply",
+    "HoldReason",
+    "Limits",
+    "Memory",
+    "Message",
+    "Nack",
+    "NackReason",
+    "Notice",
+    "Receiver",
+    "Sample",
+    "SampleFlag",
+    "Set",
+    "SetParams",
+    "SetStates",
+    "Staging",
+    "Start",
+    "State",
+    "Status",
+    "Stop",
+    "Stream",
+    "Telemetry",
+    "WireError",
+    "code_of",
+    "decode",
+    "encode",
+    "frames_in",
+    "name_of",
+    "payload_of",
+    "schema_text",
+    "sentence",
+]
+
+_CODES = {"u8": "B", "u16": "H", "u32": "I", "i16": "h", "f32": "f"}
+
+
+class _Layout(NamedTuple):
+    """`head` packs the fields `names`; `tail` is what repeats, `row` packs one of it, `wide` one with its option."""
+
+    head: struct.Struct
+    names: tuple[str, ...]
+    tail: str | None
+    row: struct.Struct
+    wide: struct.Struct
+
+
+def _wire(kind: type) -> dict[str, str]:
+    """What the annotations say: the schema's word for each field."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {field.name: get_args(hints[field.name])[1] for field in fields(kind)}
+
+
+def _layout(kind: type) -> _Layout:
+    wire = _wire(kind)
+    names = tuple(name for name, word in wire.items() if word in _CODES)
+    tail = next((name for name in wire if name not in names), None)
+    parts = re.findall(r"(\[?)\w+:(\w+)", wire[tail]) if tail else []
+    rows = ["".join(_CODES[word] for bracket, word in parts if wide or not bracket) for wide in (False, True)]
+    head = struct.Struct("<" + "".join(_CODES[wire[name]] for name in names))
+    return _Layout(head, names, tail, *(struct.Struct("<" + row) for row in rows))
+
+
+_LAYOUTS = {kind: _layout(kind) for kind in MESSAGES.values()}
+
+
+def schema_text() -> str:
+    """The schema block of PROTOCOL.md as these classes have it."""
+    lines = [f"version {VERSION}"]
+    for code, kind in MESSAGES.items():
+        words = [word if word.startswith("n*") else f"{name}:{word}" for name, word in _wire(kind).items()]
+        lines.append(" ".join([f"{code:02x} {name_of(kind):<12}", *words]).rstrip())
+    return "\n".join(lines) + "\n"
+
+
+def payload_of(message: Message) -> bytes:
+    """The bytes of a message. Raises `WireError` where a number does not fit its field, or the message the payload."""
+    layout = _LAYOUTS[type(message)]
+    try:
+        payload = layout.head.pack(*(getattr(message, name) for name in layout.names))
+        if layout.tail is not None:
+            payload += _rows(layout, getattr(message, layout.tail))
+    except (struct.error, OverflowError) as error:
+        raise WireError(f"{name_of(type(message))} cannot be packed: {error}") from error
+    if len(payload) > PAYLOAD:
+        raise WireError(f"{name_of(type(message))} has {len(payload)} bytes, more than the {PAYLOAD} of a payload")
+    return payload
+
+
+def _rows(layout, rows) -> bytes:
+    if isinstance(rows, bytes):
+        return rows
+    return b"".join(
+        layout.row.pack(*row[: len(row) - 1]) if row[-1] is None else layout.wide.pack(*row) for row in rows
+    )
+
+
+def decode(frame: Frame) -> Message:
+    """The message in a frame. Raises `WireError` for an unknown type, another length, and reserved fields not 0."""
+    if frame.type not in MESSAGES:
+        raise WireError(f"type {frame.type:#04x} is not of this protocol")
+    kind = MESSAGES[frame.type]
+    layout, name = _LAYOUTS[kind], name_of(kind)
+    head, rest = frame.payload[: layout.head.size], frame.payload[layout.head.size :]
+    if len(head) < layout.head.size or (rest and layout.tail is None):
+        raise WireError(f"{name} has {len(frame.payload)} bytes instead of {layout.head.size}")
+    values = dict(zip(layout.names, layout.head.unpack(head), strict=True))
+    if values.get("reserved"):
+        raise WireError(f"{name} has a reserved field that is not 0")
+    if layout.tail is not None:
+        values[layout.tail] = _unpack_rows(kind, layout, values, rest)
+    return kind(**values)
+
+
+def _unpack_rows(kind, layout, values, rest):
+    if kind in (Echo, EchoReply):
+        return rest
+    wide = kind is Telemetry and values["fields"] & 1
+    row = layout.wide if wide or kind is SetStates else layout.row
+    if len(rest) % row.size or (kind is SetStates and len(rest) != values["count"] * row.size):
+        raise WireError(f"{name_of(kind)} ends in the middle of what repeats")
+    make = Exponential if kind is SetStates else Sample
+    return tuple(make(*found) for found in row.iter_unpack(rest))
+
+
+def encode(message: Message, seq: int) -> bytes:
+    """The whole frame of a message, its 0x00 included."""
+    return closed(Frame(code_of(type(message)), seq, payload_of(message)))
+
+
+def frames_in(capture: bytes) -> Iterator[tuple[int, Message | WireError, Frame | None]]:
+    """Everything in captured bytes: where each frame begins, its message or what is wrong, and the frame if whole."""
+    place = 0
+    for raw in capture.split(b"\0"):
+        frame = None
+        if raw:
+            try:
+                frame = opened(raw)
+                yield place, decode(frame), frame
+            except WireError as error:
+                yield place, error, frame
+        place += len(raw) + 1

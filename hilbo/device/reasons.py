@@ -1,0 +1,202 @@
+"""The numbers with names of firmware/PROTOCOL.md, and a sentence for each that a person may have to read.
+
+`sentence` turns a NACK into words with the numbers it carries: what is wrong, and what to do about it.
+"""
+
+from enum import IntEnum, IntFlag
+
+__all__ = [
+    "ABOUT_INPUT",
+    "Capability",
+    "HoldReason",
+    "Memory",
+    "NackReason",
+    "SampleFlag",
+    "Staging",
+    "State",
+    "held_because",
+    "meaning",
+    "sentence",
+]
+
+
+class Memory(IntEnum):
+    """Of a parameter set."""
+
+    SHORT = 0
+    FULL = 1
+
+
+class Staging(IntEnum):
+    """Of the idle bank."""
+
+    EMPTY = 0
+    INCOMPLETE = 1
+    WARMING = 2
+    READY = 3
+
+
+class State(IntEnum):
+    """Of the device."""
+
+    STOPPED = 0
+    RUNNING = 1
+    STOPPING = 2
+    DRIVING = 3
+    HOLD = 4
+    ESTOP = 5
+
+
+class Capability(IntFlag):
+    """What a device can do."""
+
+    DRIVE = 1
+    FORCE_SENSOR = 2
+    PASSIVITY_CONTROLLER = 4
+    SIMULATED = 8
+
+
+class SampleFlag(IntFlag):
+    """What happened in a tick. Saturated and slewed mark a trial, HOLD and ESTOP void it."""
+
+    CONTACT = 1
+    INPUT_HELD = 2
+    SATURATED = 4
+    SLEWED = 8
+    CONTROLLED = 16
+    SWITCHING = 32
+    HOLD = 64
+    ESTOP = 128
+    RUNNING = 256
+    DRIVING = 512
+
+
+class HoldReason(IntEnum):
+    """Why the device is in HOLD, or why its state changed."""
+
+    NONE = 0
+    WATCHDOG = 1
+    INPUT = 2
+    VELOCITY = 3
+    OVERRUN = 4
+    MODEL = 5
+    ENERGY = 6
+    ESTOP = 7
+    BOOT = 8
+
+
+class NackReason(IntEnum):
+    """Why a request is refused."""
+
+    VERSION = 1
+    SCHEMA = 2
+    NO_HELLO = 3
+    UNKNOWN_TYPE = 4
+    LENGTH = 5
+    RESERVED = 6
+    STATE = 7
+    BOOT_ID = 8
+    NOT_FINITE = 9
+    K0_RANGE = 10
+    K1_RANGE = 11
+    B1_RANGE = 12
+    ALPHA_RANGE = 13
+    FORCE_LIMIT = 14
+    TICK_RATE = 15
+    MEMORY_LENGTH = 16
+    EVEN_TAPS = 17
+    STATIC_STIFFNESS = 18
+    NOT_PASSIVE = 19
+    STATES = 20
+    NOTHING_STAGED = 21
+    SET_MISMATCH = 22
+    NOT_READY = 23
+    BUSY = 24
+    NO_SET = 25
+    NO_HEARTBEAT = 26
+    LINE_TOO_SLOW = 27
+    NOT_CAPABLE = 28
+    DRIVE_RANGE = 29
+
+
+ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_TOO_SLOW, NackReason.DRIVE_RANGE}
+"""Refusals that whoever chose the numbers can mend."""
+
+_HOLD = {
+    HoldReason.NONE: "it was asked to",
+    HoldReason.WATCHDOG: "it heard no heartbeat from the host",
+    HoldReason.INPUT: "three positions in a row were bad; check the encoder",
+    HoldReason.VELOCITY: "it moved faster than its velocity limit",
+    HoldReason.OVERRUN: "a tick was missed or took too long",
+    HoldReason.MODEL: "the model's force was not finite",
+    HoldReason.ENERGY: "the passivity observer stopped it",
+    HoldReason.ESTOP: "the emergency stop was asked for",
+    HoldReason.BOOT: "it has just started",
+}
+
+_NACK = {
+    NackReason.VERSION: "The device speaks version {limit:g} of the protocol; install the hilbo that belongs to it.",
+    NackReason.SCHEMA: "The device means other bytes by the same version; install the hilbo that its firmware is from.",
+    NackReason.NO_HELLO: "The device has had no HELLO; connect again.",
+    NackReason.UNKNOWN_TYPE: "The device does not know the request {request}; its firmware and hilbo do not belong"
+    " together.",
+    NackReason.LENGTH: "{request} reached the device with {value:g} bytes instead of {limit:g}; its firmware and hilbo"
+    " do not belong together.",
+    NackReason.RESERVED: "{request} has a field that the device does not know; its firmware and hilbo do not belong"
+    " together.",
+    NackReason.STATE: "{request} is refused while the device is {state}; {way_out}.",
+    NackReason.BOOT_ID: "The device has restarted: it is stopped and knows no set; connect again, then send the set.",
+    NackReason.NOT_FINITE: "A number of the set is not finite; send finite ones.",
+    NackReason.K0_RANGE: "K0 is {value:.7g} N/mm, beyond the device's limit of {limit:.7g}.",
+    NackReason.K1_RANGE: "K1 is {value:.7g} N/mm, beyond the device's limit of {limit:.7g}.",
+    NackReason.B1_RANGE: "B1 is {value:.7g} N.s^alpha/mm, beyond the device's limit of {limit:.7g}.",
+    NackReason.ALPHA_RANGE: "alpha is {value:.7g}, beyond the device's limit of {limit:.7g}.",
+    NackReason.FORCE_LIMIT: "The force limit is {value:.7g} N; the device allows above 0 and up to {limit:.7g} N.",
+    NackReason.TICK_RATE: "The set is for {value:g} ticks a second, the device has {limit:g}; choose its T.",
+    NackReason.MEMORY_LENGTH: "The set's memory has length {value:g}, the device takes 1 to {limit:g}.",
+    NackReason.EVEN_TAPS: "N is even; the passivity bound needs an odd number of past samples, such as 101.",
+    NackReason.STATIC_STIFFNESS: "The set's static stiffness H(1) is {value:.7g} N/mm; below 0 it is active on any"
+    " device, raise K0.",
+    NackReason.NOT_PASSIVE: "The set needs {value:.7g} N.s/m of damping and the device has {limit:.7g}; lower K1, or"
+    " search with this device's damping.",
+    NackReason.STATES: "The exponentials of full memory are out of range or order; use those of"
+    " hilbo.mechanics.exponentials.",
+    NackReason.NOTHING_STAGED: "The device has no set staged; send one first.",
+    NackReason.SET_MISMATCH: "The device holds another set than the one named; send it again.",
+    NackReason.NOT_READY: "The staged set's history needs {ticks} more ticks, or no contact; wait, or let go.",
+    NackReason.BUSY: "The device still takes back the difference of the last change, {ticks} ticks more; wait.",
+    NackReason.NO_SET: "The device has no set in force; send one first.",
+    NackReason.NO_HEARTBEAT: "The device hears no heartbeat; check the line from host to device.",
+    NackReason.LINE_TOO_SLOW: "The line is too slow for this telemetry; every {limit:g}th tick is the most it carries.",
+    NackReason.NOT_CAPABLE: "The device cannot do {request}.",
+    NackReason.DRIVE_RANGE: "The drive asks for {value:.7g}, beyond the device's limit of {limit:.7g}.",
+}
+
+_WAY_OUT = {
+    State.STOPPED: "start it first",
+    State.RUNNING: "stop it first",
+    State.STOPPING: "wait until it has stopped",
+    State.DRIVING: "stop it, or wait for the end of the drive",
+    State.HOLD: "find out why, then clear it",
+    State.ESTOP: "find out why, then clear it",
+}
+
+
+def meaning(names: type[IntEnum], number: int) -> str:
+    """The name of a number; one that this version does not know stays a number."""
+    return names(number).name if number in names._value2member_map_ else f"{names.__name__.lower()} {number}"
+
+
+def held_because(reason: int) -> str:
+    """Why a device is in HOLD or changed its state, in words."""
+    return _HOLD[HoldReason(reason)] if reason in HoldReason._value2member_map_ else f"of reason {reason}"
+
+
+def sentence(reason: int, request: str, ticks: int, value: float, limit: float) -> str:
+    """A NACK of `request` (its name in PROTOCOL.md) in words."""
+    if reason not in NackReason._value2member_map_:
+        return f"The device refuses {request} for reason {reason}, which this hilbo does not know; install a newer one."
+    state = int(value) if reason == NackReason.STATE and value == value else 0
+    way_out = _WAY_OUT.get(State(state), "") if state in State._value2member_map_ else "stop it first"
+    words = {"request": request, "ticks": ticks, "value": value, "limit": limit}
+    return _NACK[NackReason(reason)].format(**words, state=meaning(State, state), way_out=way_out)

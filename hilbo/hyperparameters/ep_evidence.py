@@ -1,0 +1,152 @@
+"""Expectation propagation's log evidence as a function of a few hyperparameters: value, gradient, Hessian, closed.
+
+The covariance K and the terms L depend on p hyperparameters x. In the notation of `hilbo.inference.ep`, with C = (K +
+1/T)^-1, P = I - K C, S = P K and K_k = dK/dx_k, the evidence is stationary in the cavities (m, v), so that its gradient
+is
+
+    sum_i dL_i/dx_k at fixed cavities, + a'K_k a / 2 - tr(C K_k) / 2.
+
+The Hessian is the gradient's derivative along the fixed point, whose cavities move with x_j by m_j and v_j:
+
+    m_j = W v_j + (1 + v t) [P (K_j a - v a_x) + S a_x],     J v_j = (1 + v t)^2 p_j - Q (dt/dm (1 + v t) [...] + t_x),
+
+a_x and t_x being the changes of slopes and precisions at fixed cavities, p_j = diag(P K_j P'), W, Q and J those of
+Newton's steps. With A_j and T_j the changes of a and t in all,
+
+    sum_i [d2L_i/dx_k dx_j + a_x m_j + (a a_x - t_x / (2 (1 + v t)^2)) v_j]
+    + a'K_k A_j - p_k'T_j / 2 + [a'K_kj a - tr(C K_kj) + tr(C K_k C K_j)] / 2;
+
+the bracket of v_j is d2L/dx dv, by the heat equation dL/dv = (a^2 + da/dm) / 2 with da/dm = -t / (1 + v t). The moved
+cavities are where the fixed point of the next hyperparameters is sought: three steps away instead of ten.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.hyperparameters.laplace_evidence import Conditioned, Evidence, certified, conditioned
+from hilbo.inference.ep_search import Cavities, Joint, Tilted, coupling, find, residual_of, sites_of, solve
+
+__all__ = ["ep_evidence"]
+
+_STEPS = 200
+
+
+def ep_evidence(
+    covariance: Callable[[Float[Array, " k"]], Float[Array, "n n"]],
+    terms: Callable[[Float[Array, " l"]], Tilted],
+    own: Float[Array, " l"],
+    shape: Float[Array, " k"],
+    start: tuple[Float[Array, " n"], Float[Array, " n"]],
+) -> Evidence:
+    """The expansion in x = (own, shape): the terms depend on `own`, the covariance on `shape`.
+
+    `start`: means and log variances of cavities near which the fixed point is sought, as is the result's `place`; where
+    that fails, or where a variance is none, it is sought anew. Logarithms, because moved along their derivatives they
+    save a quarter of the steps that variances take.
+    """
+    matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
+    here = terms(own)
+    (mean, variance), post, met = _settled(here, matrix, Cavities(start[0], jnp.exp(start[1])))
+    values, weights, precision = here(mean, variance)
+    moves = _moves(terms, own, (mean, variance), post, slopes)
+
+    def explicit(own):
+        return jnp.sum(terms(own)(mean, variance)[0])
+
+    def paired(shape):
+        return jnp.sum(covariance(shape) * pairing)
+
+    pairing = 0.5 * (weights[:, None] * weights[None, :] - post.inverse)
+    gradient = jnp.concatenate([jax.jacfwd(explicit)(own), jnp.einsum("ij,ijk->k", pairing, slopes)])
+    hessian = _bilinear(weights, precision, variance, moves)
+    hessian = hessian.at[: own.size, : own.size].add(jax.jacfwd(jax.jacfwd(explicit))(own))
+    hessian = hessian.at[own.size :, own.size :].add(jax.jacfwd(jax.jacfwd(paired))(shape) + _twice(post, slopes))
+
+    joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
+    value = joined - 0.5 * weights @ mean - 0.5 * post.log_determinant
+    gaussian = mean + variance * weights, weights, precision
+    sure = met & certified(value, matrix, gaussian, post, lambda eta: here(eta - variance * weights, variance)[2])
+    place, moved = (mean, jnp.log(variance)), (moves.mean, moves.variance / variance[:, None])
+    return Evidence(value, gradient, hessian, place, moved, sure)
+
+
+class _Attempt(NamedTuple):
+    cavities: Cavities
+    post: Conditioned
+    met: Bool[Array, ""]
+    left: Int[Array, ""]  # attempts
+
+
+def _settled(terms, matrix, start):
+    """The fixed point and its posterior, and whether the residual was met: in haste, or else once more without."""
+
+    def attempt(last):
+        *cavities, found = find(terms, matrix, last.cavities, _STEPS, last.left == 2)
+        _, weights, precision = terms(*cavities)
+        post = conditioned(matrix, precision)
+        posterior = post.variance, lambda y: post.inverse @ y
+        seen = residual_of(matrix, Cavities(*cavities), weights, precision, posterior)
+        unseen = jnp.isinf(found.residual)
+        met = jnp.where(unseen, seen, found.residual) <= found.tolerance
+        return _Attempt(Cavities(*cavities), post, met, jnp.where(met | ~unseen, 0, last.left - 1))
+
+    post = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), jax.eval_shape(conditioned, matrix, start.mean))
+    begin = _Attempt(start, post, jnp.asarray(False), jnp.asarray(2))
+    return jax.lax.while_loop(lambda last: last.left > 0, attempt, begin)[:3]
+
+
+class _Moves(NamedTuple):
+    """How all moves with each hyperparameter, (n, p) each: m, v, A, T; at fixed cavities a_x and t_x; K_k a; p_k."""
+
+    mean: Float[Array, "n p"]
+    variance: Float[Array, "n p"]
+    slope: Float[Array, "n p"]
+    precision: Float[Array, "n p"]
+    slope_x: Float[Array, "n p"]
+    precision_x: Float[Array, "n p"]
+    pulled: Float[Array, "n p"]
+    widened: Float[Array, "n p"]
+
+
+def _moves(terms, own, cavities, post, slopes):
+    mean, variance = cavities
+    sites = sites_of(terms(own), mean, variance)
+    ratio = (1.0 + variance * sites.precision)[:, None]
+    joint = Joint(post.covariance, post.variance, 1.0 / ratio[:, 0])
+    follow, spread, matrix = coupling(sites, joint, variance)
+
+    without = jnp.zeros((mean.size, slopes.shape[2]), mean.dtype)
+    slope_x, precision_x = (
+        jnp.concatenate([part, without], axis=1) for part in jax.jacfwd(lambda own: terms(own)(mean, variance)[1:])(own)
+    )
+    fixed = jnp.zeros((mean.size, own.size), mean.dtype)
+    pulled = jnp.concatenate([fixed, jnp.einsum("ijk,j->ik", slopes, sites.slope)], axis=1)
+    widened = [jnp.sum(post.transfer * (slopes[:, :, k] @ post.transfer), axis=0) for k in range(slopes.shape[2])]
+    widened = jnp.concatenate([fixed, jnp.stack(widened, axis=1)], axis=1) if widened else fixed
+
+    free = ratio * (post.transfer.T @ (pulled - variance[:, None] * slope_x) + post.covariance @ slope_x)
+    wider = widened * ratio**2 - spread @ (sites.precision_m[:, None] * free + precision_x)
+    by_variance = solve(matrix, wider)
+    by_mean = free + follow @ by_variance
+    slope = slope_x - sites.precision[:, None] / ratio * by_mean + sites.slope_v[:, None] * by_variance
+    precision = precision_x + sites.precision_m[:, None] * by_mean + sites.precision_v[:, None] * by_variance
+    return _Moves(by_mean, by_variance, slope, precision, slope_x, precision_x, pulled, widened)
+
+
+def _bilinear(weights, precision, variance, moves):
+    """Products of two first derivatives; symmetric but for rounding, which is shared out."""
+    stretch = (1.0 + variance * precision)[:, None]
+    by_variance = weights[:, None] * moves.slope_x - 0.5 * moves.precision_x / stretch**2
+    own = moves.slope_x.T @ moves.mean + by_variance.T @ moves.variance
+    shape = moves.pulled.T @ moves.slope - 0.5 * moves.widened.T @ moves.precision
+    return 0.5 * (own + shape + (own + shape).T)
+
+
+def _twice(post, slopes):
+    """tr(C K_k C K_j) / 2."""
+    through = jnp.einsum("ij,jlk->kil", post.inverse, slopes)
+    return 0.5 * jnp.einsum("kil,jli->kj", through, through)

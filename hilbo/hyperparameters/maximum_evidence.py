@@ -1,0 +1,229 @@
+"""Hyperparameters by maximum evidence, alone or with weak priors, for one participant or shared by all.
+
+Unconstrained coordinates: log theta, log variance, log noise, the first threshold and the logs of the gaps between
+thresholds, so that learnt thresholds stay ordered. What is not learnt keeps the model's value. Two freedoms of the
+model have to be fixed: its scale (f, thresholds and noise times s, variance times s^2, give the same answers), by not
+learning all of variance, noise and thresholds together; and its shift, which the prior's mean 0 fixes.
+
+Weak priors, centred at the model's own values: log theta sd 1.5, log variance, log noise and log gaps sd 1, first
+threshold sd 1 in units of the prior's standard deviation. Few ordinal answers often leave the evidence without a
+maximum (theta to 0 or infinity); the result then says so instead of printing digits.
+
+The search is Newton's method with a trust radius, which takes 6 to 20 steps, a quasi-Newton one 30 to 100.
+The evidences by Laplace's method and by EP have gradients and Hessians in closed form
+(`hilbo.hyperparameters.laplace_evidence`, `hilbo.hyperparameters.ep_evidence`), and modes and cavities are sought from
+where the last ones point; the evidence by corrected EP is differentiated automatically. Of several starts, those that
+go where an earlier one ended stop there. Reference: Rasmussen & Williams (2006), section 5.5.1; paper, section IV-3
+(robustness check).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from hilbo.errors import InputError
+from hilbo.hyperparameters.coordinates import Coordinates, Learnable, coordinates_of, model_at
+from hilbo.hyperparameters.cost import divisor, evidence_cost
+from hilbo.numerics.linalg import eigh, one_at_a_time
+from hilbo.numerics.newton import TrustRegionNewton, arrives
+from hilbo.ordinal_gp import OrdinalGP, Trials
+
+__all__ = ["Learned", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
+
+_RUNAWAY = 6.9  # a factor of 1000: that far from where the search began there is no maximum to speak of
+_FLAT = 1e-3  # curvature of the log evidence: less leaves a hyperparameter open by a factor exp(30) either way
+
+
+class Learned(eqx.Module):
+    """A model with learnt hyperparameters, and how the search for it ended; leading axes for several people."""
+
+    gp: OrdinalGP
+    log_evidence: Float[Array, "*M"]
+    """Of the answers, without the prior's part."""
+    steps: Int[Array, "*M"]
+    converged: Bool[Array, "*M"]
+    """The gradient vanished, and every fit on the way to it held its certificate at the end."""
+    runaway: Bool[Array, "*M"]
+    """A hyperparameter moved by more than a factor 1000, or may move by more than exp(30) at no cost: the evidence has
+    no maximum in reach."""
+    learn: tuple[str, ...] = eqx.field(static=True)
+
+
+def maximise_evidence(
+    gp: OrdinalGP,
+    trials: Trials,
+    learn: Sequence[str] = ("theta", "noise"),
+    *,
+    weak_priors: bool = False,
+    starts: int = 4,
+    max_steps: int = 100,
+    inference: str = "laplace",
+) -> Learned:
+    """The hyperparameters under which one person's answers are most probable; under `jax.vmap`, each person's own.
+
+    **Arguments:**
+
+    - `gp`: starting values, and the values of what is not learnt.
+    - `learn`: which of "theta", "variance", "noise", "thresholds". A `theta` of shape (d,) is learnt per dimension.
+    - `weak_priors`: add the log prior above.
+    - `inference`: whose evidence, "laplace", "ep" or "ep_corrected"; "exact" has no derivatives.
+    - `starts`: the search begins at the model's values with theta and noise scaled by powers of 2; the best end wins.
+    """
+    return _maximise(
+        gp, jax.tree.map(lambda leaf: leaf[None], trials), learn, weak_priors, starts, max_steps, inference
+    )
+
+
+def maximise_shared_evidence(
+    gp: OrdinalGP,
+    trials: Trials,
+    learn: Sequence[str] = ("theta", "noise", "thresholds"),
+    *,
+    weak_priors: bool = False,
+    starts: int = 4,
+    max_steps: int = 100,
+    inference: str = "laplace",
+) -> Learned:
+    """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences."""
+    return _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference)
+
+
+def _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference):
+    learn = _checked(learn)
+    if inference == "exact":
+        raise InputError(
+            'hyperparameters: inference "exact" has no derivatives to learn by; use "ep", which is near it.'
+        )
+    options = _Search(learn, weak_priors, starts, max_steps, inference)
+    # Person by person on a CPU: each search stops when it is done, where a batch would wait for its slowest.
+    return one_at_a_time(lambda gp, trials: _searched(gp, trials, options))(gp, trials)
+
+
+class _Search(NamedTuple):
+    learn: tuple[str, ...]
+    weak_priors: bool
+    starts: int
+    max_steps: int
+    inference: str
+
+
+def _searched(gp, trials, options):
+    expand, nothing = evidence_cost(gp, trials, options.learn, options.weak_priors, options.inference)
+
+    def cost(coordinates, _):
+        """The search asks this for shapes alone."""
+        there = expand(coordinates, nothing)
+        return there.value, there.aux
+
+    def ended(carry, start):
+        known, last = carry
+        begun = expand(start, last)
+        solution = optx.minimise(
+            cost,
+            TrustRegionNewton(),
+            start,
+            has_aux=True,
+            max_steps=options.max_steps,
+            throw=False,
+            options={"expand": expand, "begun": begun, "known": known},
+        )
+        # An evidence without its certificate is no evidence: such an end never wins. Nor one that is known already.
+        end, joined = solution.state.here, arrives(solution.value, solution.state.move, known)
+        certified = end.aux.certified
+        value = jnp.where(certified & jnp.isfinite(end.value) & ~joined, end.value, jnp.inf)
+        done = (solution.result == optx.RESULTS.successful) & certified
+        found = jnp.where(done & ~joined, end.aux.at, jnp.nan)
+        known = jnp.concatenate([known[1:], found[None, :]])
+        steps = jnp.asarray(solution.stats["num_steps"]) + 1
+        return (known, begun.aux), _End(solution.value, value, end.aux.log_evidence, steps, done, _flat(end, trials))
+
+    begin = coordinates_of(gp, options.learn)
+    # One search after the other: each stops when it is done, or on its way to where an earlier one ended; and its first
+    # evidence is sought from the one before's.
+    unknown = jnp.full((options.starts, nothing.at.size), jnp.nan, nothing.at.dtype)
+    _, ends = jax.lax.scan(ended, (unknown, nothing), _spread(begin, options.starts))
+    # The search from the model itself wins a tie: where there are no answers, and where no search ended well.
+    own_first = (jnp.arange(options.starts) + _own(options.starts)) % options.starts
+    best = own_first[jnp.argmin(ends.value[own_first])]
+    end = jax.tree.map(lambda leaf: leaf[best], ends)
+    moved = [jnp.max(jnp.abs(end.at[k] - begin[k])) for k in begin if k != "first" and begin[k].size]
+    runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | end.flat
+    return Learned(model_at(end.at, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
+
+
+class _End(NamedTuple):
+    at: Coordinates
+    value: Float[Array, ""]
+    log_evidence: Float[Array, ""]
+    steps: Int[Array, ""]
+    done: Bool[Array, ""]
+    flat: Bool[Array, ""]
+
+
+def _flat(end, trials):
+    return eigh(end.hessian)[0][0] * divisor(trials) < _FLAT
+
+
+def _checked(learn):
+    learn = tuple(learn)
+    unknown = [name for name in learn if name not in get_args(Learnable)]
+    if unknown or not learn:
+        found = f'"{unknown[0]}"' if unknown else "nothing"
+        raise InputError(f"hyperparameters: asked to learn {found}; choose from {', '.join(get_args(Learnable))}.")
+    if {"variance", "noise", "thresholds"} <= set(learn):
+        raise InputError(
+            "hyperparameters: variance, noise and thresholds cannot all be learnt, because the scale of the latent"
+            " function would be free; leave one of them fixed."
+        )
+    return learn
+
+
+def _own(starts):
+    """Which of the starting points is the model itself."""
+    return (starts - 1) // 2
+
+
+def _spread(begin: Coordinates, starts: int) -> Coordinates:
+    """Starting points in a row: theta (and noise, the other way) by rising powers of 2, the model itself amid them."""
+    power = (jnp.arange(starts) - _own(starts)).astype(begin[next(iter(begin))].dtype)
+    step = {"theta": 1.4, "noise": -0.7}  # 4 and 1/2, as logarithms
+    return {
+        name: value[None] + (step.get(name, 0.0) * power).reshape(-1, *(1,) * value.ndim)
+        for name, value in begin.items()
+    }
+
+
+def optimum_sensitivity(
+    height: Callable[[Float[Array, " d"], PyTree], Float[Array, ""]],
+    refit: Callable[[OrdinalGP], PyTree],
+    w: Float[Array, " d"],
+    gp: OrdinalGP,
+    from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
+    learn: Sequence[str] = ("theta", "noise", "thresholds"),
+) -> Coordinates:
+    """How an optimum moves with the hyperparameters: d x / d(coordinate), (d, ...) in units of the search ranges.
+
+    At a maximum over the cube the gradient along free coordinates is 0, so that by the implicit function theorem
+    dw = -H^-1 d(gradient); coordinates at a wall stay there. Positive hyperparameters are on a log scale.
+
+    **Arguments:** `height` of the map at box coordinates, given what `refit` makes of a model; its maximum `w`; the
+    model; and `from_box`, to the unit cube.
+    """
+    coordinates = coordinates_of(gp, learn)
+    # Forward over forward: forward over reverse drops custom derivative rules inside a scan (docs/design.md).
+    slope = jax.jacfwd(height)
+    free = (w > 1e-6) & (w < 1.0 - 1e-6)
+    hessian = jax.jacfwd(slope)(w, refit(gp))
+    held = jnp.where(free[:, None] & free[None, :], hessian, -jnp.eye(w.shape[0], dtype=w.dtype))
+    mixed = jax.jacfwd(lambda c: jnp.where(free, slope(w, refit(model_at(c, gp))), 0.0))(coordinates)
+    to_unit = jax.jacfwd(from_box)(w)
+
+    def moved(block):
+        return (-to_unit @ jnp.linalg.solve(held, block.reshape(w.shape[0], -1))).reshape(block.shape)
+
+    return jax.tree.map(moved, mixed)

@@ -1,0 +1,214 @@
+"""From creep and relaxation tests to the parameters of the FO-SLS that make the same curves.
+
+What was measured is fitted: the recorded input (position in relaxation, force in creep) goes through a model
+(`sampled`) and its output is compared, so that no ideal step is assumed. Modulus data G(t), J(t) have no input; they
+are fitted by exact forms (`moduli`). A model has four coordinates, bounds and starts; this module brings models and
+tests together.
+
+Residuals are divided by the range of their curve; the cost is the sum over tests of NRMSE².
+Units: N, mm, s; B1 N·s^α/mm. Moduli keep their own unit.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.errors import InputError
+from hilbo.numerics.least_squares import Solution, least_squares
+
+__all__ = [
+    "Curve",
+    "Fit",
+    "Model",
+    "Test",
+    "curve_residuals",
+    "fit",
+    "nrmse",
+    "polish",
+    "residuals",
+    "search",
+]
+
+Kind = Literal["relaxation", "creep", "modulus", "compliance"]
+MEASURED = ("relaxation", "creep")  # kinds with a recorded input
+FEWEST = 8  # points of a test
+_RACE, _LONGEST = 12, 200  # steps of every start, and of the best one
+
+
+class Test(eqx.Module):
+    """One kind of test and its repeats, which share their times.
+
+    `time` (m,) in s, increasing; `output` (R, m): force (N) of relaxation, position (mm) of creep, modulus or
+    compliance; `input` (R, m): the position (mm) or force (N) that was applied, None for moduli. Before the first row
+    the material is at rest with no input (`start="rest"`), or in equilibrium with the first one.
+    Raises `InputError` for too few points, times that do not increase, numbers that are not finite, and flat curves.
+    """
+
+    __test__ = False  # no test of pytest's
+
+    kind: Kind = eqx.field(static=True)
+    time: Float[np.ndarray, " m"]
+    output: Float[np.ndarray, "R m"]
+    input: Float[np.ndarray, "R m"] | None = None
+    start: Literal["rest", "equilibrium"] = eqx.field(static=True, default="rest")
+
+    def __check_init__(self):
+        m = self.time.size
+        if m < FEWEST:
+            raise InputError(f"The {self.kind} test has {m} points; at least {FEWEST} are needed for four parameters.")
+        if not np.all(np.diff(self.time) > 0):
+            raise InputError(f"The times of the {self.kind} test do not increase from row to row; sort its rows.")
+        if (self.input is None) == (self.kind in MEASURED):
+            needs = "needs the recorded input beside the output" if self.input is None else "has no input"
+            raise InputError(f"A {self.kind} test {needs}.")
+        parts = (self.time, self.output) if self.input is None else (self.time, self.output, self.input)
+        if not all(np.all(np.isfinite(part)) for part in parts):
+            raise InputError(f"The {self.kind} test has numbers that are not finite; leave those rows out.")
+        if not np.ptp(self.output.mean(axis=0)) > 0:
+            raise InputError(f"The output of the {self.kind} test does not change; there is nothing to fit.")
+        if self.input is not None and not np.any(self.input):
+            raise InputError(f"The input of the {self.kind} test is 0 throughout; check the columns.")
+
+    @property
+    def repeats(self) -> int:
+        """How often it was done."""
+        return self.output.shape[0]
+
+
+class Model(Protocol):
+    """What is fitted: a prediction of four coordinates q, with bounds and starts that the data suggest.
+
+    `sampled.Sampled`, `moduli.Continuous` and `moduli.FractionalMaxwell`. `labels` name the coordinates, `kinds` the
+    tests that it can make.
+    """
+
+    labels: tuple[str, ...]
+    kinds: tuple[str, ...]
+
+    def at(self, tests: Sequence[Test]) -> "Model": ...
+    def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]: ...
+    def starts(self, tests: Sequence[Test]) -> np.ndarray: ...
+    def prepare(self, test: Test) -> "Curve": ...
+    def predict(self, q: Array, curve: "Curve", weights: Array) -> Array: ...
+    def natural(self, q: Array) -> Array: ...
+    def parameters(self, q: Array) -> dict[str, Array]: ...
+
+
+class Curve(eqx.Module):
+    """A test made ready for one model: its mean over weighted repeats is what is fitted.
+
+    The model is linear in its input, so the mean of the repeats is the response to the mean of their inputs, exactly.
+    `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: where the
+    measured times lie on it; `scale`: what residuals are divided by.
+    """
+
+    kind: Kind = eqx.field(static=True)
+    time: Float[Array, " m"]
+    output: Float[Array, "R m"]
+    offset: Float[Array, " R"]  # input of the equilibrium before the test
+    scale: Float[Array, " m"]
+    spectra: Array | None = None
+    before: Int[Array, " m"] | None = None
+    share: Float[Array, " m"] | None = None
+    length: int = eqx.field(static=True, default=0)
+
+
+class Fit(eqx.Module):
+    """The best fit of a model to tests.
+
+    `solution` is its minimum (`least_squares.Solution`), `start_costs` those that the starts ended in, `weights` (R,)
+    of the repeats of each curve.
+    """
+
+    model: Any  # a Model
+    curves: tuple[Curve, ...]
+    solution: Solution
+    lower: Float[Array, " p"]
+    upper: Float[Array, " p"]
+    start_costs: Float[Array, " starts"]
+    weights: tuple[Float[Array, " R"], ...]
+
+    @property
+    def q(self) -> Float[Array, " p"]:
+        """The coordinates of the fit."""
+        return self.solution.q
+
+    def parameters(self) -> dict[str, float]:
+        """The parameter set in physical units."""
+        return {name: float(value) for name, value in self.model.parameters(self.q).items()}
+
+    def held(self) -> Bool[Array, " p"]:
+        """Coordinates within a millionth of the box's width of a bound: the data pull them out of it."""
+        reach = 1e-6 * (self.upper - self.lower)
+        return (self.q - self.lower <= reach) | (self.upper - self.q <= reach)
+
+
+def fit(tests: Sequence[Test], model: Any) -> Fit:
+    """Fit one parameter set to all tests; pass one test for a fit of its own.
+
+    Every start of the model takes a few steps in one compiled call, and the best one is followed to the end.
+    Raises `InputError` for tests the model cannot make.
+    """
+    if not tests:
+        raise InputError("There is no test to fit.")
+    for test in tests:
+        if test.kind not in model.kinds:
+            raise InputError(f"A {test.kind} test cannot be fitted by a model that makes {', '.join(model.kinds)}.")
+    model = model.at(tests)
+    curves = tuple(model.prepare(test) for test in tests)
+    weights = tuple(jnp.full(test.repeats, 1 / test.repeats) for test in tests)
+    lower, upper = (jnp.asarray(end) for end in model.box(tests))
+    solution, costs = search(model, curves, weights, jnp.asarray(model.starts(tests)), lower, upper)
+    return Fit(model, curves, solution, lower, upper, costs, weights)
+
+
+def polish(found: Fit, start: Float[Array, " p"]) -> Fit:
+    """The fit found from another start, if that is better."""
+    again = _polished(found, start)
+    better = again.cost < found.solution.cost
+    return eqx.tree_at(lambda f: f.solution, found, again) if better else found
+
+
+@eqx.filter_jit
+def _polished(found, start):
+    return least_squares(
+        lambda q: residuals(found.model, found.curves, found.weights, q),
+        start,
+        found.lower,
+        found.upper,
+        max_steps=_LONGEST,
+    )
+
+
+def residuals(model, curves, weights, q) -> Float[Array, " m"]:
+    """Residuals of all curves; their sum of squares is the sum over curves of NRMSE²."""
+    return jnp.concatenate([curve_residuals(model, c, w, q) for c, w in zip(curves, weights, strict=True)])
+
+
+def curve_residuals(model, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
+    """Mean of the weighted repeats less the model's, over the curve's scale and the root of its length."""
+    misfit = weights @ curve.output - model.predict(q, curve, weights)
+    return misfit / (curve.scale * np.sqrt(curve.time.size).astype(curve.scale.dtype))
+
+
+def nrmse(found: Fit) -> dict[str, float]:
+    """Root mean square of each test's residuals over its range."""
+    parts = [curve_residuals(found.model, c, w, found.q) for c, w in zip(found.curves, found.weights, strict=True)]
+    return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(found.curves, parts, strict=True)}
+
+
+@eqx.filter_jit
+def search(model, curves, weights, starts, lower, upper) -> tuple[Solution, Float[Array, " starts"]]:
+    """All starts for a few steps, the best of them to the end; with the costs that the race ended in."""
+
+    def run(start, steps):
+        return least_squares(lambda q: residuals(model, curves, weights, q), start, lower, upper, max_steps=steps)
+
+    race = jax.vmap(lambda start: run(start, _RACE))(starts)
+    costs = jnp.where(jnp.isfinite(race.cost), race.cost, jnp.inf)
+    return run(race.q[jnp.argmin(costs)], _LONGEST), race.cost

@@ -1,0 +1,189 @@
+"""Material tables: CSV or Parquet, one row per sample of a creep or relaxation test.
+
+Columns carry their unit: `time_s`, `time (ms)` and `time [s]` are the same to the reader. `test` is relaxation
+(position applied, force measured) or creep (force applied, position measured), with `time`, `position` and `force` in
+every row; `repeat` tells repetitions apart and `material` materials. A table of moduli has `time` and `modulus`
+(relaxation) or `compliance` (creep) instead, and needs no `test`. Other columns are ignored.
+Everything is turned into s, mm, N, Pa (or N/mm) and 1/Pa (or mm/N). Whatever is wrong is one sentence with file and
+line.
+"""
+
+import os
+import re
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.identification.fitting import Test
+from hilbo.study.trial_table import numbers, of_material, place, read_cells, refuse
+
+__all__ = ["Material", "read_material"]
+
+_NAMES = {
+    "time": ("time", "t"),
+    "position": ("position", "displacement", "deformation", "indentation", "x"),
+    "force": ("force", "f"),
+    "modulus": ("modulus", "relaxation modulus", "g"),
+    "compliance": ("compliance", "creep compliance", "j"),
+}
+_QUANTITY = {name: quantity for quantity, names in _NAMES.items() for name in names}
+# Factor to the first unit of each line.
+_UNITS = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0, "h": 3600.0},
+    "position": {"mm": 1.0, "um": 1e-3, "cm": 10.0, "m": 1000.0},
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1000.0},
+    "modulus": {"Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "GPa": 1e9, "N/mm": 1.0, "N/m": 1e-3},
+    "compliance": {"1/Pa": 1.0, "1/kPa": 1e-3, "1/MPa": 1e-6, "1/GPa": 1e-9, "mm/N": 1.0, "m/N": 1e3},
+}
+_OF_LENGTH = {"N/mm", "N/m", "mm/N", "m/N"}
+_HEAD = re.compile(r"\s*([A-Za-z][A-Za-z ]*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|[_ ]([^\[\]()_]+))?\s*")
+
+
+class Material(NamedTuple):
+    """What a table says of one material.
+
+    `tests` in the order relaxation, creep, modulus, compliance; `stiffness_unit` of K: N/mm, or Pa for moduli in Pa;
+    `notes`: what was done to the data that a reader should know.
+    """
+
+    tests: tuple[Test, ...]
+    stiffness_unit: str
+    notes: tuple[str, ...]
+
+
+def read_material(
+    path: str | os.PathLike,
+    material: str | None = None,
+    *,
+    begin: str = "rest",
+    only: str | None = None,
+    longest: float | None = None,
+) -> Material:
+    """The tests of one material, or `only` one kind of them, up to `longest` s.
+
+    `begin` says how they start (`fitting.Test`). Raises `InputError`.
+    """
+    source = str(path)
+    text = read_cells(path, "a material table needs a header with units and the samples of a test")
+    columns, units = _columns(text, source)
+    if text.empty:
+        raise InputError(f"{source}: has no rows; a material table needs the samples of at least one test.")
+    text = of_material(text, material, source)
+    values = pd.DataFrame(
+        {
+            q: numbers(text, c, source, "a finite number", lambda v: v == v) * _UNITS[q][units[q]]
+            for q, c in columns.items()
+        }
+    )
+    kinds = _kinds(text, columns, source)
+    if only is not None and only not in set(kinds):
+        raise InputError(f'{source}: holds no test "{only}"; it has {", ".join(kinds.unique())}.')
+    repeats = text["repeat"].str.strip() if "repeat" in text else pd.Series("", text.index)
+    notes: list[str] = []
+    tests = [
+        _test(kind, values[kinds == kind], repeats[kinds == kind], source, begin, longest, notes)
+        for kind in ("relaxation", "creep", "modulus", "compliance")
+        if (kinds == kind).any() and only in (None, kind)
+    ]
+    lengths = {units[q] in _OF_LENGTH for q in columns if q in ("modulus", "compliance")}
+    if len(lengths) > 1:
+        raise InputError(
+            f"{place(source)}has a modulus and a compliance that belong to different units; use one system."
+        )
+    return Material(tuple(tests), "N/mm" if lengths in (set(), {True}) else "Pa", tuple(notes))
+
+
+def _columns(text, source):
+    """Which column holds each quantity, and in which unit."""
+    columns, units = {}, {}
+    for column in text.columns:
+        match = _HEAD.fullmatch(column)
+        quantity = _QUANTITY.get(match[1].lower()) if match else None
+        if match is None or quantity is None:
+            continue
+        unit = next((part.strip() for part in match.groups()[1:] if part is not None), "").replace("µ", "u")
+        unit = unit.replace("μ", "u")
+        if unit not in _UNITS[quantity]:
+            known = ", ".join(_UNITS[quantity])
+            says = f'has the unit "{unit}"' if unit else "has no unit"
+            example = f"{match[1]} ({next(iter(_UNITS[quantity]))})"
+            raise InputError(
+                f'{place(source)}column "{column}" {says}; write it like "{example}", with one of {known}.'
+            )
+        if quantity in columns:
+            raise InputError(
+                f'{place(source)}columns "{columns[quantity]}" and "{column}" both are a {quantity}; keep one.'
+            )
+        columns[quantity], units[quantity] = column, unit
+    measured, derived = {"position", "force"} & set(columns), {"modulus", "compliance"} & set(columns)
+    if "time" not in columns or not (len(measured) == 2 or (derived and not measured)):
+        raise InputError(
+            f"{place(source)}a material table has time, position and force, or time and modulus or compliance, each"
+            f" with its unit as in time_s; found {', '.join(columns) or 'none of them'}."
+        )
+    return columns, units
+
+
+def _kinds(text, columns, source):
+    """The kind of test of each row."""
+    if "position" not in columns:
+        both = {"modulus", "compliance"} <= set(columns)
+        if both:
+            raise InputError(f"{place(source)}has a modulus and a compliance in one row; put them into two tables.")
+        return pd.Series("modulus" if "modulus" in columns else "compliance", text.index)
+    if "test" not in text:
+        raise InputError(
+            f'{place(source)}column "test" is missing; write relaxation (position applied) or creep (force applied).'
+        )
+    kinds = text["test"].str.strip().str.lower()
+    refuse(
+        ~kinds.isin(("relaxation", "creep")),
+        source,
+        lambda row: f'test is "{text.at[row, "test"]}"; it must be relaxation or creep.',
+    )
+    return kinds
+
+
+def _test(kind, values, repeats, source, begin, longest, notes):
+    """One kind of test, its repeats on common times."""
+    output = {"relaxation": "force", "creep": "position"}.get(kind, kind)
+    put = {"relaxation": "position", "creep": "force"}.get(kind)
+    parts = [values[repeats == name] for name in repeats.unique()]
+    for part in parts:
+        falls = part["time"].diff() <= 0
+        refuse(falls, source, lambda row: "time does not increase from the row before; sort the rows of each repeat.")
+    if put is None:
+        refuse(values["time"] <= 0, source, lambda row: "time is not above 0; moduli are counted from the step.")
+        refuse(values[output] <= 0, source, lambda row: f"{output} is not above 0.")
+    first = [0.0 if put is None else part["time"].iloc[0] for part in parts]
+    times = [part["time"].to_numpy() - zero for part, zero in zip(parts, first, strict=True)]
+    times, parts = _shortened(times, parts, longest)
+    time, resampled = _common(times)
+    if resampled:
+        notes.append(
+            f"The repeats of the {kind} test have different times; they were interpolated to those of the first."
+        )
+    columns = [output] + ([put] if put else [])
+    stacked = {c: np.stack([np.interp(time, t, p[c]) for t, p in zip(times, parts, strict=True)]) for c in columns}
+    try:
+        return Test(kind, time, stacked[output], stacked.get(put) if put else None, "rest" if put is None else begin)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
+
+
+def _shortened(times, parts, longest):
+    if longest is None:
+        return times, parts
+    kept = [t <= longest for t in times]
+    return [t[k] for t, k in zip(times, kept, strict=True)], [p[k] for p, k in zip(parts, kept, strict=True)]
+
+
+def _common(times):
+    """Times that all repeats have, and whether interpolation is needed."""
+    first = times[0]
+    if all(t.size == first.size and np.allclose(t, first, rtol=0, atol=1e-9 * first[-1]) for t in times):
+        return first, False
+    begin, end = max(t[0] for t in times), min(t[-1] for t in times)
+    return first[(first >= begin) & (first <= end)], True

@@ -1,0 +1,83 @@
+"""From samples of a device that presses a material to the table of tests that `hilbo identify` reads.
+
+A test begins with the last sample off the material. When a light load follows a heavy one, the handle's mass may
+carry it off the material for some milliseconds: the material's force is then 0, and the handle's position is not its
+surface's. Those rows are left out, but for two at either end, the inner ones of which have force 0, so that the force
+between them is read as the 0 that it was.
+Units: mm, N, s; positions and forces are positive into the material.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hilbo.device.link import DeviceError
+from hilbo.device.telemetry import Samples
+
+__all__ = ["Pressed", "pressed", "table_of"]
+
+_NOTHING = 0.05  # mm; a test that goes no deeper has met nothing
+_LEAST = 5e-3  # N; less than this is no contact, whatever the sensor's noise
+_SURE = 4.0  # standard deviations
+_STAY = 5  # samples
+
+
+class Pressed(NamedTuple):
+    """One test, from the last sample off the material on; `off` marks samples at which the handle had left it again."""
+
+    position: Float[np.ndarray, " n"]
+    force: Float[np.ndarray, " n"]
+    off: Bool[np.ndarray, " n"]
+
+
+def pressed(seen: Samples, kind: str, sensed: bool, noise: float) -> Pressed:
+    """One test. Its force is the sensor's, whose `noise` (N) is known, or without one the motor's.
+
+    Raises `DeviceError` where nothing was met at position 0.
+    """
+    inside = np.flatnonzero(seen.position_mm > 0)
+    if inside.size == 0 or seen.position_mm.max() < _NOTHING:
+        raise DeviceError(f"The {kind} test has met nothing at position 0; put the material there.")
+    first = max(int(inside[0]) - 1, 0)
+    position = np.maximum(seen.position_mm[first:], 0.0)
+    force = -(seen.sensed_N if sensed else seen.force_N)[first:]
+    off = _left(force, noise) if sensed else np.zeros(force.size, bool)
+    return Pressed(position, np.where((position > 0) & ~off, force, 0.0), off)
+
+
+def _left(force, noise) -> np.ndarray:
+    """Samples without contact, in stays of `_STAY` or more, after the force was first felt."""
+    smooth = np.convolve(force, np.ones(_STAY) / _STAY, "same")
+    off = smooth < max(_SURE * noise / np.sqrt(_STAY), _LEAST)
+    edges = np.flatnonzero(np.diff(off, prepend=True, append=False))  # begins and ends of what is felt and not felt
+    for begin, end in zip(edges[1::2], edges[2::2], strict=False):
+        off[begin:end] = end - begin >= _STAY
+    off[: edges[0]] = False
+    return off
+
+
+def table_of(tests: Mapping[str, Sequence[Pressed]], last: Mapping[str, float], tick: float) -> Any:
+    """The table: test, repeat, time_s, position_mm, force_N; the repeats of a test have the same times."""
+    import pandas as pd
+
+    parts = []
+    for kind, repeats in tests.items():
+        size = min(min(one.position.size for one in repeats), round(last[kind] / tick) + 1)
+        off = np.any([one.off[:size] for one in repeats], axis=0)
+        silent, kept = _within(off), ~_within(_within(off))
+        time = np.arange(size)[kept] * tick
+        for number, one in enumerate(repeats, 1):
+            force = np.where(silent, 0.0, one.force[:size])
+            columns = {"time_s": time, "position_mm": one.position[:size][kept], "force_N": force[kept]}
+            parts.append(pd.DataFrame({"test": kind, "repeat": number} | columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _within(off):
+    """All samples of each stay but its first and its last."""
+    inner = off.copy()
+    inner[1:] &= off[:-1]
+    inner[:-1] &= off[1:]
+    return inner

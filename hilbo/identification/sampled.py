@@ -1,0 +1,239 @@
+"""The FO-SLS as it is rendered, as a model to be fitted to recorded tests.
+
+Coordinates (the physics of three parts, each in its own time range, so that the column-scaled Jacobian has a condition
+number of about 30 instead of 30,000):
+
+    q = (K_inst, K_eff, log κ, logit α),  K_inst = K0 + K1/(1 + κ) = H(∞),  K_eff = H(1),  κ = K1·T^α/B1
+    H(z) = K_eff + (K_inst - K_eff)·(1 + κ)·(C(z) - S) / ((1 - S)·(κ + C(z))),  S = C(1)
+
+with C(z) = Σ_{i=0..N} c_i z^{-i} (`memory`), or (1 - 1/z)^α with full memory, where S = 0. A response is the inverse
+transform of H(z)·X(z) (of X(z)/H(z) for creep) on a circle |z| = r > 1: two FFTs whatever N is. The circle damps what
+wraps around by r^{-L} = eps^0.8, so the curves are those of the recursion to about eps^0.75.
+
+Units: N, mm, s; B1 N·s^α/mm.
+"""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hilbo.errors import InputError
+from hilbo.identification.fitting import MEASURED, Curve, Test
+
+__all__ = ["Sampled"]
+
+_TAPS = 1024
+_LOG_KAPPA = np.log(10.0) * np.arange(-5.0, 3.1, 0.5)
+_LOGIT_ALPHA = np.array([-3.5, -2.2, -1.4, -0.6, 0.0, 0.6, 1.4, 2.2, 3.5, 4.4])
+
+
+class Sampled(eqx.Module):
+    """The FO-SLS as it is rendered: sampled every `T` s, with the last `N` samples or full memory.
+
+    Full memory is the infinite sum, which `viscoelastic`'s sum of exponentials meets to 1e-4 of the largest force.
+    """
+
+    N: int | Int[Array, ""] = 101
+    T: float = eqx.field(static=True, default=1e-3)
+    memory: Literal["short", "full"] = eqx.field(static=True, default="short")
+    capacity: int = eqx.field(static=True, default=0)  # taps that are computed; models with one capacity compile once
+
+    labels = ("K_inst", "K_eff", "kappa", "alpha")
+    kinds = MEASURED
+
+    def __check_init__(self):
+        if isinstance(self.N, int) and self.N < 1:
+            raise InputError(f"N is {self.N}, it must be at least 1: the number of past samples.")
+        if not 0 < self.T < np.inf:
+            raise InputError(f"T is {self.T}, it must be a time in s above 0.")
+
+    def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of q: stiffness up to 50 times the largest secant, κ up to 1e4, α from 0.01 to 0.99.
+
+        κ goes down to 1e-4, or 1e-6 with full memory. Far below S(α) the curve no longer depends on it, and K1 would
+        grow as 1/κ for ever.
+        """
+        top = max(_secant(test) for test in tests)
+        ends = np.log(0.99 / 0.01)
+        least = 1e-6 if self.memory == "full" else 1e-4
+        lower = np.array([1e-3 * top, 0.0, np.log(least), -ends])
+        return lower, np.array([50 * top, 50 * top, np.log(1e4), ends])
+
+    def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts 4"]:
+        """The five best separate places of a grid in (κ, α).
+
+        Read from position to force, every test is linear in K_inst and K_eff, which are solved for at each place.
+        """
+        curves = tuple(self.prepare(_position_driven(test)) for test in tests)
+        lower, upper = self.box(tests)
+        scales = [jnp.asarray(np.ptp(test.output.mean(axis=0)) * _unit_of_force(test)) for test in tests]
+        grid = jnp.asarray(np.stack(np.meshgrid(_LOG_KAPPA, _LOGIT_ALPHA, indexing="ij"), axis=-1))
+        costs, stiffness = (np.asarray(part) for part in _screen(self, curves, scales, grid))
+        found = [np.concatenate([stiffness[at], np.asarray(grid[at])]) for at in _separate(costs, 5)]
+        return np.clip(np.stack(found), lower, upper)
+
+    def prepare(self, test: Test) -> Curve:
+        """Inputs on the grid of the model, transformed; positions between grid points by linear interpolation."""
+        assert test.input is not None
+        elapsed = test.time - test.time[0]
+        place = elapsed / self.T
+        near = np.round(place)
+        place = np.where(np.abs(place - near) < 1e-6, near, place)
+        count = int(np.ceil(place[-1])) + 1
+        grid = np.arange(count) * self.T
+        offset = test.input[:, 0] if test.start == "equilibrium" else np.zeros(test.repeats)
+        inputs = np.stack([np.interp(grid, elapsed, row) for row in test.input]) - offset[:, None]
+        length = _transform_length(count)
+        damped = inputs * _circle(length, inputs.dtype) ** -np.arange(count, dtype=inputs.dtype)
+        before = np.minimum(place.astype(int), count - 2)
+        return Curve(
+            test.kind,
+            jnp.asarray(elapsed),
+            jnp.asarray(test.output),
+            jnp.asarray(offset),
+            jnp.asarray(np.full(test.time.size, np.ptp(test.output.mean(axis=0)))),
+            jnp.asarray(np.fft.rfft(damped, length)),
+            jnp.asarray(before),
+            jnp.asarray(place - before),
+            length,
+        )
+
+    def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
+        """The response to the weighted mean of the inputs, at the measured times."""
+        assert curve.spectra is not None and curve.share is not None and curve.before is not None
+        H = self._transfer(q, curve.length)
+        creep = curve.kind == "creep"
+        spectrum = weights.astype(curve.spectra.dtype) @ curve.spectra
+        spectrum = spectrum / H if creep else spectrum * H
+        growth = _circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
+        found = jnp.fft.irfft(spectrum, curve.length)[: curve.length // 2] * growth
+        rest = weights @ curve.offset
+        rest = rest / q[1] if creep else rest * q[1]
+        return rest + found[curve.before] * (1 - curve.share) + found[curve.before + 1] * curve.share
+
+    def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
+        """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them."""
+        K_inst, K_eff, kappa, alpha = q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])
+        S = self._taps(alpha)[1]
+        K1 = (K_inst - K_eff) * (1 + kappa) * (kappa + S) / (kappa * (1 - S))
+        K0, B1 = K_eff - K1 * S / (kappa + S), K1 / kappa * self.T**alpha
+        return {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "K_inst": K_inst, "K_eff": K_eff}
+
+    def natural(self, q: Float[Array, " 4"]) -> Float[Array, " 4"]:
+        """The coordinates under their labels: K_inst, K_eff (N/mm), κ and α."""
+        return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])])
+
+    def at(self, tests: Sequence[Test]) -> "Sampled":
+        """The same with N as an array among at least 1024 taps, so that every N is the same compiled function."""
+        del tests
+        if self.memory == "full" or self.capacity:
+            return self
+        return Sampled(jnp.asarray(self.N), self.T, self.memory, max(_TAPS, int(self.N)))
+
+    def coordinates(self, K0: float, K1: float, B1: float, alpha: float) -> Float[np.ndarray, " 4"]:
+        """q of a parameter set."""
+        kappa = K1 * self.T**alpha / B1
+        S = float(self._taps(jnp.asarray(alpha))[1])
+        ends = K0 + K1 / (1 + kappa), K0 + K1 * S / (kappa + S)
+        return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha))])
+
+    def _transfer(self, q, length):
+        """H on the circle, at the upper half of `length` points."""
+        kappa, alpha = jnp.exp(q[2]), jax.nn.sigmoid(q[3])
+        radius = _circle(length, q.dtype)
+        taps, S = self._taps(alpha)
+        if self.memory == "full":
+            angle = 2 * jnp.pi * jnp.arange(length // 2 + 1, dtype=q.dtype) / length
+            delay = jax.lax.complex(jnp.cos(angle), -jnp.sin(angle)) / radius
+            C = (1 - delay) ** alpha.astype(delay.dtype)
+        else:
+            taps = taps[: length // 2]  # those beyond the data act through S only
+            C = jnp.fft.rfft(taps * radius ** -jnp.arange(taps.size, dtype=q.dtype), length)
+        K_eff, size, S, kappa = (
+            part.astype(C.dtype) for part in (q[1], (q[0] - q[1]) * (1 + kappa) / (1 - S), S, kappa)
+        )
+        return K_eff + size * (C - S) / (kappa + C)
+
+    def _taps(self, alpha):
+        """c_0 … c_N, zero beyond, and S = C(1), by products of positive numbers."""
+        if self.memory == "full":
+            return jnp.ones(1, alpha.dtype), jnp.zeros_like(alpha)
+        i = jnp.arange(1, (self.capacity or int(self.N)) + 1, dtype=alpha.dtype)
+        sums = jnp.cumprod(jnp.where(i <= self.N, 1 - alpha / i, 1))
+        taps = jnp.where(i <= self.N, alpha / i, 0) * jnp.concatenate([jnp.ones(1, alpha.dtype), sums[:-1]])
+        return jnp.concatenate([jnp.ones(1, alpha.dtype), -taps]), sums[-1]
+
+
+def _force_and_position(test):
+    return (test.output, test.input) if test.kind == "relaxation" else (test.input, test.output)
+
+
+def _position_driven(test):
+    """The test with force as its output."""
+    force, position = _force_and_position(test)
+    return Test("relaxation", test.time, force, position, test.start)
+
+
+def _unit_of_force(test):
+    """What turns the scale of an output into one of force: the mean stiffness for positions."""
+    return _mean_secant(test) if test.kind == "creep" else 1.0
+
+
+@eqx.filter_jit
+def _screen(model, curves, scales, grid):
+    """Cost and stiffnesses (K_inst, K_eff) of the best combination at each place of the grid."""
+    weights = [jnp.full(c.output.shape[0], 1 / c.output.shape[0], c.scale.dtype) for c in curves]
+    ends = jnp.eye(2, dtype=grid.dtype)
+
+    def place(at):
+        normal, right, total = jnp.zeros((2, 2), grid.dtype), jnp.zeros(2, grid.dtype), jnp.zeros((), grid.dtype)
+        for curve, scale, w in zip(curves, scales, weights, strict=True):
+            parts = [model.predict(jnp.concatenate([end, at]), curve, w) for end in ends]
+            basis = jnp.stack(parts) / (scale * np.sqrt(curve.time.size))
+            goal = w @ curve.output / (scale * np.sqrt(curve.time.size))
+            normal, right, total = normal + basis @ basis.T, right + basis @ goal, total + goal @ goal
+        a, b, c = normal[0, 0], normal[0, 1], normal[1, 1]
+        K_eff = jnp.maximum((a * right[1] - b * right[0]) / (a * c - b * b), 0)
+        stiffness = jnp.stack([(right[0] - b * K_eff) / a, K_eff])
+        return total - 2 * right @ stiffness + stiffness @ normal @ stiffness, stiffness
+
+    costs, stiffness = jax.lax.map(place, grid.reshape(-1, 2))
+    return costs.reshape(grid.shape[:-1]), stiffness.reshape(grid.shape)
+
+
+def _separate(costs, count):
+    """Places of the lowest costs, none beside another."""
+    left, places = np.where(np.isfinite(costs), costs, np.inf), []
+    while len(places) < count and np.isfinite(left).any():
+        i, j = np.unravel_index(np.argmin(left), left.shape)
+        places.append((i, j))
+        left[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = np.inf
+    return places
+
+
+def _secant(test):
+    """Largest force over largest position."""
+    force, position = _force_and_position(test)
+    return float(np.max(np.abs(force)) / np.max(np.abs(position)))
+
+
+def _mean_secant(test):
+    force, position = _force_and_position(test)
+    return float(np.mean(np.abs(force)) / np.mean(np.abs(position)))
+
+
+def _transform_length(count):
+    """A length that transforms fast, at least three times as long as the data."""
+    from scipy.fft import next_fast_len
+
+    return 2 * next_fast_len((3 * count + 1) // 2)
+
+
+def _circle(length, dtype):
+    """Radius of the circle on which `length` points damp what wraps around to eps^0.8."""
+    return float(np.finfo(dtype).eps ** (-0.8 / length))

@@ -1,0 +1,186 @@
+"""Expectation propagation for latent values with a Gaussian prior and a product of pointwise likelihood terms.
+
+Model: eta ~ N(0, K), p(data | eta) = prod_i p_i(eta_i), each log-concave. The posterior is approximated by a Gaussian
+that has the mean and the variance of every *tilted* distribution p_i(eta_i) N(eta_i; m_i, v_i), where the cavity
+N(m_i, v_i) is what all the other answers say of eta_i. All that is asked of a term is
+L_i(m, v) = log of the integral of p_i(eta) N(eta; m, v), its slope a_i = dL_i/dm, and the precision t_i >= 0 of the
+Gaussian site that stands for it. With these the fixed point reads
+
+    m + v a = K a  (the means agree),      v_i = s_i / (1 - t_i s_i),  s = diag (K^-1 + T)^-1  (the variances agree),
+
+that is, the posterior N(K a, K - K C K), C = (K + 1/T)^-1, has Laplace's form with a for the slopes and t for the
+curvatures, and `predict`, the committee machine and the acquisition work on it unchanged. The log evidence is
+
+    log Z = sum_i [L_i + log(1 + t_i v_i) / 2] - a'm / 2 - log|I + KT| / 2,
+
+Rasmussen & Williams' (3.65) without its differences of large terms, and without 1/t, so that t = 0 is no special case.
+
+* Coordinates as in `laplace`: eta = R w, R the eigenvector root of K, and only I + R'TR >= 1 is factorised. K may be
+  singular (the same stimulus asked twice); nothing is added to it.
+* The search begins at Laplace's mode, which is near, or at `start`, and with S = K - K C K, which needs no root. Where
+  it does not end below the tolerance it begins anew with R and from the prior; where S lost digits it goes on with R.
+* For given v the means are the maximum of a concave function, so that only v is in need of a careful search. Far from
+  the fixed point damped parallel updates, near it Newton's steps in (m, v), the mean eliminated: n unknowns. A Newton
+  step that does not halve the mismatch sends the search back to updates, which are damped more the longer they take.
+* Derivatives by the implicit function theorem with the matrix of the Newton steps. The evidence is stationary in the
+  sites, so that its gradient, a'dK a / 2 - tr(C dK) / 2 + sum_i dL_i, needs none of them.
+
+References: Minka (2001), UAI; Rasmussen & Williams (2006), section 3.6; Seeger (2005), "Expectation propagation for
+exponential families". The elimination of the mean is derived in docs/design.md, "Expectation propagation".
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hilbo.gaussian import GaussianPosterior, certify, factor, inverse_and_log_determinant, square_root, still
+from hilbo.inference.ep_search import Joint, Tilted, coupling, find, joint_of, sites_of
+from hilbo.numerics.linalg import one_at_a_time
+
+__all__ = ["ep", "fixed_point", "gaussian", "inverse_of", "settled"]
+
+
+def ep(
+    covariance: Float[Array, "n n"],
+    terms: Tilted,
+    *,
+    start: Float[Array, " n"] | None = None,
+    max_steps: int = 200,
+) -> GaussianPosterior:
+    """Approximate p(eta | data) by the Gaussian that matches the tilted moments.
+
+    **Arguments:**
+
+    - `covariance`: K, (n, n), symmetric, positive semi-definite. Terms that always return 0 (padding) change nothing.
+    - `terms`: cavity means and variances (n,) -> L, slopes and precisions, (n,) each; a pytree (an `eqx.Module`, say)
+      if it holds arrays that are traced.
+    - `start`: `weights` of an earlier, similar fit (also Laplace's); changes the number of steps, not the result.
+
+    **Returns:** the posterior in the record of [`laplace`][hilbo.laplace.laplace]: `mode` is its mean, `weights` are
+    the slopes a. Differentiable in `covariance` and in the arrays of `terms`. Never raises: read
+    `certificate.converged`. In the certificate, `residual` is the largest mismatch of a mean, in prior standard
+    deviations, or of a log variance, whichever is the worse beside its tolerance.
+    """
+    return gaussian(terms, covariance, *fixed_point(terms, covariance, start, max_steps))
+
+
+def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
+    """The posterior that belongs to the cavities `fixed_point` ended at."""
+    _, slope, precision = terms(mean, variance)
+    inverse, _ = inverse_and_log_determinant(covariance, precision)
+    log_evidence = _log_evidence(terms, covariance, mean, variance)
+    fixed = jax.lax.stop_gradient((covariance, precision))
+    root, condition = factor(*fixed)
+    terms, (middle, cavity, weights) = still(terms), jax.lax.stop_gradient((mean, variance, slope))
+    certificate = certify(
+        fixed[0],
+        middle + cavity * weights,
+        weights,
+        fixed[1],
+        root,
+        lambda eta: terms(eta - cavity * weights, cavity)[2],
+        jax.lax.stop_gradient(log_evidence),
+        residual=found.residual,
+        tolerance=found.tolerance,
+        iterations=found.iterations,
+        jitter=found.changed / jnp.max(jnp.diagonal(fixed[0])),
+        condition=condition,
+    )
+    return GaussianPosterior(covariance @ slope, slope, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))
+
+
+# --- the fixed point
+
+
+@eqx.filter_custom_jvp
+def fixed_point(terms, covariance, start, max_steps):
+    """Cavity means and variances, and how they were found."""
+    return find(terms, covariance, start, max_steps)
+
+
+@jax.custom_jvp
+def _joint(covariance, precision, root):
+    """S from the root R of K, without the difference K - K C K; its derivative needs none of R's."""
+    return joint_of(covariance, root, precision).covariance
+
+
+@_joint.defjvp
+def _joint_jvp(primals, tangents):
+    joint = _joint(*primals)
+    transfer = jnp.eye(joint.shape[0], dtype=joint.dtype) - joint * primals[1][None, :]
+    return joint, transfer @ tangents[0] @ transfer.T - (joint * tangents[1][None, :]) @ joint
+
+
+def settled(covariance, sites, variance):
+    """At the fixed point, written so that it can be differentiated: S and its kin, and I - S T."""
+    root, _ = square_root(jax.lax.stop_gradient(covariance))
+    joint = _joint(covariance, sites.precision, root)
+    transfer = jnp.eye(variance.shape[0], dtype=variance.dtype) - joint * sites.precision[None, :]
+    return Joint(joint, jnp.diagonal(joint), 1.0 / (1.0 + variance * sites.precision)), transfer
+
+
+@jax.custom_jvp
+@one_at_a_time
+def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    return jnp.linalg.inv(matrix)
+
+
+@inverse_of.defjvp
+def _inverse_of_jvp(primals, tangents):
+    inverse = inverse_of(*primals)
+    return inverse, -inverse @ tangents[0] @ inverse
+
+
+@fixed_point.def_jvp
+def _fixed_point_jvp(primals, tangents):
+    """Both conditions differentiated: with P = I - K C = I - S T,
+
+    dm = W dv + (1 + v t) [P (dK a - v da) + S da],    J dv = diag(P dK P') / left^2 - Q (dt/dm (dm - W dv) + dt),
+
+    where da and dt are the changes of slopes and precisions at fixed cavities.
+    """
+    terms, covariance, _, _ = primals
+    mean, variance, found = fixed_point(*primals)
+    sites = sites_of(terms, mean, variance)
+    posterior, transfer = settled(covariance, sites, variance)
+    joint, ratio = posterior.covariance, 1.0 / posterior.left
+    follow, spread, matrix = coupling(sites, posterior, variance)
+
+    def changes(terms, covariance):
+        _, slope, precision = terms(mean, variance)
+        moved = transfer @ (covariance @ sites.slope - variance * slope) + joint @ slope
+        return moved, precision, jnp.sum((transfer @ covariance) * transfer, axis=1)
+
+    at, tangent = eqx.filter_jvp(changes, (terms, covariance), tangents[:2])
+    # What does not depend on the side that moves has no tangent at all.
+    moved, d_precision, widened = (jnp.zeros_like(a) if t is None else t for a, t in zip(at, tangent, strict=True))
+    free = ratio * moved
+    dv = inverse_of(matrix) @ (widened * ratio**2 - spread @ (sites.precision_m * free + d_precision))
+    return (mean, variance, found), (free + follow @ dv, dv, jax.tree.map(lambda _: None, found))
+
+
+# --- the evidence
+
+
+@eqx.filter_custom_jvp
+def _log_evidence(terms, covariance, mean, variance):
+    values, slope, precision = terms(mean, variance)
+    _, log_determinant = inverse_and_log_determinant(covariance, precision)
+    joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
+    return joined - 0.5 * slope @ mean - 0.5 * log_determinant
+
+
+@_log_evidence.def_jvp
+def _log_evidence_jvp(primals, tangents):
+    """At the fixed point the evidence is stationary in the cavities: their tangents have no part."""
+    terms, covariance, mean, variance = primals
+    _, slope, precision = terms(mean, variance)
+    inverse, _ = inverse_and_log_determinant(covariance, precision)
+
+    def explicit(terms, covariance):
+        quadratic = 0.5 * slope @ covariance @ slope - 0.5 * jnp.sum(inverse * covariance)
+        return jnp.sum(terms(mean, variance)[0]) + quadratic
+
+    _, tangent = eqx.filter_jvp(explicit, (terms, covariance), tangents[:2])
+    return _log_evidence(*primals), tangent

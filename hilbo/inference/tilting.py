@@ -1,0 +1,217 @@
+"""A box under a Gaussian, coordinate after coordinate: order of the variables, minimax tilting, proposals, draws.
+
+z ~ N(0, S), S = L L', is confined to a box; x = L^-1 z. With the rows of L divided by its diagonal, the interval of
+variable i in units of that diagonal is (lower_i, upper_i) less what the earlier variables contribute, (below x)_i.
+Equations and references: `hilbo.inference.exact`.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.likelihoods import confined_normal
+from hilbo.numerics.linalg import cholesky, one_at_a_time, solve_lower
+from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
+
+__all__ = ["Box", "Tilt", "accepted", "ordered_box", "propose", "tilting"]
+
+
+class Box(eqx.Module):
+    """The box in x, variables ordered: edges and Lower are in units of L's diagonal, Lower without its ones."""
+
+    lower: Float[Array, " n"]
+    upper: Float[Array, " n"]
+    below: Float[Array, "n n"]
+    half: Float[Array, "n n"]
+    """L^-1, its columns in the caller's order, its rows 0 where there is no answer."""
+    answered: Bool[Array, " n"]
+
+
+class Tilt(eqx.Module):
+    mu: Float[Array, " n"]
+    highest: Float[Array, ""]
+    """psi*, which psi(x, mu) never exceeds."""
+    gradient: Float[Array, ""]
+    iterations: Int[Array, ""]
+
+
+def ordered_box(covariance, lower, upper, noise, answered):
+    """Interval after interval the least probable one, given the expected values of those before it."""
+    n = covariance.shape[0]
+    both = answered[:, None] & answered[None, :]
+    matrix = jnp.where(both, covariance, 0.0) + jnp.diag(jnp.where(answered, noise**2, 1.0))
+    lower, upper = jnp.where(answered, lower, -jnp.inf), jnp.where(answered, upper, jnp.inf)
+
+    def next_variable(k, state):
+        columns, values, order, placed = state
+        spread = jnp.sqrt(jnp.diagonal(matrix) - jnp.sum(columns**2, axis=1))
+        shift = columns @ values
+        edges = (lower - shift) / spread, (upper - shift) / spread
+        log_mass, mean, _ = _intervals(jnp.zeros_like(shift), *edges, answered)
+        row = jnp.argmin(jnp.where(placed, 2.0, jnp.where(answered, log_mass, 1.0))).astype(order.dtype)
+        column = (matrix[:, row] - columns @ columns[row]) / spread[row]
+        column = jnp.where(placed, 0.0, column).at[row].set(spread[row])
+        return (columns.at[:, k].set(column), values.at[k].set(mean[row]), order.at[k].set(row),
+                placed.at[row].set(True))  # fmt: skip
+
+    state = jnp.zeros_like(matrix), jnp.zeros_like(lower), jnp.zeros(n, jnp.int32), jnp.zeros(n, bool)
+    order = jax.lax.fori_loop(0, n, next_variable, state)[2]
+    root = cholesky(matrix[order][:, order])
+    diagonal = jnp.diagonal(root)
+    half = solve_lower(root, jnp.eye(n, dtype=root.dtype))
+    known = answered[order]
+    half = jnp.zeros_like(half).at[:, order].set(jnp.where(known[:, None], half, 0.0))
+    below = jnp.tril(root / diagonal[:, None], -1)
+    return Box(lower[order] / diagonal, upper[order] / diagonal, below, half, known)
+
+
+def _intervals(mean, lower, upper, answered):
+    """`confined_normal` of every variable; where there is no answer there is no interval, and all is 0."""
+    lower = jnp.where(answered, lower, 0.0)
+    parts = jnp.vectorize(confined_normal, signature="(),(),()->(),(),()")(
+        mean, lower, jnp.where(answered, upper, jnp.inf)
+    )
+    return tuple(jnp.where(answered, part, 0.0) for part in parts)
+
+
+class _Saddle(eqx.Module):
+    x: Float[Array, " n"]
+    mu: Float[Array, " n"]
+    gradient: Float[Array, " 2*n"]  # in x and in mu
+    matrix: Float[Array, "2*n 2*n"]  # its derivative
+    step: Float[Array, " 2*n"]
+    scale: Float[Array, ""]
+    size: Float[Array, ""]  # of the gradient
+    psi: Float[Array, ""]
+    count: Int[Array, ""]
+
+
+def tilting(box, max_steps=100):
+    """The saddle point of psi by Newton's method.
+
+    A step is shortened until the simplified step that would follow, by the same matrix, is the shorter one: a test that
+    does not depend on the units of x and mu, which conflicting repeats stretch by sd / noise (Deuflhard 2011, 3.3).
+    """
+    n = box.lower.shape[0]
+    begin = _saddle(box, _expected(box), jnp.zeros_like(box.lower))
+    small = jnp.finfo(box.lower.dtype).eps ** 0.5
+
+    def unfinished(state):
+        return (state.count < max_steps) & (state.size > small) & (state.scale > 1e-8)
+
+    def advance(state):
+        trial = _saddle(box, state.x + state.scale * state.step[:n], state.mu + state.scale * state.step[n:])
+        following = jnp.linalg.norm(_solve(state.matrix, trial.gradient))
+        better = following <= (1.0 - 0.25 * state.scale) * jnp.linalg.norm(state.step)
+        refused = eqx.tree_at(lambda s: s.scale, state, 0.5 * state.scale)
+        taken = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, refused)
+        return eqx.tree_at(lambda s: s.count, taken, state.count + 1)
+
+    end = jax.lax.while_loop(unfinished, advance, begin)
+    return Tilt(end.mu, end.psi, end.size, end.count)
+
+
+def _expected(box):
+    """x, each at its expected value given those before it, without tilting: inside the box, and psi flat in mu."""
+
+    def one(x, k):
+        shift = box.below[k] @ x
+        value = _intervals(shift, box.lower[k], box.upper[k], box.answered[k])[1]
+        return x.at[k].set(value), None
+
+    return jax.lax.scan(one, jnp.zeros_like(box.lower), jnp.arange(box.lower.shape[0]))[0]
+
+
+def _saddle(box, x, mu):
+    """psi, its gradient, in x and in mu, and Newton's step at a point."""
+    shift = box.below @ x + mu
+    log_mass, mean, curvature = _intervals(shift, box.lower, box.upper, box.answered)
+    a, b = box.below.T @ mean - mu, mu - x + mean
+    eye = jnp.eye(x.shape[0], dtype=x.dtype)
+    bent = curvature[:, None] * box.below
+    matrix = jnp.block([[-box.below.T @ bent, -eye - bent.T], [-eye - bent, jnp.diag(1.0 - curvature)]])
+    gradient = jnp.concatenate([a, b])
+    step = -_solve(matrix, gradient)
+    psi = jnp.sum(0.5 * mu**2 - mu * x + log_mass)
+    size = jnp.linalg.norm(gradient)
+    return _Saddle(x, mu, gradient, matrix, step, jnp.ones_like(psi), size, psi, jnp.zeros((), jnp.int32))
+
+
+@one_at_a_time
+def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Array, " n"]:
+    return jnp.linalg.solve(matrix, right)
+
+
+# --- sampling
+
+
+def propose(box, mu, uniform):
+    """x (n, N) from the tilted sequence of confined normals, and psi (N,), from uniform numbers (n, N)."""
+    n, count = uniform.shape
+
+    def one(state, k):
+        x, psi = state
+        shift = box.below[k] @ x + mu[k]
+        value, log_mass = _confined(uniform[k], box.lower[k] - shift, box.upper[k] - shift)
+        value = value + mu[k]
+        return (x.at[k].set(value), psi + 0.5 * mu[k] ** 2 - mu[k] * value + log_mass), None
+
+    start = jnp.zeros((n, count), uniform.dtype), jnp.zeros(count, uniform.dtype)
+    return jax.lax.scan(one, start, jnp.arange(n))[0]
+
+
+def _confined(uniform, lower, upper):
+    """Quantile of a standard normal confined to (lower, upper), and log of the mass of that interval.
+
+    Reflected so that lower + upper >= 0. With Q the upper tail and R = Q(high) / Q(low), the quantile t has
+    Q(t) = Q(low) (1 - u (1 - R)): by the inverse normal distribution near the centre, by Newton's method in log Q
+    (three steps from a Rayleigh quantile) beyond 3.
+    """
+    mirrored = lower + upper < 0
+    low, high = jnp.where(mirrored, -upper, lower), jnp.where(mirrored, -lower, upper)
+    uniform = jnp.where(mirrored, 1.0 - uniform, uniform)
+    far = low > 3.0
+    bounded = ~jnp.isinf(high)
+    near_low = jnp.where(far, 0.0, low)
+    tail = 0.5 * jax.lax.erfc(near_low * 0.5**0.5)
+    near_share = 1.0 - 0.5 * jax.lax.erfc(jnp.where(far, 1.0, high) * 0.5**0.5) / tail
+    near = -jax.scipy.special.ndtri(tail * (1.0 - uniform * near_share))
+
+    low_, high_ = jnp.where(far, low, 4.0), jnp.where(far & bounded, high, 5.0)
+    hazard, hazard_high = low_ + excess_hazard(low_), high_ + excess_hazard(high_)
+    ratio = jnp.exp(-0.5 * (high_ - low_) * (high_ + low_)) * hazard / hazard_high
+    far_share = jnp.where(bounded, 1.0 - ratio, 1.0)
+    fallen = -jnp.log1p(-uniform * far_share)  # log Q(low) - log Q(t)
+    t = jnp.sqrt(low_**2 + 2.0 * fallen)
+    for _ in range(3):
+        at = t + excess_hazard(t)
+        t = t - (fallen - 0.5 * (t - low_) * (t + low_) - jnp.log(at / hazard)) / -at
+    value = jnp.where(far, t, near)
+    log_near = jnp.log(tail * near_share)
+    log_far = -0.5 * low_**2 - HALF_LOG_2PI - jnp.log(hazard) + jnp.log(far_share)
+    return jnp.where(mirrored, -value, value), jnp.where(far, log_far, log_near)
+
+
+def accepted(key, box, tilt, count):
+    """`count` independent draws of x (count, n); proposals are taken with probability exp(psi - psi*)."""
+    n, batch = box.lower.shape[0], 2 * count
+    found = tilt.gradient <= 1e-3
+
+    def more(state):
+        _, _, filled, rounds = state
+        return (filled < count) & (rounds < 1000) & found
+
+    def more_draws(state):
+        key, kept, filled, rounds = state
+        key, first, second = jax.random.split(key, 3)
+        tiny = jnp.finfo(kept.dtype).tiny
+        x, psi = propose(box, tilt.mu, jax.random.uniform(first, (n, batch), kept.dtype, minval=tiny))
+        taken = jnp.log(jax.random.uniform(second, (batch,), kept.dtype, minval=tiny)) < psi - tilt.highest
+        place = jnp.where(taken, filled + jnp.cumsum(taken, dtype=filled.dtype) - 1, count)
+        x = jnp.where(box.answered[:, None], x, 0.0)
+        return key, kept.at[place].set(x.T, mode="drop"), filled + jnp.sum(taken, dtype=filled.dtype), rounds + 1
+
+    nothing = jnp.full((count, n), jnp.nan, box.lower.dtype)
+    begin = key, nothing, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
+    return jax.lax.while_loop(more, more_draws, begin)[1]

@@ -1,0 +1,79 @@
+"""Exact relaxation and creep of the continuous FO-SLS, without sampling or memory limits.
+
+H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α). The force after a unit step of position, and the position after one of force, are
+
+    G(t) = K0 + K1·E_α(-(K1/B1)·t^α)
+    J(t) = 1/(K0 + K1) + (K1/(K0 + K1))²/B1 · t^α·E_{α,1+α}(-z),   z = K0·K1/(K0 + K1)/B1 · t^α
+
+The second form of J holds at K0 = 0 too, where creep has no end. Units: N/mm, N·s^α/mm, s, mm/N. Reference: Mainardi
+(2010), Fractional Calculus and Waves in Linear Viscoelasticity, section 3.4.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax.scipy.special import gammaln
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Real
+
+from hilbo.mechanics.fosls import share
+from hilbo.numerics.mittag_leffler import mittag_leffler, mittag_leffler_increment
+
+__all__ = ["creep_compliance", "relaxation_modulus"]
+
+
+@jax.jit
+def relaxation_modulus(
+    t: Real[ArrayLike, "..."],
+    K0: Real[ArrayLike, "..."],
+    K1: Real[ArrayLike, "..."],
+    B1: Real[ArrayLike, "..."],
+    alpha: Real[ArrayLike, "..."],
+) -> Float[Array, "..."]:
+    """G(t) in N/mm for t >= 0; elementwise, differentiable in every parameter, with derivative 0 of the t^α at t = 0.
+
+    K1 = inf, a spring-pot beside K0, gives K0 + B1·t^{-α}/Γ(1 - α), which is infinite at t = 0.
+    """
+    return _elementwise(_relaxation, t, K0, K1, B1, alpha)
+
+
+@jax.jit
+def creep_compliance(
+    t: Real[ArrayLike, "..."],
+    K0: Real[ArrayLike, "..."],
+    K1: Real[ArrayLike, "..."],
+    B1: Real[ArrayLike, "..."],
+    alpha: Real[ArrayLike, "..."],
+) -> Float[Array, "..."]:
+    """J(t) in mm/N for t >= 0 and K0 >= 0, K1 > 0, B1 > 0; elementwise and differentiable, K1 may be inf.
+
+    Creep with recovery by superposition: F1·J(t) + (F2 - F1)·J(t - t1) for t >= t1.
+    """
+    return _elementwise(_creep, t, K0, K1, B1, alpha)
+
+
+def _elementwise(function, *args):
+    dtype = jnp.result_type(1.0, *args)
+    return jnp.vectorize(function)(*(jnp.asarray(arg, dtype) for arg in args))
+
+
+def _power(t, alpha):
+    """t^α with finite derivatives at t = 0."""
+    return jnp.where(t > 0, jnp.where(t > 0, t, 1) ** alpha, 0)
+
+
+def _relaxation(t, K0, K1, B1, alpha):
+    power = _power(t, alpha)
+    rigid = jnp.isinf(K1)
+    spring = jnp.where(rigid, 1, K1)
+    branch = spring * mittag_leffler(alpha, spring / B1 * power)
+    # 1/Γ(1 - α) = Γ(α)·sin(πα)/π.
+    size = B1 * jnp.exp(gammaln(alpha)) * jnp.sin(jnp.pi * alpha) / jnp.pi
+    pot = jnp.where(t > 0, size / jnp.where(t > 0, power, 1), jnp.inf)
+    return K0 + jnp.where(rigid, pot, branch)
+
+
+def _creep(t, K0, K1, B1, alpha):
+    power = _power(t, alpha)
+    part = share(K1, K0)  # K1/(K0 + K1)
+    instant = jnp.where(jnp.isinf(K1), 0, part / jnp.where(jnp.isinf(K1), 1, K1))
+    return instant + part**2 / B1 * power * mittag_leffler_increment(alpha, K0 * part / B1 * power)

@@ -1,0 +1,244 @@
+"""The FO-SLS as a record: one parameter set, its responses, and its force or position in time.
+
+Continuous model H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α), 0 < α <= 1. Sampled every T seconds (see `memory` for C)
+
+    β = B1·T^{-α},   H(z) = K0 + K1·β·C(z) / (K1 + β·C(z))
+
+One history, the elongation y of the spring-pot, gives force from position or position from force. With
+g = K1/(K1 + β), k = K1·β/(K1 + β) and s_n = Σ |c_i|·y_{n-i}
+
+    F_n = K0·x_n + k·(x_n - s_n),   x_n = (F_n + k·s_n)/(K0 + k),   y_n = s_n + g·(x_n - s_n)
+
+g and k are written through β/K1 or K1/β, whichever is at most 1, so that a spring (K1 = 0), a spring-pot (K1 = inf) and
+what lies between are one code.
+
+Units: stiffness N/mm, B1 N·s^α/mm, T s, x mm, F N, damping N·s/m. Memory, N and T belong to a parameter set: α means
+another material under another N. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3.
+"""
+
+import math
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jax.typing import ArrayLike
+from jaxtyping import Array, Complex, Float, Real
+
+from hilbo.errors import InputError
+from hilbo.mechanics.memory import Memory, Span, gl_coefficients, response, span, sums
+from hilbo.mechanics.recursion import BLOCK, past_of
+from hilbo.numerics.mittag_leffler import mittag_leffler
+
+__all__ = ["FOSLS", "Start", "series", "share"]
+
+Start = Literal["rest", "equilibrium"]
+_LONGEST_RELAXATION = 1_000_000  # samples
+
+
+class FOSLS(eqx.Module):
+    """One parameter set of the FO-SLS, with the memory (short: `N` taps; full: `states` exponentials) and T it is for.
+
+    K0, K1 (N/mm), B1 (N·s^α/mm) and alpha are scalars of one floating dtype; `jax.vmap` over records or over
+    constructors for several. K1 may be `inf`: K0 beside a spring-pot. Raises InputError for K1 < 0, B1 < 0, α outside
+    (0, 1], numbers that are not finite, and for K0 < 0 with full memory; not inside `jit`, where values are unknown.
+    """
+
+    K0: Float[Array, ""]
+    K1: Float[Array, ""]
+    B1: Float[Array, ""]
+    alpha: Float[Array, ""]
+    N: int = eqx.field(static=True)
+    T: float = eqx.field(static=True)
+    memory: Memory = eqx.field(static=True)
+    states: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        K0: Real[ArrayLike, ""],
+        K1: Real[ArrayLike, ""],
+        B1: Real[ArrayLike, ""],
+        alpha: Real[ArrayLike, ""],
+        N: int = 101,
+        T: float = 1e-3,
+        *,
+        memory: Memory = "short",
+        states: int = 10,
+    ):
+        dtype = jnp.result_type(1.0, K0, K1, B1, alpha)
+        self.K0, self.K1, self.B1, self.alpha = (jnp.asarray(value, dtype) for value in (K0, K1, B1, alpha))
+        self.N, self.T, self.memory, self.states = N, float(T), memory, states
+
+    def __check_init__(self):
+        span(self.memory, self.N, self.states)
+        if not 0 < self.T < math.inf:
+            raise InputError(f"T is {self.T} s, it must be a number above 0; write for example T = 0.001.")
+        if not any(isinstance(value, Tracer) for value in (self.K0, self.K1, self.B1, self.alpha)):
+            _check_values(float(self.K0), float(self.K1), float(self.B1), float(self.alpha), self.memory)
+
+    @property
+    def span(self) -> Span:
+        """How far the model looks back."""
+        return span(self.memory, self.N, self.states)
+
+    @property
+    def beta(self) -> Float[Array, ""]:
+        """β = B1·T^{-α}, N/mm."""
+        return self.B1 * self.T**-self.alpha
+
+    def frequency_response(self, omega: Real[ArrayLike, "*w"]) -> Complex[Array, "*w"]:
+        """H(e^{jωT}) (N/mm) at angular frequencies ω (rad/s) up to π/T."""
+        return _frequency_response(self, jnp.asarray(omega, self.K0.dtype))
+
+    def continuous_response(self, omega: Real[ArrayLike, "*w"]) -> Complex[Array, "*w"]:
+        """H(jω) (N/mm) of the continuous model with the same parameters; ω >= 0 in rad/s."""
+        size = self.B1 * jnp.asarray(omega, self.K0.dtype) ** self.alpha
+        lead = jnp.pi / 2 * self.alpha
+        pot = jax.lax.complex(size * jnp.cos(lead), size * jnp.sin(lead))
+        return self.K0.astype(pot.dtype) + series(self.K1, pot)
+
+    def dc_gain(self) -> Float[Array, ""]:
+        """Static stiffness H(1), N/mm."""
+        return self.K0 + series(self.K1, self.beta * sums(self.alpha, self.span).at_dc)
+
+    def high_frequency_gain(self) -> Float[Array, ""]:
+        """H(-1), N/mm: the stiffness at the Nyquist frequency."""
+        return self.K0 + series(self.K1, self.beta * sums(self.alpha, self.span).at_nyquist)
+
+    def instantaneous_stiffness(self) -> Float[Array, ""]:
+        """K0 + k, N/mm: force per step of position in the sample of the step."""
+        return self.K0 + series(self.K1, self.beta)
+
+    def effective_damping(self) -> Float[Array, ""]:
+        """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1."""
+        found = sums(self.alpha, self.span)
+        return 1000 * self.T * self.beta * found.moment * share(self.K1, self.beta * found.at_dc) ** 2
+
+    def simulate(
+        self, x: Real[ArrayLike, " n"], *, start: Start = "rest", unilateral: bool = False, block: int = BLOCK
+    ) -> Float[Array, " n"]:
+        """Force (N) that follows positions `x` (mm), one every T; differentiable in `x` and in every parameter.
+
+        `start`: from rest at x = 0, or from the equilibrium at x[0], held for ever before. `unilateral`: contact can
+        only push: x below 0 counts as 0 in the history, and forces below 0 as 0. `block` = 1 is the plain recursion,
+        sample by sample; larger blocks give the same numbers up to rounding, faster.
+        """
+        return _force(self, jnp.asarray(x, self.K0.dtype), start, unilateral, block)
+
+    def simulate_force(
+        self, F: Real[ArrayLike, " n"], *, start: Start = "rest", block: int = BLOCK
+    ) -> Float[Array, " n"]:
+        """Position (mm) that follows forces `F` (N): the inverse of `simulate`, see there.
+
+        An equilibrium under force needs H(1) > 0; without it, the positions from such a start are not finite.
+        """
+        return _position(self, jnp.asarray(F, self.K0.dtype), start, block)
+
+    def settling_time(self, fraction: float) -> Float[Array, ""]:
+        """Time (s) of the first sample at which this `fraction` of the relaxation after a step is over.
+
+        0.9 for t90. With short memory counted sample by sample, `inf` beyond a million samples; with full memory the
+        time t at which E_α(-(K1/B1)·t^α) = 1 - fraction, which may be years.
+        """
+        if not 0 <= fraction < 1:
+            raise InputError(f"fraction is {fraction}, it must be at least 0 and below 1; write 0.9 for t90.")
+        find = _short_settling if self.memory == "short" else _full_settling
+        return find(self, jnp.asarray(fraction, self.K0.dtype))
+
+
+def series(K1, pot):
+    """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`."""
+    firm = (jnp.abs(pot) <= K1) & (K1 > 0)
+    compliance = (1 / jnp.where(firm, K1, 1)).astype(pot.dtype)
+    spring, pot_of_soft = jnp.where(firm, 0, K1).astype(pot.dtype), jnp.where(firm | (pot == 0), 1, pot)
+    return jnp.where(firm, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
+
+
+def share(K1, pot):
+    """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf."""
+    firm = (pot <= K1) & (K1 > 0)
+    ratio = jnp.where(firm, 0, K1) / jnp.where(firm | (pot == 0), 1, pot)
+    return jnp.where(firm, 1 / (1 + pot / jnp.where(firm, K1, 1)), ratio / (1 + ratio))
+
+
+@eqx.filter_jit
+def _frequency_response(model, omega):
+    pot = response(model.alpha, omega * model.T, model.span)
+    return model.K0.astype(pot.dtype) + series(model.K1, model.beta.astype(pot.dtype) * pot)
+
+
+@eqx.filter_jit
+def _force(model, x, start, unilateral, block):
+    beta = model.beta
+    gain, stiffness = share(model.K1, beta), series(model.K1, beta)
+    x = jnp.maximum(x, 0) if unilateral else x
+    before = jnp.zeros_like(beta)
+    if start == "equilibrium":
+        before = x[0] * share(model.K1, beta * sums(model.alpha, model.span).at_dc)
+    past = past_of(model.alpha, gain, share(beta, model.K1), x, before, model.span, block)
+    force = model.K0 * x + stiffness * (x - past)
+    return jnp.maximum(force, 0) if unilateral else force
+
+
+@eqx.filter_jit
+def _position(model, F, start, block):
+    beta = model.beta
+    gain, stiffness = share(model.K1, beta), series(model.K1, beta)
+    total = model.K0 + stiffness
+    before = jnp.zeros_like(beta)
+    if start == "equilibrium":
+        before = F[0] / model.dc_gain() * share(model.K1, beta * sums(model.alpha, model.span).at_dc)
+    past = past_of(model.alpha, gain / total, 1 - gain * model.K0 / total, F, before, model.span, block)
+    return (F + stiffness * past) / total
+
+
+@eqx.filter_jit
+def _short_settling(model, fraction):
+    """First sample n with s_n >= fraction·s_inf after a unit step: the force relaxes as s grows, and s only grows."""
+    beta, found = model.beta, sums(model.alpha, model.span)
+    gain, feedback = share(model.K1, beta), share(beta, model.K1)
+    goal = fraction * (1 - found.at_dc) * share(model.K1, beta * found.at_dc)
+    taps = -gl_coefficients(model.alpha, model.N)[1:]
+
+    def unfinished(carry):
+        n, past, _ = carry
+        return (past < goal) & (n < _LONGEST_RELAXATION)
+
+    def step(carry):
+        n, past, history = carry
+        history = jnp.concatenate([(gain + feedback * past)[None], history[:-1]])
+        return n + 1, taps @ history, history
+
+    n, past, _ = jax.lax.while_loop(unfinished, step, (0, jnp.zeros_like(beta), jnp.zeros_like(taps)))
+    return jnp.where(past < goal, jnp.inf, model.T * n)
+
+
+@eqx.filter_jit
+def _full_settling(model, fraction):
+    """z with E_α(-z) = 1 - fraction by bisection of log z, and the time it stands for."""
+
+    def halve(_, ends):
+        low, high = ends
+        middle = (low + high) / 2
+        late = mittag_leffler(model.alpha, jnp.exp(middle)) < 1 - fraction
+        return jnp.where(late, low, middle), jnp.where(late, middle, high)
+
+    widest = jnp.asarray(80, fraction.dtype)
+    log_z, _ = jax.lax.fori_loop(0, 60, halve, (-widest, widest))
+    return jnp.where(fraction > 0, jnp.exp((log_z + jnp.log(model.B1) - jnp.log(model.K1)) / model.alpha), 0)
+
+
+def _check_values(K0, K1, B1, alpha, memory):
+    if not 0 < alpha <= 1:
+        raise InputError(f"alpha is {alpha}, it must be above 0 and at most 1: the order of the fractional element.")
+    for name, value, most in (("K1", K1, math.inf), ("B1", B1, math.nextafter(math.inf, 0))):
+        if not 0 <= value <= most:
+            raise InputError(f"{name} is {value}, it must be 0 or above.")
+    if not math.isfinite(K0):
+        raise InputError(f"K0 is {K0}, it must be a finite number.")
+    if memory == "full" and K0 < 0:
+        raise InputError(
+            f"K0 is {K0}, it must be 0 or above with full memory, where it is the static stiffness; a set with a "
+            'negative K0 was identified with short memory: use memory = "short" and the N it belongs to.'
+        )

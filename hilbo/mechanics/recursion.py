@@ -1,0 +1,102 @@
+"""One history driven by one input: y_n = a·u_n + ρ·s_n, where s_n is what the past of y contributes.
+
+Position and force drive the FO-SLS through the same recursion, with another a and ρ (see `viscoelastic`). With c_0 = 1
+
+    short memory:  s_n = Σ_{i=1..N} |c_i|·y_{n-i}                          state: the last N values of y
+    full memory:   s_n = Σ_k p_k·m_k,  m_k <- λ_k·m_k + (1 - λ_k)·y_{n-1}  state: one fading mean for each exponential
+
+Both are linear, so that m samples are two matrix products: with the impulse response d of 1/(1 - ρ·Σ|c_i|z^{-i}),
+its lower triangular Toeplitz matrix D, and the rows M that carry the state at the start of a block on to each sample,
+
+    s = D·M·state + (D - 1)/ρ · a·u,
+
+in which every term is positive where a, ρ and u are. That is the same sum in another order, many times faster than
+sample by sample, which is the recursion that a device runs (m = 1).
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hilbo.mechanics.exponentials import exponentials
+from hilbo.mechanics.memory import Span, gl_coefficients
+
+__all__ = ["BLOCK", "past_of"]
+
+BLOCK = 32
+"""Samples at once."""
+
+
+def past_of(
+    alpha: Float[Array, ""],
+    gain: Float[Array, ""],
+    feedback: Float[Array, ""],
+    u: Float[Array, " n"],
+    before: Float[Array, ""],
+    span: Span,
+    block: int = BLOCK,
+) -> Float[Array, " n"]:
+    """s_n at every sample, for a history that has been at y = `before` for ever.
+
+    `gain` is a, `feedback` is ρ. `block` changes nothing but speed and rounding; 1 is the plain recursion.
+    """
+    blocks = -(-u.shape[0] // block)
+    driven = gain * jnp.zeros(blocks * block, u.dtype).at[: u.shape[0]].set(u).reshape(blocks, block)
+    describe = _taps if span.memory == "short" else _means
+    taps, carry, write, state = describe(alpha, before, span, block)
+    impulse, echo = _impulse(taps, feedback)
+    carry = _toeplitz(impulse) @ carry
+
+    def advance(state, inputs):
+        own, driven = inputs
+        past = carry @ state + own
+        return write(state, driven + feedback * past), past
+
+    _, past = jax.lax.scan(advance, state, (driven @ _toeplitz(echo).T, driven))
+    return past.reshape(-1)[: u.shape[0]]
+
+
+def _taps(alpha, before, span, block):
+    """Taps |c_1| … |c_m|; the last values of y, the newest last, how they act on a block, and how they move on."""
+    N, length = span.N, max(span.N, block)
+    taps = jnp.zeros(length + block, alpha.dtype).at[:N].set(-gl_coefficients(alpha, N)[1:])
+    delay = jnp.arange(block)[:, None] + length - jnp.arange(length)[None, :]
+
+    def write(state, y):
+        return jnp.concatenate([state[block:], y])
+
+    return taps[:block], taps[delay - 1], write, jnp.full(length, before)
+
+
+def _means(alpha, before, span, block):
+    """The same for exponentials: |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
+    weight, loss = exponentials(alpha, span.states)
+    # As products, which have derivatives at λ = 0.
+    powers = jnp.cumprod(jnp.concatenate([jnp.ones_like(loss)[None], jnp.tile(1 - loss, (block - 1, 1))]), axis=0)
+    carry, entry = weight[None, :] * powers, loss[:, None] * powers[::-1].T
+    decay = jnp.sum(entry, axis=1)  # 1 - λ^m, with all its digits where λ is close to 1
+
+    def write(state, y):
+        return state + (entry @ y - decay * state)
+
+    return carry @ loss, carry, write, jnp.full(span.states, before)
+
+
+def _impulse(taps, feedback):
+    """d_0 … d_{m-1}, and (d - 1)/ρ = Σ |c_i| d_{j-i}, which is the echo of an input in s."""
+
+    def add(backwards, _):
+        echo = taps @ backwards
+        now = feedback * echo
+        return jnp.concatenate([now[None], backwards[:-1]]), (now, echo)
+
+    start = jnp.zeros_like(taps).at[0].set(1)
+    _, (later, echo) = jax.lax.scan(add, start, length=taps.shape[0] - 1)
+    return jnp.concatenate([jnp.ones_like(taps[:1]), later]), jnp.concatenate([jnp.zeros_like(taps[:1]), echo])
+
+
+def _toeplitz(column):
+    """Lower triangular matrix with this first column."""
+    size = column.shape[0]
+    delay = jnp.arange(size)[:, None] - jnp.arange(size)[None, :]
+    return jnp.where(delay >= 0, column[jnp.maximum(delay, 0)], 0)

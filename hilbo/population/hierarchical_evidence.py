@@ -1,0 +1,112 @@
+"""Hyperparameters of the hierarchical model by maximum evidence: length scales, variance, thresholds and the share.
+
+All people's answers count together (`counts.evidence`): the prior variance of one person's function, of which the
+share p is common to all, the inverse squared lengths theta and the thresholds are learnt, in units of the
+classification noise, which stays as it is (the scale of f is free). With the share held at 1 this is the pooled
+model's evidence, at 0 the sum of everybody's own. The search is L-BFGS on exact gradients, in the coordinates
+log theta, log variance, log noise, first threshold, log gaps, logit p.
+"""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.flatten_util
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy.optimize import minimize
+
+from hilbo.kernels import RBF
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.ordinal_gp import OrdinalGP
+from hilbo.population.counts import Counts, evidence
+
+__all__ = ["LearntPeople", "learn_people"]
+
+_REFUSED = 1e3  # per answer: more than any answers cost
+_REACH = 7.0  # coordinates stay so far from where they began: a factor of 1,100
+
+
+class LearntPeople(eqx.Module):
+    """A model of one person, the share that people have in common, and how the search for them ended."""
+
+    gp: OrdinalGP
+    share: Float[Array, ""]
+    log_evidence: Float[Array, ""]
+    steps: int = eqx.field(static=True)
+    converged: Bool[Array, ""]
+    """The search ended by itself, and the fit at its end held its certificate."""
+
+
+def learn_people(
+    gp: OrdinalGP,
+    answers: Counts,
+    share: float = 0.8,
+    *,
+    learn: Sequence[str] = ("theta", "variance", "thresholds", "share"),
+    max_steps: int = 60,
+    tolerance: float = 1e-6,
+) -> LearntPeople:
+    """The hyperparameters under which all answers are most probable, from the values of `gp` and `share` on.
+
+    **Arguments:** `learn`: which of "theta" (as many as `gp` has), "variance", "noise", "thresholds" and "share";
+    `tolerance`: of the log evidence per answer, at which the search ends.
+    """
+    count = float(jnp.sum(answers.counts))
+    begin = {name: value for name, value in _coordinates(gp, share).items() if name in _fields(learn)}
+    flat, rebuild = jax.flatten_util.ravel_pytree(begin)
+    held = jnp.asarray(share, flat.dtype)  # an array: another number is no other function to compile
+
+    def cost(z):
+        value, slope, good = _cost(jnp.asarray(z, flat.dtype), rebuild, gp, held, answers)
+        if not good:  # no mode, no evidence: the line search is to turn back
+            return _REFUSED, np.zeros(len(z))
+        return float(value) / count, np.asarray(slope, float) / count
+
+    start = np.asarray(flat, float)
+    bounds = [(z - _REACH, z + _REACH) for z in start]
+    options = {"maxiter": max_steps, "ftol": tolerance, "gtol": 1e-6}
+    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    best = jnp.asarray(found.x, flat.dtype)
+    value, _, good = _cost(best, rebuild, gp, held, answers)
+    model, part = _model(rebuild(best), gp, held)
+    return LearntPeople(model, part, -value, int(found.nit), jnp.asarray(bool(found.success) and bool(good)))
+
+
+@eqx.filter_jit
+def _cost(z, rebuild, gp, share, answers):
+    def value(z):
+        model, part = _model(rebuild(z), gp, share)
+        found, arrived = evidence(model, part, answers)
+        return -found, arrived
+
+    (found, arrived), slope = jax.value_and_grad(value, has_aux=True)(z)
+    return found, slope, arrived & jnp.isfinite(found) & jnp.all(jnp.isfinite(slope))
+
+
+def _fields(learn):
+    return {field for name in learn for field in ({"first", "gaps"} if name == "thresholds" else {name})}
+
+
+def _coordinates(gp, share):
+    thresholds, inner = gp.likelihood.thresholds, min(max(share, 1e-3), 1 - 1e-3)
+    return {
+        "theta": jnp.log(gp.kernel.theta),
+        "variance": jnp.log(gp.kernel.variance),
+        "noise": jnp.log(gp.likelihood.noise),
+        "first": thresholds[0],
+        "gaps": jnp.log(jnp.diff(thresholds)),
+        "share": jnp.asarray(np.log(inner / (1 - inner)), thresholds.dtype),
+    }
+
+
+def _model(z, gp, share):
+    positive = {"theta": gp.kernel.theta, "variance": gp.kernel.variance, "noise": gp.likelihood.noise}
+    positive |= {name: jnp.exp(z[name]) for name in positive if name in z}
+    thresholds = gp.likelihood.thresholds
+    if "first" in z:
+        thresholds = jnp.cumsum(jnp.concatenate([z["first"][None], jnp.exp(z["gaps"])]))
+    part = jax.nn.sigmoid(z["share"]) if "share" in z else jnp.asarray(share, thresholds.dtype)
+    model = OrdinalGP(RBF(positive["theta"], positive["variance"]), OrdinalProbit(thresholds, positive["noise"]))
+    return model, part

@@ -1,0 +1,233 @@
+"""A cohort's population map by any rule, as one record that predicts; and what the answers say of how people differ.
+
+Rules of `pointwise` merge everybody's own posterior point by point. Three rules look at the answers themselves:
+
+* `hierarchical`, where the answers are few enough: the posterior of the shared function g, exact (`hierarchical`, or
+  `counts` where people answered the same stimuli); point by point otherwise, at the committee's cost.
+* `pooled`: the same with a share of 1, one function for all.
+* `grbcm`: the communication set are answers evenly chosen from everybody's, as many as one person gave; each expert
+  has them and their own.
+
+The share that people have in common is learnt by evidence, from an even choice of people if there are many, and its
+posterior mean is used: the most probable share may be 0 or 1, where nothing, or everything, would be common.
+"""
+
+from typing import Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.population import pointwise
+from hilbo.population.counts import Counts, counts_of, evidence, fit_counts, one_person
+from hilbo.population.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
+
+__all__ = ["ALL_RULES", "LARGEST_EXACT", "AnyRule", "RuleMap", "even_choice", "point_rule", "rule_map", "share_of"]
+
+AnyRule = Literal[pointwise.Rule, "grbcm", "pooled"]
+ALL_RULES: tuple[AnyRule, ...] = (*get_args(pointwise.Rule), "grbcm", "pooled")
+
+LARGEST_EXACT = 1500
+"""Answers, or latent values, up to which the exact models are used: they are cubic in their number."""
+_SHARE = 600  # answers from which the share is learnt
+
+
+class RuleMap(eqx.Module):
+    """The population map by one rule: predicts at points of the unit cube."""
+
+    rule: str = eqx.field(static=True)
+    method: str = eqx.field(static=True)
+    """ "by points" from everybody's posterior, or "exact" from all answers at once."""
+    experts: Posterior | None
+    """Stacked, one for each person; of grbcm, with the communication set."""
+    shared: Posterior | None
+    """Of the shared function g, or from the communication set alone."""
+    share: Float[Array, ""]
+    prior: Float[Array, ""]
+    """Prior variance of one person's function."""
+
+    def predict(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of the map at points (m, d)."""
+        if self.method == "exact":
+            assert self.shared is not None
+            return self.shared.predict(x)
+        means, explained = jax.vmap(lambda person: person.predict_explained(x))(self.experts)
+        if self.rule == "grbcm":
+            assert self.shared is not None
+            return pointwise.grbcm(self.shared.predict(x), means, self.prior - explained)
+        share = self.share if self.rule == "hierarchical" else None
+        return pointwise.aggregate(self.rule, means, explained, self.prior, share=share)  # type: ignore[arg-type]
+
+    @property
+    def apart(self) -> Float[Array, ""]:
+        """Variance of one person's function about the map's: only the hierarchical model says that people differ."""
+        return (1.0 - self.share) * self.prior
+
+    @property
+    def map_prior(self) -> Float[Array, ""]:
+        """Variance of the map where nobody answered, against which its own tells what the answers say."""
+        if self.rule in ("poe", "average"):
+            return self.prior / jax.tree.leaves(self.experts)[0].shape[0]
+        return self.share * self.prior
+
+    def newcomer(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of a new person's function, of which answers are foretold."""
+        mean, variance = self.predict(x)
+        return mean, variance + self.apart
+
+
+def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[pointwise.Rule, Float[Array, ""] | None]:
+    """By which rule, and with which share, everybody's posteriors are merged point by point in place of a map: by the
+    same rule, or by bcm where the rule takes all answers at once."""
+    if rule not in pointwise.RULES:
+        return "bcm", None
+    return rule, share if rule == "hierarchical" else None  # type: ignore[return-value]
+
+
+def rule_map(
+    gp: OrdinalGP,
+    trials: Trials,
+    rule: str,
+    *,
+    posteriors: Posterior | None = None,
+    share: Float[Array, ""] | None = None,
+    inference: str = "laplace",
+    largest: int = LARGEST_EXACT,
+) -> RuleMap:
+    """The map by a rule of `ALL_RULES` from stacked trials (M, n).
+
+    **Arguments:** `posteriors`: everybody's own, if they are there; `share`: of the hierarchical rule, else learnt by
+    `share_of`; `largest`: exact models are used up to so many latent values. Raises InputError for what a rule cannot
+    do with these answers.
+    """
+    if rule not in ALL_RULES:
+        raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
+    prior = jnp.asarray(gp.kernel.variance)
+    one = jnp.ones_like(prior)
+    if rule == "hierarchical":
+        part = jnp.asarray(share_of(gp, trials, inference).mean if share is None else share, prior.dtype)
+        shared = _together(gp, trials, part, inference, largest)
+        if shared is not None:
+            return RuleMap(rule, "exact", None, shared, part, prior)
+    else:
+        part, shared = one, None
+    if rule == "pooled":
+        shared = _together(gp, trials, one, inference, largest)
+        if shared is None:
+            answers, people = int(np.asarray(trials.mask).sum()), trials.mask.shape[0]
+            raise InputError(
+                f'The rule "pooled" fits one model to all answers at once, and {answers:,} of {people:,} people are too'
+                ' many; use "bcm", "hierarchical" or another rule that merges people point by point.'
+            )
+        return RuleMap(rule, "exact", None, shared, one, prior)
+    if rule == "grbcm":
+        return RuleMap(rule, "by points", *_communicating(gp, trials, inference), one, prior)
+    if posteriors is None:
+        posteriors = _experts(gp, trials, inference)
+    return RuleMap(rule, "by points", posteriors, None, part, prior)
+
+
+def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest: int = _SHARE) -> Share:
+    """The posterior of the share that people have in common; from an even choice of people where there are many."""
+    answered = np.flatnonzero(np.asarray(trials.mask).any(axis=1))
+    if len(answered) < 2:
+        raise InputError(
+            'The rule "hierarchical" learns how people differ, and only'
+            f' {len(answered)} of them gave an answer; use "bcm", whose map is then that person\'s.'
+        )
+    inference = "ep" if inference == "exact" else inference
+    trials = even_choice(jax.tree.map(lambda leaf: leaf[answered], trials), largest)
+    counts = _counts(gp, trials, inference)
+    if counts is None:
+        return learn_share(gp, of_people(trials), inference=inference)
+    return share_from(lambda shares: _curve(gp, counts, shares), trials.x.dtype)
+
+
+def even_choice(trials: Trials, largest: int) -> Trials:
+    """The people themselves, or so many of them, evenly chosen and at least two, that their answers are not more."""
+    answers = int(np.asarray(trials.mask).sum())
+    people = trials.mask.shape[0]
+    count = people if answers <= largest else max(2, int(people * largest / answers))
+    rows = np.unique(np.linspace(0, people - 1, count).round().astype(int))
+    return jax.tree.map(lambda leaf: leaf[rows], trials)
+
+
+@eqx.filter_jit
+def _curve(gp, counts, shares):
+    return jax.lax.map(lambda share: evidence(gp, share, counts), shares)
+
+
+def _experts(gp, trials, inference) -> Posterior:
+    """Everybody's own posterior, stacked; from counts where many answers are at the same points."""
+    if inference == "laplace":
+        counts = counts_of(trials, gp.likelihood.categories)
+        if 2 * counts.x.shape[0] < trials.mask.shape[1]:
+            return _counted(gp, counts)
+    return _fitted(gp, trials, inference)
+
+
+@eqx.filter_jit
+def _counted(gp, counts):
+    one = jnp.ones_like(gp.kernel.variance)
+    return jax.lax.map(lambda own: fit_counts(gp, one, Counts(counts.x, own[None])), counts.counts)
+
+
+@eqx.filter_jit
+def _fitted(gp, trials, inference):
+    return jax.vmap(lambda person: fit(gp, person, inference=inference, throw=False))(trials)
+
+
+def _counts(gp, trials, inference) -> Counts | None:
+    """The answers as counts, where that is Laplace's model of them and the cheaper form of it."""
+    if inference != "laplace":
+        return None
+    answers = int(np.asarray(trials.mask).sum())
+    found = counts_of(trials, gp.likelihood.categories)
+    return found if 4 * found.people * found.x.shape[0] ** 3 < answers**3 else None
+
+
+def _together(gp, trials, share, inference, largest) -> Posterior | None:
+    """The shared function's posterior from all answers at once; None if they are too many."""
+    counts = _counts(gp, trials, inference)
+    if counts is not None and counts.people * counts.x.shape[0] ** 3 <= largest**3:
+        found = fit_counts(gp, share, counts if float(share) < 1 else one_person(counts))
+        if bool(found.certificate.converged):
+            return found
+    if inference == "exact" or int(np.asarray(trials.mask).sum()) > largest:
+        return None
+    return shared_posterior(fit_people(gp, of_people(trials), share, inference=inference, throw=False))
+
+
+def _communicating(gp, trials, inference) -> tuple[Posterior, Posterior]:
+    """Experts of grbcm, with the communication set besides their own answers, and that set's posterior."""
+    mask = np.asarray(trials.mask)
+    person, row = np.nonzero(mask)
+    size = max(1, round(len(row) / max(int(mask.any(axis=1).sum()), 1)))
+    if len(row) < 2 or not mask.any(axis=1).all():
+        raise InputError(
+            'The rule "grbcm" needs answers of everybody, and of two people at least; leave out who gave none, or use'
+            ' "rbcm".'
+        )
+    chosen = np.unique(np.linspace(0, len(row) - 1, size).round().astype(int))
+    at = person[chosen], row[chosen]
+    common = Trials(trials.x[at], trials.q[at], jnp.ones(len(chosen), bool))
+    people = mask.shape[0]
+    own = trials.mask & ~jnp.asarray(_at(mask.shape, *at))  # nobody's answer counts twice
+
+    def beside(shared, each):
+        return jnp.concatenate([jnp.broadcast_to(shared[None], (people, *shared.shape)), each], axis=1)
+
+    grown = jax.vmap(Trials)(beside(common.x, trials.x), beside(common.q, trials.q), beside(common.mask, own))
+    alone = jax.tree.map(lambda leaf: leaf[None], common)
+    shared = jax.tree.map(lambda leaf: leaf[0], _experts(gp, alone, inference))
+    return _experts(gp, grown, inference), shared
+
+
+def _at(shape, person, row):
+    taken = np.zeros(shape, bool)
+    taken[person, row] = True
+    return taken

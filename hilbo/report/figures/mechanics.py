@@ -1,0 +1,221 @@
+"""Figures of the mechanics: tests and fits, the price of short memory, passivity, the passive set, frequency response.
+
+Like `maps`: a figure is a function from results to a matplotlib `Figure`, with axes in physical units.
+"""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+
+from hilbo import passivity
+from hilbo.identification.characterise import Characterisation
+from hilbo.identification.fitting import Fit, Test
+from hilbo.identification.memory_selection import LIMIT, Row
+from hilbo.report.figures.maps import BLUE, GREEN, GREY, ORANGE, RED, STYLE
+from hilbo.viscoelastic import FOSLS
+
+__all__ = ["bode_figure", "curves_figure", "memory_figure", "passive_set_figure", "passivity_figure", "predicted"]
+
+_LABELS = {
+    "relaxation": ("time (s)", "force (N)"),
+    "creep": ("time (s)", "position (mm)"),
+    "modulus": ("time (s)", "relaxation modulus ({})"),
+    "compliance": ("time (s)", "creep compliance (1/{})"),
+}
+_LINES = ((ORANGE, "-."), (GREEN, "--"), (RED, ":"), ("#CC79A7", "--"), ("black", ":"), ("#56B4E9", "-."))
+
+
+def predicted(found: Fit, kind: str) -> np.ndarray:
+    """The fit's curve of one kind of test, at its times."""
+    place = [c.kind for c in found.curves].index(kind)
+    return np.asarray(found.model.predict(found.q, found.curves[place], found.weights[place]))
+
+
+def curves_figure(
+    tests: Sequence[Test],
+    result: Characterisation,
+    unit: str = "N/mm",
+    shown: Sequence[int | None] = (2, 25, 201, None),
+) -> Figure:
+    """Above: mean and ± sd of the repeats, the fit, and fits with other memories; below: what each leaves over."""
+    others = [row for row in result.rows if row.N in shown and getattr(result.fit.model, "N", None) != row.N]
+    lines = [
+        (row.fit, colour, dash, 0.9, "full memory" if row.N is None else f"N = {row.N}")
+        for row, (colour, dash) in zip(others, _LINES, strict=False)
+    ]
+    lines.append((result.fit, BLUE, "-", 1.4, _fit_name(result.fit)))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(3.7 * max(len(tests), 1.35), 4.8), layout="constrained")
+        panels = figure.subplots(2, len(tests), sharex="col", squeeze=False, height_ratios=(3, 2))
+        for (upper, lower), test in zip(panels.T, tests, strict=True):
+            _measured(upper, test)
+            lower.axhline(0, color=GREY, linewidth=0.6)
+            for found, colour, dash, width, name in lines:
+                curve = predicted(found, test.kind)
+                upper.plot(test.time, curve, color=colour, linestyle=dash, linewidth=width, label=name)
+                left = test.output.mean(axis=0) - curve
+                lower.plot(test.time, left, color=colour, linestyle=dash, linewidth=0.6 * width)
+            if test.input is None:
+                upper.set(xscale="log", yscale="log")
+            elif test.kind == "relaxation":
+                upper.set(xscale="log", xlim=(test.time[1], test.time[-1]))
+            upper.set(title=test.kind, ylabel=_LABELS[test.kind][1].format(unit))
+            lower.set(xlabel="time (s)", ylabel="measured - fit")
+        figure.legend(*upper.get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def _measured(axes, test):
+    mean = test.output.mean(axis=0)
+    if test.repeats > 1:
+        sd = test.output.std(axis=0, ddof=1)
+        label = f"measured, mean ± sd of {test.repeats}"
+        axes.fill_between(test.time, mean - sd, mean + sd, color=GREY, alpha=0.3, linewidth=0, label=label)
+        axes.plot(test.time, mean, color=GREY, linewidth=0.8)
+    else:
+        axes.plot(test.time, mean, ".", color=GREY, markersize=2, label="measured")
+
+
+def _fit_name(found):
+    model = found.model
+    if getattr(model, "memory", None) == "short":
+        return f"fit, N = {int(model.N)}"
+    return "fit, full memory" if hasattr(model, "memory") else "fit"
+
+
+def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
+    """Error of the best fit against the number of taps, test by test; full memory as a level line."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.0, 2.9), layout="constrained")
+        axes = figure.subplots()
+        taps = [(row.N, row.nrmse) for row in rows if row.N is not None]
+        for (kind, colour), marker in zip((("relaxation", BLUE), ("creep", ORANGE)), "os", strict=True):
+            if kind not in rows[0].nrmse:
+                continue
+            axes.plot(
+                [N for N, _ in taps],
+                [100 * errors[kind] for _, errors in taps],
+                marker=marker,
+                color=colour,
+                label=kind,
+            )
+            for row in rows:
+                if row.N is None:
+                    axes.axhline(100 * row.nrmse[kind], color=colour, linestyle=":", label=f"{kind}, full memory")
+        axes.axhline(100 * limit, color=GREY, linewidth=0.8, linestyle="--", label=f"{100 * limit:g} %")
+        axes.set(xscale="log", yscale="log", xlabel="past samples N", ylabel="NRMSE of the best fit (%)")
+        axes.set_xticks([N for N, _ in taps], [str(N) for N, _ in taps])
+        low, high = axes.get_ylim()
+        ticks = [t for t in (0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 50) if low <= t <= high]
+        axes.set_yticks(ticks, [f"{t:g}" for t in ticks])
+        axes.minorticks_off()
+        axes.legend(frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    return figure
+
+
+def _needed(model, count=600):
+    """Frequencies (Hz), the damping they ask for (N·s/m), and the curve whose real part that is."""
+    omega = np.geomspace(2 * np.pi * 0.5, np.pi / model.T, count)
+    response = np.asarray(model.frequency_response(jnp.asarray(omega)))
+    cotangent = np.tan((np.pi - omega * model.T) / 2)
+    return omega / (2 * np.pi), 500 * model.T * (1 + 1j * cotangent) * response
+
+
+def passivity_figure(model: FOSLS, b: float) -> Figure:
+    """Left: Nyquist-type plot of (T/2)(1 + j cot(ωT/2))·H, which must stay left of b. Right: its real part over f."""
+    frequency, curve = _needed(model)
+    worst = int(np.argmax(curve.real))
+    margin, most = b - curve.real[worst], max(b, curve.real[worst])
+    colour, word = (GREEN, "margin") if margin >= 0 else (RED, "lacking")
+    near = curve.real > -2 * most  # far to the left, in slow motion, nothing is decided
+    frequency, near_curve = frequency[near], curve[near]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, 3.2), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        left.plot(near_curve.real, near_curve.imag, color=BLUE)
+        left.plot(curve.real[worst], curve.imag[worst], "o", color=colour, markersize=5, clip_on=False)
+        left.axvline(b, color="black", linewidth=1)
+        left.axvspan(b, 1.5 * most, color=GREY, alpha=0.2, linewidth=0)
+        left.set(xlim=(-2 * most, 1.5 * most), ylim=(0, None))
+        left.set(xlabel="real part: damping needed (N·s/m)", ylabel="imaginary part (N·s/m)")
+        left.set_title("passive if the curve stays left of the device's b")
+        right.semilogx(frequency, near_curve.real, color=BLUE, label="needed by the rendering")
+        right.axhline(b, color="black", linewidth=1, label=f"device, b = {b:.4g} N·s/m")
+        at = frequency[int(np.argmax(near_curve.real))]
+        right.plot([at, at], [b, curve.real[worst]], color=colour, linewidth=2.5)
+        right.plot(at, curve.real[worst], "o", color=colour, markersize=5, clip_on=False)
+        right.set(xlabel="frequency (Hz)", ylabel="damping (N·s/m)", ylim=(-2 * most, 1.5 * most))
+        right.set_title(f"{word} {abs(margin):.3f} N·s/m at {at:.0f} Hz")
+        right.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        right.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+        right.xaxis.set_minor_formatter(NullFormatter())
+        right.legend(frameon=False, loc="lower right")
+    return figure
+
+
+def passive_set_figure(model: FOSLS, b: float, K_eff: float) -> Figure:
+    """Largest passive K1 over (B1, α) of the paper's box, and slices of the passive set through it; odd N or full."""
+    B1, alpha = np.geomspace(0.1, 32, 121), np.linspace(0.01, 0.99, 121)
+    limit = np.asarray(_largest(model, B1[None, :], alpha[:, None], b, K_eff))
+    own = float(model.B1), float(model.alpha), float(model.K1)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, 3.2), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        shown = np.clip(limit, 1, 32)
+        picture = left.pcolormesh(
+            B1, alpha, np.where(limit < 1, np.nan, shown), cmap="cividis", vmin=1, vmax=32, rasterized=True
+        )
+        figure.colorbar(picture, ax=left, label="largest passive $K_1$ (N/mm; 32: the box)")
+        left.plot(own[0], own[1], "*", color=RED, markersize=12, markeredgecolor="white")
+        left.set(xscale="log", xlabel="$B_1$ (N·s$^α$/mm)", ylabel="α", xlim=(0.1, 32))
+        left.set_title("white: no $K_1$ from 1 N/mm up is passive")
+        for order, (colour, dash) in zip(
+            (0.1, own[1], 0.35, 0.6), ((ORANGE, "--"), (BLUE, "-"), (GREEN, "-."), (GREY, ":")), strict=True
+        ):
+            line = np.asarray(_largest(model, B1, np.full_like(B1, order), b, K_eff))
+            width = 2.0 if order == own[1] else 1.2
+            right.plot(
+                B1, np.minimum(line, 64), color=colour, linestyle=dash, linewidth=width, label=f"α = {order:.3g}"
+            )
+        right.plot(own[0], own[2], "*", color=RED, markersize=12, markeredgecolor="white", label="this set")
+        right.set(xscale="log", xlabel="$B_1$ (N·s$^α$/mm)", ylabel="$K_1$ (N/mm)", xlim=(0.1, 32), ylim=(0, 32))
+        right.set_title(f"passive below the line; b = {b:g} N·s/m")
+        right.legend(frameon=False)
+        for axes in (left, right):
+            axes.xaxis.set_major_formatter(FormatStrFormatter("%g"))
+    return figure
+
+
+def _largest(model, B1, alpha, b, K_eff):
+    return passivity.largest_K1(B1, alpha, b, K_eff, model.N, model.T, memory=model.memory)
+
+
+def bode_figure(model: FOSLS) -> Figure:
+    """Magnitude and phase of the rendering, beside the continuous model with the same parameters (which may differ)."""
+    omega = np.geomspace(2 * np.pi * 0.05, np.pi / model.T, 400)
+    frequency = omega / (2 * np.pi)
+    both = {
+        f"rendered, {'full memory' if model.memory == 'full' else f'N = {model.N}'}": (
+            model.frequency_response,
+            BLUE,
+            "-",
+        ),
+        "continuous, same parameters": (model.continuous_response, ORANGE, "--"),
+    }
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.6, 4.0), layout="constrained")
+        upper, lower = figure.subplots(2, 1, sharex=True)
+        for name, (function, colour, dash) in both.items():
+            response = np.asarray(function(jnp.asarray(omega)))
+            upper.loglog(frequency, np.abs(response), color=colour, linestyle=dash, label=name)
+            lower.semilogx(frequency, np.degrees(np.unwrap(np.angle(response))), color=colour, linestyle=dash)
+        upper.set(ylabel="|H| (N/mm)")
+        upper.yaxis.set_major_formatter(FormatStrFormatter("%g"))
+        upper.yaxis.set_minor_formatter(FormatStrFormatter("%g"))
+        lower.set(xlabel="frequency (Hz)", ylabel="phase (°)")
+        upper.legend(frameon=False)
+    return figure

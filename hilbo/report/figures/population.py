@@ -1,0 +1,98 @@
+"""Figures of how people are merged: the rules side by side, and how much of the space the answers cover."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from hilbo.report.figures.maps import BLUE, GREY, ORANGE, STYLE
+from hilbo.study.config import Study
+
+__all__ = ["coverage_figure", "reliability_figure", "rules_figure"]
+
+_CELLS = 61
+
+
+def rules_figure(content: dict[str, Any]) -> Figure:
+    """How every rule predicts people left out: density (lower is better), and the share within the central 95 %."""
+    rules = {rule: found for rule, found in content["rules"].items() if "negative_log_density" in found}
+    order = sorted(rules, key=lambda rule: -rules[rule]["negative_log_density"])
+    rows = np.arange(len(order))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 1.0 + 0.26 * len(order)), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        for axes, key, scale in ((left, "negative_log_density", 1.0), (right, "central_95", 100.0)):
+            values = np.array([scale * rules[rule][key] for rule in order])
+            errors = np.array([scale * rules[rule][f"{key}_error"] for rule in order])
+            axes.errorbar(values, rows, xerr=errors, fmt="o", color=BLUE, ecolor=GREY, markersize=4, linewidth=1)
+        right.axvline(95, color=ORANGE, linewidth=1)
+        left.set_yticks(rows, order)
+        left.set_xlabel("mean negative log density of held-out answers")
+        right.set_xlabel("within the central 95 % (%)")
+    return figure
+
+
+def reliability_figure(content: dict[str, Any], rules: tuple[str, ...] = ("bcm", "hierarchical")) -> Figure:
+    """Predicted probabilities of categories against how often they were chosen, for two rules."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(3.2, 3.0), layout="constrained")
+        axes = figure.subplots()
+        axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
+        for rule, colour, marker in zip(rules, (ORANGE, BLUE), ("s", "o"), strict=True):
+            bins = content["rules"].get(rule, {}).get("reliability", [])
+            axes.plot(
+                [b["predicted"] for b in bins],
+                [b["observed"] for b in bins],
+                color=colour,
+                marker=marker,
+                markersize=4,
+                linewidth=1,
+                label=rule,
+            )
+        axes.set(
+            xlabel="predicted probability of a category", ylabel="how often it was chosen", xlim=(0, 1), ylim=(0, 1)
+        )
+        axes.legend(frameon=False)
+    return figure
+
+
+def coverage_figure(
+    study: Study, predict: Callable[..., Any], at: Float[np.ndarray, " d"], prior: float, known: float = 0.8
+) -> Figure:
+    """The map's standard deviation over what it is without answers (of variance `prior`), on the slice of the first two
+    parameters through `at`; hatched where it is above `known`: nobody's answers say much there."""
+    parameters = study.space.parameters
+    side = np.linspace(0.0, 1.0, _CELLS)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.2, 3.2), layout="constrained")
+        axes = figure.subplots()
+        if len(parameters) == 1:
+            ratio = np.sqrt(np.asarray(predict(jnp.asarray(side[:, None]))[1]) / prior)
+            along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
+            axes.plot(along, ratio, color=BLUE)
+            axes.fill_between(along, 0, 1, where=ratio > known, hatch="///", facecolor="none", edgecolor=GREY)
+            axes.set(ylabel="sd of the map, over that without answers", ylim=(0, 1.05))
+        else:
+            grid = np.tile(np.asarray(at), (_CELLS, _CELLS, 1))
+            grid[..., 0], grid[..., 1] = np.meshgrid(side, side, indexing="ij")
+            flat = grid.reshape(-1, len(parameters))
+            ratio = np.sqrt(np.asarray(predict(jnp.asarray(flat))[1]) / prior).reshape(_CELLS, _CELLS)
+            feasible = np.asarray(study.space.feasible(flat)).reshape(_CELLS, _CELLS)
+            ratio = np.where(feasible, ratio, np.nan)
+            sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
+            shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud")
+            axes.contourf(*sides, ratio.T, levels=[known, 10.0], hatches=["///"], colors="none")
+            figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
+            for axis, p in zip((axes.set_xscale, axes.set_yscale), parameters[:2], strict=True):
+                axis(p.scale)
+            axes.set_ylabel(_head(parameters[1]))
+        axes.set_xlabel(_head(parameters[0]))
+    return figure
+
+
+def _head(parameter):
+    return f"{parameter.name} ({parameter.unit})" if parameter.unit else parameter.name

@@ -1,0 +1,49 @@
+"""The figure of `hilbo power`: errors against trials, one line for each number of participants."""
+
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from hilbo.report.figures.maps import BLUE, GREEN, GREY, ORANGE, RED, STYLE
+
+__all__ = ["power_figure"]
+
+_LOOKS = [
+    (RED, "o", "-"),
+    (ORANGE, "s", "--"),
+    (GREEN, "^", "-."),
+    (BLUE, "D", ":"),
+    ("black", "v", "-"),
+    (GREY, "P", "--"),
+]
+
+
+def power_figure(summary: pd.DataFrame, error: float) -> Figure:
+    """Median error of the optimum with quartiles, share of studies within `error`, and median error of the map.
+
+    `summary`: of `power.summarise`. Lines differ by colour, marker and dashes.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, 3.0), layout="constrained")
+        left, middle, right = figure.subplots(1, 3)
+        shift = 0.25 * (summary["trials"].max() - summary["trials"].min() + 1) / 25
+        for i, (count, rows) in enumerate(summary.groupby("participants")):
+            colour, marker, dashes = _LOOKS[i % len(_LOOKS)]
+            look = {"color": colour, "marker": marker, "linestyle": dashes, "markersize": 4, "linewidth": 1.2}
+            at, label = rows["trials"], f"{count} participants"
+            left.plot(at, 100 * rows["optimum_median"], label=label, **look)
+            left.vlines(at + shift * (i - 1), 100 * rows["optimum_low"], 100 * rows["optimum_high"], color=colour,
+                        linewidth=0.8, alpha=0.7)  # fmt: skip
+            below, above = rows["reached"] - rows["reached_low"], rows["reached_high"] - rows["reached"]
+            bars = 100 * np.maximum([below, above], 0.0)  # 0 and 1 end their own intervals, to rounding
+            middle.errorbar(at, 100 * rows["reached"], yerr=bars, capsize=2, **look)
+            right.plot(at, rows["map_median"], **look)
+        left.axhline(100 * error, color=GREY, linewidth=0.8)
+        left.set(ylabel="error of the optimum, NRMSE (%)", ylim=(0, None))
+        middle.set(ylabel=f"studies within {100 * error:g} % (%)", ylim=(0, 100))
+        right.set(ylabel="error of the map, P(highest answer)", ylim=(0, None))
+        for axes in (left, middle, right):
+            axes.set_xlabel("trials of each participant")
+        figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
+    return figure

@@ -1,0 +1,330 @@
+"""Figures of a study's report, beside the paper's figures 4 to 8.
+
+As in `maps`, a figure is a function from results to a matplotlib `Figure`. What differs does so by shape, hatching
+or words too, never by colour alone: the pages are printed, and read by the colour-blind.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+import pandas as pd
+from jax.typing import ArrayLike
+from jaxtyping import Float
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from hilbo.report.figures.maps import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    RED,
+    STYLE,
+    band,
+    grid_slice,
+    label_axes,
+    level_words,
+    map_panels,
+    maps_beside,
+    mark_trials,
+    sides,
+    star,
+)
+from hilbo.study.aggregate import fit_cohort
+from hilbo.study.analysis import Analysis, Progress, Reading
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.map_summary import Sets, slice_through
+
+__all__ = [
+    "class_regions",
+    "individual_convergence",
+    "people_figure",
+    "population_convergence",
+    "posterior_progress",
+    "predictive_check",
+    "sets_on_map",
+    "typical_person",
+]
+
+UNKNOWN = 0.8
+"""Share of its standard deviation without answers above which a map is drawn as not sampled."""
+_MARKS = {"best": ("*", 170, GREEN), "mid": ("D", 45, ORANGE), "worst": ("X", 80, RED)}
+_CELLS = 101
+
+
+def typical_person(found: Analysis) -> int:
+    """Whose own optimum is nearest to the median distance from the population's: shown as the example."""
+    x, best = np.asarray(found.aggregate.individuals.x), np.asarray(found.aggregate.optimum.x)
+    miss = np.sqrt(np.mean((x - best) ** 2, axis=1))
+    return int(np.argsort(miss, kind="stable")[(len(miss) - 1) // 2])
+
+
+def posterior_progress(
+    study: Study, cohort: Cohort, row: int, own: Float[np.ndarray, "k d"], counts: Sequence[int]
+) -> Figure:
+    """One participant's posterior mean after each of `counts` trials, sliced at their final third parameter.
+
+    `own` (k, d): that person's running optimum. Paper, figure 4.
+    """
+    person = cohort.rows(np.array([row]))
+    maps = {f"{n} trials": fit_cohort(study, person.first(n)) for n in counts}
+    if study.space.dim == 1:
+        return maps_beside(study, maps, own)
+    third = float(own[-1][2]) if study.space.dim > 2 else None
+    grids = [grid_slice(study, posterior, own[-1], third) for posterior in maps.values()]
+    figure, panels, draw = map_panels(study, grids)
+    for axes, name, n, x, values in zip(panels, maps, counts, own, grids, strict=True):
+        draw(axes, values)
+        mark_trials(axes, study, person.first(n), third)
+        star(axes, study, x)
+        axes.set_title(name, fontsize=9)
+    if third is not None:
+        figure.suptitle(level_words(study, 2, third), fontsize=9)
+    return figure
+
+
+def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> Figure:
+    """Left: everybody's running optimum against their final one. Right: answers in the highest category so far.
+
+    Median and quartiles over people. Paper, figure 5.
+    """
+    trials, (_, own) = progress.counts, progress.to_end()
+    top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        band(left, trials, 100 * own.T, BLUE, "median, quartiles")
+        left.set(xlabel="trials", ylabel="NRMSE to the final optimum (%)", ylim=(0, None))
+        left.legend(frameon=False)
+        band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
+        right.set(xlabel="trials", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
+        right.legend(frameon=False, loc="upper left")
+        for axes in (left, right):
+            axes.xaxis.get_major_locator().set_params(integer=True)
+    return figure
+
+
+def population_convergence(progress: Progress, references: Mapping[str, Float[np.ndarray, " d"]]) -> Figure:
+    """The population's running optimum against its final one, and against named references (system identification,
+    the truth). Paper, figure 7b."""
+    looks = [(RED, "o", "-"), (BLUE, "s", "--"), (GREEN, "^", "-.")]
+    targets = {"its final optimum": progress.merged[-1]} | dict(references)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.4, 2.9), layout="constrained")
+        axes = figure.subplots()
+        for (name, x), (colour, marker, dashes) in zip(targets.items(), looks, strict=False):
+            miss = 100 * np.sqrt(np.mean((progress.merged - x) ** 2, axis=1))
+            axes.plot(
+                progress.counts, miss, color=colour, marker=marker, linestyle=dashes, markersize=3.5, label=f"to {name}"
+            )
+        axes.set(xlabel="trials of each participant", ylabel="NRMSE of the population optimum (%)", ylim=(0, None))
+        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+    return figure
+
+
+def sets_on_map(
+    study: Study, surface, sets: Sets | None, best: Float[np.ndarray, " d"], cohort: Cohort, prior: ArrayLike
+) -> Figure:
+    """The population map through its best, mid and worst sets; hatched where it is not sampled. Paper, figure 6a.
+
+    `prior`: the map's variance where nobody answered (`RuleMap.map_prior`).
+    """
+    points: dict[str, Any] = {"best": best}
+    if sets is not None:
+        points = dict(zip(_MARKS, np.asarray(sets.x), strict=True))
+    if study.space.dim == 1:
+        return _sets_on_curve(study, surface, points)
+    thirds = {name: float(x[2]) for name, x in points.items()} if study.space.dim > 2 else {"best": None}
+    grids = [grid_slice(study, surface, best, third) for third in thirds.values()]
+    figure, panels, draw = map_panels(study, grids)
+    for axes, (name, third), values in zip(panels, thirds.items(), grids, strict=True):
+        draw(axes, values)
+        _hatch(axes, study, surface, best, third, values, prior)
+        mark_trials(axes, study, cohort, third)
+        for shown in points if third is None else [name]:
+            _mark(axes, study, shown, points[shown])
+        axes.set_title("" if third is None else f"{level_words(study, 2, third)} ({name})", fontsize=9)
+    handles: list[Any] = [
+        Line2D([], [], linestyle="", marker=_MARKS[n][0], color=_MARKS[n][2], markeredgecolor="black", label=n)
+        for n in points
+    ]
+    handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="not sampled"))
+    figure.legend(handles=handles, loc="outside upper center", ncols=_columns(figure, handles), frameon=False)
+    return figure
+
+
+def _columns(figure, handles):
+    """As many columns of a legend as the figure is wide enough for."""
+    return max(1, min(len(handles), int(figure.get_figwidth() / 1.25)))
+
+
+def _hatch(axes, study, surface, best, third, values, prior):
+    """Hatch what is feasible and of which the map knows less than `UNKNOWN`."""
+    spread = grid_slice(study, lambda x: (jnp.sqrt(surface(x)[1]), surface(x)[1]), best, third)
+    limit = UNKNOWN * np.sqrt(float(prior))
+    unknown = np.where(np.isnan(values), 0.0, np.where(spread > limit, 1.0, 0.0))
+    if unknown.any():
+        with mpl.rc_context({"hatch.linewidth": 0.5, "hatch.color": "white"}):
+            axes.contourf(*sides(study), unknown, levels=[0.5, 1.5], colors="none", hatches=["////"])
+
+
+def _mark(axes, study, name, x):
+    marker, size, colour = _MARKS[name]
+    point = np.asarray(study.space.to_physical(np.asarray(x)))
+    axes.scatter(
+        *point[:2], marker=marker, s=size, color=colour, edgecolor="black", linewidth=0.7, zorder=5, clip_on=False
+    )
+
+
+def _sets_on_curve(study, surface, points):
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.5, 3.0), layout="constrained")
+        axes = figure.subplots()
+        side = jnp.linspace(0.0, 1.0, _CELLS)
+        mean, variance = (np.asarray(part) for part in surface(side[:, None]))
+        at, sd = np.asarray(study.space.parameters[0].to_physical(side)), np.sqrt(variance)
+        label_axes(axes, study, 0, 0)
+        axes.fill_between(at, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0)
+        axes.plot(at, mean, color=BLUE)
+        for name, x in points.items():
+            marker, size, colour = _MARKS[name]
+            physical = np.asarray(study.space.to_physical(np.asarray(x)))
+            height = float(surface(jnp.asarray(x)[None, :])[0][0])
+            axes.scatter(
+                physical[0], height, marker=marker, s=size, color=colour, edgecolor="black", label=name, zorder=3
+            )
+        axes.set(yscale="linear", ylabel=f"{study.attribute} f")
+        axes.autoscale(axis="y")
+        axes.legend(frameon=False)
+    return figure
+
+
+def class_regions(readings: Mapping[str, Reading]) -> Figure:
+    """The most probable answer around each reading's optimum, and its tolerance intervals. Paper, figure 8.
+
+    One row for each reading (fixed and optimised hyperparameters); the slices are those of the first parameter with the
+    second, and with the third. White: may not be rendered.
+    """
+    study = next(iter(readings.values())).study
+    d, labels = study.space.dim, study.responses
+    pairs = [(0, 1), (0, 2)] if d > 2 else [(0, d - 1)]
+    shades = ListedColormap(mpl.colormaps["cividis"](np.linspace(0.12, 1.0, len(labels))))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(3.6 * len(pairs) + 0.2, 2.75 * len(readings) + 0.3), layout="constrained")
+        grid = np.atleast_2d(figure.subplots(len(readings), len(pairs), squeeze=False))
+        for (name, reading), row in zip(readings.items(), grid, strict=True):
+            for axes, (i, j) in zip(row, pairs, strict=True):
+                if d == 1:
+                    _class_curves(axes, reading, shades)
+                else:
+                    _regions(axes, reading, i, j, shades)
+                axes.set_title(name, fontsize=9)
+        handles: list[Any] = [
+            Patch(facecolor=shades(k), edgecolor="black", linewidth=0.5, label=label) for k, label in enumerate(labels)
+        ]
+        handles.append(Line2D([], [], color=RED, linewidth=2, label="tolerance interval"))
+        figure.legend(handles=handles, loc="outside upper center", ncols=_columns(figure, handles), frameon=False)
+    return figure
+
+
+def _regions(axes, reading, i, j, shades):
+    study, best = reading.study, np.asarray(reading.aggregate.optimum.x)
+    side = np.linspace(0.0, 1.0, _CELLS)
+    x = np.tile(best, (_CELLS, _CELLS, 1))
+    x[..., i], x[..., j] = np.meshgrid(side, side)
+    flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
+    likeliest = np.argmax(np.asarray(_probabilities(reading, flat)), axis=1).astype(float)
+    values = np.where(np.asarray(study.space.feasible(flat)), likeliest, np.nan).reshape(_CELLS, _CELLS)
+    label_axes(axes, study, i, j)
+    first, second = (np.asarray(study.space.parameters[k].to_physical(jnp.asarray(side))) for k in (i, j))
+    count = len(study.responses)
+    axes.pcolormesh(first, second, values, cmap=shades, vmin=-0.5, vmax=count - 0.5, shading="nearest", rasterized=True)
+    for index in (i, j):
+        _interval(axes, reading, index, i, j)
+    star(axes, study, best, (i, j))
+
+
+def _interval(axes, reading, index, i, j):
+    """The tolerance interval of a parameter as a line along the slice it was read on, with a bar at each end."""
+    study = reading.study
+    parameter = study.space.parameters[index]
+    found, _ = reading.tolerances[parameter.name]
+    if found is None:
+        return
+    ends = np.asarray(parameter.to_unit(jnp.asarray([found.low, found.high])))
+    points, _ = slice_through(study, reading.aggregate.optimum.x, parameter.name, jnp.linspace(ends[0], ends[1], 65))
+    physical = np.asarray(study.space.to_physical(points))
+    axes.plot(physical[:, i], physical[:, j], color=RED, linewidth=2, solid_capstyle="butt")
+    axes.plot(physical[[0, -1], i], physical[[0, -1], j], linestyle="", marker="o", color=RED, markersize=3.5)
+
+
+def _class_curves(axes, reading, shades):
+    study = reading.study
+    side = jnp.linspace(0.0, 1.0, _CELLS)
+    at = np.asarray(study.space.parameters[0].to_physical(side))
+    chances = np.asarray(_probabilities(reading, side[:, None])).T
+    label_axes(axes, study, 0, 0)
+    axes.stackplot(at, chances, colors=[shades(k) for k in range(len(chances))])
+    found, _ = reading.tolerances[study.space.parameters[0].name]
+    if found is not None:
+        axes.hlines(0.5, found.low, found.high, color=RED, linewidth=2)
+    axes.set(yscale="linear", ylabel="probability of each answer", ylim=(0, 1))
+
+
+def _probabilities(reading, x):
+    mean, variance = reading.aggregate.newcomer(x)
+    return jax.vmap(reading.study.gp.likelihood.class_probabilities)(mean, variance)
+
+
+def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
+    """Consistency, lapse rate and drift of every participant, each with its 95 % interval; crosses: left out."""
+    rows = np.arange(len(people))[::-1]
+    out = people["participant"].isin(list(left_out)).to_numpy()
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.4, 1.2 + 0.15 * max(len(people), 4)), layout="constrained")
+        panels = figure.subplots(1, 3, sharey=True)
+        words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
+        for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
+            value, low, high = (people[f"{measure}{end}"].to_numpy(float) for end in ("", "_low", "_high"))
+            known = np.isfinite(value)
+            limits = (-3.5, 3.5) if measure == "drift" else (-0.03, 1.03)
+            axes.hlines(
+                rows[known],
+                np.maximum(low, limits[0])[known],
+                np.minimum(high, limits[1])[known],
+                color=BLUE,
+                linewidth=1,
+            )
+            axes.scatter(value[known & ~out], rows[known & ~out], s=16, color=BLUE, zorder=3)
+            axes.scatter(value[known & out], rows[known & out], s=26, marker="x", color=RED, zorder=3)
+            axes.set(xlabel=label, xlim=limits)
+        panels[2].axvline(0, color=GREY, linestyle="--", linewidth=1)
+        panels[0].set_yticks(rows, list(people["participant"]), fontsize=6)
+    return figure
+
+
+def predictive_check(
+    responses: Sequence[str], observed: Float[np.ndarray, " C"], predicted: Float[np.ndarray, "draws C"]
+) -> Figure:
+    """Shares of the answers given, and of those that the posterior would give again."""
+    at = np.arange(len(responses))
+    low, middle, high = 100 * np.percentile(predicted, [2.5, 50, 97.5], axis=0)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(4.2, 2.7), layout="constrained")
+        axes = figure.subplots()
+        axes.bar(
+            at, 100 * observed, width=0.6, color="#c9d9e8", edgecolor="black", linewidth=0.6, label="answers given"
+        )
+        axes.vlines(at, low, high, color=RED, linewidth=2)
+        axes.scatter(at, middle, s=26, color=RED, zorder=3, label="would be given again")
+        axes.set_xticks(at, list(responses))
+        axes.set(ylabel="share of the answers (%)", ylim=(0, None))
+        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+    return figure

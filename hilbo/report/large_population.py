@@ -1,0 +1,94 @@
+"""The results folder of a large population: what the report of a small one has, as far as it pays.
+
+The map's grid is coarser, and the figures of progress are left out: each of their points is a fit of everybody.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy.interpolate import RegularGridInterpolator
+
+from hilbo.report.page import results_page
+from hilbo.report.participants import json_lines, people_of
+from hilbo.report.results import map_dataset, optima_table, result, save_figures
+from hilbo.study.batch_optimum import Merged
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+
+__all__ = ["population_map", "write_population"]
+
+_POINTS = 5000  # of the map's grid
+_CELLS = 41
+_DRAWN = 200  # participants whose answers the figure shows
+_DOTS = 2000  # individual optima in a figure
+
+
+def population_map(study: Study, merged: Merged) -> xr.Dataset:
+    """The map on a grid of at most 5,000 points: a pass over all people, by the whole crew."""
+    shown = min(study.space.dim, 3) if study.space.dim <= 3 else 2
+    cells = min(_CELLS, int(_POINTS ** (1 / shown)))
+    return map_dataset(study, merged.surface, merged.optimum.x, cells)
+
+
+def write_population(
+    study: Study, merged: Merged, grid: xr.Dataset, folder: Path, seed: int = 0, say=lambda text: None
+) -> dict[str, Any]:
+    """Write result.json, optima.csv, map.nc, figures and report.html; returns the content of result.json."""
+    people = people_of(study, merged)
+    content = result(study, merged, seed, None, people)
+    say("writing results")
+    with (folder / "result.json").open("w", encoding="utf-8") as file:
+        file.writelines(json_lines(content))
+    optima_table(content, people).to_csv(folder / "optima.csv", index=False)
+    grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
+    grid.to_netcdf(folder / "map.nc", engine="h5netcdf")
+    say("figures and report")
+    pictures = save_figures(_figures(study, merged, grid), folder)
+    (folder / "report.html").write_text(results_page(study, content, pictures, people), encoding="utf-8")
+    return content
+
+
+def _figures(study, merged, grid):
+    """Name -> figure, title, caption."""
+    from hilbo.report.figures import maps
+
+    found, best = {}, np.asarray(merged.optimum.x)
+    if study.space.dim <= 3:
+        some = _some(merged.cohort)
+        caption = (
+            f"The {study.attribute} of each rendering, as far as people's answers tell, from the grid of map.nc:"
+            f" brighter is better, and the star is the optimum. Dots are answers of {len(some.names)} participants,"
+            f' orange where one answered "{study.responses[-1]}".'
+        )
+        white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
+        found["map"] = (maps.map_slices(study, _from(grid), best, some), "The population map", caption + white)
+    if merged.individuals is not None and study.space.dim > 1:
+        x = np.asarray(merged.individuals.x)
+        rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), _DOTS)).round().astype(int))
+        marks = {"population map": best, "mean of optima": np.asarray(merged.mean_of_optima)}
+        caption = f"Each dot is one participant's own optimum; {len(rows):,} of {len(x):,} are shown."
+        found["optima"] = (maps.optima_scatter(study, x[rows], marks), "Individual optima", caption)
+    return found
+
+
+def _some(cohort: Cohort) -> Cohort:
+    """A few participants, evenly chosen."""
+    rows = np.unique(np.linspace(0, len(cohort.names) - 1, _DRAWN).round().astype(int))
+    return cohort.rows(rows)
+
+
+def _from(grid):
+    """The map between the grid's points, to what a figure shows: mean and variance at points of the unit cube."""
+    shape = grid["mean"].shape
+    sides = tuple(np.linspace(0.0, 1.0, count) for count in shape)
+    values = np.stack([grid["mean"].values, grid["variance"].values], axis=-1)
+    between = RegularGridInterpolator(sides, values, method="cubic")
+
+    def surface(x):
+        found = between(np.asarray(x))
+        return found[:, 0], found[:, 1]
+
+    return surface

@@ -1,0 +1,321 @@
+"""Results of `hilbo identify` and `hilbo passivity`: result.json, the [renderer] block, figures, a page.
+
+Digits are printed only of parameters that the data identify; elsewhere the table has words. `set` in result.json is
+always there: the numbers of the best curve, which belong together and to their N and T.
+"""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hilbo import passivity
+from hilbo.identification.characterise import Characterisation
+from hilbo.identification.fitting import Test
+from hilbo.identification.memory_selection import LIMIT, PAPER, smallest
+from hilbo.identification.sampled import Sampled
+from hilbo.report.page import template
+from hilbo.report.results import as_json, save_figures, versions
+from hilbo.viscoelastic import FOSLS
+
+__all__ = ["identification_result", "passivity_result", "renderer_block", "write_identification", "write_passivity"]
+
+_UNITS = {"K0": "K", "K1": "K", "K_inst": "K", "K_eff": "K", "B1": "B", "G_c": "K", "tau": "s", "G": "G", "V": "V"}
+_SYMBOLS = {"alpha": "α", "kappa": "κ", "tau": "τ", "beta": "β", "beta/alpha": "β/α"}
+
+
+def identification_result(
+    source: str,
+    tests: tuple[Test, ...],
+    result: Characterisation,
+    unit: str,
+    notes: tuple[str, ...],
+    damping: float | None,
+) -> dict[str, Any]:
+    """The content of result.json."""
+    model = result.fit.model
+    sampled = isinstance(model, Sampled)
+    about: dict[str, Any] = {"name": type(model).__name__.lower() if not sampled else "fosls", "unit": unit}
+    if sampled:
+        about |= {"memory": model.memory, "N": int(model.N) if model.memory == "short" else None, "T": model.T}
+    content = {
+        "source": source,
+        "model": about,
+        "parameters": {
+            name: {
+                "value": estimate.value if estimate.known else None,
+                "lower": estimate.lower,
+                "upper": estimate.upper,
+                "status": estimate.status,
+            }
+            for name, estimate in result.estimates.items()
+        },
+        "set": result.fit.parameters(),
+        "nrmse": result.nrmse,
+        "residuals": result.noise,
+        "bootstrap": None if result.bootstrap is None else {k: list(v) for k, v in result.bootstrap.items()},
+        "memory": [_row(row) for row in result.rows],
+        "smallest_N": None if (best := smallest(result.rows)) is None else best.N,
+        "passivity": None if result.minimum_damping is None else _passivity(result.minimum_damping, damping),
+        "renderer": renderer_block(result, damping) if sampled else None,
+        "tests": {test.kind: {"points": test.time.size, "repeats": test.repeats} for test in tests},
+        "warnings": [*notes, *result.warnings],
+        "versions": versions(),
+    }
+    return content
+
+
+def _row(row):
+    return {"N": row.N, "memory": "full" if row.N is None else "short", "nrmse": row.nrmse, "set": row.fit.parameters()}
+
+
+def _passivity(needed, damping):
+    margin = None if damping is None else damping - needed
+    return {"minimum_damping": needed, "damping": damping, "margin": margin}
+
+
+def renderer_block(result: Characterisation, damping: float | None) -> str:
+    """The [renderer] table of a study file for this material, as text; the identified set as comments."""
+    model, values = result.fit.model, result.fit.parameters()
+    lines = ["[renderer]", 'model = "fosls"', f'memory = "{model.memory}"']
+    if model.memory == "short":
+        lines.append(f"N = {int(model.N)}")
+    lines += [f"T = {model.T:g}             # s", f"K_eff = {values['K_eff']:.6g}       # N/mm, identified"]
+    needed = result.minimum_damping
+    note = "" if needed is None else f"; this set needs at least {needed:.4g}"
+    if damping is None:
+        lines.append(f"# damping =           # N.s/m, a property of your device: measure it{note}")
+    else:
+        lines.append(f"damping = {damping:g}       # N.s/m{note}")
+    lines += ["# The set itself, for this N and T only:"]
+    lines += [f"#   {name} = {values[name]:.6g}" for name in ("K0", "K1", "B1", "alpha")]
+    return "\n".join(lines) + "\n"
+
+
+def write_identification(
+    tests: tuple[Test, ...], result: Characterisation, content: dict[str, Any], folder: Path, damping: float | None
+) -> None:
+    """Write result.json, renderer.toml, curves.csv, the figures and report.html."""
+    from hilbo.report.figures import mechanics as plotting
+
+    (folder / "result.json").write_text(as_json(content))
+    _curves(tests, result, plotting.predicted).to_csv(folder / "curves.csv", index=False)
+    unit = content["model"]["unit"]
+    figures = {"tests": (plotting.curves_figure(tests, result, unit), "Tests and fits", _TESTS)}
+    if result.rows:
+        figures["memory"] = (plotting.memory_figure(result.rows), "Error against memory", _MEMORY)
+    if content["renderer"] is not None:
+        (folder / "renderer.toml").write_text(content["renderer"])
+        figures |= _set_figures(_model(result), damping or result.minimum_damping)
+    pictures = save_figures(figures, folder)
+    page = template("material.html").render(**_words(content, result), figures=pictures)
+    (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+def _model(result):
+    values, model = result.fit.parameters(), result.fit.model
+    place = (values[name] for name in ("K0", "K1", "B1", "alpha"))
+    if model.memory == "full":
+        return FOSLS(*place, T=model.T, memory="full")
+    return FOSLS(*place, N=int(model.N), T=model.T)
+
+
+def _set_figures(model, b):
+    """Figures of one parameter set on a device."""
+    from hilbo.report.figures import mechanics as plotting
+
+    figures = {"bode": (plotting.bode_figure(model), "Frequency response", _BODE)}
+    if b is not None:
+        figures["passivity"] = (plotting.passivity_figure(model, b), "Passivity", _PASSIVITY)
+        if model.memory == "full" or model.N % 2:
+            K_eff = float(model.dc_gain())
+            figures["passive-set"] = (plotting.passive_set_figure(model, b, K_eff), "The passive set", _SET)
+    return figures
+
+
+def _curves(tests, result, predicted):
+    parts = []
+    for test in tests:
+        columns = {"test": test.kind, "time_s": test.time, "mean": test.output.mean(axis=0)}
+        if test.repeats > 1:
+            columns["sd"] = test.output.std(axis=0, ddof=1)
+        parts.append(pd.DataFrame(columns | {"fit": predicted(result.fit, test.kind)}))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _words(content, result):
+    """What the page says."""
+    about, unit = content["model"], content["model"]["unit"]
+    title = "Identification" if about["name"] == "fosls" else f"Identification ({about['name']})"
+    errors = ", ".join(f"{100 * v:.2f} % on {kind}" for kind, v in content["nrmse"].items())
+    lead = f"{_model_words(about)} fitted to {content['source']}: NRMSE (of each curve's range) {errors}."
+    return {
+        "title": title,
+        "lead": lead,
+        "warnings": content["warnings"],
+        "parameters": [_parameter_row(n, e, unit, result.bootstrap) for n, e in result.estimates.items()],
+        "bootstrapped": result.bootstrap is not None,
+        "memory": _memory_table(content, result) if result.rows else None,
+        "residuals": [_residual_row(kind, row) for kind, row in content["residuals"].items()],
+        "renderer": content["renderer"],
+        "passivity": _passivity_words(content["passivity"]),
+        "versions": ", ".join(f"{k} {v}" for k, v in content["versions"].items()),
+    }
+
+
+def _model_words(about):
+    if "T" not in about:
+        return {"continuous": "The FO-SLS in continuous time", "fractionalmaxwell": "The fractional Maxwell model"}[
+            about["name"]
+        ]
+    memory = "full memory" if about["memory"] == "full" else f"N = {about['N']}"
+    return f"The FO-SLS ({memory}, T = {1000 * about['T']:g} ms)"
+
+
+def _parameter_row(name, estimate, unit, bootstrap):
+    kind = _UNITS.get(name, "")
+    shown = {
+        "K": unit,
+        "B": "N·sᵅ/mm" if unit == "N/mm" else f"{unit}·sᵅ",
+        "s": "s",
+        "G": f"{unit}·sᵝ",
+        "V": f"{unit}·sᵅ",
+    }
+    value = _rounded(estimate.value, estimate.lower, estimate.upper) if estimate.known else estimate.status
+    ends = [_rounded(end, estimate.lower, estimate.upper) if end is not None else "open" for end in estimate[1:3]]
+    interval = "" if estimate.lower is None and estimate.upper is None else f"{ends[0]} to {ends[1]}"
+    boot = (bootstrap or {}).get(name)
+    resampled = "" if boot is None else " to ".join(_rounded(end, *boot) for end in boot)
+    symbol = _SYMBOLS.get(name, name)
+    head = f"{symbol} ({shown[kind]})" if kind else symbol
+    row = [head, value, interval]
+    return row if bootstrap is None else [*row, resampled if estimate.known else ""]
+
+
+def _rounded(value, lower, upper):
+    """So many digits that the interval shows two."""
+    if lower is None or upper is None or not upper > lower:
+        return f"{value:.3g}"
+    decimals = max(0, 1 - math.floor(math.log10(upper - lower)))
+    return f"{value:.{decimals}f}"
+
+
+def _memory_table(content, result):
+    kinds = list(result.nrmse)
+    names = ("K0", "K1", "B1", "alpha")
+    rows = []
+    for row in content["memory"]:
+        label = "full" if row["N"] is None else str(row["N"])
+        errors = [f"{100 * row['nrmse'][k]:.2f} %" for k in kinds]
+        rows.append([label, *errors, *(f"{row['set'][n]:.3g}" for n in names)])
+    best = content["smallest_N"]
+    words = (
+        f"The smallest N with less than {100 * LIMIT:g} % on every test is {best}."
+        if best
+        else (f"No N that was tried stays below {100 * LIMIT:g} % on every test.")
+    )
+    paper = ", ".join(f"{100 * PAPER[k]:.2f} % ({k})" for k in kinds if k in PAPER)
+    return {"head": ["N", *kinds, "K0", "K1", "B1", "α"], "rows": rows, "words": words, "paper": paper}
+
+
+def _residual_row(kind, row):
+    over = row.get("over_repeat_noise")
+    cells = [kind, row["samples"], row["repeats"], f"{row['autocorrelation']:.2f}", row["order"]]
+    return [*cells, f"{row['effective_samples']:.0f}", "" if over is None else f"{over:.1f}"]
+
+
+def _passivity_words(found):
+    if found is None:
+        return ""
+    words = f"The set is passive on devices with a damping of at least {found['minimum_damping']:.4g} N·s/m"
+    if found["margin"] is None:
+        return words + "; give the device's own with --damping."
+    kind = "more than that" if found["margin"] >= 0 else "less than that: it is not passive there"
+    return words + f"; the device has {found['damping']:g} N·s/m, {abs(found['margin']):.3f} {kind}."
+
+
+def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
+    """What `hilbo passivity` prints: status and margin by certificate, binding frequency, largest K1, a witness."""
+    found = passivity.certify(model, b)
+    odd, K_eff = model.memory == "full" or model.N % 2 == 1, float(model.dc_gain())
+    largest = (
+        float(passivity.largest_K1(model.B1, model.alpha, b, K_eff, model.N, model.T, memory=model.memory))
+        if odd
+        else None
+    )
+    content: dict[str, Any] = {
+        "status": found.status,
+        "margin": [float(found.lower), float(found.upper)],
+        "minimum_damping": b - 0.5 * (float(found.lower) + float(found.upper)),
+        "damping": b,
+        "binding_frequency": float(found.frequency) / (2 * np.pi),
+        "largest_K1": None if largest is None or math.isinf(largest) else largest,
+        "every_K1": largest is not None and math.isinf(largest),
+        "set": {name: float(getattr(model, name)) for name in ("K0", "K1", "B1", "alpha")},
+        "K_eff": K_eff,
+        "memory": model.memory,
+        "N": model.N if model.memory == "short" else None,
+        "T": model.T,
+    }
+    if found.status == "violated" and (cycle := passivity.witness(model, b)) is not None:
+        content["witness"] = {"frequency": cycle.frequency / (2 * np.pi), "energy_per_cycle": cycle.energy}
+    return content
+
+
+def write_passivity(model: FOSLS, content: dict[str, Any], folder: Path) -> None:
+    """Write result.json and the figures of the set, with a page around them."""
+    (folder / "result.json").write_text(as_json(content))
+    pictures = save_figures(_set_figures(model, content["damping"]), folder)
+    page = template("material.html").render(
+        title=f"Passivity: {content['status']}",
+        lead=passivity_words(content),
+        warnings=[],
+        parameters=None,
+        memory=None,
+        residuals=None,
+        renderer=None,
+        passivity="",
+        versions=", ".join(f"{k} {v}" for k, v in versions().items()),
+        figures=pictures,
+    )
+    (folder / "report.html").write_text(page, encoding="utf-8")
+
+
+def passivity_words(content: dict[str, Any]) -> str:
+    """The verdict in one or two sentences."""
+    K_eff, b = content["K_eff"], content["damping"]
+    if K_eff < 0:
+        return f"violated: the static stiffness H(1) = {K_eff:.4g} N/mm is negative, which no damping makes good."
+    margin = content["margin"][0] if content["margin"][0] > 0 else content["margin"][1]
+    words = (
+        f"{content['status']}: the device has {b:g} N·s/m, {abs(margin):.4g} {'more' if margin > 0 else 'less'} than"
+        f" the {content['minimum_damping']:.5g} N·s/m that the set needs; {content['binding_frequency']:.4g} Hz binds."
+    )
+    largest, cycle = content["largest_K1"], content.get("witness")
+    if largest is not None:
+        words += f" The largest passive K1 with this B1, α and K_eff = {K_eff:.4g} N/mm is {largest:.4g} N/mm."
+    elif content["every_K1"]:
+        words += " Every K1 is passive with this B1 and α."
+    if cycle is not None:
+        words += f" A cycle at {cycle['frequency']:.4g} Hz creates {-cycle['energy_per_cycle']:.3g} mJ."
+    return words
+
+
+_TESTS = (
+    "Grey: what was measured, mean and standard deviation of the repeats. Lines: the model's response to the measured"
+    " input, for the fit and for fits with other memories. Below, the fit's residuals; what is not noise there, the"
+    " model misses."
+)
+_MEMORY = "Each point is a fit of its own: parameters belong to their N and cannot be carried over to another."
+_PASSIVITY = (
+    "The rendering is passive where it needs less damping than the device has, at every frequency up to the Nyquist"
+    " frequency (Colgate & Schenkel). The dot is where the most is needed; without a device's damping the line is at"
+    " the least that is enough."
+)
+_SET = "Which K1 are passive for which B1 and α with this effective stiffness; the star is the set itself."
+_BODE = (
+    "The rendering, and the continuous model with the same numbers. Where they differ, it is the cut of the memory"
+    " (low frequencies) or the sampling (high)."
+)

@@ -1,0 +1,126 @@
+"""What result.json says of each participant, and result.json itself, however many participants there are.
+
+Parameter sets and passivity margins of all participants are computed together; their entries are made one at a time
+while the file is written, since a hundred thousand of them as Python objects would take more memory than the fits.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from hilbo.study.config import Study
+
+__all__ = ["People", "as_json", "json_lines", "parameter_sets", "people_of", "quoted"]
+
+_TOGETHER = 4096  # sets whose mechanics are computed at once
+
+
+class People(NamedTuple):
+    """A row for each participant; iterating gives the entries of result.json."""
+
+    names: Sequence[str]
+    trials: np.ndarray
+    certificate: dict[str, np.ndarray]
+    labels: tuple[str, ...]
+    optima: dict[str, np.ndarray] | None
+    sets: dict[str, np.ndarray] | None
+    margins: np.ndarray | None
+
+    def entries(self) -> Iterator[dict[str, Any]]:
+        """Participant, trials, optimum (null if none was sought) and certificate of each."""
+        for j, name in enumerate(self.names):
+            yield {
+                "participant": name,
+                "trials": int(self.trials[j]),
+                "optimum": self._optimum(j),
+                "certificate": {key: values[j].item() for key, values in self.certificate.items()},
+            }
+
+    def _optimum(self, j):
+        if self.optima is None or self.sets is None:
+            return None
+        chances = self.optima["class_probabilities"][j].tolist()
+        return {
+            "parameters": {name: float(values[j]) for name, values in self.sets.items()},
+            "unit": self.optima["x"][j].tolist(),
+            "mean": float(self.optima["mean"][j]),
+            "sd": float(self.optima["sd"][j]),
+            "class_probabilities": dict(zip(self.labels, chances, strict=True)),
+            "passivity_margin": None if self.margins is None else float(self.margins[j]),
+        }
+
+    def table(self) -> pd.DataFrame:
+        """The rows of optima.csv: everybody's own optimum, none if none was sought."""
+        if self.sets is None:
+            return pd.DataFrame()
+        return pd.DataFrame({"source": [f"individual:{name}" for name in self.names]} | self.sets)
+
+
+def people_of(study: Study, aggregate: Any) -> People:
+    """The participants of an `Aggregate` or of a `Merged`."""
+    found = aggregate.individuals
+    sets, margins = (None, None) if found is None else parameter_sets(study, np.asarray(found.x))
+    cohort = aggregate.cohort
+    optima = None if found is None else {name: np.asarray(getattr(found, name)) for name in found.__dataclass_fields__}
+    return People(cohort.names, cohort.counts(), aggregate.certificates, study.responses, optima, sets, margins)
+
+
+def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+    """Points of the unit cube as parameter sets in physical units, derived K0 first, and their passivity margins
+    (N.s/m), None without mechanics."""
+    if len(x) > _TOGETHER:
+        padded = np.concatenate([x, np.repeat(x[-1:], -len(x) % _TOGETHER, axis=0)])  # one compilation
+        parts = [parameter_sets(study, part) for part in padded.reshape(-1, _TOGETHER, x.shape[1])]
+        sets = {name: np.concatenate([part[0][name] for part in parts])[: len(x)] for name in parts[0][0]}
+        found = [margin for _, margin in parts if margin is not None]
+        return sets, np.concatenate(found)[: len(x)] if found else None
+    physical, derived, margins = _mechanics(study, x)
+    named = {name: np.asarray(physical)[:, i] for i, name in enumerate(study.space.names)}
+    return {name: np.asarray(v) for name, v in derived.items()} | named, None if margins is None else np.asarray(
+        margins
+    )
+
+
+@eqx.filter_jit
+def _mechanics(study, x):
+    physical = study.space.to_physical(x)
+    values = {name: physical[:, i] for i, name in enumerate(study.space.names)}
+    return physical, study.space.derived(values), study.space.passivity_margin(values)
+
+
+def as_json(content: dict[str, Any]) -> str:
+    """The text of result.json; a number that is not finite (after a failed fit) is null."""
+    return "".join(json_lines(content))
+
+
+def json_lines(content: dict[str, Any]) -> Iterator[str]:
+    """The text of result.json piece by piece; `People` are written one entry at a time."""
+    yield "{"
+    for i, (key, value) in enumerate(content.items()):
+        yield f"{',' if i else ''}\n  {quoted(key)}: "
+        if isinstance(value, People):
+            for j, entry in enumerate(value.entries()):
+                yield f"{',' if j else '['}\n    {quoted(entry)}"
+            yield "\n  ]"
+        else:
+            yield quoted(value, indent=2).replace("\n", "\n  ")
+    yield "\n}\n"
+
+
+def quoted(value: Any, indent: int | None = None) -> str:
+    """JSON, with null for what is not finite."""
+    return json.dumps(_clean(value), indent=indent, allow_nan=False)
+
+
+def _clean(value):
+    if isinstance(value, dict):
+        return {key: _clean(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_clean(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,308 @@
+"""Results -> result.json, a population map in netCDF, figures, and one HTML page that explains itself.
+
+`write_results` makes a whole results folder from an aggregate: result.json (DESIGN: "Results"), optima.csv, map.nc,
+the figures as PNG and SVG, and report.html with the figures inside.
+"""
+
+import base64
+import importlib.metadata
+import io
+import json
+import platform
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import xarray as xr
+from jaxtyping import Array, Float
+
+from hilbo.report.page import results_page
+from hilbo.report.participants import People, as_json, people_of
+from hilbo.search.rendering import K0_range, margin_of, set_of
+from hilbo.study.aggregate import Aggregate, Optimum, nrmse, other_inference, progress
+from hilbo.study.batch_optimum import Merged
+from hilbo.study.config import Study
+from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
+
+__all__ = [
+    "MAP_CELLS",
+    "as_json",
+    "map_dataset",
+    "misses",
+    "moved",
+    "optima_table",
+    "optimum_content",
+    "result",
+    "save_figures",
+    "versions",
+    "write_results",
+]
+
+MAP_CELLS = 41
+"""Points of the map's grid along each parameter."""
+
+_PIXELS = 130  # of the page for an inch of a figure, so that all have letters of one size
+
+
+def misses(
+    study: Study, x: Float[Array, "... d"] | Float[np.ndarray, "... d"], truth: Float[np.ndarray, " d"]
+) -> tuple[np.ndarray, np.ndarray | None]:
+    """NRMSE of points to the truth by search range: over the searched parameters, and with the derived K0."""
+    x = np.asarray(x)
+    own = np.asarray(np.sqrt(np.mean((x - truth) ** 2, axis=-1)))
+    if study.space.mechanics is None:
+        return own, None
+    K0 = np.array([set_of(study.space, row)["K0"] for row in x.reshape(-1, x.shape[-1])]).reshape(own.shape)
+    K0_error = (K0 - set_of(study.space, truth)["K0"]) / K0_range(study.space)
+    d = x.shape[-1]
+    return own, np.asarray(np.sqrt((d * own**2 + K0_error**2) / (d + 1)))
+
+
+def versions() -> dict[str, str]:
+    """What made a result."""
+    packages = ("hilbo", "jax", "jaxlib", "numpy", "equinox", "optimistix")
+    found = {name: importlib.metadata.version(name) for name in packages}
+    return found | {
+        "python": platform.python_version(),
+        "device": str(jax.devices()[0]),
+        "dtype": str(jnp.zeros(0).dtype),
+    }
+
+
+def result(
+    study: Study,
+    aggregate: Aggregate | Merged,
+    seed: int,
+    truth: Float[np.ndarray, " d"] | None = None,
+    people: People | None = None,
+) -> dict[str, Any]:
+    """The content of result.json."""
+    people = people_of(study, aggregate) if people is None else people
+    best, mean = aggregate.optimum, aggregate.mean_of_optima
+    content = {
+        "optimum": optimum_content(study, best),
+        "participants": people if isinstance(aggregate, Merged) else list(people.entries()),
+        "alternatives": {name: optimum_content(study, found) for name, found in aggregate.alternatives.items()},
+        "mean_of_optima": None
+        if mean is None
+        else {"parameters": set_of(study.space, mean), "passivity_margin": margin_of(study.space, mean)},
+        "rule": study.rule,
+        "heterogeneity": heterogeneity(aggregate),
+        "inference": study.inference,
+        "study": study.hash,
+        "seed": seed,
+        "versions": versions(),
+    }
+    other = other_inference(study)
+    if other in aggregate.alternatives:
+        content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
+    failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
+    content["warnings"] = ([_not_converged(failed)] if failed else []) + rule_warnings(study, aggregate)
+    if truth is not None:
+        content["truth"] = _truth(study, aggregate, truth)
+    return content
+
+
+def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> dict[str, Any]:
+    """How far one optimum is from another: NRMSE, and each parameter's way in its unit and in % of its range."""
+    there, here = set_of(study.space, x), set_of(study.space, start)
+    percent = 100 * (np.asarray(x) - np.asarray(start))
+    share = dict(zip(study.space.names, percent.tolist(), strict=True))
+    if "K0" in there:
+        share = {"K0": 100 * (there["K0"] - here["K0"]) / K0_range(study.space)} | share
+    ways = {name: {"by": there[name] - here[name], "percent": share[name]} for name in there}
+    return {"nrmse": float(nrmse(x, start)), "moved": ways}
+
+
+def _not_converged(names):
+    one = len(names) == 1
+    shown = names if len(names) <= 10 else [*names[:10], f"{len(names) - 10:,} others"]
+    return (
+        f"The {'fit' if one else 'fits'} of {', '.join(shown)} did not reach {'its' if one else 'their'} tolerance, so"
+        " that the results may be off by more than rounding; see the certificates in result.json."
+    )
+
+
+def optimum_content(study: Study, found: Optimum) -> dict[str, Any]:
+    """An optimum as result.json holds it."""
+    labels = study.responses
+    return {
+        "parameters": set_of(study.space, found.x),
+        "unit": np.asarray(found.x).tolist(),
+        "mean": float(found.mean),
+        "sd": float(found.sd),
+        "class_probabilities": dict(zip(labels, np.asarray(found.class_probabilities).tolist(), strict=True)),
+        "passivity_margin": margin_of(study.space, found.x),
+    }
+
+
+def _truth(study, aggregate, truth):
+    """Misses of everything that claims to be the optimum, where the truth is known."""
+    own, own_K0 = misses(study, aggregate.individuals.x, truth)
+    quartiles = np.percentile(own, [25, 50, 75]).tolist()
+    claims = {"aggregate": aggregate.optimum.x, "mean_of_optima": aggregate.mean_of_optima}
+    claims |= {name: found.x for name, found in aggregate.alternatives.items()}
+    table = {}
+    for name, x in claims.items():
+        plain, with_K0 = misses(study, x, truth)
+        table[name] = {"nrmse": float(plain), "nrmse_with_K0": None if with_K0 is None else float(with_K0)}
+    individuals = {
+        "quartiles": quartiles,
+        "with_K0": None if own_K0 is None else np.percentile(own_K0, [25, 50, 75]).tolist(),
+    }
+    top = np.asarray((aggregate.cohort.trials.q == len(study.responses) - 1) & aggregate.cohort.trials.mask).sum(axis=1)
+    return {
+        "parameters": set_of(study.space, truth),
+        "nrmse": table,
+        "individuals": individuals,
+        "top_answers": {"mean": float(top.mean()), "sd": float(top.std(ddof=1)) if len(top) > 1 else None},
+    }
+
+
+def write_results(
+    study: Study,
+    aggregate: Aggregate,
+    folder: Path,
+    seed: int = 0,
+    truth: Float[np.ndarray, " d"] | None = None,
+    say=lambda text: None,
+) -> dict[str, Any]:
+    """Write the results folder; returns the content of result.json. `say` is told what is being done."""
+    people = people_of(study, aggregate)
+    content = result(study, aggregate, seed, truth, people)
+    (folder / "result.json").write_text(as_json(content))
+    optima_table(content, people).to_csv(folder / "optima.csv", index=False)
+    say("the population map on a grid")
+    data = map_dataset(study, aggregate.surface, aggregate.optimum.x)
+    data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
+    data.to_netcdf(folder / "map.nc", engine="h5netcdf")
+    say("progress of the optimum over trials")
+    figures = _figures(study, aggregate, seed, truth)
+    say("figures and report")
+    pictures = save_figures(figures, folder)
+    (folder / "report.html").write_text(results_page(study, content, pictures, people), encoding="utf-8")
+    return content
+
+
+def save_figures(figures: Mapping[str, tuple[Any, str, str]], folder: Path) -> list[dict[str, str]]:
+    """Write name -> (figure, title, caption) as PNG and SVG; returns what a page needs to hold them."""
+    pictures = []
+    for name, (figure, title, caption) in figures.items():
+        figure.savefig(folder / f"{name}.svg")
+        buffer = io.BytesIO()
+        figure.savefig(buffer, format="png", dpi=200)
+        (folder / f"{name}.png").write_bytes(buffer.getvalue())
+        png = base64.b64encode(buffer.getvalue()).decode()
+        width = str(round(_PIXELS * figure.get_figwidth()))
+        words = {"title": title, "caption": caption, "alt": f"{title}. {caption}"}
+        pictures.append({"name": name, "png": png, "width": width} | words)
+    return pictures
+
+
+def optima_table(content: dict[str, Any], people: People) -> pd.DataFrame:
+    """What optima.csv holds: the population's, the alternatives' and everybody's own."""
+    rows = [{"source": "aggregate"} | content["optimum"]["parameters"]]
+    rows += [{"source": name} | found["parameters"] for name, found in content["alternatives"].items()]
+    return pd.concat([pd.DataFrame(rows), people.table()])
+
+
+def map_dataset(
+    study: Study, surface: Callable[..., Any], at: Float[Array, " d"], cells: int = MAP_CELLS
+) -> xr.Dataset:
+    """The population map on a grid of all dimensions, or of the first two where there are more than three (then
+    through the point `at` of the unit cube). `surface`: points (m, d) -> mean and variance, (m,) each."""
+    parameters = study.space.parameters
+    shown = parameters if len(parameters) <= 3 else parameters[:2]
+    side = np.linspace(0.0, 1.0, cells)
+    x = np.tile(np.asarray(at), (*(cells,) * len(shown), 1))
+    for i, grid in enumerate(np.meshgrid(*(side,) * len(shown), indexing="ij")):
+        x[..., i] = grid
+    flat = x.reshape(-1, len(parameters))
+    mean, variance = surface(flat)
+    names = [p.name for p in shown]
+    shape = x.shape[:-1]
+    return xr.Dataset(
+        {
+            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": f"{study.attribute}, posterior mean"}),
+            "variance": (
+                names,
+                np.asarray(variance).reshape(shape),
+                {"long_name": f"{study.attribute}, posterior variance"},
+            ),
+            "feasible": (
+                names,
+                np.asarray(study.space.feasible(flat)).reshape(shape),
+                {"long_name": "may be rendered"},
+            ),
+        },
+        coords={p.name: (p.name, np.asarray(p.to_physical(jnp.asarray(side))), {"units": p.unit}) for p in shown},
+        attrs={"study": study.hash},
+    )
+
+
+def _figures(study, aggregate, seed, truth):
+    """Name -> figure, title, caption."""
+    from hilbo.report.figures import maps
+
+    cohort = aggregate.cohort
+    longest = int(cohort.counts().max())
+    after = [n for n in (5, 15, 25) if n <= longest] or [longest]
+    after += [longest] if longest > 25 else []
+    counts = np.unique([*np.linspace(1, longest, min(longest, 25)).round().astype(int), *after])
+    merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts.tolist()))
+    best = np.asarray(aggregate.optimum.x)
+    marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
+    marks |= {} if truth is None else {"truth": truth}
+    how = in_place(aggregate.map)
+    captions = _captions(study, truth, f" These maps are merged {how}." if how else "")
+    found = {
+        "map": maps.map_slices(study, aggregate.surface, best, cohort),
+        "progress": maps.progress_figure(study, cohort, merged, own, truth, counts),
+        "slices": maps.slices_after(study, cohort, merged[np.searchsorted(counts, after)], after, aggregate.map),
+    }
+    if study.space.dim > 1:
+        found["optima"] = maps.optima_scatter(study, np.asarray(aggregate.individuals.x), marks)
+    return {name: (figure, *captions[name]) for name, figure in found.items()}
+
+
+def _captions(study, truth, how=""):
+    """Title and caption of each figure: what is to be seen, and how to read it; `how`: the maps of fewer trials."""
+    top, names = study.responses[-1], study.space.names
+    white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
+    third = ""
+    if study.space.dim > 2:
+        third = (
+            f" The slices are at the optimum's {names[2]} and on either side of it; an answer is drawn on every slice"
+            f" that is near its own {names[2]}, so that it may lie in another slice's white."
+        )
+    rest = f" Further parameters ({', '.join(names[3:])}) are those of the optimum." if study.space.dim > 3 else ""
+    settled = "where it ends" if truth is None else "the truth"
+    dashed = "" if truth is None else " Dashed: how far the map's optimum is from where it ends."
+    return {
+        "map": (
+            "The population map",
+            f"The {study.attribute} of each rendering, as far as people's answers tell: brighter is better, and the"
+            f" star is the optimum.{white} Dots are renderings that were asked, orange where somebody answered"
+            f' "{top}".{third}{rest}',
+        ),
+        "progress": (
+            "Progress of the optimum",
+            f"Left: how far the optimum after so many trials is from {settled}, in per cent of the search ranges, for"
+            f" the individuals and for the population map.{dashed} Right: how often people had answered"
+            f' "{top}" by then. Bands hold the middle half of the people.{how}',
+        ),
+        "slices": (
+            "The population map after fewer trials",
+            "The map from everybody's first answers only, each through its own optimum, the star; if the star and the"
+            f" bright region stay where they are, further trials only refine them.{white}{rest}{how}",
+        ),
+        "optima": (
+            "Individual optima",
+            "Each dot is one participant's own optimum. Where the dots scatter widely, their plain mean need not be"
+            " good for anybody.",
+        ),
+    }

@@ -1,0 +1,113 @@
+"""Results of the robustness check: result.json, both population maps, figures, and a page that explains itself."""
+
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from hilbo.report.page import robustness_page
+from hilbo.report.results import as_json, map_dataset, optimum_content, save_figures, versions
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.robustness import LIMIT, Robustness
+
+__all__ = ["robustness_result", "write_robustness"]
+
+_TENTH = 0.1  # of every search range: two renderings that a person would hardly tell apart
+_UNRELATED = 0.1
+
+
+def write_robustness(study: Study, cohort: Cohort, found: Robustness, folder: Path, seed: int = 0) -> dict[str, Any]:
+    """Write the folder of `hilbo robustness`; returns the content of result.json."""
+    content = robustness_result(study, cohort, found, seed)
+    (folder / "result.json").write_text(as_json(content))
+    maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x)), found.fixed.x) for of in found.maps()]
+    both = xr.concat(maps, xr.DataArray(["fixed", "by evidence"], dims="hyperparameters", name="hyperparameters"))
+    both.to_netcdf(folder / "map.nc", engine="h5netcdf")
+    pictures = save_figures(_figures(study, cohort, found), folder)
+    (folder / "report.html").write_text(robustness_page(study, content, pictures), encoding="utf-8")
+    return content
+
+
+def _figures(study, cohort, found):
+    """Name -> figure, title, caption."""
+    from hilbo.report.figures import maps as plotting
+
+    limit = f"{100 * LIMIT:.0f} %"
+    maps = plotting.maps_beside(
+        study,
+        dict(zip(("fixed hyperparameters", "by maximum evidence"), found.maps(), strict=True)),
+        np.stack([found.fixed.x, found.optimised.x]),
+    )
+    moves = plotting.moved_optima(cohort.names, found.individual_nrmse, float(found.nrmse), LIMIT)
+    return {
+        "maps": (
+            maps,
+            "The population map under both",
+            "Left under the study's own hyperparameters, right under those that make the answers most probable, each"
+            " through its own optimum, the star. What matters is whether the star stays; the heights may differ.",
+        ),
+        "moves": (
+            moves,
+            "How far the optima move",
+            f"Each dot is one participant's own optimum, the line the population's; what is right of {limit} is flagged"
+            " as not robust. People with few informative answers move most.",
+        ),
+    }
+
+
+def robustness_result(study: Study, cohort: Cohort, found: Robustness, seed: int) -> dict[str, Any]:
+    """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
+    learned, people = found.learned, len(cohort.names)
+    stacked = [np.broadcast_to(np.asarray(part), (people,)) for part in (learned.converged, learned.runaway)]
+    rows = [
+        {
+            "participant": name,
+            "nrmse": float(found.individual_nrmse[j]),
+            "flagged": bool(found.flagged_individuals[j]),
+            "converged": bool(stacked[0][j]),
+            "runaway": bool(stacked[1][j]),
+        }
+        for j, name in enumerate(cohort.names)
+    ]
+    model = learned.gp
+    return {
+        "warnings": _warnings(found, stacked),
+        "fixed": optimum_content(study, found.fixed),
+        "optimised": optimum_content(study, found.optimised),
+        "nrmse": float(found.nrmse),
+        "flagged": bool(found.flagged),
+        "rule": found.rule,
+        "participants": rows,
+        "learned": {
+            "parameters": list(learned.learn),
+            "shared": found.shared,
+            "theta": np.asarray(model.kernel.theta).tolist(),
+            "noise": np.asarray(model.likelihood.noise).tolist(),
+            "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
+        },
+        "sensitivity": {name: np.asarray(block).tolist() for name, block in found.sensitivity.items()},
+        "study": study.hash,
+        "seed": seed,
+        "versions": versions(),
+    }
+
+
+def _warnings(found, stacked):
+    """What the learnt hyperparameters themselves say against the comparison, in sentences."""
+    converged, runaway = stacked
+    theta = float(np.median(found.learned.gp.kernel.theta))
+    alike = float(np.exp(-theta * _TENTH**2))
+    sentences = []
+    if alike < _UNRELATED:
+        sentences.append(
+            f"Under the learnt theta = {theta:.3g}, renderings a tenth of a search range apart have a correlation of"
+            f" {alike:.2g}: the answers do not make a smooth map, and an optimum found with it says little."
+        )
+    for state, words in ((~converged, "did not converge"), (runaway, "found no maximum of the evidence in reach")):
+        if state.any():
+            whose = "The search" if found.shared else f"{state.sum()} of {len(state)} searches"
+            sentences.append(f"{whose} for hyperparameters {words}.")
+    return sentences

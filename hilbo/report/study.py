@@ -1,0 +1,353 @@
+"""`hilbo report`: a folder of sessions as one page, in the paper's order, with figures (SVG, PNG) and tables (CSV).
+
+Each material gets its figures 4 to 8 and tables I to IV, its limits, its people and the passivity of every optimum;
+hypotheses H1 to H4 get a section each (`hilbo.report.hypotheses`). With several materials the files of each lie in a
+folder of its name. result.json holds everything by number, `inference.nc` the posterior for ArviZ, `map.nc` the
+population map.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+
+from hilbo.report import validation
+from hilbo.report.comparison import comparison_table
+from hilbo.report.hypotheses import Results, hypotheses
+from hilbo.report.page import template
+from hilbo.report.participants import people_of
+from hilbo.report.results import as_json, map_dataset, moved, optima_table, result, save_figures, versions
+from hilbo.report.study_figures import comparison_figures, study_figures
+from hilbo.report.validation import HEAD, Validated, slug, validate
+from hilbo.search.rendering import margin_of, set_of
+from hilbo.study.analysis import Analysis, analyse, moved_by_evidence
+from hilbo.study.config import Study
+from hilbo.study.folder import Material, StudyFolder
+from hilbo.study.inference_data import groups, predictive_shares, write_groups
+from hilbo.study.rule_comparison import compare
+
+__all__ = ["convergence_table", "table_1", "tolerance_table", "write_study"]
+
+_DIGITS = 2  # of measures of people and of ends of intervals, which a few dozen answers decide
+_FEWEST = 3  # people for a comparison of rules: each is left out in turn
+
+
+def write_study(
+    folder: StudyFolder,
+    out: Path,
+    seed: int = 0,
+    say=lambda text: None,
+    analyses: Mapping[str, Analysis] | None = None,
+    comparison: bool = True,
+) -> dict[str, Any]:
+    """Write the results folder of `hilbo report`; returns the content of result.json.
+
+    `analyses`: of materials (by name) whose results are known already. `comparison`: every rule of aggregation with
+    each person left out in turn, which is most of the work.
+    """
+    results, contents, sections = [], {}, []
+    analyses = {} if analyses is None else analyses
+    for material in folder.materials:
+        words = f" ({material.name})" if material.name else ""
+
+        def tell(text, words=words):
+            say(f"{text}{words}")
+
+        found = analyses.get(material.name) or analyse(material.study, material.cohort, seed, tell)
+        validated = _validated(material, folder, seed, tell)
+        results.append(Results(material.name, found, validated, material.reference, material.reference_name))
+        part = out / slug(material.name) if len(folder.materials) > 1 else out
+        part.mkdir(exist_ok=True)
+        compared = _compared(found, seed, tell) if comparison else None
+        tell("figures and tables")
+        content, section = _write_material(material, found, validated, compared, part, seed)
+        contents[material.name] = content
+        sections.append(section)
+    claims = hypotheses(results)
+    content = _content(folder, contents, claims, seed)
+    (out / "result.json").write_text(as_json(content), encoding="utf-8")
+    say("the page")
+    (out / "report.html").write_text(_page(folder, sections, claims, content), encoding="utf-8")
+    return content
+
+
+def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
+    return {
+        "materials": contents,
+        "hypotheses": [
+            {"number": h.number, "verdict": h.verdict, "evidence": [e._asdict() for e in h.evidence]} for h in claims
+        ],
+        "study": folder.study.hash,
+        "seed": seed,
+        "versions": versions(),
+        "warnings": [w for one in contents.values() for w in one["warnings"]],
+        "limits": list(folder.limits),
+    }
+
+
+def _validated(material: Material, folder: StudyFolder, seed, say) -> Validated | None:
+    if material.validation is None:
+        return None
+    say("validation sessions")
+    name = material.name if "material" in material.validation and material.name else None
+    return validate(material.validation, folder.sets, material.study.responses, name, seed=seed)
+
+
+def _compared(found: Analysis, seed, say) -> dict[str, Any] | None:
+    """Every rule beside the study's; None where people are too few."""
+    if np.sum(found.cohort.counts() > 0) < _FEWEST:
+        return None
+    say("comparing the rules of aggregation")
+    return compare(found.study, found.cohort, seed)
+
+
+def _write_material(material, found: Analysis, validated, compared, part: Path, seed):
+    """Files of one material; its content for result.json, and its section of the page."""
+    study, people = found.study, people_of(found.study, found.aggregate)
+    truth = material.reference if material.reference_name == "the truth" else None
+    content = result(study, found.aggregate, seed, truth, people)
+    data = groups(study, found.cohort, found.aggregate.posteriors, seed=seed)
+    write_groups(data, part / "inference.nc")
+    grid = map_dataset(study, found.aggregate.surface, found.aggregate.optimum.x)
+    grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
+    grid.to_netcdf(part / "map.nc", engine="h5netcdf")
+    tables = {
+        "optima": optima_table(content, people),
+        "table_I": table_1(found, material.reference),
+        "convergence": convergence_table(found),
+        "tolerance": tolerance_table(found),
+        "people": found.people.assign(left_out=found.people["participant"].map(found.left_out)),
+        "passivity": passivity_table(found),
+    }
+    shares = predictive_shares(data, len(study.responses))
+    pictures = save_figures(study_figures(found, material, shares), part)
+    if compared is not None:
+        tables["comparison"] = comparison_table(compared)
+        pictures += save_figures(comparison_figures(compared), part)
+    if validated is not None:
+        content["validation"] = validation.validation_content(validated)
+        tables |= validation.validation_csv(validated)
+        pictures += save_figures(validation.validation_figures(validated), part)
+    for name, table in tables.items():
+        table.to_csv(part / f"{name}.csv", index=False)
+    content |= {
+        "left_out": found.left_out,
+        "limits": list(found.limits),
+        "optimised": {
+            "theta": np.asarray(found.learned.gp.kernel.theta).tolist(),
+            "noise": float(found.learned.gp.likelihood.noise),
+            "thresholds": np.asarray(found.learned.gp.likelihood.thresholds).tolist(),
+            "nrmse": moved_by_evidence(found),
+        },
+        "tolerance": tables["tolerance"].to_dict("records"),
+        "comparison": compared,
+    }
+    return content, _section(material, found, validated, tables, pictures, content)
+
+
+def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
+    """The population optimum and the mean of the individual optima, beside the reference if there is one (paper,
+    table I): `parameter`, `reference`, `aggregate`, `error_percent`, `mean_of_optima`, `sd_of_optima`, ..."""
+    study, aggregate = found.study, found.aggregate
+    mean, best = aggregate.mean_of_optima, aggregate.optimum.x
+    own = pd.DataFrame([set_of(study.space, x) for x in np.asarray(aggregate.individuals.x)])
+    ours, theirs = set_of(study.space, best), set_of(study.space, mean)
+    table = pd.DataFrame(
+        {"parameter": list(ours), "aggregate": list(ours.values()), "mean_of_optima": list(theirs.values())}
+    )
+    table["sd_of_optima"] = [own[name].std(ddof=1) if len(own) > 1 else np.nan for name in ours]
+    if reference is not None:
+        table.insert(1, "reference", list(set_of(study.space, reference).values()))
+        for name, x in (("error_percent", best), ("mean_error_percent", mean)):
+            ways = moved(study, x, jnp.asarray(reference))["moved"]
+            table[name] = [abs(ways[parameter]["percent"]) for parameter in ours]
+    return table
+
+
+def convergence_table(found: Analysis) -> pd.DataFrame:
+    """After each number of trials: NRMSE of the population's running optimum to its last, and of the individuals'
+    (median, quartiles, of those who gave as many answers), and answers in the highest category so far (paper, figures 5
+    and 7b)."""
+    study, counts = found.study, found.progress.counts
+    merged, own = found.progress.to_end()
+    top = np.asarray((found.cohort.trials.q == len(study.responses) - 1) & found.cohort.trials.mask)
+    so_far = np.cumsum(top, axis=1)[:, counts - 1]
+    table = pd.DataFrame({"trials": counts, "population": merged})
+    for name, values in (("individuals", own.T), ("top_answers", so_far)):
+        table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.nanpercentile(values, [25, 50, 75], axis=0).T
+    return table
+
+
+def tolerance_table(found: Analysis) -> pd.DataFrame:
+    """Tolerance intervals under fixed and under optimised hyperparameters, with the bootstrap over people of their
+    ends; empty where the highest answer is not the likeliest at the optimum (paper, section VII)."""
+    rows = []
+    for name, reading in (("fixed", found.fixed), ("optimised", found.optimised)):
+        for parameter, (interval, ends) in reading.tolerances.items():
+            row: dict[str, Any] = {"hyperparameters": name, "parameter": parameter}
+            if interval is not None:
+                row |= {
+                    "low": interval.low,
+                    "high": interval.high,
+                    "low_end": interval.low_end,
+                    "high_end": interval.high_end,
+                }
+            if ends is not None:
+                row |= {
+                    "low_from": ends.low[0],
+                    "low_to": ends.low[1],
+                    "high_from": ends.high[0],
+                    "high_to": ends.high[1],
+                }
+            rows.append(row | {"draws_without": 1.0 if ends is None else ends.lost})
+    columns = ["hyperparameters", "parameter", "low", "high", "low_end", "high_end"]
+    return pd.DataFrame(rows, columns=[*columns, "low_from", "low_to", "high_from", "high_to", "draws_without"])
+
+
+def passivity_table(found: Analysis) -> pd.DataFrame:
+    """Everything that could be rendered as an optimum: parameters, score, probability of the highest answer, and how
+    far from the passive boundary (N.s/m; negative is not passive)."""
+    study, aggregate = found.study, found.aggregate
+    claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
+    claims |= {f"population, {name}": (other.x, other) for name, other in aggregate.alternatives.items()}
+    claims["population, optimised hyperparameters"] = (
+        found.optimised.aggregate.optimum.x,
+        found.optimised.aggregate.optimum,
+    )
+    claims["mean of the individual optima"] = (aggregate.mean_of_optima, None)
+    if found.sets is not None:
+        claims |= {name: (found.sets.x[i], None) for i, name in enumerate(("best", "mid", "worst"))}
+    rows = []
+    for name, (x, optimum) in claims.items():
+        row = {"optimum": name} | set_of(study.space, x)
+        row |= (
+            {}
+            if optimum is None
+            else {"f": float(optimum.mean), "sd": float(optimum.sd), "p_top": float(optimum.class_probabilities[-1])}
+        )
+        rows.append(row | {"passivity_margin": margin_of(study.space, x)})
+    return pd.DataFrame(rows)
+
+
+def _section(material, found, validated, tables, pictures: list[dict[str, str]], content) -> dict[str, Any]:
+    """What the template needs of one material."""
+    compared = content["comparison"]
+    study, counts = found.study, found.cohort.counts()
+    by_name = {picture["name"]: picture for picture in pictures}
+    section: dict[str, Any] = {
+        "name": material.name,
+        "lead": f"{len(found.cohort.names)} participants gave {int(counts.sum())} answers"
+        f" ({', '.join(study.responses)}).",
+        "limits": found.limits,
+        "warnings": content["warnings"],
+        "left_out": [f"{name}: {why}" for name, why in found.left_out.items()],
+        "rule": study.exclude,
+        "figures": by_name,
+        "table_1": _shown(tables["table_I"], _words_of_table_1(material)),
+        "passivity": _shown(tables["passivity"].dropna(axis=1, how="all"), {"p_top": f'P("{study.responses[-1]}")'}),
+        "tolerance": _tolerances(tables["tolerance"]),
+        "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
+        "robust": "Under the hyperparameters of maximum evidence the optimum moves by"
+        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges." + _without(found),
+        "comparison": None if compared is None else _comparison(compared),
+    }
+    if validated is not None:
+        section["validation"] = validation.validation_section(validated, study.responses, [])
+    return section
+
+
+def _comparison(compared):
+    """Recommendation and table of the rules."""
+    table = comparison_table(compared)
+    return {
+        "words": compared["recommendation"],
+        "table": _shown(table.drop(columns=["most_influential"]).dropna(axis=1, how="all")),
+    }
+
+
+def _without(found):
+    """Under which hyperparameters there is no tolerance interval at all."""
+    top = found.study.responses[-1]
+    names = [
+        name
+        for name, reading in (("fixed", found.fixed), ("optimised", found.optimised))
+        if all(interval is None for interval, _ in reading.tolerances.values())
+    ]
+    if not names:
+        return ""
+    return (
+        f' Under the {" and the ".join(names)} hyperparameters "{top}" is not the likeliest answer at the optimum, so'
+        " that there is no tolerance interval."
+    )
+
+
+def _words_of_table_1(material):
+    return {
+        "parameter": "",
+        "reference": material.reference_name,
+        "aggregate": "population map",
+        "error_percent": "error (%)",
+        "mean_of_optima": "mean of individual optima",
+        "sd_of_optima": "± sd",
+        "mean_error_percent": "its error (%)",
+    }
+
+
+def _shown(
+    table: pd.DataFrame, heads: Mapping[str, str] | None = None, digits: int = 4
+) -> tuple[list[str], list[list[str]]]:
+    """Head and cells of a table on the page, numbers with so many digits."""
+    heads = {} if heads is None else heads
+    head = [heads.get(str(name), str(name).replace("_", " ")) for name in table.columns]
+    return head, [[_cell(value, digits) for value in row] for row in table.itertuples(index=False)]
+
+
+def _tolerances(table):
+    """The tolerance intervals as they are read: each end with what it is, and with its interval."""
+    rows = []
+    for row in table.to_dict("records"):
+        ends = [
+            [
+                f"{_cell(row[end])} ({row[f'{end}_end']})",
+                " to ".join(_cell(row[f"{end}_{at}"], _DIGITS) for at in ("from", "to")),
+            ]
+            if np.isfinite(row[end])
+            else ["–", "–"]
+            for end in ("low", "high")
+        ]
+        rows.append(
+            [row["hyperparameters"], row["parameter"], *ends[0], *ends[1], f"{100 * row['draws_without']:.0f} %"]
+        )
+    return ["hyperparameters", "parameter", "from", "95 % of draws", "to", "95 % of draws", "no interval"], rows
+
+
+def _cell(value, digits=4):
+    if value is None or (isinstance(value, float | np.floating) and not np.isfinite(value)):
+        return "–" if value is None or np.isnan(value) else ("∞" if value > 0 else "−∞")
+    if isinstance(value, float | np.floating):
+        return np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
+    return str(value)
+
+
+def _page(folder: StudyFolder, sections, claims, content) -> str:
+    study: Study = folder.study
+    return template("study.html").render(
+        title=f"{study.name}: results",
+        lead=f"What {sum(len(m.cohort.names) for m in folder.materials)} participants' answers say of"
+        f" {'one material' if len(sections) == 1 else f'{len(sections)} materials'}, in the order of the paper.",
+        warnings=[*content["warnings"], *content["limits"]],
+        sections=sections,
+        hypotheses=claims,
+        shorts=[[h.number, h.statement, h.verdict] for h in claims],
+        regression_head=HEAD,
+        many=len(sections) > 1,
+        study_hash=study.hash,
+        seed=content["seed"],
+        rule=study.rule,
+        inference=study.inference,
+        versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
+    )

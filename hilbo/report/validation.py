@@ -1,0 +1,275 @@
+"""Results of validation sessions: tables II to IV, confusion, preferences, the aggregate's set against individuals'.
+
+`validate` computes one material; `write_validation` makes the folder of `hilbo validate` with one section for each
+material: result.json, the tables as CSV, the figures, and one page. `hilbo report` uses the same parts.
+
+Of every coefficient the page shows the widest of the iid, clustered and (up to 12 clusters) wild bootstrap intervals,
+which docs/statistics.md finds the safest; all kinds of error are in the CSV tables.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.stats import binomtest
+
+from hilbo.report.page import template
+from hilbo.report.results import as_json, save_figures, versions
+from hilbo.statistics.paper_tables import PaperTables, aggregate_comparisons, paper_tables, set_sources
+from hilbo.statistics.preferences import rate
+from hilbo.statistics.regression import FEW_CLUSTERS, Regression
+from hilbo.study.config import Study
+from hilbo.study.trial_table import read_cells
+from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_material, read_sets, read_validation
+
+__all__ = [
+    "HEAD",
+    "Validated",
+    "materials_of",
+    "p_words",
+    "safest",
+    "slug",
+    "validate",
+    "validation_content",
+    "validation_csv",
+    "validation_figures",
+    "validation_section",
+    "write_validation",
+]
+
+_TITLES = {
+    "II": 'Table II: is the best set more often "{top}" than the others?',
+    "III": "Table III: answers to best and worst against mid (negative: towards “{top}”)",
+    "IV": "Table IV: is the aggregate's set preferred to individuals' own? (0: neither)",
+}
+
+
+class Validated(NamedTuple):
+    """Everything that the validation sessions of one material say."""
+
+    material: str
+    tables: PaperTables
+    overall: pd.DataFrame | None
+    """Share preferring the aggregate's set to an individual's, by every kind of interval; ties left out."""
+    people: pd.DataFrame | None
+    """The same person by person: `name`, `wins`, `losses`, `ties`, `rate`, `low`, `high` (exact)."""
+    participants: int
+    comparisons: int
+
+    def regressions(self) -> dict[str, Regression]:
+        """Tables II to IV by their number, those that there are."""
+        found = {"II": self.tables.table_2, "III": self.tables.table_3, "IV": self.tables.table_4}
+        return {number: table for number, table in found.items() if table is not None}
+
+
+def materials_of(table: pd.DataFrame) -> list[str | None]:
+    """The materials of a validation or trial table, in order of appearance; [None] if it names none."""
+    return list(pd.unique(table["material"])) if "material" in table else [None]
+
+
+def validate(
+    table: pd.DataFrame,
+    sets: pd.DataFrame | None = None,
+    responses: Sequence[str] = RESPONSES,
+    material: str | None = None,
+    *,
+    seed: int = 0,
+    bootstrap: bool = True,
+) -> Validated:
+    """The statistics of one material's comparisons. Raises `InputError` for a bad table."""
+    chosen = of_material(check_validation(table, responses), material)
+    tables = paper_tables(chosen, sets, responses=responses, bootstrap=bootstrap, seed=seed)
+    rows = aggregate_comparisons(chosen, set_sources(chosen, sets)[0])
+    decided = rows[rows["preferred"] != TIE]
+    won = (decided["preferred"] != "individual").to_numpy()
+    overall = rate(won, decided[["participant", "set"]], bootstrap=bootstrap, seed=seed) if len(won) else None
+    people = pd.DataFrame([_person(name, mine) for name, mine in rows.groupby("participant", sort=False)])
+    count = chosen["participant"].nunique()
+    return Validated(material or "", tables, overall, people if len(people) else None, count, len(chosen))
+
+
+def _person(name, rows):
+    wins, losses = (int((rows["preferred"] == word).sum()) for word in ("Aggregate-Best", "individual"))
+    found = {"name": name, "wins": wins, "losses": losses, "ties": len(rows) - wins - losses}
+    if not wins + losses:
+        return found | {"rate": np.nan, "low": 0.0, "high": 1.0}
+    ends = binomtest(wins, wins + losses).proportion_ci()
+    return found | {"rate": wins / (wins + losses), "low": ends.low, "high": ends.high}
+
+
+def safest(table: Regression) -> pd.DataFrame:
+    """Of every coefficient the row with the widest interval among iid and clustered errors, of few clusters among the
+    wild bootstrap too; or its profile."""
+    few = min(table.clusters.values(), default=FEW_CLUSTERS + 1) <= FEW_CLUSTERS
+    rows = []
+    for _, mine in table.table.groupby("term", sort=False):
+        plain = mine if few else mine[~mine["errors"].str.startswith("wild")]
+        width = (plain["high"] - plain["low"]).where(np.isfinite(plain["std_error"]), -1.0)
+        separated = plain["errors"] == "profile likelihood"
+        rows.append(plain[separated].iloc[0] if separated.any() else plain.loc[width.idxmax()])
+    return pd.DataFrame(rows)
+
+
+def validation_content(found: Validated) -> dict[str, Any]:
+    """As result.json holds it."""
+    tables = found.tables
+    content: dict[str, Any] = {
+        "material": found.material,
+        "participants": found.participants,
+        "comparisons": found.comparisons,
+        "confusion": {str(name): {str(k): int(v) for k, v in row.items()} for name, row in tables.confusion.iterrows()},
+        "preferences": _records(tables.preferences),
+        "tables": {
+            number: {"rows": _records(table.table), "answers": table.answers, "clusters": table.clusters}
+            for number, table in found.regressions().items()
+        },
+        "limits": list(tables.limits),
+        "warnings": [w for table in found.regressions().values() for w in table.warnings],
+    }
+    if found.overall is not None and found.people is not None:
+        content["aggregate_best"] = {"overall": _records(found.overall), "people": _records(found.people)}
+    return content
+
+
+def _records(table):
+    return [{str(k): _plain(v) for k, v in row.items()} for row in table.to_dict("records")]
+
+
+def _plain(value):
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def validation_csv(found: Validated) -> dict[str, pd.DataFrame]:
+    """File name (without .csv) -> table."""
+    tables = found.tables
+    files = {"confusion": tables.confusion.reset_index(), "preferences": tables.preferences}
+    files |= {f"table_{number}": table.table for number, table in found.regressions().items()}
+    if found.overall is not None and found.people is not None:
+        files |= {"aggregate_best": found.overall, "aggregate_best_people": found.people}
+    return files
+
+
+def validation_figures(found: Validated) -> dict[str, tuple[Any, str, str]]:
+    """Name -> figure, title, caption."""
+    from hilbo.report.figures import validation as plotting
+
+    figures = {}
+    if found.tables.confusion.to_numpy().any() or not found.tables.preferences.empty:
+        figures["validation"] = (
+            plotting.validation_figure(found.tables.confusion, found.tables.preferences),
+            "Validation sessions",
+            "Left: how often each of the three sets was put in each class, share and count; a map that orders them"
+            " rightly has the large shares on the diagonal. Right: of each pair, how often the first was preferred,"
+            " with the 95 % interval that takes account of who answered (where everybody agreed: the share of people"
+            " who would). Paper, figures 6b and 6c.",
+        )
+    if found.overall is not None and found.people is not None:
+        figures["aggregate-best"] = (
+            plotting.aggregate_best_figure(found.people, found.overall),
+            "Aggregate-best against individual-best",
+            "How often the population's set was preferred to individuals' own, by each participant and by all (ties"
+            " left out); dashed: no preference.",
+        )
+    return figures
+
+
+def validation_section(found: Validated, responses: Sequence[str], pictures: list[dict[str, str]]) -> dict[str, Any]:
+    """What the template needs."""
+    top = responses[-1]
+    return {
+        "material": found.material,
+        "lead": f"{found.participants} participants made {found.comparisons} comparisons.",
+        "limits": found.tables.limits,
+        "figures": pictures,
+        "regressions": [
+            {"title": _TITLES[number].format(top=top), "rows": _shown(table), "warnings": table.warnings}
+            for number, table in found.regressions().items()
+        ],
+    }
+
+
+HEAD = ["", "estimate", "std. error", "t-ratio", "degrees of freedom", "p-value", "95 % interval", "errors"]
+
+
+def _shown(table):
+    rows = []
+    for _, row in safest(table).iterrows():
+        sure = np.isfinite(row["std_error"])
+        rows.append([
+            row["term"],
+            f"{row['estimate']:.4f}" if np.isfinite(row["estimate"]) else ("+∞" if row["estimate"] > 0 else "−∞"),
+            f"{row['std_error']:.4f}" if sure else "–",
+            f"{row['statistic']:.2f}" if sure else "–",
+            f"{row['degrees_of_freedom']:.0f}" if np.isfinite(row["degrees_of_freedom"]) else "–",
+            p_words(row["p_value"]),
+            f"{_end(row['low'])} to {_end(row['high'])}",
+            row["errors"],
+        ])  # fmt: skip
+    return rows
+
+
+def _end(value):
+    return f"{value:.2f}" if np.isfinite(value) else ("∞" if value > 0 else "−∞")
+
+
+def p_words(p: float) -> str:
+    """A p-value as it is printed."""
+    return "–" if not np.isfinite(p) else "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def write_validation(
+    study: Study,
+    path: Path,
+    sets: Path | None,
+    material: str | None,
+    folder: Path,
+    seed: int = 0,
+    say=lambda text: None,
+) -> dict[str, Any]:
+    """Write the folder of `hilbo validate`; returns the content of result.json."""
+    say("reading")
+    table = _read(path, study, material)
+    known = None if sets is None else read_sets(sets, study.space.names)
+    contents, sections = [], []
+    names = materials_of(table)
+    for name in names:
+        say(f"validation sessions{'' if name is None else f' of {name}'}")
+        found = validate(table, known, study.responses, name, seed=seed)
+        part = folder if len(names) == 1 else folder / slug(str(name))
+        part.mkdir(exist_ok=True)
+        for file, frame in validation_csv(found).items():
+            frame.to_csv(part / f"{file}.csv", index=False)
+        pictures = save_figures(validation_figures(found), part)
+        contents.append(validation_content(found))
+        sections.append(validation_section(found, study.responses, pictures))
+    content = {"materials": contents, "study": study.hash, "seed": seed, "versions": versions()}
+    content["warnings"] = [w for part in contents for w in part["warnings"]]
+    (folder / "result.json").write_text(as_json(content), encoding="utf-8")
+    page = template("validation.html").render(
+        title=f"{study.name}: validation sessions",
+        lead="People compared pairs of renderings, classified each, and said which was nearer to the real material.",
+        warnings=[],
+        sections=sections,
+        head=HEAD,
+        study_hash=study.hash,
+        seed=seed,
+        versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
+    )
+    (folder / "report.html").write_text(page, encoding="utf-8")
+    return content
+
+
+def _read(path: Path, study: Study, material: str | None) -> pd.DataFrame:
+    """The comparisons of all materials, or of one."""
+    if material is not None:
+        return read_validation(path, study.responses, material)
+    cells = read_cells(path, "a validation table needs a header and a comparison")
+    return check_validation(cells, study.responses, str(path))
+
+
+def slug(name: str) -> str:
+    """A name as part of a file's name."""
+    kept = "".join(c if c.isalnum() else "-" for c in name.lower())
+    return "-".join(part for part in kept.split("-") if part) or "material"

@@ -1,0 +1,17 @@
+"""Candidate points of the unit cube, among which a function is maximised before the best of them are polished."""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hilbo.search.space import SearchSpace
+
+__all__ = ["CANDIDATES", "search_points"]
+
+CANDIDATES = 4096
+"""Points inside the feasible set among which a function is maximised before polishing; a quarter more on its walls."""
+
+
+def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Float[Array, "m d"]:
+    """Points of the unit cube among which to look for a maximum: `count` inside the feasible set, a quarter of that
+    on its walls, edges and corners."""
+    return jnp.concatenate([jnp.asarray(space.candidates(count, seed)), jnp.asarray(space.walls(count // 4, seed))])

@@ -1,0 +1,32 @@
+"""A point of the unit cube as what is rendered: its parameter set with the derived K0, and its passivity margin."""
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from hilbo.search.space import SearchSpace
+
+__all__ = ["K0_range", "margin_of", "set_of"]
+
+
+def set_of(space: SearchSpace, x: ArrayLike) -> dict[str, float]:
+    """A point of the unit cube as a parameter set in physical units, derived K0 included."""
+    physical = np.asarray(space.to_physical(np.asarray(x)))
+    values = dict(zip(space.names, physical.tolist(), strict=True))
+    return {name: float(value) for name, value in space.derived(values).items()} | values
+
+
+def margin_of(space: SearchSpace, x: ArrayLike) -> float | None:
+    """Passivity margin (N.s/m) of a point, None without mechanics; negative means not passive."""
+    values = set_of(space, x)
+    margin = space.passivity_margin({name: values[name] for name in space.names})
+    return None if margin is None else float(margin)
+
+
+def K0_range(space: SearchSpace) -> float:
+    """N/mm, from the K0 at the box's most elastic corner to K_eff, by which errors of K0 are normalised.
+
+    16.14 for the paper's study: from -15.70 to 0.44 (paper, table I).
+    """
+    ends = {p.name: p.low if p.name == "alpha" else p.high for p in space.parameters}
+    assert space.mechanics is not None
+    return space.mechanics.K_eff - float(space.derived(ends)["K0"])

@@ -1,0 +1,380 @@
+"""The space that is searched: named bounded parameters with units, the unit cube, and its passive part.
+
+Three coordinates of one point:
+
+- *physical*: the numbers of tables and devices, in the units of the parameters;
+- *unit cube* x: every parameter on [0, 1] over its full range, linear or logarithmic; kernels see only these;
+- *box* w: the optimiser's coordinates. With mechanics, x_K1 = w_K1 · x_K1max(B1, α), where K1max is the largest
+  passive K1 (`passivity.largest_K1`), so that the feasible set is the whole of [0, 1]^d; without, w = x.
+
+With a range of effective damping B_eff the column starts above the lowest K1 too. B_eff = 1000·T·β·M1·(K1/(K1 + β·S))²
+rises with K1 from 0 to 1000·T·β·M1, so that the range is an interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are
+K1 = β·S·r/(1 - r), infinite for r >= 1; and x_K1 = start + w_K1 · width.
+
+A column (B1, α) with K1max below the lowest K1, or no K1 in the range, has width 0 and holds no feasible point. Points
+that fill the feasible set evenly come from uniform numbers by the Rosenblatt map whose density is the column's width;
+Rosenblatt (1952), Ann. Math. Stat. 23:470. The search keeps `SEARCH_MARGIN` away from the device's damping, so that a
+device that checks passivity again in float32 never refuses a proposal.
+"""
+
+import functools
+import math
+from collections.abc import Mapping
+from typing import Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Real
+
+from hilbo import passivity, viscoelastic
+from hilbo.errors import InputError
+from hilbo.mechanics.exponentials import STATES
+from hilbo.mechanics.memory import Memory, span, sums
+from hilbo.search.space_filling import latin_chunks, sobol_chunks, take, wall_chunks
+
+__all__ = ["COLUMNS", "ROWS", "SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace", "column_ends", "column_table"]
+
+SEARCH_MARGIN = 1e-3
+"""The search uses the damping b·(1 - SEARCH_MARGIN)."""
+
+# Cells of the table of column widths. At small B1 the width falls from all to little within 1/1000 of the range, so
+# the rows crowd there: with even rows the share of the first one alone would be off by a sixth.
+_CELLS = 256
+ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
+COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
+# The map puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse them.
+_ROUNDING = 64
+
+
+class Parameter(eqx.Module):
+    """One named parameter, `low` to `high` in `unit`; `scale` says how it lies on [0, 1]."""
+
+    name: str = eqx.field(static=True)
+    low: float = eqx.field(static=True, converter=float)
+    high: float = eqx.field(static=True, converter=float)
+    unit: str = eqx.field(static=True, default="")
+    scale: Literal["linear", "log"] = eqx.field(static=True, default="linear")
+
+    def __check_init__(self):
+        path = f"parameters.{self.name}"
+        if not (math.isfinite(self.low) and math.isfinite(self.high)):
+            raise InputError(f"{path} runs from {self.low} to {self.high}, both ends must be finite numbers.")
+        if not self.low < self.high:
+            raise InputError(f"{path}.low is {self.low}, it must be below high = {self.high}.")
+        if self.scale == "log" and self.low <= 0:
+            raise InputError(f'{path}.low is {self.low}, it must be above 0 on a scale = "log".')
+
+    def to_unit(self, value: Real[Array, "..."]) -> Float[Array, "..."]:
+        """Physical value to [0, 1]; measured from the nearer end, so that both ends are met exactly."""
+        if self.scale == "log":
+            above, below = jnp.log1p((value - self.low) / self.low), jnp.log1p((self.high - value) / value)
+            width = math.log(self.high / self.low)
+        else:
+            above, below, width = value - self.low, self.high - value, self.high - self.low
+        return jnp.where(above < below, above / width, 1 - below / width)
+
+    def to_physical(self, unit: Real[Array, "..."]) -> Float[Array, "..."]:
+        """Inverse of `to_unit`; never leaves [low, high] for a `unit` in [0, 1]."""
+        if self.scale == "log":
+            ratio = self.high / self.low
+            upwards, downwards = self.low * ratio**unit, self.high * ratio ** (unit - 1)
+        else:
+            width = self.high - self.low
+            upwards, downwards = self.low + width * unit, self.high - width * (1 - unit)
+        return jnp.where(unit < 0.5, upwards, downwards)
+
+
+class Mechanics(eqx.Module):
+    """What the renderer adds to the box: the FO-SLS, its memory and rate, and the device's damping.
+
+    `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
+    optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd) of short memory; `states`: exponentials of full memory,
+    for which alone the effective damping depends on them, and not on K1; `T`: s.
+    """
+
+    K_eff: float = eqx.field(static=True, converter=float)
+    damping: float = eqx.field(static=True, converter=float)
+    N: int = eqx.field(static=True, default=101)
+    T: float = eqx.field(static=True, converter=float, default=1e-3)
+    memory: Memory = eqx.field(static=True, default="short")
+    states: int = eqx.field(static=True, default=10)
+    effective_damping: tuple[float, float] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        for key, least in (("damping", 0.0), ("T", 0.0), ("K_eff", -math.ulp(0.0))):
+            value = getattr(self, key)
+            if not least < value < math.inf:
+                raise InputError(f"renderer.{key} is {value}, it must be {'0 or' if least else 'a number'} above 0.")
+        if self.memory == "full" and self.states not in STATES:
+            raise InputError(f"renderer.states is {self.states}, it must be one of {', '.join(map(str, STATES))}.")
+        if self.memory == "short" and (self.N < 1 or self.N % 2 == 0):
+            raise InputError(f"renderer.N is {self.N}, it must be odd and at least 1; write for example N = 101.")
+        if self.effective_damping is not None and not 0 <= self.effective_damping[0] < self.effective_damping[1]:
+            raise InputError(
+                f"renderer.effective_damping is {list(self.effective_damping)}, it must be a lower end, 0 or above, "
+                "and a higher one; write for example effective_damping = [10, 80]."
+            )
+
+
+class SearchSpace(eqx.Module):
+    """Named parameters, and with `mechanics` the passive part of their box.
+
+    With mechanics the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order; further ones are
+    unconstrained. Raises InputError if no column (B1, alpha) holds a passive K1.
+    """
+
+    parameters: tuple[Parameter, ...] = eqx.field(static=True)
+    mechanics: Mechanics | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        if not self.parameters:
+            raise InputError("parameters is empty, a search space needs at least one.")
+        if len(set(self.names)) < self.dim:
+            raise InputError(f"parameters has one name twice: {', '.join(self.names)}.")
+        if self.mechanics is not None:
+            self._check_mechanics(self.mechanics)
+
+    def _check_mechanics(self, mechanics):
+        missing = [name for name in ("K1", "B1", "alpha") if name not in self.names]
+        if missing:
+            raise InputError(f"parameters.{missing[0]} is missing, the renderer's model needs K1, B1 and alpha.")
+        for name in ("K1", "B1", "alpha"):
+            parameter = self.parameters[self._index(name)]
+            if parameter.low <= 0:
+                raise InputError(f"parameters.{name}.low is {parameter.low}, it must be above 0 for the FO-SLS.")
+        alpha = self.parameters[self._index("alpha")]
+        if alpha.high >= 1:
+            raise InputError(f"parameters.alpha.high is {alpha.high}, it must be below 1 for the FO-SLS.")
+        if not _column_table(self)[0][-1] > 0:
+            if mechanics.effective_damping is not None:
+                raise InputError(
+                    f"renderer.effective_damping leaves no parameter set: none is passive with renderer.damping = "
+                    f"{mechanics.damping} N.s/m and between {mechanics.effective_damping[0]} and "
+                    f"{mechanics.effective_damping[1]} N.s/m; widen it."
+                )
+            raise InputError(
+                f"renderer.damping is {mechanics.damping} N.s/m, with which no K1 from "
+                f"{self.parameters[self._index('K1')].low} N/mm up is passive for any B1 and alpha; "
+                "check its unit, or lower K_eff or parameters.K1.low."
+            )
+
+    @property
+    def dim(self) -> int:
+        """Number of parameters."""
+        return len(self.parameters)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names in the order of the coordinates."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def to_unit(self, physical: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
+        """Physical values to the unit cube, last axis = parameter; exact at both ends."""
+        physical = _floating(physical)
+        return jnp.stack([p.to_unit(physical[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
+
+    def to_physical(self, unit: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
+        """Unit cube to physical values, last axis = parameter; exact at both ends, and never outside them."""
+        unit = _floating(unit)
+        return jnp.stack([p.to_physical(unit[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
+
+    def from_box(self, w: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
+        """Optimiser's coordinates in [0, 1]^d to the unit cube; differentiable.
+
+        In a column without a feasible point x_K1 is 0 and `feasible` says no.
+        """
+        w = _floating(w)
+        if self.mechanics is None:
+            return w
+        if self.mechanics.effective_damping is None:
+            return w.at[..., self._index("K1")].multiply(self._limit(self.mechanics, w))
+        low, width = self._interval(self.mechanics, w)
+        K1 = self._index("K1")
+        return w.at[..., K1].set(low + w[..., K1] * width)
+
+    def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
+        """Inverse of `from_box`, for `x` in the feasible set."""
+        x = _floating(x)
+        if self.mechanics is None:
+            return x
+        if self.mechanics.effective_damping is None:
+            return x.at[..., self._index("K1")].divide(self._limit(self.mechanics, x))
+        low, width = self._interval(self.mechanics, x)
+        K1 = self._index("K1")
+        return x.at[..., K1].set((x[..., K1] - low) / width)
+
+    def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
+        """Whether points of the unit cube are in the box, passive with the search margin, and damped as asked for."""
+        x = _floating(x)
+        inside = jnp.all((x >= 0) & (x <= 1), axis=-1)
+        mechanics = self.mechanics
+        if mechanics is None:
+            return inside
+        physical = self._split(self.to_physical(x))
+        available = mechanics.damping * (1 - SEARCH_MARGIN) * (1 + _ROUNDING * float(jnp.finfo(x.dtype).eps))
+        inside &= _minimum_damping(mechanics, physical) <= available
+        if mechanics.effective_damping is not None:
+            low, high = mechanics.effective_damping
+            damping = _effective_damping(mechanics, physical)
+            slack = 4 * _ROUNDING * float(jnp.finfo(x.dtype).eps)
+            inside &= (low * (1 - slack) <= damping) & (damping <= high * (1 + slack))
+        return inside
+
+    def derived(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> dict[str, Float[Array, "..."]]:
+        """What follows from the parameters: K0 (N/mm) with mechanics, nothing without."""
+        m = self.mechanics
+        if m is None:
+            return {}
+        return {"K0": viscoelastic.K0_from_effective_stiffness(*_set(physical), m.K_eff, m.N, m.T, memory=m.memory)}
+
+    def passivity_margin(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."] | None:
+        """Damping of the device less the smallest passive one, N·s/m; None without mechanics."""
+        return None if self.mechanics is None else self.mechanics.damping - _minimum_damping(self.mechanics, physical)
+
+    def volume(self) -> float:
+        """Share of the unit cube that is feasible: the mean width of its columns, on a grid; 1 without mechanics."""
+        return 1.0 if self.mechanics is None else float(_column_table(self)[0][-1])
+
+    def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
+        """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol')."""
+        return _take(self, m, sobol_chunks(self.dim, m, seed))
+
+    def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
+        """`m` points on the walls, edges and corners of the feasible set, the passive boundary included."""
+        count = 2 ** max(m - 1, 0).bit_length()
+        return _take(self, m, sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed))
+
+    def latin_hypercube(self, n: int, seed: int) -> Float[np.ndarray, "n d"]:
+        """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
+
+        Points that fall outside the feasible set (a few, at the foot of infeasible columns) are replaced from further
+        hypercubes, at the price of the even spread.
+        """
+        return _take(self, n, latin_chunks(self.dim, n, seed))
+
+    def _index(self, name):
+        return self.names.index(name)
+
+    def _split(self, physical):
+        return {name: physical[..., i] for i, name in enumerate(self.names)}
+
+    def _limit(self, m, x):
+        """Width of the column of each point: the largest feasible x_K1, 0 where there is none."""
+        K1 = self.parameters[self._index("K1")]
+        B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
+        b = m.damping * (1 - SEARCH_MARGIN)
+        largest = passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory)
+        return K1.to_unit(jnp.clip(largest, K1.low, K1.high))
+
+    def _interval(self, m, x):
+        """Start and width of the column of each point, in x_K1, with a range of effective damping."""
+        K1 = self.parameters[self._index("K1")]
+        B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
+        first, last = _K1_range(m, B1, alpha)
+        low, high = K1.to_unit(jnp.clip(first, K1.low, K1.high)), K1.to_unit(jnp.clip(last, K1.low, K1.high))
+        high = jnp.minimum(high, self._limit(m, x))
+        return low, jnp.maximum(high - low, 0)
+
+
+def _K1_range(m, B1, alpha):
+    """The K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
+    memory = span(m.memory, m.N, m.states)
+    return tuple(viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
+
+
+def _K1_of(span, damping, B1, alpha, T):
+    """The K1 with this effective damping."""
+    beta, found = B1 * T**-alpha, sums(alpha, span)
+    square = damping / (1000 * T * beta * found.moment)
+    possible = (square > 0) & (square < 1)
+    share = jnp.sqrt(jnp.where(possible, square, 0.25))
+    K1 = beta * found.at_dc * share / (1 - share)
+    return jnp.where(possible, K1, jnp.where(square > 0, jnp.inf, 0))
+
+
+def _effective_damping(m, physical):
+    return viscoelastic.effective_damping(*_set(physical), m.N, m.T, memory=m.memory, states=m.states)
+
+
+def _floating(x):
+    return jnp.asarray(x, jnp.result_type(1.0, x))
+
+
+def _set(physical):
+    return physical["K1"], physical["B1"], physical["alpha"]
+
+
+def _minimum_damping(m, physical):
+    return passivity.minimum_damping(*_set(physical), m.K_eff, m.N, m.T, memory=m.memory)
+
+
+@functools.lru_cache(maxsize=16)
+def column_table(space):
+    """Both ends of the columns, (B1, α), on a grid: at the x_B1 `ROWS` and the x_alpha `COLUMNS`."""
+    x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
+    x[..., space._index("B1")], x[..., space._index("alpha")] = ROWS[:, None], COLUMNS
+    return tuple(np.asarray(end, float) for end in column_ends(space, x))
+
+
+@functools.lru_cache(maxsize=16)
+def _column_table(space):
+    """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
+    low, high = column_table(space)
+    node = high - low
+    mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
+    volume = mean * np.diff(ROWS)[:, None] * np.diff(COLUMNS)
+    within = np.pad(np.cumsum(volume, axis=1), ((0, 0), (1, 0)))
+    total = within[:, -1:]
+    within = np.where(total > 0, within, COLUMNS) / np.where(total > 0, total, 1)
+    return np.pad(np.cumsum(total), (1, 0)), within
+
+
+def _rosenblatt(space, uniform):
+    """Uniform numbers (n, d) to box coordinates in which a column is as likely as it is wide."""
+    if space.mechanics is None:
+        return uniform
+    rows, within = _column_table(space)
+    B1, alpha = space._index("B1"), space._index("alpha")
+    w = uniform.copy()
+    w[:, B1] = np.interp(uniform[:, B1] * rows[-1], rows, ROWS)
+    row = np.searchsorted(ROWS[1:-1], w[:, B1], side="right")
+    # All rows at once: row r of the table climbs from r to r + 1.
+    climbing = (within + np.arange(_CELLS)[:, None]).ravel()
+    w[:, alpha] = np.interp(row + uniform[:, alpha], climbing, np.tile(COLUMNS, _CELLS))
+    return w
+
+
+@eqx.filter_jit
+def column_ends(space, x):
+    """Both ends (...,) of the column of each point (..., d) of the unit cube, in x_K1; equal where none is feasible."""
+    if space.mechanics.effective_damping is None:
+        high = space._limit(space.mechanics, x)
+        return jnp.zeros_like(high), high
+    low, width = space._interval(space.mechanics, x)
+    return low, low + width
+
+
+@eqx.filter_jit
+def _from_box(space, w):
+    x = space.from_box(w)
+    return x, space.feasible(x)
+
+
+def _take(space, count, chunks, hold=None):
+    """The first `count` feasible points out of chunks of uniform numbers, some coordinates held at an end."""
+
+    def place(uniform):
+        w = _rosenblatt(space, uniform)
+        if hold is not None:
+            ends = next(hold)
+            w = np.where(np.isnan(ends), w, ends)
+        return _from_box(space, w)
+
+    kept, found, tried = take(count, chunks, place)
+    if found < count:
+        raise InputError(
+            f"renderer.effective_damping leaves {found} of {tried} passive points, too few to search; widen it."
+        )
+    return np.concatenate(kept) if kept else np.zeros((0, space.dim))

@@ -1,0 +1,72 @@
+"""The lattice on which a search space is screened: a tensor grid in columns along K1, and points of the passive wall.
+
+A column of the feasible set ends at the passive wall, x_K1 = x_K1max(B1, alpha); its ends are points of the lattice.
+Where the wall is steep, columns meet it too rarely. There the points are those at which it meets grid lines along B1
+and along alpha: found in a table of the wall by interpolation, then put exactly on the wall.
+"""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+
+from hilbo.search.lattice import Lattice
+from hilbo.search.space import COLUMNS, ROWS, SearchSpace, column_ends, column_table
+from hilbo.search.space_filling import crossings
+
+__all__ = ["lattice_of"]
+
+
+@functools.lru_cache(maxsize=16)
+def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
+    """The lattice of a space, `nodes` per coordinate; without mechanics its columns run along the first parameter."""
+    even, dim = np.linspace(0.0, 1.0, nodes), space.dim
+    if space.mechanics is None:
+        none = jnp.zeros((0, nodes ** (dim - 1)))
+        inside, extra = jnp.ones((nodes, none.shape[1]), bool), jnp.zeros((0, dim))
+        return Lattice(jnp.asarray(even), inside, none, none > 0, extra, 0, dim)
+    along = space.names.index("K1")
+    others = np.stack(np.meshgrid(*[even] * (dim - 1), indexing="ij"), axis=-1).reshape(-1, dim - 1)
+    low, high = _ends_of(space, np.insert(others, along, 0.0, axis=1))
+    inside = (low <= even[:, None]) & (even[:, None] <= high) & (high > low)
+    ends = np.stack([low, high] if space.mechanics.effective_damping else [high])
+    return Lattice(
+        nodes=jnp.asarray(even),
+        inside=jnp.asarray(inside),
+        ends=jnp.asarray(ends),
+        present=jnp.asarray(np.broadcast_to(high > low, ends.shape)),
+        extra=jnp.asarray(_steep_wall(space, even)),
+        along=along,
+        dim=dim,
+    )
+
+
+def _steep_wall(space, levels):
+    """Points of the wall at every second of these x_K1, (p, 3), for a space of K1, B1 and alpha alone."""
+    high, rises = column_table(space)[1], levels[-1:0:-2]
+    points = np.ones((0, 3))
+    for table, lines, positions, names in (
+        (high.T, COLUMNS, ROWS, ("alpha", "B1")),
+        (high, ROWS, COLUMNS, ("B1", "alpha")),
+    ):
+        at = np.abs(lines[:, None] - levels[None, :]).argmin(axis=0)
+        line, place = crossings(table[at], positions, rises)
+        found = np.ones((len(line), 3))
+        found[:, [space.names.index(name) for name in names]] = np.stack([lines[at][line], place], axis=1)
+        points = np.concatenate([points, found])
+    low, high = _ends_of(space, points)
+    points[:, space.names.index("K1")] = high
+    return points[high > low]
+
+
+def _ends_of(space, points):
+    """Both ends of the columns of some points; as many at a time as the table has, so that nothing new is compiled."""
+    shape = (len(ROWS), len(COLUMNS), space.dim)
+    parts = []
+    for begin in range(0, len(points), shape[0] * shape[1]):
+        part = points[begin : begin + shape[0] * shape[1]]
+        filled = np.full((shape[0] * shape[1], space.dim), 0.5)
+        filled[: len(part)] = part
+        ends = column_ends(space, filled.reshape(shape))
+        parts.append([np.asarray(end).reshape(-1)[: len(part)] for end in ends])
+    return tuple(np.concatenate(end) for end in zip(*parts, strict=True))

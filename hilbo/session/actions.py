@@ -1,0 +1,290 @@
+"""A live session: what may be done in a state, each as the event that says so.
+
+    state = LiveSession.start(study, header)
+    event = propose(state, chooser, at)        # or answer, undo, void, ...: what shall be logged, or RefusedError
+    state = state.after(event)                 # once it is on disk
+
+Pure: `at` is the time in s since the epoch. `hilbo.session.state` says what an event does.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from hilbo.session.records import Block, Event, Header, Need, Planned, RefusedError, Trial
+from hilbo.session.state import LiveSession, Screen
+from hilbo.study.protocols import protocol
+
+__all__ = [
+    "Block",
+    "Event",
+    "Header",
+    "LiveSession",
+    "Need",
+    "Planned",
+    "RefusedError",
+    "Screen",
+    "Trial",
+    "abort",
+    "answer",
+    "device",
+    "go_on",
+    "last_answered",
+    "more",
+    "note",
+    "pause",
+    "present",
+    "propose",
+    "repeat",
+    "restore",
+    "resume",
+    "sent",
+    "undo",
+    "void",
+    "voidable",
+]
+
+
+@runtime_checkable
+class Chooser(Protocol):
+    """What finds renderings: `hilbo.session.look_ahead.LiveChooser`."""
+
+    def choose(self, state: "LiveSession", need: Need) -> dict[str, Any]:
+        """`renderings`, `sets`, `first` and whatever explains them, for a proposal's data."""
+        ...
+
+
+# What may be done: each gives the event that says so, or raises RefusedError.
+
+
+def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
+    """The next trial: its renderings, and why these."""
+    if state.need is None:
+        raise RefusedError("nothing", f"nothing is to be proposed now: the screen shows {state.screen}.")
+    need = state.need
+    block = state.header.blocks[need.block]
+    phase = "repeat" if need.repeats is not None else block.phase
+    data = {
+        "id": len(state.trials) + 1,
+        "block": need.block,
+        "phase": phase,
+        "material": block.material,
+        "trial": _number(state, phase, block.material),
+        "planned": need.planned,
+        "repeats": need.repeats,
+    }
+    return _event(state, "propose", at, **data, **chooser.choose(state, need))
+
+
+def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event:
+    """The device has a rendering in force, as it says (`facts`: its CRC, what it read back, times)."""
+    found = _live(state, trial)
+    if side not in found.renderings:
+        raise RefusedError("bad-answer", f'trial {trial} has no side "{side}".')
+    return _event(state, "sent", at, id=trial, side=side, **facts)
+
+
+def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> Event:
+    """A step of a trial begins (`on`) or ends."""
+    found = _live(state, trial)
+    steps = steps_of(state, found)
+    if not 0 <= step < len(steps):
+        raise RefusedError("bad-answer", f"trial {trial} has {len(steps)} steps, none with the number {step}.")
+    return _event(state, "stimulus", at, id=trial, step=step, show=steps[step][0], on=bool(on))
+
+
+def answer(
+    state: LiveSession,
+    trial: Any,
+    client: Any,
+    values: Any,
+    at: float,
+    *,
+    browser: Any = None,
+    felt: bool = True,
+) -> Event | None:
+    """A participant's answer; None if this very answer (trial and client id) has been accepted already.
+
+    `values`: class_a, class_b (responses of the study), preferred ("a" or "b"), as the phase asks. `browser`: its time
+    and the response time, s; numbers by name. `felt`: refuse an answer to what was not felt. Raises RefusedError.
+    """
+    if not isinstance(trial, int) or isinstance(trial, bool) or not isinstance(client, str) or not client:
+        raise RefusedError("bad-answer", "an answer needs the number of its trial and the id of its client.")
+    found = state.trial(trial)
+    if found.values is not None:
+        if found.client == client:
+            return None
+        raise RefusedError("answered", f"trial {trial} is answered already, from another page.")
+    if found.status != "pending":
+        code = "voided" if found.status == "void" else "old-trial"
+        raise RefusedError(code, f"trial {trial} is over ({found.status}); the next one will be shown.")
+    if state.aborted is not None:
+        raise RefusedError("over", "the session has ended.")
+    if felt and found.felt != frozenset(found.renderings):
+        raise RefusedError("unfelt", f"trial {trial} has not been felt yet.")
+    _check_values(state, found, values)
+    return _event(state, "answer", at, id=trial, client=client, values=dict(values), browser=_times(browser))
+
+
+def undo(state: LiveSession, at: float, reason: str = "") -> Event:
+    """Take the last answer back; its rendering is asked again."""
+    _running(state)
+    last = last_answered(state)
+    if last is None:
+        raise RefusedError("nothing", "there is no answer to undo.")
+    return _event(state, "undo", at, id=last.id, reason=reason)
+
+
+def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
+    """Feel the pending trial once more from its first step; or an answered one, later, as a check of consistency.
+
+    The answer to a repeated trial of the second kind has the phase "repeat" and is never fitted.
+    """
+    _running(state)
+    found = state.pending if trial is None else state.trial(trial)
+    if found is None or found.status not in ("pending", "answered"):
+        raise RefusedError("nothing", "there is no trial to repeat.")
+    if found.repeats is not None and found.status == "answered":
+        raise RefusedError("nothing", f"trial {found.id} is a repetition itself; repeat trial {found.repeats}.")
+    return _event(state, "repeat", at, id=found.id)
+
+
+def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
+    """A trial shall not count; its rendering is asked again."""
+    _running(state)
+    found = state.trial(trial)
+    if found.status not in ("pending", "answered"):
+        raise RefusedError("nothing", f"trial {trial} is {found.status} already.")
+    return _event(state, "void", at, id=trial, reason=reason)
+
+
+def restore(state: LiveSession, trial: int, at: float) -> Event:
+    """A voided answer shall count after all. Raises RefusedError if its place has been filled."""
+    _running(state)
+    found = state.trial(trial)
+    if found.status != "void" or found.values is None:
+        raise RefusedError("nothing", f"trial {trial} has no voided answer.")
+    if found.repeats is None:
+        taken = found.planned is not None and any(t.planned == found.planned for t in state.answers(found.block))
+        if taken or len(state.answers(found.block)) >= state.quota(found.block):
+            raise RefusedError("nothing", f"the place of trial {trial} has been filled by a later one.")
+    return _event(state, "restore", at, id=trial)
+
+
+def pause(state: LiveSession, by: str, at: float) -> Event:
+    """A break, asked for by "participant" or "experimenter"."""
+    _running(state)
+    if state.paused is not None:
+        raise RefusedError("paused", "the session is paused already.")
+    return _event(state, "pause", at, by=by)
+
+
+def resume(state: LiveSession, at: float) -> Event:
+    """The end of a break."""
+    _running(state)
+    if state.paused is None:
+        raise RefusedError("nothing", "the session is not paused.")
+    return _event(state, "resume", at)
+
+
+def abort(state: LiveSession, reason: str, at: float) -> Event:
+    """The end of the session before its time."""
+    _running(state)
+    return _event(state, "abort", at, reason=reason)
+
+
+def note(state: LiveSession, text: str, at: float) -> Event:
+    """The experimenter's words."""
+    return _event(state, "note", at, text=text)
+
+
+def more(state: LiveSession, at: float) -> Event:
+    """Another rendering of the warm-up, at its end."""
+    if state.screen != "ready" or state.block is None:
+        raise RefusedError("nothing", "another rendering can be had at the end of the warm-up only.")
+    before = state.block - 1
+    if state.quota(before) >= len(state.header.blocks[before].trials):
+        raise RefusedError("nothing", "all renderings of the warm-up have been felt.")
+    return _event(state, "more", at, block=before)
+
+
+def go_on(state: LiveSession, at: float) -> Event:
+    """From the end of the warm-up, or of a rest, to the next block."""
+    if state.screen not in ("ready", "rest"):
+        raise RefusedError("nothing", "there is nothing to go on to: no warm-up or rest has come to its end.")
+    return _event(state, "go_on", at, block=state.block)
+
+
+def device(state: LiveSession, condition: str, at: float, *, trial: int | None = None, **facts) -> Event:
+    """The device says "ready", "running", "stopped", "hold", "estop" or "lost"; `facts`: its counters and reason.
+
+    With hold, estop or lost the trial (by default the pending one) is void if it had begun.
+    """
+    if trial is not None:
+        state.trial(trial)
+    return _event(state, "device", at, condition=condition, trial=trial, **facts)
+
+
+def steps_of(state: LiveSession, trial: Trial) -> list[tuple[str, float]]:
+    """What is felt and for how many seconds; a and b in the order of this trial."""
+    steps = protocol(state.study.session, state.header.blocks[trial.block].phase).steps
+    other = {"a": "b", "b": "a"} if trial.first == "b" else {}
+    return [(other.get(step.show, step.show), step.seconds) for step in steps]
+
+
+def last_answered(state: LiveSession) -> Trial | None:
+    """The trial whose answer came last, of those that count: what `undo` takes back."""
+    given = [t for t in state.trials if t.status == "answered"]
+    return max(given, key=lambda t: t.answered["seq"] if t.answered else 0, default=None)
+
+
+def voidable(state: LiveSession) -> Trial | None:
+    """The trial that a person means who wants one void: the one being felt, or the newest answered one."""
+    if state.pending is not None and state.pending.step is not None:
+        return state.pending
+    return next((t for t in reversed(state.trials) if t.status == "answered"), None)
+
+
+def _number(state, phase, material):
+    same = (t for t in state.trials if t.data["phase"] == phase and t.data["material"] == material)
+    return 1 + sum(1 for _ in same)
+
+
+def _event(state, kind, at, **data):
+    if not math.isfinite(at):
+        raise RefusedError("bad-answer", f"the time {at} is no time.")
+    return Event(seq=state.seq + 1, kind=kind, time=float(at), data=data)
+
+
+def _running(state):
+    if state.aborted is not None:
+        raise RefusedError("over", "the session has ended.")
+
+
+def _live(state, id):
+    found = state.trial(id)
+    if found.status != "pending":
+        raise RefusedError("old-trial", f"trial {id} is {found.status}.")
+    return found
+
+
+def _times(browser):
+    if browser is None:
+        return {}
+    good = isinstance(browser, Mapping) and len(browser) <= 8
+    if not good or not all(
+        isinstance(name, str) and isinstance(value, int | float) and math.isfinite(value)
+        for name, value in browser.items()
+    ):
+        raise RefusedError("bad-answer", "the browser's times must be numbers of seconds.")
+    return {name: float(value) for name, value in browser.items()}
+
+
+def _check_values(state, trial, values):
+    asks = protocol(state.study.session, state.header.blocks[trial.block].phase).asks
+    if not isinstance(values, Mapping) or set(values) != set(asks):
+        raise RefusedError("bad-answer", f"an answer to trial {trial.id} has {', '.join(asks)}, and nothing else.")
+    for ask in asks:
+        allowed = ("a", "b") if ask == "preferred" else state.study.responses
+        if not isinstance(values[ask], str) or values[ask] not in allowed:
+            raise RefusedError("bad-answer", f"{ask} must be one of {', '.join(allowed)}.")

@@ -1,0 +1,272 @@
+"""A session on disk: JSON Lines, appended and forced to the disk one event at a time, read back whole or refused.
+
+The first line is the header, every other an event:
+
+    {"seq":1,"kind":"propose","time":…,"data":{…},"previous":"…","crc":"…"}
+
+`previous` is the start of the SHA-256 of the line before, `crc` the CRC-32 of this line up to it. A last line without
+its end was never acknowledged: it is dropped, and said so. Any other damage is refused with its line. One writer at a
+time, by a lock of the operating system on the file, which goes with the process that holds it.
+"""
+
+import hashlib
+import os
+import re
+import time
+import zlib
+from pathlib import Path
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.session.records import Event, Header
+from hilbo.session.state import LiveSession
+from hilbo.study.config import Study
+
+__all__ = ["EventLog", "LogError", "in_use", "log_name", "log_paths", "read_log"]
+
+_SUFFIX = ".session.jsonl"
+
+
+class LogError(RuntimeError):
+    """An event could not be written; the log is as it was before, and everything acknowledged is in it."""
+
+
+class EventLog:
+    """An open log: `create` a new one or `resume` one, then `append` events; `state` is always the fold of the file.
+
+    `dropped`: what was wrong with the last line when the log was opened, or "". `sync_s`: the time the last fsync took.
+    """
+
+    def __init__(self, path: Path, file: int, state: LiveSession, previous: bytes, size: int, dropped: str) -> None:
+        self.path, self.state, self.dropped = path, state, dropped
+        self.sync_s = 0.0
+        self._file, self._previous, self._size = file, previous, size
+
+    @classmethod
+    def create(cls, path: str | os.PathLike, study: Study, header: Header) -> "EventLog":
+        """Begin a log. Raises InputError if there is one already, or it cannot be written."""
+        path = Path(path)
+        state = LiveSession.start(study, header)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644)
+        except FileExistsError:
+            raise InputError(f"{path}: exists already; resume it, or choose another session.") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder.") from error
+        log = cls(path, file, state, b"", 0, "")
+        try:
+            _lock(file, path)
+            log._write(_line(0, "header", time.time(), msgspec.to_builtins(header), b""))
+        except (LogError, InputError):
+            log.close()
+            path.unlink(missing_ok=True)
+            raise
+        _sync_folder(path.parent)
+        return log
+
+    @classmethod
+    def resume(cls, path: str | os.PathLike, study: Study) -> "EventLog":
+        """Open a log to go on with it; a torn last line is cut off. Raises InputError."""
+        path = Path(path)
+        try:
+            file = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be opened ({error.strerror}); check the path.") from error
+        try:
+            _lock(file, path)
+            content = _content(file)
+            header, events, whole, dropped = _parsed(content, path)
+            state = _folded(path, study, header, events)
+        except BaseException:
+            os.close(file)
+            raise
+        lines = content[:whole].splitlines(keepends=True)
+        if whole < len(content):
+            os.ftruncate(file, whole)
+            os.fsync(file)
+        return cls(path, file, state, lines[-1], whole, dropped)
+
+    def append(self, event: Event) -> LiveSession:
+        """Put an event on the disk, and only then into the state, which is returned. Raises LogError."""
+        state = self.state.after(event)
+        self._write(_line(event.seq, event.kind, event.time, event.data, self._previous))
+        self.state = state
+        return state
+
+    def _write(self, line):
+        begun = time.perf_counter()
+        try:
+            os.lseek(self._file, self._size, os.SEEK_SET)
+            left = memoryview(line)
+            while left:
+                left = left[os.write(self._file, left) :]
+            os.fsync(self._file)
+        except OSError as error:
+            _cut(self._file, self._size)
+            raise LogError(
+                f"{self.path}: cannot be written ({error.strerror}); free some space on the disk and try again,"
+                " everything acknowledged so far is safe."
+            ) from error
+        self._previous, self._size = line, self._size + len(line)
+        self.sync_s = time.perf_counter() - begun
+
+    def close(self) -> None:
+        """Let others write."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+    def __enter__(self) -> "EventLog":
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+
+def read_log(path: str | os.PathLike, study: Study | None = None) -> tuple[Header, list[Event], str]:
+    """Header, events, and what was dropped at the end; for readers, without a lock. Raises InputError."""
+    path = Path(path)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
+    header, events, _, dropped = _parsed(content, path)
+    if study is not None:
+        _check_study(path, study, header)
+    return header, events, dropped
+
+
+def in_use(path: str | os.PathLike) -> bool:
+    """Whether somebody is writing this log."""
+    file = os.open(path, os.O_RDWR)
+    try:
+        _lock(file, Path(path))
+    except InputError:
+        return True
+    finally:
+        os.close(file)
+    return False
+
+
+def log_name(header: Header) -> str:
+    """File name of a session's log."""
+    parts = (header.participant, header.session)
+    return "_".join(re.sub(r"[^\w.-]", "-", part) for part in parts) + _SUFFIX
+
+
+def log_paths(folder: str | os.PathLike) -> list[Path]:
+    """The logs in a folder, in the order of their names."""
+    return sorted(Path(folder).glob("*" + _SUFFIX))
+
+
+def _line(seq, kind, at, data, previous) -> bytes:
+    body = {"seq": seq, "kind": kind, "time": at, "data": data, "previous": _hash(previous)}
+    text = msgspec.json.encode(body)[:-1]
+    return text + b',"crc":"%08x"}\n' % zlib.crc32(text)
+
+
+def _hash(line) -> str:
+    return hashlib.sha256(line).hexdigest()[:16] if line else ""
+
+
+_CRC = re.compile(rb',"crc":"([0-9a-f]{8})"\}\n\Z')
+
+
+def _parsed(content, path):
+    """Header, events, the number of good bytes, and a sentence on what follows those."""
+    lines = [line for line in re.split(rb"(?<=\n)", content) if line]
+    dropped, header, events, previous, whole = "", None, [], b"", 0
+    for number, line in enumerate(lines, 1):
+        if number == len(lines) and not line.endswith(b"\n"):
+            dropped = f"{path}:{number}: the last line is torn; it was never acknowledged, and is left out."
+            break
+        raw = _checked(line, number, previous, path)
+        if number == 1:
+            header = _convert(raw["data"], Header, path, number)
+        else:
+            events.append(_convert({k: raw[k] for k in ("seq", "kind", "time", "data")}, Event, path, number))
+        previous, whole = line, whole + len(line)
+    if header is None:
+        raise InputError(f"{path}: holds no session; it has no whole first line.")
+    return header, events, whole, dropped
+
+
+def _checked(line, number, previous, path):
+    found = _CRC.search(line)
+    if found is None or int(found[1], 16) != zlib.crc32(line[: found.start()]):
+        raise InputError(f"{path}:{number}: is damaged; restore the file from a copy, nothing after it can be trusted.")
+    raw = msgspec.json.decode(line)
+    if raw.get("seq") != number - 1 or raw.get("previous") != _hash(previous):
+        raise InputError(f"{path}:{number}: does not follow the line before it; lines are missing or were changed.")
+    if (number == 1) != (raw["kind"] == "header"):
+        raise InputError(f"{path}:{number}: is no {'header' if number == 1 else 'event'}; this is no session's log.")
+    return raw
+
+
+def _convert(raw, kind, path, number):
+    try:
+        return msgspec.convert(raw, kind)
+    except msgspec.ValidationError as error:
+        raise InputError(f"{path}:{number}: is not what this hilbo writes ({error}).") from error
+
+
+def _check_study(path, study, header):
+    if header.study != study.hash:
+        raise InputError(
+            f"{path}: is the log of another study ({header.study}, not {study.hash}); use the study file that it was"
+            " started with."
+        )
+
+
+def _folded(path, study, header, events) -> LiveSession:
+    _check_study(path, study, header)
+    try:
+        return LiveSession.fold(study, header, events)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _cut(file, size):
+    """Take back what was half written; if even that fails, the next reader drops it as a torn line."""
+    try:
+        os.ftruncate(file, size)
+        os.fsync(file)
+    except OSError:
+        pass
+
+
+def _sync_folder(folder):
+    """So that the new name is on the disk too; where folders cannot be opened, the system sees to that."""
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _content(file) -> bytes:
+    os.lseek(file, 0, os.SEEK_SET)
+    pieces = []
+    while piece := os.read(file, 2**20):
+        pieces.append(piece)
+    return b"".join(pieces)
+
+
+def _lock(file, path):
+    try:
+        if os.name == "nt":
+            import msvcrt
+
+            os.lseek(file, 2**30, os.SEEK_SET)  # a byte that no log has: readers are not to be locked out
+            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        raise InputError(f"{path}: is being written by another hilbo; close that one first.") from None

@@ -1,0 +1,283 @@
+"""Session logs as tables, as a Psych-DS folder, and as a netCDF file of groups; all made from the logs alone.
+
+`trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
+and `sets_table` are those of `hilbo.study.validation_table` (voided comparisons left out), `presentations_table` has
+every trial that was ever proposed, and what became of it. `read_log_trials` reads a folder of logs as
+`hilbo.study.trial_table.read_trials` reads the exported table, through the very same text, so that both give the same
+bits.
+"""
+
+import json
+import os
+import re
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.session.event_log import log_paths, read_log
+from hilbo.session.records import Trial
+from hilbo.session.state import LiveSession
+from hilbo.study.config import Study
+from hilbo.study.trial_table import read_trials, write_trials
+
+__all__ = [
+    "netcdf",
+    "presentations_table",
+    "psych_ds",
+    "read_log_trials",
+    "read_sessions",
+    "sets_table",
+    "trials_table",
+    "validation_table",
+]
+
+_SINGLE = ("warm-up", "optimisation", "repeat")
+_WORDS = {
+    "participant": "Pseudonymous id",
+    "session": "Label of the session",
+    "phase": "warm-up, optimisation, repeat, validation or aggregate-best",
+    "material": "Reference material",
+    "trial": "Number of the trial, counted within participant, session, phase and material",
+    "response": "The participant's answer",
+    "voided": "1 if the answer does not count",
+    "status": "answered, undone, void, dropped or pending",
+    "response_time": "Time from the question to the answer, s, by the browser's clock",
+    "answered_at": "Time of the answer, s since 1970, by the server's clock",
+    "set_a": "Parameter set on side a",
+    "set_b": "Parameter set on side b",
+    "first": "The set that was felt first",
+    "class_a": "Answer about set_a",
+    "class_b": "Answer about set_b",
+    "preferred": "The set that was preferred",
+    "set_id": "Name of the parameter set",
+    "source": "aggregate, sysid or individual:PARTICIPANT",
+}
+
+
+def read_sessions(
+    folder: str | os.PathLike, study: Study, note: Callable[[str], Any] = lambda sentence: None
+) -> list[LiveSession]:
+    """Every session in a folder but dry runs; `note` is told of those. Raises InputError if there is none, or a log is
+    damaged or of another study."""
+    paths = log_paths(folder)
+    if not paths:
+        raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
+    found, dry = [], 0
+    for path in paths:
+        header, events, _ = read_log(path, study)
+        dry += header.dry_run
+        if not header.dry_run:
+            found.append(LiveSession.fold(study, header, events))
+    if not found:
+        raise InputError(f"{folder}: holds nothing but dry runs, in which nobody took part.")
+    if dry:
+        note(f"{folder}: {'1 dry run is' if dry == 1 else f'{dry} dry runs are'} left out.")
+    return found
+
+
+def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """Every answer to a single rendering, one row each, numbers as they were chosen."""
+    rows = []
+    for state in sessions:
+        for trial in state.trials:
+            if trial.data["phase"] in _SINGLE and trial.values is not None and "b" not in trial.renderings:
+                rows.append(
+                    _place(state, trial)
+                    | {"response": trial.values["class_a"]}
+                    | trial.renderings["a"]
+                    | {"voided": int(trial.status != "answered"), "status": trial.status}
+                    | _times(trial)
+                )
+    return _table(rows)
+
+
+def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """Every comparison that counts."""
+    rows = []
+    for state in sessions:
+        for trial in state.trials:
+            if trial.values is not None and trial.status == "answered" and "b" in trial.renderings:
+                sets, values = trial.sets, trial.values
+                place = _place(state, trial)
+                if trial.data["phase"] == "repeat":
+                    continue
+                rows.append(
+                    {key: place[key] for key in ("participant", "material", "session", "phase", "trial")}
+                    | {"set_a": sets["a"], "set_b": sets["b"], "first": sets[trial.first]}
+                    | {"class_a": values.get("class_a", ""), "class_b": values.get("class_b", "")}
+                    | {"preferred": sets[values["preferred"]]}
+                    | _times(trial)
+                )
+    return _table(rows)
+
+
+def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """The parameter sets that were compared. Raises InputError if one name stands for two sets."""
+    rows: dict[str, dict[str, Any]] = {}
+    for state in sessions:
+        for block in state.header.blocks:
+            study = state.study if block.material is None else state.study.material(block.material)
+            mechanics = study.space.mechanics
+            extra = {} if mechanics is None else {"N": mechanics.N, "T": float(mechanics.T)}
+            for name in (n for p in block.trials if p.b is not None for n in (p.a, p.b)):
+                source = _source(name.removeprefix(f"{block.material} "))
+                row = {"set_id": name, "source": source, **state.header.sets[name], **extra}
+                if rows.setdefault(name, row) != row:
+                    raise InputError(
+                        f'the set "{name}" of participant {state.header.participant} is not the one that others felt'
+                        " under this name; export the logs of one plan at a time."
+                    )
+    return pd.DataFrame(list(rows.values()))
+
+
+def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """Every trial that was proposed, and what became of it."""
+    rows = []
+    for state in sessions:
+        for trial in state.trials:
+            rows.append(
+                _place(state, trial)
+                | {"status": trial.status, "presentations": trial.presentation, "proposed_at": trial.proposed}
+                | {f"voided_{key}": (trial.voided or {}).get(key, "") for key in ("by", "reason")}
+                | _times(trial)
+            )
+    return _table(rows)
+
+
+def read_log_trials(
+    folder: str | os.PathLike,
+    study: Study,
+    material: str | None = None,
+    *,
+    others: bool = True,
+    say: Callable[[int], None] = lambda rows: None,
+    note: Callable[[str], Any] = lambda sentence: None,
+) -> pd.DataFrame:
+    """As `hilbo.study.trial_table.read_trials`, from a folder of session logs; `study` is the whole one, of all
+    materials."""
+    table = trials_table(read_sessions(folder, study, note))
+    if table.empty:
+        raise InputError(f"{folder}: its sessions hold no answers yet; nothing can be aggregated.")
+    chosen = study.material(material) if material and study.materials else study
+    with tempfile.TemporaryDirectory() as made:
+        path = Path(made) / "trials.csv"
+        write_trials(table, path)
+        try:
+            return read_trials(path, chosen, material, others=others, say=say)
+        except InputError as error:
+            raise InputError(str(error).replace(str(path), str(folder))) from None
+
+
+def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: Study) -> list[Path]:
+    """Tables with their sidecars and dataset_description.json, in the shape of a Psych-DS data set; the files."""
+    tables = {
+        "trials": trials_table(sessions),
+        "validation": validation_table(sessions),
+        "sets": sets_table(sessions),
+        "presentations": presentations_table(sessions),
+    }
+    data = folder / "data"
+    data.mkdir(parents=True, exist_ok=True)
+    name = re.sub(r"[^A-Za-z0-9]", "", study.name) or "study"
+    words = _WORDS | {p.name: f"Parameter, {p.unit or 'no unit'}" for p in study.space.parameters}
+    written, columns = [], {}
+    for kind, table in tables.items():
+        if table.empty:
+            continue
+        path = data / f"study-{name}_table-{kind}_data.csv"
+        write_trials(table, path)
+        columns |= dict.fromkeys(map(str, table.columns))
+        sidecar = path.with_suffix(".json")
+        here = [_variable(str(column), words) for column in table.columns]
+        sidecar.write_text(
+            _json({"description": f"{kind} of {study.name}", "variableMeasured": here}), encoding="utf-8"
+        )
+        written += [path, sidecar]
+    description = {
+        "@context": "https://schema.org/",
+        "@type": "Dataset",
+        "name": study.name,
+        "description": f"Live sessions of {len(sessions)} logs, study {study.hash}, written by hilbo.",
+        "schemaVersion": "Psych-DS 0.4.0",
+        "variableMeasured": [_variable(column, words) for column in columns],
+    }
+    path = folder / "dataset_description.json"
+    path.write_text(_json(description), encoding="utf-8")
+    return [*written, path]
+
+
+def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> bool:
+    """The answers to single renderings that count as groups of a netCDF file: observed_data has the categories and
+    constant_data what they are about, along `obs_id`; attributes name the study. xarray reads it as a DataTree, ArviZ
+    as InferenceData. False, and no file, where there are none."""
+    import numpy as np
+    import xarray as xr
+
+    table = trials_table(sessions)
+    table = table[(table["voided"] == 0) & (table["phase"] != "warm-up")] if len(table) else table
+    if table.empty:
+        return False
+    rows = {"obs_id": np.arange(len(table))}
+    ranks = {label: i for i, label in enumerate(study.responses)}
+    observed = xr.Dataset({"category": ("obs_id", table["response"].map(ranks).to_numpy(int))}, rows)
+    observed["category"].attrs["labels"] = list(study.responses)
+    constant = xr.Dataset(coords=rows)
+    for column in ("participant", "session", "phase", "material"):
+        if column in table:
+            constant[column] = ("obs_id", table[column].to_numpy(str).astype(object))
+    constant["trial"] = ("obs_id", table["trial"].to_numpy(int))
+    for parameter in study.space.parameters:
+        constant[parameter.name] = ("obs_id", table[parameter.name].to_numpy(float))
+        constant[parameter.name].attrs["units"] = parameter.unit
+    attributes = {"study": study.hash, "study_name": study.name, "made_by": "hilbo"}
+    groups = {"observed_data": observed, "constant_data": constant}
+    tree = xr.DataTree.from_dict({name: group.assign_attrs(attributes) for name, group in groups.items()})
+    tree.to_netcdf(path, engine="h5netcdf")
+    return True
+
+
+def _place(state, trial: Trial):
+    data, header = trial.data, state.header
+    return {
+        "participant": header.participant,
+        "session": header.session,
+        "phase": data["phase"],
+        "material": data["material"],
+        "trial": trial.number,
+    }
+
+
+def _times(trial: Trial):
+    answered = trial.answered or {}
+    return {
+        "response_time": answered.get("browser", {}).get("response_s"),
+        "answered_at": answered.get("time"),
+    }
+
+
+def _table(rows):
+    """Without columns that say nothing."""
+    table = pd.DataFrame(rows)
+    for column in ("material", "response_time"):
+        if column in table and table[column].isna().all():
+            table = table.drop(columns=column)
+    return table
+
+
+def _source(name):
+    if name.startswith("individual:"):
+        return name
+    person, _, kind = name.rpartition(" ")
+    return f"individual:{person}" if person and kind in ("best", "mid", "worst") else "aggregate"
+
+
+def _variable(column, words):
+    return {"@type": "PropertyValue", "name": column, "description": words.get(column, column.replace("_", " "))}
+
+
+def _json(content):
+    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"

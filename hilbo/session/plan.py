@@ -1,0 +1,236 @@
+"""A study's sessions in advance: who is shown what, in which order, from one seed; to be registered before it begins.
+
+`make_plan` gives the whole study as plain data, `plan_hash` what stands in every log, `planned_header` one session of
+it. Materials come in the orders of a Williams design, pairs balanced as `hilbo.session.counterbalance` says.
+
+A validation compares best, mid and worst: of the population's map (`source` aggregate; for people who were not in it),
+or of each participant's own (individual; for these very people). An aggregate-best validation compares the population's
+optimum with every individual's own.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from hilbo.errors import InputError
+from hilbo.session.counterbalance import block_size, comparisons, orders
+from hilbo.session.participants import check_id
+from hilbo.session.records import Block, Header, Planned
+from hilbo.study.config import Study
+from hilbo.study.protocols import Phase, protocol
+
+__all__ = [
+    "Source",
+    "check_plan",
+    "header_for",
+    "make_plan",
+    "plan_hash",
+    "planned_header",
+    "reissue",
+    "seed_of",
+    "warm_up",
+]
+
+Source = Literal["aggregate", "individual"]
+Sets = Mapping[str, Mapping[str, float]]
+_SPARE = 2  # warm-up renderings in store: so many times the least number
+_PAIRS = (("best", "mid"), ("best", "worst"), ("mid", "worst"))
+
+
+def seed_of(seed: int, *place: int) -> int:
+    """A seed below 2^31 for a place in a study, from the study's."""
+    return int(np.random.SeedSequence([seed, *place]).generate_state(1)[0] >> 1)
+
+
+def warm_up(study: Study, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
+    """The warm-up: spread, feasible renderings from the seed, as many again for "another one"; and their sets."""
+    count = protocol(study.session, "warm-up").count
+    space = _of(study, material).space
+    unit = np.concatenate([space.latin_hypercube(count, seed_of(seed, k)) for k in range(_SPARE)])
+    physical = np.asarray(space.to_physical(unit))
+    names = [f"warm-up {i + 1}" for i in range(len(physical))]
+    sets = {n: dict(zip(space.names, row, strict=True)) for n, row in zip(names, physical.tolist(), strict=True)}
+    return Block("warm-up", count, tuple(Planned(n) for n in names), material), sets
+
+
+def header_for(
+    study: Study,
+    participant: str,
+    session: str = "1",
+    seed: int = 0,
+    *,
+    materials: Sequence[str | None] = (None,),
+    warm: bool = True,
+    **others: Any,
+) -> Header:
+    """An optimisation session: a warm-up, then the study's trials with each material. `others`: fields of Header."""
+    blocks, sets = [], {}
+    if warm:
+        block, sets = warm_up(study, seed, materials[0])
+        blocks.append(block)
+    rest = protocol(study.session, "optimisation").rest
+    for i, name in enumerate(materials):
+        blocks.append(Block("optimisation", study.selection.trials, material=name, rest=rest if i else 0.0))
+    return Header(
+        study=study.hash,
+        participant=participant,
+        session=session,
+        seed=seed,
+        blocks=tuple(blocks),
+        sets=sets,
+        **others,
+    )
+
+
+def make_plan(
+    study: Study,
+    participants: Sequence[str],
+    seed: int = 0,
+    phase: Phase = "optimisation",
+    *,
+    materials: Sequence[str] = (),
+    session: str = "1",
+    sets: Mapping[str, Sets] | None = None,
+    source: Source | None = None,
+) -> dict[str, Any]:
+    """The plan of one kind of session for everybody, as plain data.
+
+    **Arguments:** `materials`: all that each participant has, by default those of the study. `sets`: for validations
+    material ("" for a study without) -> name of a set -> parameters; names are `best`, `mid` and `worst`, or with an
+    individual source `PARTICIPANT best` and so on; for aggregate-best `aggregate` and `individual:PARTICIPANT`. Raises
+    InputError.
+    """
+    if len(set(participants)) < len(participants) or not participants:
+        raise InputError("plan: participants must be named, each once.")
+    for person in participants:
+        check_id(person, "plan")
+    names: list[str | None] = list(materials or study.materials) or [None]
+    sequence = orders(len(names), len(participants), seed)
+    people = []
+    for i, person in enumerate(participants):
+        own = [names[k] for k in sequence[i]]
+        header = _header(study, person, session, seed_of(seed, i), phase, own, sets, source)
+        people.append({"participant": person, "order": i, "header": _for_plan(header)})
+    size = block_size(len(names))
+    plan = {
+        "schema": 1,
+        "study": study.hash,
+        "name": study.name,
+        "seed": seed,
+        "phase": phase,
+        "source": source,
+        "materials": names,
+        "complete_at": "any number of participants" if size == 1 else f"multiples of {size} participants",
+        "complete": len(participants) % size == 0,
+        "participants": people,
+    }
+    return plan | {"hash": plan_hash(plan)}
+
+
+def plan_hash(plan: Mapping[str, Any]) -> str:
+    """First 16 hex digits of the SHA-256 of a plan's content, its own hash left out."""
+    content = {key: value for key, value in plan.items() if key != "hash"}
+    text = json.dumps(content, sort_keys=True, ensure_ascii=False, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def planned_header(plan: Mapping[str, Any], study: Study, participant: str, **others: Any) -> Header:
+    """The header of a planned session. Raises InputError if plan, study and participant do not belong together."""
+    check_plan(plan, study)
+    rows = {row["participant"]: row for row in plan["participants"]}
+    if participant not in rows:
+        raise InputError(
+            f'participant "{participant}" is not in the plan, which has {len(rows)}; add them by a new plan, or reissue'
+            " the row of somebody who dropped out."
+        )
+    return msgspec.convert(rows[participant]["header"] | {"plan": plan["hash"]} | others, Header)
+
+
+def check_plan(plan: Mapping[str, Any], study: Study) -> None:
+    """Refuse a plan that was changed after it was made, or belongs to another study."""
+    try:
+        same = plan["hash"] == plan_hash(plan)
+        other = plan["study"] != study.hash
+    except (KeyError, TypeError) as error:
+        raise InputError(f"the plan is no plan ({error} is missing); make one with hilbo plan.") from error
+    if not same:
+        raise InputError("the plan was changed after it was made (its hash does not fit); make a new one.")
+    if other:
+        raise InputError(
+            f"the plan belongs to another study ({plan['study']}, not {study.hash}); use the study file it was made"
+            " from."
+        )
+
+
+def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
+    """The plan in which somebody new has the row (order, seed, sets) of a participant who dropped out. A row is given
+    away once. Raises InputError."""
+    check_id(new, "plan")
+    rows = [row["participant"] for row in plan["participants"]]
+    if dropped not in rows or new in rows:
+        raise InputError(f'plan: "{dropped}" must be in the plan and "{new}" must not.')
+    given = {row.get("reissued_from"): row["participant"] for row in plan["participants"]}
+    if dropped in given:
+        raise InputError(f'plan: the row of "{dropped}" has been reissued to {given[dropped]}; reissue that one.')
+    if plan["source"] == "individual":
+        raise InputError(f'plan: the sets of "{dropped}" are their own; nobody else can be validated with them.')
+    row = plan["participants"][rows.index(dropped)]
+    fresh = {
+        "participant": new,
+        "order": row["order"],
+        "reissued_from": dropped,
+        "header": row["header"] | {"participant": new},
+    }
+    changed = {**plan, "participants": [*plan["participants"], fresh]}
+    return changed | {"hash": plan_hash(changed)}
+
+
+def _for_plan(header: Header):
+    content = msgspec.to_builtins(header)
+    return {key: content[key] for key in ("study", "participant", "session", "seed", "blocks", "sets")}
+
+
+def _of(study, material):
+    return study if material is None else study.material(material)
+
+
+def _header(study, person, session, seed, phase, materials, sets, source) -> Header:
+    if phase == "optimisation":
+        return header_for(study, person, session, seed, materials=materials)
+    if phase == "warm-up" or sets is None:
+        raise InputError(f"plan: a session of {phase} needs sets to compare; give --from result.json.")
+    begin, found = warm_up(study, seed, materials[0])
+    blocks = [begin]
+    for i, material in enumerate(materials):
+        here = sets.get(material or "", {})
+        trials, used = _compared(study, person, phase, here, source, seed_of(seed, i, 7))
+        prefix = f"{material} " if material else ""
+        renamed = {f"{prefix}{name}": {k: float(v) for k, v in here[name].items()} for name in used}
+        planned = tuple(Planned(prefix + a, prefix + b, first) for a, b, first in trials)
+        rest = protocol(study.session, phase).rest if i else 0.0
+        blocks.append(Block(phase, len(planned), planned, material, rest))
+        found |= renamed
+    return Header(study=study.hash, participant=person, session=session, seed=seed, blocks=tuple(blocks), sets=found)
+
+
+def _compared(study, person, phase, sets, source, seed):
+    """A block's comparisons, and the names of the sets in it."""
+    repeats = protocol(study.session, phase).count
+    if phase == "aggregate-best":
+        others = [name for name in sets if name.startswith("individual:")]
+        if "aggregate" not in sets or not others:
+            raise InputError("plan: aggregate-best needs the population's optimum and individuals' own.")
+        pairs = [("aggregate", name) for name in others]
+    else:
+        own = f"{person} " if source == "individual" else ""
+        pairs = [(own + a, own + b) for a, b in _PAIRS]
+        missing = [name for pair in pairs for name in pair if name not in sets]
+        if missing:
+            raise InputError(
+                f'plan: there is no set "{missing[0]}"; participant {person} has no map of their own here.'
+            )
+    return comparisons(pairs, repeats, seed), list(dict.fromkeys(name for pair in pairs for name in pair))

@@ -1,0 +1,117 @@
+"""What is asked next: pure functions of the study, what a seed decides, and the answers; traceable.
+
+The first trials are a Latin hypercube inside the feasible set, the following maximise the acquisition function over a
+low-discrepancy candidate set or a lattice and are polished (paper, algorithm 1).
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from hilbo import acquisition
+from hilbo.kernels import gram
+from hilbo.ordinal_gp import Trials, fit
+from hilbo.search.candidates import CANDIDATES, search_points
+from hilbo.search.lattice import Lattice, nodes_for, screen, screen_points
+from hilbo.search.space_lattice import lattice_of
+from hilbo.study.config import Study
+
+__all__ = ["Design", "design", "next_point"]
+
+_STARTS = 4  # of the polishing, on the lattice
+_GAIN, _IN_UNITS_OF_F = 1e-7, ("ucb", "mean")  # of the prior's sd: less is no reason to polish on
+_JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
+
+
+class Design(eqx.Module):
+    """What a seed decides in advance: where the first trials are, and among which points the others are searched.
+
+    The latter are a lattice in two or three dimensions, whose nodes are products and cost a hundredth of other points;
+    else, and for Thompson's draws, `candidates`.
+    """
+
+    initial: Float[Array, "s d"]
+    candidates: Float[Array, "m d"] | None
+    lattice: Lattice | None
+    key: PRNGKeyArray
+
+
+def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
+    """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
+    space, nodes = study.space, nodes_for(float(jnp.max(study.gp.kernel.theta)))
+    on_lattice = space.dim in (2, 3) and study.selection.acquisition != "thompson"
+    return Design(
+        jnp.asarray(space.latin_hypercube(study.selection.space_filling, seed)),
+        None if on_lattice else search_points(space, seed, count),
+        lattice_of(space, nodes) if on_lattice else None,
+        jax.random.key(seed),
+    )
+
+
+def next_point(
+    study: Study, plan: Design, trials: Trials, trial: Int[Array, ""] | int, weight: ArrayLike | None = None
+) -> Float[Array, " d"]:
+    """The point (d,) of the unit cube to ask after the given answers, by the study's acquisition; traceable.
+
+    `weight`: of the standard deviation in UCB, if it is not to be the study's.
+    """
+    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
+    if study.selection.acquisition == "thompson":
+        return _thompson_point(posterior, plan, trial)
+    distance = study.selection.minimum_distance
+    allowed = (lambda x: _far_from(trials, x, distance)) if distance else None
+    return _highest(study, plan, posterior, _score(study, posterior, weight), allowed).x
+
+
+def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
+    """Where a score is largest in the feasible set; screened in float32."""
+
+    def score_at(x):
+        mean, variance = posterior.predict(x[None, :])
+        return score(mean[0], variance[0])
+
+    space = {"from_box": study.space.from_box, "to_box": study.space.to_box, "feasible": study.space.feasible}
+    if study.selection.acquisition in _IN_UNITS_OF_F:
+        space["gain"] = _GAIN * jnp.sqrt(study.gp.kernel.variance)
+    short = posterior.astype(jnp.float32)
+    known = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
+    if plan.lattice is None:
+        points = plan.candidates
+        if allowed is None:
+            values = screen_points(*known, points.astype(jnp.float32), score)
+        else:  # which may rule out all points that were not skipped
+            values = score(*short.predict(points.astype(jnp.float32)))
+        return acquisition.maximise(values, points, score_at, **space, allowed=allowed)
+    found = screen(*known, plan.lattice, score, allowed)
+    rows = acquisition.spread(found.hopes, found.points, _STARTS)
+    usable = found.hopes[rows] > -jnp.inf
+    return acquisition.climb(found.points[rows], usable, score_at, **space, allowed=allowed)
+
+
+def _score(study, posterior, weight):
+    kind = study.selection.acquisition
+    if kind == "ucb":
+        return acquisition.UCB(study.selection.weight if weight is None else weight)
+    if kind == "log_ei":
+        trials = posterior.trials
+        return acquisition.LogEI(jnp.max(jnp.where(trials.mask, posterior.mean(trials.x), -jnp.inf)))
+    if kind == "top_category":
+        return acquisition.TopCategory(study.gp.likelihood.thresholds[-1], study.gp.likelihood.noise)
+    return acquisition.Mean()
+
+
+def _far_from(trials, x, distance):
+    """Whether x keeps the smallest distance to every earlier trial."""
+    apart = jnp.sum((trials.x - x[None, :]) ** 2, axis=1) >= distance**2
+    return jnp.all(apart | ~trials.mask)
+
+
+def _thompson_point(posterior, plan, trial):
+    points = plan.candidates[:_JOINT_CANDIDATES]
+    cross = gram(posterior.gp.kernel, points, posterior.trials.x)
+    covariance = gram(posterior.gp.kernel, points, points) - cross @ posterior.latent.inverse @ cross.T
+    key = jax.random.fold_in(plan.key, trial)
+    row, _ = acquisition.thompson(key, cross @ posterior.latent.weights, covariance)
+    return points[row]

@@ -1,0 +1,287 @@
+"""The state of a live session as the fold of its events: pure, without files, clock or device.
+
+`LiveSession.fold(study, header, events)` is the state after a log, so that resuming is replaying. Renderings are in the
+events themselves: a fold computes no fit.
+
+Rules: a trial in which the device holds, stops or is lost after it began is void, and its rendering is asked again; a
+rendering voided twice is not proposed again. A repeated, voided, undone or interrupted presentation starts from its
+first step, and so does one that a pause cut off. Whatever changes the answers drops a proposal that was made from the
+old ones.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, Literal
+
+from hilbo.errors import InputError
+from hilbo.session.records import Event, Header, Need, RefusedError, Trial
+from hilbo.study.config import Study
+
+__all__ = ["LiveSession", "Screen"]
+
+Screen = Literal["wait", "trial", "ready", "rest", "paused", "done", "ended"]
+_STOPPED = ("hold", "estop", "lost")
+
+
+@dataclass(frozen=True)
+class LiveSession:
+    """The state of a session; made by `start`, `after` and `fold`."""
+
+    study: Study = field(repr=False)
+    header: Header
+    seq: int = 0
+    trials: tuple[Trial, ...] = ()
+    extra: Mapping[int, int] = field(default_factory=dict)  # block -> renderings asked for by "another one"
+    passed: frozenset[int] = frozenset()  # blocks that were begun by hand
+    wanted: tuple[int, ...] = ()  # answered trials to be felt once more
+    paused: str | None = None
+    aborted: str | None = None
+    machine: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[tuple[float, str], ...] = ()
+    began: float | None = None
+    last: float | None = None
+
+    @classmethod
+    def start(cls, study: Study, header: Header) -> "LiveSession":
+        """A session before its first event. Raises InputError if the header belongs to another study."""
+        if header.study != study.hash:
+            raise InputError(
+                f"this session belongs to a study of hash {header.study}, the study file has {study.hash}; use the file"
+                " that the session was started with."
+            )
+        return cls(study, header)
+
+    @classmethod
+    def fold(cls, study: Study, header: Header, events: Iterable[Event]) -> "LiveSession":
+        """The state after these events."""
+        state = cls.start(study, header)
+        for event in events:
+            state = state.after(event)
+        return state
+
+    def after(self, event: Event) -> "LiveSession":
+        """The next state."""
+        if event.seq != self.seq + 1:
+            raise InputError(f"event {event.seq} does not follow event {self.seq}; the log is not in order.")
+        apply = _APPLY.get(event.kind)
+        if apply is None:
+            raise InputError(f'event {event.seq} is of the kind "{event.kind}", which this hilbo does not know.')
+        found = apply(self, event)
+        began = event.time if self.began is None else self.began
+        return replace(found, seq=event.seq, began=began, last=event.time)
+
+    # What follows from the state.
+
+    @cached_property
+    def pending(self) -> Trial | None:
+        """The trial that is being felt or asked about."""
+        return next((t for t in reversed(self.trials) if t.status == "pending"), None)
+
+    def answers(self, block: int) -> list[Trial]:
+        """The trials of a block that count, in their order; repeats do not."""
+        return [t for t in self.trials if t.block == block and t.status == "answered" and t.repeats is None]
+
+    def quota(self, block: int) -> int:
+        """How many trials of a block are needed."""
+        return self.header.blocks[block].count + self.extra.get(block, 0)
+
+    def excluded(self, block: int) -> list[dict[str, float]]:
+        """Renderings of a block that were voided twice."""
+        counts: dict[tuple, int] = {}
+        for trial in self.trials:
+            if trial.block == block and trial.status == "void" and trial.voided is not None:
+                for side in trial.voided["sides"]:
+                    key = tuple(trial.renderings[side].items())
+                    counts[key] = counts.get(key, 0) + 1
+        return [dict(key) for key, count in counts.items() if count >= 2]
+
+    def skipped(self, block: int) -> list[int]:
+        """Planned trials that hold an excluded rendering and have no answer."""
+        gone = self.excluded(block)
+        if not gone:
+            return []
+        names = {t.sets[side] for t in self.trials if t.block == block for side in t.sets if t.renderings[side] in gone}
+        have = {t.planned for t in self.answers(block)}
+        plan = self.header.blocks[block].trials
+        return [i for i, p in enumerate(plan) if i not in have and {p.a, p.b} & names]
+
+    def _next_planned(self, block: int) -> int | None:
+        """The next planned trial without an answer; None where the block has enough, or none is left."""
+        if len(self.answers(block)) >= self.quota(block):
+            return None
+        gone = {t.planned for t in self.answers(block)} | set(self.skipped(block))
+        return next((i for i in range(len(self.header.blocks[block].trials)) if i not in gone), None)
+
+    def full(self, block: int) -> bool:
+        """Whether a block has all its answers, or nothing more to ask."""
+        if self.header.blocks[block].trials:
+            return self._next_planned(block) is None
+        return len(self.answers(block)) >= self.quota(block)
+
+    @cached_property
+    def block(self) -> int | None:
+        """The first block that is not full; None after the last."""
+        return next((i for i in range(len(self.header.blocks)) if not self.full(i)), None)
+
+    def gate(self, block: int) -> Literal["ready", "rest"] | None:
+        """What stands before a block until somebody goes on: the end of a warm-up, or a rest."""
+        if block == 0 or block in self.passed:
+            return None
+        if self.header.blocks[block].rest > 0:
+            return "rest"
+        return "ready" if self.header.blocks[block - 1].phase == "warm-up" else None
+
+    @cached_property
+    def screen(self) -> Screen:
+        """What the participant has in front of them."""
+        if self.aborted is not None:
+            return "ended"
+        if self.paused is not None:
+            return "paused"
+        if self.pending is not None:
+            return "trial"
+        if self.wanted:
+            return "wait"
+        if self.block is None:
+            return "done"
+        return self.gate(self.block) or "wait"
+
+    @cached_property
+    def need(self) -> Need | None:
+        """What is to be proposed now; None while a trial is pending or nothing is to be asked."""
+        if self.screen != "wait":
+            return None
+        if self.wanted:
+            source = self.trial(self.wanted[0])
+            return Need(source.block, source.planned, source.id)
+        assert self.block is not None
+        planned = self._next_planned(self.block) if self.header.blocks[self.block].trials else None
+        return Need(self.block, planned)
+
+    def trial(self, id: int) -> Trial:
+        """The trial of this id. Raises RefusedError."""
+        if not 1 <= id <= len(self.trials):
+            raise RefusedError("old-trial", f"there is no trial {id} in this session.")
+        return self.trials[id - 1]
+
+    def with_trial(self, id: int, **changes) -> "LiveSession":
+        """With one trial changed."""
+        trials = list(self.trials)
+        trials[id - 1] = replace(trials[id - 1], **changes)
+        return replace(self, trials=tuple(trials))
+
+    def dropped(self) -> "LiveSession":
+        """Without the pending proposal: the answers that it was made from have changed. Repeats come from none."""
+        trial = self.pending
+        return self if trial is None or trial.repeats else self.with_trial(trial.id, status="dropped", on=None)
+
+
+# What each event does to the state.
+
+
+def _proposed(state, event):
+    data = event.data
+    trial = Trial(
+        data["id"], data["block"], data["trial"], data, event.time, planned=data["planned"], repeats=data["repeats"]
+    )
+    wanted = state.wanted[1:] if data["repeats"] is not None else state.wanted
+    return replace(state, trials=(*state.trials, trial), wanted=wanted)
+
+
+def _sent(state, event):
+    trial = state.trial(event.data["id"])
+    return state.with_trial(trial.id, sent={**trial.sent, event.data["side"]: event.data})
+
+
+def _stimulus(state, event):
+    trial, show = state.trial(event.data["id"]), event.data["show"]
+    if not event.data["on"]:
+        return state.with_trial(trial.id, on=None)
+    before = trial.felt if event.data["step"] > 0 else frozenset()  # the first step begins everything anew
+    felt = before | ({show} & set(trial.renderings))
+    return state.with_trial(trial.id, step=event.data["step"], on=show, felt=felt)
+
+
+def _answered(state, event):
+    data = event.data
+    facts = {"seq": event.seq, "time": event.time, "browser": data["browser"]}
+    return state.with_trial(
+        data["id"], status="answered", values=data["values"], client=data["client"], answered=facts, on=None
+    )
+
+
+def _undone(state, event):
+    trial = state.trial(event.data["id"])
+    state = state.with_trial(trial.id, status="undone")
+    return replace(state, wanted=(trial.repeats, *state.wanted)) if trial.repeats else state.dropped()
+
+
+def _again(trial) -> dict[str, Any]:
+    return {"presentation": trial.presentation + 1, "step": None, "on": None, "felt": frozenset()}
+
+
+def _repeated(state, event):
+    trial = state.trial(event.data["id"])
+    if trial.status == "pending":
+        return state.with_trial(trial.id, **_again(trial))
+    return replace(state, wanted=(*state.wanted, trial.id))
+
+
+def _made_void(state, trial, by, reason):
+    changes = trial.status == "answered" and not trial.repeats
+    sides = [trial.on] if trial.on in trial.renderings else sorted(trial.felt)  # what nobody felt is not to blame
+    state = state.dropped() if changes else state
+    state = state.with_trial(trial.id, status="void", on=None, voided={"by": by, "reason": reason, "sides": sides})
+    gone = state.excluded(trial.block)
+    if trial.repeats and not any(rendering in gone for rendering in trial.renderings.values()):
+        state = replace(state, wanted=(trial.repeats, *state.wanted))
+    return state
+
+
+def _voided(state, event):
+    return _made_void(state, state.trial(event.data["id"]), "experimenter", event.data["reason"])
+
+
+def _restored(state, event):
+    trial = state.trial(event.data["id"])
+    state = state if trial.repeats else state.dropped()
+    return state.with_trial(trial.id, status="answered", voided=None)
+
+
+def _paused(state, event):
+    trial = state.pending
+    if trial is not None and trial.unfinished:
+        state = state.with_trial(trial.id, **_again(trial))
+    return replace(state, paused=event.data["by"])
+
+
+def _device(state, event):
+    data = event.data
+    trial = state.pending if data["trial"] is None else state.trial(data["trial"])
+    begun = trial is not None and trial.step is not None and trial.status in ("pending", "answered")
+    if data["condition"] in _STOPPED and begun:
+        reason = f"device: {data['condition']}" + (f" ({data['reason']})" if data.get("reason") else "")
+        state = _made_void(state, trial, "rule", reason)
+    return replace(state, machine=data)
+
+
+_APPLY = {
+    "propose": _proposed,
+    "sent": _sent,
+    "stimulus": _stimulus,
+    "answer": _answered,
+    "undo": _undone,
+    "repeat": _repeated,
+    "void": _voided,
+    "restore": _restored,
+    "pause": _paused,
+    "resume": lambda state, event: replace(state, paused=None),
+    "abort": lambda state, event: replace(state, aborted=event.data["reason"]),
+    "note": lambda state, event: replace(state, notes=(*state.notes, (event.time, event.data["text"]))),
+    "more": lambda state, event: replace(
+        state, extra={**state.extra, event.data["block"]: state.extra.get(event.data["block"], 0) + 1}
+    ),
+    "go_on": lambda state, event: replace(state, passed=state.passed | {event.data["block"]}),
+    "device": _device,
+}

@@ -1,0 +1,107 @@
+"""Beginning a new participant's session from the population's map: which renderings are chosen, and nothing else.
+
+Somebody new is taken for the population g and a deviation h of their own, f = g + h, whose variance is the share 1 - p
+of the prior's, k. What is known of f at a point before their first answer is then
+
+    m0 = mean of the map,    v0 = variance of the map + (1 - p) k,
+
+which takes the prior's place in the committee's rule: with their own posterior m, v under the study's prior k,
+
+    1 / s = 1 / v0 + (1 / v - 1 / k),    mu = s (m0 / v0 + m / v).
+
+The next rendering has the highest mu + weight · sqrt(s) among fixed feasible points; without answers mu = m0, s = v0,
+and where the map knows nothing the rule is the cold one's but for p. Point by point, as the committee itself is: what
+one answer says of h elsewhere is taken from the study's kernel.
+
+Aggregation, reports and the participant's own optimum are made from their answers under the study's prior alone;
+docs/sessions.md has how many trials this saves (benchmarks/warm_start.py).
+"""
+
+import hashlib
+import os
+from pathlib import Path
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import Trials, fit
+from hilbo.search.candidates import search_points
+from hilbo.study.config import Study
+
+__all__ = ["SHARE", "WarmStart", "informed", "read_warm_start", "warm_point", "warm_start"]
+
+SHARE = 0.5
+"""p: the part of the prior variance that people are taken to have in common."""
+
+
+class WarmStart(eqx.Module):
+    """Candidates (m, d) of the unit cube, and what the map says there before the first answer: m0 and v0, (m,)."""
+
+    points: Float[Array, "m d"]
+    mean: Float[Array, " m"]
+    variance: Float[Array, " m"]
+    source: str = eqx.field(static=True)
+    """Start of the SHA-256 of the map's file, or another name for it: what the log holds."""
+
+
+def warm_start(
+    study: Study,
+    points: Float[Array, "m d"],
+    mean: Float[Array, " m"],
+    variance: Float[Array, " m"],
+    source: str = "",
+    share: float = SHARE,
+) -> WarmStart:
+    """From the map's mean and variance at candidates of the unit cube."""
+    prior = float(study.gp.kernel.diagonal(points[0]))
+    return WarmStart(points, mean, variance + (1.0 - share) * prior, source)
+
+
+def informed(study: Study, warm: WarmStart, trials: Trials) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """mu and s (m,) at the candidates after a participant's answers; see the module."""
+    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
+    mean, explained = posterior.predict_explained(warm.points)
+    prior = study.gp.kernel.diagonal(warm.points[0])
+    gained = explained / (prior * (prior - explained))
+    variance = 1.0 / (1.0 / warm.variance + gained)
+    return variance * (warm.mean / warm.variance + mean / (prior - explained)), variance
+
+
+def warm_point(
+    study: Study, warm: WarmStart, trials: Trials, gone: Float[Array, "k d"] | None = None, apart: float = 0.0
+) -> Float[Array, " d"]:
+    """The candidate (d,) to ask next, at least `apart` from the points `gone`; traceable."""
+    mean, variance = informed(study, warm, trials)
+    score = mean + study.selection.weight * jnp.sqrt(variance)
+    if gone is not None:
+        distance = jnp.sum((warm.points[:, None, :] - gone[None, :, :]) ** 2, axis=2)
+        score = jnp.where(jnp.all(distance >= apart**2, axis=1), score, -jnp.inf)
+    return warm.points[jnp.argmax(score)]
+
+
+def read_warm_start(path: str | os.PathLike, study: Study, seed: int = 0, share: float = SHARE) -> WarmStart:
+    """From the map.nc of a results folder, interpolated linearly. Raises InputError if it is of other parameters."""
+    import xarray as xr
+    from scipy.interpolate import RegularGridInterpolator
+
+    try:
+        content = Path(path).read_bytes()
+        with xr.open_dataset(path, engine="h5netcdf") as opened:
+            grid = opened.load()
+        mean, variance = np.asarray(grid["mean"]), np.asarray(grid["variance"])
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: is no map that can be read ({error}); give a results folder's map.nc.") from error
+    sides = [np.linspace(0.0, 1.0, size) for size in mean.shape]
+    for parameter, side in zip(study.space.parameters, sides, strict=False):
+        here = np.asarray(parameter.to_physical(jnp.asarray(side)))
+        if parameter.name not in grid.coords or not np.allclose(grid[parameter.name], here, rtol=1e-6):
+            raise InputError(f"{path}: is a map of other parameters or ranges; give one of this study.")
+    if mean.ndim != study.space.dim:
+        raise InputError(f"{path}: is a slice of a map of more dimensions; a warm start needs all of them.")
+    points = search_points(study.space, seed)
+    at = np.asarray(points)
+    values = [jnp.asarray(RegularGridInterpolator(sides, v)(at), points.dtype) for v in (mean, variance)]
+    return warm_start(study, points, *values, source=hashlib.sha256(content).hexdigest()[:16], share=share)

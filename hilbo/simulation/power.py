@@ -1,0 +1,211 @@
+"""How many participants and trials a study needs for a given error: from simulated studies whose truth is known.
+
+Studies are simulated once, at the largest numbers asked for, M people and n trials each. Of a study's people the first
+m are a study of m people, since people are drawn independently; of everybody's trials the first t are what a session
+of t trials would have asked and heard, since a session looks back only. Criteria drift by the trial (the population's
+drift over the study's own number of trials), so that a short session drifts less.
+
+For every (m, t) a study is merged by the study's rule, and two errors are taken:
+  optimum: NRMSE of the population optimum to the truth, in units of the search ranges;
+  map: root mean square, over feasible points, of the difference between the probability of the highest answer that the
+       map foretells for a new person and the one that the simulated population has (the mean over many people, in
+       closed form).
+Studies are dealt to processes, one core each; the numbers do not depend on how many there are.
+"""
+
+import contextlib
+import json
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+
+import equinox as eqx
+import jax
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+from scipy.special import ndtr
+from scipy.stats import binomtest
+
+from hilbo.errors import InputError
+from hilbo.population.maps import LARGEST_EXACT, rule_map
+from hilbo.search.candidates import search_points
+from hilbo.simulation.simulate import Person, Population, people, simulate_study
+from hilbo.study.aggregate import fit_cohort, map_optimum
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+
+__all__ = ["Plan", "cores", "one_study", "power_table", "simulate_power", "summarise", "top_probability"]
+
+_POINTS = 256  # at which maps are compared
+_CROWD = 2000  # people whose mean is the population's truth
+_ONE_CORE = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+
+class Plan(eqx.Module):
+    """Which numbers of participants and trials are asked about, from how many simulated studies."""
+
+    participants: tuple[int, ...] = eqx.field(static=True)
+    trials: tuple[int, ...] = eqx.field(static=True)
+    studies: int = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+
+    def __check_init__(self):
+        for name in ("participants", "trials"):
+            values = getattr(self, name)
+            if not values or min(values) < 1 or len(set(values)) < len(values):
+                raise InputError(f"power: {name} is {list(values)}; give different whole numbers from 1.")
+        if self.studies < 2:
+            raise InputError(f"power: {self.studies} studies have no spread; simulate two at least.")
+
+
+def simulate_power(
+    study: Study,
+    population_: Population,
+    plan: Plan,
+    *,
+    jobs: int | None = None,
+    begin: Callable[[], None] | None = None,
+    say: Callable[[int], None] = lambda done: None,
+) -> pd.DataFrame:
+    """Errors of every study at every (m, t): columns `study`, `participants`, `trials`, `optimum`, `map`.
+
+    `jobs`: processes, by default as many as there are cores; each calls `begin` first (float64, a cache).
+    `say` is told how many studies are done.
+    Raises `InputError` for numbers of people or of answers that the study's rule cannot merge.
+    """
+    if study.rule == "hierarchical" and min(plan.participants) < 2:
+        raise InputError(
+            'power: the rule "hierarchical" learns how people differ and needs two of them; ask for 2 participants or'
+            " more, or use another rule."
+        )
+    answers = max(plan.participants) * max(plan.trials)
+    if study.rule == "pooled" and answers > LARGEST_EXACT:
+        raise InputError(
+            f'power: the rule "pooled" fits one model to all answers, at most {LARGEST_EXACT:,}, and'
+            f" {max(plan.participants)} participants with {max(plan.trials)} trials give {answers:,}; ask for fewer, or"
+            " use another rule."
+        )
+    jobs = min(cores() if jobs is None else jobs, plan.studies)
+    content = study.content
+    blocks: dict[int, pd.DataFrame] = {}
+    if jobs == 1:
+        for index in range(plan.studies):
+            blocks[index] = _by_itself(content, population_, plan, index)
+            say(len(blocks))
+    else:
+        with _pool(jobs, begin) as pool:
+            work = {pool.submit(_by_itself, content, population_, plan, i): i for i in range(plan.studies)}
+            for done in as_completed(work):
+                blocks[work[done]] = done.result()
+                say(len(blocks))
+    return pd.concat([blocks[index] for index in range(plan.studies)], ignore_index=True)
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+@contextlib.contextmanager
+def _pool(jobs, begin):
+    """Fresh processes with one core each, told by XLA's flags in the environment that they start with."""
+    before = os.environ.get("XLA_FLAGS")
+    os.environ["XLA_FLAGS"] = f"{before or ''} {_ONE_CORE}".strip()
+    try:
+        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=begin) as pool:
+            yield pool
+    finally:
+        if before is None:
+            del os.environ["XLA_FLAGS"]
+        else:
+            os.environ["XLA_FLAGS"] = before
+
+
+def _by_itself(content, population_, plan, index):
+    """One study, from what can be sent to another process."""
+    study = Study.from_dict({"schema": 1} | json.loads(content))
+    return one_study(study, population_, plan, index)
+
+
+def one_study(study: Study, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
+    """The errors of simulated study number `index`."""
+    most, longest = max(plan.participants), max(plan.trials)
+    seed = int(np.random.default_rng([plan.seed, index]).integers(2**31))
+    staged = _of_length(study, longest)
+    # A drift over the study's own session, told per trial, is this much over the longest one.
+    scale = longest / study.selection.trials
+    persons = people(staged, population_, most, seed)
+    persons = eqx.tree_at(lambda p: p.drift, persons, persons.drift * scale)
+    trials = simulate_study(staged, persons, seed)
+    cohort = Cohort(trials, np.zeros((most, longest, study.space.dim)), tuple(map(str, range(most))))
+    candidates = search_points(study.space, 0)
+    points = candidates[:_POINTS]
+    truth = np.asarray(study.space.to_unit(np.array([population_.truth[name] for name in study.space.names])))
+    target = top_probability(people(study, population_, _CROWD, 0), len(study.responses), np.asarray(points))
+    rows = []
+    for count in plan.trials:
+        so_far = cohort.first(count)
+        posteriors = fit_cohort(staged, so_far)
+        for m in plan.participants:
+            some, given = jax.tree.map(lambda leaf, m=m: leaf[:m], (posteriors, so_far.trials))
+            merged = rule_map(study.gp, given, study.rule, posteriors=some, inference=study.inference)
+            x = np.asarray(map_optimum(study, merged, candidates).x)
+            found = np.asarray(_foretold(study, merged, points))
+            rows.append((index, m, count, _rms(x - truth), _rms(found - target)))
+    return pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
+
+
+def _rms(difference):
+    return float(np.sqrt(np.mean(difference**2)))
+
+
+@eqx.filter_jit
+def _foretold(study, merged, points):
+    mean, variance = merged.newcomer(points)
+    return jax.vmap(study.gp.likelihood.class_probabilities)(mean, variance)[:, -1]
+
+
+def _of_length(study, trials):
+    """The study with another number of trials."""
+    content = json.loads(study.content)
+    content.setdefault("selection", {})["trials"] = trials
+    filling = min(study.selection.space_filling, trials)
+    content["selection"]["space_filling"] = filling
+    return Study.from_dict({"schema": 1} | content)
+
+
+def top_probability(persons: Person, categories: int, x: Float[np.ndarray, "m d"]) -> Float[np.ndarray, " m"]:
+    """Probability (m,) that a simulated person, drawn from these, gives the highest answer in the middle of a session.
+
+    P = (1 - lapse) Phi((lowest criterion - distance - drift / 2) / noise) + lapse / C, its mean over the persons.
+    """
+    optimum, tolerance = np.asarray(persons.optimum), np.asarray(persons.tolerance)
+    distance = np.sqrt(np.sum(((x[:, None, :] - optimum[None]) / tolerance[None]) ** 2, axis=2))
+    strict = np.asarray(persons.criteria).min(axis=1)[None, :]
+    felt = (strict - distance - np.asarray(persons.drift)[None, :] / 2) / np.asarray(persons.noise)[None, :]
+    lapses = np.asarray(persons.lapse)[None, :]
+    return np.mean((1 - lapses) * ndtr(felt) + lapses / categories, axis=1)
+
+
+def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:
+    """For every (m, t): median and quartiles of both errors, and the share of studies whose optimum misses by `error`
+    or less, with its 95 % interval (Wilson); columns end in `_median`, `_low`, `_high`; `reached`."""
+    groups = errors.groupby(["participants", "trials"])
+    table = pd.DataFrame({
+        f"{name}_{word}": groups[name].quantile(q)
+        for name in ("optimum", "map")
+        for word, q in (("median", 0.5), ("low", 0.25), ("high", 0.75))
+    })  # fmt: skip
+    within, count = groups["optimum"].apply(lambda values: int((values <= error).sum())), groups.size()
+    table["reached"] = within / count
+    ends = [binomtest(k, n).proportion_ci(method="wilson") for k, n in zip(within, count, strict=True)]
+    table["reached_low"], table["reached_high"] = [e.low for e in ends], [e.high for e in ends]
+    table["studies"] = count
+    return table.reset_index()
+
+
+def power_table(summary: pd.DataFrame, value: str) -> pd.DataFrame:
+    """One of the summary's columns as participants by trials."""
+    return summary.pivot(index="participants", columns="trials", values=value)

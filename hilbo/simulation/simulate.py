@@ -1,0 +1,171 @@
+"""Simulated participants and studies whose truth is known.
+
+A simulated person prefers one rendering and perceives every other at a dissimilarity
+
+    s = sqrt( sum_i ((x_i - optimum_i) / tolerance_i)^2 ) + drift * (trial / trials) + noise * e,    e ~ N(0, 1),
+
+and answers with the highest category whose criterion s stays below; with probability `lapse` the answer is any
+category. This is deliberately not the model that is fitted: its tails are linear where the GP's are bounded.
+A whole study (everybody's space-filling and acquisition trials) runs in one compiled call.
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import Trials
+from hilbo.session.selection import Design, design, next_point
+from hilbo.study.config import Study
+
+__all__ = ["PRESETS", "Person", "Population", "people", "simulate_study", "to_table", "truth_table"]
+
+
+class Person(eqx.Module):
+    """A simulated participant; leading axes for several. All in unit-cube coordinates."""
+
+    optimum: Float[Array, "*M d"]
+    tolerance: Float[Array, "*M d"]
+    """Distances along each parameter that are felt as one unit of dissimilarity."""
+    criteria: Float[Array, "*M c"]
+    """Decreasing, C - 1 of them: below all of them the answer is the highest category."""
+    noise: Float[Array, "*M"]
+    lapse: Float[Array, "*M"]
+    drift: Float[Array, "*M"]
+
+    def answer(self, key: PRNGKeyArray, x: Float[Array, " d"], progress: Float[Array, ""]) -> Int[Array, ""]:
+        """Category of the answer to the rendering `x` after the share `progress` of the session."""
+        perceive, lapse, guess = jax.random.split(key, 3)
+        distance = jnp.sqrt(jnp.sum(((x - self.optimum) / self.tolerance) ** 2))
+        felt = distance + self.drift * progress + self.noise * jax.random.normal(perceive, (), x.dtype)
+        judged = jnp.sum(felt < self.criteria)
+        guessed = jax.random.randint(guess, (), 0, self.criteria.shape[-1] + 1, judged.dtype)
+        return jnp.where(jax.random.uniform(lapse, (), x.dtype) < self.lapse, guessed, judged)
+
+
+class Population(eqx.Module):
+    """From which people are drawn.
+
+    `truth` is the rendering, in physical units, around which their optima lie with the standard deviations `spread`
+    (unit cube; redrawn until inside the box and feasible); tolerances are log-normal around `tolerance` with the
+    log standard deviation `tolerance_sd`, one factor per person; `drift` has mean 0 and standard deviation `drift_sd`.
+    """
+
+    truth: Mapping[str, float] = eqx.field(static=True)
+    spread: tuple[float, ...] = eqx.field(static=True)
+    tolerance: tuple[float, ...] = eqx.field(static=True)
+    tolerance_sd: float = eqx.field(static=True)
+    criteria: tuple[float, ...] = eqx.field(static=True)
+    noise: float = eqx.field(static=True)
+    lapse: float = eqx.field(static=True)
+    drift_sd: float = eqx.field(static=True)
+
+
+_PAPER = Population(
+    truth={"K1": 5.70, "B1": 5.89, "alpha": 0.203},
+    spread=(0.36, 0.135, 0.133),
+    tolerance=(0.238, 0.362, 0.087),
+    tolerance_sd=0.41,
+    criteria=(1.36, 1.0),
+    noise=0.98,
+    lapse=0.1,
+    drift_sd=0.38,
+)
+
+PRESETS: dict[str, Population] = {"paper": _PAPER}
+"""Populations by name; docs/simulation.md says how `paper` was made and what it is like."""
+
+
+def people(study: Study, population: Population, count: int, seed: int) -> Person:
+    """`count` people drawn from the population, stacked."""
+    if len(population.criteria) != len(study.responses) - 1:
+        raise InputError(
+            f"simulate: the population has {len(population.criteria)} criteria, but the study's {len(study.responses)}"
+            f" responses need {len(study.responses) - 1}."
+        )
+    rng = np.random.default_rng(seed)
+    truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
+    optima = np.empty((0, study.space.dim))
+    while len(optima) < count:
+        drawn = truth + np.array(population.spread) * rng.standard_normal((64, study.space.dim))
+        inside = np.all((drawn >= 0) & (drawn <= 1), axis=1)
+        drawn = drawn[inside]
+        optima = np.concatenate([optima, drawn[np.asarray(study.space.feasible(drawn))]])
+    factor = np.exp(population.tolerance_sd * rng.standard_normal((count, 1)))
+    return Person(
+        optimum=jnp.asarray(optima[:count]),
+        tolerance=jnp.asarray(np.array(population.tolerance) * factor),
+        criteria=jnp.asarray(np.tile(population.criteria, (count, 1))),
+        noise=jnp.full(count, population.noise),
+        lapse=jnp.full(count, population.lapse),
+        drift=jnp.asarray(population.drift_sd * rng.standard_normal(count)),
+    )
+
+
+def simulate_study(study: Study, persons: Person, seed: int) -> Trials:
+    """Everybody's session, stacked trials (M, ...): the study's space-filling and acquisition trials, in one call.
+
+    Each person has a Latin hypercube of their own; the candidates of the acquisition are shared.
+    """
+    count = persons.noise.shape[0]
+    plan = design(study, seed)
+    own = [study.space.latin_hypercube(len(plan.initial), 1 + seed * count + i) for i in range(count)]
+    keys = jax.random.split(plan.key, count)
+    return _simulate(study, plan, jnp.asarray(np.stack(own)), persons, keys)
+
+
+@eqx.filter_jit
+def _simulate(study: Study, plan: Design, initial, persons, keys):
+    trials = study.selection.trials
+
+    def answered(state, point, trial):
+        def one(person, key, data, x):
+            progress = (trial / trials).astype(x.dtype)
+            return data.append(x, person.answer(jax.random.fold_in(key, trial), x, progress))
+
+        return jax.vmap(one)(persons, keys, state, point)
+
+    def filling(state, trial):
+        return answered(state, initial[:, trial], trial), None
+
+    def choosing(state, trial):
+        points = jax.vmap(lambda data: next_point(study, plan, data, trial))(state)
+        return answered(state, points, trial), None
+
+    empty = jax.vmap(lambda _: Trials.empty(trials, study.space.dim))(jnp.arange(initial.shape[0]))
+    state, _ = jax.lax.scan(filling, empty, jnp.arange(initial.shape[1]))
+    return jax.lax.scan(choosing, state, jnp.arange(initial.shape[1], trials))[0]
+
+
+def to_table(study: Study, trials: Trials) -> pd.DataFrame:
+    """The trial table of a simulated study: participants P01, P02, ..., points in physical units."""
+    physical = np.asarray(study.space.to_physical(trials.x))
+    people_count, capacity = trials.mask.shape
+    width = max(2, len(str(people_count)))
+    rows = np.argwhere(np.asarray(trials.mask))
+    table = pd.DataFrame(
+        {
+            "participant": [f"P{person + 1:0{width}d}" for person, _ in rows],
+            "trial": rows[:, 1] + 1,
+            "response": np.array(study.responses)[np.asarray(trials.q)[tuple(rows.T)]],
+        }
+    )
+    for i, name in enumerate(study.space.names):
+        table[name] = physical[..., i][tuple(rows.T)]
+    del capacity
+    return table
+
+
+def truth_table(study: Study, population: Population, persons: Person) -> pd.DataFrame:
+    """The optima that were simulated, in physical units: the population's, and everybody's own."""
+    own = np.asarray(study.space.to_physical(persons.optimum))
+    width = max(2, len(str(len(own))))
+    centre = [population.truth[name] for name in study.space.names]
+    table = pd.DataFrame(np.vstack([centre, own]), columns=list(study.space.names))
+    table.insert(0, "source", ["population", *(f"individual:P{i + 1:0{width}d}" for i in range(len(own)))])
+    return table

@@ -1,0 +1,78 @@
+"""Simulated validation sessions: people who compare renderings of which they perceive the dissimilarity.
+
+New people are drawn from the population of a simulated study. Shown two renderings, a person perceives how unlike each
+is (`simulate.Person`), puts each in the class whose criterion it stays below, and prefers the smaller; with
+probability `lapse` each of the three answers is a guess. As in the paper, every pair of best, mid and worst is compared
+four times by everybody, and every individual's set twice with the aggregate's by each of a few judges.
+"""
+
+from itertools import combinations
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from hilbo.search.rendering import set_of
+from hilbo.simulation.simulate import Person, Population, people
+from hilbo.study.config import Study
+from hilbo.study.map_summary import Sets
+
+__all__ = ["sets_table", "validation_table"]
+
+_TIMES = 4  # that a participant compares a pair of best, mid and worst
+_TWICE = 2  # that a judge compares an individual's set with the aggregate's
+
+
+def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"], names: tuple[str, ...]) -> pd.DataFrame:
+    """Best, mid and worst of the aggregate map (the aggregate's set is best), and everybody's own: a sets table with
+    a column `role`."""
+    rows = [
+        {"set_id": role, "source": "aggregate", "role": role} | set_of(study.space, x)
+        for role, x in zip(("best", "mid", "worst"), np.asarray(sets.x), strict=True)
+    ]
+    rows += [
+        {"set_id": f"own-{name}", "source": f"individual:{name}", "role": ""} | set_of(study.space, x)
+        for name, x in zip(names, individuals, strict=True)
+    ]
+    table = pd.DataFrame(rows)
+    mechanics = study.space.mechanics
+    return table if mechanics is None else table.assign(N=mechanics.N, T=mechanics.T)
+
+
+def validation_table(
+    study: Study, population: Population, table: pd.DataFrame, *, participants: int = 20, judges: int = 8, seed: int = 0
+) -> pd.DataFrame:
+    """A validation table over the sets of `sets_table`, in a random order for everybody."""
+    rng = np.random.default_rng([seed, 1])
+    crowd = people(study, population, participants + judges, seed + 7_919)
+    x = {row["set_id"]: _unit(study, row) for _, row in table.iterrows()}
+    own = [name for name, source in zip(table["set_id"], table["source"], strict=True) if source != "aggregate"]
+    pairs = [list(combinations(("best", "mid", "worst"), 2)) * _TIMES] * participants
+    pairs += [[("best", name) for name in own] * _TWICE] * judges
+    rows = []
+    for person, asked in enumerate(pairs):
+        model = person < participants
+        name = f"{'N' if model else 'J'}{person + 1 if model else person + 1 - participants:02d}"
+        for trial, i in enumerate(rng.permutation(len(asked))):
+            a, b = asked[i] if rng.random() < 0.5 else asked[i][::-1]
+            classes, preferred = _answer(study, crowd, person, x[a], x[b], rng)
+            first = {"participant": name, "session": "model" if model else "aggregate-best", "trial": trial + 1}
+            shown = {"class_a": classes[0], "class_b": classes[1]} if model else {"class_a": "", "class_b": ""}
+            rows.append(first | {"set_a": a, "set_b": b, "first": "a"} | shown | {"preferred": (a, b)[preferred]})
+    return pd.DataFrame(rows)
+
+
+def _unit(study, row):
+    return np.asarray(study.space.to_unit(np.array([float(row[name]) for name in study.space.names])))
+
+
+def _answer(study, crowd: Person, person, x, y, rng):
+    """Classes of two renderings, and which of them is preferred."""
+    optimum, tolerance = np.asarray(crowd.optimum[person]), np.asarray(crowd.tolerance[person])
+    felt = np.array([np.sqrt(np.sum(((point - optimum) / tolerance) ** 2)) for point in (x, y)])
+    felt = felt + float(crowd.noise[person]) * rng.standard_normal(2)
+    judged = [int((value < np.asarray(crowd.criteria[person])).sum()) for value in felt]
+    lapses = rng.random(3) < float(crowd.lapse[person])
+    judged = [rng.integers(len(study.responses)) if lapse else c for c, lapse in zip(judged, lapses, strict=False)]
+    preferred = int(rng.integers(2)) if lapses[2] else int(np.argmin(felt))
+    return [study.responses[c] for c in judged], preferred

@@ -1,0 +1,131 @@
+"""Binary and ordered logit of the answers of a validation session, with every kind of error.
+
+Binary: P(y = 1) = σ(β0 + x·β). Ordered, categories 0..C-1: P(y <= c) = σ(t_c - x·β), so that a positive coefficient
+shifts answers to higher categories (McCullagh 1980). `hilbo.statistics.regression` says what each kind of error
+assumes, and what a separated coefficient gets. `hilbo.statistics.paper_tables` makes the paper's tables II to IV with
+these.
+"""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from scipy.special import logit
+
+from hilbo.errors import InputError
+from hilbo.statistics import ordered_logit as likelihood
+from hilbo.statistics.regression import Clusters, Regression, regress
+
+__all__ = ["binary_logit", "ordered_logit", "tied_preferences"]
+
+Predictors = Mapping[str, Any] | pd.DataFrame  # a column for each, n entries each
+
+
+def binary_logit(
+    outcome: Sequence | np.ndarray | pd.Series,
+    predictors: Predictors | None = None,
+    clusters: Clusters | None = None,
+    *,
+    intercept: str = "Intercept",
+    level: float = 0.95,
+    bootstrap: bool = True,
+    seed: int = 0,
+) -> Regression:
+    """Logit of a yes/no outcome (n,) on an intercept and the columns of `predictors`.
+
+    `clusters`: up to two columns that name the cluster of every answer, participants say. An outcome that never
+    changes has no finite intercept and is answered with a one-sided interval. `seed` is that of the bootstrap.
+    """
+    success = np.asarray(outcome)
+    if success.ndim != 1 or not success.size or not np.isin(success, (0, 1)).all():
+        raise InputError("the outcome of a binary logit must be a list of 0 and 1 (or no and yes), and not empty.")
+    names, x = _matrix(predictors, len(success))
+    x = np.column_stack([np.ones(len(success)), x])
+    model = likelihood.design(success.astype(int), x, np.zeros((1, 0)))
+    start = np.zeros(x.shape[1])
+    return regress(model, [intercept, *names], start, clusters, level=level, bootstrap=bootstrap, seed=seed)
+
+
+def ordered_logit(
+    category: Sequence | np.ndarray | pd.Series,
+    predictors: Predictors,
+    clusters: Clusters | None = None,
+    *,
+    categories: Sequence[str] | None = None,
+    level: float = 0.95,
+    bootstrap: bool = True,
+    seed: int = 0,
+) -> Regression:
+    """Ordered logit of categories (n,), ints from 0, on the columns of `predictors` (no constant).
+
+    `categories` names them, lowest first; the edge between two is the term "a|b". A category that never occurs has no
+    edge of its own; raises `InputError` if fewer than two occur.
+    """
+    answers = np.asarray(category)
+    if answers.ndim != 1 or not answers.size or not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0:
+        raise InputError("the categories of an ordered logit must be a list of whole numbers from 0, and not empty.")
+    labels = [str(c) for c in range(answers.max() + 1)] if categories is None else list(categories)
+    used, ranks = np.unique(answers, return_inverse=True)
+    if used[-1] >= len(labels):
+        raise InputError(f"category {used[-1]} has no name; {len(labels)} are given.")
+    if len(used) < 2:
+        raise InputError(f'all {len(answers)} answers are "{labels[used[0]]}": there is nothing to compare.')
+    names, x = _matrix(predictors, len(answers))
+    edges = [f"{labels[a]}|{labels[b]}" for a, b in pairwise(used)]
+    model = likelihood.design(ranks.ravel(), x, np.eye(len(edges)))
+    below = np.cumsum(np.bincount(ranks.ravel()))[:-1] / len(answers)
+    start = np.concatenate([np.zeros(x.shape[1]), logit(below)])
+    options = {"nuisance": len(edges), "level": level, "bootstrap": bootstrap, "seed": seed}
+    return regress(model, [*names, *edges], start, clusters, **options)
+
+
+def tied_preferences(
+    first: Sequence | np.ndarray | pd.Series,
+    second: Sequence | np.ndarray | pd.Series,
+    preferred: Sequence | np.ndarray | pd.Series,
+    clusters: Clusters | None = None,
+    *,
+    reference: str | None = None,
+    order: Sequence | np.ndarray | None = None,
+    level: float = 0.95,
+    bootstrap: bool = True,
+    seed: int = 0,
+) -> Regression:
+    """Strengths of sets from paired comparisons with ties, by the model of Rao & Kupper (1967).
+
+    P(a beats b) = σ(λ_a - λ_b - η), P(b beats a) = σ(λ_b - λ_a - η), the rest are ties: an ordered logit with edges
+    ∓η. Without ties η = 0 and it is Bradley & Terry's model. `preferred` holds one of the two sets or "tie" for each
+    comparison; the strength of `reference` (default: the last in the alphabet) is 0. `order` (+1 if `first` was shown
+    first, -1 if not, 0 if not known) adds the term "shown first".
+    """
+    left, right, chosen = (np.asarray(column, str) for column in (first, second, preferred))
+    wrong = (chosen != left) & (chosen != right) & (chosen != "tie")
+    if not left.size or wrong.any():
+        raise InputError(
+            "every comparison must prefer one of its two sets, or be a tie; and there must be one at least."
+        )
+    sets = sorted({*left, *right})
+    reference = sets[-1] if reference is None else reference
+    if reference not in sets:
+        raise InputError(f'the reference "{reference}" is in no comparison; the sets are {", ".join(sets)}.')
+    sets.remove(reference)
+    x = np.array([(left == name).astype(float) - (right == name) for name in sets]).T.reshape(len(left), len(sets))
+    if order is not None and np.any(order):
+        sets, x = [*sets, "shown first"], np.column_stack([x, np.asarray(order, float)])
+    ties = bool((chosen == "tie").any())
+    won = np.where(chosen == left, 1, 0) * (2 if ties else 1) + (chosen == "tie")
+    model = likelihood.design(won, x, np.array([[-1.0], [1.0]]) if ties else np.zeros((1, 0)))
+    start = np.concatenate([np.zeros(x.shape[1]), np.ones(int(ties))])
+    terms = [*sets, *(["tie"] if ties else [])]
+    return regress(model, terms, start, clusters, nuisance=int(ties), level=level, bootstrap=bootstrap, seed=seed)
+
+
+def _matrix(predictors, n):
+    """Names and columns (n, p) of the predictors, as finite numbers."""
+    columns = {} if predictors is None else {str(name): np.asarray(predictors[name], float) for name in predictors}
+    for name, values in columns.items():
+        if values.shape != (n,) or not np.isfinite(values).all():
+            raise InputError(f'predictor "{name}" must have one finite number for each of the {n} answers.')
+    return list(columns), np.array(list(columns.values())).T.reshape(n, len(columns))

@@ -1,0 +1,135 @@
+"""The paper's tables II to IV from a validation table, with every kind of error, and the counts behind them.
+
+II: binary logit of "close" (the highest response) against the rest, on whether the set was *best*. III: ordered logit
+of the class, coded from the highest response (0) to the lowest, on *best* and *worst*, *mid* being the reference: a
+negative coefficient is a shift towards "close". IV: binary logit of preferring the aggregate's set to an individual's,
+an intercept alone. II and III are clustered by participant, IV by participant and by the individual's set.
+Ties in IV are modelled (`logits.tied_preferences`): 0 is still "neither is preferred".
+"""
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.statistics.logits import binary_logit, ordered_logit, tied_preferences
+from hilbo.statistics.preferences import classifications, confusion, preference_rates
+from hilbo.statistics.regression import Regression
+from hilbo.study.validation_table import NONE, RESPONSES, TIE, check_validation, of_material, source_kind
+
+__all__ = ["PaperTables", "aggregate_comparisons", "paper_tables", "set_sources"]
+
+_ROLES = ("best", "mid", "worst")
+_OURS, _THEIRS = "Aggregate-Best", "individual"
+
+
+class PaperTables(eqx.Module):
+    """Tables II to IV (None if the table holds no answers of the kind), confusion matrix, and preference rates.
+
+    `limits`: one sentence for each part that is missing; the tables have their own `warnings`.
+    """
+
+    table_2: Regression | None
+    table_3: Regression | None
+    table_4: Regression | None
+    confusion: pd.DataFrame
+    preferences: pd.DataFrame
+    limits: tuple[str, ...]
+
+
+def paper_tables(
+    validation: pd.DataFrame,
+    sets: pd.DataFrame | None = None,
+    *,
+    responses: Sequence[str] = RESPONSES,
+    material: str | None = None,
+    level: float = 0.95,
+    bootstrap: bool = True,
+    seed: int = 0,
+) -> PaperTables:
+    """Every statistic of the paper's validation sessions, of one material.
+
+    `sets` is a sets table (`validation_table.read_sets`); its column `role`, if it has one, says which sets are best,
+    mid and worst. Without it these are the sets' names, and the sets of table IV are named "aggregate" and
+    "individual:PARTICIPANT". Raises `InputError` for a bad table.
+    """
+    table = of_material(check_validation(validation, responses), material)
+    sources, roles = set_sources(table, sets)
+    staged = table.assign(set_a=table["set_a"].map(roles), set_b=table["set_b"].map(roles))
+    staged["preferred"] = [roles.get(name, name) for name in table["preferred"]]
+    staged = staged[staged["set_a"].isin(_ROLES) & staged["set_b"].isin(_ROLES) & (staged["set_a"] != staged["set_b"])]
+    answers, limits = classifications(staged, responses), []
+    options = {"level": level, "bootstrap": bootstrap, "seed": seed}
+    found = {
+        "II": lambda: _table_2(answers, responses, options),
+        "III": lambda: _table_3(answers, responses, options),
+        "IV": lambda: _table_4(table, sources, options),
+    }
+    tables = {}
+    for number, make in found.items():
+        try:
+            tables[number] = make()
+        except InputError as error:
+            tables[number] = None
+            limits.append(f"Table {number} is missing: {error}")
+    counts = confusion(staged, responses, _ROLES)
+    rates = preference_rates(staged, _ROLES, **options)
+    return PaperTables(tables["II"], tables["III"], tables["IV"], counts, rates, tuple(limits))
+
+
+def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[str, str], dict[str, str]]:
+    """Source and role of every set of a validation table; without a sets table their names say both."""
+    used = sorted({*table["set_a"], *table["set_b"]})
+    if sets is None:
+        return {name: name for name in used}, {name: name for name in used}
+    unknown = [name for name in used if name not in sets.index]
+    if unknown:
+        raise InputError(f'set "{unknown[0]}" of the validation table is not in the sets table; add it there.')
+    roles = sets["role"] if "role" in sets else pd.Series(sets.index, sets.index)
+    return {name: str(sets.at[name, "source"]) for name in used}, {name: str(roles[name]) for name in used}
+
+
+def _table_2(answers, responses, options):
+    _need(answers, ("best",))
+    close = (answers["class"] == responses[-1]).astype(int)
+    best = {"Best": (answers["set"] == "best").astype(float)}
+    return binary_logit(close, best, answers[["participant"]], **options)
+
+
+def _table_3(answers, responses, options):
+    _need(answers, _ROLES)
+    shifts = {name.capitalize(): (answers["set"] == name).astype(float) for name in ("best", "worst")}
+    ranks, names = len(responses) - 1 - answers["category"], list(responses)[::-1]
+    return ordered_logit(ranks, shifts, answers[["participant"]], categories=names, **options)
+
+
+def _table_4(table, sources, options):
+    rows = aggregate_comparisons(table, sources)
+    if rows.empty:
+        raise InputError("no comparison of an aggregate's set with an individual's holds a preference.")
+    clusters, preferred = rows[["participant", "set"]], rows["preferred"].to_numpy()
+    if (preferred != TIE).all():
+        return binary_logit(preferred == _OURS, None, clusters, intercept=_OURS, **options)
+    one, other = np.full(len(rows), _OURS), np.full(len(rows), _THEIRS)
+    return tied_preferences(one, other, preferred, clusters, reference=_THEIRS, **options)
+
+
+def aggregate_comparisons(table: pd.DataFrame, sources: Mapping[str, str]) -> pd.DataFrame:
+    """Preferences between an aggregate's set and an individual's: `participant`, `set` (the individual's) and
+    `preferred` ("Aggregate-Best", "individual" or "tie"). `sources`: set -> source, as in a sets table."""
+    left, right = (table[side].map(lambda name: source_kind(sources[name])) for side in ("set_a", "set_b"))
+    mixed = ((left == "aggregate") & (right == "individual")) | ((left == "individual") & (right == "aggregate"))
+    keep = mixed & (table["preferred"] != NONE)
+    rows, first = table[keep], (left[keep] == "aggregate").to_numpy()
+    ours, theirs = (np.where(first == swap, rows["set_a"], rows["set_b"]) for swap in (True, False))
+    preferred = rows["preferred"].to_numpy()
+    words = np.where(preferred == ours, _OURS, np.where(preferred == TIE, TIE, _THEIRS))
+    return pd.DataFrame({"participant": rows["participant"].to_numpy(), "set": theirs, "preferred": words})
+
+
+def _need(answers, roles):
+    absent = [name for name in roles if name not in set(answers["set"])]
+    if absent:
+        raise InputError(f'no comparison classifies the set "{absent[0]}".')

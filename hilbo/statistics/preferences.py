@@ -1,0 +1,119 @@
+"""What a validation session counted: classes of each set, preferences of each pair, rates with every kind of interval.
+
+The rate of a pair is wins/(wins + losses); ties are counted beside it, and modelled by `logits.tied_preferences`.
+Wilson and Clopper-Pearson ("exact") intervals take all answers as independent. The clustered and bootstrapped ones are
+those of the logit's intercept, mapped to rates, so that they stay within 0 and 1. Where one set always won there is
+nothing to cluster; then the exact interval of the participants, all of whom agreed, stands beside that of the answers.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from scipy.special import expit
+from scipy.stats import binomtest
+
+from hilbo.errors import InputError
+from hilbo.statistics.logits import binary_logit
+from hilbo.statistics.regression import Clusters
+from hilbo.study.validation_table import NONE, RESPONSES, TIE
+
+__all__ = ["classifications", "confusion", "preference_rates", "rate"]
+
+_INDEPENDENT = "all answers are independent"
+
+
+def classifications(table: pd.DataFrame, responses: Sequence[str] = RESPONSES) -> pd.DataFrame:
+    """One row per set shown and classified: `participant`, `set`, `class` and `category` (0 = lowest response)."""
+    halves = [
+        table[["participant", f"set_{side}", f"class_{side}"]].set_axis(["participant", "set", "class"], axis=1)
+        for side in "ab"
+    ]
+    answers = pd.concat(halves)
+    answers = answers[answers["class"] != NONE].reset_index(drop=True)
+    return answers.assign(category=answers["class"].map({label: i for i, label in enumerate(responses)}).astype(int))
+
+
+def confusion(table: pd.DataFrame, responses: Sequence[str] = RESPONSES, sets: Sequence[str] = ()) -> pd.DataFrame:
+    """How often each set (row) was put in each class (column, highest first); divide by the row's sum for shares."""
+    answers = classifications(table, responses)
+    rows = list(sets) or sorted(answers["set"].unique())
+    return pd.crosstab(answers["set"], answers["class"]).reindex(rows, columns=list(responses)[::-1], fill_value=0)
+
+
+def rate(
+    success: Sequence | np.ndarray | pd.Series,
+    clusters: Clusters | None = None,
+    *,
+    level: float = 0.95,
+    bootstrap: bool = True,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Share of successes (n,) with each kind of interval.
+
+    Columns `rate`, `errors`, `low`, `high`, `p_value` (of a rate of 1/2), `assumes`. Raises `InputError`.
+    """
+    hits = np.asarray(success)
+    if not hits.size or not np.isin(hits, (0, 1)).all():
+        raise InputError("a rate needs a list of 0 and 1 (or no and yes) that is not empty.")
+    test = binomtest(int(hits.sum()), hits.size)
+    rows = [
+        ("Wilson", *test.proportion_ci(level, "wilson"), np.nan, _INDEPENDENT),
+        ("exact", *test.proportion_ci(level, "exact"), test.pvalue, _INDEPENDENT),
+    ]
+    if hits.min() == hits.max():
+        rows += _unanimous(hits, clusters, level)
+    elif clusters is not None and len(list(clusters)):
+        fitted = binary_logit(hits, None, clusters, level=level, bootstrap=bootstrap, seed=seed).table
+        fitted = fitted[fitted["errors"] != "iid"]
+        rows += list(
+            zip(fitted["errors"], expit(fitted["low"]), expit(fitted["high"]), fitted["p_value"], fitted["assumes"],
+                strict=True)
+        )  # fmt: skip
+    found = pd.DataFrame(rows, columns=["errors", "low", "high", "p_value", "assumes"])
+    found.insert(0, "rate", float(hits.mean()))
+    return found
+
+
+def preference_rates(
+    table: pd.DataFrame,
+    sets: Sequence[str] = (),
+    *,
+    level: float = 0.95,
+    bootstrap: bool = True,
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Of each pair of sets, how often the first was preferred: one row per pair and kind of interval.
+
+    `sets` are the ones to compare, in the order in which a pair names them; all, by the alphabet, if none is given.
+    Columns `set`, `over`, `comparisons`, `wins`, `losses`, `ties`, and those of `rate`. A pair with ties only has none.
+    """
+    asked = table[table["preferred"] != NONE]
+    names = list(sets) or sorted({*asked["set_a"], *asked["set_b"]})
+    place = {name: i for i, name in enumerate(names)}
+    asked = asked[asked["set_a"].isin(names) & asked["set_b"].isin(names)]
+    turned = asked["set_a"].map(place) > asked["set_b"].map(place)
+    one = asked["set_a"].mask(turned, asked["set_b"])
+    other = asked["set_b"].mask(turned, asked["set_a"])
+    blocks = []
+    for (a, b), rows in asked.groupby([one.map(place), other.map(place)]):
+        decided = rows[rows["preferred"] != TIE]
+        won = (decided["preferred"] == names[a]).to_numpy()
+        counts = {"set": names[a], "over": names[b], "comparisons": len(rows), "wins": int(won.sum())}
+        counts |= {"losses": int((~won).sum()), "ties": len(rows) - len(decided)}
+        options = {"level": level, "bootstrap": bootstrap, "seed": seed}
+        found = rate(won, decided[["participant"]], **options) if len(won) else pd.DataFrame({"rate": [np.nan]})
+        blocks.append(pd.DataFrame([counts] * len(found)).join(found))
+    return pd.concat(blocks, ignore_index=True) if blocks else pd.DataFrame()
+
+
+def _unanimous(hits, clusters, level):
+    """All agreed: how many people would, from the people who did."""
+    rows = []
+    columns = {} if clusters is None else {str(name): np.asarray(clusters[name]) for name in clusters}
+    for name, codes in columns.items():
+        people = len(pd.unique(codes))
+        test = binomtest(people if hits[0] else 0, people)
+        assumes = f"clusters of {name} are independent; share of them that agree in every answer"
+        rows.append((f"exact, of {people} by {name}", *test.proportion_ci(level, "exact"), test.pvalue, assumes))
+    return rows

@@ -1,0 +1,156 @@
+"""Separation: which coefficients of a logit have no finite estimate, found by linear programming.
+
+The log-likelihood of `hilbo.statistics.ordered_logit` never falls along a direction δ exactly if no upper edge falls
+and no lower edge rises: U·δ >= 0 and L·δ <= 0 in every answer. If such a direction moves an edge, the answers are
+separated (a cell of 0 or 100 %, or a combination of predictors that is), and the maximum lies at infinity (Albert &
+Anderson 1984). Edges that move along some such direction are open in the limit; the others alone decide the
+coefficients that no such direction touches, and the supremum of the likelihood is theirs. An answer without an edge
+left is certain.
+
+Reference: Konis (2007), Computational algorithms for detecting separation (linear programming), D.Phil., Oxford.
+"""
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.optimize import brentq, linprog
+
+from hilbo.statistics import ordered_logit
+from hilbo.statistics.ordered_logit import Design
+
+__all__ = ["Separation", "decisive", "independent", "profile", "separation", "supremum"]
+
+_TOLERANCE = 1e-7  # of a direction with entries up to 1; the solver's feasibility tolerance
+
+
+class Separation(eqx.Module):
+    """What is not finite.
+
+    `falls`, `rises`: whether a coefficient goes to -inf, to inf, along some direction that never lowers the likelihood
+    (both: the answers say nothing of its sign). `upper`, `lower`: edges that go to infinity or are there already.
+    """
+
+    falls: Bool[np.ndarray, " k"]
+    rises: Bool[np.ndarray, " k"]
+    upper: Bool[np.ndarray, " n"]
+    lower: Bool[np.ndarray, " n"]
+
+    @property
+    def infinite(self) -> Bool[np.ndarray, " k"]:
+        """Coefficients without a finite estimate."""
+        return self.falls | self.rises
+
+    @property
+    def certain(self) -> Bool[np.ndarray, " n"]:
+        """Answers whose probability goes to 1."""
+        return self.upper & self.lower
+
+
+def separation(model: Design) -> Separation:
+    """Find every coefficient without a finite estimate, and the edges that go with them."""
+    rows, k = _constraints(model), model.upper.shape[1]
+    upper, lower = np.isinf(model.upper_offset), np.isinf(model.lower_offset)
+    rises, falls = np.zeros(k, bool), np.zeros(k, bool)
+    if k and len(rows):
+        distinct, inverse = np.unique(rows, axis=0, return_inverse=True)
+        moves = _largest_support(distinct)
+        above, below = np.split(moves[inverse.ravel()], [np.sum(~upper)])
+        upper[~upper], lower[~lower] = above, below
+        if moves.any():
+            rises = np.array([_reach(distinct, j, 1) > _TOLERANCE for j in range(k)])
+            falls = np.array([_reach(distinct, j, -1) > _TOLERANCE for j in range(k)])
+    return Separation(falls, rises, upper, lower)
+
+
+def independent(model: Design) -> Bool[np.ndarray, " k"]:
+    """Columns that are no combination of those before them, of the edges that are not open."""
+    rows = _constraints(model)
+    keep = np.zeros(model.upper.shape[1], bool)
+    rank = 0
+    for column in range(len(keep)):
+        keep[column] = True
+        found = np.linalg.matrix_rank(rows[:, keep]) if len(rows) else 0
+        keep[column], rank = found > rank, found
+    return keep
+
+
+def supremum(model: Design, start: Float[np.ndarray, " k"], found: Separation) -> float:
+    """The supremum of the log-likelihood, reached or not."""
+    if found.certain.all():
+        return 0.0
+    rest, _, begin = decisive(model, start, found)
+    theta = ordered_logit.fit(rest, begin) if len(begin) else begin
+    return ordered_logit.log_likelihood(rest, theta)
+
+
+def decisive(
+    model: Design, start: Float[np.ndarray, " k"], found: Separation
+) -> tuple[Design, Bool[np.ndarray, " k"], Float[np.ndarray, " j"]]:
+    """The answers that are not certain, with as many coefficients as they decide, which these are, and a start.
+
+    Edges that go to infinity are open. A coefficient that is left out is 0 there: the edges that are left depend on it
+    through the others only.
+    """
+    rest = Design(
+        np.where(found.upper[:, None], 0.0, model.upper),
+        np.where(found.lower[:, None], 0.0, model.lower),
+        np.where(found.upper, np.inf, model.upper_offset),
+        np.where(found.lower, -np.inf, model.lower_offset),
+    ).rows(~found.certain)
+    keep = independent(rest)
+    rows = _constraints(rest)
+    begin = np.linalg.lstsq(rows[:, keep], rows @ start, rcond=None)[0]  # the same edges as at `start`
+    return rest.columns(keep), keep, begin
+
+
+def profile(
+    model: Design, column: int, start: Float[np.ndarray, " k"], found: Separation, level: float
+) -> tuple[float, float, float]:
+    """Profile-likelihood interval of a coefficient that has no finite estimate, and the p-value of 0.
+
+    {b: sup L at b >= sup L·(1 - level)/2}: (low, inf) if the coefficient rises, (-inf, high) if it falls, everything
+    if both. Answers count as independent. The likelihood is, but for the other coefficients, the probability of
+    answers as extreme as these, so that for a rate of 0 or 1 the interval and p are those of Clopper & Pearson; the
+    quantile of χ² would leave out up to 15 % there.
+    """
+    if found.falls[column] and found.rises[column]:
+        return -np.inf, np.inf, 1.0
+    sign = 1.0 if found.rises[column] else -1.0
+    top = supremum(model, start, found)
+    others = np.arange(len(start)) != column
+    at_a_value = separation(model.fixed(column, 0.0))  # the same for every value
+
+    def drop(size):
+        return 2 * (top - supremum(model.fixed(column, sign * size), start[others], at_a_value))
+
+    quantile = -2 * np.log((1 - level) / 2)
+    high = low = 1.0  # in `size`, along which the drop falls to 0
+    while drop(high) > quantile:
+        high *= 2
+    while drop(low) < quantile:
+        low = low - 2 * abs(low)
+    end = brentq(lambda size: drop(size) - quantile, low, high, xtol=1e-12, rtol=1e-12)
+    p_value = min(1.0, 2 * float(np.exp(-drop(0.0) / 2)))
+    return (sign * end, np.inf, p_value) if sign > 0 else (-np.inf, sign * end, p_value)
+
+
+def _constraints(model):
+    """Rows a with a·δ >= 0 for every direction along which nothing is lost: upper edges, then lower ones."""
+    has_upper, has_lower = np.isfinite(model.upper_offset), np.isfinite(model.lower_offset)
+    return np.vstack([model.upper[has_upper], -model.lower[has_lower]])
+
+
+def _largest_support(rows):
+    """Which rows some feasible direction moves: maximise Σ min(a·δ, 1); sums of directions are directions."""
+    count, k = rows.shape
+    cost = np.concatenate([np.zeros(k), -np.ones(count)])
+    bounds = [(None, None)] * k + [(0, 1)] * count
+    found = linprog(cost, A_ub=np.hstack([-rows, np.eye(count)]), b_ub=np.zeros(count), bounds=bounds)
+    return found.x[k:] > 0.5
+
+
+def _reach(rows, column, sign):
+    """How far a direction in the unit cube that loses nothing can move a coefficient."""
+    cost = np.zeros(rows.shape[1])
+    cost[column] = -sign
+    return -linprog(cost, A_ub=-rows, b_ub=np.zeros(len(rows)), bounds=(-1, 1)).fun

@@ -1,0 +1,284 @@
+"""A cohort's posteriors and its population map: batch refits, and aggregation of any prefix of trials, any people.
+
+    table     = read_trials("trials.csv", study)
+    cohort    = cohort_of(table, study)
+    aggregate = aggregate_cohort(study, cohort)
+
+All participants are fitted in one compiled batch over trials padded to one capacity. The population map is a
+committee machine over their posteriors (`hilbo.bcm`), or what the study's rule says (`hilbo.population.maps`); its
+optimum is searched like a session's.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from hilbo import acquisition, bcm
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.population import pointwise
+from hilbo.population.hierarchical import Share
+from hilbo.population.maps import RuleMap, point_rule, rule_map, share_of
+from hilbo.search.candidates import search_points
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Inference, Study
+
+__all__ = [
+    "Aggregate",
+    "Optimum",
+    "aggregate_cohort",
+    "best_point",
+    "fit_cohort",
+    "individual_optima",
+    "map_optimum",
+    "nrmse",
+    "other_inference",
+    "pooled_posterior",
+    "population",
+    "population_optimum",
+    "progress",
+]
+
+Rule = pointwise.Rule
+_LARGEST_POOL = 3000  # answers: the pooled fit is cubic in their number
+
+
+class Optimum(eqx.Module):
+    """A point of the unit cube at which a map is largest, and the map there; leading axes for several.
+
+    Of a population, `mean` and `sd` are the map's own, and the class probabilities those of a new person's answer.
+    """
+
+    x: Float[Array, "*s d"]
+    mean: Float[Array, "*s"]
+    sd: Float[Array, "*s"]
+    class_probabilities: Float[Array, "*s C"]
+
+
+class Aggregate(eqx.Module):
+    """A study's posteriors, its population optimum by the study's rule, and what stands beside it."""
+
+    cohort: Cohort
+    posteriors: Posterior
+    optimum: Optimum
+    individuals: Optimum
+    alternatives: dict[str, Optimum]
+    """Optimum of the plain average of the latent functions, of one GP on all answers (if not too many), by the
+    hierarchical rule and by bcm where the study's rule is another, and of the population map by another inference:
+    "ep", or "laplace" where the study itself says "ep"."""
+    map: RuleMap
+    """The population map by the study's rule."""
+    hierarchical: RuleMap | None
+    """The map by the hierarchical rule, beside which the study's is judged."""
+    share: Share | None
+    """What the answers say of how people differ; None if it was not asked, or fewer than two people answered."""
+
+    @property
+    def certificates(self) -> dict[str, np.ndarray]:
+        """Everybody's certificate, (M,) for each of its figures."""
+        found = self.posteriors.certificate
+        return {name: np.asarray(getattr(found, name)) for name in found.__dataclass_fields__}
+
+    def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of the population map at points of the unit cube."""
+        return _predict(self.map, jnp.asarray(x))
+
+    def newcomer(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of a new person's function at points of the unit cube: what answers are foretold
+        from. By the hierarchical rule it differs from the map, which is the function that people share."""
+        mean, variance = self.surface(x)
+        return mean, variance + self.map.apart
+
+    @property
+    def mean_of_optima(self) -> Float[Array, " d"]:
+        """Plain average of the individuals' optima in the unit cube: what the paper compares the map with."""
+        return jnp.mean(self.individuals.x, axis=0)
+
+
+def fit_cohort(
+    study: Study, cohort: Cohort, gps: OrdinalGP | None = None, inference: Inference | None = None
+) -> Posterior:
+    """Everybody's posterior, stacked; with the study's model, or with `gps`, one stacked model each; by the study's
+    inference, or by another."""
+    return _fit_cohort(study, cohort.trials, gps, inference)
+
+
+@eqx.filter_jit
+def _fit_cohort(study, trials, gps, inference=None):
+    inference = study.inference if inference is None else inference
+    if gps is None:
+        return jax.vmap(lambda t: fit(study.gp, t, inference=inference, throw=False))(trials)
+    return jax.vmap(lambda gp, t: fit(gp, t, inference=inference, throw=False))(gps, trials)
+
+
+@eqx.filter_jit
+def population(
+    posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm", share: Float[Array, ""] | None = None
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) of the population map at points of the unit cube, merged point by point.
+
+    Of bcm, participants' predictions are made in blocks and never held all at once. `share`: of the hierarchical rule.
+    """
+    prior = jax.vmap(jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel.diagonal)(x)
+    if rule != "bcm":
+        means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors)
+        return pointwise.aggregate(rule, means, explained, prior, share=share)
+    evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior)
+    return evidence.merge(prior)
+
+
+@eqx.filter_jit
+def _predict(found: RuleMap, x):
+    return population(found.experts, x) if found.rule == "bcm" and found.experts is not None else found.predict(x)
+
+
+@eqx.filter_jit
+def population_optimum(
+    study: Study,
+    posteriors: Posterior,
+    candidates: Float[Array, "m d"],
+    rule: Rule = "bcm",
+    share: Float[Array, ""] | None = None,
+) -> Optimum:
+    """Where the population map's mean is largest in the feasible set."""
+    apart = 0.0 if share is None else (1.0 - share) * study.gp.kernel.variance
+    return _optimum(study, lambda x: population(posteriors, x, rule, share), candidates, apart)
+
+
+@eqx.filter_jit
+def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
+    """Where a rule's map has its largest mean in the feasible set."""
+    return _optimum(study, lambda x: _predict(found, x), candidates, found.apart)
+
+
+def _optimum(study: Study, predict: Callable, candidates, apart) -> Optimum:
+    """`apart`: variance of one person's function about the map's."""
+    choice = acquisition.maximise(
+        predict(candidates)[0],
+        candidates,
+        lambda x: predict(x[None, :])[0][0],
+        from_box=study.space.from_box,
+        to_box=study.space.to_box,
+        feasible=study.space.feasible,
+        steps=300,
+    )
+    mean, variance = predict(choice.x[None, :])
+    probabilities = study.gp.likelihood.class_probabilities(mean[0], variance[0] + apart)
+    return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
+
+
+@eqx.filter_jit
+def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
+    """Where each participant's posterior mean is largest in the feasible set, stacked; one after the other."""
+
+    def one(posterior):
+        x = best_point(study, posterior, candidates).x
+        mean, variance = posterior.predict(x[None, :])
+        probabilities = posterior.gp.likelihood.class_probabilities(mean[0], variance[0])
+        return Optimum(x, mean[0], jnp.sqrt(variance[0]), probabilities)
+
+    # On a CPU one after the other: each search stops when it is done, where a batch waits for its slowest.
+    return jax.lax.map(one, posteriors, batch_size=None if jax.default_backend() == "cpu" else 256)
+
+
+def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
+    """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
+    return acquisition.maximise(
+        posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
+        candidates,
+        lambda x: posterior.mean(x[None, :])[0],
+        from_box=study.space.from_box,
+        to_box=study.space.to_box,
+        feasible=study.space.feasible,
+    )
+
+
+def other_inference(study: Study) -> Inference:
+    """The inference beside which a study's results are shown."""
+    return "laplace" if study.inference == "ep" else "ep"
+
+
+def pooled_posterior(study: Study, cohort: Cohort) -> Posterior | None:
+    """One GP on everybody's answers, as if from one person; None if there are too many for a dense fit."""
+    mask = np.asarray(cohort.trials.mask)
+    if mask.sum() > _LARGEST_POOL:
+        return None
+    x, q = np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
+    return fit(study.gp, Trials.from_arrays(x, q), inference=study.inference, throw=False)
+
+
+def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: bool = True) -> Aggregate:
+    """Fit everybody, merge, and find the optima; the study's `rule` decides the population optimum.
+
+    `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
+    finds them in `posteriors.certificate`.
+    """
+    candidates = search_points(study.space, seed)
+    posteriors = fit_cohort(study, cohort)
+    answered = int(np.sum(cohort.counts() > 0))
+    share = None
+    if study.rule == "hierarchical" or (alternatives and answered > 1):
+        share = share_of(study.gp, cohort.trials, study.inference)
+
+    def merged(rule, posteriors=posteriors, inference=study.inference):
+        part = None if share is None else share.mean
+        return rule_map(study.gp, cohort.trials, rule, posteriors=posteriors, share=part, inference=inference)
+
+    chosen = merged(study.rule)
+    beside = chosen if study.rule == "hierarchical" else None if share is None else merged("hierarchical")
+    others = {}
+    if alternatives:
+        maps = {"hierarchical": beside, "bcm": merged("bcm"), "average": merged("average")}
+        maps = {name: found for name, found in maps.items() if found is not None and name != study.rule}
+        others = {name: map_optimum(study, found, candidates) for name, found in maps.items()}
+        other = other_inference(study)
+        again = merged(study.rule, fit_cohort(study, cohort, inference=other), other)
+        others[other] = map_optimum(study, again, candidates)
+        pooled = pooled_posterior(study, cohort)
+        if pooled is not None and study.rule != "pooled":
+            stacked = jax.tree.map(lambda leaf: leaf[None], pooled)
+            others["pooled"] = jax.tree.map(lambda leaf: leaf[0], individual_optima(study, stacked, candidates))
+    return Aggregate(
+        cohort=cohort,
+        posteriors=posteriors,
+        optimum=map_optimum(study, chosen, candidates),
+        individuals=individual_optima(study, posteriors, candidates),
+        alternatives=others,
+        map=chosen,
+        hierarchical=beside,
+        share=share,
+    )
+
+
+def progress(
+    study: Study, cohort: Cohort, seed: int = 0, prefixes: Sequence[int] | None = None
+) -> tuple[Float[Array, "p d"], Float[Array, "p M d"]]:
+    """Optima (unit cube) after the first 1, 2, ... trials: of the population map (p, d), and of everybody (p, M, d).
+
+    The map is merged point by point by the study's rule, with the share that all answers say; by bcm where the rule
+    takes all answers at once.
+    """
+    counts = range(1, int(cohort.counts().max()) + 1) if prefixes is None else prefixes
+    candidates = search_points(study.space, seed)
+    share = share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
+    rule, share = point_rule(study.rule, share)
+    return _progress(study, cohort.trials, candidates, jnp.asarray(list(counts)), rule, share)
+
+
+@eqx.filter_jit
+def _progress(study, trials, candidates, counts, rule, share):
+    def after(count):
+        posteriors = _fit_cohort(study, jax.vmap(lambda t: t.first(count))(trials), None)
+        best = individual_optima(study, posteriors, candidates).x
+        return population_optimum(study, posteriors, candidates, rule, share).x, best
+
+    return jax.lax.map(after, counts)
+
+
+def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array, "*s"]:
+    """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube."""
+    return jnp.sqrt(jnp.mean((x - jnp.broadcast_to(reference, x.shape)) ** 2, axis=-1))

@@ -1,0 +1,225 @@
+"""Everything that a study's results say of one material, computed once for report, tables and figures.
+
+Exclusion comes first: everybody's answers are measured (`hilbo.population.response_quality`), the study's rule is
+applied, and only then is anything merged. Then: the aggregate, the optima after fewer trials, best, mid and worst,
+tolerance intervals under the study's hyperparameters and under those of maximum evidence, with their bootstrap over
+people. What cannot be had from these answers is a sentence in `limits`, not an error.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+
+from hilbo.errors import InputError
+from hilbo.hyperparameters.maximum_evidence import Learned, maximise_shared_evidence
+from hilbo.population.maps import point_rule
+from hilbo.population.response_quality import excluded, measure_people
+from hilbo.search.candidates import search_points
+from hilbo.study.aggregate import Aggregate, aggregate_cohort, nrmse, progress
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.heterogeneity import in_place
+from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
+from hilbo.study.tolerance_intervals import Ends, tolerance_ends
+
+__all__ = ["Analysis", "Progress", "Reading", "analyse", "limits_of", "moved_by_evidence", "settled"]
+
+Say = Callable[[str], None]
+_LEARN = ("theta", "noise", "thresholds")
+_SETTLED = 0.05  # NRMSE: an optimum that stays this near to its last place has settled
+_LONGEST = 25  # points of a progress curve
+
+
+class Progress(NamedTuple):
+    """Optima (unit cube) after the first `counts` trials of everybody: the population's, and each person's."""
+
+    counts: Int[np.ndarray, " p"]
+    merged: Float[np.ndarray, "p d"]
+    own: Float[np.ndarray, "p M d"]
+    ends: Int[np.ndarray, " M"]
+    """How many answers each person gave."""
+
+    def to_end(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
+        """NRMSE of the population's and of everybody's running optimum to the final one; a person's is NaN beyond their
+        last answer, where it cannot move."""
+        merged = np.sqrt(np.mean((self.merged - self.merged[-1]) ** 2, axis=1))
+        own = np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
+        return merged, np.where(self.counts[:, None] <= self.ends[None, :], own, np.nan)
+
+    def settled(self, within: float) -> list[int | None]:
+        """Of everybody the trial from which their own optimum stayed within this NRMSE of its final place; None where
+        that cannot be said."""
+        _, own = self.to_end()
+        lasts = np.searchsorted(self.counts, self.ends, side="right")
+        return [settled(self.counts[:k], own[:k, j], within) for j, k in enumerate(lasts)]
+
+
+class Reading(NamedTuple):
+    """A population map and what is read from it: tolerance interval and its ends' bootstrap for each parameter."""
+
+    study: Study
+    aggregate: Aggregate
+    tolerances: dict[str, tuple[Tolerance | None, Ends | None]]
+
+
+class Analysis(NamedTuple):
+    """All results of one material."""
+
+    study: Study
+    cohort: Cohort
+    fixed: Reading
+    optimised: Reading
+    learned: Learned
+    progress: Progress
+    sets: Sets | None
+    people: pd.DataFrame
+    """Everybody's measures, those left out too."""
+    left_out: dict[str, str]
+    """Who was left out by the study's rule, and why."""
+    limits: tuple[str, ...]
+
+    @property
+    def aggregate(self) -> Aggregate:
+        """The population's results under the study's own hyperparameters."""
+        return self.fixed.aggregate
+
+
+def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None) -> Analysis:
+    """Results of one material from all its participants' answers. Raises `InputError` if the rule leaves nobody."""
+    say("consistency, lapses and drift of everybody")
+    people = measure_people(study.gp, everybody.trials, everybody.names)
+    left = excluded(people, study.exclude)
+    if len(left) == len(everybody.names):
+        raise InputError(
+            f'the rule "{study.exclude}" leaves out all {len(left)} participants; there is nothing to merge.'
+        )
+    cohort = everybody.of([name for name in everybody.names if name not in left]) if left else everybody
+    say(f"fitting {len(cohort.names)} participants")
+    aggregate = aggregate_cohort(study, cohort, seed)
+    say("the optima after fewer trials")
+    counts = _counts(cohort)
+    merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts.tolist()))
+    say("hyperparameters by maximum evidence")
+    learned, optimised = _optimised(study, cohort, seed)
+    say("reading the maps")
+    sets, words = _sets(study, aggregate, seed)
+    limits = (*limits_of(study, cohort), *words, *_substitute(aggregate))
+    if bool(learned.runaway) or not bool(learned.converged):
+        limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
+    return Analysis(
+        study,
+        cohort,
+        _read(study, aggregate, seed),
+        _read(optimised[0], optimised[1], seed),
+        learned,
+        Progress(counts, merged, own, cohort.counts()),
+        sets,
+        people,
+        left,
+        limits,
+    )
+
+
+def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
+    """What these answers cannot say, in sentences."""
+    counts, found = cohort.counts(), []
+    if len(cohort.names) == 1:
+        map_ = "is that person's own, shrunk towards the prior" if study.rule == "rbcm" else "is that person's own"
+        found.append(
+            f"{cohort.names[0]} is the only participant: the population map {map_}, and nothing is known of how people"
+            " differ."
+        )
+    few = [name for name, count in zip(cohort.names, counts, strict=True) if count < 5]
+    if few:
+        found.append(f"Fewer than 5 answers were given by {', '.join(few)}; their maps are nearly the prior.")
+    if counts.min() != counts.max():
+        found.append(
+            f"Participants gave between {counts.min()} and {counts.max()} answers; after n trials, those with fewer"
+            " enter with what they have."
+        )
+    mask, q = np.asarray(cohort.trials.mask), np.asarray(cohort.trials.q)
+    one = [
+        f'{name} ("{study.responses[int(q[j][mask[j]][0])]}")'
+        for j, name in enumerate(cohort.names)
+        if len(np.unique(q[j][mask[j]])) == 1
+    ]
+    if one:
+        found.append(f"One answer only was ever given by {', '.join(one)}: that is no map of where to go.")
+    planned = study.selection.trials
+    if counts.max() < planned:
+        found.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
+    return tuple(found)
+
+
+def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], within: float = _SETTLED) -> int | None:
+    """The first of `counts` from which all errors are `within`; None if only the last one is, which says nothing."""
+    beyond = np.flatnonzero(errors > within)
+    first = 0 if not len(beyond) else int(beyond[-1]) + 1
+    return int(counts[first]) if first < len(counts) - 1 else None
+
+
+def _counts(cohort):
+    ends = cohort.counts()
+    longest = int(ends.max())
+    counts = [
+        *ends[ends > 0],
+        *np.linspace(1, longest, min(longest, _LONGEST)).round().astype(int),
+        *(n for n in (5, 15, 25) if n <= longest),
+    ]
+    return np.unique(counts)
+
+
+def _optimised(study, cohort, seed):
+    learned = _learn(study, cohort.trials)
+    again = eqx.tree_at(lambda s: s.gp, study, learned.gp)
+    return learned, (again, aggregate_cohort(again, cohort, seed, alternatives=False))
+
+
+@eqx.filter_jit
+def _learn(study, trials):
+    return maximise_shared_evidence(study.gp, trials, _LEARN, weak_priors=True, inference=study.inference)
+
+
+def _read(study, aggregate, seed):
+    """Tolerance intervals through the map's optimum, along every parameter."""
+    x = aggregate.optimum.x
+    rule, share = point_rule(study.rule, aggregate.map.share)
+    return Reading(
+        study,
+        aggregate,
+        {
+            name: (
+                tolerance(study, aggregate.newcomer, x, name),
+                tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share),
+            )
+            for name in study.space.names
+        },
+    )
+
+
+def _sets(study, aggregate, seed):
+    try:
+        points = search_points(study.space, seed)
+        return best_mid_worst(study, aggregate.surface, points, prior=aggregate.map.map_prior), ()
+    except InputError as error:
+        return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
+
+
+def _substitute(aggregate):
+    """A sentence where what stands beside the map is merged otherwise."""
+    how = in_place(aggregate.map)
+    if how:
+        yield (
+            f"The map is merged by the rule {aggregate.map.rule} from all answers at once; maps of fewer trials, and"
+            f" those of people drawn again for the ends of tolerance intervals, are merged {how}, so that their last"
+            " optimum need not be the map's."
+        )
+
+
+def moved_by_evidence(found: Analysis) -> float:
+    """NRMSE between the optima under fixed and under optimised hyperparameters."""
+    return float(nrmse(found.optimised.aggregate.optimum.x, found.aggregate.optimum.x))

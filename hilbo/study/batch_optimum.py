@@ -1,0 +1,246 @@
+"""Aggregation of a population of any size: the optimum of its map, and what stands beside it, by passes over people.
+
+The best candidates of the map are polished by Newton's method in the optimiser's coordinates. A step needs the map's
+value, gradient and Hessian, which are sums over people (`batch.jets`): one pass over all of them for each step, for all
+starts together. Between steps nothing is compiled and nothing is kept but the starts.
+
+Another inference costs a fit in every pass, so its optimum is sought from where a small part of the people moves to
+under it. Usually one pass is left to do, in which the whole population corrects that.
+"""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.errors import InputError
+from hilbo.numerics.newton import TrustRegionNewton
+from hilbo.population.hierarchical import Share
+from hilbo.population.maps import share_of
+from hilbo.population.pointwise import RULES
+from hilbo.search.candidates import search_points
+from hilbo.study.aggregate import Optimum, Rule, other_inference
+from hilbo.study.batch import Jets, Population, Say, Sums, jets, population_of, refit, sums
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.distributed import Crew
+
+__all__ = ["Merged", "aggregate_population", "optima_from", "optimum_near"]
+
+_STEPS = 60
+_STATIONARY, _RESOLUTION = 1e-8, 1e-6  # as a session's optimum: gradient, and radius at a kink of the passive set
+_STARTS, _APART = 3, 0.1
+_PILOT, _PILOT_SHARE = 1000, 20  # people asked first by another inference: so many, or this part of all,
+_FEWEST = 50  # and nobody if that is too few
+_SETTLED = 0.003  # of the search ranges: a Newton step of this size leaves an error of its square over a lengthscale
+
+
+class Merged(eqx.Module):
+    """What `aggregate.Aggregate` is for a cohort whose posteriors are not kept."""
+
+    cohort: Cohort
+    population: Population
+    certificates: dict[str, np.ndarray]
+    optimum: Optimum
+    individuals: Optimum | None
+    """Stacked; None if they were not asked for."""
+    alternatives: dict[str, Optimum]
+    share: Share | None = None
+    """What the answers of an even choice of people say of how people differ, where the rule asks for it."""
+    hierarchical: None = None
+
+    def surface(self, x: Float[np.ndarray, "m d"]) -> tuple[Float[np.ndarray, " m"], Float[np.ndarray, " m"]]:
+        """Mean and variance (m,) of the population map at points of the unit cube: a pass of the whole crew."""
+        study = self.population.study
+        prior = np.asarray(jax.vmap(study.gp.kernel.diagonal)(jnp.asarray(x)))
+        return sums(self.population, x, "participants asked for the map").merge(
+            prior, self.population.people, self.population.rule, self.population.share
+        )
+
+    @property
+    def mean_of_optima(self) -> Float[Array, " d"] | None:
+        """Plain average of the individuals' optima in the unit cube, if they are known."""
+        return None if self.individuals is None else jnp.mean(self.individuals.x, axis=0)
+
+
+def aggregate_population(
+    study: Study,
+    cohort: Cohort,
+    crew: Crew,
+    seed: int = 0,
+    *,
+    individuals: bool = True,
+    alternatives: bool = True,
+    say: Say | None = None,
+) -> Merged:
+    """As `aggregate.aggregate_cohort`, in bounded memory and by all devices of the crew.
+
+    Without `individuals` nobody's own optimum is sought, which is most of the work. One model of all answers is no
+    alternative here: its cost is cubic in their number.
+    """
+    candidates = np.asarray(search_points(study.space, seed))
+    rule = _streamed(study.rule, len(cohort.names))
+    share = share_of(study.gp, cohort.trials, study.inference) if rule == "hierarchical" else None
+    population = population_of(study, cohort, crew) if say is None else population_of(study, cohort, crew, say)
+    population = dataclasses.replace(population, rule=rule, share=1.0 if share is None else float(share.mean))
+    fitted = refit(population, candidates, individuals)
+    rules: tuple[Rule, ...] = tuple(dict.fromkeys((rule, "average"))) if alternatives else (rule,)
+    best = optima_from(fitted.population, candidates, fitted.sums, rules)
+    others = {"average": best["average"]} if alternatives and rule != "average" else {}
+    if alternatives:
+        others[other_inference(study)] = _by_other_inference(fitted.population, best[rule])
+    return Merged(cohort, fitted.population, fitted.certificate, best[rule], fitted.individuals, others, share)
+
+
+def _streamed(rule: str, people: int) -> Rule:
+    """A rule that is a sum over people, as a stream of them needs it."""
+    if rule not in RULES:
+        raise InputError(
+            f'The rule "{rule}" needs all answers at once and cannot be streamed over {people:,} people; use'
+            f" {', '.join(RULES[:-1])} or {RULES[-1]}."
+        )
+    return rule
+
+
+def optima_from(
+    population: Population, candidates: Float[np.ndarray, "m d"], found: Sums, rules: tuple[Rule, ...] = ("bcm",)
+) -> dict[str, Optimum]:
+    """The maximum of the map by each rule in the feasible set, from the sums at candidates (m, d)."""
+    prior = np.asarray(jax.vmap(population.study.gp.kernel.diagonal)(jnp.asarray(candidates)))
+    maps = {rule: found.merge(prior, population.people, rule, population.share) for rule in rules}
+    rows = {rule: _spread(maps[rule][0], candidates) for rule in rules}
+    starts = np.concatenate([candidates[rows[rule]] for rule in rules])
+    reached = optimum_near(population, starts, tuple(rule for rule in rules for _ in range(_STARTS)))
+    feasible = np.asarray(_feasible(population.study, np.stack([optimum.x for optimum in reached])))
+    best = {}
+    for i, rule in enumerate(rules):
+        chosen = slice(i * _STARTS, (i + 1) * _STARTS)
+        usable = [optimum for optimum, may in zip(reached[chosen], feasible[chosen], strict=True) if may]
+        top = rows[rule][0]
+        mean, variance = (part[top] for part in maps[rule])
+        candidate = _optimum(population.study, candidates[top], mean, variance, _apart(population, rule))
+        best[rule] = max([candidate, *usable], key=lambda optimum: float(optimum.mean))
+    return best
+
+
+@eqx.filter_jit
+def _feasible(study, x):
+    return study.space.feasible(x)
+
+
+@eqx.filter_jit
+def _optimum(study, x, mean, variance, apart):
+    mean, variance = jnp.asarray(mean), jnp.asarray(variance)
+    chances = study.gp.likelihood.class_probabilities(mean, variance + apart)
+    return Optimum(jnp.asarray(x), mean, jnp.sqrt(variance), chances)
+
+
+def _apart(population, rule):
+    """Variance of one person's function about the map's, as `RuleMap.apart`."""
+    prior = np.asarray(population.study.gp.kernel.variance)
+    return prior * np.asarray(1.0 - population.share if rule == "hierarchical" else 0.0, prior.dtype)
+
+
+def _spread(values, candidates):
+    """Rows of good candidates from different places: the best, the best apart from it, and so on."""
+    rows, remaining = [], values.copy()
+    for _ in range(_STARTS):
+        rows.append(int(np.argmax(remaining)))
+        near = np.sum((candidates - candidates[rows[-1]]) ** 2, axis=1) < _APART**2
+        remaining[near] = -np.inf
+    return rows
+
+
+def _by_other_inference(population, best):
+    """The optimum nearby under the other inference."""
+    study, at = population.study, np.asarray(best.x)[None, :]
+    other = other_inference(study)
+    pilot = population.every(min(_PILOT, population.people // _PILOT_SHARE))
+    if pilot.people >= _FEWEST:
+        (own,), (moved,) = (optimum_near(p, at, (population.rule,)) for p in (pilot, pilot.by(other)))
+        box = study.space.to_box
+        begin = jnp.clip(box(best.x) + box(moved.x) - box(own.x), 0.0, 1.0)
+        at = np.asarray(study.space.from_box(begin))[None, :]
+    name = {"ep": "expectation propagation", "laplace": "Laplace"}[other]
+    words = f"participants fitted by {name} for comparison"
+    return optimum_near(population.by(other), at, (population.rule,), tolerance=_SETTLED, words=words)[0]
+
+
+def optimum_near(
+    population: Population,
+    starts: Float[np.ndarray, "s d"],
+    rules: tuple[Rule, ...],
+    *,
+    tolerance: float = 0.0,
+    words: str = "participants, polishing the optimum",
+) -> list[Optimum]:
+    """For each start, the maximum of the map by its rule that Newton's method finds from there, in the feasible set.
+
+    Ends when every start is stationary, or would move by `tolerance` of the search ranges or less; the step is then
+    taken, and the map there read off the last expansion.
+    """
+    study, asked = population.study, len(rules)
+    slots = _STARTS * -(-asked // _STARTS)  # few shapes, few compilations
+    rows = np.arange(slots) % asked
+    plain = np.array([rule == "average" for rule in rules])[rows]
+    w, state = _begin(study, np.asarray(starts)[rows])
+    for _ in range(_STEPS):
+        at = _ahead(study, w, state)
+        there = jets(population, np.asarray(at), words)
+        people, by = jnp.asarray(float(population.people)), (population.rule, population.share)
+        w, state, finished, last = _advance(study, w, state, there, at, plain, people, by)
+        if bool(jnp.all(finished | (jnp.max(jnp.abs(state.move), axis=1) <= tolerance))):
+            break
+    x, mean, variance = last if tolerance else state.here.aux
+    return [_optimum(study, x[i], mean[i], variance[i], _apart(population, rules[i])) for i in range(asked)]
+
+
+_SOLVER = TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION)
+
+
+def _nowhere(w, _):
+    """The solver does not look at its function before the first step."""
+    raise NotImplementedError
+
+
+@eqx.filter_jit
+def _begin(study, starts):
+    def one(x):
+        w = study.space.to_box(x)
+        number = jax.ShapeDtypeStruct((), w.dtype)
+        aux = (jax.ShapeDtypeStruct(w.shape, w.dtype), number, number)
+        return w, _SOLVER.init(_nowhere, w, None, {}, number, aux, frozenset())
+
+    return jax.vmap(one)(jnp.asarray(starts))
+
+
+@eqx.filter_jit
+def _ahead(study, w, state):
+    """The points (s, d) of the unit cube at which the next step wants the map."""
+    return jax.vmap(study.space.from_box)(w + state.move)
+
+
+@eqx.filter_jit
+def _advance(study, w, state, jets, at, plain, people, by):
+    """A step of the solver, whose function is the map expanded at the point it asks for."""
+    bounds = {"lower": jnp.zeros(w.shape[1:], w.dtype), "upper": jnp.ones(w.shape[1:], w.dtype)}
+
+    def one(w, state, jets, at, plain):
+        def expanded(w, _):
+            x = study.space.from_box(w)
+            off, prior = x - at, study.gp.kernel.diagonal(x)
+            there = jax.tree.map(lambda v, g, h: v + g @ off + 0.5 * off @ h @ off, *jets)
+            mean, variance = (
+                jnp.where(plain, *both)
+                for both in zip(there.merge(prior, people, "average"), there.merge(prior, people, *by), strict=True)
+            )
+            return -mean, (x, mean, variance)
+
+        w, state, _ = _SOLVER.step(expanded, w, None, bounds, state, frozenset())
+        done, _ = _SOLVER.terminate(expanded, w, None, bounds, state, frozenset())
+        return w, state, done, expanded(w + state.move, None)[1]
+
+    return jax.vmap(one)(w, state, Jets(*jets), at, plain)

@@ -1,0 +1,81 @@
+"""The answers of a study's participants, padded to one capacity: from a trial table to what a batch of fits takes."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+from jaxtyping import Int
+
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import Trials
+from hilbo.study.config import Study
+
+__all__ = ["Cohort", "cohort_of"]
+
+
+class Cohort(eqx.Module):
+    """The answers of M participants, padded to one capacity.
+
+    `trials` is stacked, (M, capacity, ...); `physical` (M, capacity, d) holds the same points as tables do.
+    """
+
+    trials: Trials
+    physical: np.ndarray
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    def first(self, count: int) -> "Cohort":
+        """Only everybody's first `count` trials."""
+        return Cohort(jax.vmap(lambda t: t.first(count))(self.trials), self.physical, self.names)
+
+    def of(self, names: Sequence[str]) -> "Cohort":
+        """Only these participants."""
+        known = set(self.names)
+        unknown = [name for name in names if name not in known]
+        if unknown:
+            raise InputError(
+                f'participant "{unknown[0]}" is not in the table, which has {len(self.names)} participants.'
+            )
+        places = {name: row for row, name in enumerate(self.names)}
+        return self.rows(np.array([places[name] for name in names]))
+
+    def rows(self, rows: Int[np.ndarray, " k"]) -> "Cohort":
+        """Only the participants in these places."""
+        names = tuple(self.names[row] for row in rows)
+        return Cohort(jax.tree.map(lambda leaf: leaf[rows], self.trials), self.physical[rows], names)
+
+    def counts(self) -> Int[np.ndarray, " M"]:
+        """Answers of each participant."""
+        return np.asarray(self.trials.mask.sum(axis=1))
+
+
+def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
+    """Participants from a checked trial table (`trial_table.read_trials`), in order of their first appearance.
+
+    `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
+    """
+    person, names = pd.factorize(table["participant"])
+    counts = np.bincount(person)
+    longest = int(counts.max())
+    capacity = max(longest, study.selection.trials) if capacity is None else capacity
+    if capacity < longest:
+        raise InputError(f"cohort_of: capacity is {capacity}, but {longest} answers of a participant need as many.")
+    order = np.argsort(person, kind="stable")
+    rank = np.arange(len(person)) - np.repeat(np.cumsum(counts) - counts, counts)
+    rows = person[order], rank
+    physical = np.full((len(counts), capacity, study.space.dim), np.nan)
+    physical[rows] = table[list(study.space.names)].to_numpy(float)[order]
+    answers = np.zeros((len(counts), capacity), np.int32)
+    answers[rows] = table["category"].to_numpy()[order]
+    held = np.arange(capacity)[None, :] < counts[:, None]
+    middle = [(p.low + p.high) / 2 for p in study.space.parameters]
+    x = _to_unit(study.space, np.where(held[..., None], physical, middle))
+    return Cohort(jax.vmap(Trials)(x, jnp.asarray(answers), jnp.asarray(held)), physical, tuple(names))
+
+
+@eqx.filter_jit
+def _to_unit(space, physical):
+    """Person by person, as `session.ask_tell.physical_trials` does for one: the same bits."""
+    return jax.lax.map(space.to_unit, jnp.asarray(physical))

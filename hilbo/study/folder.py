@@ -1,0 +1,199 @@
+"""A folder to report: study file, trial tables, and what there is of validation and sets tables.
+
+    study.toml        the study file
+    trials*.csv       one or several trial tables (or .parquet); a column `material` tells materials apart
+    validation*.csv   optional: validation tables
+    sets.csv          optional: sets table; a set of source "sysid" is what tables and figures are held against
+    truth.csv         optional, of a simulated study: `source` "population" and the parameters that are the truth
+A study of several materials names them in [materials.NAME] (which overrides the renderer or parameters) or in the
+tables' column `material` alone, when they share everything. Whatever is wrong is one sentence with its file.
+"""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float
+
+from hilbo.errors import InputError
+from hilbo.study.cohort import Cohort, cohort_of
+from hilbo.study.config import Study
+from hilbo.study.trial_table import numbers, read_cells, read_trials
+from hilbo.study.validation_table import check_validation, read_sets
+
+__all__ = ["Material", "StudyFolder", "read_folder"]
+
+
+class Material(NamedTuple):
+    """One material's part of a folder."""
+
+    name: str
+    """Empty if the study has one material without a name."""
+    study: Study
+    cohort: Cohort
+    validation: pd.DataFrame | None
+    reference: Float[np.ndarray, " d"] | None
+    """The system-identification set, or the truth of a simulated study, in the unit cube; where it lies in the box."""
+    reference_name: str
+
+
+class StudyFolder(NamedTuple):
+    """A folder, read and checked."""
+
+    study: Study
+    materials: list[Material]
+    sets: pd.DataFrame | None
+    limits: tuple[str, ...]
+
+
+def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
+    """Read everything in a folder; `exclude`: a rule in place of the study file's own.
+
+    Raises `InputError` for what is wrong or missing.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder}: is no folder; hilbo report wants one with study.toml and trials.csv.")
+    study = _ruled(Study.load(folder / "study.toml"), exclude)
+    trials = _tables(folder, "trials")
+    if not trials:
+        raise InputError(f"{folder}: holds no trials.csv (nor .parquet, nor trials-*.csv); put the trial table there.")
+    validation = [_validation(path, study) for path in _tables(folder, "validation")]
+    sets_path, truth_path = folder / "sets.csv", folder / "truth.csv"
+    sets = read_sets(sets_path, study.space.names) if sets_path.exists() else None
+    truth = _truth(truth_path, study) if truth_path.exists() else None
+    compared = pd.concat(validation, ignore_index=True) if validation else None
+    names = _names(study, trials)
+    told = {folder / "validation.csv": compared, sets_path: _of(sets, "sysid"), truth_path: _of(truth, "population")}
+    _told_apart(names, told)
+    materials = [_material(name, study, trials, compared, sets, truth) for name in names]
+    return StudyFolder(study, materials, sets, _limits(materials, compared, sets))
+
+
+def _ruled(study, exclude):
+    """The study with another rule of exclusion."""
+    if exclude is None:
+        return study
+    content = {"schema": 1} | json.loads(study.content)
+    content["study"] |= {"exclude": exclude}
+    return Study.from_dict(content, study.source)
+
+
+def _tables(folder, stem):
+    found = [
+        p
+        for p in folder.iterdir()
+        if p.suffix in (".csv", ".parquet") and (p.stem == stem or p.stem.startswith(f"{stem}-"))
+    ]
+    return sorted(found)
+
+
+def _validation(path, study):
+    return check_validation(
+        read_cells(path, "a validation table needs a header and a comparison"), study.responses, str(path)
+    )
+
+
+def _names(study, paths):
+    """Materials in the study's order, then in that of the tables; [""] if none is named anywhere."""
+    named = []
+    for path in paths:
+        cells = read_cells(path)
+        named += list(pd.unique(cells["material"])) if "material" in cells else [""]
+    ordered = [name for name in study.materials if name in named] + [
+        n for n in dict.fromkeys(named) if n not in study.materials
+    ]
+    if "" in ordered and len(ordered) > 1:
+        raise InputError(f"{paths[0]}: some rows name a material and some do not; name it in every row of every table.")
+    unknown = [name for name in ordered if name and study.materials and name not in study.materials]
+    if unknown:
+        known = ", ".join(study.materials)
+        raise InputError(f'{paths[0]}: material "{unknown[0]}" is not in the study file, which has {known}.')
+    return ordered
+
+
+def _of(table, source):
+    """A sets table's rows of one source."""
+    return None if table is None else table[table["source"] == source]
+
+
+def _told_apart(names, tables):
+    """Every row of these tables must name its material where there are several, or where another row does."""
+    for path, table in tables.items():
+        if table is None or table.empty or ("material" not in table and len(names) == 1):
+            continue
+        if "material" not in table or table["material"].isna().any() or (table["material"] == "").any():
+            of = f"; this study has {', '.join(names)}" if len(names) > 1 else ""
+            raise InputError(f'{path}: rows without a material; name it in a column "material" in every row{of}.')
+
+
+def _material(name, study, paths, compared, sets, truth):
+    own = study.material(name) if name in study.materials else study
+    tables = []
+    for path in paths:
+        cells = read_cells(path)
+        here = set(cells["material"]) if "material" in cells else {""}
+        if name in here:
+            tables.append(read_trials(path, own, name or None, others=False))
+    table = pd.concat(tables, ignore_index=True)
+    _once(table, paths[0])
+    if compared is not None and name and "material" in compared:
+        compared = compared[compared["material"] == name]
+    reference, words = _reference(own, name, sets, truth)
+    validation = None if compared is None or compared.empty else compared
+    return Material(name, own, cohort_of(table, own), validation, reference, words)
+
+
+def _once(table, path):
+    """Several tables must not hold the same answer twice."""
+    key = [column for column in ("participant", "session", "phase", "trial") if column in table]
+    again = table.duplicated(key)
+    if again.any():
+        row = table[again].iloc[0]
+        raise InputError(
+            f"{path.parent}: participant {row['participant']}, trial {row['trial']} is in two trial tables; keep one."
+        )
+
+
+def _truth(path, study):
+    cells = read_cells(path, "a table of truth needs a header and a row")
+    missing = [name for name in ("source", *study.space.names) if name not in cells]
+    if missing:
+        raise InputError(f'{path}:1: column "{missing[0]}" is missing.')
+    values = {name: numbers(cells, name, str(path), "a finite number", np.isfinite) for name in study.space.names}
+    return pd.DataFrame(values).assign(
+        source=cells["source"], **({"material": cells["material"]} if "material" in cells else {})
+    )
+
+
+def _reference(study, name, sets, truth):
+    """What the optimum is held against: the sets table's system identification, else the simulation's truth."""
+    for table, source, words in ((sets, "sysid", "system identification"), (truth, "population", "the truth")):
+        rows = _of(table, source)
+        if rows is None:
+            continue
+        rows = rows[rows["material"] == name] if name and "material" in rows else rows
+        if len(rows) == 1 and np.isfinite(rows[list(study.space.names)].to_numpy(float)).all():
+            physical = rows[list(study.space.names)].to_numpy(float)[0]
+            return np.asarray(study.space.to_unit(physical)), words
+        if len(rows) > 1:
+            raise InputError(
+                f'there are {len(rows)} sets of source "{source}" for material "{name}"; keep one, or add a'
+                ' column "material".'
+            )
+    return None, ""
+
+
+def _limits(materials, compared, sets):
+    found = []
+    if compared is None:
+        found.append(
+            "There is no validation table: nothing here says whether people agree with the map when asked again."
+        )
+    for material in materials:
+        if compared is not None and material.validation is None:
+            found.append(f"No validation session compared renderings of {material.name}.")
+    if sets is None and compared is not None:
+        found.append("There is no sets table: sets are known by their names in the validation table only.")
+    return tuple(found)

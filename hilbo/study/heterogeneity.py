@@ -1,0 +1,68 @@
+"""What result.json says of the rule by which people were merged, and a warning where its assumptions fail."""
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from hilbo.population.hierarchical import Share
+from hilbo.population.maps import RuleMap
+from hilbo.population.pointwise import RULES
+from hilbo.study.config import Study
+
+__all__ = ["heterogeneity", "in_place", "rule_warnings", "share_content"]
+
+_ALIKE = ("bcm", "poe", "gpoe", "rbcm", "grbcm", "pooled")  # rules that take people to share one function
+_SURE = 3.0  # log Bayes factor, about 20 to 1
+_TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
+
+
+def heterogeneity(aggregate: Any) -> dict[str, Any] | None:
+    """How people differ, for result.json; None where it was not asked."""
+    return None if aggregate.share is None else share_content(aggregate.share)
+
+
+def share_content(share: Share) -> dict[str, Any]:
+    """A learnt share as plain numbers."""
+    return {
+        "share": float(share.mean),
+        "most_probable": float(share.best),
+        "interval": np.asarray(share.interval).tolist(),
+        "log_bayes_factor_that_people_differ": float(share.against_one),
+        "converged": bool(share.converged),
+    }
+
+
+def in_place(found: RuleMap) -> str:
+    """How maps of fewer trials, or of people drawn again, are merged where that is not as the map is; else nothing."""
+    if found.rule not in RULES:
+        return "by bcm"
+    return "" if found.method == "by points" else f"by the rule {found.rule} point by point"
+
+
+def rule_warnings(study: Study, aggregate: Any) -> list[str]:
+    """A sentence where the study's rule takes people to be alike and the answers say that they are not."""
+    found = aggregate.share
+    if found is None or study.rule not in _ALIKE or float(found.against_one) < _SURE:
+        return []
+    low, high = (float(end) for end in found.interval)
+    words = (
+        f"People differ: of the prior variance they share {float(found.mean):.2f} (95 % from {low:.2f} to {high:.2f}),"
+        f' and the rule "{study.rule}" takes that to be 1'
+    )
+    ratio = _ratio(aggregate)
+    if ratio is not None and ratio >= _TOO_SURE:
+        words += (
+            f"; at its optimum the map says a standard deviation of {float(aggregate.optimum.sd):.2f}, the hierarchical"
+            f" one {ratio:.1f} times as much"
+        )
+    return [words + '. Where intervals matter, use rule = "hierarchical"; its optimum stands among the alternatives.']
+
+
+def _ratio(aggregate):
+    """The hierarchical map's standard deviation over the map's, at the optimum."""
+    if aggregate.hierarchical is None:
+        return None
+    _, variance = aggregate.hierarchical.predict(jnp.asarray(aggregate.optimum.x)[None, :])
+    return math.sqrt(float(variance[0])) / float(aggregate.optimum.sd)

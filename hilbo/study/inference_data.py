@@ -1,0 +1,99 @@
+"""A material's results for ArviZ: posterior, posterior predictive and observed answers as netCDF groups.
+
+Groups and variables (dimensions chain, draw, participant, trial):
+    posterior             f: latent score at everybody's own trials, drawn from N(mode, K - K C K)
+    posterior_predictive  response: answers (categories from 0) that would be given there again
+    log_likelihood        response: log P(answer | f)
+    observed_data         response: the answers, -1 where there is none
+    constant_data         one variable for each parameter, in its unit; thresholds and noise of the likelihood
+`arviz.from_netcdf` and `xarray.open_datatree` read the file. Everybody's posterior is their own: nothing is shared.
+"""
+
+import os
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import xarray as xr
+
+from hilbo.kernels import gram
+from hilbo.numerics.linalg import eigh
+from hilbo.ordinal_gp import Posterior
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+
+__all__ = ["groups", "predictive_shares", "write_groups"]
+
+_DIMS = ("chain", "draw", "participant", "trial")
+
+
+def groups(
+    study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0
+) -> dict[str, xr.Dataset]:
+    """The groups by name; `draws` independent draws, as one chain. Values where nobody answered are NaN or -1."""
+    keys = jax.random.split(jax.random.key(seed), len(cohort.names))
+    f, response, log_likelihood = (np.moveaxis(np.asarray(part), 0, 1)[None] for part in _draw(posteriors, keys, draws))
+    mask = np.asarray(cohort.trials.mask)
+    coords = {"participant": list(cohort.names), "trial": np.arange(1, mask.shape[1] + 1)}
+    chains = coords | {"chain": [0], "draw": np.arange(draws)}
+    held = mask[None, None]
+    observed = np.where(mask, np.asarray(cohort.trials.q), -1)
+    constants: dict[str, Any] = {
+        p.name: (("participant", "trial"), np.where(mask, cohort.physical[..., i], np.nan), {"units": p.unit})
+        for i, p in enumerate(study.space.parameters)
+    }
+    likelihood = study.gp.likelihood
+    constants["thresholds"] = ("edge", np.asarray(likelihood.thresholds))
+    constants["noise"] = ((), np.asarray(likelihood.noise))
+    names = ", ".join(f"{k} = {label}" for k, label in enumerate(study.responses))
+    say = {"long_name": "answer", "categories": names}
+    return {
+        "posterior": xr.Dataset({"f": (_DIMS, np.where(held, f, np.nan), {"long_name": study.attribute})}, chains),
+        "posterior_predictive": xr.Dataset({"response": (_DIMS, np.where(held, response, -1), say)}, chains),
+        "log_likelihood": xr.Dataset({"response": (_DIMS, np.where(held, log_likelihood, np.nan))}, chains),
+        "observed_data": xr.Dataset({"response": (("participant", "trial"), observed, say)}, coords),
+        "constant_data": xr.Dataset(constants, coords, {"study": study.hash, "inference": study.inference}),
+    }
+
+
+def write_groups(found: dict[str, xr.Dataset], path: str | os.PathLike) -> None:
+    """One netCDF file with a group for each part."""
+    for i, (name, data) in enumerate(found.items()):
+        data.to_netcdf(path, mode="a" if i else "w", group=name, engine="h5netcdf")
+
+
+def predictive_shares(found: dict[str, xr.Dataset], categories: int) -> tuple[np.ndarray, np.ndarray]:
+    """Share of every category (C,) among the answers, and in each draw of them (draws, C)."""
+    observed = found["observed_data"]["response"].values
+    held = observed >= 0
+    predicted = found["posterior_predictive"]["response"].values[0][:, held]
+    count = [np.mean(predicted == k, axis=1) for k in range(categories)]
+    return np.bincount(observed[held], minlength=categories) / held.sum(), np.stack(count, axis=1)
+
+
+@eqx.filter_jit
+def _draw(posteriors, keys, draws):
+    """Latent scores, answers and log-likelihoods (M, draws, n)."""
+
+    def one(person):
+        posterior, key = person
+        trials, kernel = posterior.trials, posterior.gp.kernel
+        covariance = gram(kernel, trials.x, trials.x)
+        known = posterior.latent.factor @ covariance
+        values, vectors = eigh(covariance - known.T @ known)
+        root = vectors * jnp.sqrt(jnp.where(values > 0, values, jnp.zeros_like(values)))[None, :]
+        mean = covariance @ posterior.latent.weights
+        first, second = jax.random.split(key)
+        f = mean[None, :] + jax.random.normal(first, (draws, len(mean)), mean.dtype) @ root.T
+        likelihood = posterior.gp.likelihood
+        zero = jnp.zeros_like(mean)
+        chances = jax.vmap(lambda row: jax.vmap(likelihood.class_probabilities)(row, zero))(f)
+        below = jnp.cumsum(chances, axis=2)[..., :-1]
+        uniform = jax.random.uniform(second, f.shape, f.dtype)
+        answers = jnp.sum(uniform[..., None] > below, axis=2)
+        log_likelihood = jax.vmap(lambda row: jax.vmap(likelihood.log_prob)(row, trials.q))(f)
+        return f, answers, log_likelihood
+
+    return jax.lax.map(one, (posteriors, keys))

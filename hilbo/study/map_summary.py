@@ -1,0 +1,214 @@
+"""Reading a population map: best, mid and worst renderings, and how far a parameter may move before "close" is lost.
+
+A map is anything that predicts, `predict(x) -> mean, variance` of the latent score at points (m, d) of the unit cube.
+
+*Best* is the feasible maximum of the mean. *Worst* is the deepest local minimum of the mean in the feasible set at
+which the map knows something: sd <= `known` times what it is where nobody answered. *Mid* is the candidate whose mean
+is nearest to the middle of the two, among those at least `apart` from both, and equally known. All three follow from
+the map alone (paper, section VI-C).
+
+The *tolerance interval* of a parameter is the connected feasible interval through the optimum on which the highest
+answer is the most probable one of what `predict` is about, a new person's function (paper, section VII-C). Along any
+parameter but K1 the slice stays passive: K1 is held where it is passive, and on the passive boundary where it is not,
+the closest passive point; along K1 the interval ends, one-sided, where the boundary cuts it. Each end says what it is:
+another answer, the passive boundary, or the range.
+"""
+
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from hilbo import acquisition
+from hilbo.errors import InputError
+from hilbo.study.config import Study
+
+__all__ = ["End", "Predict", "Sets", "Tolerance", "best_mid_worst", "dominant", "slice_through", "tolerance"]
+
+Predict = Callable[[Float[Array, "m d"]], tuple[Float[Array, " m"], Float[Array, " m"]]]
+End = Literal["other answer", "passive boundary", "range"]
+
+_STARTS = 24  # minima that are looked into,
+_SEPARATE = 0.1  # from starts so far apart
+_GRID = 1025  # points of a slice; its ends are then found by bisection
+_HALVINGS = 40
+
+
+class Sets(eqx.Module):
+    """Three renderings, best, mid and worst: points (3, d) of the unit cube, and the map there."""
+
+    x: Float[Array, "3 d"]
+    mean: Float[Array, "3"]
+    sd: Float[Array, "3"]
+
+
+class Tolerance(eqx.Module):
+    """The tolerance interval of one parameter, in its physical unit."""
+
+    parameter: str = eqx.field(static=True)
+    low: float
+    high: float
+    low_end: End = eqx.field(static=True)
+    high_end: End = eqx.field(static=True)
+
+
+def best_mid_worst(
+    study: Study,
+    predict: Predict,
+    candidates: Float[Array, "m d"],
+    *,
+    known: float = 0.8,
+    apart: float = 0.2,
+    prior: ArrayLike | None = None,
+) -> Sets:
+    """The three renderings of a validation session; see the module. Deterministic: the map and the candidates decide.
+
+    **Arguments:** `candidates`, feasible points (`search_points`); `known`, the largest sd of worst and mid in
+    units of the prior's; `apart`, the least distance of mid from both, in the unit cube; `prior`, the map's variance
+    where nobody answered (`RuleMap.map_prior`), one person's if it is not given. Raises InputError if the map knows
+    nothing well enough, or has nothing in between.
+    """
+    candidates = jnp.asarray(candidates)
+    mean, sd = _at(predict, candidates)
+    limit = known * jnp.sqrt(study.gp.kernel.diagonal(candidates[0]) if prior is None else prior)
+    best = _optimum(study, predict, candidates, mean)
+    minima = _minima(study, predict, candidates, jnp.where(sd <= limit, mean, jnp.inf))
+    depth, doubt = _at(predict, minima)
+    usable = np.asarray((doubt <= limit) & study.space.feasible(minima))
+    if not usable.any():
+        raise InputError(
+            f"best_mid_worst: the map has no minimum with an sd below {known:g} of the prior's; more answers are"
+            " needed, or a larger `known`."
+        )
+    worst = minima[int(np.argmin(np.where(usable, depth, np.inf)))]
+    ends = jnp.stack([best, worst])
+    middle = jnp.mean(_at(predict, ends)[0])
+    far = jnp.min(jnp.linalg.norm(candidates[:, None] - ends[None], axis=-1), axis=1) >= apart
+    fits = np.asarray(far & (sd <= limit))
+    if not fits.any():
+        raise InputError(
+            f"best_mid_worst: no point is {apart:g} of the ranges away from both best and worst and known well enough;"
+            " use a smaller `apart` or a larger `known`."
+        )
+    mid = candidates[int(np.argmin(np.where(fits, np.abs(np.asarray(mean - middle)), np.inf)))]
+    x = jnp.stack([best, mid, worst])
+    return Sets(x, *_at(predict, x))
+
+
+def dominant(study: Study, predict: Predict, x: Float[Array, "m d"]) -> Bool[Array, " m"]:
+    """Whether the highest answer is the most probable one at points (m, d) (paper, section VII-C)."""
+    return _lead(study, predict, x) > 0
+
+
+def slice_through(
+    study: Study, x: Float[Array, " d"], parameter: str, values: Float[Array, " m"]
+) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
+    """Points (m, d): x with its coordinate of `parameter` at `values` (unit scale), and K1 lowered to the passive
+    boundary where it must be; and whether they are feasible."""
+    space = study.space
+    index = space.names.index(parameter)
+    points = jnp.broadcast_to(x, (values.shape[0], x.shape[0])).at[:, index].set(values)
+    if space.mechanics is not None and parameter != "K1":
+        K1 = space.names.index("K1")
+        wall = space.from_box(points.at[:, K1].set(1.0))[:, K1]
+        points = points.at[:, K1].set(jnp.minimum(points[:, K1], wall))
+    return points, space.feasible(points)
+
+
+def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: str) -> Tolerance | None:
+    """The tolerance interval of a parameter through the optimum `x` (d,); None if another answer is likelier there."""
+    index = study.space.names.index(parameter)
+    here = float(x[index])
+    grid = np.unique(np.append(np.linspace(0.0, 1.0, _GRID), here))
+    inside, passive = _inside(study, predict, x, parameter, jnp.asarray(grid, x.dtype))
+    middle = int(np.searchsorted(grid, here))
+    if not inside[middle]:
+        return None
+    ends = []
+    for step in (-1, 1):
+        last = middle
+        while 0 <= last + step < len(grid) and inside[last + step]:
+            last += step
+        beyond = last + step
+        if not 0 <= beyond < len(grid):
+            ends.append((grid[last], "range"))
+            continue
+        kind: End = "other answer" if passive[beyond] else "passive boundary"
+        ends.append((_bisect(study, predict, x, parameter, grid[last], grid[beyond]), kind))
+    to_physical = study.space.parameters[index].to_physical
+    (low, low_end), (high, high_end) = ((float(to_physical(jnp.asarray(at))), kind) for at, kind in ends)
+    return Tolerance(parameter, low, high, low_end, high_end)
+
+
+def _inside(study, predict, x, parameter, values):
+    points, feasible = slice_through(study, x, parameter, values)
+    return np.asarray(feasible & dominant(study, predict, points)), np.asarray(feasible)
+
+
+def _bisect(study, predict, x, parameter, inner, outer):
+    """The end of an interval between a value inside it and one outside."""
+    for _ in range(_HALVINGS):
+        middle = (inner + outer) / 2
+        if _inside(study, predict, x, parameter, jnp.asarray([middle], x.dtype))[0][0]:
+            inner = middle
+        else:
+            outer = middle
+    return inner
+
+
+@eqx.filter_jit
+def _lead(study, predict, x):
+    """Probability of the highest answer less that of the likeliest other one."""
+    p = jax.vmap(study.gp.likelihood.class_probabilities)(*predict(x))
+    return p[:, -1] - jnp.max(p[:, :-1], axis=1)
+
+
+@eqx.filter_jit
+def _at(predict, x):
+    mean, variance = predict(x)
+    return mean, jnp.sqrt(variance)
+
+
+@eqx.filter_jit
+def _optimum(study, predict, candidates, mean):
+    return _maximum(study, lambda x: predict(x[None, :])[0][0], candidates, mean, starts=3).x
+
+
+def _minima(study, predict, candidates, depth):
+    """Local minima (s, d) of the mean, downhill from the lowest candidates of different places."""
+    points, left = np.asarray(candidates), np.asarray(depth).copy()
+    rows = []
+    while len(rows) < _STARTS and np.isfinite(left).any():
+        rows.append(int(left.argmin()))
+        left[np.linalg.norm(points - points[rows[-1]], axis=1) < _SEPARATE] = np.inf
+    if not rows:
+        return candidates[:0]
+    padded = rows + [rows[0]] * (_STARTS - len(rows))  # one shape, one compilation
+    return _downhill(study, predict, candidates[np.array(padded)])
+
+
+@eqx.filter_jit
+def _downhill(study, predict, begin):
+    def one(x):
+        return _maximum(study, lambda x: -predict(x[None, :])[0][0], x[None, :], jnp.zeros(1, x.dtype), 1).x
+
+    return jax.lax.map(one, begin)
+
+
+def _maximum(study, height, candidates, values, starts):
+    space = study.space
+    return acquisition.maximise(
+        values,
+        candidates,
+        height,
+        from_box=space.from_box,
+        to_box=space.to_box,
+        feasible=space.feasible,
+        starts=starts,
+        steps=300,
+    )

@@ -1,0 +1,150 @@
+"""The paper's robustness check: do the optima stay where they are when the evidence chooses the hyperparameters?
+
+The population optimum and everybody's own are found twice, under the study's fixed hyperparameters and under learnt
+ones (shared by all, or each person's own), and compared in units of the search ranges (NRMSE). Besides, the derivative
+of the population optimum with respect to each hyperparameter says which of them it leans on. People are merged by the
+study's rule, point by point; the share of the hierarchical rule is learnt anew, and held for the derivative.
+Paper, section IV-3: less than 3 %.
+"""
+
+from collections.abc import Sequence
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from hilbo.errors import InputError
+from hilbo.hyperparameters.maximum_evidence import (
+    Learned,
+    maximise_evidence,
+    maximise_shared_evidence,
+    optimum_sensitivity,
+)
+from hilbo.ordinal_gp import Posterior, fit
+from hilbo.population.maps import point_rule, share_of
+from hilbo.population.pointwise import Rule
+from hilbo.search.candidates import search_points
+from hilbo.study.aggregate import Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+
+__all__ = ["LIMIT", "Robustness", "robustness"]
+
+LIMIT = 0.03
+"""NRMSE from which an optimum is flagged as not robust (paper, section IV-3)."""
+
+
+class Robustness(eqx.Module):
+    """Optima under fixed and under learnt hyperparameters, and how far apart they are."""
+
+    learned: Learned
+    """One model if `shared`, else stacked, one for each participant."""
+    fixed: Optimum
+    optimised: Optimum
+    fixed_individuals: Optimum
+    optimised_individuals: Optimum
+    posteriors: Posterior
+    """Of all participants, under the fixed hyperparameters,"""
+    posteriors_learnt: Posterior
+    """and under the learnt ones."""
+    nrmse: Float[Array, ""]
+    """Between the population optima."""
+    individual_nrmse: Float[Array, " M"]
+    sensitivity: dict[str, Float[Array, "..."]]
+    """d(population optimum, unit cube) / d(log theta, log noise, first threshold, log gaps) at the fixed values."""
+    shared: bool = eqx.field(static=True)
+    rule: Rule = eqx.field(static=True)
+    """By which people were merged, point by point: the study's, or bcm where that takes all answers at once."""
+    shares: tuple[Float[Array, ""] | None, Float[Array, ""] | None]
+    """Of the hierarchical rule, under the fixed and under the learnt hyperparameters."""
+
+    def maps(self) -> tuple[partial, partial]:
+        """The population maps under the fixed and under the learnt hyperparameters: functions of points (m, d)."""
+        both = zip((self.posteriors, self.posteriors_learnt), self.shares, strict=True)
+        fixed, learnt = (partial(population, posteriors, rule=self.rule, share=share) for posteriors, share in both)
+        return fixed, learnt
+
+    @property
+    def flagged(self) -> Bool[Array, ""]:
+        """Whether the population optimum moves by 3 % of the search ranges or more."""
+        return self.nrmse >= LIMIT
+
+    @property
+    def flagged_individuals(self) -> Bool[Array, " M"]:
+        """The same for everybody's own optimum."""
+        return self.individual_nrmse >= LIMIT
+
+
+def robustness(
+    study: Study,
+    cohort: Cohort,
+    seed: int = 0,
+    *,
+    learn: Sequence[str] = ("theta", "noise", "thresholds"),
+    shared: bool = True,
+    weak_priors: bool = True,
+) -> Robustness:
+    """Repeat the paper's check for a cohort.
+
+    `shared`: one set of hyperparameters for all, else each participant's own. `weak_priors` keep the learnt values
+    finite where 25 ordinal answers do not (`learned.runaway` says where even they ran away).
+    """
+    if "variance" in learn:
+        raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
+    candidates = search_points(study.space, seed)
+    posteriors = fit_cohort(study, cohort)
+    learned = _learn(study, cohort.trials, tuple(learn), shared, weak_priors)
+    if shared:
+        study_learnt = eqx.tree_at(lambda s: s.gp, study, learned.gp)
+        again = fit_cohort(study_learnt, cohort)
+    else:
+        study_learnt = study
+        again = fit_cohort(study, cohort, learned.gp)
+    rule, share = point_rule(study.rule, _share(study, cohort))
+    shares = share, None if share is None else _share(study_learnt, cohort)
+    fixed, optimised = (
+        population_optimum(s, p, candidates, rule, share)
+        for s, p, share in zip((study, study_learnt), (posteriors, again), shares, strict=True)
+    )
+    before, after = (individual_optima(s, p, candidates) for s, p in ((study, posteriors), (study_learnt, again)))
+    return Robustness(
+        learned=learned,
+        fixed=fixed,
+        optimised=optimised,
+        fixed_individuals=before,
+        optimised_individuals=after,
+        posteriors=posteriors,
+        posteriors_learnt=again,
+        nrmse=nrmse(optimised.x, fixed.x),
+        individual_nrmse=jnp.sqrt(jnp.mean((after.x - before.x) ** 2, axis=1)),
+        sensitivity=_sensitivity(study, cohort.trials, fixed.x, tuple(learn), rule, share),
+        shared=shared,
+        rule=rule,
+        shares=shares,
+    )
+
+
+def _share(study, cohort):
+    """What people have in common, where the study's rule asks for it."""
+    return share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
+
+
+@eqx.filter_jit
+def _learn(study, trials, learn, shared, weak_priors):
+    settings = {"weak_priors": weak_priors, "inference": study.inference}
+    if shared:
+        return maximise_shared_evidence(study.gp, trials, learn, **settings)
+    return jax.lax.map(lambda t: maximise_evidence(study.gp, t, learn, **settings), trials)
+
+
+@eqx.filter_jit
+def _sensitivity(study, trials, x, learn, rule, share):
+    def refit(gp):
+        return jax.vmap(lambda t: fit(gp, t, inference=study.inference, throw=False))(trials)
+
+    def height(w, posteriors):
+        return population(posteriors, study.space.from_box(w)[None, :], rule, share)[0][0]
+
+    return optimum_sensitivity(height, refit, study.space.to_box(x), study.gp, study.space.from_box, learn)

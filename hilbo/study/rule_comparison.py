@@ -1,0 +1,180 @@
+"""Every aggregation rule on one cohort, as data: how it predicts people it has not seen, and what its map says.
+
+For each rule: the predictive density, calibration and reliability with each person left out (`leave_one_out`); its
+optimum; how the optimum is spread, by joint draws of the map (of bcm, hierarchical and pooled, whose joint posterior is
+known) and by a bootstrap over people (of the rules that merge people point by point); what each person moves; how it
+agrees with one model of all answers; and how much of the space the answers cover, the map's standard deviation over
+what it is without answers. And, once, how people differ, with a recommendation in words.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.errors import InputError
+from hilbo.population.hierarchical import Share
+from hilbo.population.joint import joint_map, posterior_map
+from hilbo.population.leave_one_out import LeftOut, calibration, clustered, influence, leave_one_out, reliability
+from hilbo.population.maps import ALL_RULES, RuleMap, rule_map, share_of
+from hilbo.population.pointwise import RULES, aggregate
+from hilbo.search.candidates import search_points
+from hilbo.study.aggregate import fit_cohort, map_optimum, nrmse
+from hilbo.study.cohort import Cohort
+from hilbo.study.heterogeneity import share_content
+
+__all__ = ["KNOWN", "compare", "recommendation"]
+
+KNOWN = 0.8
+"""Where the map's standard deviation is below so much of what it is without answers, these cover the space."""
+
+_POINTS = 400  # at which joint draws and bootstrap seek the optimum
+_DRAWS = 2000
+
+
+def compare(study: Any, cohort: Cohort, seed: int = 0) -> dict[str, Any]:
+    """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say. What a rule
+    cannot do stands there as its reason.
+
+    Raises InputError for fewer than three people with answers: two must be left when one is left out.
+    """
+    answered = np.flatnonzero(cohort.counts() > 0)
+    if len(answered) < 3:
+        raise InputError(
+            f"compare: {len(answered)} people gave answers; at least three are needed, since each is left out in turn."
+        )
+    cohort = cohort.rows(answered)
+    candidates = search_points(study.space, seed)
+    x = candidates[: min(_POINTS, len(candidates))]
+    posteriors = fit_cohort(study, cohort)
+    share = share_of(study.gp, cohort.trials, study.inference)
+    pooled = _map(study, cohort, "pooled", posteriors, share)
+    rules: dict[str, Any] = {}
+    left: dict[str, LeftOut] = {}
+    for rule in ALL_RULES:
+        found = _map(study, cohort, rule, posteriors, share)
+        if isinstance(found, str):
+            rules[rule] = {"refused": found}
+            continue
+        left[rule], maps = leave_one_out(
+            study.gp, cohort.trials, rule, share=share.mean, posteriors=posteriors, inference=study.inference
+        )
+        rules[rule] = calibration(left[rule], seed) | {"reliability": reliability(left[rule])}
+        rules[rule] |= _one(study, cohort, posteriors, found, maps, pooled, candidates, x, seed)
+    content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
+    return content | {"rules": rules, "recommendation": recommendation(left, rules, share, len(answered))}
+
+
+def _map(study, cohort, rule, posteriors, share) -> RuleMap | str:
+    """A rule's map, or the sentence that says why there is none."""
+    try:
+        return rule_map(
+            study.gp, cohort.trials, rule, posteriors=posteriors, share=share.mean, inference=study.inference
+        )
+    except InputError as error:
+        return str(error)
+
+
+def _one(study, cohort, posteriors, found, maps, pooled, candidates, x, seed):
+    best = map_optimum(study, found, candidates)
+    mean, variance = found.predict(x)
+    moved = influence(found, maps, x)
+    return {
+        "method": found.method,
+        "optimum": _parameters(study, best.x),
+        "optimum_sd": float(best.sd),
+        "covered": float(jnp.mean(jnp.sqrt(variance / found.map_prior) < KNOWN)),
+        "influence": dict(zip(cohort.names, moved.tolist(), strict=True)),
+        "agreement_with_pooled": None if isinstance(pooled, str) else _agreement(mean, pooled.predict(x)[0]),
+        "from_pooled": None
+        if isinstance(pooled, str)
+        else float(nrmse(best.x, map_optimum(study, pooled, candidates).x)),
+        "optimum_by_draws": _by_draws(study, found, posteriors, x, seed),
+        "optimum_by_bootstrap": _by_bootstrap(study, found, posteriors, x, seed),
+    }
+
+
+def _agreement(mean, other):
+    """Correlation over the points: the scales of two maps need not be the same."""
+    return float(jnp.corrcoef(mean, other)[0, 1])
+
+
+def _by_draws(study, found: RuleMap, posteriors, x, seed):
+    """Quantiles of where joint draws of the map are largest; None where the map has no joint posterior."""
+    if found.method == "exact" and found.shared is not None:
+        joint = posterior_map(found.shared, x)
+    elif found.rule == "bcm":
+        joint = joint_map(posteriors, x)
+    else:
+        return None
+    return _quantiles(study, x, np.asarray(joint.optima(jax.random.key(seed), _DRAWS)))
+
+
+def _by_bootstrap(study, found: RuleMap, posteriors, x, seed):
+    """Quantiles of where the map of people drawn with replacement is largest; None for rules that take all at once."""
+    if found.rule not in RULES:
+        return None
+    means, explained = jax.vmap(lambda person: person.predict_explained(x))(posteriors)
+    people = means.shape[0]
+    rows = np.random.default_rng(seed).integers(0, people, (_DRAWS // 4, people))
+    share = found.share if found.rule == "hierarchical" else None
+
+    def top(rows):
+        mean, _ = aggregate(found.rule, means[rows], explained[rows], found.prior, share=share)  # type: ignore[arg-type]
+        return jnp.argmax(mean)
+
+    at = np.asarray(jax.jit(lambda rows: jax.lax.map(top, rows))(jnp.asarray(rows)))
+    return _quantiles(study, x, np.bincount(at, minlength=x.shape[0]) / len(at))
+
+
+def _quantiles(study, x, weight):
+    """5, 50 and 95 % of each parameter, in its unit, over weighted points."""
+    physical = np.asarray(study.space.to_physical(np.asarray(x)))
+    found = {}
+    for i, name in enumerate(study.space.names):
+        order = np.argsort(physical[:, i])
+        total = np.cumsum(weight[order])
+        at = np.searchsorted(total, np.array([0.05, 0.5, 0.95]) * total[-1])
+        found[name] = physical[order[np.minimum(at, len(order) - 1)], i].tolist()
+    return found
+
+
+def _parameters(study, x: Float[Array, " d"]) -> dict[str, float]:
+    return dict(zip(study.space.names, np.asarray(study.space.to_physical(np.asarray(x))).tolist(), strict=True))
+
+
+def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Share, people: int) -> str:
+    """Which rule to use, and why, in a few sentences; `left`: what each rule foretold of everybody's answers.
+
+    Two rules are near if the difference of their costs, answer by answer, is within two of its errors by person: people
+    are foretold well or badly by all rules alike, which the error of one rule's mean cost would take for doubt.
+    """
+    scored = {rule: found for rule, found in rules.items() if "negative_log_density" in found}
+    best = min(scored, key=lambda rule: scored[rule]["negative_log_density"])
+    low, high = (float(end) for end in share.interval)
+    differ = float(share.against_one)
+    evidence = (
+        "People differ" if differ > 3 else "Nothing says that people differ" if differ < 0 else "People may differ"
+    )
+    words = (
+        f"{evidence}: they share {float(share.mean):.2f} of the prior variance (95 % from {low:.2f} to {high:.2f}; log"
+        f" Bayes factor against people who are alike {differ:+.1f}). Of people left out, {best} predicts best"
+        f" ({scored[best]['negative_log_density']:.3f} ± {scored[best]['negative_log_density_error']:.3f})"
+    )
+    own = scored.get("hierarchical")
+    chosen = best
+    if own is not None:
+        gap, error = clustered(left["hierarchical"].cost - left[best].cost, left[best].person)
+        near = not math.isfinite(error) or gap <= 2 * error
+        if near and (differ > 3 or best == "hierarchical"):
+            chosen = "hierarchical"
+        elif near and differ < 0 and "bcm" in scored:
+            chosen = "bcm"
+    inside = 100 * scored[chosen]["central_95"]
+    words += f". Recommended: {chosen}; of held-out answers {inside:.1f} % lie in its central 95 %"
+    words += "." if people >= 8 else f". With {people} people differences between rules are hardly told from chance."
+    return words

@@ -1,0 +1,273 @@
+"""Trial tables: CSV or Parquet, one row per answer, read and checked before anything is fitted.
+
+Columns: `participant`, `trial`, `response` and one per parameter in physical units; optional `session`, `phase`,
+`material`, `voided`; others are kept. A number means what its decimals say (correctly rounded), so that a table and
+the log it came from give the same bits. Whatever is wrong is one sentence with the file and the line (Parquet: row).
+A table is read piece by piece, and a piece's text is gone when its numbers are known.
+"""
+
+import csv
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.study.config import Study
+
+__all__ = ["NOT_FITTED", "numbers", "of_material", "place", "read_cells", "read_trials", "refuse", "write_trials"]
+
+NOT_FITTED = ("warm-up", "repeat")
+"""Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
+_KEY = ("participant", "session", "phase", "material", "trial")
+_TRUE = {"1", "1.0", "true", "yes"}
+_FALSE = {"", "0", "0.0", "false", "no", "nan", "none", "<na>"}
+_PIECE = 50_000  # rows
+
+
+def read_trials(
+    path: str | os.PathLike,
+    study: Study,
+    material: str | None = None,
+    *,
+    others: bool = True,
+    say: Callable[[int], None] = lambda rows: None,
+) -> pd.DataFrame:
+    """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
+
+    Adds the column `category` (0 = lowest response). Warm-up, repeated and voided rows are checked and left out.
+    `material` selects the rows of one material, and must be given if there are several. `others`: keep the columns that
+    are nobody's business. `say` is told how many rows have been read. Raises `InputError`.
+    """
+    source, known, pieces, rows = str(path), {}, [], 0
+    for text in _pieces(path):
+        _check_columns(text, study, source)
+        pieces.append(_checked(text, study, source, others, known))
+        say(rows := rows + len(text))
+    if not rows:
+        raise InputError(f"{source}: has no rows; a trial table needs at least one answer.")
+    table = pd.concat(pieces)
+    del pieces
+    _check_duplicates(table, source)
+    table = table[table.pop("_fitted")]
+    if table.empty:
+        raise InputError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
+    table = of_material(table, material, source)
+    ranks = pd.factorize(table["participant"])[0]
+    sessions = _session_order(table["session"]) if "session" in table else 0
+    order = table.assign(_person=ranks, _session=sessions).sort_values(["_person", "_session", "trial"], kind="stable")
+    return order.drop(columns=["_person", "_session"])
+
+
+def _checked(text, study, source, others, known):
+    """A piece with its numbers as numbers and its texts as one object each, and `_fitted`: which rows count."""
+    numeric = {"trial", *study.space.names}
+    table = pd.DataFrame(index=text.index)
+    for column in text.columns:
+        if column in numeric:
+            table[column] = np.nan  # its place among the columns
+        elif others or column in _KEY:
+            table[column] = [known.setdefault(cell, cell) for cell in text[column]]
+    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
+    table["trial"] = whole.astype(int)
+    refuse(text["participant"] == "", source, lambda row: "participant is empty; give each row a participant.")
+    for parameter in study.space.parameters:
+        table[parameter.name] = _parameter(text, parameter, source)
+    table["category"] = _categories(text["response"], study.responses, source)
+    table["_fitted"] = ~_flags(text, "voided", source) & (~text["phase"].isin(NOT_FITTED) if "phase" in text else True)
+    return table
+
+
+def _session_order(names: pd.Series) -> pd.Series:
+    """Sessions follow their numbers where all have one, else the alphabet."""
+    numbers = pd.to_numeric(names, errors="coerce")
+    return names if numbers.isna().any() else numbers
+
+
+def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
+    """Write a trial table, numbers as the shortest decimals that read back to the same bits."""
+    if Path(path).suffix == ".parquet":
+        table.to_parquet(path, index=False)
+    else:
+        table.to_csv(path, index=False)  # pandas writes the shortest decimals that read back the same
+
+
+def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a header and an answer") -> pd.DataFrame:
+    """Every cell as text, so that nothing is guessed; the index is the line (CSV) or the row (Parquet).
+
+    Raises `InputError` for what is no table; `needs` is said of an empty file.
+    """
+    return pd.concat(_pieces(path, needs))
+
+
+def _pieces(path, needs="a trial table needs a header and an answer") -> Iterator[pd.DataFrame]:
+    """The cells of a table as text, some rows at a time; at least one piece, which may have none."""
+    source, path = str(path), Path(path)
+    try:
+        for frame in _parquet_pieces(path) if path.suffix == ".parquet" else _csv_pieces(path, source, needs):
+            again = frame.columns[frame.columns.duplicated()]
+            if len(again):
+                raise InputError(f'{place(source)}column "{again[0]}" stands there twice; keep one of them.')
+            yield frame
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read ({error.strerror or error}); check the path.") from error
+    except (ValueError, csv.Error) as error:  # pyarrow's errors, and text that is no UTF-8, are ValueErrors
+        reason = str(error).strip().splitlines()[-1]
+        raise InputError(f"{source}: is not a table that can be read ({reason}); save it as CSV or Parquet.") from error
+
+
+def _parquet_pieces(path):
+    from pyarrow.parquet import ParquetFile
+
+    with ParquetFile(path) as file:
+        begin = 1
+        yield _as_text(file.schema_arrow.empty_table().to_pandas(), begin)
+        for batch in file.iter_batches(_PIECE):
+            yield _as_text(batch.to_pandas(), begin)
+            begin += batch.num_rows
+
+
+def _as_text(frame, begin):
+    columns = {i: _column_as_text(frame.iloc[:, i]) for i in range(frame.shape[1])}  # a name may stand there twice
+    index = np.arange(begin, begin + len(frame))
+    return pd.DataFrame(columns, index=index, dtype=object).set_axis(frame.columns, axis=1)
+
+
+def _column_as_text(column):
+    if column.dtype.kind == "f":
+        return [repr(v) for v in column.tolist()]
+    return ["" if v is None or v is pd.NA else repr(v) if isinstance(v, float) else str(v) for v in column.tolist()]
+
+
+def _csv_pieces(path, source, needs):
+    """By Python's csv module: it knows the line of a row, and a row that is too long is no reason to guess."""
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        reader = csv.reader(file, skipinitialspace=True, strict=True)
+        rows, lines, header, begin, pieces = [], [], [], 1, 0
+        for row in reader:
+            if any(row):  # not an empty line, nor a spreadsheet's row of commas
+                header = header or row
+                if len(row) != len(header):
+                    raise InputError(
+                        f"{source}:{begin}: has {len(row)} cells, the header has {len(header)}; mend that line."
+                    )
+                rows.append(row)
+                lines.append(begin)
+                if len(rows) > _PIECE:
+                    yield _piece(rows, lines, header, pieces)
+                    rows, lines, pieces = [], [], pieces + 1
+            begin = reader.line_num + 1
+        if not header:
+            raise InputError(f"{source}: is empty; {needs}.")
+        if rows:
+            yield _piece(rows, lines, header, pieces)
+
+
+def _piece(rows, lines, header, pieces):
+    skip = 0 if pieces else 1  # the first row of the first piece is the header
+    return pd.DataFrame(rows[skip:], index=lines[skip:], columns=header, dtype=object)
+
+
+def place(source: str, row: object = None) -> str:
+    """Where in a table: the line of a CSV file, the row of a Parquet file, or the heads of its columns."""
+    if str(source).endswith(".parquet"):
+        return f"{source}: " if row is None else f"{source}: row {row}: "
+    return f"{source}:{1 if row is None else row}: "
+
+
+def _check_columns(text, study, source):
+    needed = ("participant", "trial", "response", *study.space.names)
+    missing = [name for name in needed if name not in text.columns]
+    if missing:
+        raise InputError(
+            f'{place(source)}column "{missing[0]}" is missing; a trial table of this study has {", ".join(needed)}.'
+        )
+
+
+def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> pd.Series:
+    """A column as float64, each cell correctly rounded; `valid` says which values may be, `words` which those are."""
+
+    cells = text[column].tolist()
+    try:
+        found = [] if "_" in "".join(cells) else [float(cell) for cell in cells]
+    except ValueError:
+        found = []
+    values = pd.Series(found if len(found) == len(cells) else [_number(c) for c in cells], text.index, dtype=float)
+    wrong = ~(np.isfinite(values) & valid(values))
+    refuse(wrong, source, lambda row: f'{column} is "{text.at[row, column]}"; it must be {words}.')
+    return values
+
+
+def _number(cell):
+    try:
+        return np.nan if "_" in cell else float(cell)  # Python reads 1_5 as 15
+    except ValueError:
+        return np.nan
+
+
+def _parameter(text, parameter, source):
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    words = f"a number from {parameter.low:g} to {parameter.high:g}{unit}, the study's range"
+    return numbers(text, parameter.name, source, words, lambda v: (v >= parameter.low) & (v <= parameter.high))
+
+
+def _categories(cells, responses, source):
+    """Categories from 0: labels compared as text; ranks from 1 only if no label of the study reads as an integer."""
+    ranks_allowed = not any(label.strip().lstrip("+-").isdigit() for label in responses)
+    lookup = {label: i for i, label in enumerate(responses)}
+    if ranks_allowed:
+        lookup |= {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0")}
+    categories = cells.map(lookup)
+    ranks = f", or a rank from 1 to {len(responses)}" if ranks_allowed else ""
+    refuse(
+        categories.isna(),
+        source,
+        lambda row: f'response is "{cells.at[row]}"; it must be one of {", ".join(responses)}{ranks}.',
+    )
+    return categories.astype(int)
+
+
+def _flags(text, column, source):
+    if column not in text:
+        return pd.Series(False, text.index)
+    cells = text[column].str.strip().str.lower()
+    refuse(~cells.isin(_TRUE | _FALSE), source, lambda row: f'{column} is "{text.at[row, column]}"; write 1 or 0.')
+    return cells.isin(_TRUE)
+
+
+def _check_duplicates(table, source):
+    key = [column for column in _KEY if column in table]
+    again = table.duplicated(key)
+    if again.any():
+        row = again.idxmax()
+        same = (table[key] == table.loc[row, key]).all(axis=1).idxmax()
+        line = "row" if source.endswith(".parquet") else "line"
+        raise InputError(
+            f"{place(source, row)}participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} stands in"
+            f" {line} {same} already; each ({', '.join(key)}) may occur once."
+        )
+
+
+def of_material(table: pd.DataFrame, material: str | None, source: str) -> pd.DataFrame:
+    """The rows of one material; which one must be said where there are several."""
+    if "material" not in table:
+        if material is not None:
+            raise InputError(f'{place(source)}column "material" is missing; without it no material can be chosen.')
+        return table
+    found = list(table["material"].unique())
+    if material is None and len(found) > 1:
+        raise InputError(f"{source}: holds {len(found)} materials ({', '.join(found)}); choose one with --material.")
+    if material is not None and material not in found:
+        raise InputError(f'{source}: holds no material "{material}"; it has {", ".join(found)}.')
+    return table if material is None else table[table["material"] == material]
+
+
+def refuse(wrong: pd.Series, source: str, sentence: Callable[[object], str]) -> None:
+    """Raise `InputError` with `sentence(row)` for the first row that is wrong."""
+    if wrong.any():
+        row = wrong.idxmax()
+        raise InputError(f"{place(source, row)}{sentence(row)}")

@@ -1,0 +1,175 @@
+"""Validation tables, one row per comparison of two parameter sets, and sets tables, one row per set; read and checked.
+
+Validation: `participant, trial, set_a, set_b, class_a, class_b, preferred`, optional `material, session, first`; others
+are kept. `class_a`, `class_b` are labels of the study's responses (or ranks from 1, if no label reads as an integer),
+`preferred` and `first` one of the two sets, or "a" or "b"; `preferred` may be "tie". What was not asked is empty.
+Sets: `set_id, source` (aggregate, sysid or individual:PARTICIPANT), and the parameters that the caller names.
+Whatever is wrong is one sentence with the file and the line.
+"""
+
+import os
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+
+from hilbo.errors import InputError
+from hilbo.study.trial_table import numbers, read_cells, refuse
+
+__all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_sets", "read_validation", "source_kind"]
+
+RESPONSES = ("different", "similar", "close")
+TIE = "tie"
+NONE = ""
+"""What stands where nothing was asked."""
+
+_NEEDED = ("participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred")
+_OPTIONAL = ("material", "session", "first")
+_KEY = ("participant", "material", "session", "trial")
+_RESERVED = ("a", "b", TIE)
+_INDIVIDUAL = "individual:"
+
+
+def read_validation(
+    path: str | os.PathLike, responses: Sequence[str] = RESPONSES, material: str | None = None
+) -> pd.DataFrame:
+    """The comparisons of one material; `responses` are the study's, lowest first. Raises `InputError`.
+
+    All cells are text but `trial`; classes are labels, `preferred` and `first` names of sets (or "tie"), or empty.
+    """
+    text = read_cells(path, "a validation table needs a header and a comparison")
+    return of_material(check_validation(text, responses, str(path)), material, str(path))
+
+
+def check_validation(
+    table: pd.DataFrame, responses: Sequence[str] = RESPONSES, source: str = "validation table"
+) -> pd.DataFrame:
+    """Check a table however it was made, and bring it into the form that `read_validation` gives."""
+    missing = [name for name in _NEEDED if name not in table.columns]
+    if missing:
+        raise InputError(
+            f'{source}:1: column "{missing[0]}" is missing; a validation table has {", ".join(_NEEDED)}'
+            f" and may have {', '.join(_OPTIONAL)}."
+        )
+    if table.empty:
+        raise InputError(f"{source}: has no rows; a validation table needs at least one comparison.")
+    text = table.copy()
+    for column in (*_NEEDED, *(name for name in _OPTIONAL if name in text)):
+        cells = ["" if pd.isna(cell) else str(cell).strip() for cell in text[column]]
+        text[column] = ["" if cell == "nan" else cell for cell in cells]  # a column of nothing, read from Parquet
+    out = text.copy()
+    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
+    out["trial"] = whole.astype(int)
+    for column in ("participant", "set_a", "set_b"):
+        refuse(text[column] == "", source, lambda row, c=column: f"{c} is empty; every comparison has one.")
+    for column in ("set_a", "set_b"):
+        refuse(
+            text[column].isin(_RESERVED),
+            source,
+            lambda row, c=column: (
+                f'{c} is "{text.at[row, c]}", which has a meaning of its own; name the set otherwise.'
+            ),
+        )
+    same = text["set_a"] == text["set_b"]
+    refuse(same, source, lambda row: f'set_a and set_b are both "{text.at[row, "set_a"]}"; compare two sets.')
+    for column in ("class_a", "class_b"):
+        out[column] = _classes(text, column, responses, source)
+    out["preferred"] = _chosen(text, "preferred", (TIE,), source)
+    if "first" in text:
+        out["first"] = _chosen(text, "first", (), source)
+    nothing = (out["class_a"] == NONE) & (out["class_b"] == NONE) & (out["preferred"] == NONE)
+    refuse(nothing, source, lambda row: "holds no answer; fill in class_a and class_b, or preferred, or leave it out.")
+    _check_duplicates(out, source)
+    return out
+
+
+def of_material(table: pd.DataFrame, material: str | None, source: str = "validation table") -> pd.DataFrame:
+    """The rows of one material, which must be named if there are several."""
+    found = list(table["material"].unique()) if "material" in table else []
+    if material is None:
+        if len(found) > 1:
+            raise InputError(f"{source}: holds {len(found)} materials ({', '.join(found)}); choose one of them.")
+        return table
+    if material not in found:
+        has = f"it has {', '.join(found)}" if found else 'it has no column "material"'
+        raise InputError(f'{source}: holds no comparisons of material "{material}"; {has}.')
+    return table[table["material"] == material]
+
+
+def read_sets(path: str | os.PathLike, parameters: Sequence[str] = ()) -> pd.DataFrame:
+    """A sets table, indexed by `set_id`; the named parameters, `N` and `T` are numbers. Raises `InputError`."""
+    source = str(path)
+    text = read_cells(path, "a sets table needs a header and a parameter set")
+    needed = ("set_id", "source", *parameters)
+    missing = [name for name in needed if name not in text.columns]
+    if missing:
+        raise InputError(f'{source}:1: column "{missing[0]}" is missing; this sets table has {", ".join(needed)}.')
+    out = text.copy()
+    refuse(text["set_id"] == "", source, lambda row: "set_id is empty; name every set.")
+    again = text["set_id"].duplicated()
+    refuse(again, source, lambda row: f'set_id "{text.at[row, "set_id"]}" stands there already; name every set once.')
+    unknown = pd.Series([source_kind(cell) is None for cell in text["source"]], text.index)
+    refuse(
+        unknown,
+        source,
+        lambda row: f'source is "{text.at[row, "source"]}"; it must be aggregate, sysid or individual:PARTICIPANT.',
+    )
+    for name in parameters:
+        out[name] = numbers(text, name, source, "a finite number", np.isfinite)
+    if "N" in text:
+        whole = numbers(text, "N", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
+        out["N"] = whole.astype(int)
+    if "T" in text:
+        out["T"] = numbers(text, "T", source, "a time above 0, in s", lambda v: v > 0)
+    return out.set_index("set_id")
+
+
+def source_kind(text: str) -> str | None:
+    """Which kind of source this names: aggregate, sysid, individual, or None."""
+    if text in ("aggregate", "sysid"):
+        return text
+    return "individual" if text.startswith(_INDIVIDUAL) and len(text) > len(_INDIVIDUAL) else None
+
+
+def _classes(text, column, responses, source):
+    lookup = {label: label for label in responses} | {"": NONE}
+    ranks = ""
+    if not any(label.strip().lstrip("+-").isdigit() for label in responses):
+        lookup = {form: label for i, label in enumerate(responses, 1) for form in (str(i), f"{i}.0")} | lookup
+        ranks = f", a rank from 1 to {len(responses)}"
+    found = text[column].map(lookup)
+    refuse(
+        found.isna(),
+        source,
+        lambda row: f'{column} is "{text.at[row, column]}"; it must be one of {", ".join(responses)}{ranks}, or empty.',
+    )
+    return found
+
+
+def _chosen(text, column, others, source):
+    """One of the two sets by its name or as "a" or "b", or one of `others`."""
+    cells = text[column].mask(text[column] == "a", text["set_a"]).mask(text[column] == "b", text["set_b"])
+    good = (cells == text["set_a"]) | (cells == text["set_b"]) | cells.isin((NONE, *others))
+    allowed = "".join(f", {other}" for other in others)
+    refuse(
+        ~good,
+        source,
+        lambda row: (
+            f'{column} is "{text.at[row, column]}"; it must be {text.at[row, "set_a"]}, {text.at[row, "set_b"]}'
+            f"{allowed}, or empty."
+        ),
+    )
+    return cells
+
+
+def _check_duplicates(table, source):
+    key = [column for column in _KEY if column in table]
+    again = table.duplicated(key)
+    refuse(
+        again,
+        source,
+        lambda row: (
+            f"participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} stands there already;"
+            f" each ({', '.join(key)}) may occur once."
+        ),
+    )

@@ -1,0 +1,272 @@
+"""Whole sessions in headless Chromium: real server, real pages, the firmware's own core as the device."""
+
+import json
+import os
+import subprocess
+import time
+
+import pytest
+from live_server import DATA, PATIENCE, Live
+
+from hilbo.app import rehearsal
+from hilbo.app.robot import Client, Participant, browser, find_browser
+from hilbo.session.event_log import EventLog, read_log
+from hilbo.study.config import Study
+
+pytestmark = [
+    pytest.mark.deep,
+    pytest.mark.skipif(find_browser() is None, reason="needs playwright and Chromium (Debian: chromium)"),
+]
+
+
+@pytest.mark.parametrize(("kind", "trials"), [("optimisation", 9), ("validation", 12)])
+def test_a_whole_session_by_one_command(tmp_path, kind, trials):
+    (tmp_path / "base.toml").write_text(DATA.read_text(encoding="utf-8").replace("trials = 25", "trials = 9"))
+    command = [*rehearsal.HILBO, "simulate", "--live", "--study", str(tmp_path / "base.toml"), "--kind", kind]
+    command += ["--out", str(tmp_path / "out"), "--seconds", "0.3", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["answers"] == 3 + trials
+    assert found["mishaps"] == []
+    assert found["fits_after_an_answer"] == 0
+    assert {name.split("-")[0] for name in found["screens"]} == {"participant", "experimenter"}
+    assert any("800x1280" in name for name in found["screens"])
+    study = Study.load(tmp_path / "out" / "study.toml")
+    _, events, dropped = read_log(found["log"], study)
+    assert dropped == ""
+    assert sum(event.kind == "answer" for event in events) == 3 + trials
+    with EventLog.resume(found["log"], study) as log:
+        assert log.state.screen == "done"
+
+
+@pytest.fixture
+def pages(tmp_path):
+    """A session in this process, the participant's page and the experimenter's."""
+    with Live(tmp_path, seconds=0.1) as live, browser() as program:
+        links = live.place.links()
+        experimenter = program.new_context().new_page()
+        experimenter.goto(links["experimenter"])
+        experimenter.wait_for_url("**/experimenter")
+        window = program.new_context().new_page()
+
+        def watch():
+            return experimenter.evaluate("fetch('/api/experimenter').then(r => r.json())")
+
+        participant = Participant(
+            window, links["participant"], watch, lambda _, ask: "a" if ask == "preferred" else "close"
+        )
+        yield live, participant, experimenter
+
+
+def press(experimenter, command, reason=None):
+    """A button of the experimenter's page, and Yes where it asks."""
+    experimenter.wait_for_selector(f"[data-command={command}]:enabled")
+    experimenter.click(f"[data-command={command}]")
+    if reason is not None:
+        experimenter.fill("#sure-why", reason)
+        experimenter.click("#sure button[value=yes]")
+
+
+def until(window, expression):
+    """Waits for what is true in a page; pages allow no waiting by a script of others."""
+    end = time.monotonic() + PATIENCE
+    while not window.evaluate(expression):
+        assert time.monotonic() < end, expression
+        window.wait_for_timeout(20)
+
+
+def until_logged(live, window, count):
+    end = time.monotonic() + PATIENCE
+    while len(live.events("answer")) < count:
+        assert time.monotonic() < end
+        window.wait_for_timeout(50)
+
+
+def until_event(live, window, kind):
+    end = time.monotonic() + PATIENCE
+    while not live.events(kind):
+        assert time.monotonic() < end
+        window.wait_for_timeout(50)
+
+
+def until_answered(participant, count):
+    end = time.monotonic() + PATIENCE
+    while participant.answered < count:
+        participant.act()
+        assert time.monotonic() < end, participant.phase
+        time.sleep(0.02)
+
+
+def test_every_button_of_the_experimenter_is_an_event(pages):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    press(experimenter, "pause")
+    participant.window.wait_for_selector("body[data-phase=paused]")
+    press(experimenter, "resume")
+    experimenter.fill("#note-text", "yawned")
+    experimenter.keyboard.press("Enter")
+    participant.window.wait_for_selector("#options:visible")
+    press(experimenter, "repeat")
+    participant.window.wait_for_selector("#options:visible")
+    press(experimenter, "undo", "slipped")
+    until_answered(participant, 2)
+    press(experimenter, "void", "noise")
+    participant.window.wait_for_selector("#break:visible")
+    participant.window.click("#break")
+    participant.window.wait_for_selector("body[data-phase=paused]")
+    press(experimenter, "abort", "enough")
+    participant.window.wait_for_selector("body[data-phase=ended]")
+    kinds = {event.kind for event in live.events()}
+    assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= kinds
+    live.replays()
+
+
+@pytest.mark.parametrize("way", ["key", "button"])
+def test_the_emergency_stop_is_in_reach_while_something_is_asked(pages, way):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    experimenter.wait_for_selector("[data-command=abort]:enabled")
+    experimenter.click("[data-command=abort]")
+    experimenter.wait_for_selector("#sure[open]")
+    if way == "key":
+        experimenter.keyboard.press("Escape")
+        experimenter.keyboard.press("Escape")
+    else:
+        experimenter.click("#sure .stop")
+    until(experimenter, "view.device.state === 'estop'")
+    until(experimenter, "!document.getElementById('sure').open")
+    assert live.events("abort") == []
+
+
+def test_a_dialog_names_its_trial_and_never_hits_another(pages):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    until(experimenter, "view.means.void && view.means.void.trial === 2")
+    experimenter.click("[data-command=void]")
+    assert "V2" in experimenter.inner_text("#sure-text")
+    until_answered(participant, 2)
+    until(experimenter, "view.means.void.trial === 3")
+    experimenter.fill("#sure-why", "noise")
+    experimenter.keyboard.press("Enter")  # means Yes
+    until(experimenter, "!document.getElementById('sure').open")
+    until(experimenter, "document.getElementById('alert').textContent.includes('Meanwhile V3 has come')")
+    assert [trial.status for trial in live.hub.state.trials[:2]] == ["answered", "answered"]
+    experimenter.click("[data-command=undo]")
+    assert "V2" in experimenter.inner_text("#sure-text")
+    experimenter.click("#sure-no")
+    until(experimenter, "!document.getElementById('sure').open")
+    experimenter.click("[data-command=undo]")
+    experimenter.fill("#sure-why", "slipped")
+    experimenter.keyboard.press("Enter")
+    until_event(live, experimenter, "undo")
+    assert live.events("undo")[0].data == {"id": 2, "reason": "slipped"}
+
+
+def test_the_experimenter_reads_a_refusal_and_keeps_a_note_that_was_not_written(pages, monkeypatch):
+    live, participant, experimenter = pages
+    until_answered(participant, 1)
+    real = os.write
+
+    def full(file, data):
+        if file == live.log._file and b'"kind":"note"' in bytes(data):
+            raise OSError(28, "No space left on device")
+        return real(file, data)
+
+    monkeypatch.setattr(os, "write", full)
+    experimenter.fill("#note-text", "yawned")
+    experimenter.keyboard.press("Enter")
+    until(experimenter, "!document.getElementById('alert').hidden")
+    monkeypatch.setattr(os, "write", real)
+    assert "space" in experimenter.inner_text("#alert")
+    assert experimenter.input_value("#note-text") == "yawned"
+    experimenter.evaluate("command('resume').then(() => { said.until += 1e6; })")  # however slow this computer is
+    until(experimenter, "document.getElementById('alert').textContent.includes('nothing to go on to')")
+    until_answered(participant, 2)  # many views later
+    assert "nothing to go on to" in experimenter.inner_text("#alert")
+    experimenter.click("#note button")
+    until_event(live, experimenter, "note")
+    until(experimenter, "document.getElementById('note-text').value === ''")
+    until(experimenter, "document.getElementById('alert').hidden")
+
+
+def test_a_page_of_the_experimenter_that_was_replaced_says_so_and_asks_no_more(pages):
+    live, _, experimenter = pages
+    Client(live.place.links()["experimenter"])  # a newer link is opened elsewhere
+    until(experimenter, "document.getElementById('alert').textContent.includes('newer link')")
+    asked: list[str] = []
+    experimenter.on("request", lambda request: asked.append(request.url))
+    experimenter.wait_for_timeout(3000)
+    assert asked == []
+
+
+def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
+    live, participant, _ = pages
+    window = participant.window
+    until_answered(participant, 1)
+    window.wait_for_selector("#options:visible")
+    window.route("**/api/participant/answer", lambda route: route.abort())  # sent, never arrives
+    trial = window.evaluate("trial")
+    for _ in range(3):
+        window.keyboard.press("1")
+    until(window, "localStorage.getItem('hilbo.answer') !== null")
+    window.wait_for_timeout(300)
+    window.unroute("**/api/participant/answer")
+    window.reload()  # as closed and opened again
+    until(window, "localStorage.getItem('hilbo.answer') === null")
+    given = [event for event in live.events("answer") if f"tag:{event.data['id']}." in trial]
+    assert len(given) == 1
+    window.wait_for_selector("#options:visible, #go:visible")
+    window.route("**/api/participant/answer", lambda route: (route.fetch(), route.abort()))  # arrives, answer lost
+    count = len(live.events("answer"))
+    if window.is_visible("#go"):
+        window.click("#go")
+    window.wait_for_selector("#options:visible")
+    for _ in range(3):
+        window.keyboard.press("2")
+    until_logged(live, window, count + 1)
+    window.unroute("**/api/participant/answer")
+    until(window, "localStorage.getItem('hilbo.answer') === null")
+    assert len(live.events("answer")) == count + 1
+
+
+def test_a_page_whose_signs_of_life_do_not_arrive_says_so_and_comes_back(pages):
+    live, participant, experimenter = pages
+    window = participant.window
+    until_answered(participant, 1)
+    until(experimenter, "view.participant_here")
+    window.route("**/api/participant/here", lambda route: route.abort())
+    window.wait_for_selector("#line:visible")
+    until(experimenter, "!view.participant_here")
+    until(experimenter, "view.phase === 'hello' || view.phase === 'answer'")
+    window.unroute("**/api/participant/here")
+    window.wait_for_selector("#line", state="hidden")
+    until(experimenter, "view.participant_here")
+    until_answered(participant, 2)
+    assert live.hub.watchers.participant_here
+
+
+def test_the_pages_load_nothing_from_elsewhere_and_names_reach_a_screen_reader(pages):
+    _, participant, _ = pages
+    window = participant.window
+    asked: list[str] = []
+    window.on("request", lambda request: asked.append(request.url))
+    window.reload()
+    window.wait_for_selector("#go:visible")
+    assert asked
+    assert all(url.startswith(("http://127.0.0.1:", "data:")) for url in asked)
+    assert window.get_by_role("button", name="Begin").is_visible()
+    assert window.get_attribute("#title", "aria-live") == "assertive"
+    window.keyboard.press("Space")
+    window.wait_for_selector("#options:visible")
+    assert window.get_by_role("group", name=window.inner_text("#title")).is_visible()
+
+
+def test_a_second_window_takes_over_and_the_first_says_so(pages):
+    live, participant, _ = pages
+    first = participant.window
+    second = first.context.new_page()
+    second.goto(live.participant.address + "/participant")
+    until(first, "document.body.dataset.phase === 'over'")
+    assert "another window" in first.inner_text("#title")
+    second.wait_for_selector("#go:visible")

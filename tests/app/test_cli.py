@@ -1,0 +1,264 @@
+"""`hilbo session` refuses in one sentence, before anything is begun; `hilbo doctor` says what to mend."""
+
+import contextlib
+import hashlib
+import json
+import socket
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from commands import run
+from live_server import DATA, study_of
+from msgspec import to_builtins
+
+from hilbo.app import serve
+from hilbo.app.opening import Wanted, opened
+from hilbo.app.rehearsal import example_sets
+from hilbo.cli import doctor
+from hilbo.cli.main import app
+from hilbo.device.simulator import Simulator
+from hilbo.errors import InputError
+from hilbo.hardware_bridge import Renderer
+from hilbo.session import actions
+from hilbo.session.event_log import read_log
+from hilbo.session.participants import add_person
+from hilbo.session.plan import header_for, make_plan, plan_hash
+from hilbo.session.warm_start import read_warm_start
+
+PERSON = {"participant": "P01", "consent_time": "2026-03-02T10:00", "protocol_number": "7", "age": "", "handedness": ""}
+
+
+def command(*arguments):
+    """A command of hilbo, in this process."""
+    return app([str(a) for a in arguments], standalone_mode=False)
+
+
+def refused(*arguments):
+    """The sentence with which it is refused."""
+    with pytest.raises(InputError) as caught:
+        command("session", *arguments)
+    return str(caught.value)
+
+
+def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")  # commands would choose the user's
+    logs = tmp_path / "logs"
+    place = ("--logs", logs, "--port", 0, "--participant", "P01")
+    assert "has no [renderer]" in refused(DATA.parent / "video_quality.toml", *place, "--dry-run")
+    assert "cannot be read" in refused(tmp_path / "none.toml", *place)
+    assert "participants.csv: cannot be read" in refused(DATA, *place)
+    assert "pseudonym" in refused(DATA, "--logs", logs, "--port", 0, "--participant", "Jane Doe")
+    assert "cannot be opened" in refused(DATA, *place, "--resume")
+    (tmp_path / "plan.json").write_text("{}")
+    assert "is no plan" in refused(DATA, *place, "--plan", tmp_path / "plan.json", "--dry-run")
+    add_person(logs / "participants.csv", PERSON | {"participant": "P02"})
+    assert '"P01" is not in the list' in refused(DATA, *place)
+    assert "is no map" in refused(DATA, *place, "--dry-run", "--warm-start", tmp_path / "none.nc")
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        assert "choose another --port" in refused(DATA, *place[:2], "--port", other.getsockname()[1], *place[4:])
+    assert list(logs.glob("*.jsonl")) == []
+
+
+def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_path):
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    logs.mkdir()
+    add_person(logs / "participants.csv", PERSON)
+    wanted = Wanted(file, "P01", logs=logs)
+    hub, log = opened(wanted, lambda _: None, lambda _: None)
+    assert log.state.header.consent == PERSON["consent_time"]
+    with pytest.raises(InputError, match="another hilbo"):
+        opened(wanted._replace(resume=True), lambda _: None, lambda _: None)
+    log.close()
+    with pytest.raises(InputError, match="--resume"):
+        opened(wanted, lambda _: None, lambda _: None)
+    with pytest.raises(InputError, match="another study"):
+        opened(wanted._replace(resume=True, study=DATA), lambda _: None, lambda _: None)
+    text = log.path.read_bytes()
+    log.path.write_bytes(text.replace(b"P01", b"P02", 1))
+    with pytest.raises(InputError, match="damaged"):
+        opened(wanted._replace(resume=True), lambda _: None, lambda _: None)
+    log.path.write_bytes(text)
+    again, log = opened(wanted._replace(resume=True), lambda _: None, lambda _: None)
+    log.close()
+    assert again.tag == hub.tag
+    assert again.state == hub.state
+
+
+def a_map(study, path):
+    """The map.nc of a population that likes one corner."""
+    sides = [np.linspace(0.0, 1.0, 4)] * study.space.dim
+    unit = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1)
+    names = study.space.names
+    coords = {p.name: np.asarray(p.to_physical(jnp.asarray(sides[0]))) for p in study.space.parameters}
+    values = {"mean": 2.0 - unit.sum(axis=-1), "variance": np.full(unit.shape[:-1], 0.1)}
+    xr.Dataset({name: (names, value) for name, value in values.items()}, coords).to_netcdf(path, engine="h5netcdf")
+    return path
+
+
+def begun(wanted):
+    """Log, first two proposals."""
+    hub, log = opened(wanted, lambda _: None, lambda _: None)
+    with log:
+        state, found = log.state, []
+        for number, response in enumerate(("different", "close"), 1):
+            event = actions.propose(state, hub.chooser, 0.0)
+            found.append(event.data)
+            state = state.after(event)
+            answer = actions.answer(state, number, "c", {"class_a": response}, 1.0, felt=False)
+            assert answer is not None
+            state = state.after(answer)
+    return log, found
+
+
+def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_path):
+    study = study_of(tmp_path)
+    file, logs = a_map(study, tmp_path / "map.nc"), tmp_path / "logs"
+    header = header_for(study, "P01", seed=7, warm=False)
+    plan = {"schema": 1, "study": study.hash, "participants": [{"participant": "P01", "header": to_builtins(header)}]}
+    (tmp_path / "plan.json").write_text(json.dumps(plan | {"hash": plan_hash(plan)}))
+    wanted = Wanted(
+        tmp_path / "study.toml", "P01", logs=logs, plan=tmp_path / "plan.json", warm_start=file, dry_run=True
+    )
+    log, first = begun(wanted)
+    assert log.state.header.seed == 7
+    assert log.state.header.warm_start == f"={hashlib.sha256(file.read_bytes()).hexdigest()[:16]}"
+    assert [data["choice"]["by"] for data in first] == ["map", "map"]
+    again = wanted._replace(resume=True, seed=3)
+    assert begun(again)[1] == first
+    with pytest.raises(InputError, match="give the maps that it was begun with"):
+        opened(again._replace(warm_start=None), lambda _: None, lambda _: None)
+    candidates = read_warm_start(file, study, 7).points
+    first_unit = study.space.to_unit(np.array([first[0]["renderings"]["a"][n] for n in study.space.names]))
+    assert float(jnp.min(jnp.max(jnp.abs(candidates - first_unit[None, :]), axis=1))) < 1e-9
+
+
+def test_a_warm_start_that_is_refused_leaves_no_log(tmp_path):
+    study = study_of(tmp_path)
+    logs = tmp_path / "logs"
+    wanted = Wanted(tmp_path / "study.toml", "P01", logs=logs, warm_start=tmp_path / "none.nc", dry_run=True)
+    with pytest.raises(InputError, match="is no map"):
+        opened(wanted, lambda _: None, lambda _: None)
+    plan = make_plan(study, ["P01"], 0, "validation", sets={"": example_sets(study)}, source="aggregate")
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    planned = wanted._replace(plan=tmp_path / "plan.json", warm_start=a_map(study, tmp_path / "map.nc"))
+    with pytest.raises(InputError, match="nothing is chosen"):
+        opened(planned, lambda _: None, lambda _: None)
+    assert not list(tmp_path.rglob("*.jsonl"))
+
+
+def test_a_device_that_cannot_be_used_is_one_sentence_and_leaves_no_log(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study = study_of(tmp_path)
+    logs = tmp_path / "logs"
+    place = (tmp_path / "study.toml", "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run")
+    with (
+        contextlib.closing(Simulator(finger="none")) as simulator,
+        Renderer.open(simulator.port, patience=10.0),
+        socket.create_server(("127.0.0.1", 0)) as silent,
+    ):
+        cases = [
+            (("--device", tmp_path / "ttyACM0"), 2, "ttyACM0"),
+            (("--device", simulator.port), 2, "another program"),
+            (("--device", f"socket://127.0.0.1:{silent.getsockname()[1]}"), 1, "answer"),
+            (("--sim", "damping=0.05"), 2, "damping"),
+            (("--device", tmp_path / "none", "--warm-start", a_map(study, tmp_path / "map.nc")), 2, "none"),
+        ]
+        for arguments, code, word in cases:
+            found, out, err = run(capsys, monkeypatch, "session", *place, *arguments)
+            assert (found, out) == (code, ""), err
+            assert word in err.splitlines()[-1]
+            assert err.splitlines()[-1].startswith("hilbo: ")
+            assert "Traceback" not in err
+            assert not list(logs.glob("*.jsonl"))
+
+
+def test_a_session_that_was_begun_keeps_its_log_when_the_device_is_not_there(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    _, log = opened(Wanted(file, "P01", logs=logs, dry_run=True), lambda _: None, lambda _: None)
+    log.close()
+    before = log.path.read_bytes()
+    place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run", "--resume")
+    assert run(capsys, monkeypatch, "session", *place, "--device", tmp_path / "ttyACM0")[0] == 2
+    assert log.path.read_bytes() == before
+
+
+def test_a_dry_run_stays_one_and_a_session_with_a_person_too(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    logs.mkdir()
+    add_person(logs / "participants.csv", PERSON)
+    place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--device", tmp_path / "ttyACM0")
+    for session, dry, word in (("1", True, "begun as a dry run"), ("2", False, "leave --dry-run out")):
+        wanted = Wanted(file, "P01", session, logs=logs, dry_run=dry)
+        _, log = opened(wanted, lambda _: None, lambda _: None)
+        log.close()
+        assert read_log(log.path)[0].dry_run == dry
+        other = () if dry else ("--dry-run",)
+        assert word in refused(*place, "--session", session, "--resume", *other)
+        assert "another hilbo" not in refused(*place, "--session", session, "--resume", *other)
+        opened(wanted._replace(resume=True), lambda _: None, lambda _: None)[1].close()
+
+
+def test_links_are_for_this_computer_unless_the_network_is_asked_for(monkeypatch):
+    place = serve.bound(0)
+    assert place.socket.getsockname()[0] == "127.0.0.1"
+    assert all(link.startswith("http://127.0.0.1:") for link in place.links().values())
+    place.socket.close()
+    monkeypatch.setattr(serve, "lan_addresses", lambda: ["192.0.2.7"])
+    place = serve.bound(0, lan=True)
+    links = place.links()
+    assert links["participant"].startswith("http://192.0.2.7:")
+    assert links["experimenter"].startswith("http://127.0.0.1:")
+    assert links["participant"].partition("#")[2] != links["experimenter"].partition("#")[2]
+    assert serve.qr_image(links["participant"]).startswith("data:image/svg+xml;base64,")
+    assert serve.qr_text(links["participant"]).count("\n") > 10
+    place.socket.close()
+    monkeypatch.setattr(serve, "lan_addresses", lambda: [])
+    with pytest.raises(InputError, match="no network"):
+        serve.bound(0, lan=True)
+
+
+def test_the_doctor_finds_all_well_with_the_simulated_device(tmp_path, capsys):
+    def connect(damping):
+        return Renderer.open("sim", damping=damping, options={"finger": "none"}, patience=10.0)
+
+    found = {check.name: check for check in doctor.checks(DATA, connect, tmp_path, 0)}
+    assert set(found) >= {
+        "versions", "disk", "server's port", "browser", "serial ports", "study", "precision and cache",
+        "feasible set", "time of a step", "device", "device loopback", "damping",
+    }  # fmt: skip
+    assert [name for name, check in found.items() if check.level == "bad"] == []
+    assert "0 wrong" in found["device loopback"].words
+
+
+def test_the_doctor_says_what_to_mend(tmp_path):
+    def connect(_):
+        return Renderer.open("sim", options={"finger": "none", "damping": 0.5}, patience=10.0)
+
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        found = {check.name: check for check in doctor.checks(DATA, connect, tmp_path / "no" / "where", port)}
+    assert found["damping"].level == "bad"
+    assert "measure-damping" in found["damping"].mend
+    assert found["server's port"].level == "bad"
+    assert found["disk"].level == "bad"
+    assert all(check.mend for check in found.values() if check.level == "bad")
+    (broken := tmp_path / "study.toml").write_text("schema = 2")
+    (tmp_path / "out").mkdir()
+    found = {check.name: check for check in doctor.checks(broken, lambda _: unplugged(), tmp_path / "out", 0)}
+    assert found["study"].level == found["device"].level == "bad"
+    assert json.dumps([check._asdict() for check in found.values()])
+
+
+def unplugged():
+    raise InputError("there is no such port")

@@ -1,0 +1,158 @@
+"""What interrupts a live session: its device, a full disk, a laptop that sleeps, a break, a network that goes silently.
+
+Whatever it is, nothing is lost, and what was being felt is felt again once somebody presses Begin.
+"""
+
+import json
+import os
+import time
+import urllib.request
+
+import pytest
+from live_server import PATIENCE, Live, ask, refused
+
+from hilbo.app import watchers
+from hilbo.app.robot import Client
+from hilbo.session.records import Block, Planned
+
+
+@pytest.fixture
+def live(tmp_path):
+    with Live(tmp_path) as found:
+        yield found
+
+
+def test_a_device_that_is_gone_voids_the_trial_and_comes_back(live):
+    live.begin()
+    live.answer()
+    live.question()
+    pending = live.hub.state.pending
+    live.hub.rig.device.simulator._process.kill()
+    view = live.until(
+        lambda v: v["device"]["state"] != "lost" and v["whole"]["trials"][pending.id - 1]["voided"], live.whole
+    )
+    voided = view["whole"]["trials"][pending.id - 1]["voided"]
+    assert voided["by"] == "rule"
+    assert "device" in voided["reason"]
+    live.begin()  # nothing goes on by itself
+    found = live.answer(live.question())
+    assert not found["again"]
+    assert live.hub.state.trials[pending.id].renderings == pending.renderings
+    live.replays()
+
+
+def test_an_emergency_stop_holds_everything_until_it_is_cleared(live):
+    live.begin()
+    live.question()
+    live.command("estop")
+    seen = live.until(lambda v: v["device"]["state"] == "estop" and v["phase"] == "trouble", live.whole)
+    assert "clear" in seen["may"]
+    assert live.view()["questions"] is None
+    live.command("clear")
+    live.answer(live.question())
+    assert [e.data["condition"] for e in live.events("device")][-2:] == ["estop", "ready"]
+
+
+def test_a_full_disk_keeps_the_answer_unacknowledged_and_nothing_is_lost(live, monkeypatch):
+    live.begin()
+    view = live.question()
+    live.until(lambda v: v["phase"] == "answer")
+    real = os.write
+
+    def full(file, data):
+        if file == live.log._file:
+            raise OSError(28, "No space left on device")
+        return real(file, data)
+
+    monkeypatch.setattr(os, "write", full)
+    with refused(503):
+        live.answer(view)
+    assert "space" in live.whole()["alert"]
+    monkeypatch.setattr(os, "write", real)
+    assert not live.answer(view)["again"]
+    assert len(live.events("answer")) == 1
+
+
+def test_a_link_opened_on_a_full_disk_can_be_opened_again(live):
+    link = live.command("invite")["link"]
+    token = link.partition("#")[2]
+    (live.folder / "keys.part").mkdir()  # nothing can be written there
+    with refused(503):
+        live.participant.post("/api/join", {"token": token})
+    assert live.view()["phase"]
+    (live.folder / "keys.part").rmdir()
+    assert Client(link).get("/api/participant")["phase"]
+
+
+def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
+    with Live(tmp_path, seconds=60.0) as live:  # it sleeps in the first step
+        import hilbo.app.interruptions as module
+
+        live.begin()
+        live.until(lambda v: v["phase"] == "step")
+        real = module.time.time
+        monkeypatch.setattr(module.time, "time", lambda: real() + 3600)
+        live.until(lambda v: v["may"]["begin"])
+        assert "slept" in live.events("note")[-1].data["text"]
+        assert live.events("repeat")
+
+
+SHORT_THEN_LONG = 'steps = [{show = "reference", seconds = 0.02}, {show = "a", seconds = 30}]'
+
+
+def test_a_rendering_that_a_break_cut_off_is_felt_again_before_it_is_asked_about(tmp_path):
+    with Live(tmp_path, blocks=(Block("warm-up", 1, (Planned("best"),)),), warm_up=SHORT_THEN_LONG) as live:
+        live.begin()
+        live.until(lambda view: view["step"] and view["step"]["show"] == "a")
+        live.participant.post("/api/participant/break", {})
+        live.until(lambda view: view["phase"] == "paused")
+        live.command("resume")
+        view = live.until(lambda view: view["step"] or view["questions"])
+        assert view["step"]["show"] == "reference"
+        live.until(lambda view: view["step"] and view["step"]["show"] == "a")
+        shown = [(e.data["show"], e.data["on"]) for e in live.events("stimulus")]
+        assert shown == [("reference", True), ("reference", False), ("a", True)] * 2
+
+
+class Page:
+    """A participant's window without a browser: a cookie, a stream, and signs of life as long as it is told to."""
+
+    def __init__(self, live):
+        self.live, self.origin = live, live.participant.address
+        token = live.place.link("participant").partition("/#")[2]
+        request = urllib.request.Request(self.origin + "/api/join", data=json.dumps({"token": token}).encode())
+        with urllib.request.urlopen(request, timeout=PATIENCE) as reply:
+            self.cookie = reply.headers["Set-Cookie"].partition(";")[0]
+        self.stream = ask(live, "/api/participant/events?page=one", Cookie=self.cookie)
+
+    def post(self, name):
+        headers = {"Cookie": self.cookie, "Origin": self.origin, "X-Hilbo-Page": "one"}
+        ask(self.live, f"/api/participant/{name}", data=b"{}", **headers).close()
+
+
+def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tmp_path, monkeypatch):
+    monkeypatch.setattr(watchers, "_SILENT", 0.0)  # no program counts
+    with Live(tmp_path, seconds=60.0) as live:
+        page = Page(live)
+        live.until(lambda v: v["phase"] == "hello", live.whole)
+        page.post("begin")
+        live.until(lambda v: v["phase"] == "step", live.whole)
+        end = time.monotonic() + 5.0  # longer than a page may be silent
+        while time.monotonic() < end:
+            page.post("here")
+            time.sleep(0.5)
+        view = live.whole()
+        assert view["participant_here"]
+        assert view["phase"] == "step"
+        live.until(lambda v: not v["participant_here"], live.whole)  # nothing is closed, and nothing comes any more
+        live.until(lambda v: v["phase"] == "hello", live.whole)
+        assert live.events("repeat")
+        live.command("pause")
+        live.command("resume")  # by the experimenter, with nobody there
+        live.until(lambda v: v["phase"] == "hello", live.whole)
+        page.post("here")
+        assert live.whole()["participant_here"]
+        live.command("pause")
+        live.command("resume")
+        live.until(lambda v: v["phase"] == "step", live.whole)
+        page.stream.close()

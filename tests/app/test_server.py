@@ -1,0 +1,131 @@
+"""Who the server of a live session lets do what, through the JSON that pages and programs speak; what it refuses."""
+
+import json
+import random
+import urllib.error
+from pathlib import Path
+
+import pytest
+from live_server import Live, ask, refused
+
+from hilbo.app.hub import COMMANDS, PRESSES
+
+
+@pytest.fixture(scope="module")
+def quiet(tmp_path_factory):
+    """A session in which nobody presses Begin."""
+    with Live(tmp_path_factory.mktemp("quiet")) as found:
+        found.until(lambda view: view["may"]["begin"])
+        found.until(lambda _: found.hub.state.pending.sent)
+        yield found
+
+
+PATHS = [
+    *(("participant", path) for path in ("", "/events")),
+    *(("participant", f"/{name}") for name in ("answer", *PRESSES)),
+    *(("experimenter", path) for path in ("", "/events", "/map")),
+    *(("experimenter", f"/{name}") for name in COMMANDS),
+]
+READS = ("", "/events", "/map")
+
+
+@pytest.mark.parametrize(("role", "path"), PATHS)
+def test_everything_needs_the_key_of_its_role(quiet, role, path):
+    other = quiet.experimenter if role == "participant" else quiet.participant
+    data = None if path in READS else b"{}"
+    before = quiet.hub.state.seq
+    for key in (None, "wrong", other._key):
+        headers = {} if key is None else {"Authorization": f"Bearer {key}"}
+        with refused(401):
+            ask(quiet, f"/api/{role}{path}", data=data, **headers)
+    assert quiet.hub.state.seq == before
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "example.org"},
+        {"Host": "example.org:80"},
+        {"Origin": "http://example.org"},
+        {"Origin": "null"},
+        {"Sec-Fetch-Site": "cross-site"},
+    ],
+)
+@pytest.mark.parametrize("path", ["/", "/static/participant.js", "/participant", "/api/participant", "/api/join"])
+def test_what_comes_from_elsewhere_is_refused_with_the_right_key_too(quiet, path, headers):
+    with refused(403):
+        ask(quiet, path, Authorization=f"Bearer {quiet.participant._key}", **headers)
+
+
+def test_a_cookie_alone_does_not_change_anything(quiet):
+    key = quiet.participant._key
+    with refused(403):
+        ask(quiet, "/api/participant/begin", data=b"{}", Cookie=f"hilbo_participant={key}")
+    origin = quiet.participant.address
+    with ask(quiet, "/api/participant", Cookie=f"hilbo_participant={key}", Origin=origin) as reply:
+        assert "default-src 'none'" in reply.headers["Content-Security-Policy"]
+        assert reply.headers["Cache-Control"] == "no-store"
+
+
+def test_a_page_without_a_key_gets_nothing_but_the_way_in(quiet):
+    with pytest.raises(urllib.error.HTTPError) as caught:
+        ask(quiet, "/experimenter")
+    with caught.value as error:
+        assert "join.js" in error.read().decode()
+    assert caught.value.code == 401
+    with refused(401):
+        quiet.participant.post("/api/join", {"token": "again"})
+
+
+def test_what_is_not_understood_is_refused_and_harms_nothing(quiet):
+    view = quiet.until(lambda view: view["trial"])
+    rng, before = random.Random(0), quiet.hub.state.seq
+    for number in range(200):
+        with refused_somehow():
+            quiet_post(quiet, "answer", malformed(rng, view["trial"]["id"], number))
+    assert quiet.hub.state.seq == before
+    assert quiet.view() == view
+
+
+def malformed(rng, trial, number):
+    """A message that is none: bytes, wrong types, unknown keys, wrong names, endless or deep ones."""
+    good = {"trial": trial, "client": "c", "answers": {"class_a": "close"}, "response_ms": 1.0}
+    kinds = [
+        lambda: rng.randbytes(rng.randrange(1, 200)),
+        lambda: json.dumps(good | {"extra": 1}).encode(),
+        lambda: json.dumps({k: v for k, v in good.items() if k != rng.choice(list(good)[:3])}).encode()[:-1],
+        lambda: json.dumps(good | {rng.choice(list(good)): rng.choice([None, 3, [], {}, "", True])}).encode(),
+        lambda: json.dumps(
+            good | {"trial": rng.choice(["", "tag:1", "x:1.1", "tag:999.1", "tag:-1.1", "tag:1.99"])}
+        ).encode(),
+        lambda: json.dumps(good | {"answers": {"class_a": "best"}}).encode(),
+        lambda: json.dumps(good | {"client": "c" * 65}).encode(),
+        lambda: b"[" * 20_000,
+        lambda: json.dumps(good | {"clicked": "x" * 20_000}).encode(),
+        lambda: json.dumps(good | {"response_ms": rng.choice([-1, 1e300])}).encode(),
+        lambda: b'{"trial": "\xff\xfe"}',
+        lambda: b"null",
+    ]
+    return kinds[number % len(kinds)]()
+
+
+def quiet_post(live, name, data):
+    ask(live, f"/api/participant/{name}", data=data, Authorization=f"Bearer {live.participant._key}")
+
+
+class refused_somehow:  # noqa: N801  (read as a word)
+    def __enter__(self):
+        return self
+
+    def __exit__(self, kind, error, trace):
+        assert isinstance(error, urllib.error.HTTPError), error
+        with error:
+            assert error.code in (400, 409), error
+            assert json.loads(error.read())["error"]
+        return True
+
+
+def test_the_documents_name_every_address():
+    text = (Path(__file__).parents[2] / "docs" / "live.md").read_text(encoding="utf-8")
+    for name in (*PRESSES, *COMMANDS, "answer", "events", "join"):
+        assert f"`{name}`" in text or f"/{name}" in text, name

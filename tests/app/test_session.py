@@ -1,0 +1,199 @@
+"""Live sessions through the server, its hub and a simulated device: trials, commands, windows, and their log."""
+
+import contextlib
+import http.client
+import json
+import threading
+
+import pytest
+from live_server import PATIENCE, Live, ask, refused
+
+from hilbo.session.export import validation_table
+from hilbo.session.records import Block, Planned
+
+
+@pytest.fixture
+def live(tmp_path):
+    with Live(tmp_path) as found:
+        yield found
+
+
+def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
+    with Live(tmp_path, repeats=4) as live:
+        heard, own = [], live.participant._ask
+
+        def ear(request):
+            found = own(request)
+            heard.append(json.dumps(found))
+            return found
+
+        live.participant._ask = ear
+        listening = threading.Thread(target=listen, args=(live, heard))
+        listening.start()
+        live.begin()
+        for _ in range(12):
+            view = live.question()
+            assert [question["name"] for question in view["questions"]] == ["class_a", "class_b", "preferred"]
+            first = live.answer(view)
+            assert first["accepted"] == view["trial"]["id"]
+            assert not first["again"]
+            assert live.answer(view)["again"]  # sent again: accepted once
+            with refused(409):
+                live.answer(view, client="somebody-else")
+        assert live.until(lambda view: view["phase"] == "done")["progress"]["done"] == 12
+        answers = live.events("answer")
+        assert [event.data["id"] for event in answers] == list(range(1, 13))
+        assert {event.data["client"] for event in answers} == {"me"}
+        assert answers[0].data["browser"]["response_s"] == 0.0125
+        live.replays()
+        assert validation_table([live.replayed()])["response_time"].tolist() == [0.0125] * 12
+        check_order(live.events())
+        state = live.hub.state
+    listening.join(PATIENCE)
+    assert any(line.startswith("event: view") for line in heard)
+    check_blinding("\n".join(heard), state)
+
+
+def listen(live, heard):
+    """Everything that comes as server-sent events, until the server ends; and the page itself."""
+    key = {"Authorization": f"Bearer {live.participant._key}"}
+    with (
+        ask(live, "/api/participant/events?page=ear", **key) as stream,
+        contextlib.suppress(OSError, http.client.HTTPException),
+    ):
+        for kind in ("html", "js"):
+            with ask(live, f"/static/participant.{kind}") as page:
+                heard.append(page.read().decode())
+        for line in stream:
+            heard.append(line.decode())
+
+
+def check_blinding(heard, state):
+    """Nothing of what a participant must not know is in what their browser was told."""
+    words = ["best", "mid", "worst", "mean", "margin", "certificate", "K1", "B1", "alpha", "renderings", "choice"]
+    for word in [*words, "passiv", "probabilit", "aggregate", "individual", "validation"]:
+        assert word not in heard, word
+    for values in [values for trial in state.trials for values in trial.renderings.values()]:
+        for value in values.values():
+            assert f"{value:.4g}" not in heard
+            assert str(value) not in heard
+
+
+def check_order(events):
+    """What a trial needs comes in its order: proposed, in force, shown, answered; and in force before it is shown."""
+    for number in range(1, 13):
+        kinds = [(e.kind, e.data.get("side") or e.data.get("show")) for e in events if e.data.get("id") == number]
+        assert kinds[0] == ("propose", None)
+        assert kinds[-1] == ("answer", None)
+        for side in ("a", "b"):
+            assert kinds.index(("sent", side)) < kinds.index(("stimulus", side))
+
+
+def test_the_sets_that_were_shown_are_those_of_the_trial(live):
+    live.begin()
+    live.answer()
+    trial = live.hub.state.trials[0]
+    for side, sent in trial.sent.items():
+        for name in ("K0", "K1", "B1", "alpha"):
+            assert sent["in_force"][name] == pytest.approx(trial.renderings[side][name], rel=1e-6)
+
+
+def test_every_command_is_an_event_and_replayed(live):
+    live.begin()
+    live.answer()
+    live.question()
+    live.command("pause")
+    assert live.view()["phase"] == "paused"
+    with refused(409):
+        live.command("pause")
+    with refused(409):
+        live.participant.post("/api/participant/more", {})
+    live.command("resume")
+    live.command("note", text="  yawned ")
+    with refused(400):
+        live.command("note", text=" ")
+    name = live.question()["trial"]["id"]
+    live.command("repeat")
+    again = live.until(lambda view: view["questions"] and view["trial"]["id"] != name)
+    with refused(409):
+        live.answer(again | {"trial": {"id": name}})
+    live.command("undo", reason="slipped")
+    live.command("void", reason="noise") if live.hub.state.pending and live.hub.state.pending.step is not None else None
+    live.answer(live.question())
+    live.command("void", reason="door slammed")
+    live.participant.post("/api/participant/break", {})
+    assert live.hub.state.paused == "participant"
+    live.command("resume")
+    live.command("abort", reason="fire alarm")
+    assert live.until(lambda view: view["phase"] == "ended")
+    with refused(409):
+        live.command("undo")
+    kinds = [event.kind for event in live.events()]
+    assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= set(kinds)
+    live.replays()
+    assert live.hub.state.notes[0][1] == "yawned"
+
+
+def test_void_and_undo_mean_the_trial_that_their_sender_saw(live):
+    live.begin()
+    live.answer()
+    view = live.until(lambda v: v["means"]["void"] and v["means"]["void"]["trial"] == 2, live.whole)
+    assert view["means"] == {"void": {"trial": 2, "name": "V2"}, "undo": {"trial": 1, "name": "V1"}}
+    live.answer()
+    live.until(lambda v: v["means"]["undo"]["trial"] == 2 and v["means"]["void"]["trial"] == 3, live.whole)
+    before = live.hub.state.trials[:2]
+    for what, trial, now in (("void", 2, "V3"), ("undo", 1, "V2"), ("void", 99, "V3")):
+        with refused(409, f"Meanwhile {now} has come"):
+            live.command(what, trial=trial, reason="noise")
+    assert live.hub.state.trials[:2] == before
+    with refused(400):
+        live.command("void", trial="2")
+    live.command("undo", trial=2, reason="slipped")
+    assert live.hub.state.trials[1].status == "undone"
+    assert live.events("undo")[0].data == {"id": 2, "reason": "slipped"}
+    again = live.until(lambda v: v["means"]["void"]["trial"] > 3, live.whole)["means"]["void"]["trial"]
+    live.command("void", trial=again, reason="noise")
+    assert live.hub.state.trials[again - 1].status == "void"
+
+
+def test_the_server_ends_and_goes_on_with_the_same_trial(tmp_path):
+    with Live(tmp_path) as live:
+        live.begin()
+        view = live.question()
+        sent = live.message(view)
+        live.participant.post("/api/participant/answer", sent)
+        live.until(lambda v: v["trial"] and v["trial"]["id"] != view["trial"]["id"])
+        live.question()
+        before = live.hub.state.pending.renderings
+    with Live(tmp_path) as live:
+        assert live.participant.post("/api/participant/answer", sent)["again"]
+        assert live.hub.state.pending.renderings == before
+        assert len(live.events("answer")) == 1
+
+
+def test_the_newest_window_of_a_participant_is_the_one_that_counts(live):
+    live.begin()
+    first, second = live.hub.watchers.add("participant", "one"), live.hub.watchers.add("participant", "two")
+    assert first.ended
+    assert "another window" in first.why
+    assert not second.ended
+    live.hub.watchers.remove(second)
+    assert live.question()
+
+
+def test_another_one_and_begin_at_the_end_of_the_warm_up(tmp_path):
+    blocks = (
+        Block("warm-up", 1, (Planned("best"), Planned("mid"))),
+        Block("validation", 1, (Planned("best", "mid"),)),
+    )
+    with Live(tmp_path, blocks=blocks) as live:
+        live.begin()
+        live.answer()
+        view = live.until(lambda v: v["phase"] == "ready")
+        assert view["may"] == {"begin": True, "more": True, "break": True}
+        live.participant.post("/api/participant/more", {})
+        live.answer(live.question())
+        assert not live.until(lambda v: v["phase"] == "ready")["may"]["more"]
+        live.participant.post("/api/participant/begin", {})
+        live.answer(live.question())
+        assert live.until(lambda v: v["phase"] == "done")

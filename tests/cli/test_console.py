@@ -1,0 +1,40 @@
+"""What the commands say while they work, and the folder that is whole or absent."""
+
+import pytest
+
+from hilbo.cli.console import _Pace, progress, results
+from hilbo.errors import InputError
+
+
+def test_work_that_goes_by_people_says_how_many_and_how_long():
+    pace = _Pace()
+    assert pace.line("reading", None, None, 0.0) == ("reading", True)
+    assert pace.line("people fitted", 100, 1100, 30.0) == ("100 of 1,100 people fitted", True)  # no pace yet
+    assert pace.line("people fitted", 200, 1100, 31.0) == ("200 of 1,100 people fitted, 0:09 left", False)
+    assert pace.line("people fitted", 300, 1100, 40.0) == ("300 of 1,100 people fitted, 0:40 left", True)
+    assert pace.line("people fitted", 1100, 1100, 41.0) == ("1,100 of 1,100 people fitted", False)
+    assert pace.line("people fitted", 100, 1100, 42.0)[0] == "100 of 1,100 people fitted"  # the next pass
+    assert pace.line("rows read", 50_000, None, 43.0) == ("50,000 rows read", True)
+
+
+def test_progress_goes_to_stderr_and_may_be_quiet(capsys):
+    with progress() as say:
+        say("people fitted", 2, 3)
+    with progress(quiet=True) as say:
+        say("silence")
+    out, err = capsys.readouterr()
+    assert out == "" and err.startswith("2 of 3 people fitted\ndone in ") and "silence" not in err
+
+
+def test_a_folder_is_whole_or_absent(tmp_path):
+    def failing():
+        with results(tmp_path / "out", False) as folder:
+            (folder / "result.json").write_text("{}")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        failing()
+    assert not list(tmp_path.iterdir())
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"), results(tmp_path / "file" / "out", False):
+        pass

@@ -1,0 +1,112 @@
+"""`hilbo identify` and `hilbo passivity` as a user types them."""
+
+import json
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from commands import run
+from material import FOAM, foam_tests
+
+from hilbo.report import material
+from hilbo.study.config import Study
+from hilbo.viscoelastic import FOSLS
+
+STUDY = "hilbo/data/paper.toml"
+
+
+def test_passivity_of_the_published_sets(capsys, monkeypatch):
+    set_a = ["passivity", "--K1", 5.58, "--B1", 7.88, "--alpha", 0.176, "--study", STUDY]
+    code, stdout, _ = run(capsys, monkeypatch, *set_a, "--json")
+    content = json.loads(stdout)
+    assert (code, content["status"]) == (0, "passive")
+    assert content["minimum_damping"] == pytest.approx(0.75981, abs=1e-5)
+    assert content["largest_K1"] == pytest.approx(6.867, abs=1e-3)
+    assert content["binding_frequency"] == pytest.approx(500)
+    code, stdout, _ = run(capsys, monkeypatch, *set_a, "--damping", 0.7)
+    assert stdout.startswith("violated: the device has 0.7 N·s/m, 0.05981 less than the 0.75981")
+    assert "creates" in stdout
+
+
+def test_an_even_number_of_taps_has_no_closed_form():
+    content = material.passivity_result(FOSLS(-3.0, 5.58, 7.88, 0.176, N=100), 0.95)
+    assert content["status"] in ("passive", "violated")
+    assert content["largest_K1"] is None and not content["every_K1"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["passivity", "--K1", "5"], "--B1 is missing"),
+        (["passivity", "--K1", "5", "--B1", "1", "--alpha", "1.5"], "alpha is 1.5"),
+        (["passivity", "--K1", "-5", "--B1", "1", "--alpha", "0.5"], "K1 is -5"),
+        (["passivity", "--K1", "5", "--B1", "1", "--alpha", "0.5", "--damping", "0"], "--damping is 0"),
+        (["passivity", "--K1", "5", "--B1", "1", "--alpha", "0.5", "--K0", "1", "--K-eff", "1"], "leave one out"),
+        (["passivity", "--K1", "5", "--B1", "1", "--alpha", "0.5", "--K0", "-9", "--memory", "full"], "0 or above"),
+        (["identify", "nothing.csv", "--out", "out"], "nothing.csv: cannot be read"),
+        (["identify", "t.csv", "--out", "out"], 't.csv:1: column "time" has no unit'),
+        (["identify", "t.csv", "--out", "out", "--memory", "long"], '--memory is "long"'),
+        (["identify", "t.csv", "--out", "out", "--T", "0"], "--T is 0"),
+    ],
+)
+def test_bad_input_ends_with_2_and_writes_nothing(capsys, monkeypatch, tmp_path, arguments, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.csv").write_text("test,time,x_mm,F_N\nrelaxation,0,0,0\n")
+    code, stdout, stderr = run(capsys, monkeypatch, *arguments)
+    assert (code, stdout) == (2, "")
+    assert words in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
+
+
+def write(tests, path):
+    parts = []
+    for test in tests:
+        pair = (test.input, test.output) if test.kind == "relaxation" else (test.output, test.input)
+        for repeat in range(test.repeats):
+            columns = {"test": test.kind, "repeat": repeat, "time_s": test.time}
+            parts.append(pd.DataFrame(columns | {"position_mm": pair[0][repeat], "force_N": pair[1][repeat]}))
+    pd.concat(parts).to_csv(path, index=False)
+
+
+@pytest.mark.deep
+def test_identify_writes_everything(capsys, monkeypatch, tmp_path):
+    write(foam_tests(6, noise=0.004, hold=0.5, seed=2), tmp_path / "foam.csv")
+    out = tmp_path / "out"
+    code, stdout, _ = run(
+        capsys, monkeypatch, "identify", tmp_path / "foam.csv", "--out", out, "--damping", 0.95, "--json"
+    )
+    assert code == 0
+    content = json.loads(stdout)
+    assert content == json.loads((out / "result.json").read_text())
+    for name, truth in zip(("K0", "K1", "B1", "alpha"), FOAM, strict=True):
+        row = content["parameters"][name]
+        assert row["status"] == "identified"
+        assert row["lower"] < truth < row["upper"]
+    assert [row["N"] for row in content["memory"]] == [2, 25, 101, 201, 1000, None]
+    assert content["renderer"] == (out / "renderer.toml").read_text()
+    text = Path(STUDY).read_text()
+    before, _, rest = text.partition("[renderer]")
+    study = Study.from_dict(tomllib.loads(before + content["renderer"] + rest[rest.index("[gp]") :]))
+    assert study.space.mechanics.K_eff == pytest.approx(0.44325, abs=2e-3)
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 5
+    assert "http://" not in page and "https://" not in page and "N·sᵅ/mm" in page
+    curves = pd.read_csv(out / "curves.csv")
+    assert np.abs(curves["mean"] - curves["fit"]).max() < 0.1
+
+
+@pytest.mark.deep
+def test_what_is_not_identifiable_has_words_instead_of_digits(capsys, monkeypatch, tmp_path):
+    out = tmp_path / "out"
+    arguments = ["identify", "hilbo/data/fish_muscle.csv", "--out", out, "--json"]
+    code, stdout, stderr = run(capsys, monkeypatch, *arguments)
+    assert code == 0
+    content = json.loads(stdout)
+    assert content["renderer"] is None
+    assert content["nrmse"]["modulus"] <= 0.023
+    unknown = [name for name, row in content["parameters"].items() if row["status"] != "identified"]
+    assert "K_eff" in unknown and all(content["parameters"][name]["value"] is None for name in unknown)
+    assert "bound of K_eff" in stderr
+    assert "not identifiable" in (out / "report.html").read_text()

@@ -1,0 +1,224 @@
+"""hilbo plan, export, participants, and aggregate from logs, as a user types them."""
+
+import json
+import sys
+
+import msgspec
+import pytest
+from live import Driver
+
+from hilbo import Study
+from hilbo.cli import main
+from hilbo.session.actions import Block
+from hilbo.session.event_log import EventLog, log_name
+from hilbo.session.plan import planned_header
+from hilbo.study.validation_table import read_sets, read_validation
+
+TOML = """\
+schema = 1
+[study]
+name = "plain"
+responses = ["different", "similar", "close"]
+[parameters.u]
+low = 0.0
+high = 1.0
+[parameters.v]
+low = 0.0
+high = 1.0
+[gp]
+theta = 10.0
+variance = 1.0
+thresholds = [-0.5, 0.5]
+noise = 0.5
+[selection]
+space_filling = 2
+trials = {trials}
+"""
+
+
+@pytest.fixture
+def hilbo(capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["hilbo", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stopped:
+            main.main()
+        captured = capsys.readouterr()
+        return stopped.value.code or 0, captured.out, captured.err
+
+    return run
+
+
+def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6))
+    study = Study.load("study.toml")
+    code, out, err = hilbo("plan", "study.toml", "--participants", 3, "--seed", 5, "--json")
+    plan = json.loads(out)
+    assert code == 0 and "complete blocks" in err and plan == json.loads((tmp_path / "plan.json").read_text())
+    assert [row["participant"] for row in plan["participants"]] == ["P01", "P02", "P03"]
+    assert planned_header(plan, study, "P02").seed == plan["participants"][1]["header"]["seed"]
+    code, _, err = hilbo("plan", "study.toml", "--participants", 3)
+    assert code == 2 and "plan.json: exists already" in err
+    assert hilbo("plan", "study.toml", "--reissue", "P02=P09")[0] == 0
+    changed = json.loads((tmp_path / "plan.json").read_text())
+    assert planned_header(changed, study, "P09").seed == planned_header(plan, study, "P02").seed
+    for again, sentence in (
+        ("P01", "write OLD=NEW"),
+        ("P01=", 'participant is ""'),
+        ("P01=P 10", 'participant is "P 10"'),
+        ("P02=P10", "has been reissued to P09"),
+    ):
+        code, _, err = hilbo("plan", "study.toml", "--reissue", again)
+        assert code == 2 and sentence in err
+        assert json.loads((tmp_path / "plan.json").read_text()) == changed
+    assert hilbo("plan", "study.toml", "--reissue", "P09=P10")[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ((), "give either --participants (how many) or --names"),
+        (("--participants", 2, "--kind", "dance"), '--kind is "dance"'),
+        (("--participants", 2, "--kind", "validation"), "give --from result.json"),
+        (("--participants", 2, "--kind", "validation", "--from", "none.json"), "none.json: cannot be read"),
+        (("--participants", 2, "--kind", "validation", "--from", "a", "--from", "b"), "once for each material (none"),
+        (("--names", "P1,P1"), "each once"),
+        (("--names", "P1", "--material", "foam"), "materials.foam is not in the study"),
+        (("--reissue", "P1=P2"), "is no plan that can be read"),
+        (("--reissue", "P1"), '--reissue is "P1"; write OLD=NEW'),
+        (("--names", "P01,P02,"), 'participant is ""; an id has'),
+        (("--names", "P 1"), 'participant is "P 1"; an id has'),
+        (("--participants", 2, "--seed", -1), "--seed"),
+        (("--participants", 2, "--seed", 2**31), "--seed"),
+    ],
+)
+def test_a_wrong_plan_is_one_sentence(hilbo, tmp_path, arguments, sentence):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6))
+    code, _, err = hilbo("plan", "study.toml", *arguments)
+    assert code == 2 and sentence in err and not (tmp_path / "plan.json").exists()
+
+
+def test_participants_are_listed_and_deleted(hilbo, tmp_path):
+    consent = ("--consent-time", "2026-05-04T10:00", "--protocol-number", "7")
+    assert hilbo("participants", "add", "participants.csv", "P01", *consent)[0] == 0
+    assert hilbo("participants", "add", "participants.csv", "P01", *consent)[0] == 2
+    code, _, err = hilbo("participants", "delete", ".", "P01")
+    assert code == 2 and "add --yes" in err and "P01" in (tmp_path / "participants.csv").read_text()
+    assert hilbo("participants", "add", "new/logs/participants.csv", "P02", *consent)[0] == 0
+    assert "P02" in (tmp_path / "new" / "logs" / "participants.csv").read_text()
+    (tmp_path / "file").write_text("")
+    code, _, err = hilbo("participants", "add", "file/participants.csv", "P01", *consent)
+    assert code == 2 and err.startswith("hilbo: file/participants.csv: cannot be written")
+    assert hilbo("participants", "delete", ".", "P01", "--yes")[0] == 0
+    assert "P01" not in (tmp_path / "participants.csv").read_text()
+
+
+def felt(point):
+    apart = ((point["u"] - 0.3) ** 2 + (point["v"] - 0.6) ** 2) ** 0.5
+    return "close" if apart < 0.2 else "similar" if apart < 0.4 else "different"
+
+
+def validation_log(folder, study, answered=True):
+    """A session of comparisons and nothing else."""
+    folder.mkdir()
+    driver = Driver("validation")
+    blocks = driver.header.blocks[1:]
+    driver.header = msgspec.structs.replace(driver.header, study=study.hash, blocks=blocks)
+    driver.state = type(driver.state).start(study, driver.header)
+    driver.step()
+    if answered:
+        driver.finish()
+    with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
+        for event in driver.events:
+            log.append(event)
+
+
+def logs_of(folder, study, people, trials, **facts):
+    """Sessions whose renderings a fake chooser found, and whose answers follow one rule."""
+    folder.mkdir()
+    for person in people:
+        driver = Driver()
+        blocks = (Block("optimisation", trials),)
+        seed = int(person[1:])
+        driver.header = msgspec.structs.replace(
+            driver.header, study=study.hash, participant=person, blocks=blocks, sets={}, seed=seed, **facts
+        )
+        driver.state = type(driver.state).start(study, driver.header)
+        driver.values = lambda trial, number: {"class_a": felt(trial.renderings["a"])}
+        driver.step()
+        driver.finish()
+        with EventLog.create(folder / log_name(driver.header), study, driver.header) as log:
+            for event in driver.events:
+                log.append(event)
+
+
+def test_an_export_says_how_many_dry_runs_it_leaves_out(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=3))
+    study = Study.load("study.toml")
+    logs_of(tmp_path / "logs", study, ["P01"], 3)
+    logs_of(tmp_path / "dry", study, ["P09"], 3, dry_run=True)
+    for path in (tmp_path / "dry").iterdir():
+        path.rename(tmp_path / "logs" / path.name)
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables")
+    assert code == 0 and "hilbo: logs: 1 dry run is left out." in err
+    assert not any("P09" in path.read_text() for path in (tmp_path / "tables").rglob("*.csv"))
+
+
+def test_a_folder_of_comparisons_alone_is_exported(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=3))
+    study = Study.load("study.toml")
+    validation_log(tmp_path / "logs", study)
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables")
+    assert code == 0, err
+    data = tmp_path / "tables" / "data"
+    assert len(read_validation(data / "study-plain_table-validation_data.csv", study.responses)) == 6
+    assert set(read_sets(data / "study-plain_table-sets_data.csv", ("u", "v")).index) == set("DEF")
+    assert not (tmp_path / "tables" / "trials.nc").exists()
+    validation_log(tmp_path / "begun", study, answered=False)
+    code, _, err = hilbo("export", "begun", "--study", "study.toml", "--out", "none")
+    assert code == 2 and "no answers that count" in err and not (tmp_path / "none").exists()
+
+
+@pytest.mark.deep
+def test_from_logs_to_a_validation_plan(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=20))
+    study = Study.load("study.toml")
+    people = ["P01", "P02", "P03"]
+    logs_of(tmp_path / "logs", study, people, 20)
+    assert hilbo("export", "logs", "--study", "study.toml", "--out", "tables")[0] == 0
+    table = "tables/data/study-plain_table-trials_data.csv"
+    for source, out in (("logs", "a"), (table, "b")):
+        code, _, err = hilbo("aggregate", source, "--study", "study.toml", "--out", out)
+        assert code == 0, err
+    assert (tmp_path / "a" / "result.json").read_bytes() == (tmp_path / "b" / "result.json").read_bytes()
+    assert (tmp_path / "a" / "optima.csv").read_bytes() == (tmp_path / "b" / "optima.csv").read_bytes()
+    given = ("--kind", "validation", "--from", "a/result.json", "--trials")
+    code, _, err = hilbo("plan", "study.toml", "--participants", 4, *given, "logs", "--out", "v.json")
+    assert code == 0, err
+    plan = json.loads((tmp_path / "v.json").read_text())
+    sets = plan["participants"][0]["header"]["sets"]
+    best = json.loads((tmp_path / "a" / "result.json").read_text())["optimum"]["parameters"]
+    assert sets["best"] == pytest.approx(best, abs=1e-6)
+    own = ("--names", "P01,P03", "--source", "individual", *given, table, "--out", "w.json")
+    code, _, err = hilbo("plan", "study.toml", *own)
+    assert code == 0, err
+    assert "P03 worst" in json.loads((tmp_path / "w.json").read_text())["participants"][1]["header"]["sets"]
+    code, _, err = hilbo("plan", "study.toml", "--names", "P01", *given, "logs", "--out", "x.json")
+    assert code == 2 and "invite people who are not" in err
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables", "--force")
+    assert code == 0, err
+
+
+def test_a_plan_of_one_material_or_of_all(hilbo, tmp_path):
+    materials = "[materials.foam]\n[materials.soft]\n[materials.hard]\n"
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6) + materials)
+    code, _, err = hilbo("plan", "study.toml", "--participants", 4, "--out", "all.json")
+    assert code == 0 and "balance is exact at multiples of 6 participants" in err
+    assert hilbo("plan", "study.toml", "--participants", 4, "--material", "soft", "--out", "one.json")[0] == 0
+    for name, count in (("all", 3), ("one", 1)):
+        plan = json.loads((tmp_path / f"{name}.json").read_text())
+        assert [len(row["header"]["blocks"]) for row in plan["participants"]] == [1 + count] * 4
+    given = ("--kind", "aggregate-best", "--from", "foam=a.json", "--from", "soft=b.json")
+    code, _, err = hilbo("plan", "study.toml", "--participants", 4, *given)
+    assert code == 2 and "once for each material (foam, soft, hard)" in err

@@ -1,0 +1,149 @@
+"""Maximum evidence against SciPy on the independent reference, the model's freedoms, and derivatives of an optimum."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from datasets import noisy, separated
+from reference_laplace import numpy_laplace
+from scipy.optimize import minimize
+
+from hilbo.errors import InputError
+from hilbo.hyperparameters import maximum_evidence as hyper
+from hilbo.hyperparameters.coordinates import log_prior
+from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo.study.aggregate import fit_cohort, population, population_optimum
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.robustness import robustness
+
+
+def problem(make=noisy):
+    d = make()
+    theta = float(np.mean(d.theta))
+    return d, OrdinalGP(RBF(theta, d.variance), OrdinalProbit(d.thresholds, d.noise)), Trials.from_arrays(d.x, d.q, 25)
+
+
+def test_the_maximum_is_scipys():
+    d, gp, trials = problem()
+    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("theta", "noise"), starts=2))(trials)
+
+    def cost(log):
+        return -numpy_laplace(d.x, d.q, np.exp(log[0]), d.variance, d.thresholds, np.exp(log[1]), d.x)["log_evidence"]
+
+    best = minimize(cost, np.log([float(gp.kernel.theta), d.noise]), method="Nelder-Mead", options={"fatol": 1e-9})
+    assert bool(learned.converged)
+    assert float(learned.log_evidence) == pytest.approx(-best.fun, abs=1e-4)
+
+
+def test_learnt_thresholds_stay_ordered_and_the_rest_stays():
+    _, gp, trials = problem(separated)
+    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("thresholds",), weak_priors=True, starts=1))(trials)
+    assert bool(jnp.all(jnp.diff(learned.gp.likelihood.thresholds) > 0))
+    assert learned.gp.kernel.theta == gp.kernel.theta
+    assert float(learned.log_evidence) >= float(fit(gp, trials).log_evidence) - 1e-9
+
+
+def test_the_scale_freedom_is_real_and_refused():
+    d, gp, trials = problem()
+    likelihood = OrdinalProbit(2.0 * gp.likelihood.thresholds, 2.0 * gp.likelihood.noise)
+    scaled = OrdinalGP(RBF(gp.kernel.theta, 4.0 * gp.kernel.variance), likelihood)
+    assert float(fit(scaled, trials).log_evidence) == pytest.approx(float(fit(gp, trials).log_evidence), rel=1e-12)
+    with pytest.raises(InputError, match="scale of the latent"):
+        hyper.maximise_evidence(gp, trials, ("variance", "noise", "thresholds"))
+    with pytest.raises(InputError, match='asked to learn "length"'):
+        hyper.maximise_evidence(gp, trials, ("length",))
+    del d
+
+
+@pytest.mark.parametrize("inference", ["laplace", "ep"])
+def test_without_answers_the_model_stays(inference):
+    _, gp, trials = problem()
+    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, inference=inference))(trials.first(0))
+    assert float(learned.log_evidence) == 0.0 and bool(learned.runaway)
+    assert learned.gp.kernel.theta == pytest.approx(float(gp.kernel.theta), rel=1e-12)
+    assert learned.gp.likelihood.noise == pytest.approx(float(gp.likelihood.noise), rel=1e-12)
+
+
+def test_the_prior_is_largest_at_its_centre():
+    _, gp, _ = problem()
+    every = ("theta", "noise", "thresholds")
+    assert float(log_prior(gp, gp, every)) == 0.0
+    away = eqx.tree_at(lambda g: g.likelihood.noise, gp, gp.likelihood.noise * np.e)
+    assert float(log_prior(away, gp, every)) == pytest.approx(-0.5)
+
+
+@pytest.fixture(scope="module")
+def checked():
+    study = Study.load("hilbo/data/paper.toml")
+    rng = np.random.default_rng(3)
+    x = study.space.candidates(60, 1)
+    goal = np.array([0.15, 0.25, 0.2])
+    felt = np.linalg.norm((x - goal) / [0.15, 0.4, 0.3], axis=1) + 0.3 * rng.standard_normal(60)
+    q = (felt < 1.8).astype(int) + (felt < 1.0)
+    trials = jax.tree.map(lambda *a: jnp.stack(a), *[Trials.from_arrays(x[i::3], q[i::3], 25) for i in range(3)])
+    cohort = Cohort(trials, np.zeros((3, 25, 3)), ("A", "B", "C"))
+    return study, cohort, robustness(study, cohort)
+
+
+@pytest.mark.deep
+def test_robustness_compares_optima(checked):
+    _, _, found = checked
+    assert float(found.nrmse) == pytest.approx(float(np.sqrt(np.mean((found.fixed.x - found.optimised.x) ** 2))))
+    assert found.individual_nrmse.shape == (3,)
+    assert bool(found.flagged) == (float(found.nrmse) >= 0.03)
+    assert found.learned.learn == ("theta", "noise", "thresholds")
+
+
+@pytest.mark.deep
+def test_robustness_is_that_of_the_studys_rule(checked):
+    study, cohort, found = checked
+    assert found.rule == "bcm" and found.shares == (None, None)
+    other = robustness(dataclasses.replace(study, rule="hierarchical"), cohort)
+    fixed, learnt = (float(share) for share in other.shares)
+    assert 0 < fixed < 1 and 0 < learnt < 1 and fixed != learnt
+    heights = population(found.posteriors, other.fixed.x[None, :], "hierarchical", other.shares[0])[0]
+    assert float(other.fixed.mean) == pytest.approx(float(heights[0]), rel=1e-10)
+    assert float(jnp.abs(other.fixed.mean - found.fixed.mean)) > 1e-3
+    for of, optimum in zip(other.maps(), (other.fixed, other.optimised), strict=True):
+        assert float(of(optimum.x[None, :])[0][0]) == pytest.approx(float(optimum.mean), rel=1e-10)
+
+
+@pytest.mark.deep
+def test_the_optimum_moves_as_its_derivative_says(checked):
+    study, cohort, found = checked
+    candidates = jnp.asarray(study.space.candidates(4096, 0))
+    step = 0.02
+
+    def optimum(log_noise):
+        changed = eqx.tree_at(lambda s: s.gp.likelihood.noise, study, jnp.exp(jnp.asarray(log_noise)))
+        return population_optimum(changed, fit_cohort(changed, cohort), candidates).x
+
+    middle = float(jnp.log(study.gp.likelihood.noise))
+    moved = (optimum(middle + step) - optimum(middle - step)) / (2 * step)
+    np.testing.assert_allclose(found.sensitivity["noise"], moved, atol=1e-3)
+
+
+@pytest.mark.deep
+def test_evidence_may_be_that_of_expectation_propagation():
+    _, gp, trials = problem()
+    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("noise",), starts=1, inference="ep"))(trials)
+    assert bool(learned.converged)
+    nearby = [
+        eqx.tree_at(lambda g: g.likelihood.noise, learned.gp, learned.gp.likelihood.noise * f) for f in (0.9, 1.1)
+    ]
+    for other in nearby:
+        assert float(fit(other, trials, inference="ep").log_evidence) < float(learned.log_evidence)
+    with pytest.raises(InputError, match="has no derivatives"):
+        hyper.maximise_evidence(gp, trials, inference="exact")
+
+
+def test_a_hyperparameter_without_influence_is_said_to_run_away():
+    _, gp, _ = problem()
+    single = Trials.from_arrays(np.full((1, 3), 0.4), np.array([1]), 25)
+    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("theta",), starts=1))(single)
+    assert bool(learned.converged)
+    assert bool(learned.runaway)

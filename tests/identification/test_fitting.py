@@ -1,0 +1,167 @@
+"""Fits of measured tests: curves against filters, parameters against the truth, bounds and bad input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from helpers import check_grad
+from material import FOAM, foam_tests, force, loads, position
+
+from hilbo.errors import InputError
+from hilbo.identification.fitting import Test, fit, nrmse
+from hilbo.identification.memory_selection import select_memory, smallest
+from hilbo.identification.sampled import Sampled
+from hilbo.viscoelastic import FOSLS
+
+ALONE = jnp.ones(1)
+
+
+@pytest.mark.parametrize("N", [1, 2, 101, 1000])
+@pytest.mark.parametrize("kind", ["relaxation", "creep"])
+def test_a_curve_is_that_of_the_filter(N, kind):
+    parameters = FOAM if N <= 101 else (0.44, *FOAM[1:])
+    test = next(t for t in foam_tests(N=N, parameters=parameters) if t.kind == kind)
+    model = Sampled(N)
+    found = model.predict(jnp.asarray(model.coordinates(*parameters)), model.prepare(test), ALONE)
+    np.testing.assert_allclose(found, test.output[0], rtol=0, atol=1e-11 * np.ptp(test.output))
+
+
+def test_full_memory_is_the_infinite_sum():
+    (t, x), (u, F) = loads()
+    exact = (0.44, 1.2, 3.0, 0.35)
+    longer = 6001  # more taps than samples: nothing is cut
+    K0 = exact[0]
+    for kind, time, put, out in (
+        ("relaxation", t, x, force(exact, x, longer)),
+        ("creep", u, F, position(exact, F, longer)),
+    ):
+        model = Sampled(memory="full")
+        q = jnp.asarray(model.coordinates(*exact))
+        assert q[1] == K0
+        found = model.predict(q, model.prepare(Test(kind, time, out[None], put[None])), ALONE)
+        np.testing.assert_allclose(found, out, rtol=0, atol=1e-11 * np.ptp(out))
+
+
+def test_an_equilibrium_before_the_first_row():
+    (t, x), _ = loads()
+    preload = x + 1.5
+    model = Sampled()
+    curve = model.prepare(Test("relaxation", t, force(FOAM, x)[None], preload[None], "equilibrium"))
+    found = model.predict(jnp.asarray(model.coordinates(*FOAM)), curve, ALONE)
+    expected = FOSLS(*FOAM).simulate(preload, start="equilibrium")
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+def test_times_between_samples_are_interpolated():
+    (t, x), _ = loads(hold=0.5)
+    F = force(FOAM, x)
+    times = np.sort(np.random.default_rng(0).uniform(0, 0.5, 50))
+    times[0] = 0.0
+    # The input has its corners at samples, so that nothing of it is lost.
+    knots = np.unique(np.concatenate([times, [0.02]]))
+    test = Test("relaxation", knots, np.interp(knots, t, F)[None], np.interp(knots, t, x)[None])
+    model = Sampled()
+    found = model.predict(jnp.asarray(model.coordinates(*FOAM)), model.prepare(test), ALONE)
+    np.testing.assert_allclose(found, np.interp(knots, t, F), atol=1e-10)
+
+
+def test_derivatives_of_a_curve():
+    model, creep = Sampled(25), foam_tests(hold=0.1)[1]
+    q, curve, pick = jnp.asarray(model.coordinates(*FOAM)), model.prepare(creep), jnp.arange(3, 200, 40)
+    check_grad(jax.jit(lambda q: model.predict(q, curve, ALONE)[pick]), q, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "kinds",
+    [
+        pytest.param(("relaxation",), marks=pytest.mark.deep),
+        pytest.param(("creep",), marks=pytest.mark.deep),
+        ("relaxation", "creep"),
+    ],
+)
+def test_without_noise_the_parameters_come_back(kinds):
+    tests = [test for test in foam_tests() if test.kind in kinds]
+    found = fit(tests, Sampled())
+    values = found.parameters()
+    assert found.solution.converged
+    assert [values[name] for name in ("K0", "K1", "B1", "alpha")] == pytest.approx(FOAM, rel=1e-6)
+    assert values["K_eff"] == pytest.approx(0.44325, abs=5e-6)
+    assert max(nrmse(found).values()) < 1e-9
+    assert not np.any(found.held())
+
+
+@pytest.mark.deep
+def test_full_memory_comes_back_from_its_recursion():
+    exact = FOSLS(0.44, 1.2, 3.0, 0.35, memory="full")
+    (t, x), (u, F) = loads()
+    tests = [
+        Test("relaxation", t, np.asarray(exact.simulate(x))[None], x[None]),
+        Test("creep", u, np.asarray(exact.simulate_force(F))[None], F[None]),
+    ]
+    values = fit(tests, Sampled(memory="full")).parameters()
+    # The recursion is a sum of ten exponentials, off by up to 1e-4 of the largest force.
+    assert [values[n] for n in ("K0", "K1", "B1", "alpha")] == pytest.approx((0.44, 1.2, 3.0, 0.35), rel=3e-3)
+    assert nrmse(fit(tests, Sampled(memory="full")))["relaxation"] < 1e-4
+
+
+@pytest.mark.deep
+def test_repeats_with_different_inputs_are_one_fit():
+    (t, x), _ = loads()
+    sizes = np.array([[0.8], [1.0], [1.3]])
+    test = Test("relaxation", t, sizes * force(FOAM, x), sizes * x)
+    assert fit([test], Sampled()).parameters()["K1"] == pytest.approx(5.70, rel=1e-6)
+
+
+@pytest.mark.deep
+def test_a_fit_that_runs_away_says_so():
+    (t, x), _ = loads()
+    spring = Test("relaxation", t, (0.8 * x + 1e-4 * np.sin(40 * t))[None], x[None])
+    found = fit([spring], Sampled())
+    assert np.any(found.held()) or not found.solution.converged or found.parameters()["K_inst"] < 0.81
+
+
+@pytest.mark.deep
+def test_the_smallest_memory_of_an_n_101_material():
+    rows = select_memory(foam_tests(), choices=(25, 101, None))
+    errors = {row.N: row.nrmse for row in rows}
+    assert max(errors[101].values()) < 1e-9
+    assert min(errors[25].values()) > 5e-4
+    best = smallest(rows)
+    assert best is not None and best.N == 25  # all are far below 4 %
+    assert smallest(rows, 1e-3).N == 101
+    assert smallest([row for row in rows if row.N != 101], 5e-4) is None  # full memory has no number of taps
+
+
+def of(kind="relaxation", points=50, **changes):
+    t = np.arange(points) * 1e-3
+    parts = {"time": t, "output": 1 + t[None], "input": np.ones((1, points))} | changes
+    return Test(kind, **parts)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: of(points=5), "5 points"),
+        (lambda: of(time=np.zeros(50)), "do not increase"),
+        (lambda: of(output=np.full((1, 50), np.nan)), "not finite"),
+        (lambda: of(output=np.ones((1, 50))), "does not change"),
+        (lambda: of(input=np.zeros((1, 50))), "is 0 throughout"),
+        (lambda: of(input=None), "needs the recorded input"),
+        (lambda: of("modulus"), "has no input"),
+        (lambda: Sampled(0), "N is 0"),
+        (lambda: Sampled(T=-1.0), "T is -1.0"),
+        (lambda: fit([], Sampled()), "no test to fit"),
+        (lambda: fit([of("modulus", input=None)], Sampled()), "cannot be fitted"),
+    ],
+)
+def test_bad_input_gets_one_sentence(make, words):
+    with pytest.raises(InputError, match=words):
+        make()
+
+
+def test_every_number_of_taps_is_the_same_compiled_function():
+    tests = foam_tests(hold=0.2)
+    one, other = (Sampled(N).at(tests) for N in (2, 101))
+    static = [eqx.partition(model, eqx.is_array)[1] for model in (one, other)]
+    assert static[0] == static[1]

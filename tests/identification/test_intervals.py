@@ -1,0 +1,146 @@
+"""Intervals against brute force: profiles by scipy, spectra by Toeplitz matrices, the bootstrap by refits."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from material import FOAM, foam_tests
+from scipy.linalg import toeplitz
+from scipy.optimize import brentq
+from scipy.optimize import least_squares as scipy_least_squares
+from scipy.stats import t as student
+
+from hilbo.errors import InputError
+from hilbo.identification import intervals
+from hilbo.identification.fitting import Fit, Test, fit, residuals
+from hilbo.identification.sampled import Sampled
+from hilbo.numerics.least_squares import Solution
+from hilbo.viscoelastic import FOSLS
+
+
+@pytest.fixture(scope="module")
+def found():
+    return fit(foam_tests(6, noise=0.004, rho=0.8, seed=1, hold=0.5), Sampled())
+
+
+@pytest.mark.deep
+def test_noise_is_recognised(found):
+    for part in intervals.noise(found):
+        assert int(part.order) >= 1
+        assert float(part.lag_one) == pytest.approx(0.8, abs=0.1)
+    sizes = [curve.time.size for curve in found.curves]
+    shares = [float(part.effective) / size for part, size in zip(intervals.noise(found), sizes, strict=True)]
+    assert shares == pytest.approx([1 / 9, 1 / 9], rel=0.5)  # (1 - 0.8)/(1 + 0.8)
+
+
+def test_a_filtered_product_is_that_with_the_autocovariance_matrix():
+    rng = np.random.default_rng(0)
+    slopes, a = rng.standard_normal((200, 3)), np.array([0.5, 0.2])
+    lags = [1.0, a[0] / (1 - a[1])]
+    for _ in range(198):
+        lags.append(a[0] * lags[-1] + a[1] * lags[-2])
+    innovation = 1 - a @ lags[1:3]
+    model = intervals.Noise(
+        jnp.asarray(2),
+        jnp.zeros(8).at[:2].set(a),
+        jnp.asarray(0.0),
+        jnp.asarray(0.0),
+        jnp.asarray(0.0),
+        jnp.asarray(innovation),
+    )
+    expected = slopes.T @ toeplitz(lags) @ slopes
+    np.testing.assert_allclose(intervals._filtered(jnp.asarray(slopes), model), expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("freedom", [5, 12, 100])
+def test_the_quantile_is_students(freedom):
+    assert float(intervals._student(1.959964, jnp.asarray(float(freedom)))) == pytest.approx(
+        student.ppf(0.975, freedom), rel=2e-2 if freedom == 5 else 2e-3
+    )
+
+
+@pytest.mark.deep
+def test_ends_of_a_profile_are_where_scipy_finds_them(found):
+    around, sides = intervals.spread(found), intervals.profile_intervals(found)
+    assert np.all(sides.found)
+    assert not np.any(sides.open_lower) and not np.any(sides.open_upper)
+    misfit = jax.jit(lambda q: residuals(found.model, found.curves, found.weights, q))
+    slopes = jax.jit(jax.jacfwd(misfit))
+    j, q = 3, np.asarray(found.q)
+
+    def rise(value):
+        whole = lambda p: jnp.asarray(np.insert(p, j, value))  # noqa: E731
+        best = scipy_least_squares(
+            lambda p: np.asarray(misfit(whole(p))),
+            np.delete(q, j),
+            jac=lambda p: np.delete(np.asarray(slopes(whole(p))), j, axis=1),
+            x_scale="jac",
+        )
+        return 2 * best.cost - float(found.solution.cost) - float(around.cut[j])
+
+    ends = brentq(rise, q[j] - 2, q[j], xtol=1e-4), brentq(rise, q[j], q[j] + 2, xtol=1e-4)
+    width = ends[1] - ends[0]
+    assert float(sides.lower[j]) == pytest.approx(ends[0], abs=3e-3 * width)
+    assert float(sides.upper[j]) == pytest.approx(ends[1], abs=3e-3 * width)
+    truth = found.model.coordinates(*FOAM)
+    assert np.all((sides.lower < truth) & (truth < sides.upper))
+
+
+@pytest.mark.deep
+def test_the_bootstrap_is_about_as_wide_as_the_profile(found):
+    sides = intervals.profile_intervals(found)
+    lower, upper = intervals.block_bootstrap(found, jax.random.key(0))
+    ratio = (upper - lower) / (sides.upper - sides.lower)
+    assert np.all((ratio > 0.4) & (ratio < 3))
+
+
+@pytest.mark.deep
+def test_influences_are_refits_to_first_order(found):
+    quick = intervals.block_bootstrap(found, jax.random.key(1), 100)
+    exact = intervals.block_bootstrap(found, jax.random.key(1), 100, exact=True)
+    width = np.asarray(quick[1] - quick[0])
+    np.testing.assert_array_less(np.abs(np.asarray(exact[0] - quick[0])), 0.25 * width)
+    np.testing.assert_array_less(np.abs(np.asarray(exact[1] - quick[1])), 0.25 * width)
+
+
+@pytest.mark.deep
+def test_white_noise_has_the_classical_cut():
+    found = fit(foam_tests(noise=0.01, hold=0.5, seed=3), Sampled())
+    around = intervals.spread(found)
+    m, p = sum(c.time.size for c in found.curves), 4
+    assert [int(part.order) for part in intervals.noise(found)] == [0, 0]
+    classical = student.ppf(0.975, m - p) ** 2 * float(found.solution.cost)
+    # Two curves of different length have weights of their own, so that the classical cut is met to first order.
+    assert np.asarray(around.cut) == pytest.approx(np.full(4, classical / m), rel=0.6)
+
+
+@pytest.mark.deep
+def test_what_differs_between_repeats_is_in_the_interval():
+    """Positions held an unknown part of a count beside where they are said to be: no residual shows it."""
+    truth, rng, inside = FOSLS(*FOAM).dc_gain(), np.random.default_rng(0), 0
+    tests = foam_tests(16, noise=1e-3, hold=0.3)
+    for _ in range(30):
+        scales = 1 + 1e-3 * rng.standard_normal((2, 16, 1))
+        moved = [Test(t.kind, t.time, t.output * s, t.input) for t, s in zip(tests, scales, strict=True)]
+        found = fit(moved, Sampled())
+        half = 2.04 * np.sqrt(intervals.spread(found).covariance[1, 1])  # Student's, of 30 degrees of freedom
+        inside += abs(float(found.q[1] - truth)) <= half
+    assert inside >= 26
+
+
+@pytest.mark.deep
+def test_what_the_data_do_not_tell_has_an_open_end():
+    """Half a second of one slow test: κ and α cannot be told apart from a slower, weaker branch."""
+    found = fit(foam_tests(noise=0.3, hold=0.1, seed=5), Sampled())
+    sides = intervals.profile_intervals(found)
+    assert np.any(sides.open_lower | sides.open_upper | ~sides.found)
+
+
+def test_too_few_repeats_have_no_bootstrap():
+    model, tests = Sampled(), foam_tests(repeats=4, hold=0.1)
+    curves, weights = tuple(model.prepare(t) for t in tests), (jnp.ones(4) / 4, jnp.ones(4) / 4)
+    q, nothing = jnp.zeros(4), jnp.asarray(0)
+    solution = Solution(q, jnp.asarray(0.0), jnp.eye(4), q, nothing, nothing > 0)
+    found = Fit(model, curves, solution, q, q, jnp.zeros(5), weights)
+    with pytest.raises(InputError, match="has 4 repeats"):
+        intervals.block_bootstrap(found, jax.random.key(0))

@@ -1,0 +1,92 @@
+"""Reading material tables: units, repeats, and one sentence for each mistake."""
+
+import numpy as np
+import pytest
+
+from hilbo.errors import InputError
+from hilbo.identification.material_tables import read_material
+
+ROWS = [("relaxation", r, 10 * i, 0.001 * min(i, 5), 1.0 + 1 / (i + r)) for r in (1, 2) for i in range(12)]
+HEAD = "test,repeat,time (ms),x [m],force_N"
+
+
+def table(tmp_path, head=HEAD, rows=ROWS):
+    path = tmp_path / "t.csv"
+    path.write_text("\n".join([head, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+def test_units_become_seconds_millimetres_and_newtons(tmp_path):
+    (test,), unit, notes = read_material(table(tmp_path))
+    assert (test.kind, test.repeats, test.time.size, unit, notes) == ("relaxation", 2, 12, "N/mm", ())
+    np.testing.assert_allclose(test.time, np.arange(12) * 0.01)
+    np.testing.assert_allclose(test.input[0], np.minimum(np.arange(12), 5))
+    np.testing.assert_allclose(test.output[1], 1 + 1 / (np.arange(12) + 2))
+
+
+@pytest.mark.parametrize(
+    ("head", "unit", "factor"),
+    [("t_s,G_kPa", "Pa", 1e3), ("time [min],modulus (MPa)", "Pa", 1e6), ("t (s),G [N/mm]", "N/mm", 1.0)],
+)
+def test_moduli_keep_their_own_system(tmp_path, head, unit, factor):
+    rows = [(1 + i, 20 - i) for i in range(10)]
+    (test,), found, _ = read_material(table(tmp_path, head, rows))
+    assert (test.kind, found) == ("modulus", unit)
+    np.testing.assert_allclose(test.output[0], factor * (20 - np.arange(10)))
+    assert test.time[0] == (60 if "min" in head else 1)
+
+
+def test_repeats_with_other_times_are_interpolated(tmp_path):
+    rows = [(*row[:2], row[2] + (3 if row[1] == 2 and row[2] else 0), *row[3:]) for row in ROWS]
+    (test,), _, notes = read_material(table(tmp_path, rows=rows))
+    assert "different times" in notes[0]
+    assert test.time.size == 12
+    assert test.output[1, 1] == pytest.approx(np.interp(10, [0, 13], [1.5, 1 + 1 / 3]))
+
+
+def test_a_part_of_a_table(tmp_path):
+    (test,), _, _ = read_material(table(tmp_path), longest=0.08)
+    assert test.time[-1] == 0.08
+    with pytest.raises(InputError, match='holds no test "creep"'):
+        read_material(table(tmp_path), only="creep")
+
+
+def changed(**cells):
+    rows = [list(row) for row in ROWS]
+    for column, value in cells.items():
+        rows[3][["test", "repeat", "time", "x", "force"].index(column)] = value
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("head", "rows", "words"),
+    [
+        (HEAD.replace(" (ms)", ""), ROWS, 't.csv:1: column "time" has no unit; write it like "time \\(s\\)"'),
+        (HEAD.replace("ms", "parsec"), ROWS, 'has the unit "parsec"'),
+        (HEAD.replace("force_N", "load"), ROWS, "found time, position"),
+        (HEAD.replace("test", "kind"), ROWS, 'column "test" is missing'),
+        (HEAD + ",F_N", [(*row, 1) for row in ROWS], 'columns "force_N" and "F_N" both are a force'),
+        (HEAD, changed(test="tension"), 't.csv:5: test is "tension"'),
+        (HEAD, changed(force="nan"), 't.csv:5: force_N is "nan"'),
+        (HEAD, changed(time=10), "t.csv:5: time does not increase"),
+        (HEAD, ROWS[:5], "t.csv: The relaxation test has 5 points"),
+        (HEAD, [], "has no rows"),
+        ("t_s,G_Pa", [(i, 5) for i in range(9)], "t.csv:2: time is not above 0"),
+        ("t_s,G_Pa", [(i + 1, 5) for i in range(9)], "does not change"),
+        ("t_s,G_Pa,J_1/Pa", [(1, 2, 3)], "put them into two tables"),
+        ("material," + HEAD, [(i % 2, *row) for i, row in enumerate(ROWS)], "choose one with --material"),
+    ],
+)
+def test_mistakes_have_a_place(tmp_path, head, rows, words):
+    with pytest.raises(InputError, match=words):
+        read_material(table(tmp_path, head, rows))
+
+
+def test_the_shipped_tables_are_read():
+    fish = read_material("hilbo/data/fish_muscle.csv")
+    assert (fish.tests[0].time.size, fish.stiffness_unit) == (566, "Pa")
+    foam = read_material("hilbo/data/memory_foam_simulated.csv")
+    assert [(test.kind, test.repeats, test.time.size) for test in foam.tests] == [
+        ("relaxation", 16, 301),
+        ("creep", 16, 601),
+    ]

@@ -1,0 +1,96 @@
+"""The hierarchical model from counts: against the dense model of every answer on its own."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
+from hilbo.errors import InputError
+from hilbo.population.counts import Counts, counts_of, evidence, fit_counts, one_person
+from hilbo.population.hierarchical import fit_people, of_people, population, shared_posterior
+from hilbo.population.hierarchical_evidence import learn_people
+
+GP = OrdinalGP(RBF(jnp.array([4.0, 2.0]), 1.5), OrdinalProbit((-0.5, 0.5), 0.5))
+
+
+def cohort(people=4, answers=12, points=7, seed=0):
+    """Everybody is asked at the same few points, some of them more often than others."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(size=(points, 2))
+    each = [
+        Trials.from_arrays(x[rng.integers(0, points, answers)], rng.integers(0, 3, answers), answers + 1)
+        for _ in range(people)
+    ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+
+def test_counts_count_every_answer():
+    trials = cohort()
+    found = counts_of(trials, 3)
+    mask = np.asarray(trials.mask)
+    assert float(found.counts.sum()) == mask.sum() and found.x.shape == (7, 2)
+    for person, point, category in ((0, 2, 1), (3, 5, 0)):
+        same = (np.asarray(trials.x[person]) == np.asarray(found.x[point])).all(axis=1) & mask[person]
+        answered = (np.asarray(trials.q[person])[same] == category).sum()
+        assert float(found.counts[person, point, category]) == answered
+
+
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_equals_the_model_of_every_answer(share):
+    trials = cohort()
+    dense = fit_people(GP, of_people(trials), share)
+    found = fit_counts(GP, jnp.asarray(share), counts_of(trials, 3))
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(9, 2)))
+    assert bool(found.certificate.converged)
+    np.testing.assert_allclose(found.log_evidence, dense.log_evidence, rtol=1e-12)
+    for a, b, c in zip(found.predict(x), population(dense, x), shared_posterior(dense).predict(x), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-11)
+        np.testing.assert_allclose(c, b, atol=1e-13)
+
+
+def test_the_evidence_has_the_derivatives_of_the_dense_one():
+    trials = cohort()
+    counts, together = counts_of(trials, 3), of_people(trials)
+    share = jnp.asarray(0.3)
+    found = jax.grad(lambda gp, p: evidence(gp, p, counts)[0], argnums=(0, 1))(GP, share)
+    dense = jax.grad(lambda gp, p: fit_people(gp, together, p, throw=False).log_evidence, argnums=(0, 1))(GP, share)
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(dense), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-8)
+
+
+def test_points_at_which_nobody_answered_change_nothing():
+    counts = counts_of(cohort(), 3)
+    more = Counts(
+        jnp.concatenate([counts.x, jnp.array([[0.5, 0.5], [0.1, 0.9]])]),
+        jnp.concatenate([counts.counts, jnp.zeros((4, 2, 3))], axis=1),
+    )
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(9, 2)))
+    one, other = (fit_counts(GP, jnp.asarray(0.6), c) for c in (counts, more))
+    np.testing.assert_allclose(other.log_evidence, one.log_evidence, rtol=1e-12)
+    for a, b in zip(other.predict(x), one.predict(x), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+@pytest.mark.deep
+def test_people_who_do_not_differ_are_one_person():
+    counts = counts_of(cohort(), 3)
+    one, other = fit_counts(GP, jnp.ones(()), counts), fit_counts(GP, jnp.asarray(0.4), one_person(counts))
+    np.testing.assert_allclose(fit_counts(GP, jnp.ones(()), one_person(counts)).log_evidence, one.log_evidence)
+    np.testing.assert_allclose(other.log_evidence, one.log_evidence, rtol=1e-12)  # one person's share is no matter
+
+
+@pytest.mark.deep
+def test_learning_reaches_a_maximum():
+    counts = counts_of(cohort(6, 30, 9, seed=2), 3)
+    found = learn_people(GP, counts, 0.7, tolerance=1e-12, max_steps=200)
+    assert bool(found.converged)
+    slopes = jax.grad(lambda gp, p: evidence(gp, p, counts)[0], argnums=(0, 1))(found.gp, found.share)
+    begin = evidence(GP, jnp.asarray(0.7), counts)[0]
+    assert found.log_evidence > begin
+    assert abs(float(slopes[1])) * float(found.share * (1 - found.share)) < 0.05
+
+
+def test_nobody_answered():
+    with pytest.raises(InputError, match="nobody gave an answer"):
+        counts_of(jax.tree.map(lambda leaf: leaf[None], Trials.empty(8, 2)), 3)

@@ -1,0 +1,123 @@
+"""The hierarchical model: against its own algebra by brute force, its limits, and people simulated from it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo.errors import InputError
+from hilbo.population.hierarchical import NEWCOMER, fit_people, learn_share, of_people, population
+
+GP = OrdinalGP(RBF(4.0, 1.0), OrdinalProbit((-0.5, 0.5), 0.5))
+
+
+def simulated(people, answers, share, seed=0):
+    """Answers of people whose functions are drawn from the model; stacked trials."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(size=(people * answers, 2))
+    person = np.repeat(np.arange(people), answers)
+    prior = np.exp(-4.0 * ((x[:, None] - x[None]) ** 2).sum(-1)) * np.where(person[:, None] == person, 1.0, share)
+    eigenvalues, vectors = np.linalg.eigh(prior)
+    f = vectors @ (np.sqrt(np.maximum(eigenvalues, 0)) * rng.normal(size=len(x)))
+    z = f + 0.5 * rng.normal(size=len(x))
+    q = (z > -0.5).astype(int) + (z > 0.5)
+    each = [Trials.from_arrays(x[person == j], q[person == j]) for j in range(people)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+
+def test_share_one_is_the_pooled_model():
+    trials = simulated(3, 8, 0.5)
+    mask = np.asarray(trials.mask)
+    pooled = fit(GP, Trials.from_arrays(np.asarray(trials.x)[mask], np.asarray(trials.q)[mask]))
+    together = fit_people(GP, of_people(trials), 1.0)
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
+    np.testing.assert_allclose(together.log_evidence, pooled.log_evidence, rtol=1e-12)
+    for a, b in zip(population(together, x), pooled.predict(x), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-11)
+
+
+def test_share_zero_is_everybody_alone():
+    trials = simulated(3, 8, 0.5)
+    alone = jax.vmap(lambda t: fit(GP, t, throw=False))(trials)
+    together = fit_people(GP, of_people(trials), 0.0)
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
+    np.testing.assert_allclose(together.log_evidence, jnp.sum(alone.latent.log_evidence), rtol=1e-12)
+    for j in range(3):
+        own = jax.tree.map(lambda leaf, j=j: leaf[j], alone).predict(x)
+        as_one = together.predict(jnp.concatenate([x, jnp.full((20, 1), float(j))], axis=1))
+        for a, b in zip(as_one, own, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-11)
+    mean, variance = population(together, x)
+    np.testing.assert_allclose(mean, 0.0, atol=1e-14)
+    np.testing.assert_allclose(variance, 0.0, atol=1e-14)  # of g, which is then nothing
+
+
+def test_a_newcomer_differs_from_the_population_by_their_own_function():
+    trials = of_people(simulated(4, 6, 0.5))
+    posterior = fit_people(GP, trials, 0.3)
+    x = jnp.asarray(np.random.default_rng(2).uniform(size=(9, 2)))
+    mean, variance = population(posterior, x)
+    new_mean, new_variance = posterior.predict(jnp.concatenate([x, jnp.full((9, 1), NEWCOMER)], axis=1))
+    np.testing.assert_allclose(new_mean, mean, rtol=1e-14)
+    np.testing.assert_allclose(new_variance, variance + 0.7, rtol=1e-13)
+
+
+def test_the_shared_function_by_brute_force():
+    """g at new points given the sites of the fit as normal observations, with the covariances written out."""
+    trials = of_people(simulated(3, 5, 0.5))
+    posterior = fit_people(GP, trials, 0.4)
+    mask = np.asarray(trials.mask)
+    x, person = np.asarray(trials.x)[mask][:, :2], np.asarray(trials.x)[mask][:, 2]
+    new = np.random.default_rng(3).uniform(size=(7, 2))
+
+    def k(a, b):
+        return np.exp(-4.0 * ((a[:, None] - b[None]) ** 2).sum(-1))
+
+    prior = k(x, x) * np.where(person[:, None] == person, 1.0, 0.4)
+    terms = [
+        GP.likelihood.expand(jnp.asarray(f), q)
+        for f, q in zip(posterior.latent.mode[mask], trials.q[mask], strict=True)
+    ]
+    slope, weight = (np.array([float(t[i]) for t in terms]) for i in (1, 2))
+    target = np.asarray(posterior.latent.mode)[mask] + slope / weight
+    solve = np.linalg.solve(prior + np.diag(1 / weight), np.c_[target, 0.4 * k(x, new)])
+    mean, variance = population(posterior, jnp.asarray(new))
+    np.testing.assert_allclose(mean, 0.4 * k(new, x) @ solve[:, 0], rtol=1e-9)
+    np.testing.assert_allclose(variance, 0.4 - np.sum(0.4 * k(new, x) * solve[:, 1:].T, axis=1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.9])
+def test_the_learnt_share_holds_the_true_one(share):
+    found = learn_share(GP, of_people(simulated(12, 25, share, seed=3)))
+    low, high = found.interval
+    assert bool(found.converged)
+    assert 0 <= low < share < high <= 1
+    if share < 0.5:  # a tenth of the variance is too little to be seen in 300 answers
+        assert float(found.against_one) > 10
+    assert float(found.interpolation_error) < 0.02
+
+
+def test_people_who_do_not_differ():
+    found = learn_share(GP, of_people(simulated(12, 25, 1.0, seed=4)))
+    assert float(found.interval[1]) > 0.99 and float(found.against_one) < 0
+
+
+def test_one_person_says_nothing_of_the_share():
+    found = learn_share(GP, of_people(simulated(1, 10, 0.5)))
+    np.testing.assert_allclose(found.log_evidence, found.log_evidence[0], rtol=1e-12)
+    np.testing.assert_allclose(found.interval, [0.025, 0.975], atol=1e-3)
+
+
+@pytest.mark.deep
+def test_the_curve_is_the_evidence_between_its_nodes():
+    trials = of_people(simulated(6, 10, 0.6))
+    found = learn_share(GP, trials)
+    for share in (0.013, 0.31, 0.77, 0.999):
+        at = np.interp(share, found.shares, found.log_evidence)
+        np.testing.assert_allclose(at, fit_people(GP, trials, share).log_evidence, atol=1e-4)
+
+
+def test_nobody_answered():
+    with pytest.raises(InputError, match="nobody gave an answer"):
+        of_people(jax.tree.map(lambda leaf: leaf[None], Trials.empty(8, 2)))

@@ -1,0 +1,89 @@
+"""The committee of full covariances: against the formula in 60 digits, and where it must be the pointwise one."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo.kernels import gram
+from hilbo.population.joint import joint_map
+from hilbo.study.aggregate import population
+
+GP = OrdinalGP(RBF(8.0, 1.7), OrdinalProbit((-0.5, 0.5), 0.5))
+
+
+def cohort(people=4, answers=6, dim=2, seed=0):
+    rng = np.random.default_rng(seed)
+    each = [Trials.from_arrays(rng.uniform(size=(answers, dim)), rng.integers(0, 3, answers), 8) for _ in range(people)]
+    trials = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    return jax.vmap(lambda t: fit(GP, t, throw=False))(trials)
+
+
+def one(posteriors, j):
+    return jax.tree.map(lambda leaf: leaf[j], posteriors)
+
+
+def joint_moments(posterior, x):
+    cross = gram(posterior.gp.kernel, x, posterior.trials.x)
+    known = posterior.latent.factor @ cross.T
+    return cross @ posterior.latent.weights, gram(posterior.gp.kernel, x, x) - known.T @ known
+
+
+def test_equals_the_formula():
+    posteriors = cohort()
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 2)))
+    found = joint_map(posteriors, x)
+    with mpmath.workdps(60):
+        prior = mpmath.matrix(np.asarray(gram(GP.kernel, x, x)).tolist())
+        precision, weighted = -3 * prior**-1, mpmath.zeros(5, 1)
+        for j in range(4):
+            mean, covariance = joint_moments(one(posteriors, j), x)
+            own = mpmath.matrix(np.asarray(covariance).tolist()) ** -1
+            precision += own
+            weighted += own * mpmath.matrix(np.asarray(mean).tolist())
+        expected = precision**-1
+        mean = np.array((expected * weighted).tolist(), float)[:, 0]
+        expected = np.array(expected.tolist(), float)
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found.root @ found.root.T, expected, rtol=1e-9, atol=1e-11)
+
+
+def test_one_point_is_the_pointwise_committee():
+    posteriors = cohort(people=7)
+    for x in jnp.asarray(np.random.default_rng(2).uniform(size=(6, 1, 2))):
+        found, (mean, variance) = joint_map(posteriors, x), population(posteriors, x)
+        np.testing.assert_allclose(found.mean, mean, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(found.variance, variance, rtol=1e-12)
+
+
+def test_one_person_is_that_person():
+    posteriors = cohort(people=1)
+    x = jnp.asarray(np.random.default_rng(3).uniform(size=(200, 2)))
+    mean, covariance = joint_moments(one(posteriors, 0), x)
+    found = joint_map(posteriors, x)
+    np.testing.assert_allclose(found.mean, mean, atol=1e-9)
+    np.testing.assert_allclose(found.root @ found.root.T, covariance, atol=1e-9)
+
+
+def test_people_who_know_nothing_leave_the_prior():
+    empty = jax.tree.map(lambda leaf: leaf[None], fit(GP, Trials.empty(8, 2)))
+    x = jnp.asarray(np.random.default_rng(4).uniform(size=(50, 2)))
+    found = joint_map(empty, x)
+    np.testing.assert_array_equal(found.mean, 0.0)
+    np.testing.assert_allclose(found.root @ found.root.T, gram(GP.kernel, x, x), atol=1e-12)
+
+
+def test_the_many_draws_of_the_map_have_its_moments():
+    posteriors = cohort()
+    x = jnp.asarray(np.random.default_rng(5).uniform(size=(30, 2)))
+    found = joint_map(posteriors, x)
+    draws = np.asarray(found.draw(jax.random.key(0), 40_000))
+    sd = np.sqrt(np.asarray(found.variance))
+    assert np.abs((draws.mean(axis=0) - np.asarray(found.mean)) / sd).max() < 4.5 / 200  # of 30 standard errors
+    np.testing.assert_allclose(draws.std(axis=0), sd, rtol=4.5 / np.sqrt(2 * 40_000))
+    shares = np.asarray(found.optima(jax.random.key(1), 40_000))
+    counted = np.bincount(draws.argmax(axis=1), minlength=30) / 40_000
+    assert shares.sum() == pytest.approx(1.0)
+    assert np.abs(shares - counted).max() < 4.5 * np.sqrt(0.5 / 40_000)

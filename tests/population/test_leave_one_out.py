@@ -1,0 +1,76 @@
+"""Predictions of people left out: calibration measures on answers of known probabilities, and who is left out."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
+from hilbo.errors import InputError
+from hilbo.population.leave_one_out import (
+    LeftOut,
+    calibration,
+    clustered,
+    influence,
+    integral_transform,
+    leave_one_out,
+    reliability,
+)
+from hilbo.population.maps import rule_map
+
+GP = OrdinalGP(RBF(4.0, 1.0), OrdinalProbit((-0.5, 0.5), 0.5))
+
+
+def calibrated(n=20_000, seed=0):
+    rng = np.random.default_rng(seed)
+    probabilities = rng.dirichlet([1.0, 2.0, 3.0], n)
+    q = (rng.uniform(size=n)[:, None] > np.cumsum(probabilities, axis=1)).sum(axis=1)
+    return LeftOut(np.repeat(np.arange(20), n // 20), q, probabilities)
+
+
+def test_the_transform_of_a_calibrated_prediction_is_uniform():
+    found = calibrated()
+    u = integral_transform(found.probabilities, found.q, 1)
+    assert np.abs(np.sort(u) - (np.arange(len(u)) + 0.5) / len(u)).max() < 1.63 / np.sqrt(len(u))  # Kolmogorov, 1 %
+    content = calibration(found)
+    assert content["central_95"] == pytest.approx(0.95, abs=4 * content["central_95_error"])
+    assert content["z2"] == pytest.approx(1.0, abs=4 * content["z2_error"])
+    assert max(abs(b["predicted"] - b["observed"]) for b in reliability(found)) < 0.03
+
+
+def test_a_prediction_that_is_too_sure_is_seen():
+    found = calibrated()
+    sharp = found.probabilities**3
+    sharp = LeftOut(found.person, found.q, sharp / sharp.sum(axis=1, keepdims=True))
+    assert calibration(sharp)["z2"] > 1.3 and calibration(sharp)["central_95"] < 0.93
+
+
+def test_errors_are_those_of_the_mean_of_clusters():
+    rng = np.random.default_rng(3)
+    values, person = rng.normal(size=60), np.repeat(np.arange(6), 10)
+    means = values.reshape(6, 10).mean(axis=1)
+    np.testing.assert_allclose(clustered(values, person), (means.mean(), means.std(ddof=1) / np.sqrt(6)), rtol=1e-12)
+
+
+def cohort(people=4):
+    rng = np.random.default_rng(0)
+    each = [Trials.from_arrays(rng.uniform(size=(5, 2)), rng.integers(0, 3, 5), 6) for _ in range(people)]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+
+def test_nobody_predicts_themselves():
+    trials = cohort()
+    found, maps = leave_one_out(GP, trials, "bcm")
+    assert found.probabilities.shape == (20, 3) and found.person.tolist() == np.repeat(np.arange(4), 5).tolist()
+    turned = jax.vmap(Trials)(trials.x, trials.q.at[2].set(2 - trials.q[2]), trials.mask)
+    other, _ = leave_one_out(GP, turned, "bcm")
+    mine = found.person == 2
+    np.testing.assert_allclose(other.probabilities[mine], found.probabilities[mine], rtol=1e-12)
+    assert np.abs(other.probabilities[~mine] - found.probabilities[~mine]).max() > 0.01
+    moved = influence(rule_map(GP, trials, "bcm"), maps, trials.x[0])
+    assert moved.shape == (4,) and (moved > 0).all()
+
+
+def test_two_people_are_too_few():
+    with pytest.raises(InputError, match="at least three are needed"):
+        leave_one_out(GP, cohort(2), "bcm")

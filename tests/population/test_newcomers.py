@@ -1,0 +1,155 @@
+"""A new person's answers are foretold from the map and from how people differ about it; what a map knows is told by
+its own variance without answers."""
+
+import dataclasses
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+from studies import plain
+
+from hilbo import Trials
+from hilbo.population.maps import RuleMap, point_rule
+from hilbo.population.pointwise import RULES
+from hilbo.report.figures import study as plotting_study
+from hilbo.study import analysis
+from hilbo.study.aggregate import fit_cohort, map_optimum, population
+from hilbo.study.batch_optimum import _apart, _optimum
+from hilbo.study.cohort import Cohort
+from hilbo.study.heterogeneity import in_place
+from hilbo.study.tolerance_intervals import _inside
+
+STUDY = plain()
+SHARE, PEOPLE = 0.4, 3
+
+
+@pytest.fixture(scope="module")
+def posteriors():
+    """Three people of four answers, and the same who said nothing."""
+    rng = np.random.default_rng(0)
+    x, q = rng.uniform(size=(PEOPLE, 4, 2)), rng.integers(0, 3, (PEOPLE, 4))
+    return {said: fit_cohort(STUDY, _cohort(x, q, np.full((PEOPLE, 4), said))) for said in (True, False)}
+
+
+def _cohort(x, q, mask):
+    trials = jax.vmap(Trials)(jnp.asarray(x), jnp.asarray(q, jnp.int32), jnp.asarray(mask))
+    return Cohort(trials, x, ("A", "B", "C"))
+
+
+def of_rule(rule, experts):
+    share = SHARE if rule == "hierarchical" else 1.0
+    return RuleMap(rule, "by points", experts, None, jnp.asarray(share), jnp.asarray(1.0))
+
+
+def chances(mean, variance):
+    """Ordinal probit with thresholds -0.5, 0.5 and noise 0.5, by scipy."""
+    below = norm.cdf((np.array([-0.5, 0.5]) - mean) / np.sqrt(0.5**2 + variance))
+    return np.diff(below, prepend=0.0, append=1.0)
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_map_without_answers_has_its_prior(posteriors, rule):
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 2)))
+    found = of_rule(rule, posteriors[False])
+    np.testing.assert_allclose(found.predict(x)[1], float(found.map_prior), rtol=1e-12)
+
+
+def test_class_probabilities_of_an_optimum_are_a_new_persons(posteriors):
+    found = of_rule("hierarchical", posteriors[True])
+    best = map_optimum(STUDY, found, jnp.asarray(STUDY.space.candidates(64, 0)))
+    mean, variance = (float(part[0]) for part in found.predict(best.x[None, :]))
+    np.testing.assert_allclose([best.mean, best.sd], [mean, np.sqrt(variance)], rtol=1e-10)
+    np.testing.assert_allclose(best.class_probabilities, chances(mean, variance + 1.0 - SHARE), rtol=1e-9)
+
+
+def test_a_stream_of_people_says_the_same():
+    people = SimpleNamespace(study=STUDY, share=SHARE)
+    for rule, apart in (("hierarchical", 1.0 - SHARE), ("average", 0.0)):
+        found = _optimum(STUDY, np.zeros(2), np.asarray(0.7), np.asarray(0.3), _apart(people, rule))
+        np.testing.assert_allclose(found.class_probabilities, chances(0.7, 0.3 + apart), rtol=1e-12)
+        assert float(found.sd) == pytest.approx(np.sqrt(0.3))
+
+
+def test_draws_of_tolerance_intervals_are_a_new_persons(posteriors):
+    """Between the means at which "close" leads for the map alone and for a new person about it."""
+    x = jnp.asarray(STUDY.space.candidates(400, 3))
+    means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors[True])
+    rows, share = jnp.arange(PEOPLE)[None, :], jnp.asarray(SHARE)
+    inside = np.asarray(_inside(STUDY, 3 * means, explained, jnp.ones(400), rows, "hierarchical", share))[0]
+    mean, variance = population(posteriors[True], x, "hierarchical", share)
+    expected, sure = (
+        np.array([chances(m, v + more).argmax() == 2 for m, v in zip(3 * mean, variance, strict=True)])
+        for more in (1.0 - SHARE, 0.0)
+    )
+    np.testing.assert_array_equal(inside, expected)
+    assert (expected != sure).any()
+
+
+def test_what_stands_in_place_of_a_map_is_said(posteriors):
+    """Of a rule that takes all answers at once, maps of fewer trials and of other people are merged otherwise."""
+    for rule in ("bcm", "average", "hierarchical"):
+        assert in_place(of_rule(rule, posteriors[True])) == "" and not list(_substitute(of_rule(rule, None)))
+    one = jax.tree.map(lambda leaf: leaf[0], posteriors[True])  # any posterior will do
+    for rule, how in (("hierarchical", "by the rule hierarchical point by point"), ("pooled", "by bcm")):
+        whole = RuleMap(rule, "exact", None, one, jnp.asarray(SHARE), jnp.asarray(1.0))
+        (words,) = _substitute(whole)
+        assert in_place(whole) == how and f"are merged {how}" in words and f"by the rule {rule} from" in words
+    share = jnp.asarray(SHARE)
+    assert point_rule("hierarchical", share) == ("hierarchical", share)
+    assert point_rule("bcm", share) == ("bcm", None) and point_rule("pooled", share) == ("bcm", None)
+
+
+def _substitute(found):
+    return analysis._substitute(SimpleNamespace(map=found))
+
+
+def test_maps_of_fewer_trials_are_merged_as_their_stars(monkeypatch):
+    from hilbo.report.figures import maps as plotting
+
+    def drawn(maps):
+        for of in maps.values():
+            of(None)
+        return plotting.Figure()
+
+    study = dataclasses.replace(STUDY, rule="hierarchical")
+    asked, cohort = [], _cohort(np.zeros((PEOPLE, 4, 2)), np.zeros((PEOPLE, 4)), np.ones((PEOPLE, 4), bool))
+    monkeypatch.setattr(plotting, "fit_cohort", lambda study, some: int(some.counts().max()))
+    monkeypatch.setattr(plotting, "population", lambda count, x, rule, share: asked.append((count, rule, float(share))))
+    monkeypatch.setattr(plotting, "maps_beside", lambda study, maps, optima: drawn(maps))
+    plotting.slices_after(study, cohort, np.zeros((2, 2)), [2, 4], of_rule("hierarchical", None))
+    assert asked == [(2, "hierarchical", SHARE), (4, "hierarchical", SHARE)]
+
+
+def test_readings_are_of_new_people(monkeypatch):
+    aggregate = SimpleNamespace(
+        optimum=SimpleNamespace(x=jnp.zeros(2)),
+        map=of_rule("hierarchical", None),
+        posteriors=None,
+        surface="the map",
+        newcomer=lambda x: (jnp.zeros(len(x)), jnp.full(len(x), 3.0)),
+    )
+    monkeypatch.setattr(analysis, "tolerance", lambda study, predict, x, name: predict)
+    monkeypatch.setattr(analysis, "tolerance_ends", lambda *args, **named: None)
+    read = analysis._read(STUDY, aggregate, 0)
+    assert all(found[0] is aggregate.newcomer for found in read.tolerances.values())
+    np.testing.assert_allclose(plotting_study._probabilities(read, jnp.zeros((1, 2)))[0], chances(0.0, 3.0), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("prior", "hatched"), [(0.1, True), (1.0, False)])
+def test_what_a_map_does_not_know_is_hatched(prior, hatched):
+    """A map whose variance is 0.09 everywhere knows nothing if that is 0.9 of its own prior's."""
+    drawn = []
+    axes = SimpleNamespace(contourf=lambda *args, **named: drawn.append(args))
+    plotting_study._hatch(
+        axes,
+        STUDY,
+        lambda x: (jnp.zeros(len(x)), jnp.full(len(x), 0.09)),
+        np.zeros(2),
+        None,
+        np.zeros((101, 101)),
+        prior,
+    )
+    assert bool(drawn) == hatched

@@ -1,0 +1,188 @@
+"""Results folders: numbers against the mechanics' golden ones, formats, pages that explain themselves."""
+
+import json
+from html.parser import HTMLParser
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray as xr
+from studies import answered, plain_study
+
+from hilbo.report import participants, results
+from hilbo.search.rendering import K0_range, margin_of, set_of
+from hilbo.study.aggregate import aggregate_cohort, population
+from hilbo.study.config import Study
+
+PAPER = Study.load("hilbo/data/paper.toml")
+SYSTEM_IDENTIFICATION = (5.70, 5.89, 0.203)
+AGGREGATE = (5.58, 7.88, 0.176)
+MEAN_OF_OPTIMA = (8.44, 10.28, 0.282)
+
+
+def unit(values):
+    return np.asarray(PAPER.space.to_unit(np.array(values)))
+
+
+def test_k0_is_measured_from_the_corner_of_the_box():
+    assert K0_range(PAPER.space) == pytest.approx(16.14, abs=0.005)
+
+
+@pytest.mark.parametrize(("values", "three", "with_K0"), [(AGGREGATE, 0.0393, 0.0352), (MEAN_OF_OPTIMA, 0.105, 0.112)])
+def test_misses_are_those_of_the_paper(values, three, with_K0):
+    found = results.misses(PAPER, unit(values), unit(SYSTEM_IDENTIFICATION))
+    assert found == pytest.approx((three, with_K0), abs=5e-4)
+
+
+def test_errors_by_search_range_are_those_of_the_paper():
+    for values, percent in ((AGGREGATE, (1.8, 0.4, 6.2, 2.8)), (MEAN_OF_OPTIMA, (13.1, 8.8, 13.7, 8.1))):
+        off = unit(values) - unit(SYSTEM_IDENTIFICATION)
+        K0 = [set_of(PAPER.space, unit(v))["K0"] for v in (values, SYSTEM_IDENTIFICATION)]
+        found = 100 * np.abs([(K0[0] - K0[1]) / K0_range(PAPER.space), *off])
+        np.testing.assert_allclose(found, percent, atol=0.06)
+
+
+def test_misses_of_many_points_are_those_of_each():
+    points = np.stack([unit(AGGREGATE), unit(MEAN_OF_OPTIMA)])
+    many = np.stack(results.misses(PAPER, points, unit(SYSTEM_IDENTIFICATION)), axis=1)
+    each = [results.misses(PAPER, x, unit(SYSTEM_IDENTIFICATION)) for x in points]
+    np.testing.assert_allclose(many, each, rtol=1e-12)
+
+
+def test_a_parameter_set_has_its_k0_and_margin():
+    assert set_of(PAPER.space, unit(AGGREGATE))["K0"] == pytest.approx(-3.19, abs=0.01)
+    assert margin_of(PAPER.space, unit(AGGREGATE)) == pytest.approx(0.95 - 0.75981, abs=1e-5)
+    assert margin_of(PAPER.space, unit(MEAN_OF_OPTIMA)) == pytest.approx(0.95 - 1.34159, abs=1e-5)
+
+
+def test_what_is_not_finite_is_null():
+    text = results.as_json({"a": [float("nan"), 1.0], "b": {"c": float("-inf"), "d": "NaN"}, "e": True})
+    assert json.loads(text) == {"a": [None, 1.0], "b": {"c": None, "d": "NaN"}, "e": True}
+
+
+@pytest.fixture(
+    scope="module", params=[pytest.param(1, marks=pytest.mark.deep), 2, pytest.param(4, marks=pytest.mark.deep)]
+)
+def written(request, tmp_path_factory):
+    """Study, aggregate, content and folder of a small study in one, two and four dimensions."""
+    study = plain_study(request.param)
+    aggregate = aggregate_cohort(study, answered(study))
+    folder = tmp_path_factory.mktemp(f"d{request.param}")
+    truth = np.full(request.param, 0.5) if request.param == 2 else None
+    content = results.write_results(study, aggregate, folder, truth=truth)
+    return study, aggregate, content, folder
+
+
+def test_the_content_is_what_stands_in_the_file(written):
+    study, aggregate, content, folder = written
+    assert json.loads((folder / "result.json").read_text()) == content
+    assert content["optimum"]["unit"] == aggregate.optimum.x.tolist()
+    assert set(content["optimum"]["parameters"]) == set(study.space.names)
+    assert sum(content["optimum"]["class_probabilities"].values()) == pytest.approx(1, abs=1e-12)
+    assert [p["trials"] for p in content["participants"]] == [6, 6]
+    assert (content["study"], content["warnings"]) == (study.hash, [])
+    assert {"hilbo", "jax", "jaxlib", "numpy", "python", "device", "dtype"} <= set(content["versions"])
+
+
+def test_the_map_is_the_population_s(written):
+    study, aggregate, _, folder = written
+    data = xr.load_dataset(folder / "map.nc", engine="h5netcdf")
+    names = list(data["mean"].dims)
+    assert names == list(study.space.names)[: 2 if study.space.dim > 3 else None]
+    corner = np.array(aggregate.optimum.x)
+    corner[: len(names)] = 0.0
+    mean, variance = population(aggregate.posteriors, jnp.asarray(corner)[None])
+    assert float(data["mean"].isel(dict.fromkeys(names, 0))) == pytest.approx(float(mean[0]), abs=1e-12)
+    assert float(data["variance"].isel(dict.fromkeys(names, 0))) == pytest.approx(float(variance[0]), abs=1e-12)
+    assert all(data[name].attrs["units"] == "mm" for name in names)
+    assert data.attrs["study"] == study.hash
+    for name in names:
+        assert data[name].values[[0, -1]].tolist() == [1.0, 10.0]
+
+
+class Page(HTMLParser):
+    """The tags of a page, which must be closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.images, self.heads, self.captions = [], [], 0, 0
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.images += [dict(attrs)] if tag == "img" else []
+        self.heads += tag == "th" and "scope" in dict(attrs)
+        self.captions += tag == "caption"
+        if tag not in ("img", "meta", "br", "link"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_is_whole_and_needs_nothing_else(written):
+    study, _, content, folder = written
+    text = (folder / "report.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert "<any & all>" not in text and "&lt;any &amp; all&gt;" in text
+    assert len(page.images) == (3 if study.space.dim == 1 else 4)
+    assert all(image["alt"] and image["src"].startswith("data:image/png;base64,") for image in page.images)
+    assert page.captions == 4 and page.heads > 10
+    assert "://" not in text and "<script" not in text and "nan" not in text.lower().replace("base64", "")[:2000]
+    assert ("truth" in text) == ("truth" in content)
+    assert study.hash in text and content["versions"]["jax"] in text
+
+
+def test_figures_are_png_and_svg(written):
+    study, _, _, folder = written
+    for name in ("map", "progress", "slices", *(["optima"] if study.space.dim > 1 else [])):
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert "</svg>" in (folder / f"{name}.svg").read_text()
+
+
+def test_a_failed_certificate_is_said_in_one_sentence():
+    study = plain_study(2)
+    aggregate = aggregate_cohort(study, answered(study))
+    failed = eqx.tree_at(lambda a: a.posteriors.certificate.converged, aggregate, jnp.array([True, False]))
+    content = results.result(study, failed, 0)
+    assert content["warnings"] == [
+        "The fit of P1 did not reach its tolerance, so that the results may be off by more than rounding;"
+        " see the certificates in result.json."
+    ]
+    from hilbo.report.page import results_page
+    from hilbo.report.participants import people_of
+
+    page = results_page(study, content, [], people_of(study, failed))
+    assert content["warnings"][0] in page and "committee" in page
+    other = results_page(study, content | {"rule": "hierarchical"}, [], people_of(study, failed))
+    assert "committee" not in other and "by the rule <code>hierarchical</code>" in other
+
+
+def test_many_participants_are_written_as_few():
+    names, x = [f"P{i}" for i in range(5)], np.random.default_rng(0).uniform(size=(5, 3)) * [1, 1, 0.1]
+    sets, margins = participants.parameter_sets(PAPER, x)
+    for j in range(5):
+        one = set_of(PAPER.space, x[j])
+        assert {name: values[j] for name, values in sets.items()} == pytest.approx(one, rel=1e-12)
+        assert list(sets) == list(one)
+        assert margins[j] == pytest.approx(margin_of(PAPER.space, x[j]), rel=1e-12)
+    optima = {"x": x, "mean": x[:, 0], "sd": x[:, 1], "class_probabilities": x}
+    certificate = {"residual": np.array([1.0, np.nan, 0, 0, 0]), "converged": np.ones(5, bool)}
+    people = participants.People(names, np.arange(5), certificate, PAPER.responses, optima, sets, margins)
+    content = {"rule": "bcm", "participants": people, "alternatives": {"a": {}}}
+    text = results.as_json(content)
+    listed = results.as_json(content | {"participants": list(people.entries())})
+    assert json.loads(text) == json.loads(listed)
+    assert json.loads(text)["participants"][1]["certificate"] == {"residual": None, "converged": True}
+    without = participants.People(names, np.arange(5), certificate, PAPER.responses, None, None, None)
+    assert next(without.entries())["optimum"] is None and without.table().empty
+
+
+def test_a_way_is_said_in_units_and_percent():
+    found = results.moved(PAPER, jnp.asarray(unit(AGGREGATE)), jnp.asarray(unit(SYSTEM_IDENTIFICATION)))
+    assert list(found["moved"]) == ["K0", "K1", "B1", "alpha"]
+    assert found["moved"]["B1"]["by"] == pytest.approx(7.88 - 5.89)
+    percents = [way["percent"] for way in found["moved"].values()]
+    np.testing.assert_allclose(np.abs(percents), (1.8, 0.4, 6.2, 2.8), atol=0.06)
+    assert found["nrmse"] == pytest.approx(0.0393, abs=5e-4)

@@ -1,0 +1,240 @@
+"""`hilbo report`: what it says of poor data and of the hypotheses, its tables, its figures and its page."""
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import arviz as az
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from commands import run
+from studies import paper_counts, plain
+
+from hilbo import Trials
+from hilbo.population.maps import RuleMap
+from hilbo.report.figures.study import individual_convergence
+from hilbo.report.hypotheses import Evidence, Hypothesis, _convergence, _materials
+from hilbo.report.study import _comparison, _shown, _tolerances
+from hilbo.report.study_figures import comparison_figures
+from hilbo.report.validation import validate
+from hilbo.study.aggregate import fit_cohort, population
+from hilbo.study.analysis import Progress, _counts, limits_of, settled
+from hilbo.study.cohort import Cohort
+from hilbo.study.inference_data import groups, predictive_shares, write_groups
+from hilbo.study.map_summary import tolerance
+from hilbo.study.tolerance_intervals import tolerance_ends
+
+
+def crowd(answers):
+    """A cohort of the plain study (two parameters) with these lists of (u, v, category)."""
+    longest = max(map(len, answers))
+    stacked = []
+    for rows in answers:
+        x, q = np.array([row[:2] for row in rows]).reshape(-1, 2), np.array([row[2] for row in rows], int)
+        stacked.append(Trials.from_arrays(x, q, longest))
+    trials = jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
+    physical = np.asarray(plain().space.to_physical(trials.x))
+    return Cohort(trials, physical, tuple(f"P{j}" for j in range(len(answers))))
+
+
+HILL = [(u, v, 2 - (abs(u - 0.4) > 0.2) - (abs(v - 0.5) > 0.25)) for u in (0.1, 0.4, 0.7) for v in (0.1, 0.5, 0.9)]
+
+
+def test_limits_are_named():
+    study = plain()
+    found = limits_of(study, crowd([HILL, HILL[:2], [(0.1, 0.1, 0)] * 6]))
+    assert found[0].startswith("Fewer than 5 answers were given by P1")
+    assert "between 2 and 9" in found[1] and 'P2 ("different")' in found[2]
+    assert "plans 25 trials; nobody has given more than 9" in found[3]
+    assert limits_of(study, crowd([HILL]))[0].startswith(
+        "P0 is the only participant: the population map is that person's own,"
+    )
+    shrunk = limits_of(dataclasses.replace(study, rule="rbcm"), crowd([HILL]))[0]
+    assert "own, shrunk towards the prior, and nothing" in shrunk
+
+
+@pytest.mark.parametrize(
+    ("errors", "expected"), [([0.5, 0.2, 0.04, 0.01, 0], 3), ([0.5, 0.5, 0.5, 0.5, 0], None), ([0.0] * 5, 1)]
+)
+def test_when_an_optimum_has_settled(errors, expected):
+    assert settled(np.arange(1, 6), np.array(errors, float)) == expected
+
+
+def test_who_stopped_early_has_not_converged_for_that():
+    """One moves until the end, one stays from trial 2 on, and one stops after a trial or two, still moving."""
+    ways = np.array([[0, 1, 2, 3, 4, 5], [0, 5, 5, 5, 5, 5], [0, 5, 5, 5, 5, 5]]).T / 10
+    progress = Progress(np.arange(1, 7), ways[:, 1:2], ways[:, :, None], np.array([6, 6, 2]))
+    assert progress.settled(0.05) == [None, 2, None]
+    assert np.isnan(progress.to_end()[1][2:, 2]).all() and np.isfinite(progress.to_end()[1][:, :2]).all()
+    assert set(_counts(crowd([HILL, HILL[:4], HILL[:7]]))) >= {4, 5, 7, 9}
+    (line,) = individual_convergence(plain(), crowd([HILL, HILL, HILL[:2]]), progress).axes[0].lines
+    np.testing.assert_allclose(line.get_ydata(), [50, 0, 15, 10, 5, 0], atol=1e-12)
+    one = jnp.ones(())
+    aggregate = SimpleNamespace(map=RuleMap("bcm", "by points", None, None, one, one))
+    for end, words in ((2, "1 of 3 individual optima"), (1, "1 of 2 individual optima")):
+        found = SimpleNamespace(
+            progress=progress._replace(ends=np.array([6, 6, end])),
+            cohort=SimpleNamespace(names=("A", "B", "C")),
+            aggregate=aggregate,
+        )
+        (item,) = _convergence(SimpleNamespace(found=found, reference=None))
+        assert item.side == "for" and words in item.text and "(for: one at least)" in item.text
+
+
+def test_other_materials_are_the_others():
+    """H1 to H3 are of the first material, and its figures are no evidence for H4."""
+    study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
+    optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.9, 0.5]]))
+    found = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
+    parts = {"found": found, "reference_name": "the truth"}
+    first, second, third = (
+        SimpleNamespace(name=name, validated=asked, reference=reference, **parts)
+        for name, asked, reference in (("A", None, np.zeros(2)), ("B", validated, np.full(2, 0.5)), ("C", None, None))
+    )
+    items = list(_materials([first, second, third]))
+    assert [item.text[0] for item in items] == ["B", "B", "C"] and [i.side for i in items] == ["for", "for", "open"]
+    assert items[0].text.endswith("(for: nearer than that).")
+    assert "76.6 % of the decided comparisons (20 ties;" in items[1].text
+    assert [item.side for item in _materials([first])] == ["open"]
+
+
+def test_measures_have_the_digits_that_answers_give():
+    head, rows = _shown(pd.DataFrame({"lapse_low": [0.12345], "trials": [25], "drift_high": [np.inf]}), digits=2)
+    assert (head, rows) == (["lapse low", "trials", "drift high"], [["0.12", "25", "∞"]])
+    row = dict(hyperparameters="fixed", parameter="u", draws_without=0.0, low_end="range", high_end="range")
+    row |= dict(low=1.0, high=12.346, low_from=1.0, low_to=1.2346, high_from=1.1, high_to=12.346)
+    _, ((*_, low, ends, _),) = _tolerances(pd.DataFrame([row]))
+    assert (low, ends) == ("12.35 (range)", "1.1 to 12")
+
+
+def test_verdicts_count_what_can_be_said():
+    def verdict(*sides):
+        return Hypothesis("H1", "", tuple(Evidence(side, "") for side in sides)).verdict
+
+    assert verdict("open") == "These data cannot say."
+    assert verdict("for", "open", "for") == "All that can be said (2 of 2) speaks for it."
+    assert verdict("for", "against", "open") == "1 of 2 items speak for it, 1 against."
+
+
+class Population(eqx.Module):
+    posteriors: object
+
+    def __call__(self, x):
+        return population(self.posteriors, x)
+
+
+@pytest.mark.deep
+def test_one_persons_tolerance_does_not_depend_on_the_draw():
+    """With one participant every bootstrap draw is the same map, and the ends are those of the exact interval."""
+    study, cohort = plain(), crowd([HILL * 3])
+    posteriors, x = fit_cohort(study, cohort), jnp.array([0.4, 0.5])
+    exact = tolerance(study, Population(posteriors), x, "v")
+    ends = tolerance_ends(study, posteriors, x, "v", draws=5)
+    assert ends.lost == 0.0 and ends.low[0] == ends.low[1] and ends.high[0] == ends.high[1]
+    width = 10 / 256  # of the grid, in the parameter's unit
+    assert 0 <= ends.low[0] - exact.low < 1.01 * width and 0 <= exact.high - ends.high[0] < 1.01 * width
+    two = crowd([HILL * 3, [(u, v, 0) for u, v, _ in HILL] * 3])
+    spread = tolerance_ends(study, fit_cohort(study, two), x, "v", draws=50)
+    assert spread.lost > 0.1  # draws of the second person alone have no interval
+
+
+def test_groups_are_what_arviz_reads(tmp_path):
+    study, cohort = plain(), crowd([HILL, HILL[:4]])
+    posteriors = fit_cohort(study, cohort)
+    found = groups(study, cohort, posteriors, draws=4000)
+    f = found["posterior"]["f"].values[0]
+    mean, variance = posteriors_at(posteriors)
+    np.testing.assert_allclose(f[:, 0].mean(axis=0), mean[0], atol=0.06)
+    np.testing.assert_allclose(f[:, 0].var(axis=0), variance[0], atol=0.06)
+    assert np.isnan(f[:, 1, 4:]).all() and (found["observed_data"]["response"].values[1, 4:] == -1).all()
+    observed, predicted = predictive_shares(found, 3)
+    assert observed.sum() == pytest.approx(1.0) and predicted.shape == (4000, 3)
+    write_groups(found, tmp_path / "inference.nc")
+    read = az.from_netcdf(tmp_path / "inference.nc", engine="h5netcdf")
+    assert {"posterior", "posterior_predictive", "observed_data", "log_likelihood", "constant_data"} <= set(
+        read.groups()
+    )
+    tree = xr.open_datatree(tmp_path / "inference.nc", engine="h5netcdf")
+    np.testing.assert_array_equal(tree["constant_data"]["u"].values[0], cohort.physical[0, :, 0])
+    tree.close()
+
+
+def posteriors_at(posteriors):
+    def one(posterior):
+        return posterior.predict(posterior.trials.x)
+
+    return tuple(np.asarray(part) for part in jax.lax.map(one, posteriors))
+
+
+@pytest.mark.deep
+def test_a_report_of_two_materials(capsys, monkeypatch, tmp_path):
+    table = pd.read_csv("hilbo/data/video_quality.csv", dtype=str)
+    table = table[table["participant"].isin(["V01", "V02", "V03", "V04"])].groupby("participant").head(15)
+    table["material"] = np.where(table["participant"].isin(["V01", "V02"]), "one", "two")
+    folder, out = tmp_path / "folder", tmp_path / "out"
+    folder.mkdir()
+    (folder / "study.toml").write_text(Path("hilbo/data/video_quality.toml").read_text())
+    table.to_csv(folder / "trials.csv", index=False)
+    pair = "participant,material,trial,set_a,set_b,class_a,class_b,preferred\n"
+    (folder / "validation.csv").write_text(pair + "".join(f"N{i},one,1,best,worst,good,bad,a\n" for i in range(4)))
+    code, stdout, _ = run(capsys, monkeypatch, "report", folder, "--out", out, "--exclude", "trials < 9", "--json")
+    assert code == 0
+    content = json.loads(stdout)
+    assert set(content["materials"]) == {"one", "two"} and "validation" in content["materials"]["one"]
+    assert [h["number"] for h in content["hypotheses"]] == ["H1", "H2", "H3", "H4"]
+    assert "No validation session compared renderings of two." in content["limits"]
+    for name in ("one", "two"):
+        for file in (
+            "table_I.csv",
+            "convergence.csv",
+            "tolerance.csv",
+            "people.csv",
+            "passivity.csv",
+            "inference.nc",
+            "map.nc",
+        ):
+            assert (out / name / file).stat().st_size
+        assert all((out / name / f"classes.{kind}").stat().st_size for kind in ("png", "svg"))
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2 * 9 + 1 and "http://" not in page
+    assert "Hypothesis 4" in page and "fair, good, excellent" in page
+    assert run(capsys, monkeypatch, "report", folder, "--out", out, "--force", "--exclude", "mood > 1")[0] == 2
+
+
+def test_the_comparison_of_rules_is_shown():
+    """From the content of `rule_comparison.compare`: a row for each rule, refused ones too, and two figures."""
+    scores = {
+        "negative_log_density": 1.1,
+        "negative_log_density_error": 0.1,
+        "central_95": 0.94,
+        "central_95_error": 0.01,
+    }
+    bins = [{"predicted": 0.1, "observed": 0.2}, {"predicted": 0.8, "observed": 0.7}]
+    found = scores | {
+        "method": "by points",
+        "z2": 1.2,
+        "covered": 0.5,
+        "optimum_sd": 0.2,
+        "optimum": {"u": 0.4, "v": 12.0},
+    }
+    found |= {"influence": {"A": 0.1, "B": 0.3}, "reliability": bins}
+    content = {
+        "rules": {"bcm": found, "hierarchical": found, "pooled": {"refused": "too many"}},
+        "recommendation": "Use bcm.",
+    }
+    shown = _comparison(content)
+    head, rows = shown["table"]
+    assert (
+        shown["words"] == "Use bcm."
+        and head[0] == "rule"
+        and [row[0] for row in rows] == ["bcm", "hierarchical", "pooled"]
+    )
+    assert "too many" in rows[2] and "–" in rows[2]
+    figures = comparison_figures(content)
+    assert set(figures) == {"comparison", "reliability"} and len(figures["comparison"][0].axes) == 2

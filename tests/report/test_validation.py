@@ -1,0 +1,101 @@
+"""`hilbo validate`: the paper's tables and the page, what few comparisons can say, and simulated judges."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+from commands import run
+from studies import paper_counts
+
+from hilbo import Study
+from hilbo.report.validation import p_words, safest, slug, validate, validation_figures
+from hilbo.simulation.simulate import PRESETS
+from hilbo.simulation.validation_sessions import sets_table, validation_table
+from hilbo.study.map_summary import Sets
+
+COLUMNS = ["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"]
+
+
+def test_validate_writes_the_papers_tables(capsys, monkeypatch, tmp_path):
+    table, out = tmp_path / "validation.csv", tmp_path / "results"
+    paper_counts(np.random.default_rng(1)).to_csv(table, index=False)
+    arguments = ["validate", table, "--study", "hilbo/data/paper.toml", "--out", out]
+    code, stdout, stderr = run(capsys, monkeypatch, *arguments, "--json")
+    assert (code, json.loads(stdout)) == (0, json.loads((out / "result.json").read_text()))
+    (foam,) = json.loads(stdout)["materials"]
+    assert (foam["material"], foam["participants"], foam["comparisons"]) == ("foam", 28, 624)
+    assert foam["confusion"]["best"] == {"close": 147, "similar": 11, "different": 2}
+    found = {number: {row["term"]: row["estimate"] for row in t["rows"]} for number, t in foam["tables"].items()}
+    printed = (found["II"]["Intercept"], found["III"]["Best"], found["III"]["Worst"], found["IV"]["Aggregate-Best"])
+    assert [round(v, 4) for v in printed] == [-2.5123, -4.1431, 2.9738, 0.9773]
+    page = (out / "report.html").read_text()
+    assert page.count("data:image/png;base64,") == 2 and "http" not in page
+    assert all(text in page for text in ("-2.5123", "4.9378", "-4.1431", "2.9738", "0.9773", "report the larger"))
+    assert pd.read_csv(out / "aggregate_best_people.csv")["wins"].sum() == 279
+    assert run(capsys, monkeypatch, *arguments)[0] == 2  # nothing is overwritten
+    assert "below the iid ones" in stderr
+
+
+def test_validate_refuses_in_one_sentence(capsys, monkeypatch, tmp_path):
+    table = tmp_path / "validation.csv"
+    table.write_text("participant,trial,set_a,set_b,class_a,class_b,preferred\nA,1,best,mid,splendid,similar,a\n")
+    code, _, stderr = run(
+        capsys, monkeypatch, "validate", table, "--study", "hilbo/data/paper.toml", "--out", tmp_path / "o"
+    )
+    assert code == 2 and 'validation.csv:2: class_a is "splendid"' in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["validation.csv"]
+
+
+def test_what_one_comparison_can_say():
+    table = pd.DataFrame([("A", 1, "best", "mid", "close", "different", "a")], columns=COLUMNS)
+    found = validate(table)
+    assert found.overall is None and found.people is None
+    assert any("Table III is missing" in text for text in found.tables.limits)
+    rows = safest(found.regressions()["II"]).set_index("term")
+    assert np.isposinf(rows.at["Best", "estimate"]) and np.isfinite(rows.at["Best", "low"])
+
+
+@pytest.mark.parametrize(("people", "few"), [(9, True), (14, False)])
+def test_what_is_shown_is_what_the_warning_says_to_report(people, few):
+    """Of few clusters the wider of the clustered and the wild bootstrap interval, as the table's own warning has it."""
+    answers = paper_counts(np.random.default_rng(1))
+    names = answers["participant"].unique()[:people]
+    table = validate(answers[answers["participant"].isin(names)]).regressions()["II"]
+    assert any("wild bootstrap interval" in words for words in table.warnings) == few
+    kinds = table.table[few | ~table.table["errors"].str.startswith("wild")]
+    widest = (kinds["high"] - kinds["low"]).groupby(kinds["term"]).max()
+    rows = safest(table).set_index("term")
+    np.testing.assert_array_equal(rows["high"] - rows["low"], widest[rows.index])
+    assert rows["errors"].str.startswith("wild").any() == few
+
+
+def test_ties_are_kept_apart():
+    found = validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
+    assert found.people["ties"].sum() == 20 and found.people["wins"].sum() == 279
+    assert found.overall["rate"].iloc[0] == pytest.approx(279 / 364)
+
+
+def test_a_pair_that_was_only_tied_is_drawn():
+    rows = [("A", 1, "best", "mid", "close", "similar", "tie"), ("A", 2, "mid", "worst", "similar", "different", "a")]
+    rows += [("B", 1, "mid", "worst", "similar", "different", "b")]
+    table = pd.DataFrame(rows, columns=COLUMNS)
+    assert set(validation_figures(validate(table, bootstrap=False))) == {"validation"}
+
+
+def test_words():
+    assert [p_words(p) for p in (0.0004, 0.0312, np.nan)] == ["< 0.001", "0.031", "–"]
+    assert slug("Medium (soft) silicone") == "medium-soft-silicone"
+
+
+def test_simulated_judges_prefer_what_is_nearer():
+    study = Study.load("hilbo/data/paper.toml")
+    truth = np.array([5.70, 5.89, 0.203])
+    near = study.space.to_unit(truth)
+    x = jnp.stack([jnp.asarray(near), jnp.asarray(near) + 0.1, jnp.array([0.05, 0.95, 0.9])])
+    sets = sets_table(study, Sets(x, jnp.zeros(3), jnp.ones(3)), np.asarray(x)[2:], ("P01",))
+    assert sets["set_id"].tolist() == ["best", "mid", "worst", "own-P01"] and sets["N"].eq(101).all()
+    found = validate(validation_table(study, PRESETS["paper"], sets, seed=3), sets.set_index("set_id"), bootstrap=False)
+    rates = found.tables.preferences.drop_duplicates(["set", "over"]).set_index(["set", "over"])["rate"]
+    assert rates["best", "worst"] > 0.8 and rates["mid", "worst"] > 0.8 and found.comparisons == 20 * 12 + 8 * 2

@@ -1,0 +1,149 @@
+"""Screening on a lattice and of any points: the same maximum as when nothing is skipped."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hilbo import acquisition
+from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo.search import lattice
+from hilbo.search.space import Mechanics, Parameter, SearchSpace
+from hilbo.search.space_lattice import lattice_of
+
+K1, B1, ALPHA = Parameter("K1", 1, 32), Parameter("B1", 0.001, 32), Parameter("alpha", 0.01, 0.99)
+SPACES = {
+    "mechanics": SearchSpace((K1, B1, ALPHA), Mechanics(K_eff=0.44, damping=0.95)),
+    "other order, damped": SearchSpace(
+        (ALPHA, K1, B1), Mechanics(K_eff=0.44, damping=0.95, effective_damping=(10.0, 80.0))
+    ),
+    "plane": SearchSpace((Parameter("a", 0, 1), Parameter("b", 0, 1))),
+}
+SCORES = [acquisition.UCB(0.7), acquisition.LogEI(0.3), acquisition.TopCategory(0.5, 0.5), acquisition.Mean()]
+each_space = pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
+
+
+@functools.cache
+def posterior(dim, seed=0):
+    rng = np.random.default_rng(seed)
+    x = rng.random((12, dim))
+    q = (np.linalg.norm(x - 0.4, axis=1) < 0.45).astype(int) + (np.linalg.norm(x - 0.4, axis=1) < 0.25)
+    gp = OrdinalGP(RBF(30.0, 1.0), OrdinalProbit((-0.5, 0.5), 0.5))
+    return fit(gp, Trials.from_arrays(x, q, 16))
+
+
+def known(posterior):
+    return posterior.gp.kernel, posterior.trials.x, posterior.latent.weights, posterior.latent.factor
+
+
+def every_point(found):
+    """All points of a lattice that may be chosen."""
+    usable = jnp.concatenate([found.inside, found.present])
+    points = found.points(*map(jnp.asarray, np.indices(usable.shape)))
+    return jnp.concatenate([points[usable], found.extra])
+
+
+@each_space
+@pytest.mark.parametrize("score", SCORES, ids=lambda s: type(s).__name__)
+def test_the_maximum_over_the_lattice_is_found_with_few_variances(space, score):
+    found, fitted = lattice_of(space, 16), posterior(space.dim)
+    highest, hopes, points = lattice.screen(*known(fitted), found, score)
+    everything = score(*fitted.predict(every_point(found)))
+    assert jnp.argmax(hopes) == 0 and hopes[0] == jnp.inf
+    np.testing.assert_allclose(highest, jnp.max(everything), rtol=1e-11)
+    mean, variance = fitted.predict(points[:1])
+    np.testing.assert_allclose(score(mean[0], variance[0]), highest, rtol=1e-9)
+
+
+@each_space
+@pytest.mark.parametrize("score", SCORES, ids=lambda s: type(s).__name__)
+def test_a_column_is_known_by_its_most_hopeful_point(space, score):
+    found, fitted = lattice_of(space, 12), posterior(space.dim)
+    _, hopes, points = lattice.screen(*known(fitted), found, score)
+    mean, variance = fitted.predict(points[1:])
+    value, bound = score(mean, variance), score.optimistic(mean, jnp.asarray(1.0))
+    searched = hopes[1:] > -jnp.inf
+    np.testing.assert_allclose(hopes[1:][searched], (0.8 * value + 0.2 * bound)[searched], rtol=1e-9, atol=1e-12)
+    usable = jnp.concatenate([found.inside, found.present])
+    everywhere = fitted.predict(found.points(*map(jnp.asarray, np.indices(usable.shape))).reshape(-1, space.dim))
+    every_hope = 0.8 * score(*everywhere) + 0.2 * score.optimistic(everywhere[0], jnp.asarray(1.0))
+    largest = jnp.max(jnp.where(usable, every_hope.reshape(usable.shape), -jnp.inf), axis=0)
+    columns = searched[: usable.shape[1]]
+    np.testing.assert_allclose(hopes[1:][: usable.shape[1]][columns], largest[columns], rtol=1e-9, atol=1e-12)
+
+
+def test_most_columns_get_no_variance():
+    space = SPACES["mechanics"]
+    found = lattice_of(space, 24)
+    hopes = lattice.screen(*known(posterior(3)), found, SCORES[0]).hopes
+    columns = found.inside.shape[1]
+    assert jnp.sum(hopes[1 : 1 + columns] > -jnp.inf) <= 96 < columns / 5
+
+
+@pytest.mark.parametrize("score", SCORES, ids=lambda s: type(s).__name__)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_the_maximum_over_any_points_is_found(score, dtype):
+    points = jnp.asarray(np.random.default_rng(1).random((3000, 3)), dtype)
+    fitted = posterior(3).astype(dtype)
+    values = lattice.screen_points(*known(fitted), points, score, 64)
+    everything = score(*posterior(3).predict(points.astype(jnp.float64)))
+    # A value above the true one's rounding below the maximum: in float32 the argmax may be a neighbour's.
+    assert everything[jnp.argmax(values)] >= jnp.max(everything) - (1e-5 if dtype is np.float32 else 1e-12)
+    assert jnp.sum(values > -jnp.inf) < 3000
+
+
+@pytest.mark.parametrize("score", SCORES, ids=lambda s: type(s).__name__)
+def test_optimistic_values_bound_the_score_and_rise_with_the_mean(score):
+    mean = jnp.linspace(-3.0, 3.0, 61)
+    bound = score.optimistic(mean, jnp.asarray(1.3))
+    assert jnp.all(jnp.diff(bound) >= 0)
+    for share in (1e-6, 0.1, 0.5, 0.9, 1.0):
+        assert jnp.all(score(mean, jnp.full_like(mean, 1.3 * share)) <= bound + 1e-13)
+
+
+@each_space
+def test_points_of_the_lattice_are_feasible_and_meet_the_wall(space):
+    found = lattice_of(space, 16)
+    points = every_point(found)
+    assert jnp.all(space.feasible(points))
+    outside = jnp.argwhere(~found.inside)
+    if space.mechanics is None:
+        assert len(outside) == 0 and len(points) == 16**space.dim
+        return
+    wrong = found.points(outside[:, 0], outside[:, 1])
+    assert not jnp.any(space.feasible(wrong))
+    w = space.to_box(found.extra)[:, space.names.index("K1")]
+    np.testing.assert_allclose(w, 1.0, rtol=1e-12)
+    assert len(w) > 50
+    last = found.present[-1]
+    ends = found.points(jnp.full(last.shape, 15 + len(found.ends)), jnp.arange(last.size))[last]
+    np.testing.assert_allclose(space.to_box(ends)[:, space.names.index("K1")], 1.0, rtol=1e-12)
+
+
+def test_a_smallest_distance_is_kept():
+    space, fitted = SPACES["mechanics"], posterior(3)
+    found = lattice_of(space, 12)
+    best = lattice.screen(*known(fitted), found, SCORES[0]).points[0]
+    _, hopes, points = lattice.screen(*known(fitted), found, SCORES[0], lambda x: jnp.sum((x - best) ** 2) >= 0.3**2)
+    assert jnp.all(jnp.linalg.norm(points[hopes > -jnp.inf] - best[None, :], axis=1) >= 0.3)
+
+
+def test_nothing_to_choose_is_no_start():
+    found = lattice_of(SPACES["mechanics"], 12)
+    highest, hopes, _ = lattice.screen(*known(posterior(3)), found, SCORES[0], lambda x: jnp.sum(x) < 0)
+    assert highest == -jnp.inf and jnp.all(hopes == -jnp.inf)
+
+
+def test_nodes_follow_the_length_scale():
+    assert [lattice.nodes_for(theta) for theta in (1e-3, 30.0, 1e5)] == [12, 25, 32]
+
+
+def test_a_kernel_is_the_product_of_its_coordinates():
+    rng = np.random.default_rng(0)
+    x, y = jnp.asarray(rng.random((4, 3))), jnp.asarray(rng.random((5, 3)))
+    for kernel in (RBF(30.0, 2.0), RBF((3.0, 10.0, 50.0), 2.0)):
+        factors = [kernel.along(i, x[:, i], y[:, i]) for i in range(3)]
+        whole = jax.vmap(lambda p, kernel=kernel: jax.vmap(lambda r: kernel(p, r))(y))(x)
+        np.testing.assert_allclose(2.0 * factors[0] * factors[1] * factors[2], whole, rtol=1e-14)

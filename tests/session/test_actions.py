@@ -1,0 +1,253 @@
+"""The fold of a session's events: whatever is done in whatever order, nothing answered is lost and replays agree."""
+
+import dataclasses
+import json
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from live import CHOOSER, KINDS, SETS, STUDY, Driver, header
+
+from hilbo.errors import InputError
+from hilbo.session import actions as live
+from hilbo.session.actions import Header, LiveSession, RefusedError
+from hilbo.session.views import experimenter_view, participant_view
+
+anything = st.lists(st.tuples(st.sampled_from(KINDS), st.integers(0, 1000)), max_size=60)
+
+
+def driven(kind, doings):
+    driver = Driver(kind)
+    driver.step()
+    for doing in doings:
+        driver.do(*doing)
+    return driver
+
+
+@given(st.sampled_from(("optimisation", "validation")), anything, st.integers(0, 1000))
+@settings(max_examples=150)
+def test_any_interleaving_replays_and_resumes_to_the_same_next_trial(kind, doings, cut):
+    driver = driven(kind, doings)
+    assert LiveSession.fold(STUDY, driver.header, driver.events) == driver.state
+    place = cut % (len(driver.events) + 1)
+    resumed = LiveSession.fold(STUDY, driver.header, driver.events[:place])
+    following = driver.events[place] if place < len(driver.events) else None
+    if following is not None and following.kind == "propose":
+        assert live.propose(resumed, CHOOSER, following.time) == following
+    for event in driver.events[place:]:
+        resumed = resumed.after(event)
+    assert resumed == driver.state
+
+
+@given(st.sampled_from(("optimisation", "validation")), anything)
+@settings(max_examples=150)
+def test_whatever_is_done_answers_stay_and_rules_hold(kind, doings):
+    driver = driven(kind, doings)
+    state = driver.state
+    for trial, values in driver.accepted.items():
+        assert state.trial(trial).values == values
+    for block in range(2):
+        assert len(state.answers(block)) <= state.quota(block)
+        planned = [t.planned for t in state.answers(block)]
+        assert len(set(planned)) == len(planned) or planned[0] is None
+    assert sum(t.status == "pending" for t in state.trials) <= 1
+    again = LiveSession.start(STUDY, driver.header)
+    for event in driver.events:
+        if event.kind == "propose":
+            gone = again.excluded(event.data["block"])
+            assert not any(rendering in gone for rendering in event.data["renderings"].values())
+        again = again.after(event)
+    keys = [(t.data["phase"], t.data["material"], t.number) for t in state.trials]
+    assert len(set(keys)) == len(keys)
+
+
+@given(st.sampled_from(("optimisation", "validation")), anything)
+@settings(max_examples=60)
+def test_every_session_comes_to_its_end_and_participants_learn_nothing(kind, doings):
+    driver = driven(kind, doings)
+    seen = [json.dumps(participant_view(driver.state))]
+    json.dumps(experimenter_view(driver.state), default=str)
+    driver.finish()
+    seen.append(json.dumps(participant_view(driver.state)))
+    if driver.state.aborted is None:
+        assert driver.state.screen == "done"
+    numbers = [repr(v) for t in driver.state.trials for r in t.renderings.values() for v in r.values()]
+    for text in seen:
+        assert not any(number in text for number in numbers)
+        assert not any(f'"{name}"' in text for name in (*SETS, "u", "v", "optimisation", "validation"))
+
+
+def to_first_answerable(kind="optimisation"):
+    driver = Driver(kind)
+    driver.step()
+    while driver.state.screen != "trial" or driver.state.pending.block != 1:
+        driver.do("go" if driver.state.screen == "ready" else "answer", 0)
+    return driver
+
+
+def test_an_answer_is_accepted_once():
+    driver = to_first_answerable()
+    trial = driver.state.pending
+    with pytest.raises(RefusedError, match="not been felt") as told:
+        live.answer(driver.state, trial.id, "x", {"class_a": "close"}, 1.0)
+    assert told.value.code == "unfelt"
+    driver.feel(trial)
+    driver.log(live.answer(driver.state, trial.id, "x", {"class_a": "close"}, 1.0, browser={"time": 3.5}))
+    assert live.answer(driver.state, trial.id, "x", {"class_a": "close"}, 2.0) is None
+    with pytest.raises(RefusedError, match="from another page") as told:
+        live.answer(driver.state, trial.id, "y", {"class_a": "similar"}, 2.0)
+    assert told.value.code == "answered"
+    assert driver.state.trial(trial.id).answered["browser"] == {"time": 3.5}
+
+
+@pytest.mark.parametrize(
+    ("values", "sentence"),
+    [
+        ({"class_a": "closer"}, "class_a must be one of different, similar, close"),
+        ({}, "has class_a, and nothing else"),
+        ({"class_a": "close", "preferred": "a"}, "has class_a, and nothing else"),
+        ("close", "has class_a, and nothing else"),
+        ({"class_a": ["close"]}, "class_a must be one of"),
+    ],
+)
+def test_what_is_no_answer_is_refused(values, sentence):
+    driver = to_first_answerable()
+    driver.feel(driver.state.pending)
+    with pytest.raises(RefusedError, match=sentence):
+        live.answer(driver.state, driver.state.pending.id, "x", values, 1.0)
+
+
+def test_undo_asks_the_same_rendering_again():
+    driver = to_first_answerable()
+    before = driver.state.pending.renderings
+    driver.do("answer", 2)
+    assert driver.state.pending.renderings != before
+    driver.do("undo", 0)
+    assert driver.state.pending.renderings == before
+    assert [t.status for t in driver.state.trials[-3:]] == ["undone", "dropped", "pending"]
+    with pytest.raises(RefusedError, match="is over"):
+        live.answer(driver.state, driver.state.trials[-2].id, "late", {"class_a": "close"}, 1.0)
+
+
+def test_a_hold_voids_what_has_begun_and_the_second_one_excludes_it():
+    driver = to_first_answerable()
+    point = driver.state.pending.renderings["a"]
+    driver.do("hold early", 0)
+    assert driver.state.pending.status == "pending" and driver.state.pending.renderings["a"] == point
+    driver.do("hold", 0)
+    assert driver.state.trials[-2].voided == {"by": "rule", "reason": "device: hold (speed)", "sides": ["a"]}
+    assert driver.state.pending.renderings["a"] == point
+    driver.do("hold", 0)
+    assert driver.state.pending.renderings["a"] != point
+    assert driver.state.excluded(1) == [point]
+
+
+def test_a_voided_answer_can_be_restored_until_its_place_is_filled():
+    driver = to_first_answerable()
+    trial = driver.state.pending.id
+    driver.do("answer", 0)
+    driver.do("void old", trial - 1)
+    assert driver.state.trial(trial).status == "void"
+    asked = driver.state.pending.renderings
+    driver.do("restore", trial - 1)
+    assert driver.state.trial(trial).status == "answered" and driver.state.pending.renderings != asked
+    driver.do("void old", trial - 1)
+    driver.finish()
+    with pytest.raises(RefusedError, match="has been filled"):
+        live.restore(driver.state, trial, 1.0)
+
+
+def test_a_pause_in_mid_trial_begins_the_trial_again():
+    driver = to_first_answerable("validation")
+    trial = driver.state.pending
+    for step in (0, 1):
+        driver.log(live.present(driver.state, trial.id, step, True, 1.0))
+    assert driver.state.pending.felt == {"a"}
+    driver.do("pause", 0)
+    assert driver.state.screen == "paused" and participant_view(driver.state)["screen"] == "paused"
+    driver.do("resume", 0)
+    again = driver.state.pending
+    assert (again.id, again.presentation, again.step, again.felt) == (trial.id, 2, None, frozenset())
+
+
+@pytest.mark.parametrize("steps", [1, 2, 4])
+def test_a_rendering_that_was_cut_off_by_a_pause_has_not_been_felt(steps):
+    driver = to_first_answerable("validation")
+    trial = driver.state.pending
+    for step in range(steps):
+        driver.log(live.present(driver.state, trial.id, step, True, 1.0))
+        if step + 1 < steps:
+            driver.log(live.present(driver.state, trial.id, step, False, 1.0))
+    assert driver.state.pending.unfinished
+    driver.do("pause", 0)
+    again = driver.state.pending
+    assert (again.presentation, again.step, again.felt) == (2, None, frozenset())
+    driver.do("resume", 0)
+    driver.feel(again)
+    assert not driver.state.pending.unfinished
+    driver.do("pause", 0)
+    driver.do("resume", 0)
+    assert driver.state.pending.presentation == 2  # felt whole: only the answer is missing
+
+
+def test_an_answered_trial_can_be_repeated_and_does_not_count():
+    driver = to_first_answerable()
+    trial = driver.state.pending
+    driver.do("answer", 0)
+    driver.do("answer", 1)
+    driver.do("again", trial.id - 1)
+    driver.do("answer", 2)
+    repeated = driver.state.pending
+    assert repeated.repeats == trial.id and repeated.renderings == trial.renderings
+    assert repeated.data["phase"] == "repeat"
+    driver.do("answer", 0)
+    driver.do("undo", 0)
+    assert driver.state.trial(repeated.id).status == "undone" and driver.state.pending.repeats is None
+    driver.do("answer", 0)
+    assert driver.state.pending.repeats == trial.id
+    driver.do("answer", 0)
+    assert len(driver.state.answers(1)) == 4
+    driver.finish()
+    assert len(driver.state.answers(1)) == 6
+
+
+def test_the_warm_up_goes_on_for_as_long_as_one_likes():
+    driver = Driver()
+    driver.step()
+    driver.do("answer", 0)
+    driver.do("answer", 0)
+    assert driver.state.screen == "ready" and participant_view(driver.state)["may"]["another"]
+    for _ in range(2):
+        driver.do("more", 0)
+        driver.do("answer", 0)
+    assert not participant_view(driver.state)["may"]["another"]
+    with pytest.raises(RefusedError, match="all renderings"):
+        live.more(driver.state, 1.0)
+    driver.do("go", 0)
+    assert driver.state.pending.block == 1
+
+
+def test_sides_come_in_the_order_of_the_trial():
+    driver = to_first_answerable("validation")
+    first, second = driver.state.pending, None
+    assert [show for show, _ in live.steps_of(driver.state, first)] == ["reference", "a", "neutral", "b"]
+    driver.do("answer", 0)
+    second = driver.state.pending
+    assert [show for show, _ in live.steps_of(driver.state, second)] == ["reference", "b", "neutral", "a"]
+    assert first.sets == second.sets
+
+
+def test_a_header_of_another_study_and_events_out_of_order_are_refused():
+    other = Header(**{f: getattr(header(), f) for f in Header.__struct_fields__} | {"study": "0" * 16})
+    with pytest.raises(InputError, match="belongs to a study of hash 0000"):
+        LiveSession.start(STUDY, other)
+    driver = Driver()
+    driver.step()
+    with pytest.raises(InputError, match="does not follow event 1"):
+        driver.state.after(driver.events[0])
+    with pytest.raises(InputError, match="does not know"):
+        driver.state.after(live.Event(seq=2, kind="dance", time=0.0, data={}))
+
+
+def test_states_are_records():
+    assert dataclasses.fields(LiveSession) and Driver().state.screen == "wait"

@@ -1,0 +1,173 @@
+"""Ask and tell: one compilation, the same points again, inside the passive set."""
+
+import json
+import subprocess
+import sys
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hilbo import Session, Study
+from hilbo.acquisition import UCB
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import Trials, fit
+from hilbo.session.ask_tell import physical_trials
+from hilbo.session.selection import design, next_point
+
+PAPER = "hilbo/data/paper.toml"
+
+
+def answer(study, point):
+    x = np.asarray(study.space.to_unit(np.array(list(point.values()))))
+    distance = np.linalg.norm(x - [0.15, 0.18, 0.2])
+    return "close" if distance < 0.1 else "similar" if distance < 0.3 else "different"
+
+
+def run(study, seed=3, trials=None):
+    session, asked = Session.start(study, seed=seed), []
+    while not session.done and (trials is None or len(asked) < trials):
+        asked.append(session.ask())
+        session = session.tell(answer(study, asked[-1]))
+    return session, asked
+
+
+@pytest.fixture(scope="module")
+def study():
+    return Study.load(PAPER)
+
+
+@pytest.fixture(scope="module")
+def finished(study):
+    return run(study)
+
+
+def test_a_whole_session_compiles_once(study, finished):
+    compiled = finished[0].step.compiled
+    assert compiled._cache_size() == 1
+    again = run(study, seed=4)[0]
+    assert again.step.compiled is compiled
+    again.best()
+    assert compiled._cache_size() == 1
+
+
+def test_warming_compiles_the_step_that_is_used(study, finished):
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["selection"] = {"trials": 8}
+    session = Session.start(Study.from_dict(raw))
+    session.warm().join()
+    assert session.step.compiled._cache_size() == 1
+    for _ in range(6):
+        session = session.tell("different")
+    assert session.step.compiled._cache_size() == 1
+
+
+def test_replay_gives_the_same_points_bit_for_bit(study, finished):
+    session, asked = finished
+    responses = [study.responses[q] for q in session.answers]
+    again = Session.replay(study, responses, seed=3)
+    np.testing.assert_array_equal(again.points, session.points)
+    halfway = Session.replay(study, responses[:12], seed=3)
+    assert halfway.ask() == asked[12]
+
+
+def test_replay_in_another_process_gives_the_same_points_bit_for_bit(study, finished):
+    session, asked = finished
+    responses = [study.responses[q] for q in session.answers[:9]]
+    code = (
+        "import jax, json, sys; jax.config.update('jax_enable_x64', True)\n"
+        "from hilbo import Session, Study\n"
+        f"s = Session.replay(Study.load('{PAPER}'), {responses!r}, seed=3)\n"
+        "print(json.dumps(s.ask()))"
+    )
+    done = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == asked[9]
+
+
+def test_every_point_is_feasible_and_the_session_ends(study, finished):
+    session, asked = finished
+    assert len(asked) == study.selection.trials
+    assert bool(jnp.all(study.space.feasible(study.space.to_unit(session.points))))
+    with pytest.raises(InputError, match="all 25 trials"):
+        session.ask()
+
+
+def test_the_best_point_is_feasible_and_better_than_every_asked_one(study, finished):
+    session = finished[0]
+    best = study.space.to_unit(np.array(list(session.best().values())))
+    posterior = session.posterior()
+    assert bool(study.space.feasible(best))
+    assert float(posterior.mean(best[None])[0]) >= float(posterior.mean(session.trials.x).max()) - 1e-6
+
+
+def test_the_best_point_is_the_means_whatever_chooses_trials(study, finished):
+    """Not the acquisition's, and as near to earlier trials as it likes to be."""
+    session, _ = finished
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["selection"] |= {"acquisition": "log_ei", "minimum_distance": 0.2}
+    other = Session.start(Study.from_dict(raw), seed=3)
+    for point, answered in zip(session.points, session.answers, strict=True):
+        other = other.tell(study.responses[answered], at=dict(zip(study.space.names, point.tolist(), strict=True)))
+    assert other.best() == pytest.approx(session.best(), rel=1e-4)
+
+
+def test_states_are_immutable(study):
+    session = Session.start(study, seed=3)
+    following = session.tell("close")
+    assert len(session.answers) == 0
+    assert len(following.answers) == 1
+
+
+def test_an_unknown_answer_is_refused(study):
+    with pytest.raises(InputError, match='"closer" is no answer'):
+        Session.start(study).tell("closer")
+
+
+def test_padding_is_only_padding(study, finished):
+    session = finished[0]
+    trials = physical_trials(study, session.points[:7], session.answers[:7], 25)
+    np.testing.assert_array_equal(trials.x[:7], physical_trials(study, session.points, session.answers, 25).x[:7])
+    np.testing.assert_allclose(trials.x[:7], study.space.to_unit(session.points[:7]), rtol=0, atol=4e-16)
+    assert int(trials.mask.sum()) == 7
+
+
+@pytest.mark.parametrize("kind", ["thompson", "top_category", "mean", pytest.param("log_ei", marks=pytest.mark.deep)])
+def test_other_acquisitions_choose_feasible_points(study, kind):
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["selection"] = {"acquisition": kind, "trials": 7}
+    session, asked = run(Study.from_dict(raw))
+    assert len(asked) == 7
+    assert bool(jnp.all(study.space.feasible(study.space.to_unit(session.points))))
+
+
+@pytest.mark.deep
+def test_a_smallest_distance_keeps_trials_apart(study):
+    raw = json.loads(study.content) | {"schema": 1}
+    raw["selection"] = {"minimum_distance": 0.2, "trials": 12}
+    session, _ = run(Study.from_dict(raw))
+    x = np.asarray(study.space.to_unit(session.points))
+    for n in range(5, 12):  # the space-filling trials come as they are
+        assert np.linalg.norm(x[:n] - x[n], axis=1).min() >= 0.2 - 1e-12
+
+
+def test_the_study_is_a_pytree_of_its_model_alone(study):
+    assert len(eqx.filter(study, eqx.is_array).gp.likelihood.thresholds) == 2
+
+
+def test_a_small_hill_is_found_beside_a_wide_plateau(study):
+    """Where nothing is known UCB is 0.7; nodes of the lattice beside this hill are lower, its top is higher."""
+    x = np.stack(
+        [
+            [0.238, 0.096, 0.005, 0.438, 0.081, 0.078, 0.075, 0.148, 0.000, 0.079],
+            [0.693, 0.571, 0.178, 0.878, 0.283, 0.560, 0.558, 0.545, 0.647, 0.471],
+            [0.457, 0.205, 0.990, 0.046, 0.508, 0.169, 0.163, 0.239, 0.170, 0.077],
+        ],
+        axis=1,
+    )
+    trials = Trials.from_arrays(x, np.array([0, 2, 0, 0, 0, 2, 1, 0, 0, 0]), study.selection.trials)
+    chosen = next_point(study, design(study, 0), trials, len(x))
+    hill = jnp.array([0.181, 0.666, 0.110])
+    at_choice, at_hill = UCB(0.7)(*fit(study.gp, trials).predict(jnp.stack([chosen, hill])))
+    assert study.space.feasible(hill) and at_hill > 0.701
+    assert at_choice > at_hill

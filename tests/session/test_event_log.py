@@ -1,0 +1,236 @@
+"""A session's log under everything that can happen to a file and to the process that writes it."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import zlib
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from live import CHOOSER, RAW, STUDY, Driver, header
+
+from hilbo import Study
+from hilbo.errors import InputError
+from hilbo.session import actions as live
+from hilbo.session.actions import Event, LiveSession
+from hilbo.session.event_log import EventLog, LogError, log_name, log_paths, read_log
+
+CHILD = """
+import sys
+sys.path[:0] = ["tests/support", "."]
+from live import STUDY, CHOOSER, Driver, header
+from hilbo.session import actions as live
+from hilbo.session.event_log import EventLog
+"""
+
+
+def drive(driver, rounds=9):
+    driver.step()
+    for number in range(rounds):
+        kind = "go" if driver.state.screen == "ready" else "answer"
+        driver.do(kind, number)
+    return driver
+
+
+@pytest.fixture(scope="module")
+def driven():
+    return drive(Driver())
+
+
+def write(path, driver):
+    with EventLog.create(path, STUDY, driver.header) as log:
+        for event in driver.events:
+            log.append(event)
+        assert log.state == driver.state
+    return path.read_bytes()
+
+
+def test_a_log_reads_back_and_goes_on(tmp_path, driven):
+    path = tmp_path / log_name(driven.header)
+    write(path, driven)
+    assert log_paths(tmp_path) == [path]
+    found, events, dropped = read_log(path, STUDY)
+    assert (found, events, dropped) == (driven.header, driven.events, "")
+    with EventLog.resume(path, STUDY) as log:
+        assert log.state == driven.state
+        log.append(live.note(log.state, "again: ü, \n, \u2028", 1e9 + 0.1))
+    assert read_log(path)[1][-1].data["text"] == "again: ü, \n, \u2028"
+    first = path.read_bytes().split(b"\n")[0]
+    assert b'"schema":1,"study":"' + STUDY.hash.encode() in first
+
+
+@given(st.integers(0, 10**9))
+@settings(max_examples=40)
+def test_a_log_cut_anywhere_resumes_to_the_same_next_trial(tmp_path_factory, driven, number):
+    folder = tmp_path_factory.mktemp("cut")
+    whole = write(folder / "whole.jsonl", driven)
+    cut = number % (len(whole) + 1)
+    path = folder / "cut.jsonl"
+    path.write_bytes(whole[:cut])
+    lines = whole[:cut].count(b"\n")
+    if lines == 0:
+        with pytest.raises(InputError, match="no whole first line"):
+            EventLog.resume(path, STUDY)
+        return
+    with EventLog.resume(path, STUDY) as log:
+        kept = driven.events[: lines - 1]
+        assert log.state == LiveSession.fold(STUDY, driven.header, kept)
+        assert bool(log.dropped) == (whole[:cut][-1:] != b"\n")
+        assert path.read_bytes() == whole[: whole[:cut].rfind(b"\n") + 1]
+        following = driven.events[lines - 1] if lines - 1 < len(driven.events) else None
+        if following is not None and following.kind == "propose":
+            assert live.propose(log.state, CHOOSER, following.time) == following
+        for event in driven.events[lines - 1 :]:
+            log.append(event)
+    assert path.read_bytes().split(b"\n")[1:] == whole.split(b"\n")[1:]
+
+
+@given(st.integers(0, 10**9), st.integers(1, 255))
+@settings(max_examples=80)
+def test_a_changed_byte_is_refused_with_its_line(tmp_path_factory, driven, number, change):
+    folder = tmp_path_factory.mktemp("damage")
+    content = bytearray(write(folder / "whole.jsonl", driven))
+    place = number % (len(content) - 1)  # the very last newline away is a torn line
+    line = content[:place].count(b"\n") + 1
+    content[place] ^= change
+    path = folder / "damaged.jsonl"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"damaged\.jsonl:{line}: "):
+        EventLog.resume(path, STUDY)
+    assert path.read_bytes() == content
+
+
+def test_missing_swapped_and_forged_lines_are_refused(tmp_path, driven):
+    lines = write(tmp_path / "whole.jsonl", driven).splitlines(keepends=True)
+    path = tmp_path / "log.jsonl"
+    for changed in (lines[:3] + lines[4:], [*lines[:3], lines[4], lines[3], *lines[5:]], lines[1:]):
+        path.write_bytes(b"".join(changed))
+        with pytest.raises(InputError, match=r"does not follow|is no header"):
+            read_log(path)
+    body = lines[5].rpartition(b',"crc"')[0].replace(b'"time":', b'"time":1')
+    lines[5] = body + b',"crc":"%08x"}\n' % zlib.crc32(body)
+    path.write_bytes(b"".join(lines))
+    with pytest.raises(InputError, match=r"log\.jsonl:7: does not follow"):
+        read_log(path)
+
+
+def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driven):
+    path = tmp_path / "log.jsonl"
+    write(path, driven)
+    other = Study.from_dict(RAW | {"gp": RAW["gp"] | {"theta": 11.0}})
+    with pytest.raises(InputError, match="is the log of another study"):
+        EventLog.resume(path, other)
+    with pytest.raises(InputError, match="exists already"):
+        EventLog.create(path, STUDY, driven.header)
+    with EventLog.resume(path, STUDY):
+        with pytest.raises(InputError, match="written by another hilbo"):
+            EventLog.resume(path, STUDY)
+        code = CHILD + f"EventLog.resume({str(path)!r}, STUDY)"
+        run = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+        assert "written by another hilbo" in run.stderr
+    EventLog.resume(path, STUDY).close()  # and is free again
+    with pytest.raises(InputError, match="cannot be opened"):
+        EventLog.resume(tmp_path / "none.jsonl", STUDY)
+    for content, sentence in ((b"", "no whole first line"), (b"participant,trial\n", "is damaged")):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=sentence):
+            read_log(path)
+
+
+def test_an_event_that_does_not_follow_is_not_written(tmp_path, driven):
+    path = tmp_path / "log.jsonl"
+    with EventLog.create(path, STUDY, driven.header) as log:
+        size = path.stat().st_size
+        with pytest.raises(InputError, match="does not follow"):
+            log.append(driven.events[3])
+        assert path.stat().st_size == size
+
+
+FULL = """
+import resource, signal, os
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+path = sys.argv[1]
+driver = Driver()
+log = EventLog.create(path, STUDY, driver.header)
+resource.setrlimit(resource.RLIMIT_FSIZE, (os.path.getsize(path) + 5000, resource.RLIM_INFINITY))
+try:
+    while True:
+        log.append(live.note(log.state, "x" * 300, 1.0))
+        print(log.state.seq, flush=True)
+except Exception as error:
+    print(type(error).__name__, error)
+resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+log.append(live.note(log.state, "space again", 2.0))
+print(log.state.seq)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="limits of POSIX")
+def test_a_full_disk_is_one_sentence_and_loses_nothing(tmp_path):
+    path = tmp_path / "log.jsonl"
+    command = [sys.executable, "-W", "ignore", "-c", CHILD + FULL, str(path)]
+    run = subprocess.run(command, capture_output=True, text=True, check=True)
+    *told, sentence, last = run.stdout.splitlines()
+    assert sentence.startswith("LogError") and "free some space" in sentence
+    assert int(last) == int(told[-1]) + 1 and int(told[-1]) > 5
+    _, events, dropped = read_log(path, STUDY)
+    assert dropped == "" and [event.seq for event in events] == list(range(1, int(last) + 1))
+    assert events[-1].data["text"] == "space again"
+
+
+def test_a_failing_fsync_acknowledges_nothing(tmp_path, driven, monkeypatch):
+    path = tmp_path / "log.jsonl"
+    with EventLog.create(path, STUDY, driven.header) as log:
+        log.append(driven.events[0])
+        state, size = log.state, path.stat().st_size
+
+        def fails(file):
+            raise OSError(5, "Input/output error")
+
+        monkeypatch.setattr(os, "fsync", fails)
+        with pytest.raises(LogError, match="Input/output error"):
+            log.append(driven.events[1])
+        assert log.state is state and path.stat().st_size == size
+        monkeypatch.undo()
+        log.append(driven.events[1])
+    assert read_log(path)[1] == driven.events[:2]
+
+
+KILLED = """
+log = EventLog.resume(sys.argv[1], STUDY)
+while True:
+    log.append(live.note(log.state, "x" * (log.state.seq % 977), float(log.state.seq)))
+    print(log.state.seq, flush=True)
+"""
+
+
+@pytest.mark.deep
+@pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
+def test_kill_9_while_appending_loses_nothing_acknowledged(tmp_path):
+    path = tmp_path / "log.jsonl"
+    EventLog.create(path, STUDY, header()).close()
+    rng, acknowledged = random.Random(0), 0
+    for _ in range(12):
+        command = [sys.executable, "-W", "ignore", "-c", CHILD + KILLED, str(path)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as child:
+            assert child.stdout is not None
+            for _ in range(rng.randrange(1, 200)):
+                acknowledged = int(child.stdout.readline())
+            child.send_signal(signal.SIGKILL)
+            rest = [line for line in child.stdout.read().splitlines(keepends=True) if line.endswith("\n")]
+            acknowledged = int(rest[-1]) if rest else acknowledged
+        _, events, _ = read_log(path, STUDY)
+        assert [event.seq for event in events] == list(range(1, len(events) + 1))
+        assert len(events) in (acknowledged, acknowledged + 1)
+
+
+def test_numbers_survive_a_log_bit_for_bit(tmp_path):
+    values = [0.1, 1 / 3, 5e-324, 1.7976931348623157e308, -0.0, 123456789.123456789]
+    path = tmp_path / "log.jsonl"
+    with EventLog.create(path, STUDY, header()) as log:
+        log.append(Event(seq=1, kind="device", time=0.1 + 0.2, data={"condition": "ready", "trial": None, "v": values}))
+    (event,) = read_log(path)[1]
+    assert event.time == 0.1 + 0.2 and list(map(repr, event.data["v"])) == list(map(repr, values))

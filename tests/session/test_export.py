@@ -1,0 +1,238 @@
+"""From logs to tables and back: the same bits by every way, and nothing left of somebody who was deleted."""
+
+import json
+import os
+
+import arviz
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+from commands import run
+from live import STUDY, Driver
+
+from hilbo.errors import InputError
+from hilbo.session.event_log import EventLog, log_name
+from hilbo.session.export import netcdf, psych_ds, read_log_trials, read_sessions, sets_table, trials_table
+from hilbo.session.participants import add_person, check_consent, delete_participant, read_people
+from hilbo.study.aggregate import fit_cohort
+from hilbo.study.cohort import cohort_of
+from hilbo.study.inference_data import groups, write_groups
+from hilbo.study.trial_table import read_trials
+from hilbo.study.validation_table import read_sets, read_validation
+
+
+def write(folder, person, kind, session, doings=(), **facts):
+    import msgspec
+
+    driver = Driver(kind)
+    driver.header = msgspec.structs.replace(driver.header, participant=person, session=session, **facts)
+    driver.state = type(driver.state).start(STUDY, driver.header)
+    driver.step()
+    for doing in doings:
+        driver.do(*doing)
+    driver.finish()
+    folder.mkdir(exist_ok=True)
+    with EventLog.create(folder / log_name(driver.header), STUDY, driver.header) as log:
+        for event in driver.events:
+            log.append(event)
+    return driver.state
+
+
+TROUBLE = [("answer", 1)] * 2 + [("go", 0), ("answer", 2), ("answer", 0), ("undo", 0), ("void old", 2), ("answer", 1)]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    logs = tmp_path / "logs"
+    write(logs, "P01", "optimisation", "1")
+    write(logs, "P02", "optimisation", "1", [*TROUBLE, ("again", 6), ("hold", 0)])
+    write(logs, "P03", "validation", "2", [("answer", 1), ("void", 0)])
+    return logs
+
+
+def test_logs_and_exported_table_give_the_same_bits(folder, tmp_path):
+    sessions = read_sessions(folder, STUDY)
+    out = tmp_path / "out"
+    psych_ds(sessions, out, STUDY)
+    path = out / "data" / "study-plain_table-trials_data.csv"
+    direct, exported = read_log_trials(folder, STUDY), read_trials(path, STUDY)
+    pd.testing.assert_frame_equal(direct, exported, check_exact=True)
+    assert direct["participant"].value_counts().to_dict() == {"P01": 6, "P02": 6}
+    for state in sessions[:2]:
+        chosen = [t.renderings["a"]["u"] for t in state.answers(1)]
+        here = direct[direct["participant"] == state.header.participant]
+        assert here["u"].tolist() == chosen
+        assert here["response"].tolist() == [t.values["class_a"] for t in state.answers(1)]
+    one, two = cohort_of(direct, STUDY), cohort_of(exported, STUDY)
+    for a, b in zip(
+        (one.trials.x, one.trials.q, one.physical), (two.trials.x, two.trials.q, two.physical), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+    table = trials_table(sessions)
+    assert set(table["phase"]) == {"warm-up", "optimisation", "repeat"} and table["voided"].sum() >= 2
+
+
+def test_the_psych_ds_folder_describes_every_column(folder, tmp_path):
+    written = psych_ds(read_sessions(folder, STUDY), tmp_path / "out", STUDY)
+    description = json.loads((tmp_path / "out" / "dataset_description.json").read_text())
+    measured = {variable["name"] for variable in description["variableMeasured"]}
+    tables = [path for path in written if path.suffix == ".csv"]
+    assert len(tables) == 4
+    for path in tables:
+        table = pd.read_csv(path)
+        assert set(table.columns) <= measured
+        sidecar = json.loads(path.with_suffix(".json").read_text())
+        assert [variable["name"] for variable in sidecar["variableMeasured"]] == list(table.columns)
+    data = tmp_path / "out" / "data"
+    comparisons = read_validation(data / "study-plain_table-validation_data.csv", STUDY.responses)
+    assert len(comparisons) == 6 and set(comparisons["participant"]) == {"P03"}
+    sets = read_sets(data / "study-plain_table-sets_data.csv", ("u", "v"))
+    assert set(sets.index) == set("DEF") and sets.loc["D", "u"] == 0.123456789 + 0.3
+
+
+def test_netcdf_is_read_by_xarray_and_arviz(folder, tmp_path):
+    path = tmp_path / "trials.nc"
+    netcdf(read_sessions(folder, STUDY), path, STUDY)
+    tree = xr.open_datatree(path, engine="h5netcdf").load()
+    assert tree["observed_data"]["category"].sizes == {"obs_id": 13}  # with the repetition
+    data = arviz.from_netcdf(str(path))
+    table = read_log_trials(folder, STUDY)
+    fitted = data.constant_data["phase"].values == "optimisation"
+    assert sorted(data.constant_data["u"].values[fitted]) == sorted(table["u"])
+    assert data.observed_data["category"].values[fitted].sum() == table["category"].sum()
+    tree.close()
+
+
+def test_one_participant_is_deleted_from_everything(folder, tmp_path):
+    psych_ds(read_sessions(folder, STUDY), tmp_path / "out", STUDY)
+    netcdf(read_sessions(folder, STUDY), tmp_path / "out" / "trials.nc", STUDY)
+    people = tmp_path / "participants.csv"
+    for person in ("P01", "P02", "P03"):
+        add_person(people, {"participant": person, "consent_time": "2026-05-04T10:00", "protocol_number": "7"})
+    gone = delete_participant(tmp_path, "P02")
+    assert len(gone) == 5  # list, trials, presentations, netCDF, log
+    assert set(read_people(people)) == {"P01", "P03"}
+    for path in tmp_path.rglob("*"):
+        if path.suffix in (".csv", ".jsonl"):
+            assert "P02" not in path.read_text()
+    assert "P02" not in arviz.from_netcdf(str(tmp_path / "out" / "trials.nc")).constant_data["participant"].values
+    assert set(read_log_trials(folder, STUDY)["participant"]) == {"P01"}
+    with pytest.raises(InputError, match='nothing of participant "P02"'):
+        delete_participant(tmp_path, "P02")
+    with (
+        EventLog.resume(next(folder.glob("P01*")), STUDY),
+        pytest.raises(InputError, match="end the session first"),
+    ):
+        delete_participant(tmp_path, "P01")
+
+
+def test_a_participant_is_deleted_from_a_report_and_nothing_else_of_it_is(folder, capsys, monkeypatch, tmp_path):
+    cohort = cohort_of(read_log_trials(folder, STUDY), STUDY)
+    assert cohort.names == ("P01", "P02")
+    path = tmp_path / "report" / "inference.nc"
+    path.parent.mkdir()
+    write_groups(groups(STUDY, cohort, fit_cohort(STUDY, cohort), draws=5), path)
+    for name in ("P01", "P02"):
+        (folder / f".{name}-1.keys").write_text("{}")
+    with xr.open_datatree(path, engine="h5netcdf") as opened:
+        before = opened.load()
+    code, _, err = run(capsys, monkeypatch, "participants", "delete", tmp_path, "P02", "--yes")
+    assert code == 0, err
+    assert not list(tmp_path.rglob("P02_*")) and not (folder / ".P02-1.keys").exists()
+    assert (folder / ".P01-1.keys").exists()
+    with xr.open_datatree(path, engine="h5netcdf") as opened:
+        after = opened.load()
+    assert set(after.children) == set(before.children) == {
+        "posterior", "posterior_predictive", "log_likelihood", "observed_data", "constant_data"
+    }  # fmt: skip
+    for name, group in before.children.items():
+        xr.testing.assert_identical(after[name].to_dataset(), group.to_dataset().sel(participant=["P01"]))
+    assert arviz.from_netcdf(str(path)).posterior["participant"].values.tolist() == ["P01"]
+    assert run(capsys, monkeypatch, "participants", "delete", tmp_path, "P01", "--yes")[0] == 0
+    with xr.open_datatree(path, engine="h5netcdf") as opened:
+        assert opened["posterior"]["f"].sizes["participant"] == 0
+    assert b"P01" not in path.read_bytes()
+    assert run(capsys, monkeypatch, "participants", "delete", tmp_path, "P01", "--yes")[0] == 2
+
+
+def test_keys_of_somebody_whose_id_begins_alike_stay(folder):
+    write(folder, "P02-b", "optimisation", "1")
+    for name in (".P02-1", ".P02-b-1"):
+        (folder / f"{name}.keys").write_text("{}")
+    delete_participant(folder, "P02")
+    assert [path.name for path in folder.glob("*.keys")] == [".P02-b-1.keys"]
+
+
+def test_a_deletion_that_cannot_be_ended_begins_with_the_logs(folder, monkeypatch, tmp_path):
+    people = tmp_path / "participants.csv"
+    add_person(people, {"participant": "P02", "consent_time": "2026-05-04T10:00", "protocol_number": "7"})
+    real = os.replace
+
+    def full(source, target):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(OSError, match="space"):
+        delete_participant(tmp_path, "P02")
+    assert not list(folder.glob("P02*"))
+    monkeypatch.setattr(os, "replace", real)
+    assert delete_participant(tmp_path, "P02") == {str(people): 1}
+
+
+def test_dry_runs_are_nobodys_answers(folder, tmp_path):
+    before, heard = read_log_trials(folder, STUDY), []
+    for session in ("1", "2"):
+        write(folder, "test", "optimisation", session, dry_run=True)
+    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY, note=heard.append), before)
+    assert heard == [f"{folder}: 2 dry runs are left out."]
+    assert {state.header.participant for state in read_sessions(folder, STUDY)} == {"P01", "P02", "P03"}
+    write(tmp_path / "dry", "test", "optimisation", "1", dry_run=True)
+    with pytest.raises(InputError, match="holds nothing but dry runs"):
+        read_sessions(tmp_path / "dry", STUDY)
+
+
+def test_folders_without_answers_are_refused(tmp_path):
+    with pytest.raises(InputError, match="holds no session logs"):
+        read_log_trials(tmp_path, STUDY)
+    driver = Driver()
+    EventLog.create(tmp_path / log_name(driver.header), STUDY, driver.header).close()
+    with pytest.raises(InputError, match="hold no answers yet"):
+        read_log_trials(tmp_path, STUDY)
+    assert not netcdf(read_sessions(tmp_path, STUDY), tmp_path / "x.nc", STUDY)
+    assert not (tmp_path / "x.nc").exists()
+
+
+def test_one_name_for_two_sets_is_refused(folder):
+    import msgspec
+
+    state = read_sessions(folder, STUDY)[2]
+    other = msgspec.structs.replace(state.header, sets=state.header.sets | {"D": {"u": 0.5, "v": 0.5}})
+    with pytest.raises(InputError, match='the set "D" of participant P03'):
+        sets_table([state, type(state).start(STUDY, other)])
+
+
+def test_consent_comes_before_the_first_trial(tmp_path):
+    path = tmp_path / "participants.csv"
+    row = {"participant": "P01", "consent_time": "", "protocol_number": "FENS-1", "age": "23", "handedness": "right"}
+    people = add_person(path, row)
+    with pytest.raises(InputError, match="has no consent_time"):
+        check_consent(people, "P01")
+    with pytest.raises(InputError, match="not in the list"):
+        check_consent(people, "P02")
+    people = add_person(path, row | {"participant": "P02", "consent_time": "2026-05-04T10:15"})
+    assert check_consent(people, "P02", "FENS-1")["age"] == "23"
+    with pytest.raises(InputError, match="agreed to protocol FENS-1, the study's is FENS-2"):
+        check_consent(people, "P02", "FENS-2")
+    for change, sentence in (
+        ({"participant": "Ada Lovelace"}, "nobody's name"),
+        ({"age": "old"}, "whole number of years"),
+        ({"handedness": "paw"}, "right, left, both"),
+        ({"consent_time": "yesterday"}, "write it as 2026"),
+        ({}, "stands there already"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            add_person(path, row | change)
+    path.write_text("participant,age\nP01,3\n")
+    with pytest.raises(InputError, match='1: column "consent_time" is missing'):
+        read_people(path)

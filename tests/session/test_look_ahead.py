@@ -1,0 +1,206 @@
+"""What a live session shows next: the very renderings of `Session`, found before they are asked for."""
+
+import msgspec
+import numpy as np
+import pytest
+from live import RAW, STUDY, header
+
+from hilbo import Session, Study
+from hilbo.errors import InputError
+from hilbo.search.candidates import search_points
+from hilbo.session import actions as live
+from hilbo.session.actions import Block, LiveSession
+from hilbo.session.logged_session import LoggedSession
+from hilbo.session.look_ahead import APART, LiveChooser
+from hilbo.session.progress import consistency, minutes_left, trust_of
+from hilbo.session.warm_start import informed, warm_start
+
+ANSWERS = ("similar", "different", "close", "close", "similar", "close")
+
+
+def start(**changes):
+    head = msgspec.structs.replace(header(), blocks=(Block("optimisation", 6),), sets={}, **changes)
+    return LiveSession.start(STUDY, head)
+
+
+def asked(state, chooser, at=0.0):
+    return state.after(live.propose(state, chooser, at))
+
+
+def felt(state):
+    for step in range(len(live.steps_of(state, state.pending))):
+        for on in (True, False):
+            state = state.after(live.present(state, state.pending.id, step, on, 0.5))
+    return state
+
+
+def told(state, response, at=1.0):
+    return state.after(live.answer(state, state.pending.id, f"c{state.seq}", {"class_a": response}, at, felt=False))
+
+
+@pytest.fixture(scope="module")
+def chooser():
+    return LiveChooser(start())
+
+
+def test_renderings_are_those_of_a_session_and_no_fit_runs_after_an_answer(chooser):
+    state, session, events = start(), Session.start(STUDY, seed=0), []
+    for number, response in enumerate(ANSWERS):
+        before = chooser.fits
+        event = live.propose(state, chooser, 0.0)
+        assert chooser.fits == before or number == 0
+        events.append(event)
+        state = state.after(event)
+        assert state.pending.renderings["a"] == session.ask()
+        found = chooser.lookahead(state)
+        assert set(found) == (set(STUDY.responses) if number < 5 else set())
+        choice = state.pending.data["choice"]
+        assert choice["by"] == ("latin hypercube" if number < 2 else "ucb") and choice["certificate"]["converged"]
+        if number >= 2:
+            x = STUDY.space.to_unit(np.array(list(session.ask().values())))
+            mean, variance = session.posterior().predict(x[None, :])
+            np.testing.assert_allclose([choice["mean"], choice["sd"] ** 2], [mean[0], variance[0]], atol=1e-9)
+            assert choice["score"] == pytest.approx(choice["mean"] + 0.7 * choice["sd"], rel=1e-12)
+        session = session.tell(response)
+        state = told(state, response)
+    assert state.screen == "done" and session.done
+    fresh, state = LiveChooser(start()), start()
+    for event in events[:4]:
+        state = told(state.after(event), ANSWERS[event.data["trial"] - 1])
+    assert live.propose(state, fresh, 0.0).data == events[4].data | {"planned": None}
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_rendering_voided_twice_is_replaced_by_a_feasible_one_apart(chooser, count):
+    state = start()
+    for response in ANSWERS[:count]:
+        state = told(asked(state, chooser), response)
+    state = asked(state, chooser)
+    point = state.pending.renderings["a"]
+    for again in range(2):
+        state = felt(state)
+        state = state.after(live.void(state, state.pending.id, "noise", 1.0))
+        state = asked(state, chooser)
+        assert (state.pending.renderings["a"] == point) == (again == 0)
+    unit = [STUDY.space.to_unit(np.array([p["u"], p["v"]])) for p in (point, state.pending.renderings["a"])]
+    assert np.linalg.norm(unit[0] - unit[1]) >= APART
+    assert bool(STUDY.space.feasible(unit[1]))
+    state = asked(told(state, "close"), chooser)
+    assert state.pending.renderings["a"] != point
+
+
+def test_a_warm_start_chooses_from_the_map_and_is_in_the_header():
+    points = search_points(STUDY.space, 0)
+    mean = 2.0 - 40.0 * ((points - np.array([0.7, 0.2])[None, :]) ** 2).sum(axis=1)
+    warm = warm_start(STUDY, points, mean, 0.05 * np.ones(len(points)) + 0 * mean, "a-map")
+    state = start(warm_start="=a-map")
+    chooser = LiveChooser(state, {None: warm})
+    state = asked(state, chooser)
+    first = np.array(list(state.pending.renderings["a"].values())[:2])
+    assert np.linalg.norm(first - [0.7, 0.2]) < 0.05 and state.pending.data["choice"]["by"] == "map"
+    assert set(chooser.lookahead(state)) == set(STUDY.responses)
+    state = asked(told(state, "different"), chooser)
+    second = np.array(list(state.pending.renderings["a"].values())[:2])
+    assert np.linalg.norm(second - first) > 0.05
+    with pytest.raises(InputError, match="warm start is =a-map, not none"):
+        LiveChooser(state)
+    mu, s = informed(STUDY, warm, Session.start(STUDY).trials)
+    np.testing.assert_allclose(mu, warm.mean, rtol=1e-12)
+    np.testing.assert_allclose(s, 0.05 + 0.5, rtol=1e-12)
+
+
+def test_the_informed_posterior_is_the_committee_of_map_and_answers():
+    points = search_points(STUDY.space, 0)[:50]
+    mean, variance = np.linspace(-1, 1, 50), np.linspace(0.1, 0.9, 50)
+    warm = warm_start(STUDY, points, points[:, 0] * 0 + mean, points[:, 0] * 0 + variance, share=0.25)
+    session = Session.start(STUDY)
+    for response in ANSWERS[:3]:
+        session = session.tell(response)
+    own_mean, own_variance = (np.asarray(v) for v in session.posterior().predict(points))
+    before = variance + 0.75
+    precision = 1 / before + 1 / own_variance - 1.0  # the prior's variance is 1
+    mu, s = informed(STUDY, warm, session.trials)
+    np.testing.assert_allclose(s, 1 / precision, rtol=1e-9)
+    np.testing.assert_allclose(mu, (mean / before + own_mean / own_variance) / precision, rtol=1e-8, atol=1e-12)
+
+
+def begun(chooser):
+    state = start()
+    for number, response in enumerate(ANSWERS[:4]):
+        state = told(asked(state, chooser), response, at=20.0 * number)
+    return state
+
+
+def test_pace_and_consistency(chooser):
+    assert minutes_left(start()) == pytest.approx(6 * 1.5 * 8 / 60)
+    state = begun(chooser)
+    assert minutes_left(state) == pytest.approx(2 * 20 / 60)
+    assert consistency(state).pairs == 0
+    state = asked(state.after(live.repeat(state, 1.0, 3)), chooser)
+    found = trust_of(state, 0)
+    assert found is not None and found.movement is None  # the answer to a repeat moves nothing
+    state = told(state, "similar")
+    assert consistency(state).__dict__ == {"pairs": 1, "alike": 0, "distance": 1.0}  # "similar" after "close"
+
+
+def test_a_logged_session_is_a_session_and_resumes(tmp_path):
+    head = msgspec.structs.replace(header(warm=1), seed=7)
+    session, asked_for = Session.start(STUDY, seed=7), []
+    for part in (3, 10):
+        with LoggedSession.open(tmp_path, STUDY, head) as logged:
+            for _ in range(part):
+                point = logged.ask()
+                assert logged.ask() == point
+                if point is None:
+                    break
+                if logged.state.pending.block == 1:
+                    asked_for.append(point)
+                    assert point == session.ask()
+                    session = session.tell(ANSWERS[len(asked_for) - 1])
+                logged.tell(ANSWERS[len(asked_for) - 1])
+    assert len(asked_for) == 6 and logged.state.screen == "done"
+    with pytest.raises(InputError, match="begun with another seed"):
+        LoggedSession.open(tmp_path, STUDY, header(warm=1))
+    with LoggedSession.open(tmp_path, STUDY, head) as logged, pytest.raises(InputError, match="call ask"):
+        logged.tell("close")
+
+
+@pytest.mark.deep
+def test_trust_in_the_best_rendering(chooser):
+    state = begun(chooser)
+    assert trust_of(start(), 0) is None
+    found = trust_of(asked(state, chooser), 0)
+    assert found is not None and 0 < found.top < 1 and 0 <= found.movement < 1
+    session = Session.start(STUDY)
+    for response in ANSWERS[:4]:
+        session = session.tell(response)
+    best = np.array(list(session.best().values()))
+    posterior = session.posterior()
+    found_best = np.array(list(found.best.values()))
+    means = posterior.mean(STUDY.space.to_unit(np.stack([best, found_best])))
+    np.testing.assert_allclose(means[0], means[1], atol=1e-6)
+    p = posterior.class_probabilities(STUDY.space.to_unit(best)[None, :])[0]
+    assert found.top == pytest.approx(float(p[-1]), abs=1e-6)
+    asks = asked(state, chooser).pending.renderings["a"]
+    chances = posterior.class_probabilities(STUDY.space.to_unit(np.array(list(asks.values())))[None, :])[0]
+    moved = [
+        np.sqrt(np.mean((np.array(list(session.tell(r).best().values())) - best) ** 2)) for r in STUDY.responses
+    ]  # the box is the unit square
+    assert found.movement == pytest.approx(float(np.dot(chances, moved)), abs=1e-3)
+
+
+def test_several_materials_have_studies_of_their_own():
+    raw = RAW | {"materials": {"soft": {"parameters": {"u": {"low": 5.0, "high": 6.0}}}, "hard": {}}}
+    study = Study.from_dict(raw)
+    head = msgspec.structs.replace(
+        header(),
+        study=study.hash,
+        sets={},
+        blocks=tuple(Block("optimisation", 1, material=m) for m in ("soft", "hard")),
+    )
+    state = LiveSession.start(study, head)
+    chooser = LiveChooser(state)
+    state = asked(state, chooser)
+    assert 5.0 <= state.pending.renderings["a"]["u"] <= 6.0
+    state = asked(told(state, "close"), chooser)
+    assert state.pending.data["material"] == "hard" and state.pending.renderings["a"]["u"] <= 1.0

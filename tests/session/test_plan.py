@@ -1,0 +1,200 @@
+"""Plans: whole studies in advance, the same from the same seed, refused when changed or of another study."""
+
+import json
+from collections import Counter
+
+import msgspec
+import numpy as np
+import pytest
+from live import RAW, STUDY
+
+from hilbo import Study
+from hilbo.errors import InputError
+from hilbo.session import actions as live
+from hilbo.session.actions import LiveSession
+from hilbo.session.look_ahead import LiveChooser
+from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue, warm_up
+from hilbo.session.plan_sets import aggregate_best_sets, check_participants, read_result
+from hilbo.session.views import participant_view
+from hilbo.study.protocols import protocol
+
+PEOPLE = [f"P{i:02d}" for i in range(1, 9)]
+SETS = {name: {"u": 0.1 + 0.3 * i, "v": 0.9 - 0.2 * i} for i, name in enumerate(("best", "mid", "worst"))}
+MATERIALS = Study.from_dict(RAW | {"materials": {"foam": {}, "soft": {}, "hard": {}}})
+
+
+def test_a_plan_is_reproduced_from_its_seed_and_survives_json():
+    plan = make_plan(STUDY, PEOPLE, 3)
+    assert plan == make_plan(STUDY, PEOPLE, 3) != make_plan(STUDY, PEOPLE, 4)
+    again = json.loads(json.dumps(plan))
+    assert plan_hash(again) == plan["hash"]
+    header = planned_header(again, STUDY, "P03")
+    assert header.plan == plan["hash"] and header.participant == "P03"
+    assert [block.phase for block in header.blocks] == ["warm-up", "optimisation"]
+    seeds = [row["header"]["seed"] for row in plan["participants"]]
+    assert len(set(seeds)) == len(seeds)
+
+
+def test_a_changed_plan_another_study_and_strangers_are_refused():
+    plan = make_plan(STUDY, PEOPLE, 3)
+    changed = json.loads(json.dumps(plan))
+    changed["participants"][0]["header"]["seed"] += 1
+    with pytest.raises(InputError, match="was changed after it was made"):
+        planned_header(changed, STUDY, "P01")
+    with pytest.raises(InputError, match="belongs to another study"):
+        planned_header(plan, MATERIALS, "P01")
+    with pytest.raises(InputError, match='participant "P99" is not in the plan'):
+        planned_header(plan, STUDY, "P99")
+    with pytest.raises(InputError, match="is no plan"):
+        planned_header({}, STUDY, "P01")
+    with pytest.raises(InputError, match="each once"):
+        make_plan(STUDY, ["P01", "P01"])
+
+
+def test_three_materials_come_in_all_orders():
+    plan = make_plan(MATERIALS, [f"P{i}" for i in range(12)], 0)
+    assert plan["complete"] and plan["complete_at"] == "multiples of 6 participants"
+    seen = Counter(
+        tuple(b["material"] for b in row["header"]["blocks"] if b["phase"] == "optimisation")
+        for row in plan["participants"]
+    )
+    assert len(seen) == 6 and set(seen.values()) == {2}
+    assert not make_plan(MATERIALS, [f"P{i}" for i in range(8)], 0)["complete"]
+
+
+def test_validation_shows_each_pair_four_times_and_each_set_eight():
+    plan = make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate")
+    for person in PEOPLE:
+        header = planned_header(plan, STUDY, person)
+        trials = header.blocks[1].trials
+        assert len(trials) == header.blocks[1].count == 12
+        assert Counter(name for t in trials for name in (t.a, t.b)) == dict.fromkeys(SETS, 8)
+        assert set(Counter(frozenset((t.a, t.b)) for t in trials).values()) == {4}
+        assert Counter(t.first for t in trials) == {"a": 6, "b": 6}
+    orders = {planned_header(plan, STUDY, person).blocks[1].trials for person in PEOPLE}
+    assert len(orders) > 1
+    with pytest.raises(InputError, match="give --from"):
+        make_plan(STUDY, PEOPLE, 0, "validation")
+    with pytest.raises(InputError, match="no map of their own"):
+        make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="individual")
+
+
+def test_individual_sets_are_shown_to_their_owner_only():
+    sets = {f"{person} {name}": values for person in PEOPLE for name, values in SETS.items()}
+    plan = make_plan(STUDY, PEOPLE, 0, "validation", sets={"": sets}, source="individual")
+    header = planned_header(plan, STUDY, "P02")
+    assert {n for n in header.sets if not n.startswith("warm-up")} == {f"P02 {name}" for name in SETS}
+    with pytest.raises(InputError, match="nobody else can be validated"):
+        reissue(plan, "P02", "P30")
+
+
+def test_aggregate_best_of_three_materials_rests_between_them():
+    own = {"aggregate": SETS["best"]} | {f"individual:P{i}": {"u": 0.01 * i, "v": 0.5} for i in range(24)}
+    plan = make_plan(MATERIALS, PEOPLE[:6], 0, "aggregate-best", sets=dict.fromkeys(MATERIALS.materials, own))
+    header = planned_header(plan, MATERIALS, "P01")
+    assert [block.phase for block in header.blocks] == ["warm-up", *["aggregate-best"] * 3]
+    assert [block.rest for block in header.blocks] == [0, 0, 600, 600]
+    assert {block.count for block in header.blocks[1:]} == {48}
+    names = {name for trial in header.blocks[2].trials for name in (trial.a, trial.b)}
+    assert names <= set(header.sets) and len(names) == 25
+
+
+def test_a_row_is_reissued_with_its_order_and_seed():
+    plan = make_plan(MATERIALS, PEOPLE, 0)
+    changed = reissue(plan, "P03", "P30")
+    old, new = (planned_header(changed, MATERIALS, person) for person in ("P03", "P30"))
+    assert new == msgspec.structs.replace(old, participant="P30") and changed["hash"] != plan["hash"]
+    with pytest.raises(InputError, match="must be in the plan"):
+        reissue(plan, "P99", "P30")
+
+
+def test_warm_up_renderings_are_feasible_spread_and_seeded():
+    study = Study.load("hilbo/data/paper.toml")
+    block, sets = warm_up(study, 5)
+    assert block.count == 12 and len(block.trials) == 24 and warm_up(study, 5)[1] == sets != warm_up(study, 6)[1]
+    physical = np.array([list(values.values()) for values in sets.values()])
+    unit = np.asarray(study.space.to_unit(physical))
+    assert bool(np.all(study.space.feasible(unit)))
+    apart = np.linalg.norm(unit[:12, None] - unit[None, :12], axis=2) + 9 * np.eye(12)
+    assert apart.min() > 0.03
+
+
+def test_a_planned_validation_session_runs_blind():
+    head = planned_header(make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate"), STUDY, "P01")
+    state = LiveSession.start(STUDY, head)
+    chooser, seen = LiveChooser(state), []
+    while state.screen != "done":
+        if state.screen == "ready":
+            state = state.after(live.go_on(state, 0.0))
+            continue
+        state = state.after(live.propose(state, chooser, 0.0))
+        seen.append(json.dumps(participant_view(state)))
+        asks = protocol(STUDY.session, state.header.blocks[state.pending.block].phase).asks
+        values = {ask: "a" if ask == "preferred" else "close" for ask in asks}
+        state = state.after(live.answer(state, state.pending.id, "c", values, 1.0, felt=False))
+    assert len(seen) == 24 and chooser.fits == 0
+    for secret in ("best", "mid", "worst", "warm-up 1", "0.1", "0.9", "margin", "mean", "sets"):
+        assert not any(f'"{secret}' in text for text in seen), secret
+
+
+def result():
+    people = [{"participant": f"P0{i}", "optimum": {"parameters": SETS["mid"]}} for i in (1, 2)]
+    return {"study": STUDY.hash, "seed": 0, "optimum": {"parameters": SETS["best"]}, "participants": people}
+
+
+def test_results_are_checked(tmp_path):
+    path = tmp_path / "result.json"
+    path.write_text(json.dumps(result()))
+    assert read_result(path, STUDY) == result()
+    assert set(aggregate_best_sets(STUDY, result())) == {"aggregate", "individual:P01", "individual:P02"}
+    with pytest.raises(InputError, match="result of another study"):
+        read_result(path, MATERIALS)
+    path.write_text("{}")
+    with pytest.raises(InputError, match=r"is no result\.json"):
+        read_result(path, STUDY)
+    check_participants(result(), ["V01"], "aggregate")
+    check_participants(result(), ["P01"], "individual")
+    with pytest.raises(InputError, match="invite people who are not"):
+        check_participants(result(), ["V01", "P02"], "aggregate")
+    with pytest.raises(InputError, match="no map of their own"):
+        check_participants(result(), ["V01"], "individual")
+
+
+def test_a_study_changes_protocols_and_texts():
+    raw = RAW | {
+        "session": {
+            "texts": {"question": "Wie ähnlich?"},
+            "labels": {"close": "Nah"},
+            "optimisation": {"steps": [{"show": "a", "seconds": 3}]},
+            "aggregate_best": {"count": 3, "rest": 60},
+        }
+    }
+    study = Study.from_dict(raw)
+    assert study.hash != STUDY.hash and study.session.text("question") == "Wie ähnlich?"
+    assert protocol(study.session, "optimisation").seconds == 3 and protocol(study.session, "aggregate-best").count == 3
+    assert study.session.label("close") == "Nah" and study.session.label("similar") == "Similar"
+    assert "highly close" in study.session.definition("close")
+    paper = protocol(STUDY.session, "validation")
+    assert sum(step.seconds for step in paper.steps if step.show != "neutral") == 12
+    assert protocol(STUDY.session, "optimisation").seconds == 8
+
+
+@pytest.mark.parametrize(
+    ("session", "sentence"),
+    [
+        ({"texts": {"quesiton": "?"}}, r"session\.texts\.quesiton is no text of a session"),
+        ({"labels": {"near": "?"}}, r"session\.labels\.near is no text of a session, those are different"),
+        ({"colour": "red"}, r"session\.colour is not a key of a study file"),
+        ({"validation": {"steps": [{"show": "a", "seconds": 1}]}}, r'must show "a" and "b"'),
+        (
+            {"validation": {"steps": [{"show": "a", "seconds": 1}, {"show": "b", "seconds": 1}]}},
+            r'must have "neutral" or "reference" between',
+        ),
+        ({"optimisation": {"steps": [{"show": "a", "seconds": 0}]}}, r"session\.optimisation\.steps is .* must be"),
+        ({"optimisation": {"steps": [{"show": "a", "second": 1}]}}, r"session\.optimisation\.steps is .* must be"),
+        ({"warm_up": {"count": 0}}, r"session\.warm_up\.count is 0, it must be a whole number from 1"),
+    ],
+)
+def test_a_wrong_session_table_is_one_sentence(session, sentence):
+    with pytest.raises(InputError, match=sentence):
+        Study.from_dict(RAW | {"session": session})

@@ -1,0 +1,123 @@
+"""Simulated studies for planning: truths in closed form, prefixes that are studies of their own, and bad plans."""
+
+import dataclasses
+import json
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+from hilbo import Study
+from hilbo.cli import main
+from hilbo.errors import InputError
+from hilbo.report.figures.power import power_figure
+from hilbo.report.power import enough, write_power
+from hilbo.simulation.power import Plan, one_study, power_table, simulate_power, summarise, top_probability
+from hilbo.simulation.simulate import PRESETS, people
+
+
+def study():
+    return Study.load("hilbo/data/paper.toml")
+
+
+def test_the_probability_of_the_highest_answer_is_that_of_many_answers():
+    persons = people(study(), PRESETS["paper"], 3, 5)
+    x = np.array([[0.15, 0.2, 0.2], [0.6, 0.6, 0.4]])
+    keys, half = jax.random.split(jax.random.key(0), 20_000), jnp.asarray(0.5)
+
+    @jax.jit
+    def share(point):
+        given = jax.vmap(lambda person: jax.vmap(lambda key: person.answer(key, point, half))(keys))(persons)
+        return jnp.mean(given == 2)
+
+    found = [float(share(jnp.asarray(point))) for point in x]
+    np.testing.assert_allclose(top_probability(persons, 3, x), found, atol=0.01)
+
+
+def test_summaries_of_errors_that_are_known():
+    rows = [(s, m, t, 0.1 * s / m, 0.01 * t) for s in range(5) for m in (1, 2) for t in (10, 20)]
+    errors = pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
+    table = summarise(errors, 0.2)
+    assert power_table(table, "optimum_median").loc[1, 10] == pytest.approx(0.2)
+    assert power_table(table, "reached").to_numpy().tolist() == [[0.6, 0.6], [1.0, 1.0]]
+    assert power_table(table, "map_median").loc[2, 20] == pytest.approx(0.2)
+    assert enough(table)["trials"].tolist()[1] == 10 and np.isnan(enough(table)["trials"][0])
+    n, z = 5, 1.959963984540054  # all five within: Wilson's interval ends at 1 / (1 + z^2 / n)
+    np.testing.assert_allclose(table[["reached_low", "reached_high"]].iloc[2], [1 / (1 + z**2 / n), 1.0])
+    assert len(power_figure(table, 0.2).axes) == 3
+
+
+def test_the_page_says_how_sure_a_share_is(tmp_path):
+    rows = [(s, 2, t, 0.1 * s, 0.01 * t) for s in range(5) for t in (10, 20)]
+    errors = pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
+    cost = {"preset": "paper", "seconds": 1.0, "jobs": 1}
+    content = write_power(study(), errors, Plan((2,), (10, 20), 5, 0), 0.25, cost, tmp_path)
+    assert "60 % (23 to 88)" in (tmp_path / "report.html").read_text()
+    assert content["summary"][0]["reached_low"] == pytest.approx(0.2307, abs=1e-4)
+
+
+def test_enough_is_what_larger_numbers_hold_too():
+    reached = {2: [0.9, 0.7, 0.8, 0.85], 3: [0.7, 0.9, 0.9, 0.79], 4: [0.8, 0.8, 0.8, 0.8]}
+    rows = [(m, 10 + 5 * i, share) for m, shares in reached.items() for i, share in enumerate(shares)]
+    found = enough(pd.DataFrame(rows, columns=["participants", "trials", "reached"]))
+    np.testing.assert_array_equal(found["trials"], [20, np.nan, 10])
+
+
+def test_one_person_cannot_differ():
+    with pytest.raises(InputError, match="ask for 2 participants or more"):
+        simulate_power(dataclasses.replace(study(), rule="hierarchical"), PRESETS["paper"], Plan((1, 3), (5,), 2, 0))
+
+
+def test_more_answers_than_one_model_takes_are_refused_before_anything_is_simulated():
+    with pytest.raises(InputError, match="at most 1,500, and 61 participants with 25 trials give 1,525"):
+        simulate_power(dataclasses.replace(study(), rule="pooled"), PRESETS["paper"], Plan((2, 61), (5, 25), 2, 0))
+
+
+@pytest.mark.parametrize("plan", [((), (5,), 4), ((3, 3), (5,), 4), ((0,), (5,), 4), ((3,), (5,), 1)])
+def test_plans_that_say_nothing_are_refused(plan):
+    with pytest.raises(InputError, match="power: "):
+        Plan(*plan, seed=0)
+
+
+@pytest.mark.parametrize(
+    ("option", "words"),
+    [
+        (("--participants", "six"), "write whole numbers separated by commas"),
+        (("--preset", "nobody"), '--preset is "nobody"'),
+        (("--trials", "5,5"), "give different whole numbers"),
+    ],
+)
+def test_bad_options_write_nothing(capsys, monkeypatch, tmp_path, option, words):
+    monkeypatch.setattr(
+        sys, "argv", ["hilbo", "power", "hilbo/data/paper.toml", "--out", str(tmp_path / "out"), *option]
+    )
+    with pytest.raises(SystemExit) as stopped:
+        main.main()
+    assert stopped.value.code == 2 and words in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+@pytest.mark.deep
+def test_the_command_says_what_it_cost(capsys, monkeypatch, tmp_path):
+    out = tmp_path / "out"
+    few = ["--participants", "2,3", "--trials", "6", "--studies", "2", "--jobs", "2", "--json"]
+    monkeypatch.setattr(sys, "argv", ["hilbo", "power", "hilbo/data/paper.toml", "--out", str(out), *few])
+    with pytest.raises(SystemExit) as stopped:
+        main.main()
+    content = json.loads(capsys.readouterr().out)
+    assert not stopped.value.code and content["jobs"] == 2 and content["seconds"] > 0 and content["seed"] == 0
+    assert len(pd.read_csv(out / "errors.csv")) == 4 and len(content["summary"]) == 2
+    page = (out / "report.html").read_text()
+    assert "on 2 cores" in page and page.count("data:image/png;base64,") == 1
+
+
+@pytest.mark.deep
+def test_a_smaller_study_is_the_start_of_a_larger_one():
+    """The first people and trials alone give what they give within a larger study, to rounding."""
+    large = one_study(study(), PRESETS["paper"], Plan((2, 3), (6, 8), 2, 1), 0)
+    assert large["study"].eq(0).all() and large[["optimum", "map"]].gt(0).all(axis=None)
+    again = simulate_power(study(), PRESETS["paper"], Plan((2, 3), (6, 8), 2, 1), jobs=1)
+    pd.testing.assert_frame_equal(again[again["study"] == 0].reset_index(drop=True), large)
+    assert not np.allclose(again["optimum"][:4], again["optimum"][4:])

@@ -1,0 +1,169 @@
+"""Tables II to IV, preferences and ties: printed figures of the paper, closed forms, and bad input."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from reference_statistics import estimates
+from scipy import stats
+from scipy.special import logit
+from studies import BEST, MID, WORST, paper_counts
+
+from hilbo.errors import InputError
+from hilbo.statistics import logits as st
+from hilbo.statistics.paper_tables import paper_tables
+from hilbo.statistics.preferences import classifications, confusion, preference_rates, rate
+
+
+@pytest.fixture(scope="module")
+def paper():
+    return paper_tables(paper_counts(np.random.default_rng(1)))
+
+
+def test_table_2_of_the_paper(paper):
+    found = estimates(paper.table_2)
+    assert round(found["Intercept"], 4) == -2.5123 and round(found["Best"], 2) == 4.94
+    exact = logit(24 / 320), logit(147 / 160) - logit(24 / 320)
+    np.testing.assert_allclose(found[["Intercept", "Best"]], exact, rtol=1e-12)
+    iid = paper.table_2.by("iid")["std_error"]
+    np.testing.assert_allclose(iid["Intercept"], np.sqrt(1 / 24 + 1 / 296), rtol=1e-12)
+    np.testing.assert_allclose(iid["Best"], np.sqrt(1 / 24 + 1 / 296 + 1 / 147 + 1 / 13), rtol=1e-12)
+
+
+def test_table_3_of_the_paper(paper):
+    found = estimates(paper.table_3)
+    assert round(found["Best"], 4) == -4.1431 and round(found["Worst"], 4) == 2.9738
+    assert list(found.index) == ["Best", "Worst", "close|similar", "similar|different"]
+
+
+def test_table_4_of_the_paper(paper):
+    assert round(estimates(paper.table_4)["Aggregate-Best"], 4) == 0.9773
+    kinds = ["iid", "clustered by participant", "clustered by set", "clustered by participant and set"]
+    wild = [kind.replace("clustered", "wild bootstrap") for kind in kinds[1:]]
+    assert list(paper.table_4.table["errors"]) == kinds + wild
+    assert paper.table_4.clusters == {"participant": 8, "set": 24}
+    # The paper's own two-way error, 0.0844, is below this one.
+    np.testing.assert_allclose(paper.table_4.by("iid")["std_error"], np.sqrt(1 / 279 + 1 / 105), rtol=1e-12)
+
+
+def test_counts_behind_the_tables(paper):
+    assert paper.limits == ()
+    np.testing.assert_array_equal(paper.confusion, [BEST, MID, WORST])
+    pairs = paper.preferences.drop_duplicates(["set", "over"]).set_index(["set", "over"])
+    assert list(pairs["wins"]) == [76, 80, 72] and list(pairs["rate"]) == [0.95, 1.0, 0.9]
+
+
+def test_a_pair_without_a_loss_is_answered_and_not_fitted(paper):
+    rows = paper.preferences.query("set == 'best' and over == 'worst'").set_index("errors")
+    assert list(rows.index) == ["Wilson", "exact", "exact, of 20 by participant"]
+    np.testing.assert_allclose(rows.loc["exact", ["low", "high"]].astype(float), [0.025 ** (1 / 80), 1])
+    np.testing.assert_allclose(rows.loc["exact, of 20 by participant", "low"], 0.025 ** (1 / 20))
+    np.testing.assert_allclose(rows.loc["exact, of 20 by participant", "p_value"], 2.0**-19)
+
+
+# Preferences and ties
+
+
+def test_rates_against_closed_forms():
+    hits = np.arange(80) < 76
+    found = rate(hits, {"participant": np.tile(np.arange(20), 4)}).set_index("errors")
+    z, p = stats.norm.ppf(0.975), 0.95
+    middle, half = (p + z**2 / 160), z * np.sqrt(p * (1 - p) / 80 + z**2 / 25600)
+    np.testing.assert_allclose(found.loc["Wilson", "low"], (middle - half) / (1 + z**2 / 80))
+    np.testing.assert_allclose(found.loc["exact", "high"], stats.beta.ppf(0.975, 77, 4))
+    clustered = found.loc["clustered by participant"]
+    assert 0 < clustered["low"] < 0.95 < clustered["high"] < 1
+
+
+def test_ties_are_counted_and_modelled():
+    """With one pair Rao & Kupper's model is saturated: the shares give strength and tie in closed form."""
+    wins, losses, ties = 50, 20, 30
+    chosen = np.repeat(["a1", "a2", "tie"], [wins, losses, ties])
+    found = estimates(st.tied_preferences(["a1"] * 100, ["a2"] * 100, chosen))
+    won, lost = logit(wins / 100), logit(losses / 100)
+    np.testing.assert_allclose(found[["a1", "tie"]], [(won - lost) / 2, -(won + lost) / 2], rtol=1e-10)
+    turned = st.tied_preferences(["a2"] * 100, ["a1"] * 100, chosen, reference="a1")
+    np.testing.assert_allclose(estimates(turned)[["a2", "tie"]], [-found["a1"], found["tie"]], rtol=1e-10)
+    tables = paper_tables(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
+    assert list(estimates(tables.table_4).index) == ["Aggregate-Best", "tie"]
+    np.testing.assert_allclose(estimates(tables.table_4)["Aggregate-Best"], (logit(279 / 384) - logit(85 / 384)) / 2)
+
+
+def test_strengths_from_three_sets_and_the_order_shown(paper):
+    table = paper_counts(np.random.default_rng(1)).query("session == 'model'")
+    found = st.tied_preferences(
+        table["set_a"], table["set_b"], table["preferred"], table[["participant"]], order=np.ones(len(table))
+    )
+    strength = estimates(found)
+    assert strength["best"] > strength["mid"] > 0 and list(strength.index) == ["best", "mid", "shown first"]
+    assert np.isfinite(strength).all()  # 80 of 80 does not separate what the other pairs join
+
+
+def test_a_pair_of_ties_only_has_no_rate():
+    table = pd.DataFrame({"participant": ["A", "B"], "set_a": "x", "set_b": "y", "preferred": "tie"})
+    found = preference_rates(table).squeeze()
+    assert found["ties"] == 2 and np.isnan(found["rate"])
+
+
+# The table, whole
+
+
+def test_counts_of_classes():
+    table = paper_counts(np.random.default_rng(1))
+    assert len(classifications(table)) == 480
+    shares = confusion(table, sets=("best", "mid", "worst"))
+    assert shares.loc["mid", "similar"] == 114
+
+
+def test_roles_and_sources_come_from_the_sets_table(paper):
+    table = paper_counts(np.random.default_rng(1))
+    ids = {name: f"s{i}" for i, name in enumerate(pd.unique(table[["set_a", "set_b"]].to_numpy().ravel()))}
+    sets = pd.DataFrame({"set_id": ids.values(), "role": ids.keys()}).assign(
+        source=[name if ":" in name else "aggregate" for name in ids]
+    )
+    for column in ("set_a", "set_b", "preferred"):
+        table[column] = table[column].replace(ids)
+    found = paper_tables(table, sets.set_index("set_id"), bootstrap=False)
+    for name in ("table_2", "table_3", "table_4"):
+        pd.testing.assert_series_equal(estimates(getattr(found, name)), estimates(getattr(paper, name)))
+    with pytest.raises(InputError, match="is not in the sets table; add it there"):
+        paper_tables(table, sets.set_index("set_id").drop("s3"))
+
+
+def test_missing_sessions_are_said():
+    table = paper_counts(np.random.default_rng(1))
+    first = paper_tables(table.query("session == 'model'"), bootstrap=False)
+    assert first.table_4 is None and "Table IV is missing: no comparison" in first.limits[0]
+    second = paper_tables(table.query("session != 'model'"), bootstrap=False)
+    assert second.table_2 is None and second.table_3 is None and second.table_4 is not None
+    assert len(second.limits) == 2 and second.confusion.to_numpy().sum() == 0 and second.preferences.empty
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: st.binary_logit([0, 1, 2]), "must be a list of 0 and 1"),
+        (lambda: st.binary_logit([]), "not empty"),
+        (lambda: st.binary_logit([0, 1], {"x": [1.0, np.nan]}), 'predictor "x" must have one finite number'),
+        (lambda: st.binary_logit([0, 1, 1], {"x": [2.0, 2, 2]}), '"x" is a combination of the other coefficients'),
+        (lambda: st.ordered_logit([0, 1, 2], {"x": [2.0, 2, 2]}), '"x" is a combination of the other coefficients'),
+        (lambda: st.ordered_logit([1, 1], {"x": [0.0, 1]}, categories="abc"), 'all 2 answers are "b"'),
+        (lambda: st.ordered_logit([0, 3], {"x": [0.0, 1]}, categories="abc"), "category 3 has no name"),
+        (lambda: st.ordered_logit([0.5, 1.0], {"x": [0.0, 1]}), "whole numbers from 0"),
+        (lambda: st.binary_logit([0, 1], None, {"a": [1, 2], "b": [1, 2], "c": [1, 2]}), "not by 3"),
+        (lambda: st.binary_logit([0, 1], None, {"a": [1]}), "has 1 entries for 2 answers"),
+        (lambda: st.binary_logit([0, 1], None, {"a": ["x", None]}), "has empty entries"),
+        (lambda: st.tied_preferences(["a"], ["b"], ["c"]), "must prefer one of its two sets"),
+        (lambda: st.tied_preferences(["a"], ["b"], ["a"], reference="z"), 'reference "z" is in no comparison'),
+        (lambda: rate([]), "not empty"),
+    ],
+)
+def test_bad_input_is_one_sentence(call, sentence):
+    with pytest.raises(InputError, match=sentence):
+        call()
+
+
+def test_a_category_that_never_occurs_has_no_edge():
+    found = st.ordered_logit([0, 2, 0, 2, 2], {"x": [0.0, 0, 1, 1, 0]}, categories=("low", "mid", "high"))
+    assert list(estimates(found).index) == ["x", "low|high"]
+    binary = st.binary_logit([0, 1, 0, 1, 1], {"x": [0.0, 0, 1, 1, 0]})
+    np.testing.assert_allclose(estimates(found)["x"], estimates(binary)["x"], rtol=1e-10)

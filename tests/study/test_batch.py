@@ -1,0 +1,184 @@
+"""Populations merged block by block, against the same people's posteriors held all at once."""
+
+import dataclasses
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from studies import PEOPLE, STUDY, population_answers, population_study
+
+from hilbo.errors import InputError
+from hilbo.search.candidates import search_points
+from hilbo.study import distributed
+from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population, population_optimum
+from hilbo.study.batch import Sums, _block, block_size, jets, population_of, refit, sums
+from hilbo.study.batch_optimum import aggregate_population, optima_from, optimum_near
+from hilbo.study.cohort import cohort_of
+
+
+@functools.cache
+def cohort():
+    return cohort_of(population_answers(), STUDY)
+
+
+@functools.cache
+def candidates():
+    return np.asarray(search_points(STUDY.space, 0, 256))
+
+
+@functools.cache
+def fitted(individuals=False):
+    return refit(population_of(STUDY, cohort(), distributed.alone()), candidates(), individuals)
+
+
+@functools.cache
+def posteriors(inference="laplace"):
+    return fit_cohort(STUDY, cohort(), inference=inference)
+
+
+@pytest.mark.deep
+def test_the_merged_map_is_that_of_the_posteriors_held_at_once():
+    for rule in ("bcm", "average"):
+        found = fitted().sums.merge(1.3, PEOPLE, rule)
+        expected = population(posteriors(), jnp.asarray(candidates()), rule)
+        np.testing.assert_allclose(found[0], expected[0], atol=1e-12)
+        np.testing.assert_allclose(found[1], expected[1], atol=1e-13)
+    for rule in ("poe", "gpoe"):  # from bcm's sums
+        found = fitted().sums.merge(1.3, PEOPLE, rule)
+        for a, b in zip(found, population(posteriors(), jnp.asarray(candidates()), rule), strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-12)
+    certificate = posteriors().certificate
+    assert fitted().certificate["converged"].all()
+    np.testing.assert_array_equal(fitted().certificate["iterations"], certificate.iterations)
+
+
+@pytest.mark.parametrize(("rule", "share"), [("hierarchical", 0.6), ("rbcm", 1.0)])
+def test_other_rules_are_sums_of_their_own(rule, share):
+    streamed = dataclasses.replace(fitted().population, rule=rule, share=share)
+    found = sums(streamed, candidates()).merge(1.3, PEOPLE, rule, share)
+    part = jnp.asarray(share) if rule == "hierarchical" else None
+    for a, b in zip(found, population(posteriors(), jnp.asarray(candidates()), rule, part), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+
+
+def test_rules_that_are_no_sum_are_refused():
+    for rule in ("pooled", "grbcm"):
+        study = dataclasses.replace(STUDY, rule=rule)
+        with pytest.raises(InputError, match=f'"{rule}" needs all answers at once and cannot be streamed'):
+            aggregate_population(study, cohort(), distributed.alone())
+
+
+def test_posteriors_made_again_from_their_modes_say_the_same():
+    again = sums(fitted().population, candidates())
+    for one, other in zip(again, fitted().sums, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13, atol=1e-13)
+
+
+def test_jets_are_the_derivatives_of_the_sums():
+    at, step = np.array([[0.3, 0.6], [0.7, 0.2]]), 1e-4
+    found = jets(fitted().population, at)
+    moved = [at + step * np.array(way) for way in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))]
+    around = sums(fitted().population, np.concatenate([at, *moved]))
+    for name in Sums._fields:
+        value, gradient, hessian = (getattr(part, name) for part in found)
+        f = getattr(around, name).reshape(7, 2)
+        slope = np.stack([f[1] - f[2], f[3] - f[4]], axis=1) / (2 * step)
+        bend = (f[5] + f[6] - f[1] - f[2] - f[3] - f[4] + 2 * f[0]) / (2 * step**2)
+        np.testing.assert_allclose(value, f[0], rtol=1e-12)
+        np.testing.assert_allclose(gradient, slope, atol=1e-5 * np.abs(slope).max())
+        np.testing.assert_allclose(hessian[:, 0, 1], bend, atol=1e-4 * np.abs(hessian).max())
+        np.testing.assert_allclose(hessian[:, 0, 1], hessian[:, 1, 0], rtol=1e-9)
+
+
+def test_people_without_answers_add_exactly_nothing():
+    whole = cohort().rows(np.arange(20))
+    silent = jax.tree.map(lambda leaf: leaf.at[4:].set(leaf[:16] if leaf.dtype != bool else False), whole.trials)
+    few, crew = cohort().rows(np.arange(4)), distributed.alone()
+    padded = type(whole)(silent, whole.physical, whole.names)
+    one, other = (refit(population_of(STUDY, people, crew), candidates()) for people in (few, padded))
+    for of_few, of_padded in zip(one.sums, other.sums, strict=True):
+        np.testing.assert_allclose(of_few, of_padded, rtol=1e-14, atol=0)
+    assert not other.population.modes[4:].any()
+
+
+def test_the_optimum_is_the_highest_point_of_the_map():
+    best = optima_from(fitted().population, candidates(), fitted().sums, ("bcm", "average"))
+    many = jnp.asarray(search_points(STUDY.space, 5, 4096))
+    for rule, found in best.items():
+        heights = population(posteriors(), many, rule)[0]
+        mean, variance = population(posteriors(), found.x[None, :], rule)
+        assert float(found.mean) == pytest.approx(float(mean[0]), abs=1e-12)
+        assert float(found.sd) == pytest.approx(float(jnp.sqrt(variance[0])), abs=1e-12)
+        assert float(found.mean) >= float(heights.max())
+        assert float(jnp.sum(found.class_probabilities)) == pytest.approx(1, abs=1e-12)
+
+
+def test_a_search_that_may_end_early_reads_the_map_off_its_last_expansion():
+    exact = optima_from(fitted().population, candidates(), fitted().sums)["bcm"]
+    near = np.asarray(exact.x)[None, :] + 0.002
+    (found,) = optimum_near(fitted().population, near, ("bcm",), tolerance=0.003)
+    np.testing.assert_allclose(found.x, exact.x, atol=1e-4)
+    assert float(found.mean) == pytest.approx(float(exact.mean), abs=1e-6)
+
+
+@pytest.mark.deep
+def test_a_streamed_optimum_foretells_a_new_person():
+    streamed = dataclasses.replace(fitted().population, rule="hierarchical", share=0.6)
+    found = optima_from(streamed, candidates(), sums(streamed, candidates()), ("hierarchical", "average"))
+    for rule, share in (("hierarchical", jnp.asarray(0.6)), ("average", None)):
+        small = population_optimum(STUDY, posteriors(), jnp.asarray(candidates()), rule, share)
+        np.testing.assert_allclose(found[rule].class_probabilities, small.class_probabilities, atol=1e-6)
+
+
+@pytest.mark.deep
+def test_everything_is_as_for_a_small_cohort():
+    small = aggregate_cohort(STUDY, cohort())
+    told = []
+    merged = aggregate_population(
+        STUDY, cohort(), distributed.alone(), say=lambda words, done, people: told.append((done, people))
+    )
+    np.testing.assert_allclose(merged.optimum.x, small.optimum.x, atol=1e-7)
+    np.testing.assert_allclose(merged.individuals.x, small.individuals.x, atol=1e-6)
+    np.testing.assert_allclose(merged.mean_of_optima, small.mean_of_optima, atol=1e-6)
+    np.testing.assert_allclose(merged.alternatives["average"].x, small.alternatives["average"].x, atol=1e-7)
+    np.testing.assert_allclose(merged.alternatives["ep"].x, small.alternatives["ep"].x, atol=5e-4)
+    np.testing.assert_allclose(merged.alternatives["ep"].mean, small.alternatives["ep"].mean, atol=1e-6)
+    assert told[0][1] == PEOPLE and (PEOPLE, PEOPLE) in told
+    x = np.array([[0.2, 0.9]])
+    np.testing.assert_allclose(merged.surface(x), small.surface(x), atol=1e-12)
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("inference", ["ep", "exact"])
+def test_other_inferences_are_fitted_again(inference):
+    study = population_study(inference)
+    found = refit(population_of(study, cohort(), distributed.alone()), candidates())
+    expected = population(posteriors(inference), jnp.asarray(candidates()))
+    np.testing.assert_allclose(found.sums.merge(1.3, PEOPLE)[0], expected[0], atol=1e-9)
+    again = sums(found.population, candidates())
+    np.testing.assert_allclose(again.weighted, found.sums.weighted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("task", ["individuals", "jets"])
+def test_a_block_made_at_once_is_one_made_person_by_person(task):
+    """As GPUs make it, and as CPUs do; the first ones keep people together in groups."""
+    trials = jax.tree.map(lambda leaf: jnp.asarray(leaf[:32]), fitted().population.trials)
+    modes = None if task == "individuals" else jnp.asarray(fitted().population.modes[:32])
+    points = jnp.asarray(candidates()[:40])
+    found = [
+        eqx.filter_jit(_block)(STUDY, points, trials, modes, task, "laplace", platform) for platform in ("cpu", "gpu")
+    ]
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9), *[total for total, _ in found])
+    if task == "individuals":
+        np.testing.assert_allclose(found[1][1]["modes"], found[0][1]["modes"], atol=1e-10)
+        np.testing.assert_allclose(found[1][1]["optima"][0], found[0][1]["optima"][0], atol=1e-7)
+
+
+@pytest.mark.parametrize(("people", "platform", "size"), [(1, "cpu", 1), (24, "cpu", 2), (100_000, "cpu", 256)])
+def test_blocks_are_powers_of_two_and_at_least_sixteen(people, platform, size):
+    assert block_size(people, platform) == size
+    assert block_size(100_000, "gpu") == 1024

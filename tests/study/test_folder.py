@@ -1,0 +1,123 @@
+"""The folder that `hilbo report` reads: materials, references, several tables; bad folders in one sentence."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from commands import run
+
+from hilbo.errors import InputError
+from hilbo.report.validation import validate
+from hilbo.statistics.paper_tables import aggregate_comparisons
+from hilbo.study.analysis import analyse
+from hilbo.study.folder import read_folder
+
+STUDY = Path("hilbo/data/paper.toml").read_text()
+HEAD = "participant,trial,response,K1,B1,alpha\n"
+ROW = "A,1,close,5,6,0.2\n"
+VALIDATION = "participant,trial,set_a,set_b,class_a,class_b,preferred\n"
+
+
+def folder_with(tmp_path, **files):
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for name, text in ({"study.toml": STUDY} | {k.replace("__", "."): v for k, v in files.items()}).items():
+        (folder / name).write_text(text)
+    return folder
+
+
+BAD = {
+    "no trials": ({}, "holds no trials.csv"),
+    "the same answer twice": ({"trials__csv": HEAD + ROW, "trials-2__csv": HEAD + ROW}, "is in two trial tables"),
+    "another parameter": (
+        {"trials__csv": "participant,trial,response,K1,B1\nA,1,close,5,6\n"},
+        'column "alpha" is missing',
+    ),
+    "another answer": ({"trials__csv": HEAD + "A,1,superb,5,6,0.2\n"}, 'response is "superb"'),
+    "half of the materials": (
+        {"trials__csv": HEAD + ROW, "trials-2__csv": "material," + HEAD + "foam,B,1,close,5,6,0.2\n"},
+        "some rows name a material",
+    ),
+    "two truths": (
+        {"trials__csv": HEAD + ROW, "truth__csv": "source,K1,B1,alpha\npopulation,5,6,0.2\npopulation,5,6,0.3\n"},
+        'there are 2 sets of source "population"',
+    ),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_bad_folders_are_refused_in_one_sentence(capsys, monkeypatch, tmp_path, what):
+    files, words = BAD[what]
+    code, _, stderr = run(capsys, monkeypatch, "report", folder_with(tmp_path, **files), "--out", tmp_path / "out")
+    assert code == 2 and words in stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_the_report_never_replaces_what_it_reads(capsys, monkeypatch, tmp_path):
+    folder = folder_with(tmp_path, trials__csv=HEAD + ROW)
+    for out in (folder, tmp_path):
+        code, _, stderr = run(capsys, monkeypatch, "report", folder, "--out", out, "--force")
+        assert code == 2 and "holds the folder that is read" in stderr
+    code, _, stderr = run(capsys, monkeypatch, "report", tmp_path / "none", "--out", tmp_path / "out")
+    assert code == 2 and "is no folder" in stderr
+    other = folder_with(tmp_path / "folder", trials__csv=HEAD + ROW)
+    code, _, stderr = run(
+        capsys,
+        monkeypatch,
+        "validate",
+        folder / "trials.csv",
+        "--study",
+        folder / "study.toml",
+        "--out",
+        other,
+        "--force",
+    )
+    assert code == 2 and "is not a result of hilbo's" in stderr  # data without a result beside it
+
+
+def test_materials_have_their_own_references(tmp_path):
+    text = STUDY + "\n[materials.soft.renderer]\nK_eff = 0.3\n"
+    trials = "material," + HEAD + "soft,A,1,close,5,6,0.2\nhard,A,1,different,4,6,0.2\n"
+    with pytest.raises(InputError, match='material "hard" is not in the study file'):
+        read_folder(folder_with(tmp_path, study__toml=text, trials__csv=trials))
+    folder = tmp_path / "folder"
+    (folder / "study.toml").write_text(text + "[materials.hard]\n")
+    (folder / "truth.csv").write_text("source,material,K1,B1,alpha\npopulation,soft,5,6,0.2\npopulation,hard,8,6,0.2\n")
+    found = read_folder(folder)
+    assert [m.name for m in found.materials] == ["soft", "hard"] and len(found.limits) == 1
+    soft, hard = found.materials
+    assert soft.study.space.mechanics.K_eff == 0.3 and hard.study.space.mechanics.K_eff == 0.44
+    np.testing.assert_allclose([m.reference[0] for m in (soft, hard)], [4 / 31, 7 / 31])
+    strict = read_folder(folder, "trials < 5").materials[0]
+    with pytest.raises(InputError, match="leaves out all 1"):
+        analyse(strict.study, strict.cohort)
+
+
+def test_two_validation_tables_are_read_as_one(tmp_path):
+    row = "{},1,aggregate,individual:B,close,different,{}\n"
+    first, second = (VALIDATION + row.format(*cells) for cells in (("A", "a"), ("B", "b")))
+    folder = folder_with(tmp_path, trials__csv=HEAD + ROW, **{"validation-1__csv": first, "validation-2__csv": second})
+    (material,) = read_folder(folder).materials
+    found = validate(material.validation, bootstrap=False)
+    assert found.people["wins"].tolist() == [1, 0] and found.comparisons == 2
+    twice = aggregate_comparisons(
+        pd.concat([material.validation] * 2), {"aggregate": "aggregate", "individual:B": "individual:B"}
+    )
+    assert len(twice) == 4
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("validation", VALIDATION + "A,1,best,mid,close,similar,a\n"),
+        ("sets", "set_id,source,K1,B1,alpha\nsysid,sysid,5,6,0.2\n"),
+        ("truth", "source,K1,B1,alpha\npopulation,5,6,0.2\n"),
+        ("truth", "source,material,K1,B1,alpha\npopulation,soft,5,6,0.2\npopulation,,5,6,0.2\n"),
+    ],
+)
+def test_what_is_of_no_material_is_not_taken_for_all(tmp_path, file, text):
+    trials = "material," + HEAD + "soft,A,1,close,5,6,0.2\nhard,A,1,different,4,6,0.2\n"
+    folder = folder_with(tmp_path, trials__csv=trials, **{f"{file}__csv": text})
+    with pytest.raises(InputError, match=f"{file}.csv: rows without a material.*this study has soft, hard"):
+        read_folder(folder)

@@ -1,0 +1,83 @@
+"""Every rule on one cohort as data, its figures, and what it recommends."""
+
+import dataclasses
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from studies import answered, plain_study
+
+from hilbo.errors import InputError
+from hilbo.population.hierarchical import Share
+from hilbo.population.leave_one_out import LeftOut, calibration
+from hilbo.population.maps import ALL_RULES
+from hilbo.report.comparison import write_comparison
+from hilbo.study.rule_comparison import compare, recommendation
+
+
+@pytest.mark.deep
+def test_everything_is_compared_and_written(tmp_path):
+    study = dataclasses.replace(plain_study(2), rule="poe")
+    content = write_comparison(study, answered(study, people=4), tmp_path)
+    assert json.loads((tmp_path / "comparison.json").read_text()) == content
+    assert set(content["rules"]) == set(ALL_RULES)
+    for found in content["rules"].values():
+        assert found["negative_log_density"] > 0 and 0 <= found["central_95"] <= 1 and 0 <= found["covered"] <= 1
+        assert set(found["influence"]) == {"P0", "P1", "P2", "P3"}
+        assert set(found["optimum"]) == {"p0", "p1"}
+    assert content["rules"]["pooled"]["agreement_with_pooled"] == pytest.approx(1.0)
+    assert content["rules"]["poe"]["covered"] < 1 and content["rules"]["average"]["covered"] < 1
+    for rule in ("bcm", "hierarchical", "pooled"):
+        low, middle, high = content["rules"][rule]["optimum_by_draws"]["p0"]
+        assert 1 <= low <= middle <= high <= 10
+    assert content["rules"]["pooled"]["optimum_by_bootstrap"] is None
+    assert {"comparison.png", "reliability.svg", "coverage.png", "comparison.csv"} <= {
+        p.name for p in tmp_path.iterdir()
+    }
+
+
+def test_two_people_cannot_be_compared():
+    study = plain_study(2)
+    with pytest.raises(InputError, match="at least three are needed"):
+        compare(study, answered(study, people=2))
+
+
+def share(mean, against):
+    """A posterior of the share with this Bayes factor against 1."""
+    shares = jnp.linspace(0.0, 1.0, 101)
+    curve = jnp.where(shares < 1, float(against), 0.0)
+    ends = jnp.asarray([mean - 0.1, mean + 0.1])
+    one = jnp.asarray(mean)
+    return Share(shares, curve, one, one, ends, jnp.zeros(()), jnp.asarray(True))
+
+
+def advice(found, people=12, spread=0.5, paired=0.01, **costs):
+    """With these mean costs; people differ by `spread` in all rules alike, and by `paired` between rules."""
+    rng = np.random.default_rng(0)
+    person = np.repeat(np.arange(people), 5)
+
+    def noise(scale):
+        values = rng.normal(size=people)
+        return scale * (values - values.mean()) / values.std(ddof=1)
+
+    common, left = noise(spread), {}
+    for rule, mean in costs.items():
+        cost = (mean + common + (noise(paired) if rule == "hierarchical" else 0.0))[person]
+        probabilities = np.stack([np.exp(-cost), 1 - np.exp(-cost)], axis=1)
+        left[rule] = LeftOut(person, np.zeros(len(person), int), probabilities)
+    return recommendation(left, {rule: calibration(each) for rule, each in left.items()}, found, people)
+
+
+def test_the_recommendation_follows_evidence_and_density():
+    differ, alike = share(0.5, 40.0), share(0.9, -2.0)
+    assert "Recommended: hierarchical" in advice(differ, bcm=2.2, hierarchical=2.204, gpoe=2.199)
+    assert "Recommended: bcm" in advice(alike, bcm=2.2, hierarchical=2.204, gpoe=2.199)
+    assert "hardly told from chance" in advice(differ, 4, bcm=2.2, hierarchical=2.1)
+
+
+def test_rules_are_compared_on_the_same_people():
+    """0.05 is a third of a mean cost's error, and far more than the difference's."""
+    differ = share(0.5, 40.0)
+    assert "Recommended: gpoe" in advice(differ, bcm=2.2, hierarchical=2.25, gpoe=2.2 - 1e-6)
+    assert "Recommended: hierarchical" in advice(differ, paired=0.2, bcm=2.2, hierarchical=2.25, gpoe=2.2 - 1e-6)

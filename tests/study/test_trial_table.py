@@ -1,0 +1,269 @@
+"""Trial tables: what is read, in which order, to the last bit; and what is refused, with the line and what to do."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hilbo.errors import InputError
+from hilbo.study import trial_table
+from hilbo.study.config import Study
+from hilbo.study.trial_table import read_trials, write_trials
+
+GP = {"theta": 3.0, "variance": 1.0, "thresholds": [-0.5, 0.5], "noise": 0.5}
+HEADER = "participant,trial,response,gain,delay\n"
+
+
+def study(responses=("different", "similar", "close")):
+    gp = GP | {"thresholds": np.linspace(-0.5, 0.5, len(responses) - 1).tolist()}
+    parameters = {"gain": {"low": 0.0, "high": 2.0, "unit": "N/mm"}, "delay": {"low": 1.0, "high": 100.0}}
+    table = {"name": "any", "responses": list(responses)}
+    return Study.from_dict({"schema": 1, "study": table, "parameters": parameters, "gp": gp})
+
+
+def written(tmp_path, text, name="t.csv"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refusal(tmp_path, text, of=None, **options):
+    """The one sentence with which a table is refused, without its folder."""
+    with pytest.raises(InputError) as refused:
+        read_trials(written(tmp_path, text), of or study(), **options)
+    sentence = str(refused.value)
+    assert "\n" not in sentence and sentence.endswith(".")
+    return sentence.replace(f"{tmp_path}/", "")
+
+
+def test_rows_come_by_participant_in_the_order_of_the_table_and_of_their_trials(tmp_path):
+    text = HEADER + "B,2,close,1,2\nA,10,similar,1,3\nB,1,different,1,4\nA,9,close,1,5\n"
+    table = read_trials(written(tmp_path, text), study())
+    assert table["participant"].tolist() == ["B", "B", "A", "A"]
+    assert table["trial"].tolist() == [1, 2, 9, 10]  # as numbers: as text 10 would stand before 9
+    assert table["category"].tolist() == [0, 2, 2, 1]
+
+
+def test_other_columns_are_kept_as_text(tmp_path):
+    table = read_trials(written(tmp_path, "note," + HEADER + "007,A,1,close,1,2\n,A,2,close,1,2\n"), study())
+    assert table["note"].tolist() == ["007", ""]
+
+
+def test_participants_named_like_missing_values_or_numbers_are_people(tmp_path):
+    text = HEADER + "NA,1,close,1,2\n01,1,close,1,2\n1,1,close,1,2\nnull,1,close,1,2\n"
+    assert read_trials(written(tmp_path, text), study())["participant"].tolist() == ["NA", "01", "1", "null"]
+
+
+def test_a_file_of_a_spreadsheet_is_read(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_bytes(
+        ("\ufeff" + HEADER + 'Zoë, 1, close, 1.0, 2\n"Ann, B.",1.0,similar,5e-1,2\n').replace("\n", "\r\n").encode()
+    )
+    table = read_trials(path, study())
+    assert table["participant"].tolist() == ["Zoë", "Ann, B."]
+    assert table["gain"].tolist() == [1.0, 0.5]
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_numbers_come_back_bit_for_bit(tmp_path, name):
+    rng = np.random.default_rng(0)
+    table = pd.DataFrame(
+        {
+            "participant": "A",
+            "trial": np.arange(1, 501),
+            "response": "close",
+            "gain": 2 * rng.uniform(0, 1, 500) ** 9,
+            "delay": rng.uniform(1, 100, 500),
+        }
+    )
+    table.loc[0, ["gain", "delay"]] = [5e-324, np.nextafter(100.0, 0.0)]
+    write_trials(table, tmp_path / name)
+    again = read_trials(tmp_path / name, study())
+    assert again["gain"].tolist() == table["gain"].tolist()
+    assert again["delay"].tolist() == table["delay"].tolist()
+
+
+def test_csv_and_parquet_say_the_same(tmp_path):
+    text = HEADER + "A,1,close,0.1,2\nA,2,similar,1,100\n"
+    read = read_trials(written(tmp_path, text), study())
+    typed = pd.read_csv(written(tmp_path, text))
+    typed.to_parquet(tmp_path / "t.parquet")
+    columns = ["participant", "trial", "category", "gain", "delay"]
+    assert read_trials(tmp_path / "t.parquet", study())[columns].to_dict("list") == read[columns].to_dict("list")
+
+
+def test_warm_up_and_voided_rows_are_left_out(tmp_path):
+    text = HEADER.replace("\n", ",phase,voided\n")
+    text += "A,1,close,1,2,warm-up,0\nA,1,close,1,2,main,0\nA,2,close,1,2,main,yes\nA,3,close,1,2,main,\n"
+    table = read_trials(written(tmp_path, text), study())
+    assert table["trial"].tolist() == [1, 3]
+
+
+def test_sessions_follow_each_other(tmp_path):
+    text = "session," + HEADER + "s2,A,1,close,1,2\ns1,A,2,similar,1,2\ns1,A,1,different,1,2\n"
+    assert read_trials(written(tmp_path, text), study())["category"].tolist() == [0, 1, 2]
+
+
+def test_numbered_sessions_follow_their_numbers(tmp_path):
+    text = "session," + HEADER + "10,A,1,similar,1,2\n9,A,1,different,1,2\n"
+    assert read_trials(written(tmp_path, text), study())["category"].tolist() == [0, 1]
+
+
+def test_ranks_count_from_1(tmp_path):
+    table = read_trials(written(tmp_path, HEADER + "A,1,3,1,2\nA,2,1.0,1,2\nA,3,similar,1,2\n"), study())
+    assert table["category"].tolist() == [2, 0, 1]
+
+
+def test_labels_that_read_as_integers_are_labels(tmp_path):
+    numbered = study(("3", "2", "1"))  # the lowest answer is called 3
+    table = read_trials(written(tmp_path, HEADER + "A,1,3,1,2\nA,2,1,1,2\n"), numbered)
+    assert table["category"].tolist() == [0, 2]
+    mixed = study(("none", "1", "2"))
+    assert 'response is "3"; it must be one of none, 1, 2.' in refusal(tmp_path, HEADER + "A,1,3,1,2\n", of=mixed)
+
+
+def test_one_material_is_chosen(tmp_path):
+    text = "material," + HEADER + "foam,A,1,close,1,2\ngel,A,1,different,1,2\n"
+    assert read_trials(written(tmp_path, text), study(), "gel")["category"].tolist() == [0]
+    assert "2 materials (foam, gel); choose" in refusal(tmp_path, text)
+    assert 'holds no material "silk"; it has foam, gel' in refusal(tmp_path, text, material="silk")
+    assert 'column "material" is missing' in refusal(tmp_path, HEADER + "A,1,close,1,2\n", material="gel")
+
+
+BAD = {
+    "unknown response": (
+        "A,1,superb,1,2",
+        't.csv:2: response is "superb"; it must be one of different, similar, close',
+    ),
+    "rank 0": ("A,1,0,1,2", "or a rank from 1 to 3"),
+    "rank between": ("A,1,1.5,1,2", 'response is "1.5"'),
+    "other case": ("A,1,Close,1,2", 'response is "Close"'),
+    "no response": ("A,1,,1,2", 'response is ""'),
+    "NaN": ("A,1,close,nan,2", 't.csv:2: gain is "nan"; it must be a number from 0 to 2 N/mm'),
+    "infinite": ("A,1,close,inf,2", 'gain is "inf"'),
+    "no number": ("A,1,close,,2", 'gain is ""'),
+    "text": ("A,1,close,high,2", 'gain is "high"'),
+    "decimal comma": ('A,1,close,"1,5",2', 'gain is "1,5"'),
+    "below": ("A,1,close,1,0.99", 't.csv:2: delay is "0.99"; it must be a number from 1 to 100'),
+    "above": ("A,1,close,2.0000000000000004,2", 'gain is "2.0000000000000004"'),
+    "trial 0": ("A,0,close,1,2", 't.csv:2: trial is "0"; it must be a whole number from 1'),
+    "half a trial": ("A,1.5,close,1,2", 'trial is "1.5"'),
+    "no participant": (",1,close,1,2", "t.csv:2: participant is empty"),
+    "second line": ("A,1,close,1,2\nA,2,near,1,2", 't.csv:3: response is "near"'),
+    "twice": (
+        "A,1,close,1,2\nB,1,close,1,2\nA,1,similar,1,3",
+        "t.csv:4: participant A, trial 1 stands in line 2 already",
+    ),
+    "twice, spelt otherwise": ("A,1,close,1,2\nA,1.0,similar,1,3", "t.csv:3: participant A, trial 1 stands in line 2"),
+    "underscore": ("A,1,close,1_5,2", 'gain is "1_5"'),
+    "one cell more": ("A,1,close,1,2,3", "t.csv:2: has 6 cells, the header has 5; mend that line"),
+    "one cell less": ("A,1,close,1,2\nA,2,close,1", "t.csv:3: has 4 cells, the header has 5"),
+    "an open quote": ('A,1,close,1,"2', "t.csv: is not a table that can be read"),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_bad_row_is_refused_in_one_sentence(tmp_path, what):
+    rows, words = BAD[what]
+    assert words in refusal(tmp_path, HEADER + rows + "\n")
+
+
+def test_a_bad_line_counts_from_the_top_of_the_file_past_blank_ones_and_long_cells(tmp_path):
+    text = "note," + HEADER + '"two\nlines",A,1,close,1,2\n\nx,A,2,near,1,2\n'
+    assert 't.csv:5: response is "near"' in refusal(tmp_path, text)
+
+
+@pytest.mark.parametrize("missing", ["participant", "trial", "response", "gain", "delay"])
+def test_a_missing_column_is_named(tmp_path, missing):
+    text = HEADER.replace(missing, "other") + "A,1,close,1,2\n"
+    assert f't.csv:1: column "{missing}" is missing' in refusal(tmp_path, text)
+
+
+def test_a_column_twice_is_refused(tmp_path):
+    assert 't.csv:1: column "gain" stands there twice' in refusal(
+        tmp_path, HEADER.replace("\n", ",gain\n") + "A,1,close,1,2,1\n"
+    )
+
+
+def test_semicolons_are_no_commas(tmp_path):
+    assert 't.csv:1: column "participant" is missing' in refusal(
+        tmp_path, (HEADER + "A,1,close,1,2\n").replace(",", ";")
+    )
+
+
+def test_rows_of_commas_are_nobodys(tmp_path):
+    assert len(read_trials(written(tmp_path, HEADER + ",,,,\nA,1,close,1,2\n\n,,,,\n"), study())) == 1
+
+
+def test_warm_up_alone_is_refused(tmp_path):
+    text = HEADER.replace("\n", ",phase\n") + "A,1,close,1,2,warm-up\n"
+    assert "no rows to fit" in refusal(tmp_path, text)
+
+
+def test_a_voided_flag_is_yes_or_no(tmp_path):
+    text = HEADER.replace("\n", ",voided\n") + "A,1,close,1,2,maybe\n"
+    assert 't.csv:2: voided is "maybe"; write 1 or 0' in refusal(tmp_path, text)
+
+
+@pytest.mark.parametrize(("text", "words"), [("", "is empty"), (HEADER, "has no rows")])
+def test_an_empty_table_is_refused(tmp_path, text, words):
+    assert words in refusal(tmp_path, text)
+
+
+def test_what_cannot_be_read_is_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_trials(tmp_path / "nowhere.csv", study())
+    with pytest.raises(InputError, match="cannot be read"):
+        read_trials(tmp_path, study())
+    (tmp_path / "t.parquet").write_bytes(b"no parquet")
+    with pytest.raises(InputError, match=r"t\.parquet: is not a table"):
+        read_trials(tmp_path / "t.parquet", study())
+    (tmp_path / "latin.csv").write_bytes(HEADER.encode() + "Zoë,1,close,1,2\n".encode("latin-1"))
+    with pytest.raises(InputError, match=r"latin\.csv: is not a table"):
+        read_trials(tmp_path / "latin.csv", study())
+
+
+def many(count):
+    return "".join(f"P{i // 5},{i % 5 + 1},close,1,{2 + i % 7}\n" for i in range(count))
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_pieces_make_the_same_table(tmp_path, monkeypatch, name):
+    path = written(tmp_path, HEADER + many(53), name)
+    if name.endswith("parquet"):
+        pd.read_csv(written(tmp_path, HEADER + many(53))).to_parquet(path)
+    whole, told = read_trials(path, study()), []
+    monkeypatch.setattr(trial_table, "_PIECE", 10)
+    pd.testing.assert_frame_equal(read_trials(path, study(), say=told.append), whole)
+    assert told[-1] == 53 and told == sorted(told) and len(told) > 4
+
+
+def test_a_damaged_row_far_down_is_found_with_its_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(trial_table, "_PIECE", 10)
+    text = HEADER + many(53)
+    assert 't.csv:41: response is "near"' in refusal(tmp_path, text.replace("P7,5,close", "P7,5,near"))
+    assert "t.csv:41: has 4 cells" in refusal(tmp_path, text.replace("P7,5,close,1", "P7,5,close"))
+    again = refusal(tmp_path, text.replace("P9,1,", "P0,2,"))  # two pieces apart
+    assert "t.csv:47: participant P0, trial 2 stands in line 3 already" in again
+
+
+def test_other_columns_may_be_left_out(tmp_path):
+    table = read_trials(written(tmp_path, "note," + HEADER + "007,A,1,close,1,2\n"), study(), others=False)
+    assert set(table.columns) == {"participant", "trial", "gain", "delay", "category"}
+
+
+def test_a_parquet_file_has_rows_and_no_lines(tmp_path):
+    good = pd.read_csv(written(tmp_path, HEADER + many(20)))
+
+    def refused(frame):
+        frame.to_parquet(tmp_path / "t.parquet")
+        with pytest.raises(InputError) as error:
+            read_trials(tmp_path / "t.parquet", study())
+        return str(error.value)
+
+    assert 't.parquet: row 7: gain is "9.0"; it must be' in refused(good.assign(gain=[1.0] * 6 + [9.0] * 14))
+    twice = refused(pd.concat([good, good.iloc[[3]]]))
+    assert "t.parquet: row 21: participant P0, trial 4 stands in row 4 already" in twice
+    assert 't.parquet: column "gain" is missing' in refused(good.drop(columns="gain"))
+    mixed = good.astype({"gain": object})
+    mixed.loc[2, "gain"] = None
+    assert 't.parquet: row 3: gain is ""' in refused(mixed).replace('"nan"', '""')
