@@ -322,7 +322,7 @@ def test_the_interpreter_ends_although_a_device_is_open():
     """A program that forgets to close its device ends, and with it the heartbeats."""
     code = "from peer import Peer; device = Peer().open(patience=60.0); print(device.state().name)"
     root = Path(__file__).parents[1]
-    paths = os.pathsep.join([str(root), str(root / "tests")])
+    paths = os.pathsep.join([str(root), str(root / "tests" / "support")])
     run = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=os.environ | {"PYTHONPATH": paths}
     )

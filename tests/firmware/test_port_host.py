@@ -104,7 +104,7 @@ def test_silence_ends_in_zero_force_within_the_watchdog(moment):
 
 def killed(moment: int) -> None:
     with Port("--finger", "hold", "--seed", str(moment)) as port:
-        script = Path(__file__).with_name("killed_host.py")
+        script = Path(__file__).parents[1] / "support" / "killed_host.py"
         pipe = subprocess.PIPE
         host = subprocess.Popen([sys.executable, script, port.slave], stdin=pipe, stdout=pipe, text=True)
         assert host.stdin and host.stdout
