@@ -27,7 +27,7 @@ class Fault(NamedTuple):
     file: str
     old: str
     new: str
-    tests: str  # tests/test_firmware_*.py
+    tests: str  # tests/firmware/test_*.py
 
 
 FAULTS = [
@@ -111,7 +111,7 @@ def is_noticed(fault: Fault) -> bool:
                 f"{fault.name}: {fault.old!r} stands {text.count(fault.old)} times in {fault.file}, not once."
             )
         source.write_text(text.replace(fault.old, fault.new), encoding="utf-8")
-        tests = ROOT / "tests" / f"test_firmware_{fault.tests}.py"
+        tests = ROOT / "tests" / "firmware" / f"test_{fault.tests}.py"
         environment = os.environ | {"HILBO_FIRMWARE_CORE": str(core), "HILBO_FIRMWARE_FLAGS": "-Wno-error"}
         options = ["-x", "-q", "-n", "0", "-m", "not deep", "-p", "no:cacheprovider"]
         command = [sys.executable, "-m", "pytest", *options, str(tests)]
