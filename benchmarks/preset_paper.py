@@ -17,16 +17,18 @@ ROOT = Path(__file__).parents[1]
 def one_study(study, seed, candidates):
     """Answers and errors of one simulated study (NRMSE over K1, B1, alpha by search range)."""
     from hilbo.simulation import simulate
-    from hilbo.study.aggregate import fit_cohort, nrmse, population_optimum, progress
+    from hilbo.study.aggregate import aggregate_cohort, nrmse, population_optimum
     from hilbo.study.cohort import Cohort
+    from hilbo.study.progress import follow
 
     population = simulate.PRESETS["paper"]
     truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
     trials = simulate.simulate_study(study, simulate.people(study, population, 24, seed), seed)
     cohort = Cohort(trials, np.zeros((24, 25, 3)), tuple(f"P{j:02d}" for j in range(24)))
-    merged, own = (np.asarray(part) for part in progress(study, cohort, 0))
-    posteriors = fit_cohort(study, cohort)
-    average = np.asarray(population_optimum(study, posteriors, candidates, "average").x)
+    aggregate = aggregate_cohort(study, cohort, 0, alternatives=False)
+    progress = follow(study, aggregate, 0)
+    merged, own = progress.population, progress.own
+    average = np.asarray(population_optimum(study, aggregate.posteriors, candidates, "average").x)
     close = np.asarray((trials.q == 2).sum(axis=1))
     return {
         "close": (close.mean(), close.std(ddof=1)),

@@ -18,6 +18,7 @@ import numpy as np
 from hilbo import Study
 from hilbo.report.comparison import comparison_table
 from hilbo.simulation.simulate import PRESETS, people, simulate_study, to_table
+from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.rule_comparison import compare
 from hilbo.study.trial_table import read_trials
@@ -38,7 +39,7 @@ for words, spread in (("alike", (0.02, 0.02, 0.02)), ("as in the preset", PRESET
     answers = simulate_study(study, people(study, population, 6, seed=1), seed=1)
     table = to_table(study, answers)
     cohort = Cohort(answers, np.asarray(study.space.to_physical(answers.x)), tuple(table["participant"].unique()))
-    found = compare(study, cohort)
+    found = compare(study, aggregate_cohort(study, cohort, alternatives=False))
     print(words, "-", found["recommendation"])
     print(comparison_table(found)[SHOWN].round(3).to_string(index=False), "\n")
 
@@ -49,6 +50,6 @@ for words, spread in (("alike", (0.02, 0.02, 0.02)), ("as in the preset", PRESET
 # %%
 video = Study.load("hilbo/data/video_quality.toml")
 everybody = cohort_of(read_trials("hilbo/data/video_quality.csv", video), video)
-found = compare(video, everybody.of(everybody.names[:6]).first(20))
+found = compare(video, aggregate_cohort(video, everybody.of(everybody.names[:6]).first(20), alternatives=False))
 print(found["recommendation"])
 print(comparison_table(found)[SHOWN].round(3).to_string(index=False))

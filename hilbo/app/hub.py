@@ -37,8 +37,8 @@ class NotNowError(InputError):
 
 
 class Hub:
-    """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` opens the device, `maps` what makes
-    the slices of its posterior.
+    """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` opens the device, `maps` makes
+    what draws the slices of the chooser's posterior.
 
     `invite`, once set, makes a new link for the participant; `gap` (s) is the pause between two trials, `tag` is what
     trials of this session are known by in browsers.
@@ -51,7 +51,7 @@ class Hub:
         connect: Callable[[], Any],
         *,
         tag: str,
-        maps: Callable[[LiveSession], Any] | None = None,
+        maps: Callable[[Any], Any] | None = None,
         gap: float = 0.7,
     ):
         self.log, self.chooser, self.tag, self.gap = log, chooser, tag, gap
@@ -89,8 +89,8 @@ class Hub:
         """Compile what choosing and drawing need; nothing is rendered before it is done."""
         self.chooser.warm()
         if self._make_maps is not None:
-            maps = self._make_maps(self.state)
-            maps.warm(self.state)
+            maps = self._make_maps(self.chooser)
+            maps.warm()
             self._maps = maps
         self._loop.call_soon_threadsafe(self.publish)
 

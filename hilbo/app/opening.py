@@ -14,7 +14,7 @@ from hilbo.app.slices import Maps
 from hilbo.errors import InputError
 from hilbo.session.actions import Header, LiveSession
 from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.look_ahead import LiveChooser, told_of
+from hilbo.session.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.participants import check_consent, read_people
 from hilbo.session.plan import header_for, planned_header
 from hilbo.session.warm_start import read_warm_start
@@ -73,7 +73,7 @@ def _begun(wanted, study) -> tuple[EventLog, LiveChooser]:
             f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
         )
     warm = _warm_starts(wanted, study, header)
-    header = msgspec.structs.replace(header, warm_start=told_of(warm))
+    header = msgspec.structs.replace(header, warm_start=warm_start_sources(warm))
     chooser = LiveChooser(LiveSession.start(study, header), warm)
     return EventLog.create(path, study, header), chooser
 

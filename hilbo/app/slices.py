@@ -1,17 +1,20 @@
 """Slices of the posterior mean through its maximum, for the experimenter's page; one compiled function."""
 
 import itertools
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Bool, Float
 
-from hilbo.ordinal_gp import fit
+from hilbo.ordinal_gp import Posterior
 from hilbo.session import progress
 from hilbo.session.actions import LiveSession
-from hilbo.session.ask_tell import Session, physical_trials
+from hilbo.session.look_ahead import Answers, LiveChooser
+from hilbo.study.config import Study
 
 __all__ = ["Maps"]
 
@@ -19,35 +22,31 @@ _SIDE = 33
 
 
 class Maps:
-    """Makes the slices of a session's map, material by material."""
+    """Makes the slices of a session's map, material by material, from the posteriors that its chooser keeps."""
 
-    def __init__(self, state: LiveSession):
-        self._sessions: dict[str | None, Session] = {}
-        for block in state.header.blocks:
-            if not block.trials:
-                study = state.study if block.material is None else state.study.material(block.material)
-                self._sessions[block.material] = Session.start(study, state.header.seed)
+    def __init__(self, chooser: LiveChooser):
+        self._chooser = chooser
 
-    def warm(self, state: LiveSession) -> None:
-        """Compile what `slices` needs."""
-        for material, session in self._sessions.items():
-            self._found(state, material, [])
-            study = session.study
-            middle = np.array([[(p.low + p.high) / 2 for p in study.space.parameters]])
-            progress.trust(study, middle, [0], middle[0], state.header.seed)
+    def warm(self) -> None:
+        """Compile what `slices` and `trust` need, with no answers."""
+        for block in self._chooser.chosen_blocks:
+            fitted, study = self._chooser.fitted(Answers(block)), self._chooser.study(block)
+            self._sliced(Answers(block), None)
+            following = [fitted] * len(study.responses)
+            progress.trust(study, fitted, fitted.point, following, lambda one, of=block: self._chooser.best(of, one))
 
     def trust(self, state: LiveSession) -> list[list[str]]:
         """How far the session has come, in words: name and value."""
         rows = []
-        chosen = [i for i, b in enumerate(state.header.blocks) if not b.trials and state.answers(i)]
+        chosen = [i for i in self._chooser.chosen_blocks if state.answers(i)]
         block = next((i for i in chosen if not state.full(i)), chosen[-1] if chosen else None)
-        found = None if block is None else progress.trust_of(state, block)
-        if found is not None:
-            rows.append(["Best so far", ", ".join(f"{name} {value:.3g}" for name, value in found.best.items())])
+        trust = None if block is None else progress.trust_of(state, block, self._chooser)
+        if trust is not None:
+            rows.append(["Best so far", ", ".join(f"{name} {value:.3g}" for name, value in trust.best.items())])
             top = state.study.responses[-1]
-            rows.append([f'… would be "{top}"', f"{100 * found.top:.0f} %"])
-            if found.movement is not None:
-                rows.append(["… moves with one more", f"by {100 * found.movement:.1f} % of the ranges"])
+            rows.append([f'… would be "{top}"', f"{100 * trust.top:.0f} %"])
+            if trust.movement is not None:
+                rows.append(["… moves with one more", f"by {100 * trust.movement:.1f} % of the ranges"])
         twice = progress.consistency(state)
         if twice.pairs:
             rows.append(["Asked twice", f"{twice.alike} of {twice.pairs} alike"])
@@ -58,44 +57,40 @@ class Maps:
     def slices(self, state: LiveSession) -> dict[str, Any] | None:
         """For each pair of parameters: mean on a grid (row by row, None where not feasible), the maximum, and the
         trials with their distance from the slice. None where the session chooses nothing."""
-        blocks = [i for i, block in enumerate(state.header.blocks) if not block.trials]
+        blocks = self._chooser.chosen_blocks
         if not blocks:
             return None
-        present = state.pending.block if state.pending is not None else blocks[0]
-        block = present if present in blocks else blocks[0]
-        material = state.header.blocks[block].material
-        answered = [t for t in state.answers(block) if t.values and "class_a" in t.values]
-        return self._found(state, material, answered)
-
-    def _found(self, state, material, answered):
-        session = self._sessions[material]
-        study = session.study
-        names = study.space.names
-        points = np.array([[t.renderings["a"][n] for n in names] for t in answered]).reshape(-1, len(names))
-        answers = np.array([study.responses.index(t.values["class_a"]) for t in answered], int)
-        trials = physical_trials(study, points, answers, study.selection.trials)
-        posterior = fit(study.gp, trials, inference=study.inference, throw=False)
-        best, mean, feasible = jax.device_get(_slices(study, posterior, session.step.best(points, answers)))
-        marks = np.asarray(trials.x)[: len(answered)]
-        levels = answers / (len(study.responses) - 1)
-        now = self._now(state, study)
-        return {"slices": [
-            _slice(study, best, mean[k], feasible[k], pair, marks, levels, now)
-            for k, pair in enumerate(itertools.combinations(range(len(names)), 2))
-        ]}  # fmt: skip
-
-    @staticmethod
-    def _now(state, study):
         trial = state.pending
-        if trial is None or trial.sets:
-            return None
-        return np.asarray(study.space.to_unit(np.array([trial.renderings["a"][n] for n in study.space.names])))
+        block = trial.block if trial is not None and trial.block in blocks else blocks[0]
+        asked = None if trial is None or trial.sets else trial.renderings["a"]
+        return self._sliced(Answers.of(state, block), asked)
+
+    def _sliced(self, answers: Answers, asked: Mapping[str, float] | None) -> dict[str, Any]:
+        """`slices` after some answers; `asked`: the rendering that is being felt."""
+        study, fitted = self._chooser.study(answers.block), self._chooser.fitted(answers)
+        names = study.space.names
+        best = self._chooser.best(answers.block, fitted)
+        made: _Slices = jax.device_get(_slices(study, fitted.posterior, best))
+        marks = np.asarray(fitted.posterior.trials.x)[: len(answers.categories)]
+        levels = np.array(answers.categories, int) / (len(study.responses) - 1)
+        now = None if asked is None else np.asarray(study.space.to_unit(np.array([asked[name] for name in names])))
+        pairs = itertools.combinations(range(len(names)), 2)
+        return {"slices": [_slice(study, made, k, pair, marks, levels, now) for k, pair in enumerate(pairs)]}
 
 
-def _slice(study, best, mean, feasible, pair, marks, levels, now):
-    names = study.space.names
-    others = [k for k in range(len(names)) if k not in pair]
-    held = [f"{names[k]} {float(study.space.parameters[k].to_physical(jnp.asarray(best[k]))):.3g}" for k in others]
+class _Slices(NamedTuple):
+    """The best point of the unit cube, and the posterior mean and what is feasible on the grids through it."""
+
+    best: Float[Array, " d"]
+    mean: Float[Array, "pairs side side"]
+    feasible: Bool[Array, "pairs side side"]
+
+
+def _slice(study, made: _Slices, k: int, pair: tuple[int, int], marks, levels, now) -> dict[str, Any]:
+    """One grid, for the page; `marks` (n, d) and `levels` (n,) are the answers, `now` (d,) what is being felt."""
+    best, names = made.best, study.space.names
+    others = [i for i in range(len(names)) if i not in pair]
+    held = [f"{names[i]} {float(study.space.parameters[i].to_physical(jnp.asarray(best[i]))):.3g}" for i in others]
     across, up = pair
     trials = [
         {"x": float(x[across]), "y": float(x[up]), "level": float(level), "now": False,
@@ -106,7 +101,7 @@ def _slice(study, best, mean, feasible, pair, marks, levels, now):
         trials.append({"x": float(now[across]), "y": float(now[up]), "level": 0.0, "now": True, "away": 0.0})
     shown = [
         [round(float(v), 4) if ok else None for v, ok in zip(row, oks, strict=True)]
-        for row, oks in zip(mean, feasible, strict=True)
+        for row, oks in zip(made.mean[k], made.feasible[k], strict=True)
     ]
     return {
         "across": names[across],
@@ -119,7 +114,7 @@ def _slice(study, best, mean, feasible, pair, marks, levels, now):
 
 
 @eqx.filter_jit
-def _slices(study, posterior, physical):
+def _slices(study: Study, posterior: Posterior, physical: Float[Array | np.ndarray, " d"]) -> _Slices:
     best = study.space.to_unit(physical)
     axis = jnp.linspace(0.0, 1.0, _SIDE, dtype=best.dtype)
     up, across = jnp.meshgrid(axis, axis, indexing="ij")
@@ -129,4 +124,4 @@ def _slices(study, posterior, physical):
     ]
     points = jnp.concatenate(grids)
     shape = (len(grids), _SIDE, _SIDE)
-    return best, posterior.mean(points).reshape(shape), study.space.feasible(points).reshape(shape)
+    return _Slices(best, posterior.mean(points).reshape(shape), study.space.feasible(points).reshape(shape))

@@ -90,9 +90,7 @@ def aggregate(
             cohort = cohort.first(first) if first else cohort
             agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
         if team.devices == 1 and len(cohort.names) <= _LARGE and individuals:
-            content = _aggregate(chosen, cohort, folder, seed, say)
-            if compare:
-                _compare(chosen, cohort, folder, seed, say)
+            content = _aggregate(chosen, cohort, folder, seed, say, compare=compare)
         elif compare:
             raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
         else:
@@ -212,20 +210,18 @@ def _by_rule(study, rule):
     return dataclasses.replace(study, rule=rule)
 
 
-def _compare(study, cohort, folder, seed, say) -> None:
+def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False) -> dict[str, Any]:
+    """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
     from hilbo.report.comparison import write_comparison
+    from hilbo.report.results import write_results
+    from hilbo.study.analysis import analyse_population
 
-    say("every rule, with each person left out")
-    write_comparison(study, cohort, folder, seed)
-
-
-def _aggregate(study, cohort, folder, seed, say, truth=None) -> dict[str, Any]:
-    from hilbo.report import results as report
-    from hilbo.study.aggregate import aggregate_cohort
-
-    say(f"fitting {len(cohort.names)} participants ({study.name})")
-    found = aggregate_cohort(study, cohort, seed)
-    return report.write_results(study, found, folder, seed, truth, say)
+    population = analyse_population(study, cohort, seed, say)
+    content = write_results(population, folder, truth, say)
+    if compare:
+        say("every rule, with each person left out")
+        write_comparison(study, population.aggregate, folder, seed)
+    return content
 
 
 def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -> dict[str, Any]:

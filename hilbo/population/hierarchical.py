@@ -40,7 +40,7 @@ __all__ = [
 NEWCOMER = -1.0
 """The number of a person who has given no answers."""
 
-_NODES, _BATCH = 33, 9  # of the log evidence's Chebyshev interpolation in p; computed at a time
+_NODES = 33  # of the log evidence's Chebyshev interpolation in p
 _ENOUGH = 1e-5  # error of the log evidence between them
 _FINE = 2001
 
@@ -131,25 +131,22 @@ def shared_posterior(posterior: Posterior) -> Posterior:
 
 def learn_share(gp: OrdinalGP, trials: Trials, *, inference: str = "laplace") -> Share:
     """The posterior of the share p, from `of_people(...)`; `gp` is one person's model."""
-    return share_from(lambda shares: _evidences(gp, trials, shares, inference), trials.x.dtype)
+    return share_from(lambda share: _evidence(gp, trials, share, inference), trials.x.dtype)
 
 
 def share_from(
-    evidences: Callable[[Float[Array, " k"]], tuple[Float[Array, " k"], Bool[Array, " k"]]], dtype: DTypeLike
+    evidence: Callable[[Float[Array, ""]], tuple[Float[Array, ""], Bool[Array, ""]]], dtype: DTypeLike
 ) -> Share:
-    """The posterior of the share from its log evidence: a function of shares (k,) to values and whether fits held.
+    """The posterior of the share from its log evidence: a function of a share to its value and whether the fit held.
 
     The evidence is computed at Chebyshev points of [0, 1], 9, 17 or 33 of them, and interpolated: it is smooth in p,
     and so the whole curve, its maximum and its intervals come at a small cost.
     """
     known: dict[int, tuple[float, bool]] = {}  # by place among the finest nodes, in which the coarser ones are
     for step in (4, 2, 1):
-        ahead = [i for i in range(0, _NODES, step) if i not in known]
-        for begin in range(0, len(ahead), _BATCH):
-            places = ahead[begin : begin + _BATCH]
-            padded = places + places[:1] * (_BATCH - len(places))  # one shape, one compilation
-            values, held = evidences(jnp.asarray((1 + _nodes()[padded]) / 2, dtype))
-            known |= {i: (float(v), bool(h)) for i, v, h in zip(places, values, held, strict=False)}
+        for node in (i for i in range(0, _NODES, step) if i not in known):
+            value, held = evidence(jnp.asarray((1 + _nodes()[node]) / 2, dtype))
+            known[node] = float(value), bool(held)
         every = sorted(known)
         fitted = np.array([known[i][0] for i in every])
         coefficients = np.polynomial.chebyshev.chebfit(_nodes()[every], fitted, len(every) - 1)
@@ -176,9 +173,9 @@ def _nodes() -> np.ndarray:
 
 
 @eqx.filter_jit
-def _evidences(gp, trials, shares, inference):
-    def one(share):
-        posterior = fit_people(gp, trials, share, inference=inference, throw=False)
-        return posterior.log_evidence, posterior.certificate.converged
-
-    return jax.lax.map(one, shares)
+def _evidence(
+    gp: OrdinalGP, trials: Trials, share: Float[Array, ""], inference: str
+) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Log evidence at one share, and whether the fit held its certificate."""
+    posterior = fit_people(gp, trials, share, inference=inference, throw=False)
+    return posterior.log_evidence, posterior.certificate.converged

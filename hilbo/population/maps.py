@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
@@ -116,7 +116,7 @@ def rule_map(
     else:
         part, shared = one, None
     if rule == "pooled":
-        shared = _together(gp, trials, one, inference, largest)
+        shared = _pooled(gp, trials, inference, largest)
         if shared is None:
             answers, people = int(np.asarray(trials.mask).sum()), trials.mask.shape[0]
             raise InputError(
@@ -144,7 +144,7 @@ def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest:
     counts = _counts(gp, trials, inference)
     if counts is None:
         return learn_share(gp, of_people(trials), inference=inference)
-    return share_from(lambda shares: _curve(gp, counts, shares), trials.x.dtype)
+    return share_from(lambda share: _evidence(gp, counts, share), trials.x.dtype)
 
 
 def even_choice(trials: Trials, largest: int) -> Trials:
@@ -157,8 +157,9 @@ def even_choice(trials: Trials, largest: int) -> Trials:
 
 
 @eqx.filter_jit
-def _curve(gp, counts, shares):
-    return jax.lax.map(lambda share: evidence(gp, share, counts), shares)
+def _evidence(gp: OrdinalGP, counts: Counts, share: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Log evidence of a share from counts, and whether the fit held its certificate."""
+    return evidence(gp, share, counts)
 
 
 def _experts(gp, trials, inference) -> Posterior:
@@ -192,14 +193,32 @@ def _counts(gp, trials, inference) -> Counts | None:
 
 def _together(gp, trials, share, inference, largest) -> Posterior | None:
     """The shared function's posterior from all answers at once; None if they are too many."""
-    counts = _counts(gp, trials, inference)
-    if counts is not None and counts.people * counts.x.shape[0] ** 3 <= largest**3:
-        found = fit_counts(gp, share, counts if float(share) < 1 else one_person(counts))
-        if bool(found.certificate.converged):
-            return found
+    posterior = _from_counts(gp, _counts(gp, trials, inference), share, largest)
+    if posterior is not None:
+        return posterior
     if inference == "exact" or int(np.asarray(trials.mask).sum()) > largest:
         return None
     return shared_posterior(fit_people(gp, of_people(trials), share, inference=inference, throw=False))
+
+
+def _pooled(gp: OrdinalGP, trials: Trials, inference: str, largest: int) -> Posterior | None:
+    """One GP on everybody's answers, as if from one person; None if they are too many."""
+    counts = _counts(gp, trials, inference)
+    one = jnp.ones_like(gp.kernel.variance)
+    posterior = _from_counts(gp, None if counts is None else one_person(counts), one, largest)
+    mask = np.asarray(trials.mask)
+    if posterior is not None or mask.sum() > largest:
+        return posterior
+    everybody = Trials.from_arrays(np.asarray(trials.x)[mask], np.asarray(trials.q)[mask])
+    return fit(gp, everybody, inference=inference, throw=False)
+
+
+def _from_counts(gp: OrdinalGP, counts: Counts | None, share: Float[Array, ""], largest: int) -> Posterior | None:
+    """The shared function's posterior from counts; None if there are none, too many points, or the fit failed."""
+    if counts is None or counts.people * counts.x.shape[0] ** 3 > largest**3:
+        return None
+    posterior = fit_counts(gp, share, counts if float(share) < 1 else one_person(counts))
+    return posterior if bool(posterior.certificate.converged) else None
 
 
 def _communicating(gp, trials, inference) -> tuple[Posterior, Posterior]:

@@ -3,14 +3,12 @@
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from hilbo.population.maps import rule_map
 from hilbo.report.participants import as_json
 from hilbo.report.results import save_figures
-from hilbo.study.cohort import Cohort
+from hilbo.study.aggregate import Aggregate
 from hilbo.study.config import Study
 from hilbo.study.rule_comparison import KNOWN, compare
 
@@ -22,26 +20,23 @@ _COLUMNS = ("method", "negative_log_density", "negative_log_density_error", "cen
 _CAPTION = "Errors are by person; the share of the rule hierarchical is learnt from everybody."
 
 
-def write_comparison(study: Study, cohort: Cohort, folder: Path, seed: int = 0) -> dict[str, Any]:
+def write_comparison(study: Study, aggregate: Aggregate, folder: Path, seed: int = 0) -> dict[str, Any]:
     """Write the comparison of all rules; returns the content of comparison.json."""
     from hilbo.report.figures import population as plotting
 
-    content = compare(study, cohort, seed)
+    content = compare(study, aggregate, seed)
     (folder / "comparison.json").write_text(as_json(content))
     comparison_table(content).to_csv(folder / "comparison.csv", index=False)
-    rule = study.rule if "optimum" in content["rules"][study.rule] else "bcm"
-    share = jnp.asarray(content["share"]["share"])
-    found = rule_map(study.gp, cohort.trials, rule, share=share, inference=study.inference)
-    best = np.array([content["rules"][rule]["optimum"][name] for name in study.space.names])
-    at = np.asarray(study.space.to_unit(best))
     figures = {
         "comparison": (plotting.rules_figure(content), "Every rule, each person left out", _CAPTION),
         "reliability": (plotting.reliability_figure(content), "Reliability", "On the line: as often as predicted."),
         "coverage": (
-            plotting.coverage_figure(study, found.predict, at, float(found.map_prior), KNOWN),
+            plotting.coverage_figure(
+                study, aggregate.surface, np.asarray(aggregate.optimum.x), float(aggregate.map.map_prior), KNOWN
+            ),
             "What the answers cover",
-            f"By the rule {rule}; hatched: the map's standard deviation is more than {KNOWN:g} of what it is without"
-            " answers.",
+            f"By the rule {study.rule}; hatched: the map's standard deviation is more than {KNOWN:g} of what it is"
+            " without answers.",
         ),
     }
     save_figures(figures, folder)

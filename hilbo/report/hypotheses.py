@@ -14,8 +14,9 @@ import numpy as np
 
 from hilbo.report.results import misses
 from hilbo.report.validation import Validated, safest
-from hilbo.study.analysis import Analysis, settled
+from hilbo.study.analysis import Analysis
 from hilbo.study.heterogeneity import in_place
+from hilbo.study.progress import settled
 
 __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
@@ -207,7 +208,7 @@ def _convergence(results):
     if results.reference is not None:
         miss = [
             float(misses(found.study, x, results.reference)[0])
-            for x in (found.progress.merged[at], found.progress.merged[-1])
+            for x in (found.progress.population[at], found.progress.population[-1])
         ]
         yield Evidence(
             _side(miss[0] <= miss[1] + _NEAR),

@@ -1,6 +1,6 @@
 """Results -> result.json, a population map in netCDF, figures, and one HTML page that explains itself.
 
-`write_results` makes a whole results folder from an aggregate: result.json (DESIGN: "Results"), optima.csv, map.nc,
+`write_results` makes a whole results folder from an analysis: result.json (DESIGN: "Results"), optima.csv, map.nc,
 the figures as PNG and SVG, and report.html with the figures inside.
 """
 
@@ -23,7 +23,8 @@ from jaxtyping import Array, Float
 from hilbo.report.page import results_page
 from hilbo.report.participants import People, as_json, people_of
 from hilbo.search.rendering import K0_range, margin_of, set_of
-from hilbo.study.aggregate import Aggregate, Optimum, nrmse, other_inference, progress
+from hilbo.study.aggregate import Aggregate, Optimum, nrmse, other_inference
+from hilbo.study.analysis import Population
 from hilbo.study.batch_optimum import Merged
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
@@ -164,26 +165,23 @@ def _truth(study, aggregate, truth):
 
 
 def write_results(
-    study: Study,
-    aggregate: Aggregate,
+    population: Population,
     folder: Path,
-    seed: int = 0,
     truth: Float[np.ndarray, " d"] | None = None,
     say=lambda text: None,
 ) -> dict[str, Any]:
     """Write the results folder; returns the content of result.json. `say` is told what is being done."""
+    study, aggregate = population.study, population.aggregate
     people = people_of(study, aggregate)
-    content = result(study, aggregate, seed, truth, people)
+    content = result(study, aggregate, population.seed, truth, people)
     (folder / "result.json").write_text(as_json(content))
     optima_table(content, people).to_csv(folder / "optima.csv", index=False)
     say("the population map on a grid")
     data = map_dataset(study, aggregate.surface, aggregate.optimum.x)
     data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     data.to_netcdf(folder / "map.nc", engine="h5netcdf")
-    say("progress of the optimum over trials")
-    figures = _figures(study, aggregate, seed, truth)
     say("figures and report")
-    pictures = save_figures(figures, folder)
+    pictures = save_figures(_figures(population, truth), folder)
     (folder / "report.html").write_text(results_page(study, content, pictures, people), encoding="utf-8")
     return content
 
@@ -244,29 +242,24 @@ def map_dataset(
     )
 
 
-def _figures(study, aggregate, seed, truth):
+def _figures(population: Population, truth: Float[np.ndarray, " d"] | None) -> dict[str, tuple[Any, str, str]]:
     """Name -> figure, title, caption."""
     from hilbo.report.figures import maps
 
-    cohort = aggregate.cohort
-    longest = int(cohort.counts().max())
-    after = [n for n in (5, 15, 25) if n <= longest] or [longest]
-    after += [longest] if longest > 25 else []
-    counts = np.unique([*np.linspace(1, longest, min(longest, 25)).round().astype(int), *after])
-    merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts.tolist()))
+    study, aggregate = population.study, population.aggregate
     best = np.asarray(aggregate.optimum.x)
     marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
     marks |= {} if truth is None else {"truth": truth}
     how = in_place(aggregate.map)
     captions = _captions(study, truth, f" These maps are merged {how}." if how else "")
-    found = {
-        "map": maps.map_slices(study, aggregate.surface, best, cohort),
-        "progress": maps.progress_figure(study, cohort, merged, own, truth, counts),
-        "slices": maps.slices_after(study, cohort, merged[np.searchsorted(counts, after)], after, aggregate.map),
+    figures = {
+        "map": maps.map_slices(study, aggregate.surface, best, population.cohort),
+        "progress": maps.progress_figure(study, population, truth),
+        "slices": maps.slices_after(study, population.progress),
     }
     if study.space.dim > 1:
-        found["optima"] = maps.optima_scatter(study, np.asarray(aggregate.individuals.x), marks)
-    return {name: (figure, *captions[name]) for name, figure in found.items()}
+        figures["optima"] = maps.optima_scatter(study, np.asarray(aggregate.individuals.x), marks)
+    return {name: (figure, *captions[name]) for name, figure in figures.items()}
 
 
 def _captions(study, truth, how=""):

@@ -102,7 +102,7 @@ def _compared(found: Analysis, seed, say) -> dict[str, Any] | None:
     if np.sum(found.cohort.counts() > 0) < _FEWEST:
         return None
     say("comparing the rules of aggregation")
-    return compare(found.study, found.cohort, seed)
+    return compare(found.study, found.aggregate, seed)
 
 
 def _write_material(material, found: Analysis, validated, compared, part: Path, seed):

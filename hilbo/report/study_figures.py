@@ -52,10 +52,10 @@ def _individuals(found: Analysis) -> Figures:
     from hilbo.report.figures import study as plotting_study
 
     study, cohort, progress, top = found.study, found.cohort, found.progress, found.study.responses[-1]
-    who, (after, rows) = plotting_study.typical_person(found), _moments(progress.counts)
+    who = plotting_study.typical_person(found)
     return {
         "progression": (
-            plotting_study.posterior_progress(study, cohort, who, progress.own[rows, who], after),
+            plotting_study.posterior_progress(study, cohort, progress, who),
             "One participant's map, trial by trial (paper, figure 4)",
             f"{cohort.names[who]}, whose optimum is at the median distance from the population's. Dots: what was asked,"
             f' orange where the answer was "{top}"; star: the highest point so far.{_white(study)}',
@@ -76,7 +76,6 @@ def _population_map(found: Analysis) -> Figures:
     from hilbo.report.figures import study as plotting_study
 
     study, cohort, of = found.study, found.cohort, found.aggregate
-    after, rows = _moments(found.progress.counts)
     return {
         "map": (
             plotting_study.sets_on_map(
@@ -88,7 +87,7 @@ def _population_map(found: Analysis) -> Figures:
             f" slice, and may lie in its white.{_white(study)}",
         ),
         "maps-after": (
-            maps.slices_after(study, cohort, found.progress.merged[rows], after, of.map),
+            maps.slices_after(study, found.progress),
             "The population map after fewer trials (paper, figure 7a)",
             f"From everybody's first answers only, each through its own optimum, the star.{_white(study)}{_how(found)}",
         ),
@@ -171,10 +170,3 @@ def _how(found: Analysis) -> str:
     """How maps were merged, where that needs saying."""
     how = in_place(found.aggregate.map)
     return f" These maps are merged {how}." if how else ""
-
-
-def _moments(counts):
-    """Up to four of the numbers of trials, 5, 15 and 25 as in the paper, and the last; and where they are in counts."""
-    chosen = [n for n in (5, 15, 25) if n in counts]
-    chosen += [int(counts[-1])] if counts[-1] not in chosen else []
-    return chosen, np.searchsorted(counts, chosen)

@@ -10,21 +10,18 @@ answers so far and the seed: fits start cold, from the physical values that a ta
 log, of a table, on another day) gives the same points bit for bit.
 """
 
-import functools
 import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import msgspec
 import numpy as np
 
 from hilbo.errors import InputError
-from hilbo.numerics.compiling import compiler_options
 from hilbo.ordinal_gp import Posterior, Trials, fit
-from hilbo.session.selection import Design, design, next_point
+from hilbo.session.selection import Design, design
+from hilbo.session.step import Step, padding
 from hilbo.study.config import Study
 
 __all__ = ["Session", "physical_trials"]
@@ -35,90 +32,14 @@ def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capac
 
     Rows beyond n are put in the middle of the box before the change of coordinates, so that it compiles once.
     """
-    padded, categories = _padded(points, answers, _padding(study, capacity))
-    return Trials(_to_unit(study.space, padded), jnp.asarray(categories), jnp.arange(capacity) < len(points))
-
-
-def _padding(study, capacity):
-    return np.tile([(p.low + p.high) / 2 for p in study.space.parameters], (capacity, 1))
-
-
-def _padded(points, answers, padding):
-    padded, categories = padding.copy(), np.zeros(len(padding), np.int32)
+    padded, categories = padding(study, capacity), np.zeros(capacity, np.int32)
     padded[: len(points)], categories[: len(answers)] = points, answers
-    return padded, categories
+    return Trials(_to_unit(study.space, padded), jnp.asarray(categories), jnp.arange(capacity) < len(points))
 
 
 @eqx.filter_jit
 def _to_unit(space, physical):
     return space.to_unit(physical)
-
-
-@eqx.filter_jit
-def _to_physical(space, unit):
-    return space.to_physical(unit)
-
-
-class _Step:
-    """What is compiled once for a study and a design: from answers to the next point, in physical units.
-
-    Everything but the answers is bound, so that a call costs no look at the study: JAX gets its arrays as one flat
-    tuple, because walking through the records costs more than the fit where caches are cold.
-    """
-
-    def __init__(self, study, plan):
-        self._study, self._plan = study, plan
-        self.arrays, self.compiled = _program(study, plan)
-        self.weight, self.capacity = np.float64(study.selection.weight), study.selection.trials
-        self.initial = np.asarray(_to_physical(study.space, plan.initial))
-        self.responses, self.names = study.responses, study.space.names
-        self.padding = _padding(study, self.capacity)
-
-    def __call__(self, points, answers):
-        """The next point, as numbers that survive a round trip through text; None when all trials are answered."""
-        count = len(answers)
-        if count >= self.capacity:
-            return None
-        if count < len(self.initial):
-            return self.initial[count]
-        return self._found(self.compiled, points, answers, self.weight)
-
-    def best(self, points, answers):
-        """Where the posterior mean is largest."""
-        return self._found(self._of_the_mean, points, answers, np.float64(0.0))
-
-    @functools.cached_property
-    def _of_the_mean(self):
-        """The UCB of weight 0 is largest where the mean is: in most studies this is the program that chooses."""
-        plain = msgspec.structs.replace(self._study.selection, acquisition="ucb", minimum_distance=None)
-        return _program(replace(self._study, selection=plain), self._plan)[1]
-
-    def warm(self):
-        """Compile what chooses."""
-        self._found(self.compiled, self.padding[:0], (), self.weight)
-
-    def _found(self, program, points, answers, weight):
-        padded, categories = _padded(points, answers, self.padding)
-        return np.asarray(program(self.arrays, padded, categories, np.int32(len(answers)), weight))
-
-
-def _program(study, plan):
-    """The arrays of a study and a design, and what is compiled for all that differ in nothing else."""
-    leaves, structure = jax.tree.flatten((study, plan))
-    fixed = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
-    return tuple(leaf for leaf in leaves if eqx.is_array(leaf)), _compiled(structure, fixed)
-
-
-@functools.lru_cache(maxsize=32)
-def _compiled(structure, fixed):
-    @functools.partial(jax.jit, compiler_options=compiler_options())
-    def step(arrays, points, answers, count, weight):
-        given = iter(arrays)
-        study, plan = jax.tree.unflatten(structure, [next(given) if leaf is None else leaf for leaf in fixed])
-        trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)
-        return study.space.to_physical(next_point(study, plan, trials, count, weight))
-
-    return step
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,13 +56,13 @@ class Session:
     answers: np.ndarray
     proposal: np.ndarray | None
     seed: int
-    step: _Step = field(repr=False)
+    step: Step = field(repr=False)
 
     @classmethod
     def start(cls, study: Study, seed: int = 0) -> "Session":
         """A session without answers. The seed decides the space-filling trials and the candidates."""
         plan = design(study, seed)
-        step = _Step(study, plan)
+        step = Step(study, plan)
         points, answers = np.zeros((0, study.space.dim)), np.zeros(0, int)
         return cls(study, plan, points, answers, step(points, answers), seed, step)
 
@@ -192,8 +113,7 @@ class Session:
 
     def best(self) -> dict[str, float]:
         """The rendering with the largest posterior mean: parameter -> value in physical units."""
-        self.posterior()  # which refuses answers that cannot be fitted
-        return dict(zip(self.step.names, self.step.best(self.points, self.answers).tolist(), strict=True))
+        return dict(zip(self.step.names, self.step.best(self.posterior()).tolist(), strict=True))
 
 
 def _asked(session) -> np.ndarray:

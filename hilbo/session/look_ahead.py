@@ -1,75 +1,105 @@
 """What a live session shows next, found before it is asked for: no fit runs after an answer.
 
 `LiveChooser.lookahead(state)` finds the next rendering for each answer that may come; `choose` then only looks it up.
-Optimisation renderings are `hilbo.session.ask_tell.Session`'s, bit for bit: they depend on the study, the seed and the
-answers that count. A rendering voided twice is replaced: in the space-filling trials by the candidate farthest from all
-others, afterwards by the highest UCB that keeps a distance of `APART` from it in the unit cube.
-
-With a warm start (`hilbo.session.warm_start`, one for each material) there are no space-filling trials: points come
-from it.
-
-Every choice says why: `choice` has what chose it, mean and sd of the latent score, the acquisition's value, the
-probabilities of the answers, the passivity margin (N.s/m) and the certificate of the fit.
+Each answer's posterior is fitted once, by the step that chooses (`hilbo.session.step`), and kept: it explains the
+choice, and the experimenter's page reads it. Optimisation renderings are `hilbo.session.ask_tell.Session`'s, bit for
+bit: they depend on the study, the seed and the answers that count. A rendering voided twice is replaced
+(`hilbo.session.excluded`). With a warm start (`hilbo.session.warm_start`, one for each material) there are no
+space-filling trials: points come from it.
 """
 
-import dataclasses
 import threading
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
-from hilbo import acquisition
 from hilbo.errors import InputError
-from hilbo.ordinal_gp import Trials, fit
-from hilbo.search.candidates import search_points
-from hilbo.session.ask_tell import Session, physical_trials
-from hilbo.session.records import Need
+from hilbo.session import excluded as apart
+from hilbo.session.ask_tell import Session
+from hilbo.session.explanation import Choice, described, explained
+from hilbo.session.records import Need, Planned
 from hilbo.session.state import LiveSession
-from hilbo.session.warm_start import WarmStart, warm_point
+from hilbo.session.step import Fitted
+from hilbo.session.warm_start import WarmStart
 from hilbo.study.config import Study
 
-__all__ = ["APART", "LiveChooser", "told_of"]
+__all__ = ["Answers", "LiveChooser", "warm_start_sources"]
 
-APART = 0.05
-"""Least distance in the unit cube from a rendering that was voided twice."""
+_KEPT = 64  # posteriors, the newest: those of the present, of what may follow, and of what undo leads back to
 
-_History = tuple[tuple[tuple[float, ...], int], ...]  # points and categories
-_Key = tuple[int, _History, tuple[tuple[float, ...], ...]]
+
+class Answers(NamedTuple):
+    """The answers of a block that count: their renderings in physical units, and their categories."""
+
+    block: int
+    points: tuple[tuple[float, ...], ...] = ()
+    categories: tuple[int, ...] = ()
+
+    @classmethod
+    def of(cls, state: LiveSession, block: int) -> "Answers":
+        """The answers of a block so far."""
+        answered = state.answers(block)
+        names, responses = state.study.space.names, state.study.responses
+        points = tuple(_place(trial.renderings["a"], names) for trial in answered)
+        given = [trial.values["class_a"] for trial in answered if trial.values is not None]
+        return cls(block, points, tuple(map(responses.index, given)))
+
+    def followed_by(self, point: tuple[float, ...], category: int) -> "Answers":
+        """With one more."""
+        return self._replace(points=(*self.points, point), categories=(*self.categories, category))
+
+
+class _Situation(NamedTuple):
+    """What a choice depends on beside study and seed: the answers, and the renderings voided twice."""
+
+    answers: Answers
+    excluded: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def of(cls, state: LiveSession, block: int) -> "_Situation":
+        names = state.study.space.names
+        return cls(Answers.of(state, block), tuple(_place(values, names) for values in state.excluded(block)))
 
 
 class LiveChooser:
     """Finds and remembers the renderings of one session. May be used from several threads.
 
-    `fits` counts the choices that had to be computed with a posterior, `found` those that were looked up.
+    `fits` counts the fits that were computed, `looked_up` the choices that were there when they were asked for.
     """
 
     def __init__(self, state: LiveSession, warm: Mapping[str | None, WarmStart] | None = None) -> None:
-        self.fits, self.found = 0, 0
+        self.fits, self.looked_up = 0, 0
         self._warm_starts = _checked_warm(state, warm or {})
-        self._lock = threading.Lock()
-        self._known: dict[_Key, dict[str, Any]] = {}
+        self._lock = threading.RLock()
+        self._choices: dict[_Situation, dict[str, Any]] = {}
+        self._fitted: dict[Answers, Fitted] = {}
         header, study = state.header, state.study
+        self._blocks = header.blocks
         materials = {block.material for block in header.blocks}
         self._studies = {name: study if name is None else study.material(name) for name in materials}
-        chosen = {block.material for block in header.blocks if not block.trials}
-        self._sessions = {name: Session.start(self._studies[name], header.seed) for name in chosen}
+        self._sessions = {
+            block.material: Session.start(self._studies[block.material], header.seed)
+            for block in header.blocks
+            if not block.trials
+        }
         self._sets = {
-            (name, id): _described(self._studies[name], values)
+            (name, id): described(self._studies[name], values)
             for name in materials
             for id, values in header.sets.items()
             if any(id in (p.a, p.b) for b in header.blocks if b.material == name for p in b.trials)
         }
 
     def warm(self) -> None:
-        """Compile what optimisation trials need."""
-        for name, study in self._studies.items():
-            if name in self._sessions:
-                middle = tuple((p.low + p.high) / 2 for p in study.space.parameters)
-                self._compute(name, ((middle, 0),) * max(1, study.selection.space_filling), ())
+        """Compile what optimisation trials need, by choosing their first."""
+        for number in self.chosen_blocks:
+            self._choice(_Situation(Answers(number), ()))
+
+    @property
+    def chosen_blocks(self) -> list[int]:
+        """The blocks whose renderings are not planned."""
+        return [number for number, block in enumerate(self._blocks) if not block.trials]
 
     def choose(self, state: LiveSession, need: Need) -> dict[str, Any]:
         """The data of a proposal: `renderings`, and `sets`, `first` or `choice`."""
@@ -79,7 +109,10 @@ class LiveChooser:
             return {key: data[key] for key in ("renderings", "sets", "first", "choice") if key in data}
         if need.planned is not None:
             return self._planned(block.material, block.trials[need.planned])
-        return self._look(_key(state, need.block), block.material)
+        with self._lock:
+            situation = _Situation.of(state, need.block)
+            self.looked_up += situation in self._choices
+            return self._choice(situation)
 
     def lookahead(self, state: LiveSession) -> dict[str, dict[str, Any]]:
         """For each answer to the pending optimisation trial: what would be proposed after it. Empty where that is
@@ -87,208 +120,100 @@ class LiveChooser:
         trial = state.pending
         if trial is None or trial.repeats is not None or state.header.blocks[trial.block].trials:
             return {}
-        block = state.header.blocks[trial.block]
         if len(state.answers(trial.block)) + 1 >= state.quota(trial.block):
             return {}
-        number, history, excluded = _key(state, trial.block)
-        point = tuple(trial.renderings["a"][name] for name in state.study.space.names)
-        return {
-            response: self._look((number, (*history, (point, category)), excluded), block.material, count=False)
-            for category, response in enumerate(state.study.responses)
-        }
+        excluded = _Situation.of(state, trial.block).excluded
+        following = zip(state.study.responses, _following(state), strict=True)
+        return {response: self._choice(_Situation(answers, excluded)) for response, answers in following}
 
-    def _planned(self, material, planned):
+    # What the experimenter's page reads.
+
+    def study(self, block: int) -> Study:
+        """The study of a block's material."""
+        return self._studies[self._blocks[block].material]
+
+    def fitted(self, answers: Answers) -> Fitted:
+        """The posterior after some answers, and what it chooses: each fitted once while it is kept."""
+        with self._lock:
+            if answers not in self._fitted:
+                self.fits += 1
+                points = _rows(answers.points, self.study(answers.block))
+                self._fitted[answers] = self._session(answers.block).step.fitted(points, answers.categories)
+                while len(self._fitted) > _KEPT:
+                    self._fitted.pop(next(iter(self._fitted)))
+            return self._fitted[answers]
+
+    def fitted_after_each_answer(self, state: LiveSession) -> list[Fitted]:
+        """The same after each answer that the pending optimisation trial may get."""
+        return [self.fitted(answers) for answers in _following(state)]
+
+    def best(self, block: int, fitted: Fitted) -> Float[np.ndarray, " d"]:
+        """Where the posterior mean is largest, in physical units; nothing is fitted."""
+        return self._session(block).step.best(fitted.posterior)
+
+    def _session(self, block: int) -> Session:
+        return self._sessions[self._blocks[block].material]
+
+    def _planned(self, material: str | None, planned: Planned) -> dict[str, Any]:
         sides = {"a": planned.a} if planned.b is None else {"a": planned.a, "b": planned.b}
-        described = {side: self._sets[material, id] for side, id in sides.items()}
+        sets = {side: self._sets[material, id] for side, id in sides.items()}
         return {
-            "renderings": {side: dict(found["parameters"]) for side, found in described.items()},
+            "renderings": {side: dict(one.parameters) for side, one in sets.items()},
             "sets": sides,
             "first": planned.first,
-            "choice": {"by": "plan", "margin": {side: found["margin"] for side, found in described.items()}},
+            "choice": {"by": "plan", "margin": {side: one.margin for side, one in sets.items()}},
         }
 
-    def _look(self, key, material, count=True):
+    def _choice(self, situation: _Situation) -> dict[str, Any]:
         with self._lock:
-            if key in self._known:
-                self.found += count
-            else:
-                self._known[key] = self._compute(material, key[1], key[2])
-            return self._known[key]
+            if situation not in self._choices:
+                study, fitted = self.study(situation.answers.block), self.fitted(situation.answers)
+                self._choices[situation] = explained(study, fitted.posterior, self._chosen(situation, fitted))
+            return self._choices[situation]
 
-    def _compute(self, material, history, excluded):
-        study, session, warm = self._studies[material], self._sessions[material], self._warm_starts.get(material)
-        points = np.array([point for point, _ in history], float).reshape(len(history), study.space.dim)
-        answers = np.array([category for _, category in history], int)
-        initial = session.step.initial
-        gone = np.array(excluded, float).reshape(-1, study.space.dim)
+    def _chosen(self, situation: _Situation, fitted: Fitted) -> Choice:
+        answers = situation.answers
+        study, session = self.study(answers.block), self._session(answers.block)
+        warm = self._warm_starts.get(self._blocks[answers.block].material)
+        excluded = _rows(situation.excluded, study)
+        count, initial = len(answers.categories), session.step.initial
         if warm is not None:
-            self.fits += 1
-            found, by = _from_map(study, warm, *_padded(study, points, answers), np.int32(len(history)), gone), "map"
-        elif len(history) < len(initial):
-            found = _not_among(study, initial[len(history)], gone, np.concatenate([initial, points]), session.seed)
-            by = "latin hypercube"
-        else:
-            self.fits += 1
-            found, by = session.step(points, answers), study.selection.acquisition
-            if _near(study, found, gone):
-                found, by = _apart(study, session, points, answers, gone), "ucb, apart"
-        trials = physical_trials(study, points, answers, study.selection.trials)
-        posterior = fit(study.gp, trials, inference=study.inference, throw=False)
-        terms = _terms(study, posterior, np.asarray(found))
-        return _explained(study, found, by, terms)
+            return Choice(apart.point_from_map(study, warm, fitted.posterior, excluded), "map")
+        if count < len(initial):
+            others = np.concatenate([initial, _rows(answers.points, study)])
+            return Choice(apart.spread_point(study, initial[count], excluded, others, session.seed), "latin hypercube")
+        if apart.is_near(study, fitted.point, excluded):
+            return Choice(apart.point_kept_apart(study, session.plan, fitted.posterior, excluded), "ucb, apart")
+        return Choice(fitted.point, study.selection.acquisition)
 
 
-def told_of(warm: Mapping[str | None, WarmStart]) -> str | None:
+def warm_start_sources(warm: Mapping[str | None, WarmStart]) -> str | None:
     """What a header says of a session's warm starts, one for each material; None where there are none."""
     return ",".join(f"{name or ''}={warm[name].source}" for name in sorted(warm, key=str)) or None
 
 
-def _key(state, block) -> _Key:
-    names = state.study.space.names
-    history = tuple(
-        (tuple(t.renderings["a"][n] for n in names), state.study.responses.index(t.values["class_a"]))
-        for t in state.answers(block)
-    )
-    return block, history, tuple(tuple(point[n] for n in names) for point in state.excluded(block))
+def _place(values: Mapping[str, float], names: tuple[str, ...]) -> tuple[float, ...]:
+    return tuple(values[name] for name in names)
 
 
-def _checked_warm(state, warm):
+def _rows(points: tuple[tuple[float, ...], ...], study: Study) -> Float[np.ndarray, "k d"]:
+    return np.array(points, float).reshape(-1, study.space.dim)
+
+
+def _following(state: LiveSession) -> list[Answers]:
+    """The answers after each one that the pending trial may get."""
+    trial = state.pending
+    assert trial is not None
+    answers, point = Answers.of(state, trial.block), _place(trial.renderings["a"], state.study.space.names)
+    return [answers.followed_by(point, category) for category in range(len(state.study.responses))]
+
+
+def _checked_warm(state: LiveSession, warm: Mapping[str | None, WarmStart]) -> dict[str | None, WarmStart]:
     """The warm starts, which must be those of the header: the next trial is to be the same after a resume."""
-    told = told_of(warm)
-    if told != state.header.warm_start:
+    sources = warm_start_sources(warm)
+    if sources != state.header.warm_start:
         raise InputError(
-            f"the session's warm start is {state.header.warm_start or 'none'}, not {told or 'none'}; give the maps that"
-            " it was begun with."
+            f"the session's warm start is {state.header.warm_start or 'none'}, not {sources or 'none'}; give the maps"
+            " that it was begun with."
         )
     return dict(warm)
-
-
-def _from_map(study, warm, x, q, count, gone):
-    return np.asarray(_map_point(study, warm, x, q, count, _held(study, gone)))
-
-
-def _held(study, gone):
-    """The points that are gone, padded with places far away, so that nothing is compiled again for one more."""
-    held = np.full((max(8, len(gone)), study.space.dim), 9.0)
-    if len(gone):
-        held[-len(gone) :] = _units(study, gone)
-    return jnp.asarray(held)
-
-
-@eqx.filter_jit
-def _map_point(study, warm, points, answers, count, gone):
-    trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)
-    return study.space.to_physical(warm_point(study, warm, trials, gone, APART))
-
-
-def _near(study, point, gone) -> bool:
-    """Whether a point is nearer than `APART` to one that is gone."""
-    if not len(gone):
-        return False
-    unit = _units(study, np.concatenate([gone, np.asarray(point)[None]]))
-    return bool(np.min(np.linalg.norm(unit[:-1] - unit[-1], axis=1)) < APART)
-
-
-def _units(study, physical):
-    return np.asarray(study.space.to_unit(physical))
-
-
-def _not_among(study, point, gone, others, seed):
-    """A space-filling point; in place of one that is gone, the candidate farthest from all points so far."""
-    if not any(np.array_equal(point, other) for other in gone):
-        return point
-    candidates = study.space.candidates(256, seed)
-    distance = np.linalg.norm(candidates[:, None] - _units(study, np.concatenate([others, gone]))[None], axis=2)
-    return np.asarray(study.space.to_physical(candidates[int(distance.min(axis=1).argmax())]))
-
-
-def _padded(study, points, answers):
-    capacity, count = study.selection.trials, len(answers)
-    middle = np.array([(p.low + p.high) / 2 for p in study.space.parameters])
-    x, q = np.tile(middle, (capacity, 1)), np.zeros(capacity, np.int32)
-    x[:count], q[:count] = points, answers
-    return x, q
-
-
-@eqx.filter_jit
-def _terms(study, posterior, x):
-    """Mean, variance and class probabilities at x, the certificate of the fit, and what the space says of x."""
-    unit = study.space.to_unit(x)
-    mean, variance = posterior.predict(unit[None, :])
-    values = dict(zip(study.space.names, x, strict=True))
-    derived = study.space.derived(values)
-    return {
-        "unit": unit,
-        "mean": mean[0],
-        "variance": variance[0],
-        "probabilities": study.gp.likelihood.class_probabilities(mean[0], variance[0]),
-        "certificate": posterior.certificate,
-        "derived": derived,
-        "margin": study.space.passivity_margin(values),
-    }
-
-
-def _explained(study, point, by, terms):
-    terms = jax.device_get(terms)
-    parameters = dict(zip(study.space.names, np.asarray(point).tolist(), strict=True))
-    mean, sd = float(terms["mean"]), float(np.sqrt(terms["variance"]))
-    certificate = terms["certificate"]
-    choice = {
-        "by": by,
-        "unit": terms["unit"].tolist(),
-        "mean": mean,
-        "sd": sd,
-        "score": mean + study.selection.weight * sd if by.startswith("ucb") else None,
-        "probabilities": dict(zip(study.responses, terms["probabilities"].tolist(), strict=True)),
-        "margin": None if terms["margin"] is None else float(terms["margin"]),
-        "certificate": {
-            field.name: getattr(certificate, field.name).item() for field in dataclasses.fields(certificate)
-        },
-    }
-    derived = {name: float(value) for name, value in terms["derived"].items()}
-    return {"renderings": {"a": parameters | derived}, "choice": choice}
-
-
-def _described(study: Study, values: Mapping[str, float]) -> dict[str, Any]:
-    """A planned set with what follows from it, and its passivity margin."""
-    derived, margin = _facts(study, {name: np.asarray(values[name], float) for name in study.space.names})
-    parameters = {name: float(values[name]) for name in study.space.names}
-    parameters |= {name: float(value) for name, value in derived.items()}
-    return {"parameters": parameters, "margin": None if margin is None else float(margin)}
-
-
-@eqx.filter_jit
-def _facts(study, values):
-    return study.space.derived(values), study.space.passivity_margin(values)
-
-
-def _apart(study, session, points, answers, gone) -> np.ndarray:
-    candidates = search_points(study.space, session.seed)
-    x, q = _padded(study, points, answers)
-    return np.asarray(_apart_point(study, x, q, np.int32(len(answers)), _held(study, gone), candidates))
-
-
-@eqx.filter_jit
-def _apart_point(study, points, answers, count, gone, candidates):
-    """The highest UCB that keeps its distance from the points `gone` (k, d) of the unit cube, in physical units."""
-    trials = Trials(study.space.to_unit(points), answers, jnp.arange(len(points), dtype=count.dtype) < count)
-    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
-    score = acquisition.UCB(study.selection.weight)
-
-    def score_at(x):
-        mean, variance = posterior.predict(x[None, :])
-        return score(mean[0], variance[0])
-
-    def allowed(x):
-        return jnp.all(jnp.sum((gone - x[None, :]) ** 2, axis=1) >= APART**2)
-
-    found = acquisition.maximise(
-        score(*posterior.predict(candidates)),
-        candidates,
-        score_at,
-        from_box=study.space.from_box,
-        to_box=study.space.to_box,
-        feasible=study.space.feasible,
-        allowed=allowed,
-    )
-    return study.space.to_physical(found.x)

@@ -10,16 +10,16 @@
 default.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from hilbo.ordinal_gp import fit
-from hilbo.session.ask_tell import Session, physical_trials
+from hilbo.session.look_ahead import Answers, LiveChooser
 from hilbo.session.state import LiveSession
+from hilbo.session.step import Fitted
 from hilbo.study.config import Study
 from hilbo.study.protocols import protocol
 
@@ -48,28 +48,20 @@ class Consistency:
 
 def trust(
     study: Study,
-    points: Float[np.ndarray, "n d"],
-    answers: Sequence[int],
+    fitted: Fitted,
     upcoming: Float[np.ndarray, " d"] | None,
-    seed: int,
+    following: Sequence[Fitted],
+    best: Callable[[Fitted], Float[np.ndarray, " d"]],
 ) -> Trust:
-    """From the answered renderings (physical units), their categories, and the rendering that comes next."""
-    find, categories = Session.start(study, seed).step.best, np.asarray(answers, int)
-    best = find(points, categories)
-    following = best if upcoming is None else upcoming
-    posterior = fit(
-        study.gp,
-        physical_trials(study, points, categories, study.selection.trials),
-        inference=study.inference,
-        throw=False,
-    )
-    top, chances = np.asarray(_chances(study, posterior, np.stack([best, following])))
-    named = dict(zip(study.space.names, best.tolist(), strict=True))
+    """From the posterior after the answers so far, the rendering that comes next (physical units), and the posteriors
+    after each answer to it. `best` finds where a posterior's mean is largest. Nothing is fitted."""
+    bests = np.stack([best(one) for one in (fitted, *following)])
+    asked = bests[0] if upcoming is None else upcoming
+    top, chances = np.asarray(_chances(study, fitted.posterior, np.stack([bests[0], asked])))
+    named = dict(zip(study.space.names, bests[0].tolist(), strict=True))
     if upcoming is None:
         return Trust(named, float(top[-1]), None)
-    more = np.concatenate([points, upcoming[None]])
-    bests = [best, *(find(more, np.append(categories, one)) for one in range(len(study.responses)))]
-    units = np.asarray(_units(study, np.stack(bests)))
+    units = np.asarray(_units(study, bests))
     moved = np.sqrt(np.mean((units[1:] - units[0]) ** 2, axis=1))
     return Trust(named, float(top[-1]), float(chances @ moved))
 
@@ -84,22 +76,18 @@ def _units(study, physical):
     return study.space.to_unit(physical)
 
 
-def trust_of(state: LiveSession, block: int) -> Trust | None:
-    """`trust` in an optimisation block of a session; None before its first answer."""
-    name = state.header.blocks[block].material
-    study = state.study if name is None else state.study.material(name)
-    answered = state.answers(block)
-    if not answered:
+def trust_of(state: LiveSession, block: int, chooser: LiveChooser) -> Trust | None:
+    """`trust` in an optimisation block of a session, whose `chooser` knows the posteriors; None before its first
+    answer."""
+    answers, study = Answers.of(state, block), chooser.study(block)
+    if not answers.categories:
         return None
-
-    def point(trial):
-        return [trial.renderings["a"][name] for name in study.space.names]
-
+    trial = state.pending
     # The answer to a repeat does not count, and moves nothing.
-    asked = next((t for t in [state.pending] if t is not None and t.block == block and t.repeats is None), None)
-    upcoming = None if asked is None else np.array(point(asked))
-    answers = [study.responses.index(trial.values["class_a"]) for trial in answered if trial.values is not None]
-    return trust(study, np.array([point(trial) for trial in answered]), answers, upcoming, state.header.seed)
+    counts = trial is not None and trial.block == block and trial.repeats is None
+    upcoming = np.array([trial.renderings["a"][name] for name in study.space.names]) if trial and counts else None
+    following = chooser.fitted_after_each_answer(state) if counts else []
+    return trust(study, chooser.fitted(answers), upcoming, following, lambda one: chooser.best(block, one))
 
 
 def consistency(state: LiveSession) -> Consistency:

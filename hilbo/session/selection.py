@@ -12,13 +12,13 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from hilbo import acquisition
 from hilbo.kernels import gram
-from hilbo.ordinal_gp import Trials, fit
+from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.search.candidates import CANDIDATES, search_points
 from hilbo.search.lattice import Lattice, nodes_for, screen, screen_points
 from hilbo.search.space_lattice import lattice_of
 from hilbo.study.config import Study
 
-__all__ = ["Design", "design", "next_point"]
+__all__ = ["Design", "design", "next_point", "point_after", "point_apart"]
 
 _STARTS = 4  # of the polishing, on the lattice
 _GAIN, _IN_UNITS_OF_F = 1e-7, ("ucb", "mean")  # of the prior's sd: less is no reason to polish on
@@ -58,11 +58,29 @@ def next_point(
     `weight`: of the standard deviation in UCB, if it is not to be the study's.
     """
     posterior = fit(study.gp, trials, inference=study.inference, throw=False)
+    return point_after(study, plan, posterior, trial, weight)
+
+
+def point_after(
+    study: Study, plan: Design, posterior: Posterior, trial: Int[Array, ""] | int, weight: ArrayLike | None = None
+) -> Float[Array, " d"]:
+    """The same from the posterior of the answers."""
     if study.selection.acquisition == "thompson":
         return _thompson_point(posterior, plan, trial)
     distance = study.selection.minimum_distance
-    allowed = (lambda x: _far_from(trials, x, distance)) if distance else None
+    allowed = (lambda x: _far_from(posterior.trials, x, distance)) if distance else None
     return _highest(study, plan, posterior, _score(study, posterior, weight), allowed).x
+
+
+def point_apart(
+    study: Study, plan: Design, posterior: Posterior, excluded: Float[Array, "k d"], apart: float
+) -> Float[Array, " d"]:
+    """The highest UCB (d,) at least `apart` from the points `excluded`, all in the unit cube; traceable."""
+
+    def allowed(x):
+        return jnp.all(jnp.sum((excluded - x[None, :]) ** 2, axis=1) >= apart**2)
+
+    return _highest(study, plan, posterior, acquisition.UCB(study.selection.weight), allowed).x
 
 
 def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hilbo.errors import InputError
-from hilbo.ordinal_gp import Trials, fit
+from hilbo.ordinal_gp import Posterior
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
 
@@ -60,9 +60,8 @@ def warm_start(
     return WarmStart(points, mean, variance + (1.0 - share) * prior, source)
 
 
-def informed(study: Study, warm: WarmStart, trials: Trials) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+def informed(study: Study, warm: WarmStart, posterior: Posterior) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """mu and s (m,) at the candidates after a participant's answers; see the module."""
-    posterior = fit(study.gp, trials, inference=study.inference, throw=False)
     mean, explained = posterior.predict_explained(warm.points)
     prior = study.gp.kernel.diagonal(warm.points[0])
     gained = explained / (prior * (prior - explained))
@@ -71,13 +70,17 @@ def informed(study: Study, warm: WarmStart, trials: Trials) -> tuple[Float[Array
 
 
 def warm_point(
-    study: Study, warm: WarmStart, trials: Trials, gone: Float[Array, "k d"] | None = None, apart: float = 0.0
+    study: Study,
+    warm: WarmStart,
+    posterior: Posterior,
+    excluded: Float[Array, "k d"] | None = None,
+    apart: float = 0.0,
 ) -> Float[Array, " d"]:
-    """The candidate (d,) to ask next, at least `apart` from the points `gone`; traceable."""
-    mean, variance = informed(study, warm, trials)
+    """The candidate (d,) to ask after a participant's answers, `apart` or farther from the `excluded`; traceable."""
+    mean, variance = informed(study, warm, posterior)
     score = mean + study.selection.weight * jnp.sqrt(variance)
-    if gone is not None:
-        distance = jnp.sum((warm.points[:, None, :] - gone[None, :, :]) ** 2, axis=2)
+    if excluded is not None:
+        distance = jnp.sum((warm.points[:, None, :] - excluded[None, :, :]) ** 2, axis=2)
         score = jnp.where(jnp.all(distance >= apart**2, axis=1), score, -jnp.inf)
     return warm.points[jnp.argmax(score)]
 

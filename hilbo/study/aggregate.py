@@ -1,4 +1,4 @@
-"""A cohort's posteriors and its population map: batch refits, and aggregation of any prefix of trials, any people.
+"""A cohort's posteriors, its population map by the study's rule, and the optima of both.
 
     table     = read_trials("trials.csv", study)
     cohort    = cohort_of(table, study)
@@ -9,7 +9,7 @@ committee machine over their posteriors (`hilbo.bcm`), or what the study's rule 
 optimum is searched like a session's.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -19,10 +19,10 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from hilbo import acquisition, bcm
-from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.ordinal_gp import OrdinalGP, Posterior, fit
 from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
-from hilbo.population.maps import RuleMap, point_rule, rule_map, share_of
+from hilbo.population.maps import LARGEST_EXACT, RuleMap, rule_map, share_of
 from hilbo.search.candidates import search_points
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Inference, Study
@@ -37,14 +37,13 @@ __all__ = [
     "map_optimum",
     "nrmse",
     "other_inference",
-    "pooled_posterior",
     "population",
     "population_optimum",
-    "progress",
+    "predict_map",
 ]
 
 Rule = pointwise.Rule
-_LARGEST_POOL = 3000  # answers: the pooled fit is cubic in their number
+_LARGEST_POOL = 3000  # answers of the pooled alternative: its fit is cubic in their number
 
 
 class Optimum(eqx.Module):
@@ -72,10 +71,15 @@ class Aggregate(eqx.Module):
     "ep", or "laplace" where the study itself says "ep"."""
     map: RuleMap
     """The population map by the study's rule."""
-    hierarchical: RuleMap | None
-    """The map by the hierarchical rule, beside which the study's is judged."""
+    maps: dict[str, RuleMap]
+    """The maps by all rules that were asked for, the study's among them."""
     share: Share | None
     """What the answers say of how people differ; None if it was not asked, or fewer than two people answered."""
+
+    @property
+    def hierarchical(self) -> RuleMap | None:
+        """The map by the hierarchical rule, beside which the study's is judged."""
+        return self.maps.get("hierarchical")
 
     @property
     def certificates(self) -> dict[str, np.ndarray]:
@@ -85,7 +89,7 @@ class Aggregate(eqx.Module):
 
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube."""
-        return _predict(self.map, jnp.asarray(x))
+        return predict_map(self.map, jnp.asarray(x))
 
     def newcomer(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of a new person's function at points of the unit cube: what answers are foretold
@@ -132,8 +136,9 @@ def population(
 
 
 @eqx.filter_jit
-def _predict(found: RuleMap, x):
-    return population(found.experts, x) if found.rule == "bcm" and found.experts is not None else found.predict(x)
+def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Mean and variance (m,) of a population map at points of the unit cube; bcm's as a stream over people."""
+    return population(map_.experts, x) if map_.rule == "bcm" and map_.experts is not None else map_.predict(x)
 
 
 @eqx.filter_jit
@@ -152,7 +157,7 @@ def population_optimum(
 @eqx.filter_jit
 def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
     """Where a rule's map has its largest mean in the feasible set."""
-    return _optimum(study, lambda x: _predict(found, x), candidates, found.apart)
+    return _optimum(study, lambda x: predict_map(found, x), candidates, found.apart)
 
 
 def _optimum(study: Study, predict: Callable, candidates, apart) -> Optimum:
@@ -202,15 +207,6 @@ def other_inference(study: Study) -> Inference:
     return "laplace" if study.inference == "ep" else "ep"
 
 
-def pooled_posterior(study: Study, cohort: Cohort) -> Posterior | None:
-    """One GP on everybody's answers, as if from one person; None if there are too many for a dense fit."""
-    mask = np.asarray(cohort.trials.mask)
-    if mask.sum() > _LARGEST_POOL:
-        return None
-    x, q = np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
-    return fit(study.gp, Trials.from_arrays(x, q), inference=study.inference, throw=False)
-
-
 def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: bool = True) -> Aggregate:
     """Fit everybody, merge, and find the optima; the study's `rule` decides the population optimum.
 
@@ -223,60 +219,45 @@ def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: 
     share = None
     if study.rule == "hierarchical" or (alternatives and answered > 1):
         share = share_of(study.gp, cohort.trials, study.inference)
-
-    def merged(rule, posteriors=posteriors, inference=study.inference):
-        part = None if share is None else share.mean
-        return rule_map(study.gp, cohort.trials, rule, posteriors=posteriors, share=part, inference=inference)
-
-    chosen = merged(study.rule)
-    beside = chosen if study.rule == "hierarchical" else None if share is None else merged("hierarchical")
-    others = {}
+    rules = _rules(study, cohort, share) if alternatives else [study.rule]
+    maps = {rule: _rule_map(study, cohort, rule, posteriors, share) for rule in rules}
+    others = {rule: map_optimum(study, maps[rule], candidates) for rule in rules if rule != study.rule}
     if alternatives:
-        maps = {"hierarchical": beside, "bcm": merged("bcm"), "average": merged("average")}
-        maps = {name: found for name, found in maps.items() if found is not None and name != study.rule}
-        others = {name: map_optimum(study, found, candidates) for name, found in maps.items()}
         other = other_inference(study)
-        again = merged(study.rule, fit_cohort(study, cohort, inference=other), other)
-        others[other] = map_optimum(study, again, candidates)
-        pooled = pooled_posterior(study, cohort)
-        if pooled is not None and study.rule != "pooled":
-            stacked = jax.tree.map(lambda leaf: leaf[None], pooled)
-            others["pooled"] = jax.tree.map(lambda leaf: leaf[0], individual_optima(study, stacked, candidates))
+        by_other = fit_cohort(study, cohort, inference=other)
+        others[other] = map_optimum(study, _rule_map(study, cohort, study.rule, by_other, share, other), candidates)
     return Aggregate(
         cohort=cohort,
         posteriors=posteriors,
-        optimum=map_optimum(study, chosen, candidates),
+        optimum=map_optimum(study, maps[study.rule], candidates),
         individuals=individual_optima(study, posteriors, candidates),
         alternatives=others,
-        map=chosen,
-        hierarchical=beside,
+        map=maps[study.rule],
+        maps=maps,
         share=share,
     )
 
 
-def progress(
-    study: Study, cohort: Cohort, seed: int = 0, prefixes: Sequence[int] | None = None
-) -> tuple[Float[Array, "p d"], Float[Array, "p M d"]]:
-    """Optima (unit cube) after the first 1, 2, ... trials: of the population map (p, d), and of everybody (p, M, d).
-
-    The map is merged point by point by the study's rule, with the share that all answers say; by bcm where the rule
-    takes all answers at once.
-    """
-    counts = range(1, int(cohort.counts().max()) + 1) if prefixes is None else prefixes
-    candidates = search_points(study.space, seed)
-    share = share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
-    rule, share = point_rule(study.rule, share)
-    return _progress(study, cohort.trials, candidates, jnp.asarray(list(counts)), rule, share)
+def _rules(study: Study, cohort: Cohort, share: Share | None) -> list[str]:
+    """The study's rule, and those whose optima stand beside its own, as far as these answers allow them."""
+    few = cohort.counts().sum() <= _LARGEST_POOL
+    beside = [*(["hierarchical"] if share is not None else []), "bcm", "average", *(["pooled"] if few else [])]
+    return list(dict.fromkeys([study.rule, *beside]))
 
 
-@eqx.filter_jit
-def _progress(study, trials, candidates, counts, rule, share):
-    def after(count):
-        posteriors = _fit_cohort(study, jax.vmap(lambda t: t.first(count))(trials), None)
-        best = individual_optima(study, posteriors, candidates).x
-        return population_optimum(study, posteriors, candidates, rule, share).x, best
-
-    return jax.lax.map(after, counts)
+def _rule_map(
+    study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share | None, inference: str | None = None
+) -> RuleMap:
+    """The map by a rule from everybody's posteriors, or from all answers where the rule takes them at once."""
+    return rule_map(
+        study.gp,
+        cohort.trials,
+        rule,
+        posteriors=posteriors,
+        share=None if share is None else share.mean,
+        inference=study.inference if inference is None else inference,
+        largest=_LARGEST_POOL if rule == "pooled" else LARGEST_EXACT,
+    )
 
 
 def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array, "*s"]:

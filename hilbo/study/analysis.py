@@ -12,50 +12,38 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
 
 from hilbo.errors import InputError
 from hilbo.hyperparameters.maximum_evidence import Learned, maximise_shared_evidence
 from hilbo.population.maps import point_rule
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, aggregate_cohort, nrmse, progress
+from hilbo.study.aggregate import Aggregate, aggregate_cohort, nrmse
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
+from hilbo.study.progress import Progress, follow
 from hilbo.study.tolerance_intervals import Ends, tolerance_ends
 
-__all__ = ["Analysis", "Progress", "Reading", "analyse", "limits_of", "moved_by_evidence", "settled"]
+__all__ = ["Analysis", "Population", "Reading", "analyse", "analyse_population", "limits_of", "moved_by_evidence"]
 
 Say = Callable[[str], None]
 _LEARN = ("theta", "noise", "thresholds")
-_SETTLED = 0.05  # NRMSE: an optimum that stays this near to its last place has settled
-_LONGEST = 25  # points of a progress curve
 
 
-class Progress(NamedTuple):
-    """Optima (unit cube) after the first `counts` trials of everybody: the population's, and each person's."""
+class Population(NamedTuple):
+    """What the answers of one cohort say, and how it came about over the trials: what `hilbo aggregate` writes."""
 
-    counts: Int[np.ndarray, " p"]
-    merged: Float[np.ndarray, "p d"]
-    own: Float[np.ndarray, "p M d"]
-    ends: Int[np.ndarray, " M"]
-    """How many answers each person gave."""
+    study: Study
+    aggregate: Aggregate
+    progress: Progress
+    seed: int
 
-    def to_end(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
-        """NRMSE of the population's and of everybody's running optimum to the final one; a person's is NaN beyond their
-        last answer, where it cannot move."""
-        merged = np.sqrt(np.mean((self.merged - self.merged[-1]) ** 2, axis=1))
-        own = np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
-        return merged, np.where(self.counts[:, None] <= self.ends[None, :], own, np.nan)
-
-    def settled(self, within: float) -> list[int | None]:
-        """Of everybody the trial from which their own optimum stayed within this NRMSE of its final place; None where
-        that cannot be said."""
-        _, own = self.to_end()
-        lasts = np.searchsorted(self.counts, self.ends, side="right")
-        return [settled(self.counts[:k], own[:k, j], within) for j, k in enumerate(lasts)]
+    @property
+    def cohort(self) -> Cohort:
+        """Whose answers these are."""
+        return self.aggregate.cohort
 
 
 class Reading(NamedTuple):
@@ -69,12 +57,10 @@ class Reading(NamedTuple):
 class Analysis(NamedTuple):
     """All results of one material."""
 
-    study: Study
-    cohort: Cohort
+    population: Population
     fixed: Reading
     optimised: Reading
     learned: Learned
-    progress: Progress
     sets: Sets | None
     people: pd.DataFrame
     """Everybody's measures, those left out too."""
@@ -83,9 +69,32 @@ class Analysis(NamedTuple):
     limits: tuple[str, ...]
 
     @property
+    def study(self) -> Study:
+        """The study, with its own hyperparameters."""
+        return self.population.study
+
+    @property
+    def cohort(self) -> Cohort:
+        """The participants whose answers were merged."""
+        return self.population.cohort
+
+    @property
     def aggregate(self) -> Aggregate:
         """The population's results under the study's own hyperparameters."""
-        return self.fixed.aggregate
+        return self.population.aggregate
+
+    @property
+    def progress(self) -> Progress:
+        """The optima after fewer trials."""
+        return self.population.progress
+
+
+def analyse_population(study: Study, cohort: Cohort, seed: int = 0, say: Say = lambda text: None) -> Population:
+    """The aggregate of a cohort, and its optima after fewer trials; everything is fitted once."""
+    say(f"fitting {len(cohort.names)} participants ({study.name})")
+    aggregate = aggregate_cohort(study, cohort, seed)
+    say("the optima after fewer trials")
+    return Population(study, aggregate, follow(study, aggregate, seed), seed)
 
 
 def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None) -> Analysis:
@@ -98,11 +107,8 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
             f'the rule "{study.exclude}" leaves out all {len(left)} participants; there is nothing to merge.'
         )
     cohort = everybody.of([name for name in everybody.names if name not in left]) if left else everybody
-    say(f"fitting {len(cohort.names)} participants")
-    aggregate = aggregate_cohort(study, cohort, seed)
-    say("the optima after fewer trials")
-    counts = _counts(cohort)
-    merged, own = (np.asarray(part) for part in progress(study, cohort, seed, counts.tolist()))
+    population = analyse_population(study, cohort, seed, say)
+    aggregate = population.aggregate
     say("hyperparameters by maximum evidence")
     learned, optimised = _optimised(study, cohort, seed)
     say("reading the maps")
@@ -111,12 +117,10 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     if bool(learned.runaway) or not bool(learned.converged):
         limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
     return Analysis(
-        study,
-        cohort,
+        population,
         _read(study, aggregate, seed),
         _read(optimised[0], optimised[1], seed),
         learned,
-        Progress(counts, merged, own, cohort.counts()),
         sets,
         people,
         left,
@@ -153,24 +157,6 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     if counts.max() < planned:
         found.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
     return tuple(found)
-
-
-def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], within: float = _SETTLED) -> int | None:
-    """The first of `counts` from which all errors are `within`; None if only the last one is, which says nothing."""
-    beyond = np.flatnonzero(errors > within)
-    first = 0 if not len(beyond) else int(beyond[-1]) + 1
-    return int(counts[first]) if first < len(counts) - 1 else None
-
-
-def _counts(cohort):
-    ends = cohort.counts()
-    longest = int(ends.max())
-    counts = [
-        *ends[ends > 0],
-        *np.linspace(1, longest, min(longest, _LONGEST)).round().astype(int),
-        *(n for n in (5, 15, 25) if n <= longest),
-    ]
-    return np.unique(counts)
 
 
 def _optimised(study, cohort, seed):

@@ -17,14 +17,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hilbo.errors import InputError
+from hilbo.ordinal_gp import Posterior
+from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
 from hilbo.population.joint import joint_map, posterior_map
 from hilbo.population.leave_one_out import LeftOut, calibration, clustered, influence, leave_one_out, reliability
 from hilbo.population.maps import ALL_RULES, RuleMap, rule_map, share_of
-from hilbo.population.pointwise import RULES, aggregate
+from hilbo.population.pointwise import RULES
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import fit_cohort, map_optimum, nrmse
+from hilbo.study.aggregate import Aggregate, map_optimum, nrmse
 from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
 from hilbo.study.heterogeneity import share_content
 
 __all__ = ["KNOWN", "compare", "recommendation"]
@@ -36,40 +39,41 @@ _POINTS = 400  # at which joint draws and bootstrap seek the optimum
 _DRAWS = 2000
 
 
-def compare(study: Any, cohort: Cohort, seed: int = 0) -> dict[str, Any]:
+def compare(study: Study, aggregate: Aggregate, seed: int = 0) -> dict[str, Any]:
     """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say. What a rule
     cannot do stands there as its reason.
 
     Raises InputError for fewer than three people with answers: two must be left when one is left out.
     """
-    answered = np.flatnonzero(cohort.counts() > 0)
+    answered = np.flatnonzero(aggregate.cohort.counts() > 0)
     if len(answered) < 3:
         raise InputError(
             f"compare: {len(answered)} people gave answers; at least three are needed, since each is left out in turn."
         )
-    cohort = cohort.rows(answered)
+    cohort = aggregate.cohort.rows(answered)
     candidates = search_points(study.space, seed)
     x = candidates[: min(_POINTS, len(candidates))]
-    posteriors = fit_cohort(study, cohort)
-    share = share_of(study.gp, cohort.trials, study.inference)
-    pooled = _map(study, cohort, "pooled", posteriors, share)
+    posteriors = jax.tree.map(lambda leaf: leaf[answered], aggregate.posteriors)
+    share = aggregate.share or share_of(study.gp, cohort.trials, study.inference)
+    known = aggregate.maps if len(answered) == len(aggregate.cohort.names) else {}
+    maps = {rule: known.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in ALL_RULES}
+    pooled = maps["pooled"]
     rules: dict[str, Any] = {}
     left: dict[str, LeftOut] = {}
-    for rule in ALL_RULES:
-        found = _map(study, cohort, rule, posteriors, share)
+    for rule, found in maps.items():
         if isinstance(found, str):
             rules[rule] = {"refused": found}
             continue
-        left[rule], maps = leave_one_out(
+        left[rule], folds = leave_one_out(
             study.gp, cohort.trials, rule, share=share.mean, posteriors=posteriors, inference=study.inference
         )
         rules[rule] = calibration(left[rule], seed) | {"reliability": reliability(left[rule])}
-        rules[rule] |= _one(study, cohort, posteriors, found, maps, pooled, candidates, x, seed)
+        rules[rule] |= _one(study, cohort, posteriors, found, folds, pooled, candidates, x, seed)
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
     return content | {"rules": rules, "recommendation": recommendation(left, rules, share, len(answered))}
 
 
-def _map(study, cohort, rule, posteriors, share) -> RuleMap | str:
+def _map(study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share) -> RuleMap | str:
     """A rule's map, or the sentence that says why there is none."""
     try:
         return rule_map(
@@ -124,7 +128,7 @@ def _by_bootstrap(study, found: RuleMap, posteriors, x, seed):
     share = found.share if found.rule == "hierarchical" else None
 
     def top(rows):
-        mean, _ = aggregate(found.rule, means[rows], explained[rows], found.prior, share=share)  # type: ignore[arg-type]
+        mean, _ = pointwise.aggregate(found.rule, means[rows], explained[rows], found.prior, share=share)  # type: ignore[arg-type]
         return jnp.argmax(mean)
 
     at = np.asarray(jax.jit(lambda rows: jax.lax.map(top, rows))(jnp.asarray(rows)))

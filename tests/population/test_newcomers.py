@@ -20,6 +20,7 @@ from hilbo.study.aggregate import fit_cohort, map_optimum, population
 from hilbo.study.batch_optimum import _apart, _optimum
 from hilbo.study.cohort import Cohort
 from hilbo.study.heterogeneity import in_place
+from hilbo.study.progress import _map_by_points
 from hilbo.study.tolerance_intervals import _inside
 
 STUDY = plain()
@@ -106,21 +107,15 @@ def _substitute(found):
     return analysis._substitute(SimpleNamespace(map=found))
 
 
-def test_maps_of_fewer_trials_are_merged_as_their_stars(monkeypatch):
-    from hilbo.report.figures import maps as plotting
-
-    def drawn(maps):
-        for of in maps.values():
-            of(None)
-        return plotting.Figure()
-
-    study = dataclasses.replace(STUDY, rule="hierarchical")
-    asked, cohort = [], _cohort(np.zeros((PEOPLE, 4, 2)), np.zeros((PEOPLE, 4)), np.ones((PEOPLE, 4), bool))
-    monkeypatch.setattr(plotting, "fit_cohort", lambda study, some: int(some.counts().max()))
-    monkeypatch.setattr(plotting, "population", lambda count, x, rule, share: asked.append((count, rule, float(share))))
-    monkeypatch.setattr(plotting, "maps_beside", lambda study, maps, optima: drawn(maps))
-    plotting.slices_after(study, cohort, np.zeros((2, 2)), [2, 4], of_rule("hierarchical", None))
-    assert asked == [(2, "hierarchical", SHARE), (4, "hierarchical", SHARE)]
+def test_maps_of_fewer_trials_are_merged_as_their_stars(posteriors):
+    """Point by point, with the share that all answers say."""
+    aggregate = SimpleNamespace(map=of_rule("hierarchical", None))
+    merged = _map_by_points(dataclasses.replace(STUDY, rule="hierarchical"), aggregate, posteriors[True])
+    x = jnp.asarray(np.random.default_rng(2).uniform(size=(5, 2)))
+    expected = population(posteriors[True], x, "hierarchical", jnp.asarray(SHARE))
+    np.testing.assert_allclose(np.stack(merged.predict(x)), np.stack(expected), rtol=1e-12)
+    by_bcm = _map_by_points(dataclasses.replace(STUDY, rule="pooled"), aggregate, posteriors[True])
+    assert (by_bcm.rule, by_bcm.method) == ("bcm", "by points")
 
 
 def test_readings_are_of_new_people(monkeypatch):

@@ -13,6 +13,7 @@ from studies import answered, plain_study
 from hilbo.report import participants, results
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import aggregate_cohort, population
+from hilbo.study.analysis import analyse_population
 from hilbo.study.config import Study
 
 PAPER = Study.load("hilbo/data/paper.toml")
@@ -67,11 +68,11 @@ def test_what_is_not_finite_is_null():
 def written(request, tmp_path_factory):
     """Study, aggregate, content and folder of a small study in one, two and four dimensions."""
     study = plain_study(request.param)
-    aggregate = aggregate_cohort(study, answered(study))
+    population = analyse_population(study, answered(study))
     folder = tmp_path_factory.mktemp(f"d{request.param}")
     truth = np.full(request.param, 0.5) if request.param == 2 else None
-    content = results.write_results(study, aggregate, folder, truth=truth)
-    return study, aggregate, content, folder
+    content = results.write_results(population, folder, truth=truth)
+    return study, population.aggregate, content, folder
 
 
 def test_the_content_is_what_stands_in_the_file(written):

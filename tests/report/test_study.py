@@ -24,10 +24,11 @@ from hilbo.report.study import _comparison, _shown, _tolerances
 from hilbo.report.study_figures import comparison_figures
 from hilbo.report.validation import validate
 from hilbo.study.aggregate import fit_cohort, population
-from hilbo.study.analysis import Progress, _counts, limits_of, settled
+from hilbo.study.analysis import limits_of
 from hilbo.study.cohort import Cohort
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.map_summary import tolerance
+from hilbo.study.progress import Progress, _counts, settled
 from hilbo.study.tolerance_intervals import tolerance_ends
 
 
@@ -69,10 +70,10 @@ def test_when_an_optimum_has_settled(errors, expected):
 def test_who_stopped_early_has_not_converged_for_that():
     """One moves until the end, one stays from trial 2 on, and one stops after a trial or two, still moving."""
     ways = np.array([[0, 1, 2, 3, 4, 5], [0, 5, 5, 5, 5, 5], [0, 5, 5, 5, 5, 5]]).T / 10
-    progress = Progress(np.arange(1, 7), ways[:, 1:2], ways[:, :, None], np.array([6, 6, 2]))
+    progress = Progress(np.arange(1, 7), ways[:, 1:2], ways[:, :, None], np.array([6, 6, 2]), {})
     assert progress.settled(0.05) == [None, 2, None]
     assert np.isnan(progress.to_end()[1][2:, 2]).all() and np.isfinite(progress.to_end()[1][:, :2]).all()
-    assert set(_counts(crowd([HILL, HILL[:4], HILL[:7]]))) >= {4, 5, 7, 9}
+    assert set(_counts(crowd([HILL, HILL[:4], HILL[:7]]).counts())) >= {4, 5, 7, 9}
     (line,) = individual_convergence(plain(), crowd([HILL, HILL, HILL[:2]]), progress).axes[0].lines
     np.testing.assert_allclose(line.get_ydata(), [50, 0, 15, 10, 5, 0], atol=1e-12)
     one = jnp.ones(())

@@ -14,9 +14,10 @@ from hilbo import bcm
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.session.ask_tell import physical_trials
-from hilbo.study.aggregate import aggregate_cohort, fit_cohort, nrmse, population, progress
+from hilbo.study.aggregate import aggregate_cohort, fit_cohort, nrmse, population
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
+from hilbo.study.progress import follow
 from hilbo.study.trial_table import read_trials, write_trials
 
 STUDY = Study.load("hilbo/data/paper.toml")
@@ -143,9 +144,13 @@ def test_the_optimum_is_where_the_map_is_highest(cohort):
     assert bool(STUDY.space.feasible(found.optimum.x))
     assert set(found.alternatives) == {"average", "hierarchical", "pooled", "ep"}
     assert found.share is not None and 0 < float(found.share.mean) < 1
-    merged, own = progress(STUDY, cohort, 0, [5, 9])
-    np.testing.assert_allclose(merged[-1], found.optimum.x, atol=1e-4)
-    np.testing.assert_allclose(own[-1], found.individuals.x, atol=1e-3)
+    progress = follow(STUDY, found, 0, [5, 9])
+    np.testing.assert_array_equal(progress.population[-1], found.optimum.x)
+    np.testing.assert_array_equal(progress.own[-1], found.individuals.x)
+    after = aggregate_cohort(STUDY, cohort.first(5), alternatives=False)
+    np.testing.assert_array_equal(progress.population[0], after.optimum.x)
+    np.testing.assert_array_equal(progress.own[0], after.individuals.x)
+    assert progress.moments == [5, 9]
 
 
 @pytest.mark.parametrize("inference", ["ep", pytest.param("exact", marks=pytest.mark.deep)])

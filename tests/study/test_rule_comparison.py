@@ -13,13 +13,14 @@ from hilbo.population.hierarchical import Share
 from hilbo.population.leave_one_out import LeftOut, calibration
 from hilbo.population.maps import ALL_RULES
 from hilbo.report.comparison import write_comparison
+from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.rule_comparison import compare, recommendation
 
 
 @pytest.mark.deep
 def test_everything_is_compared_and_written(tmp_path):
     study = dataclasses.replace(plain_study(2), rule="poe")
-    content = write_comparison(study, answered(study, people=4), tmp_path)
+    content = write_comparison(study, aggregate_cohort(study, answered(study, people=4)), tmp_path)
     assert json.loads((tmp_path / "comparison.json").read_text()) == content
     assert set(content["rules"]) == set(ALL_RULES)
     for found in content["rules"].values():
@@ -40,7 +41,7 @@ def test_everything_is_compared_and_written(tmp_path):
 def test_two_people_cannot_be_compared():
     study = plain_study(2)
     with pytest.raises(InputError, match="at least three are needed"):
-        compare(study, answered(study, people=2))
+        compare(study, aggregate_cohort(study, answered(study, people=2), alternatives=False))
 
 
 def share(mean, against):

@@ -12,17 +12,17 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 
-from hilbo.ordinal_gp import Posterior
-from hilbo.population.maps import RuleMap, point_rule
-from hilbo.study.aggregate import fit_cohort, population
+from hilbo.study.aggregate import predict_map
+from hilbo.study.analysis import Population
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.progress import Progress
 
 __all__ = [
     "BLUE",
@@ -63,17 +63,21 @@ _OTHER: dict = {"s": 7, "marker": "o", "facecolor": "white", "edgecolor": "black
 _TOP: dict = {"s": 16, "marker": "o", "facecolor": ORANGE, "edgecolor": "black", "linewidth": 0.5}
 
 
-def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
+Surface = Callable[..., tuple[Any, Any]]
+"""Mean and variance (m,) of a map at points (m, d) of the unit cube."""
+
+
+def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
     """Slices of the population map's mean through the optimum, the non-passive part white, near trials marked.
 
     The first two parameters span the slices; there is one at the optimum's value of the third, and one on either side.
     Further parameters stay at the optimum. With one parameter, the map is a curve with its standard deviation.
-    `posteriors`: everybody's, merged by bcm, or a function that gives the map's mean and variance at points (m, d).
+    `surface`: the map's mean and variance at points (m, d) of the unit cube.
     """
     if study.space.dim == 1:
-        return _map_curve(study, posteriors, optimum, cohort)
+        return _map_curve(study, surface, optimum, cohort)
     thirds = [None] if study.space.dim == 2 else _levels(float(optimum[2]))
-    grids = [grid_slice(study, posteriors, optimum, third) for third in thirds]
+    grids = [grid_slice(study, surface, optimum, third) for third in thirds]
     figure, panels, draw = map_panels(study, grids)
     for axes, third, values in zip(panels, thirds, grids, strict=True):
         draw(axes, values)
@@ -87,30 +91,20 @@ def map_slices(study: Study, posteriors, optimum: Float[np.ndarray, " d"], cohor
     return figure
 
 
-def slices_after(
-    study: Study, cohort: Cohort, optima: Float[np.ndarray, "k d"], counts: Sequence[int], found: RuleMap
-) -> Figure:
-    """The population map after the first `counts` trials of everybody, each at its own optimum (the star), merged as
-    `aggregate.progress` does where all answers give the map `found`."""
-    rule, share = point_rule(study.rule, found.share)
-
-    def after(count):
-        return partial(population, fit_cohort(study, cohort.first(count)), rule=rule, share=share)
-
-    return maps_beside(study, {f"{n} trials": after(n) for n in counts}, optima)
+def slices_after(study: Study, progress: Progress) -> Figure:
+    """The population map after the first trials of everybody, each at its own optimum (the star)."""
+    maps = {f"{count} trials": partial(predict_map, map_) for count, map_ in progress.maps.items()}
+    return maps_beside(study, maps, progress.population[progress.at(progress.moments)])
 
 
-def maps_beside(
-    study: Study, maps: Mapping[str, Posterior | Callable[..., Any]], optima: Float[np.ndarray, "k d"]
-) -> Figure:
-    """Named population maps side by side, each sliced through its own optimum (the star), on one colour scale.
-
-    A map is everybody's posteriors, merged by bcm, or a function as of `map_slices`.
-    """
+def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndarray, "k d"]) -> Figure:
+    """Named population maps side by side, each sliced through its own optimum (the star), on one colour scale."""
     if study.space.dim == 1:
         return _curves_beside(study, maps, optima)
     thirds = [float(x[2]) if study.space.dim > 2 else None for x in optima]
-    grids = [grid_slice(study, p, x, third) for p, x, third in zip(maps.values(), optima, thirds, strict=True)]
+    grids = [
+        grid_slice(study, surface, x, third) for surface, x, third in zip(maps.values(), optima, thirds, strict=True)
+    ]
     figure, panels, draw = map_panels(study, grids)
     for axes, name, x, third, values in zip(panels, maps, optima, thirds, grids, strict=True):
         draw(axes, values)
@@ -135,38 +129,28 @@ def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population
     return figure
 
 
-def progress_figure(
-    study: Study,
-    cohort: Cohort,
-    population_optima: Float[np.ndarray, "p d"],
-    individual: Float[np.ndarray, "p M d"],
-    truth: Float[np.ndarray, " d"] | None = None,
-    counts: Int[np.ndarray, " p"] | None = None,
-) -> Figure:
+def progress_figure(study: Study, population: Population, truth: Float[np.ndarray, " d"] | None = None) -> Figure:
     """How the optima settle (left, NRMSE to the last trial's, or to the truth), and answers in the top category."""
-    trials = np.arange(1, len(population_optima) + 1) if counts is None else counts
-    reference = population_optima[-1] if truth is None else truth
-    target = individual[-1] if truth is None else np.broadcast_to(truth, individual.shape[1:])
-    own = np.sqrt(np.mean((individual - target) ** 2, axis=2))
-    if truth is None:  # beyond a person's last answer nothing can move
-        own = np.where(trials[:, None] <= cohort.counts()[None, :], own, np.nan)
-    merged = np.sqrt(np.mean((population_optima - reference) ** 2, axis=1))
-    top = np.cumsum(np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask), axis=1)[
-        :, trials - 1
-    ]
+    progress, cohort = population.progress, population.cohort
+    trials = progress.counts
+    to_end, own = progress.to_end()
+    from_goal = to_end
+    if truth is not None:
+        from_goal = np.sqrt(np.mean((progress.population - truth) ** 2, axis=1))
+        own = np.sqrt(np.mean((progress.own - truth) ** 2, axis=2))
+    top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
         goal = "the final optimum" if truth is None else "the truth"
         band(left, trials, 100 * own.T, BLUE, "individuals: median, quartiles")
-        left.plot(trials, 100 * merged, color=RED, marker="o", markersize=3, label="population map")
+        left.plot(trials, 100 * from_goal, color=RED, marker="o", markersize=3, label="population map")
         if truth is not None:
-            to_end = np.sqrt(np.mean((population_optima - population_optima[-1]) ** 2, axis=1))
             left.plot(trials, 100 * to_end, color=GREY, linestyle="--", label="population map, to its final optimum")
         left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
         left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
         left.legend(frameon=False, loc="upper right")
-        band(right, trials, top, GREEN, "median, quartiles")
+        band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
         right.set(xlabel="trials of each participant", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
         right.legend(frameon=False, loc="upper left")
         for axes in (left, right):
@@ -236,7 +220,9 @@ def sides(study: Study) -> list[np.ndarray]:
     return [np.asarray(p.to_physical(jnp.asarray(side))) for p in study.space.parameters[:2]]
 
 
-def grid_slice(study, posteriors, optimum, third):
+def grid_slice(
+    study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None
+) -> Float[np.ndarray, "c c"]:
     """Mean of the population map over the first two parameters, NaN where nothing may be rendered."""
     side = np.linspace(0.0, 1.0, _CELLS)
     x = np.tile(np.asarray(optimum, float), (_CELLS, _CELLS, 1))
@@ -244,19 +230,14 @@ def grid_slice(study, posteriors, optimum, third):
     if third is not None:
         x[..., 2] = third
     flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
-    mean = np.asarray(_map(posteriors, flat)[0])
+    mean = np.asarray(surface(flat)[0])
     return np.where(np.asarray(study.space.feasible(flat)), mean, np.nan).reshape(_CELLS, _CELLS)
 
 
-def _map(posteriors, x) -> tuple[ArrayLike, ArrayLike]:
-    """Mean and variance of a population's map by bcm, or of a function that gives them."""
-    return population(posteriors, x) if isinstance(posteriors, Posterior) else posteriors(x)
-
-
-def _curve(study, posteriors):
+def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Physical values, mean and standard deviation of a map of one parameter."""
     side = jnp.linspace(0.0, 1.0, _CELLS)
-    mean, variance = _map(posteriors, side[:, None])
+    mean, variance = surface(side[:, None])
     return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
 
 
@@ -268,10 +249,10 @@ def _curve_axes(study):
     return figure, axes
 
 
-def _map_curve(study, posteriors, optimum, cohort):
+def _map_curve(study, surface, optimum, cohort):
     with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
-        at, mean, sd = _curve(study, posteriors)
+        at, mean, sd = _curve(study, surface)
         axes.fill_between(at, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label="± standard deviation")
         axes.plot(at, mean, color=BLUE, label="population map")
         axes.autoscale(axis="y")
@@ -290,8 +271,8 @@ def _map_curve(study, posteriors, optimum, cohort):
 def _curves_beside(study, maps, optima):
     with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
-        for (name, posterior), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
-            at, mean, _ = _curve(study, posterior)
+        for (name, surface), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
+            at, mean, _ = _curve(study, surface)
             axes.plot(at, mean, color=colour, label=name)
             best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
             axes.plot(best, np.interp(best, at, mean), "*", color=colour, markersize=11, markeredgecolor="white")

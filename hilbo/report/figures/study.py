@@ -36,11 +36,11 @@ from hilbo.report.figures.maps import (
     sides,
     star,
 )
-from hilbo.study.aggregate import fit_cohort
-from hilbo.study.analysis import Analysis, Progress, Reading
+from hilbo.study.analysis import Analysis, Reading
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.map_summary import Sets, slice_through
+from hilbo.study.progress import Progress
 
 __all__ = [
     "class_regions",
@@ -66,21 +66,19 @@ def typical_person(found: Analysis) -> int:
     return int(np.argsort(miss, kind="stable")[(len(miss) - 1) // 2])
 
 
-def posterior_progress(
-    study: Study, cohort: Cohort, row: int, own: Float[np.ndarray, "k d"], counts: Sequence[int]
-) -> Figure:
-    """One participant's posterior mean after each of `counts` trials, sliced at their final third parameter.
+def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: int) -> Figure:
+    """One participant's posterior mean after their first trials, sliced at their final third parameter.
 
-    `own` (k, d): that person's running optimum. Paper, figure 4.
+    Paper, figure 4.
     """
-    person = cohort.rows(np.array([row]))
-    maps = {f"{n} trials": fit_cohort(study, person.first(n)) for n in counts}
+    person, own = cohort.rows(np.array([row])), progress.own[progress.at(progress.moments), row]
+    maps = {f"{count} trials": posterior.predict for count, posterior in progress.person(row).items()}
     if study.space.dim == 1:
         return maps_beside(study, maps, own)
     third = float(own[-1][2]) if study.space.dim > 2 else None
-    grids = [grid_slice(study, posterior, own[-1], third) for posterior in maps.values()]
+    grids = [grid_slice(study, predict, own[-1], third) for predict in maps.values()]
     figure, panels, draw = map_panels(study, grids)
-    for axes, name, n, x, values in zip(panels, maps, counts, own, grids, strict=True):
+    for axes, name, n, x, values in zip(panels, maps, progress.moments, own, grids, strict=True):
         draw(axes, values)
         mark_trials(axes, study, person.first(n), third)
         star(axes, study, x)
@@ -115,12 +113,12 @@ def population_convergence(progress: Progress, references: Mapping[str, Float[np
     """The population's running optimum against its final one, and against named references (system identification,
     the truth). Paper, figure 7b."""
     looks = [(RED, "o", "-"), (BLUE, "s", "--"), (GREEN, "^", "-.")]
-    targets = {"its final optimum": progress.merged[-1]} | dict(references)
+    targets = {"its final optimum": progress.population[-1]} | dict(references)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.4, 2.9), layout="constrained")
         axes = figure.subplots()
         for (name, x), (colour, marker, dashes) in zip(targets.items(), looks, strict=False):
-            miss = 100 * np.sqrt(np.mean((progress.merged - x) ** 2, axis=1))
+            miss = 100 * np.sqrt(np.mean((progress.population - x) ** 2, axis=1))
             axes.plot(
                 progress.counts, miss, color=colour, marker=marker, linestyle=dashes, markersize=3.5, label=f"to {name}"
             )
