@@ -38,15 +38,17 @@ def count_fits() -> Iterator[Counter[str]]:
     fits: Counter[str] = Counter()
     lock, solve = threading.Lock(), ordinal_gp._fit
 
-    def record(inference, model, x, q, mask):
+    def record(inference, kind, model, x, q, mask):
         if np.any(mask):
-            key = _key(inference, model, x[mask], q[mask])
+            key = _key(inference, kind, model, x[mask], q[mask])
             with lock:
                 fits[key] += 1
 
     @functools.partial(jax.jit, static_argnames="inference")
     def counted(gp, trials, start, inference):
-        jax.debug.callback(functools.partial(record, inference), jax.tree.leaves(gp), trials.x, trials.q, trials.mask)
+        kind = str(jax.tree.structure(gp))  # two kernels may have the same numbers
+        leaves = jax.tree.leaves(gp)
+        jax.debug.callback(functools.partial(record, inference, kind), leaves, trials.x, trials.q, trials.mask)
         return solve(gp, trials, start, inference)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -59,8 +61,8 @@ def count_fits() -> Iterator[Counter[str]]:
             jax.clear_caches()
 
 
-def _key(inference, model, x, q) -> str:
-    digest = hashlib.sha256()
+def _key(inference, kind, model, x, q) -> str:
+    digest = hashlib.sha256(kind.encode())
     for numbers in (*model, x, q):
         rounded = np.round(np.asarray(numbers, np.float64), _DECIMALS) + 0.0  # no negative zero
         digest.update(repr(rounded.shape).encode() + rounded.tobytes())
