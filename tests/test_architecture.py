@@ -59,6 +59,7 @@ ONLY_IN = {"matplotlib": {"report.figures"}, "serial": {"device.ports"}}
 WITHOUT_JAX = {
     *("errors", "device", "hardware_bridge", "identification.device_tests", "cli.measure", "cli.device"),
     "cli.device_screen",
+    "study.set_table",
 }
 LATER = {"device.parameter_sets"}  # imports JAX when a set with full memory has to be sent, and not before
 OUTSIDE_WORLD = {"os", "io", "sys", "time", "datetime", "pathlib", "logging", "random", "socket", "subprocess"}

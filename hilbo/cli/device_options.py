@@ -132,6 +132,9 @@ def simulator(line: Line) -> Any:
     return Simulator(**sim_options(line.sim))
 
 
+_OF_A_SET = ("K0", "K1", "B1", "alpha", "N", "T", "memory", "states", "force_limit")
+
+
 def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
     """What `Renderer.send` takes, or None where no set is chosen."""
     own = {"K0": chosen.K0, "K1": chosen.K1, "B1": chosen.B1, "alpha": chosen.alpha, "N": chosen.N, "T": chosen.T}
@@ -155,9 +158,12 @@ def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
 
 def sets_of(path: Path, line: Line, K_eff: float | None = None) -> dict[str, dict[str, Any]]:
     """Every set of a table, as `Renderer.send` takes them."""
-    from hilbo.study.set_tables import read_sets
+    from hilbo.study.set_table import read_sets
 
-    return {name: _whole(values, line, K_eff) for name, values in read_sets(path).items()}
+    return {
+        name: _whole({key: value for key, value in values.items() if key in _OF_A_SET}, line, K_eff)
+        for name, values in read_sets(path).items()
+    }
 
 
 def _whole(given, line, K_eff) -> dict[str, Any]:

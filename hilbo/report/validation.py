@@ -22,7 +22,7 @@ from hilbo.statistics.preferences import rate
 from hilbo.statistics.regression import FEW_CLUSTERS, Regression
 from hilbo.study.config import Study
 from hilbo.study.trial_table import read_cells
-from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_material, read_sets, read_validation
+from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
 
 __all__ = [
     "HEAD",
@@ -231,7 +231,7 @@ def write_validation(
     """Write the folder of `hilbo validate`; returns the content of result.json."""
     say("reading")
     table = _read(path, study, material)
-    known = None if sets is None else read_sets(sets, study.space.names)
+    known = None if sets is None else sets_frame(sets, study.space.names)
     contents, sections = [], []
     names = materials_of(table)
     for name in names:

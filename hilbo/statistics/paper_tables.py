@@ -17,7 +17,8 @@ from hilbo.errors import InputError
 from hilbo.statistics.logits import binary_logit, ordered_logit, tied_preferences
 from hilbo.statistics.preferences import classifications, confusion, preference_rates
 from hilbo.statistics.regression import Regression
-from hilbo.study.validation_table import NONE, RESPONSES, TIE, check_validation, of_material, source_kind
+from hilbo.study.set_table import source_kind
+from hilbo.study.validation_table import NONE, RESPONSES, TIE, check_validation, of_material
 
 __all__ = ["PaperTables", "aggregate_comparisons", "paper_tables", "set_sources"]
 
@@ -51,7 +52,7 @@ def paper_tables(
 ) -> PaperTables:
     """Every statistic of the paper's validation sessions, of one material.
 
-    `sets` is a sets table (`validation_table.read_sets`); its column `role`, if it has one, says which sets are best,
+    `sets` is a sets table (`validation_table.sets_frame`); its column `role`, if it has one, says which sets are best,
     mid and worst. Without it these are the sets' names, and the sets of table IV are named "aggregate" and
     "individual:PARTICIPANT". Raises `InputError` for a bad table.
     """

@@ -21,7 +21,7 @@ from hilbo.errors import InputError
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.trial_table import numbers, read_cells, read_trials
-from hilbo.study.validation_table import check_validation, read_sets
+from hilbo.study.validation_table import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]
 
@@ -61,7 +61,7 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
         raise InputError(f"{folder}: holds no trials.csv (nor .parquet, nor trials-*.csv); put the trial table there.")
     validation = [_validation(path, study) for path in _tables(folder, "validation")]
     sets_path, truth_path = folder / "sets.csv", folder / "truth.csv"
-    sets = read_sets(sets_path, study.space.names) if sets_path.exists() else None
+    sets = sets_frame(sets_path, study.space.names) if sets_path.exists() else None
     truth = _truth(truth_path, study) if truth_path.exists() else None
     compared = pd.concat(validation, ignore_index=True) if validation else None
     names = _names(study, trials)

@@ -10,13 +10,13 @@ Whatever is wrong is one sentence with the file and the line.
 import os
 from collections.abc import Sequence
 
-import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
+from hilbo.study.set_table import read_sets
 from hilbo.study.trial_table import numbers, read_cells, refuse
 
-__all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_sets", "read_validation", "source_kind"]
+__all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_validation", "sets_frame"]
 
 RESPONSES = ("different", "similar", "close")
 TIE = "tie"
@@ -27,7 +27,6 @@ _NEEDED = ("participant", "trial", "set_a", "set_b", "class_a", "class_b", "pref
 _OPTIONAL = ("material", "session", "first")
 _KEY = ("participant", "material", "session", "trial")
 _RESERVED = ("a", "b", TIE)
-_INDIVIDUAL = "individual:"
 
 
 def read_validation(
@@ -96,39 +95,11 @@ def of_material(table: pd.DataFrame, material: str | None, source: str = "valida
     return table[table["material"] == material]
 
 
-def read_sets(path: str | os.PathLike, parameters: Sequence[str] = ()) -> pd.DataFrame:
-    """A sets table, indexed by `set_id`; the named parameters, `N` and `T` are numbers. Raises `InputError`."""
-    source = str(path)
-    text = read_cells(path, "a sets table needs a header and a parameter set")
-    needed = ("set_id", "source", *parameters)
-    missing = [name for name in needed if name not in text.columns]
-    if missing:
-        raise InputError(f'{source}:1: column "{missing[0]}" is missing; this sets table has {", ".join(needed)}.')
-    out = text.copy()
-    refuse(text["set_id"] == "", source, lambda row: "set_id is empty; name every set.")
-    again = text["set_id"].duplicated()
-    refuse(again, source, lambda row: f'set_id "{text.at[row, "set_id"]}" stands there already; name every set once.')
-    unknown = pd.Series([source_kind(cell) is None for cell in text["source"]], text.index)
-    refuse(
-        unknown,
-        source,
-        lambda row: f'source is "{text.at[row, "source"]}"; it must be aggregate, sysid or individual:PARTICIPANT.',
-    )
-    for name in parameters:
-        out[name] = numbers(text, name, source, "a finite number", np.isfinite)
-    if "N" in text:
-        whole = numbers(text, "N", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
-        out["N"] = whole.astype(int)
-    if "T" in text:
-        out["T"] = numbers(text, "T", source, "a time above 0, in s", lambda v: v > 0)
-    return out.set_index("set_id")
-
-
-def source_kind(text: str) -> str | None:
-    """Which kind of source this names: aggregate, sysid, individual, or None."""
-    if text in ("aggregate", "sysid"):
-        return text
-    return "individual" if text.startswith(_INDIVIDUAL) and len(text) > len(_INDIVIDUAL) else None
+def sets_frame(path: str | os.PathLike, parameters: Sequence[str] = ()) -> pd.DataFrame:
+    """A sets table (`set_table.read_sets`) whose sets say where they are from, indexed by `set_id`."""
+    frame = pd.DataFrame.from_dict(read_sets(path, ("source", *parameters)), orient="index").rename_axis("set_id")
+    text = frame.select_dtypes(exclude="number").columns
+    return frame.fillna(dict.fromkeys(text, ""))
 
 
 def _classes(text, column, responses, source):

@@ -19,7 +19,7 @@ from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
 from hilbo.cli.device_screen import trace
 from hilbo.device import protocol
 from hilbo.device.simulator import Simulator
-from hilbo.study.set_tables import read_sets
+from hilbo.study.set_table import read_sets
 
 pytestmark = needs_device
 
@@ -113,11 +113,12 @@ def test_bad_input_is_one_sentence(device, tmp_path, monkeypatch, arguments, cod
     ("text", "words"),
     [
         ("set_id,K1,B1\n", 'column "alpha" is missing'),
-        ("set_id,K1,B1,alpha\n", "has no sets"),
-        ("set_id,K1,B1,alpha\nA,1,2,x\n", 'sets.csv:2: alpha is "x", it must be a number'),
+        ("set_id,K1,B1,alpha\n", "has no rows"),
+        ("set_id,K1,B1,alpha\nA,1,2,x\n", 'sets.csv:2: alpha is "x"; it must be a finite number'),
         ("set_id,K1,B1,alpha,N\nA,1,2,0.5,1.5\n", "N is"),
-        ("set_id,K1,B1,alpha\nA,1,2,0.5\nA,1,2,0.5\n", "used before"),
-        ("set_id,K1,B1,alpha\nA,1,2\n", 'alpha is ""'),
+        ("set_id,K1,B1,alpha\nA,1,2,0.5\nA,1,2,0.5\n", "stands there already"),
+        ("set_id,K1,B1,alpha\nA,1,2\n", "has 3 cells and the header 4"),
+        ("set_id,K1,B1,alpha\nA,1,2,\n", 'alpha is ""'),
     ],
 )
 def test_a_bad_sets_table_is_one_sentence(device, sets, text, words):
@@ -129,7 +130,7 @@ def test_a_bad_sets_table_is_one_sentence(device, sets, text, words):
 def test_a_sets_table_may_leave_things_out(sets):
     sets.write_text("set_id,K1,B1,alpha,memory,note\nA,1,2,0.5,full,hello\nB,2,3,0.25,,\n")
     assert read_sets(sets) == {
-        "A": {"K1": 1.0, "B1": 2.0, "alpha": 0.5, "memory": "full"},
+        "A": {"K1": 1.0, "B1": 2.0, "alpha": 0.5, "memory": "full", "note": "hello"},
         "B": {"K1": 2.0, "B1": 3.0, "alpha": 0.25},
     }
 

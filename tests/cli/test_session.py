@@ -12,7 +12,7 @@ from hilbo.cli import main
 from hilbo.session.actions import Block
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.plan import planned_header
-from hilbo.study.validation_table import read_sets, read_validation
+from hilbo.study.validation_table import read_validation, sets_frame
 
 TOML = """\
 schema = 1
@@ -173,7 +173,7 @@ def test_a_folder_of_comparisons_alone_is_exported(hilbo, tmp_path):
     assert code == 0, err
     data = tmp_path / "tables" / "data"
     assert len(read_validation(data / "study-plain_table-validation_data.csv", study.responses)) == 6
-    assert set(read_sets(data / "study-plain_table-sets_data.csv", ("u", "v")).index) == set("DEF")
+    assert set(sets_frame(data / "study-plain_table-sets_data.csv", ("u", "v")).index) == set("DEF")
     assert not (tmp_path / "tables" / "trials.nc").exists()
     validation_log(tmp_path / "begun", study, answered=False)
     code, _, err = hilbo("export", "begun", "--study", "study.toml", "--out", "none")

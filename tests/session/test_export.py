@@ -19,7 +19,7 @@ from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import cohort_of
 from hilbo.study.inference_data import groups, write_groups
 from hilbo.study.trial_table import read_trials
-from hilbo.study.validation_table import read_sets, read_validation
+from hilbo.study.validation_table import read_validation, sets_frame
 
 
 def write(folder, person, kind, session, doings=(), **facts):
@@ -87,7 +87,7 @@ def test_the_psych_ds_folder_describes_every_column(folder, tmp_path):
     data = tmp_path / "out" / "data"
     comparisons = read_validation(data / "study-plain_table-validation_data.csv", STUDY.responses)
     assert len(comparisons) == 6 and set(comparisons["participant"]) == {"P03"}
-    sets = read_sets(data / "study-plain_table-sets_data.csv", ("u", "v"))
+    sets = sets_frame(data / "study-plain_table-sets_data.csv", ("u", "v"))
     assert set(sets.index) == set("DEF") and sets.loc["D", "u"] == 0.123456789 + 0.3
 
 

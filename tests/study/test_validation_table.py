@@ -4,7 +4,8 @@ import pandas as pd
 import pytest
 
 from hilbo.errors import InputError
-from hilbo.study.validation_table import check_validation, read_sets, read_validation, source_kind
+from hilbo.study.set_table import source_kind
+from hilbo.study.validation_table import check_validation, read_validation, sets_frame
 
 HEAD = "participant,material,session,trial,set_a,set_b,first,class_a,class_b,preferred"
 GOOD = ["P1,foam,1,1,best,mid,b,close,similar,a", "P1,foam,1,2,mid,worst,mid,2,1,tie", "P2,foam,1,1,best,i1,,,,i1"]
@@ -96,7 +97,7 @@ def test_ranks_are_refused_where_a_label_is_a_number(tmp_path):
 
 
 def test_sets_are_read(tmp_path):
-    found = read_sets(
+    found = sets_frame(
         write(tmp_path, "best,aggregate,5.58,101,0.001", "i1,individual:P1,4,101,0.001", head=SETS), ["K1"]
     )
     assert found.at["best", "K1"] == 5.58 and found.at["i1", "N"] == 101 and found.at["i1", "T"] == 0.001
@@ -112,14 +113,19 @@ def test_sets_are_read(tmp_path):
         ("x,sysid,five,101,0.001", ':3: K1 is "five"; it must be a finite number'),
         ("x,sysid,5,1.5,0.001", ':3: N is "1.5"'),
         ("x,sysid,5,101,0", ':3: T is "0"; it must be a time above 0, in s'),
+        ("x,sysid,1_5,101,0.001", ':3: K1 is "1_5"; it must be a finite number'),
+        ("x,sysid,5,101", ":3: has 4 cells and the header 5"),
     ],
 )
 def test_a_bad_set_is_named(tmp_path, row, sentence):
     with pytest.raises(InputError) as caught:
-        read_sets(write(tmp_path, "best,aggregate,5,101,0.001", row, head=SETS), ["K1"])
+        sets_frame(write(tmp_path, "best,aggregate,5,101,0.001", row, head=SETS), ["K1"])
     assert f"table.csv{sentence}" in str(caught.value)
+    twice = SETS.replace("N", "K1", 1)
+    with pytest.raises(InputError, match='column "K1" stands there twice'):
+        sets_frame(write(tmp_path, "best,aggregate,5,5,0.001", head=twice), ["K1"])
     with pytest.raises(InputError, match='column "B1" is missing'):
-        read_sets(write(tmp_path, "best,aggregate,5,101,0.001", head=SETS), ["K1", "B1"])
+        sets_frame(write(tmp_path, "best,aggregate,5,101,0.001", head=SETS), ["K1", "B1"])
 
 
 def test_sources():
