@@ -23,9 +23,11 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 install_import_hook("hilbo", "beartype.beartype")  # stays for the whole run: hilbo is imported by the tests
 
-from hilbo.numerics.compiling import set_flags  # noqa: E402
+from hilbo.numerics.compiling import compiler_options, set_flags  # noqa: E402
 
 set_flags()  # as hilbo's commands are compiled
+
+QUICKLY = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 
 # The same examples in every run; pytest --hypothesis-profile=search draws new ones.
 settings.register_profile("fixed", deadline=None, derandomize=True)
@@ -34,6 +36,15 @@ settings.load_profile("fixed")
 
 MANY_MAPPINGS = 15_000
 REQUIRE_ALL = os.environ.get("HILBO_REQUIRE_ALL", "") not in ("", "0")
+
+
+def pytest_configure(config):
+    """The default run compiles in a third of the time: the same programs, of which LLVM optimises nothing. Runs with
+    deep tests compile as users do, and so does a run whose XLA_FLAGS name an optimisation level."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    quick = config.getoption("markexpr") == "not deep" and "xla_backend_optimization_level" not in flags
+    if quick and compiler_options():
+        os.environ["XLA_FLAGS"] = f"{flags} {QUICKLY}".strip()
 
 
 @pytest.fixture(scope="module", autouse=True)

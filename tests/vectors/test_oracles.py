@@ -1,0 +1,23 @@
+"""The stored numbers are those that their makers make."""
+
+import numpy as np
+import pytest
+from oracles import oracle
+
+from tests.vectors.make_oracles import ORACLES, leaves
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("name", ORACLES)
+def test_what_is_stored_is_what_is_made(name):
+    made, stored = dict(leaves(ORACLES[name].make())), dict(leaves(oracle(name)))
+    assert made.keys() == stored.keys()
+    for path, values in made.items():
+        np.testing.assert_allclose(
+            stored[path], values, rtol=ORACLES[name].rtol, atol=ORACLES[name].atol, err_msg="/".join(path)
+        )
+
+
+@pytest.mark.parametrize("name", ORACLES)
+def test_every_oracle_is_stored(name):
+    assert all(np.all(values == values) for _, values in leaves(oracle(name)))
