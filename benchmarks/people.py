@@ -32,7 +32,7 @@ from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit  # noqa: E402
 from hilbo.population.counts import Counts, fit_counts  # noqa: E402
 from hilbo.population.hierarchical_evidence import learn_people  # noqa: E402
 from hilbo.population.leave_one_out import clustered, integral_transform  # noqa: E402
-from hilbo.population.pointwise import RULES, aggregate, grbcm  # noqa: E402
+from hilbo.population.pointwise import RULES, aggregate  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 WORDS = {
@@ -56,14 +56,6 @@ class Data:
         counts = np.zeros((len(self.names), len(self.points), categories))
         np.add.at(counts, (self.who, self.place, q), 1.0)
         self.counts = Counts(jnp.asarray(self.points), jnp.asarray(counts))
-
-    def shared(self, left):
-        """Counts of an even part of everybody's answers but one person's, as many as one person's: grbcm's set."""
-        rows = np.flatnonzero(self.who != left)
-        rows = rows[:: len(self.names) - 1]
-        found = np.zeros(self.counts.counts.shape)
-        np.add.at(found, (self.who[rows], self.place[rows], self.q[rows]), 1.0)
-        return jnp.asarray(found)
 
 
 def video(path, _):
@@ -113,16 +105,6 @@ def predicted(gp, share, counts, common, mask, x):
     return {rule: jax.vmap(gp.likelihood.class_probabilities)(*found) for rule, found in maps.items()}
 
 
-def generalised_robust(gp, counts, common, left, x):
-    """grbcm of all but one person, each with the communication set."""
-    rest = np.delete(np.arange(len(counts.counts)), left)
-    shared = jnp.sum(common, axis=0, keepdims=True)
-    own = Counts(counts.x, counts.counts[rest] - common[rest] + shared)
-    base = jax.tree.map(lambda leaf: leaf[0], each(gp, Counts(counts.x, shared))).predict(x)
-    means, variances = jax.vmap(lambda p: p.predict(x))(each(gp, own))
-    return jax.vmap(gp.likelihood.class_probabilities)(*grbcm(base, means, variances))
-
-
 def probit(data, train, test):
     """An ordinal probit, quadratic in the standardised parameters, by maximum likelihood."""
     z = (data.x - data.x[train].mean(axis=0)) / data.x[train].std(axis=0)
@@ -169,7 +151,6 @@ def main():
         rows = np.resize(np.flatnonzero(test), longest)  # padded, for one compilation
         x = jnp.asarray(data.x[rows])
         found = predicted(learnt.gp, learnt.share, counts, None, jnp.asarray(mask), x)
-        found["grbcm"] = generalised_robust(learnt.gp, counts, data.shared(left), left, x)
         found = {rule: np.asarray(p)[: test.sum()] for rule, p in found.items()}
         found["probit"] = np.asarray(probit(data, ~test, test))
         share = np.bincount(data.q[~test], minlength=data.categories) / (~test).sum()

@@ -1,12 +1,10 @@
 """A cohort's population map by any rule, as one record that predicts; and what the answers say of how people differ.
 
-Rules of `pointwise` merge everybody's own posterior point by point. Three rules look at the answers themselves:
+Rules of `pointwise` merge everybody's own posterior point by point. Two rules look at the answers themselves:
 
 * `hierarchical`, where the answers are few enough: the posterior of the shared function g, exact (`hierarchical`, or
   `counts` where people answered the same stimuli); point by point otherwise, at the committee's cost.
 * `pooled`: the same with a share of 1, one function for all.
-* `grbcm`: the communication set are answers evenly chosen from everybody's, as many as one person gave; each expert
-  has them and their own.
 
 The share that people have in common is learnt by evidence, from an even choice of people if there are many, and its
 posterior mean is used: the most probable share may be 0 or 1, where nothing, or everything, would be common.
@@ -28,8 +26,8 @@ from hilbo.population.hierarchical import Share, fit_people, learn_share, of_peo
 
 __all__ = ["ALL_RULES", "LARGEST_EXACT", "AnyRule", "RuleMap", "even_choice", "point_rule", "rule_map", "share_of"]
 
-AnyRule = Literal[pointwise.Rule, "grbcm", "pooled"]
-ALL_RULES: tuple[AnyRule, ...] = (*get_args(pointwise.Rule), "grbcm", "pooled")
+AnyRule = Literal[pointwise.Rule, "pooled"]
+ALL_RULES: tuple[AnyRule, ...] = (*get_args(pointwise.Rule), "pooled")
 
 LARGEST_EXACT = 1500
 """Answers, or latent values, up to which the exact models are used: they are cubic in their number."""
@@ -43,9 +41,9 @@ class RuleMap(eqx.Module):
     method: str = eqx.field(static=True)
     """ "by points" from everybody's posterior, or "exact" from all answers at once."""
     experts: Posterior | None
-    """Stacked, one for each person; of grbcm, with the communication set."""
+    """Stacked, one for each person, of a map by points."""
     shared: Posterior | None
-    """Of the shared function g, or from the communication set alone."""
+    """Of the shared function g, of an exact map."""
     share: Float[Array, ""]
     prior: Float[Array, ""]
     """Prior variance of one person's function."""
@@ -56,9 +54,6 @@ class RuleMap(eqx.Module):
             assert self.shared is not None
             return self.shared.predict(x)
         means, explained = jax.vmap(lambda person: person.predict_explained(x))(self.experts)
-        if self.rule == "grbcm":
-            assert self.shared is not None
-            return pointwise.grbcm(self.shared.predict(x), means, self.prior - explained)
         share = self.share if self.rule == "hierarchical" else None
         return pointwise.aggregate(self.rule, means, explained, self.prior, share=share)  # type: ignore[arg-type]
 
@@ -70,7 +65,7 @@ class RuleMap(eqx.Module):
     @property
     def map_prior(self) -> Float[Array, ""]:
         """Variance of the map where nobody answered, against which its own tells what the answers say."""
-        if self.rule in ("poe", "average"):
+        if self.rule == "average":
             return self.prior / jax.tree.leaves(self.experts)[0].shape[0]
         return self.share * self.prior
 
@@ -124,8 +119,6 @@ def rule_map(
                 ' many; use "bcm", "hierarchical" or another rule that merges people point by point.'
             )
         return RuleMap(rule, "exact", None, shared, one, prior)
-    if rule == "grbcm":
-        return RuleMap(rule, "by points", *_communicating(gp, trials, inference), one, prior)
     if posteriors is None:
         posteriors = _experts(gp, trials, inference)
     return RuleMap(rule, "by points", posteriors, None, part, prior)
@@ -219,34 +212,3 @@ def _from_counts(gp: OrdinalGP, counts: Counts | None, share: Float[Array, ""], 
         return None
     posterior = fit_counts(gp, share, counts if float(share) < 1 else one_person(counts))
     return posterior if bool(posterior.certificate.converged) else None
-
-
-def _communicating(gp, trials, inference) -> tuple[Posterior, Posterior]:
-    """Experts of grbcm, with the communication set besides their own answers, and that set's posterior."""
-    mask = np.asarray(trials.mask)
-    person, row = np.nonzero(mask)
-    size = max(1, round(len(row) / max(int(mask.any(axis=1).sum()), 1)))
-    if len(row) < 2 or not mask.any(axis=1).all():
-        raise InputError(
-            'The rule "grbcm" needs answers of everybody, and of two people at least; leave out who gave none, or use'
-            ' "rbcm".'
-        )
-    chosen = np.unique(np.linspace(0, len(row) - 1, size).round().astype(int))
-    at = person[chosen], row[chosen]
-    common = Trials(trials.x[at], trials.q[at], jnp.ones(len(chosen), bool))
-    people = mask.shape[0]
-    own = trials.mask & ~jnp.asarray(_at(mask.shape, *at))  # nobody's answer counts twice
-
-    def beside(shared, each):
-        return jnp.concatenate([jnp.broadcast_to(shared[None], (people, *shared.shape)), each], axis=1)
-
-    grown = jax.vmap(Trials)(beside(common.x, trials.x), beside(common.q, trials.q), beside(common.mask, own))
-    alone = jax.tree.map(lambda leaf: leaf[None], common)
-    shared = jax.tree.map(lambda leaf: leaf[0], _experts(gp, alone, inference))
-    return _experts(gp, grown, inference), shared
-
-
-def _at(shape, person, row):
-    taken = np.zeros(shape, bool)
-    taken[person, row] = True
-    return taken

@@ -24,12 +24,13 @@ from jaxtyping import Array, Float
 from hilbo.gaussian import factor, mean_and_explained
 from hilbo.kernels import RBF, gram
 from hilbo.ordinal_gp import Trials, fit
-from hilbo.study.aggregate import Optimum, Rule, individual_optima
+from hilbo.population.pointwise import Rule, Sums, terms
+from hilbo.study.aggregate import Optimum, individual_optima
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Inference, Study
 from hilbo.study.distributed import AXIS, Crew
 
-__all__ = ["Fitted", "Jets", "Population", "Say", "Sums", "block_size", "jets", "population_of", "refit", "sums"]
+__all__ = ["Fitted", "Jets", "Population", "Say", "block_size", "jets", "population_of", "refit", "sums"]
 
 _TOGETHER = 64  # people whose predictions are made at once, except on CPUs: those hold one person's in their caches
 
@@ -41,29 +42,6 @@ Say = Callable[[str, int, int], None]
 
 def _silent(words: str, done: int, people: int) -> None:
     del words, done, people
-
-
-class Sums(NamedTuple):
-    """Sums over people at points (m,), or derivatives of those sums with further axes.
-
-    `added` precision and precision-`weighted` means (as in `bcm.Evidence`), plain `means`, `explained` variances;
-    arrays of JAX or NumPy.
-    """
-
-    added: Any
-    weighted: Any
-    means: Any
-    explained: Any
-
-    def merge(self, prior, people, rule: Rule = "bcm", share: float = 1.0) -> tuple[Any, Any]:
-        """Mean and variance of the map of so many people with the prior variance `prior`, by a rule of `pointwise`;
-        `added` and `weighted` are of that rule (bcm's serve poe and gpoe too)."""
-        if rule == "average":
-            return self.means / people, (prior - self.explained / people) / people
-        weight = 1.0 / people if rule == "gpoe" else 1.0
-        kept = prior / people if rule == "poe" else prior * share
-        variance = kept / (1.0 + kept * weight * self.added)
-        return variance * weight * self.weighted, variance
 
 
 class Jets(NamedTuple):
@@ -279,10 +257,7 @@ def _sums_of(expert, points, by):
     rule, share = by
     cross = gram(expert.kernel, expert.x, points)
     means, explained = mean_and_explained(expert.weights, expert.factor, expert.inverse, cross)
-    prior = jax.vmap(expert.kernel.diagonal)(points)
-    remaining = prior - share * explained
-    weight = -0.5 * jnp.log1p(-explained / prior) if rule == "rbcm" else jnp.ones_like(means)
-    return Sums(weight * explained / (prior * remaining), weight * means / remaining, means, explained)
+    return terms(rule, means, explained, jax.vmap(expert.kernel.diagonal)(points), share)
 
 
 def _jets_of(expert, points, by):

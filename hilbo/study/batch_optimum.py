@@ -20,10 +20,10 @@ from hilbo.errors import InputError
 from hilbo.numerics.newton import TrustRegionNewton
 from hilbo.population.hierarchical import Share
 from hilbo.population.maps import share_of
-from hilbo.population.pointwise import RULES
+from hilbo.population.pointwise import RULES, Rule, Sums
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Optimum, Rule, other_inference
-from hilbo.study.batch import Jets, Population, Say, Sums, jets, population_of, refit, sums
+from hilbo.study.aggregate import Optimum, other_inference
+from hilbo.study.batch import Jets, Population, Say, jets, population_of, refit, sums
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.distributed import Crew

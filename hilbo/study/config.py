@@ -21,6 +21,7 @@ import msgspec
 from hilbo.errors import InputError
 from hilbo.mechanics.memory import Memory
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
+from hilbo.population.maps import ALL_RULES, AnyRule
 from hilbo.search.space import Mechanics, Parameter, SearchSpace
 from hilbo.study.fields import NotNegative as _NotNegative
 from hilbo.study.fields import Number as _Number
@@ -30,7 +31,7 @@ from hilbo.study.fields import check_keys, check_table, enclosing, lines_of, pre
 from hilbo.study.fields import words as _text
 from hilbo.study.protocols import SessionTable
 
-__all__ = ["RBF", "Inference", "OrdinalGP", "OrdinalProbit", "Rule", "Selection", "Study"]
+__all__ = ["RBF", "Inference", "OrdinalGP", "OrdinalProbit", "Selection", "Study"]
 
 
 class _StudyTable(_Table, frozen=True):
@@ -94,11 +95,8 @@ class Selection(_Table, frozen=True):
     minimum_distance: Annotated[_NotNegative | None, _text("a number, 0 or above", "0.05")] = None
 
 
-Rule = Literal["bcm", "hierarchical", "rbcm", "gpoe", "poe", "average", "grbcm", "pooled"]
-
-
 class _AggregationTable(_Table, frozen=True):
-    rule: Annotated[Rule, _text("one of " + ", ".join(f'"{name}"' for name in get_args(Rule)), '"bcm"')] = "bcm"
+    rule: Annotated[AnyRule, _text("one of " + ", ".join(f'"{name}"' for name in ALL_RULES), '"bcm"')] = "bcm"
 
 
 class _Content(_Table, frozen=True):
@@ -144,7 +142,7 @@ class Study(eqx.Module):
     """The rule by which people are left out (`hilbo.population.response_quality`), empty for nobody."""
     selection: Selection = eqx.field(static=True)
     inference: Inference = eqx.field(static=True)
-    rule: Rule = eqx.field(static=True)
+    rule: AnyRule = eqx.field(static=True)
     source: str = eqx.field(static=True)
     content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON
     session: SessionTable = eqx.field(static=True, repr=False, default=SessionTable())

@@ -13,7 +13,7 @@ from hilbo.study.config import Study
 
 __all__ = ["heterogeneity", "in_place", "rule_warnings", "share_content"]
 
-_ALIKE = ("bcm", "poe", "gpoe", "rbcm", "grbcm", "pooled")  # rules that take people to share one function
+_ALIKE = ("bcm", "rbcm", "pooled")  # rules that take people to share one function
 _SURE = 3.0  # log Bayes factor, about 20 to 1
 _TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.maps import RuleMap, point_rule
@@ -80,7 +80,7 @@ def follow(study: Study, aggregate: Aggregate, seed: int = 0, counts: Sequence[i
     for count in asked.tolist():
         last = count == longest
         posteriors = aggregate.posteriors if last else fit_cohort(study, cohort.first(count))
-        map_ = _map_by_points(study, aggregate, posteriors)
+        map_ = _map_by_points(study, aggregate.map.share, posteriors)
         population.append(np.asarray(map_optimum(study, map_, candidates).x))
         optima = aggregate.individuals if last else individual_optima(study, posteriors, candidates)
         own.append(np.asarray(optima.x))
@@ -96,11 +96,11 @@ def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], with
     return int(counts[first]) if first < len(counts) - 1 else None
 
 
-def _map_by_points(study: Study, aggregate: Aggregate, posteriors: Posterior) -> RuleMap:
+def _map_by_points(study: Study, share: Float[Array, ""], posteriors: Posterior) -> RuleMap:
     """The map of these posteriors by the study's rule, or by bcm where the rule takes all answers at once."""
-    rule, share = point_rule(study.rule, aggregate.map.share)
+    rule, part = point_rule(study.rule, share)
     prior = jnp.asarray(study.gp.kernel.variance)
-    return RuleMap(rule, "by points", posteriors, None, jnp.ones_like(prior) if share is None else share, prior)
+    return RuleMap(rule, "by points", posteriors, None, jnp.ones_like(prior) if part is None else part, prior)
 
 
 def _counts(ends: Int[np.ndarray, " M"]) -> Int[np.ndarray, " p"]:

@@ -8,9 +8,8 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.errors import InputError
 from hilbo.population.hierarchical import fit_people, of_people, population
-from hilbo.population.maps import ALL_RULES, even_choice, rule_map, share_of
+from hilbo.population.maps import even_choice, rule_map, share_of
 from hilbo.population.pointwise import RULES, aggregate
-from hilbo.study.config import Rule
 
 GP = OrdinalGP(RBF(4.0, 1.3), OrdinalProbit((-0.5, 0.5), 0.5))
 X = jnp.asarray(np.random.default_rng(9).uniform(size=(6, 2)))
@@ -20,10 +19,6 @@ def cohort(people=3, answers=6, seed=0):
     rng = np.random.default_rng(seed)
     each = [Trials.from_arrays(rng.uniform(size=(answers, 2)), rng.integers(0, 3, answers), 8) for _ in range(people)]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-
-
-def test_a_study_file_knows_the_same_rules():
-    assert set(Rule.__args__) == set(ALL_RULES)
 
 
 @pytest.mark.parametrize("rule", [rule for rule in RULES if rule != "hierarchical"])
@@ -54,17 +49,6 @@ def test_few_answers_are_merged_exactly_and_many_by_points():
     same = rule_map(GP, trials, "hierarchical", share=jnp.ones(()))
     for a, b in zip(same.predict(X), rule_map(GP, trials, "pooled").predict(X), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
-
-
-@pytest.mark.deep
-def test_grbcm_shares_answers_and_counts_none_twice():
-    found = rule_map(GP, cohort(), "grbcm")
-    assert found.experts is not None and found.shared is not None
-    common = int(found.shared.trials.mask.sum())
-    held = np.asarray(found.experts.trials.mask.sum(axis=1))
-    assert common == 6
-    assert held.sum() == 3 * 6 + (3 - 1) * common
-    assert bool(jnp.all(found.predict(X)[1] > 0))
 
 
 def test_what_a_rule_cannot_do_is_refused():

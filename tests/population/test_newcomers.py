@@ -109,12 +109,12 @@ def _substitute(found):
 
 def test_maps_of_fewer_trials_are_merged_as_their_stars(posteriors):
     """Point by point, with the share that all answers say."""
-    aggregate = SimpleNamespace(map=of_rule("hierarchical", None))
-    merged = _map_by_points(dataclasses.replace(STUDY, rule="hierarchical"), aggregate, posteriors[True])
+    share = jnp.asarray(SHARE)
+    merged = _map_by_points(dataclasses.replace(STUDY, rule="hierarchical"), share, posteriors[True])
     x = jnp.asarray(np.random.default_rng(2).uniform(size=(5, 2)))
     expected = population(posteriors[True], x, "hierarchical", jnp.asarray(SHARE))
     np.testing.assert_allclose(np.stack(merged.predict(x)), np.stack(expected), rtol=1e-12)
-    by_bcm = _map_by_points(dataclasses.replace(STUDY, rule="pooled"), aggregate, posteriors[True])
+    by_bcm = _map_by_points(dataclasses.replace(STUDY, rule="pooled"), share, posteriors[True])
     assert (by_bcm.rule, by_bcm.method) == ("bcm", "by points")
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from hilbo import bcm
 from hilbo.errors import InputError
-from hilbo.population.pointwise import RULES, aggregate, grbcm
+from hilbo.population.pointwise import RULES, aggregate
 
 PRIOR = 1.3
 
@@ -36,12 +36,9 @@ def textbook(rule, means, explained, share):
             return sum(b / a / g for b, a, g in zip(m, v, grown, strict=True)) / precision, 1 / precision
         beta = {
             "bcm": [mpmath.mpf(1)] * M,
-            "poe": [mpmath.mpf(1)] * M,
-            "gpoe": [mpmath.mpf(1) / M] * M,
             "rbcm": [(mpmath.log(k) - mpmath.log(a)) / 2 for a in v],
         }[rule]
-        left = 0 if rule in ("poe", "gpoe") else 1 - sum(beta)
-        precision = sum(b / a for b, a in zip(beta, v, strict=True)) + left / k
+        precision = sum(b / a for b, a in zip(beta, v, strict=True)) + (1 - sum(beta)) / k
         return sum(b * c / a for b, c, a in zip(beta, m, v, strict=True)) / precision, 1 / precision
 
 
@@ -115,12 +112,11 @@ def test_absent_people_may_hold_anything(rule):
 
 def test_nobody_knows_anything():
     nothing = jnp.zeros((5, 2))
-    for rule in ("bcm", "rbcm", "gpoe"):
+    for rule in ("bcm", "rbcm"):
         mean, variance = aggregate(rule, nothing, nothing, PRIOR)
         np.testing.assert_array_equal(mean, 0.0)
         np.testing.assert_allclose(variance, PRIOR, rtol=1e-15)
     np.testing.assert_allclose(aggregate("hierarchical", nothing, nothing, PRIOR, share=0.3)[1], 0.3 * PRIOR)
-    np.testing.assert_allclose(aggregate("poe", nothing, nothing, PRIOR)[1], PRIOR / 5)  # its well-known fault
 
 
 def test_less_is_learnt_about_people_who_differ_more():
@@ -128,26 +124,6 @@ def test_less_is_learnt_about_people_who_differ_more():
     shares = jnp.linspace(0.05, 1.0, 30)
     variances = jax.vmap(lambda p: aggregate("hierarchical", means, explained, PRIOR, share=p)[1] / p)(shares)
     assert np.all(np.diff(np.asarray(variances), axis=0) < 0)  # in units of g's prior variance
-
-
-def test_generalised_robust_committee():
-    rng = np.random.default_rng(5)
-    base = jnp.asarray(rng.normal(size=3)), jnp.asarray(rng.uniform(0.5, 1.0, 3))
-    means = jnp.asarray(rng.normal(size=(4, 3)))
-    variances = base[1][None, :] * jnp.asarray(rng.uniform(0.1, 0.999, (4, 3)))
-    mean, variance = grbcm(base, means, variances)
-    for i in range(3):
-        with mpmath.workdps(40):
-            c, v = mpmath.mpf(float(base[1][i])), [mpmath.mpf(float(a)) for a in variances[:, i]]
-            beta = [mpmath.mpf(1)] + [(mpmath.log(c) - mpmath.log(a)) / 2 for a in v[1:]]
-            precision = sum(b / a for b, a in zip(beta, v, strict=True)) - (sum(beta) - 1) / c
-            total = sum(b * float(m) / a for b, m, a in zip(beta, means[:, i], v, strict=True))
-            expected = (total - (sum(beta) - 1) * float(base[0][i]) / c) / precision
-        np.testing.assert_allclose([mean[i], variance[i]], [float(expected), float(1 / precision)], rtol=1e-12)
-    # One expert is itself; experts who add nothing to what is shared leave it as it is.
-    np.testing.assert_allclose(grbcm(base, means[:1], variances[:1])[0], means[0], rtol=1e-14)
-    nothing = jnp.broadcast_to(base[0], (4, 3)), jnp.broadcast_to(base[1], (4, 3))
-    np.testing.assert_allclose(grbcm(base, *nothing)[1], base[1], rtol=1e-14)
 
 
 def test_wrong_rules_are_refused():

@@ -11,10 +11,11 @@ import pytest
 from studies import PEOPLE, STUDY, population_answers, population_study
 
 from hilbo.errors import InputError
+from hilbo.population.pointwise import Sums
 from hilbo.search.candidates import search_points
 from hilbo.study import distributed
 from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population, population_optimum
-from hilbo.study.batch import Sums, _block, block_size, jets, population_of, refit, sums
+from hilbo.study.batch import _block, block_size, jets, population_of, refit, sums
 from hilbo.study.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.study.cohort import cohort_of
 
@@ -46,10 +47,6 @@ def test_the_merged_map_is_that_of_the_posteriors_held_at_once():
         expected = population(posteriors(), jnp.asarray(candidates()), rule)
         np.testing.assert_allclose(found[0], expected[0], atol=1e-12)
         np.testing.assert_allclose(found[1], expected[1], atol=1e-13)
-    for rule in ("poe", "gpoe"):  # from bcm's sums
-        found = fitted().sums.merge(1.3, PEOPLE, rule)
-        for a, b in zip(found, population(posteriors(), jnp.asarray(candidates()), rule), strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-12)
     certificate = posteriors().certificate
     assert fitted().certificate["converged"].all()
     np.testing.assert_array_equal(fitted().certificate["iterations"], certificate.iterations)
@@ -65,10 +62,9 @@ def test_other_rules_are_sums_of_their_own(rule, share):
 
 
 def test_rules_that_are_no_sum_are_refused():
-    for rule in ("pooled", "grbcm"):
-        study = dataclasses.replace(STUDY, rule=rule)
-        with pytest.raises(InputError, match=f'"{rule}" needs all answers at once and cannot be streamed'):
-            aggregate_population(study, cohort(), distributed.alone())
+    study = dataclasses.replace(STUDY, rule="pooled")
+    with pytest.raises(InputError, match='"pooled" needs all answers at once and cannot be streamed'):
+        aggregate_population(study, cohort(), distributed.alone())
 
 
 def test_posteriors_made_again_from_their_modes_say_the_same():

@@ -19,7 +19,7 @@ from hilbo.study.rule_comparison import compare, recommendation
 
 @pytest.mark.deep
 def test_everything_is_compared_and_written(tmp_path):
-    study = dataclasses.replace(plain_study(2), rule="poe")
+    study = dataclasses.replace(plain_study(2), rule="rbcm")
     content = write_comparison(study, aggregate_cohort(study, answered(study, people=4)), tmp_path)
     assert json.loads((tmp_path / "comparison.json").read_text()) == content
     assert set(content["rules"]) == set(ALL_RULES)
@@ -28,7 +28,7 @@ def test_everything_is_compared_and_written(tmp_path):
         assert set(found["influence"]) == {"P0", "P1", "P2", "P3"}
         assert set(found["optimum"]) == {"p0", "p1"}
     assert content["rules"]["pooled"]["agreement_with_pooled"] == pytest.approx(1.0)
-    assert content["rules"]["poe"]["covered"] < 1 and content["rules"]["average"]["covered"] < 1
+    assert content["rules"]["rbcm"]["covered"] < 1 and content["rules"]["average"]["covered"] < 1
     for rule in ("bcm", "hierarchical", "pooled"):
         low, middle, high = content["rules"][rule]["optimum_by_draws"]["p0"]
         assert 1 <= low <= middle <= high <= 10
@@ -72,13 +72,13 @@ def advice(found, people=12, spread=0.5, paired=0.01, **costs):
 
 def test_the_recommendation_follows_evidence_and_density():
     differ, alike = share(0.5, 40.0), share(0.9, -2.0)
-    assert "Recommended: hierarchical" in advice(differ, bcm=2.2, hierarchical=2.204, gpoe=2.199)
-    assert "Recommended: bcm" in advice(alike, bcm=2.2, hierarchical=2.204, gpoe=2.199)
+    assert "Recommended: hierarchical" in advice(differ, bcm=2.2, hierarchical=2.204, rbcm=2.199)
+    assert "Recommended: bcm" in advice(alike, bcm=2.2, hierarchical=2.204, rbcm=2.199)
     assert "hardly told from chance" in advice(differ, 4, bcm=2.2, hierarchical=2.1)
 
 
 def test_rules_are_compared_on_the_same_people():
     """0.05 is a third of a mean cost's error, and far more than the difference's."""
     differ = share(0.5, 40.0)
-    assert "Recommended: gpoe" in advice(differ, bcm=2.2, hierarchical=2.25, gpoe=2.2 - 1e-6)
-    assert "Recommended: hierarchical" in advice(differ, paired=0.2, bcm=2.2, hierarchical=2.25, gpoe=2.2 - 1e-6)
+    assert "Recommended: rbcm" in advice(differ, bcm=2.2, hierarchical=2.25, rbcm=2.2 - 1e-6)
+    assert "Recommended: hierarchical" in advice(differ, paired=0.2, bcm=2.2, hierarchical=2.25, rbcm=2.2 - 1e-6)
