@@ -22,7 +22,21 @@ import typer
 from hilbo.errors import InputError
 from hilbo.numerics.compiling import set_flags
 
-__all__ = ["PARTS", "Force", "Json", "Out", "Say", "Seed", "fail", "finish", "progress", "remark", "results", "start"]
+__all__ = [
+    "PARTS",
+    "Force",
+    "Json",
+    "Out",
+    "Say",
+    "Seed",
+    "fail",
+    "finish",
+    "print_result",
+    "progress",
+    "remark",
+    "results",
+    "start",
+]
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
 Seed = Annotated[
@@ -178,6 +192,14 @@ def finish(content: dict[str, Any], out: Path, as_json: bool) -> None:
             shutil.copyfileobj(file, sys.stdout)
     else:
         print(f"{out / 'report.html'}", file=sys.stderr)
+
+
+def print_result(content: Any, words: str, as_json: bool) -> None:
+    """A result without a folder, for a machine or in words, on stdout."""
+    if as_json:
+        print(json.dumps(content, indent=2, allow_nan=False, default=float))
+    elif words:
+        print(words)
 
 
 def remark(sentence: str) -> None:

@@ -14,10 +14,9 @@ from typing import Annotated, Any
 import typer
 
 from hilbo.cli import measure
-from hilbo.cli.console import Force, Json, fail
+from hilbo.cli.console import Force, Json, fail, print_result
 from hilbo.cli.device_options import Chosen, Line, chosen_set, opened, sets_of, takes
-from hilbo.cli.device_results import check_free, finish, write_table
-from hilbo.cli.device_words import decoded, said, set_words
+from hilbo.cli.device_output import check_free, decoded, said, set_words, write_table
 from hilbo.errors import InputError
 
 __all__ = ["app"]
@@ -36,7 +35,7 @@ def ports(as_json: Json = False) -> None:
 
     found = list_ports()
     words = "\n".join(f"{port.name}  {port.description}" for port in found) or "There is no serial port."
-    finish([port._asdict() for port in found], words, as_json)
+    print_result([port._asdict() for port in found], words, as_json)
 
 
 @app.command()
@@ -60,7 +59,7 @@ def hello(line: Line, as_json: Json = False) -> None:
     limits = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in content["limits"].items())
     words = "\n".join(f"{name:26} {said(name, value)}" for name, value in about.items())
     now = set_words(found) if found else "none"
-    finish(
+    print_result(
         content,
         f"{words}\ncan                        {', '.join(can)}\nlimits  {limits}\nin force  {now}",
         as_json,
@@ -76,7 +75,7 @@ def set_(chosen: Chosen, line: Line, as_json: Json = False) -> None:
         raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --name.")
     with opened(line) as device:
         found = device.send(**wanted)
-    finish(found._asdict(), f"in force: {set_words(found)}", as_json)
+    print_result(found._asdict(), f"in force: {set_words(found)}", as_json)
 
 
 @app.command()
@@ -89,7 +88,7 @@ def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: Json = F
     with opened(line) as device:
         _begin(device, wanted)
         content = watch(device, seconds, "rendering; Ctrl-C stops")
-    finish(content, "", as_json)
+    print_result(content, "", as_json)
     if content["state"] in ("HOLD", "ESTOP"):
         fail(f"The device has gone to {content['state']} by itself; find out why, then clear it.", 1)
 
@@ -115,7 +114,7 @@ def clear(line: Line, as_json: Json = False) -> None:
     with opened(line) as device:
         device.clear()
         state = device.state().name
-    finish({"state": state}, f"the device is {state}", as_json)
+    print_result({"state": state}, f"the device is {state}", as_json)
 
 
 @app.command()
@@ -126,7 +125,7 @@ def monitor(line: Line, seconds: Seconds = None, as_json: Json = False) -> None:
 
     with opened(line) as device:
         content = watch(device, seconds)
-    finish(content, "", as_json)
+    print_result(content, "", as_json)
 
 
 @app.command()
@@ -151,7 +150,7 @@ def record(
         state, counts = device.state().name, device.counts()
     write_table(table, out)
     content = {"file": str(out), "samples": len(table), "state": state, "counts": counts._asdict()}
-    finish(content, f"{out}: {len(table)} samples", as_json)
+    print_result(content, f"{out}: {len(table)} samples", as_json)
 
 
 @app.command()
@@ -176,7 +175,9 @@ def decode(
         else:
             rows.append({"byte": place, "seq": seq, "message": name_of(type(message)), "fields": asdict(message)})
     words = "\n".join(decoded(row) for row in rows)
-    finish(json.loads(json.dumps(rows, default=lambda value: value.hex())), words or "The file has no frames.", as_json)
+    print_result(
+        json.loads(json.dumps(rows, default=lambda value: value.hex())), words or "The file has no frames.", as_json
+    )
 
 
 @app.command()
@@ -193,7 +194,7 @@ def feel(
     wanted = sets_of(sets, line)
     with opened(line) as device:
         content = device_screen.feel(device, wanted, seconds)
-    finish(content, "", as_json)
+    print_result(content, "", as_json)
 
 
 @app.command()
@@ -234,4 +235,4 @@ def _at_once(line, name, as_json) -> None:
             link.request(getattr(protocol, name)())
         finally:
             link.close()
-    finish({"done": name.lower()}, "done", as_json)
+    print_result({"done": name.lower()}, "done", as_json)

@@ -6,7 +6,6 @@ one sentence.
 """
 
 import contextlib
-import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -237,29 +236,10 @@ def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -
 def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
     say("simulating")
     start()
-    from importlib.resources import files
+    from hilbo.simulation.folder import simulate_folder
 
-    import numpy as np
-
-    from hilbo.simulation import simulate as simulation
-    from hilbo.study.cohort import cohort_of
-    from hilbo.study.config import Study
-    from hilbo.study.trial_table import write_trials
-
-    if preset not in simulation.PRESETS:
-        raise InputError(f'--preset is "{preset}"; there are {", ".join(simulation.PRESETS)}.')
-    population = simulation.PRESETS[preset]
-    source = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if study is None else study
-    chosen = Study.load(source)
-    people = simulation.people(chosen, population, count, seed)
-    trials = simulation.simulate_study(chosen, people, seed)
-    table = simulation.to_table(chosen, trials)
-    write_trials(table, folder / "trials.csv")
-    write_trials(simulation.truth_table(chosen, population, people), folder / "truth.csv")
-    shutil.copyfile(source, folder / "study.toml")
-    truth = np.asarray(chosen.space.to_unit(np.array([population.truth[name] for name in chosen.space.names])))
-    table["category"] = table["response"].map({label: i for i, label in enumerate(chosen.responses)})
-    return _aggregate(chosen, cohort_of(table, chosen), folder, seed, say, truth)
+    simulated = simulate_folder(folder, preset, count, seed, study)
+    return _aggregate(simulated.study, simulated.cohort, folder, seed, say, simulated.truth)
 
 
 def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:

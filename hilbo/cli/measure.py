@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from hilbo.cli.console import Force, Json, Seed, fail, progress
+from hilbo.cli.console import Force, Json, Seed, fail, print_result, progress
 from hilbo.cli.device_options import Line, opened, takes
-from hilbo.cli.device_results import check_free, finish, write_table
+from hilbo.cli.device_output import check_free, write_table
 
 __all__ = ["COMMANDS"]
 
@@ -37,7 +37,7 @@ def selftest(
         f"watchdog   HOLD {found.watchdog_ticks} ticks after the last heartbeat (at most {found.watchdog_limit}),"
         f" force {abs(found.force_after_N):g} N {hold} ticks later"
     )
-    finish(found._asdict() | {"passed": good}, words, as_json)
+    print_result(found._asdict() | {"passed": good}, words, as_json)
     if not good:
         fail("The device has not passed; do not use it with people.", 1)
 
@@ -61,7 +61,7 @@ def measure_damping(line: Line, seed: Seed = 0, as_json: Json = False) -> None:
     if reported > found.damping.upper:
         print("hilbo: the device reports more damping than it has; mend its configuration.", file=sys.stderr)
     rest = {"residual_N": found.residual, "sweeps": found.sweeps, "periods": found.periods, "reported": reported}
-    finish(content | rest, "\n".join(words), as_json)
+    print_result(content | rest, "\n".join(words), as_json)
 
 
 @takes(line=Line)
@@ -88,7 +88,7 @@ def characterise(
         damping = device.device.damping_N_s_per_m
     write_table(table, out)
     content = {"file": str(out), "samples": len(table), "repeats": repeats, "damping": damping}
-    finish(content, f"{out}: now  hilbo identify {out} --out results --damping {damping:.6g}", as_json)
+    print_result(content, f"{out}: now  hilbo identify {out} --out results --damping {damping:.6g}", as_json)
 
 
 COMMANDS = {"selftest": selftest, "measure-damping": measure_damping, "characterise": characterise}

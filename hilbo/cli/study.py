@@ -1,6 +1,5 @@
 """The commands of a whole study: `hilbo validate`, `hilbo power` and `hilbo report`."""
 
-import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -110,25 +109,16 @@ def report(
 def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: int = 24) -> dict[str, Any]:
     """A simulated study of the paper's kind with its validation sessions, as a folder that `hilbo report` reads, and
     its report in the same folder; returns the content of result.json."""
-    from importlib.resources import files
-
     import numpy as np
 
     from hilbo.report.study import write_study
-    from hilbo.simulation import simulate as simulation
+    from hilbo.simulation.folder import simulate_folder
     from hilbo.simulation.validation_sessions import sets_table, validation_table
     from hilbo.study.analysis import analyse
-    from hilbo.study.config import Study
     from hilbo.study.folder import read_folder
-    from hilbo.study.trial_table import write_trials
 
     say("simulating")
-    source = Path(str(files("hilbo") / "data" / "paper.toml"))
-    study, population = Study.load(source), simulation.PRESETS["paper"]
-    people = simulation.people(study, population, count, seed)
-    write_trials(simulation.to_table(study, simulation.simulate_study(study, people, seed)), folder / "trials.csv")
-    write_trials(simulation.truth_table(study, population, people), folder / "truth.csv")
-    shutil.copyfile(source, folder / "study.toml")
+    study, population, _, _ = simulate_folder(folder, "paper", count, seed)
     (material,) = read_folder(folder).materials
     found = analyse(material.study, material.cohort, seed, say)
     if found.sets is not None:

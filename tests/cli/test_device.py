@@ -321,7 +321,7 @@ def test_a_trace_shows_the_largest_excursions():
 
 
 def test_every_message_of_a_capture_can_be_shown():
-    from hilbo.cli.device_words import _field
+    from hilbo.cli.device_output import _field
 
     assert _field((protocol.Exponential(0.5, 0.25),)) == "(0.5,0.25)"
     assert _field(b"\x01\xff") == "01ff"

@@ -1,6 +1,31 @@
-"""What devices say, in words for a terminal: what they are, their sets, and captured messages."""
+"""What the commands of `hilbo device` put out: words about devices and their sets, and files that are never overwritten
+unasked."""
 
-__all__ = ["decoded", "said", "set_words"]
+import os
+from pathlib import Path
+from typing import Any
+
+from hilbo.errors import InputError
+
+__all__ = ["check_free", "decoded", "said", "set_words", "write_table"]
+
+
+def check_free(out: Path, force: bool) -> None:
+    """Raises `InputError` where `out` cannot be written, or would be overwritten without `force`."""
+    if out.exists() and not (force and out.is_file()):
+        raise InputError(f"{out}: exists already; choose another file, or add --force to replace it.")
+    if not out.resolve().parent.is_dir():
+        raise InputError(f"{out}: there is no folder {out.resolve().parent}; make it, or choose another file.")
+
+
+def write_table(table: Any, out: Path) -> None:
+    """A pandas table as CSV, whole or not at all. Raises `InputError`."""
+    part = out.with_name(f".{out.name}.part")
+    try:
+        table.to_csv(part, index=False)
+        os.replace(part, out)
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another file.") from error
 
 
 def said(name, value) -> str:

@@ -1,0 +1,47 @@
+"""A simulated study as a folder that `hilbo aggregate` and `hilbo report` read: its tables, truth and study file."""
+
+import shutil
+from importlib.resources import files
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from hilbo.errors import InputError
+from hilbo.simulation import simulate
+from hilbo.simulation.simulate import Population
+from hilbo.study.cohort import Cohort, cohort_of
+from hilbo.study.config import Study
+from hilbo.study.trial_table import write_trials
+
+__all__ = ["Simulated", "simulate_folder"]
+
+
+class Simulated(NamedTuple):
+    """A simulated study, its people's answers, and where their population's optimum truly is, (d,) in the unit cube."""
+
+    study: Study
+    population: Population
+    cohort: Cohort
+    truth: Float[np.ndarray, " d"]
+
+
+def simulate_folder(folder: Path, preset: str, count: int, seed: int, source: Path | None = None) -> Simulated:
+    """Simulate `count` people of a preset and write trials.csv, truth.csv and study.toml.
+
+    `source`: a study file in place of the preset's own. Raises InputError for a preset that there is not.
+    """
+    if preset not in simulate.PRESETS:
+        raise InputError(f'--preset is "{preset}"; there are {", ".join(simulate.PRESETS)}.')
+    population = simulate.PRESETS[preset]
+    path = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if source is None else source
+    study = Study.load(path)
+    people = simulate.people(study, population, count, seed)
+    table = simulate.to_table(study, simulate.simulate_study(study, people, seed))
+    write_trials(table, folder / "trials.csv")
+    write_trials(simulate.truth_table(study, population, people), folder / "truth.csv")
+    shutil.copyfile(path, folder / "study.toml")
+    table["category"] = table["response"].map({label: i for i, label in enumerate(study.responses)})
+    truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
+    return Simulated(study, population, cohort_of(table, study), truth)
