@@ -122,12 +122,12 @@ def test_any_bytes_leave_the_device_safe(seed):
 
 
 SANITIZED = [
-    "test_firmware_frames.py::test_any_bytes_leave_the_device_safe",
-    "test_firmware_frames.py::test_a_conversation_cut_after_every_byte",
-    "test_firmware_protocol.py",
-    "test_firmware_sets.py",
-    "test_firmware_telemetry.py",
-    "test_firmware_safety.py",
+    "test_frames.py::test_any_bytes_leave_the_device_safe",
+    "test_frames.py::test_a_conversation_cut_after_every_byte",
+    "test_protocol.py",
+    "test_sets.py",
+    "test_telemetry.py",
+    "test_safety.py",
 ]
 
 
