@@ -1,36 +1,39 @@
-"""A parameter set on its way to a device: its messages, their CRC, and the set as the device reports it.
+"""A parameter set from what is wanted of a device to what it reports: its messages on the wire, their CRC, and back.
 
-Numbers are rounded to binary32 here, once; everything after that is compared bit for bit.
-Units: K N/mm, B1 N·s^α/mm, T s, force N, damping N·s/m.
+Numbers are rounded to binary32 on the wire, once; everything after that is compared bit for bit.
 """
 
 import math
 import struct
 import zlib
 from collections.abc import Sequence
-from typing import NamedTuple, SupportsFloat
+from dataclasses import asdict, dataclass
+from typing import Any, SupportsFloat
 
 from hilbo.device.messages import Exponential, HelloReply, Set, SetParams, SetStates
 from hilbo.device.protocol import payload_of
 from hilbo.errors import InputError
 
-__all__ = ["InForce", "Wanted", "crc_of", "differences", "in_force", "wanted_for"]
+__all__ = ["InForce", "ParameterSet", "crc_of", "differences", "in_force", "wanted_for"]
 
 _PER_MESSAGE = 7  # exponentials
-_SAME = (
-    "set_id",
-    "memory",
-    "length",
-    "K0_N_per_mm",
-    "K1_N_per_mm",
-    "B1_N_s_alpha_per_mm",
-    "alpha",
-    "force_limit_N",
-)
+_WIRE_NAMES = {
+    "length": "length",
+    "K0": "K0_N_per_mm",
+    "K1": "K1_N_per_mm",
+    "B1": "B1_N_s_alpha_per_mm",
+    "alpha": "alpha",
+    "force_limit": "force_limit_N",
+}
 
 
-class Wanted(NamedTuple):
-    """What somebody wants rendered; `length` is N of short memory, or the number of exponentials of full memory."""
+@dataclass(frozen=True)
+class ParameterSet:
+    """What a device is to render, or has in force.
+
+    K0, K1 in N/mm, B1 in N·s^α/mm, `force_limit` in N. `memory` is "short" or "full"; `length` is N of short memory, or
+    the number of exponentials of full memory.
+    """
 
     K0: float
     K1: float
@@ -38,11 +41,10 @@ class Wanted(NamedTuple):
     alpha: float
     memory: str
     length: int
-    tick_rate: int
     force_limit: float
 
-    def messages(self, set_id: int) -> list[SetParams | SetStates]:
-        """SET_PARAMS, and with full memory the SET_STATES that follow it. Raises `InputError`."""
+    def messages(self, set_id: int, tick_rate: int) -> list[SetParams | SetStates]:
+        """SET_PARAMS, and with full memory the SET_STATES that follow it; `tick_rate` in Hz. Raises `InputError`."""
         if self.memory not in ("short", "full"):
             raise InputError(f'memory is "{self.memory}", it must be "short" or "full".')
         for name in ("K0", "K1", "B1", "alpha", "force_limit"):
@@ -51,33 +53,22 @@ class Wanted(NamedTuple):
                 raise InputError(f"{name} is {value}, it must be a finite number.")
         if not 0 <= self.length < 2**16:
             raise InputError(f"N (or states) is {self.length}, it must be a number of samples (or exponentials).")
-        head = SetParams(
-            set_id=set_id,
-            memory=int(self.memory == "full"),
-            length=self.length,
-            tick_rate_Hz=self.tick_rate,
-            K0_N_per_mm=self.K0,
-            K1_N_per_mm=self.K1,
-            B1_N_s_alpha_per_mm=self.B1,
-            alpha=self.alpha,
-            force_limit_N=self.force_limit,
-        )
+        numbers = {wire: getattr(self, name) for name, wire in _WIRE_NAMES.items()}
+        head = SetParams(set_id=set_id, memory=int(self.memory == "full"), tick_rate_Hz=tick_rate, **numbers)
         return [head, *(_states(set_id, self.alpha, self.length) if self.memory == "full" else [])]
 
 
-class InForce(NamedTuple):
+@dataclass(frozen=True)
+class InForce(ParameterSet):
     """A set as a device has it, rounded to binary32; `needs` is the damping (N·s/m) that the device computed for it."""
 
     set_id: int
-    K0: float
-    K1: float
-    B1: float
-    alpha: float
-    memory: str
-    length: int
-    force_limit: float
     needs: float
     crc: int
+
+    def _asdict(self) -> dict[str, Any]:
+        """As logs and `--json` have it: flat, the id first."""
+        return {"set_id": self.set_id} | asdict(self)
 
 
 def wanted_for(
@@ -92,19 +83,20 @@ def wanted_for(
     memory: str = "short",
     states: int = 10,
     force_limit: SupportsFloat | None = None,
-) -> Wanted:
-    """A set in numbers for a device, whose own force limit is the default. Raises `InputError` for what cannot be sent.
+) -> ParameterSet:
+    """A set for a device, whose own force limit is the default. Raises `InputError` for what cannot be sent.
 
-    Full memory loads JAX here, so that it is there when the set has to be sent in a hurry.
+    Units as in `ParameterSet`, T in s. Full memory loads JAX here, so that it is there when the set has to be sent in a
+    hurry.
     """
     rate = device.tick_rate_Hz
     if not abs(rate * float(T) - 1) < 1e-9:
         raise InputError(f"T is {T} s and the device's tick {1 / rate:g} s; a set belongs to its T, choose another.")
     limit = device.force_limit_N if force_limit is None else float(force_limit)
     length = states if memory == "full" else N
-    found = Wanted(float(K0), float(K1), float(B1), float(alpha), memory, length, rate, limit)
-    found.messages(1)
-    return found
+    wanted = ParameterSet(float(K0), float(K1), float(B1), float(alpha), memory, length, limit)
+    wanted.messages(1, rate)
+    return wanted
 
 
 def crc_of(messages: Sequence[SetParams | SetStates]) -> int:
@@ -112,27 +104,31 @@ def crc_of(messages: Sequence[SetParams | SetStates]) -> int:
     return zlib.crc32(b"".join(payload_of(message) for message in messages))
 
 
-def in_force(found: Set) -> InForce | None:
+def in_force(reply: Set) -> InForce | None:
     """The set in a SET message, None where the device has none."""
-    if not found.flags & 1:
+    if not reply.flags & 1:
         return None
-    numbers = (found.K0_N_per_mm, found.K1_N_per_mm, found.B1_N_s_alpha_per_mm, found.alpha)
-    memory, needs = "full" if found.memory else "short", found.minimum_damping_N_s_per_m
-    return InForce(found.set_id, *numbers, memory, found.length, found.force_limit_N, needs, found.crc)
+    numbers = {name: getattr(reply, wire) for name, wire in _WIRE_NAMES.items()}
+    memory, needs = "full" if reply.memory else "short", reply.minimum_damping_N_s_per_m
+    return InForce(**numbers, memory=memory, set_id=reply.set_id, needs=needs, crc=reply.crc)
 
 
-def differences(sent: Sequence[SetParams | SetStates], found: Set) -> list[str]:
+def differences(sent: Sequence[SetParams | SetStates], reply: Set) -> list[str]:
     """In what the device's set is not, bit for bit, the one that was sent."""
-    wrong = [name for name in _SAME if _bits(getattr(found, name)) != _bits(getattr(sent[0], name))]
-    wrong += ["crc"] if found.crc != crc_of(sent) else []
-    return wrong if found.flags & 1 else ["no set"]
+    if not reply.flags & 1:
+        return ["no set"]
+    names = ("set_id", "memory", *_WIRE_NAMES.values())
+    wrong = [name for name in names if _bits(getattr(reply, name)) != _bits(getattr(sent[0], name))]
+    return wrong + (["crc"] if reply.crc != crc_of(sent) else [])
 
 
-def _bits(value) -> bytes | int:
+def _bits(value: float | int) -> bytes | int:
+    """What is compared: an integer itself, a number as its binary32."""
     return struct.pack("<f", value) if isinstance(value, float) else value
 
 
-def _states(set_id, alpha, count) -> list[SetStates]:
+def _states(set_id: int, alpha: float, count: int) -> list[SetStates]:
+    """The exponentials of full memory, as many to a message as fit."""
     import jax.numpy as jnp
     import numpy as np
 
@@ -142,7 +138,7 @@ def _states(set_id, alpha, count) -> list[SetStates]:
         raise InputError(f"states is {count}, it must be one of {', '.join(map(str, STATES))}.")
     if not 0 < alpha < 1:
         raise InputError(f"alpha is {alpha}, it must be above 0 and below 1.")
-    found = np.stack([np.asarray(part, float) for part in exponentials(jnp.asarray(alpha, float), count)], 1)
-    pairs = tuple(Exponential(*map(float, pair)) for pair in found)
+    weight, loss = (np.asarray(values, float) for values in exponentials(jnp.asarray(alpha, float), count))
+    pairs = tuple(Exponential(*map(float, pair)) for pair in zip(weight, loss, strict=True))
     chunks = [(first, pairs[first : first + _PER_MESSAGE]) for first in range(0, count, _PER_MESSAGE)]
     return [SetStates(set_id=set_id, first=first, count=len(chunk), states=chunk) for first, chunk in chunks]
