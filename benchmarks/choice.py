@@ -63,7 +63,7 @@ def compare(study, trials):
                 mean, variance = posterior.predict(x[None, :])
                 return score(mean[0], variance[0])
 
-            own = selection.next_point(study, plan, data, 0)
+            own = selection.point_after(study, plan, posterior, 0)
             values = score(*posterior.predict(every))
             inside = values[:POINTS]
             polished = acquisition.maximise(inside, many, at, **box, starts=1)

@@ -22,7 +22,7 @@ import numpy as np
 from hilbo import Study
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.candidates import search_points
-from hilbo.session.selection import design, next_point
+from hilbo.session.selection import design, point_after
 from hilbo.session.warm_start import warm_point, warm_start
 from hilbo.simulation.simulate import PRESETS, Person, people, simulate_study
 from hilbo.study.aggregate import population
@@ -36,7 +36,8 @@ def sessions(study: Study, persons: Person, initial, keys, plan, points, warm):
 
     def one(person, first, key):
         def step(trials, trial):
-            chosen = next_point(study, plan, trials, trial) if warm is None else warm_point(study, warm, trials)
+            before = fit(study.gp, trials, inference=study.inference, throw=False)
+            chosen = point_after(study, plan, before, trial) if warm is None else warm_point(study, warm, before)
             count = first.shape[0]
             x = jnp.where(trial < count, first[jnp.minimum(trial, count - 1)], chosen) if count else chosen
             progress = (trial / TRIALS).astype(x.dtype)

@@ -80,4 +80,4 @@ print(participant_view(log.state)["message"])
 log.close()
 with EventLog.resume(log.path, study) as again:
     print("the same state:", again.state == log.state, "in", again.state.seq, "events")
-print("looked up:", chooser.found, "computed while somebody felt:", chooser.fits)
+print("looked up:", chooser.looked_up, "computed while somebody felt:", chooser.fits)

@@ -10,8 +10,9 @@ from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
 from hilbo.session import actions as live
 from hilbo.session.actions import Block, LiveSession
+from hilbo.session.excluded import APART
 from hilbo.session.logged_session import LoggedSession
-from hilbo.session.look_ahead import APART, LiveChooser
+from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.progress import consistency, minutes_left, trust_of
 from hilbo.session.warm_start import informed, warm_start
 
@@ -104,7 +105,7 @@ def test_a_warm_start_chooses_from_the_map_and_is_in_the_header():
     assert np.linalg.norm(second - first) > 0.05
     with pytest.raises(InputError, match="warm start is =a-map, not none"):
         LiveChooser(state)
-    mu, s = informed(STUDY, warm, Session.start(STUDY).trials)
+    mu, s = informed(STUDY, warm, Session.start(STUDY).posterior())
     np.testing.assert_allclose(mu, warm.mean, rtol=1e-12)
     np.testing.assert_allclose(s, 0.05 + 0.5, rtol=1e-12)
 
@@ -119,7 +120,7 @@ def test_the_informed_posterior_is_the_committee_of_map_and_answers():
     own_mean, own_variance = (np.asarray(v) for v in session.posterior().predict(points))
     before = variance + 0.75
     precision = 1 / before + 1 / own_variance - 1.0  # the prior's variance is 1
-    mu, s = informed(STUDY, warm, session.trials)
+    mu, s = informed(STUDY, warm, session.posterior())
     np.testing.assert_allclose(s, 1 / precision, rtol=1e-9)
     np.testing.assert_allclose(mu, (mean / before + own_mean / own_variance) / precision, rtol=1e-8, atol=1e-12)
 
@@ -137,7 +138,7 @@ def test_pace_and_consistency(chooser):
     assert minutes_left(state) == pytest.approx(2 * 20 / 60)
     assert consistency(state).pairs == 0
     state = asked(state.after(live.repeat(state, 1.0, 3)), chooser)
-    found = trust_of(state, 0)
+    found = trust_of(state, 0, chooser)
     assert found is not None and found.movement is None  # the answer to a repeat moves nothing
     state = told(state, "similar")
     assert consistency(state).__dict__ == {"pairs": 1, "alike": 0, "distance": 1.0}  # "similar" after "close"
@@ -168,8 +169,8 @@ def test_a_logged_session_is_a_session_and_resumes(tmp_path):
 @pytest.mark.deep
 def test_trust_in_the_best_rendering(chooser):
     state = begun(chooser)
-    assert trust_of(start(), 0) is None
-    found = trust_of(asked(state, chooser), 0)
+    assert trust_of(start(), 0, chooser) is None
+    found = trust_of(asked(state, chooser), 0, chooser)
     assert found is not None and 0 < found.top < 1 and 0 <= found.movement < 1
     session = Session.start(STUDY)
     for response in ANSWERS[:4]:

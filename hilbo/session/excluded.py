@@ -1,0 +1,82 @@
+"""Choices that keep away from renderings that were voided twice; nothing is fitted here.
+
+In the space-filling trials such a rendering is replaced by the candidate farthest from all others, afterwards by the
+highest UCB that keeps a distance of `APART` from it in the unit cube, and so do choices from a population's map.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.ordinal_gp import Posterior
+from hilbo.session.selection import Design, point_apart
+from hilbo.session.warm_start import WarmStart, warm_point
+from hilbo.study.config import Study
+
+__all__ = ["APART", "is_near", "point_from_map", "point_kept_apart", "spread_point"]
+
+APART = 0.05
+"""Least distance in the unit cube from a rendering that was voided twice."""
+_ROOM, _FAR = 8, 9.0  # so many excluded points at least, those that are none far from the unit cube
+_SPREAD = 256  # candidates
+
+
+def is_near(study: Study, point: Float[np.ndarray, " d"], excluded: Float[np.ndarray, "k d"]) -> bool:
+    """Whether a point is nearer than `APART` to an excluded one; all in physical units."""
+    if not len(excluded):
+        return False
+    unit = _to_unit(study, np.concatenate([excluded, np.asarray(point)[None]]))
+    return bool(np.min(np.linalg.norm(unit[:-1] - unit[-1], axis=1)) < APART)
+
+
+def spread_point(
+    study: Study,
+    point: Float[np.ndarray, " d"],
+    excluded: Float[np.ndarray, "k d"],
+    others: Float[np.ndarray, "m d"],
+    seed: int,
+) -> Float[np.ndarray, " d"]:
+    """A space-filling point; in place of an excluded one, the candidate farthest from all points, physical units."""
+    if not any(np.array_equal(point, other) for other in excluded):
+        return point
+    candidates = study.space.candidates(_SPREAD, seed)
+    taken = _to_unit(study, np.concatenate([others, excluded]))
+    distance = np.linalg.norm(candidates[:, None] - taken[None], axis=2)
+    return np.asarray(study.space.to_physical(candidates[int(distance.min(axis=1).argmax())]))
+
+
+def point_kept_apart(
+    study: Study, plan: Design, posterior: Posterior, excluded: Float[np.ndarray, "k d"]
+) -> Float[np.ndarray, " d"]:
+    """The highest UCB at least `APART` from the excluded points, in physical units."""
+    return np.asarray(_kept_apart(study, plan, posterior, _padded(study, excluded)))
+
+
+def point_from_map(
+    study: Study, warm: WarmStart, posterior: Posterior, excluded: Float[np.ndarray, "k d"]
+) -> Float[np.ndarray, " d"]:
+    """The warm start's choice at least `APART` from the excluded points, in physical units."""
+    return np.asarray(_from_map(study, warm, posterior, _padded(study, excluded)))
+
+
+def _padded(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[Array, "r d"]:
+    """Excluded points in the unit cube, behind places far away, so that one more compiles nothing again."""
+    rows = np.full((max(_ROOM, len(excluded)), study.space.dim), _FAR)
+    if len(excluded):
+        rows[-len(excluded) :] = _to_unit(study, excluded)
+    return jnp.asarray(rows)
+
+
+def _to_unit(study: Study, physical: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k d"]:
+    return np.asarray(study.space.to_unit(physical))
+
+
+@eqx.filter_jit
+def _kept_apart(study, plan, posterior, excluded):
+    return study.space.to_physical(point_apart(study, plan, posterior, excluded, APART))
+
+
+@eqx.filter_jit
+def _from_map(study, warm, posterior, excluded):
+    return study.space.to_physical(warm_point(study, warm, posterior, excluded, APART))

@@ -1,0 +1,88 @@
+"""Why a rendering is proposed: what its posterior and its space say of it, as the data of a proposal.
+
+`choice` has what chose the rendering, mean and sd of the latent score, the acquisition's value, the probabilities of
+the answers, the passivity margin (N.s/m) and the certificate of the fit. Nothing is fitted here.
+"""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.ordinal_gp import Posterior
+from hilbo.study.config import Study
+
+__all__ = ["Choice", "Described", "described", "explained"]
+
+
+class Choice(NamedTuple):
+    """A rendering (d,) in physical units, and what chose it."""
+
+    point: Float[np.ndarray, " d"]
+    by: str
+
+
+class Described(NamedTuple):
+    """A rendering's values by name in physical units, with what follows from them, and its passivity margin."""
+
+    parameters: dict[str, float]
+    margin: float | None
+
+
+class _Explanation(NamedTuple):
+    """What is computed at a rendering: its place in the unit cube, the latent score there, the space's facts."""
+
+    unit: Float[Array, " d"]
+    mean: Float[Array, ""]
+    variance: Float[Array, ""]
+    probabilities: Float[Array, " c"]
+    certificate: Any
+    derived: dict[str, Float[Array, ""]]
+    margin: Float[Array, ""] | None
+
+
+def explained(study: Study, posterior: Posterior, choice: Choice) -> dict[str, Any]:
+    """`renderings` and `choice` of a proposal's data."""
+    found: _Explanation = jax.device_get(_explanation(study, posterior, np.asarray(choice.point)))
+    parameters = dict(zip(study.space.names, np.asarray(choice.point).tolist(), strict=True))
+    mean, sd = float(found.mean), float(np.sqrt(found.variance))
+    figures = {f.name: getattr(found.certificate, f.name).item() for f in dataclasses.fields(found.certificate)}
+    words = {
+        "by": choice.by,
+        "unit": found.unit.tolist(),
+        "mean": mean,
+        "sd": sd,
+        "score": mean + study.selection.weight * sd if choice.by.startswith("ucb") else None,
+        "probabilities": dict(zip(study.responses, found.probabilities.tolist(), strict=True)),
+        "margin": None if found.margin is None else float(found.margin),
+        "certificate": figures,
+    }
+    derived = {name: float(value) for name, value in found.derived.items()}
+    return {"renderings": {"a": parameters | derived}, "choice": words}
+
+
+@eqx.filter_jit
+def _explanation(study: Study, posterior: Posterior, point: Float[Array | np.ndarray, " d"]) -> _Explanation:
+    unit = study.space.to_unit(point)
+    mean, variance = (moment[0] for moment in posterior.predict(unit[None, :]))
+    derived, margin = _facts(study, dict(zip(study.space.names, point, strict=True)))
+    probabilities = study.gp.likelihood.class_probabilities(mean, variance)
+    return _Explanation(unit, mean, variance, probabilities, posterior.certificate, derived, margin)
+
+
+def described(study: Study, values: Mapping[str, float]) -> Described:
+    """A planned set, by name in physical units."""
+    derived, margin = _facts(study, {name: np.asarray(values[name], float) for name in study.space.names})
+    parameters = {name: float(values[name]) for name in study.space.names}
+    parameters |= {name: float(value) for name, value in derived.items()}
+    return Described(parameters, None if margin is None else float(margin))
+
+
+@eqx.filter_jit
+def _facts(study: Study, values: Mapping[str, Any]):
+    """What follows from a rendering's values, by name, and its passivity margin; None without mechanics."""
+    return study.space.derived(values), study.space.passivity_margin(values)

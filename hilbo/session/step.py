@@ -1,0 +1,244 @@
+"""What is compiled once for a session: from answers to their posterior and the next point, one fit for both.
+
+Sessions and live sessions run this very program, so that they ask the same points bit for bit. It takes a posterior
+that is known already in place of answers, and then only searches: the largest posterior mean needs no second fit.
+
+Numbers go in and come out as one vector each, because an array costs more on its way than the numbers in it. The part
+of Laplace's certificate that nobody reads before a choice is explained, 5 % of a step, is made from the fit's numbers
+when the posterior is asked for.
+"""
+
+import dataclasses
+import functools
+import math
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import msgspec
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.gaussian import GaussianPosterior, certify
+from hilbo.kernels import gram
+from hilbo.numerics.compiling import compiler_options
+from hilbo.ordinal_gp import OrdinalTerms, Posterior, Trials, fit
+from hilbo.session.selection import Design, point_after
+from hilbo.study.config import Study
+
+__all__ = ["Fitted", "Step", "padding"]
+
+_COUNT, _WEIGHT, _KNOWN, _FACTS = 0, 1, 2, 3  # places in a query, which goes on with categories and points
+_FROM_THE_SEARCH = ("residual", "tolerance", "iterations", "jitter", "condition")  # of a certificate
+_MADE_LATER = ("smallest_variance", "evidence_error", "evidence_rounding", "converged")
+
+
+class Fitted(NamedTuple):
+    """Answers, fitted: the point (d,) that they choose, physical units, and the posterior that chose it."""
+
+    point: Float[np.ndarray, " d"]
+    posterior: Posterior
+
+
+def padding(study: Study, capacity: int) -> Float[np.ndarray, "capacity d"]:
+    """What stands in rows without an answer, in physical units: the middle of the box."""
+    return np.tile([(p.low + p.high) / 2 for p in study.space.parameters], (capacity, 1))
+
+
+class Step:
+    """The compiled step of a study and a design.
+
+    Everything but the answers is bound, so that a call costs no look at the study: JAX gets its arrays as one flat
+    tuple, because walking through the records costs more than the fit where caches are cold.
+    """
+
+    def __init__(self, study: Study, plan: Design) -> None:
+        self._study, self._plan = study, plan
+        self._program, self._arrays = _program_of(study, plan)
+        self.weight, self.capacity = float(study.selection.weight), study.selection.trials
+        self.initial: Float[np.ndarray, "s d"] = np.asarray(_to_physical(study.space, plan.initial))
+        self.responses, self.names = study.responses, study.space.names
+        blank = padding(study, self.capacity).ravel()
+        self._blank = np.concatenate([np.zeros(_FACTS + self.capacity), blank])
+
+    @property
+    def compiled(self) -> Any:
+        """The jitted function behind it, shared by all studies that differ in numbers only."""
+        return self._program.compiled
+
+    def __call__(self, points: Float[np.ndarray, "n d"], answers: Any) -> Float[np.ndarray, " d"] | None:
+        """The next point, as numbers that survive a round trip through text; None when all trials are answered."""
+        count = len(answers)
+        if count >= self.capacity:
+            return None
+        if count < len(self.initial):
+            return self.initial[count]
+        return self._run(points, answers)[: len(self.names)]
+
+    def fitted(self, points: Float[np.ndarray, "n d"], answers: Any) -> Fitted:
+        """The posterior after any number of answers, and the point that it chooses; by the same call."""
+        numbers = self._run(points, answers)
+        dim = len(self.names)
+        posterior = Posterior(self._study.gp, *jax.device_put(self._layout.tree(numbers[dim:])))
+        return Fitted(numbers[:dim], _certified(posterior) if self._study.inference == "laplace" else posterior)
+
+    def best(self, posterior: Posterior) -> Float[np.ndarray, " d"]:
+        """Where the mean of a posterior of this study is largest, in physical units; nothing is fitted."""
+        program, arrays = self._of_the_mean
+        query = self._blank.copy()
+        query[_KNOWN] = 1.0
+        known = jnp.asarray(self._layout.vector(posterior))
+        return np.asarray(program.compiled(arrays, query, known))[: len(self.names)]
+
+    def warm(self) -> None:
+        """Compile what chooses."""
+        self._run(np.zeros((0, len(self.names))), ())
+
+    def _run(self, points, answers) -> Float[np.ndarray, " k"]:
+        query, count = self._blank.copy(), len(answers)
+        query[_COUNT], query[_WEIGHT] = count, self.weight
+        query[_FACTS : _FACTS + count] = answers
+        begin = _FACTS + self.capacity
+        query[begin : begin + count * len(self.names)] = np.ravel(points)
+        return np.asarray(self._program.compiled(self._arrays, query, self._unknown))
+
+    @functools.cached_property
+    def _layout(self) -> "_Layout":
+        return self._program.layout(self._arrays)
+
+    @functools.cached_property
+    def _unknown(self) -> Float[Array, " p"]:
+        return jnp.zeros(self._layout.size)
+
+    @functools.cached_property
+    def _of_the_mean(self):
+        """The UCB of weight 0 is largest where the mean is: in most studies this is the program that chooses."""
+        plain = msgspec.structs.replace(self._study.selection, acquisition="ucb", minimum_distance=None)
+        return _program_of(dataclasses.replace(self._study, selection=plain), self._plan)
+
+
+class _Query(NamedTuple):
+    """What a step is asked: how many answers there are, the weight of the sd, and whether a posterior is given."""
+
+    count: Int[Array, ""]
+    weight: Float[Array, ""]
+    known: Bool[Array, ""]
+    categories: Int[Array, " n"]
+    points: Float[Array, "n d"]
+
+    @classmethod
+    def of(cls, numbers: Float[Array, " k"], capacity: int) -> "_Query":
+        begin = _FACTS + capacity
+        return cls(
+            numbers[_COUNT].astype(jnp.int32),
+            numbers[_WEIGHT],
+            numbers[_KNOWN] > 0,
+            numbers[_FACTS:begin].astype(jnp.int32),
+            numbers[begin:].reshape(capacity, -1),
+        )
+
+
+class _Layout(NamedTuple):
+    """How a posterior's trials and latent values lie in a vector."""
+
+    structure: Any
+    leaves: tuple[jax.ShapeDtypeStruct, ...]
+
+    @property
+    def size(self) -> int:
+        return sum(math.prod(leaf.shape) for leaf in self.leaves)
+
+    def vector(self, posterior: Posterior) -> Float[np.ndarray, " p"]:
+        """A posterior's numbers, on the host."""
+        return np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((posterior.trials, posterior.latent))])
+
+    def tree(self, vector: Any) -> Any:
+        """Trials and latent values from a vector (p,) of NumPy or JAX."""
+        ends = np.cumsum([math.prod(leaf.shape) for leaf in self.leaves])
+        parts = [
+            vector[end - math.prod(leaf.shape) : end].reshape(leaf.shape).astype(leaf.dtype)
+            for leaf, end in zip(self.leaves, ends.tolist(), strict=True)
+        ]
+        return jax.tree.unflatten(self.structure, parts)
+
+
+class _Program:
+    """What is compiled for all studies and designs of one `structure`, whose leaves are arrays or `fixed`."""
+
+    def __init__(self, structure: Any, fixed: tuple[Any, ...]) -> None:
+        self._structure, self._fixed = structure, fixed
+        self.compiled = jax.jit(self._step, compiler_options=compiler_options())
+
+    def layout(self, arrays: tuple[Array, ...]) -> _Layout:
+        """Of its posteriors."""
+
+        def fitted(arrays):
+            study, _ = self._bound(arrays)
+            capacity = study.selection.trials
+            numbers = jnp.zeros(_FACTS + capacity * (1 + study.space.dim))
+            return _fitted(study, _Query.of(numbers, capacity))
+
+        leaves, structure = jax.tree.flatten(jax.eval_shape(fitted, arrays))
+        return _Layout(structure, tuple(leaves))
+
+    def _bound(self, arrays) -> tuple[Study, Design]:
+        given = iter(arrays)
+        return jax.tree.unflatten(self._structure, [next(given) if leaf is None else leaf for leaf in self._fixed])
+
+    def _step(self, arrays: tuple[Array, ...], numbers: Float[Array, " k"], known: Float[Array, " p"]):
+        """The next point in physical units and, behind it, the posterior's numbers."""
+        study, plan = self._bound(arrays)
+        query, layout = _Query.of(numbers, study.selection.trials), self.layout(arrays)
+        trials, latent = jax.lax.cond(query.known, lambda: layout.tree(known), lambda: _fitted(study, query))
+        point = point_after(study, plan, Posterior(study.gp, trials, latent), query.count, query.weight)
+        parts = [study.space.to_physical(point), *jax.tree.leaves((trials, latent))]
+        return jnp.concatenate([part.astype(numbers.dtype).ravel() for part in parts])
+
+
+def _fitted(study: Study, query: _Query):
+    """Trials and latent values."""
+    mask = jnp.arange(len(query.categories), dtype=query.count.dtype) < query.count
+    trials = Trials(study.space.to_unit(query.points), query.categories, mask)
+    latent = fit(study.gp, trials, inference=study.inference, throw=False).latent
+    return trials, _uncertified(latent) if study.inference == "laplace" else latent
+
+
+def _uncertified(latent: Any) -> GaussianPosterior:
+    """Without what `_certified` makes again, which is then not compiled."""
+    certificate = latent.certificate
+    nothing = {name: jnp.zeros_like(getattr(certificate, name)) for name in _MADE_LATER}
+    return dataclasses.replace(latent, certificate=dataclasses.replace(certificate, **nothing))
+
+
+@jax.jit
+def _certified(posterior: Posterior) -> Posterior:
+    """With the certificate that the fit would have given it."""
+    trials, latent, likelihood = posterior.trials, posterior.latent, posterior.gp.likelihood
+    terms = OrdinalTerms(likelihood, trials.q, trials.mask)
+    certificate = certify(
+        gram(posterior.gp.kernel, trials.x, trials.x),
+        latent.mode,
+        latent.weights,
+        terms(latent.mode)[2],
+        latent.factor,
+        lambda eta: terms(eta)[2],
+        latent.log_evidence,
+        **{name: getattr(latent.certificate, name) for name in _FROM_THE_SEARCH},
+    )
+    return dataclasses.replace(posterior, latent=dataclasses.replace(latent, certificate=certificate))
+
+
+def _program_of(study: Study, plan: Design) -> tuple[_Program, tuple[Array, ...]]:
+    """The program of a study and a design, and their arrays."""
+    leaves, structure = jax.tree.flatten((study, plan))
+    fixed = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
+    return _program(structure, fixed), tuple(leaf for leaf in leaves if eqx.is_array(leaf))
+
+
+_program = functools.lru_cache(maxsize=32)(_Program)
+
+
+@eqx.filter_jit
+def _to_physical(space, unit):
+    return space.to_physical(unit)
