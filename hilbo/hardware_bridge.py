@@ -167,12 +167,12 @@ class Renderer:
 
     def start(self) -> None:
         """Render the set that is in force. Telemetry from before is dropped."""
-        found = self.in_force()
-        if found is None:
+        current = self.in_force()
+        if current is None:
             raise DeviceError("The device has no set in force; send one first.")
         self._link.heartbeat()
         self._buffer.take()
-        self._link.request(protocol.Start(set_id=found.set_id, crc=found.crc, boot_id=self.device.boot_id))
+        self._link.request(protocol.Start(set_id=current.set_id, crc=current.crc, boot_id=self.device.boot_id))
 
     def stop(self) -> None:
         """Force to zero, smoothly."""
@@ -196,8 +196,8 @@ class Renderer:
 
     def limits(self) -> dict[str, tuple[float, float]]:
         """What the device takes: lowest and highest K0, K1 (N/mm), B1 (N·s^α/mm) and alpha."""
-        found = self._link.request(protocol.GetLimits())
-        return {n: (getattr(found, f"{n}_low"), getattr(found, f"{n}_high")) for n in ("K0", "K1", "B1", "alpha")}
+        limits = self._link.request(protocol.GetLimits())
+        return {n: (getattr(limits, f"{n}_low"), getattr(limits, f"{n}_high")) for n in ("K0", "K1", "B1", "alpha")}
 
     def echo(self, data: bytes) -> bytes:
         """The same bytes back, from the device."""
@@ -288,12 +288,12 @@ class Renderer:
 
     def events(self) -> list[str]:
         """What the device has told unasked since the last call, in words."""
-        found = []
+        sentences = []
         with contextlib.suppress(IndexError):
             while True:
                 notice = self._link.notices.popleft()
-                found.append(f"tick {notice.tick}: {meaning(State, notice.state)}, {held_because(notice.reason)}")
-        return found
+                sentences.append(f"tick {notice.tick}: {meaning(State, notice.state)}, {held_because(notice.reason)}")
+        return sentences
 
     def reconnect(self, timeout: SupportsFloat = 5.0) -> bool:
         """Connect again after the line or the device was away; True if the device has not restarted meanwhile.

@@ -110,10 +110,10 @@ def _check_free(out: Path, force: bool) -> None:
 def _listed(folder: Path) -> dict[str, str]:
     """The files that hilbo wrote into a folder, and what they held; none if it did not write that folder."""
     try:
-        found = json.loads((folder / _MANIFEST).read_bytes())
+        listed = json.loads((folder / _MANIFEST).read_bytes())
     except (OSError, ValueError):
         return {}
-    return found if isinstance(found, dict) else {}
+    return listed if isinstance(listed, dict) else {}
 
 
 def _list_files(folder: Path) -> None:
@@ -172,10 +172,10 @@ class _Pace:
             again = text == self.text
             self.text, self.first, self.told = text, (done, now), self.told if again else -math.inf
         self.done = done
-        begin, since = self.first
+        done_before, time_before = self.first
         line = f"{done:,} {text}" if people is None else f"{done:,} of {people:,} {text}"
-        if people is not None and begin < done < people:
-            left = round((now - since) / (done - begin) * (people - done))
+        if people is not None and done_before < done < people:
+            left = round((now - time_before) / (done - done_before) * (people - done))
             line += f", {left // 60}:{left % 60:02d} left"
         if now - self.told < _EVERY:
             return line, False

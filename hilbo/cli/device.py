@@ -33,9 +33,9 @@ def ports(as_json: Json = False) -> None:
     """The serial ports of this computer."""
     from hilbo.device.ports import list_ports
 
-    found = list_ports()
-    words = "\n".join(f"{port.name}  {port.description}" for port in found) or "There is no serial port."
-    print_result([port._asdict() for port in found], words, as_json)
+    serial_ports = list_ports()
+    words = "\n".join(f"{port.name}  {port.description}" for port in serial_ports) or "There is no serial port."
+    print_result([port._asdict() for port in serial_ports], words, as_json)
 
 
 @app.command()
@@ -48,17 +48,17 @@ def hello(line: Line, as_json: Json = False) -> None:
 
     with opened(line) as device:
         about = asdict(device.device)
-        found = device.in_force()
+        in_force = device.in_force()
         can = [flag.name.lower() for flag in Capability(about["capabilities"]) if flag.name]
         content = about | {
             "can": can,
             "limits": device.limits(),
             "telemetry_divisor": device.divisor,
-            "in_force": found and found._asdict(),
+            "in_force": in_force and in_force._asdict(),
         }
     limits = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in content["limits"].items())
     words = "\n".join(f"{name:26} {said(name, value)}" for name, value in about.items())
-    now = set_words(found) if found else "none"
+    now = set_words(in_force) if in_force else "none"
     print_result(
         content,
         f"{words}\ncan                        {', '.join(can)}\nlimits  {limits}\nin force  {now}",
@@ -74,8 +74,8 @@ def set_(chosen: Chosen, line: Line, as_json: Json = False) -> None:
     if wanted is None:
         raise InputError("No set is given; a set has --K1, --B1 and --alpha, or --sets and --name.")
     with opened(line) as device:
-        found = device.send(**wanted)
-    print_result(found._asdict(), f"in force: {set_words(found)}", as_json)
+        in_force = device.send(**wanted)
+    print_result(in_force._asdict(), f"in force: {set_words(in_force)}", as_json)
 
 
 @app.command()

@@ -75,9 +75,9 @@ def takes(**groups: type) -> Callable:
     """Gives a command the options of these records, and hands it the records under these names."""
 
     def decorate(command: Callable) -> Callable:
-        own = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name not in groups]
+        kept = [p for p in inspect.signature(command, eval_str=True).parameters.values() if p.name not in groups]
         added = [p for group in groups.values() for p in inspect.signature(group, eval_str=True).parameters.values()]
-        parts = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in own + added]
+        parameters = [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in kept + added]
 
         @functools.wraps(command)
         def run(**given: Any) -> None:
@@ -89,8 +89,8 @@ def takes(**groups: type) -> Callable:
             except DeviceError as error:
                 fail(str(error), 1)
 
-        run.__signature__ = inspect.Signature(parts)  # type: ignore[attr-defined]
-        run.__annotations__ = {p.name: p.annotation for p in parts}
+        run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        run.__annotations__ = {p.name: p.annotation for p in parameters}
         del run.__wrapped__
         return run
 
@@ -137,17 +137,17 @@ _OF_A_SET = ("K0", "K1", "B1", "alpha", "N", "T", "memory", "states", "force_lim
 
 def chosen_set(chosen: Chosen, line: Line) -> dict[str, Any] | None:
     """What `Renderer.send` takes, or None where no set is chosen."""
-    own = {"K0": chosen.K0, "K1": chosen.K1, "B1": chosen.B1, "alpha": chosen.alpha, "N": chosen.N, "T": chosen.T}
-    own |= {"memory": chosen.memory, "states": chosen.states, "force_limit": chosen.force_limit}
-    given = {name: value for name, value in own.items() if value is not None}
+    options = {"K0": chosen.K0, "K1": chosen.K1, "B1": chosen.B1, "alpha": chosen.alpha, "N": chosen.N, "T": chosen.T}
+    options |= {"memory": chosen.memory, "states": chosen.states, "force_limit": chosen.force_limit}
+    given = {name: value for name, value in options.items() if value is not None}
     if chosen.sets is not None:
-        found = sets_of(chosen.sets, line, chosen.K_eff)
-        if chosen.name is None and len(found) > 1:
-            raise InputError(f"{chosen.sets}: holds the sets {', '.join(found)}; choose one with --name.")
-        name = next(iter(found)) if chosen.name is None else chosen.name
-        if name not in found:
-            raise InputError(f'{chosen.sets}: holds no set "{name}"; it has {", ".join(found)}.')
-        return found[name] | given
+        named_sets = sets_of(chosen.sets, line, chosen.K_eff)
+        if chosen.name is None and len(named_sets) > 1:
+            raise InputError(f"{chosen.sets}: holds the sets {', '.join(named_sets)}; choose one with --name.")
+        name = next(iter(named_sets)) if chosen.name is None else chosen.name
+        if name not in named_sets:
+            raise InputError(f'{chosen.sets}: holds no set "{name}"; it has {", ".join(named_sets)}.')
+        return named_sets[name] | given
     if not given and chosen.K_eff is None:
         return None
     for name in ("K1", "B1", "alpha"):
@@ -169,8 +169,8 @@ def sets_of(path: Path, line: Line, K_eff: float | None = None) -> dict[str, dic
 def _whole(given, line, K_eff) -> dict[str, Any]:
     """Memory from the study where it is not given, and K0 from the effective stiffness."""
     mechanics = _mechanics(line)
-    known = {} if mechanics is None else {n: getattr(mechanics, n) for n in ("N", "T", "memory", "states")}
-    known = {"N": 101, "T": 1e-3, "memory": "short"} | known | given
+    values = {} if mechanics is None else {n: getattr(mechanics, n) for n in ("N", "T", "memory", "states")}
+    values = {"N": 101, "T": 1e-3, "memory": "short"} | values | given
     if "K0" not in given:
         from hilbo.cli.console import start
 
@@ -179,11 +179,11 @@ def _whole(given, line, K_eff) -> dict[str, Any]:
 
         if K_eff is None:
             K_eff = 0.44 if mechanics is None else mechanics.K_eff
-        place = (K_eff, known["N"], known["T"])
-        known["K0"] = float(
-            K0_from_effective_stiffness(given["K1"], given["B1"], given["alpha"], *place, memory=known["memory"])
+        branch = (given["K1"], given["B1"], given["alpha"])
+        values["K0"] = float(
+            K0_from_effective_stiffness(*branch, K_eff, values["N"], values["T"], memory=values["memory"])
         )
-    return known
+    return values
 
 
 def _mechanics(line) -> Any:
@@ -205,15 +205,15 @@ def _damping(line) -> float | None:
 
 def sim_options(pairs: list[str] | None) -> dict[str, Any]:
     """Options of the simulated device, from KEY=VALUE."""
-    found: dict[str, Any] = {}
+    options: dict[str, Any] = {}
     for pair in pairs or ():
         name, separator, value = pair.partition("=")
         if not separator or not name:
             raise InputError(
                 f'--sim is "{pair}"; write KEY=VALUE, such as finger=sine or material=-2.89,5.7,5.89,.203,101.'
             )
-        found[name] = {"yes": True, "no": False}.get(value, value)
-    return found
+        options[name] = {"yes": True, "no": False}.get(value, value)
+    return options
 
 
 @contextlib.contextmanager

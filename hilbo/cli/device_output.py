@@ -20,29 +20,32 @@ def check_free(out: Path, force: bool) -> None:
 
 def write_table(table: Any, out: Path) -> None:
     """A pandas table as CSV, whole or not at all. Raises `InputError`."""
-    part = out.with_name(f".{out.name}.part")
+    unfinished = out.with_name(f".{out.name}.part")
     try:
-        table.to_csv(part, index=False)
-        os.replace(part, out)
+        table.to_csv(unfinished, index=False)
+        os.replace(unfinished, out)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another file.") from error
 
 
 def said(name, value) -> str:
+    """A field of HELLO's answer in words."""
     if name in ("schema", "firmware", "boot_id"):
         return f"{value:08x}"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
-def set_words(found) -> str:
-    length = f"N = {found.length}" if found.memory == "short" else f"full memory, {found.length} exponentials"
+def set_words(current) -> str:
+    """A set in force (`InForce`) in a line, with units."""
+    length = f"N = {current.length}" if current.memory == "short" else f"full memory, {current.length} exponentials"
     return (
-        f"K0 = {found.K0:.6g}, K1 = {found.K1:.6g} N/mm, B1 = {found.B1:.6g} N.s^alpha/mm, alpha = {found.alpha:.6g},"
-        f" {length}; at most {found.force_limit:.4g} N; needs {found.needs:.4g} N.s/m"
+        f"K0 = {current.K0:.6g}, K1 = {current.K1:.6g} N/mm, B1 = {current.B1:.6g} N.s^alpha/mm,"
+        f" alpha = {current.alpha:.6g}, {length}; at most {current.force_limit:.4g} N; needs {current.needs:.4g} N.s/m"
     )
 
 
 def decoded(row) -> str:
+    """A frame of a capture in a line: its byte, its number, its message or what is wrong."""
     seq = "  -" if row["seq"] is None else f"{row['seq']:3}"
     if row["message"] is None:
         return f"{row['byte']:8} {seq}  ?  {row['wrong']}"

@@ -41,8 +41,8 @@ def trace(values: Any, width: int) -> str:
     if values.size == 0:
         return " " * width
     low, high = min(values.min(), 0.0), max(values.max(), 0.0)
-    parts = [part for part in np.array_split(values, min(width, values.size)) if part.size]
-    peaks = np.array([part[np.argmax(np.abs(part))] for part in parts])
+    shares = [share for share in np.array_split(values, min(width, values.size)) if share.size]
+    peaks = np.array([share[np.argmax(np.abs(share))] for share in shares])
     levels = np.zeros(peaks.size) if high == low else (peaks - low) / (high - low)
     return "".join(_BARS[round(level * (len(_BARS) - 1))] for level in levels).rjust(width)
 

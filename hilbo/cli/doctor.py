@@ -45,8 +45,8 @@ def checks(study: Path | None, connect: Callable[[float | None], Any], folder: P
     yield _serial_ports()
     chosen = None
     if study is not None:
-        found, chosen = _study(study)
-        yield found
+        check, chosen = _study(study)
+        yield check
     yield _precision()
     if chosen is not None:
         yield _feasible(chosen)
@@ -55,14 +55,14 @@ def checks(study: Path | None, connect: Callable[[float | None], Any], folder: P
 
 
 def _versions() -> Check:
-    found, missing = [f"Python {platform.python_version()}"], []
-    for part in _PARTS:
+    versions, missing = [f"Python {platform.python_version()}"], []
+    for package in _PARTS:
         try:
-            found.append(f"{part} {metadata.version(part)}")
+            versions.append(f"{package} {metadata.version(package)}")
         except metadata.PackageNotFoundError:
-            missing.append(part)
-    extras = sorted({_OPTIONAL[part] for part in missing if part in _OPTIONAL})
-    words = ", ".join(found) + (f"; not installed: {', '.join(missing)}" if missing else "")
+            missing.append(package)
+    extras = sorted({_OPTIONAL[package] for package in missing if package in _OPTIONAL})
+    words = ", ".join(versions) + (f"; not installed: {', '.join(missing)}" if missing else "")
     mend = f"pip install 'hilbo[{','.join(extras)}]'" if extras else ""
     return Check("versions", "bad" if "live" in extras else "note" if missing else "good", words, mend)
 
@@ -99,21 +99,23 @@ def _port(port: int) -> Check:
 
 
 def _browser() -> Check:
-    found = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
-    if found is None and sys.platform not in ("win32", "darwin"):
+    browser = next((path for name in _BROWSERS if (path := shutil.which(name))), None)
+    if browser is None and sys.platform not in ("win32", "darwin"):
         return Check("browser", "note", "none is found here", "install one, or use a tablet with --lan")
-    return Check("browser", "good", found or "the system's")
+    return Check("browser", "good", browser or "the system's")
 
 
 def _serial_ports() -> Check:
     from hilbo.device.ports import list_ports
 
     try:
-        found = list_ports()
+        serial_ports = list_ports()
     except InputError as error:
         return Check("serial ports", "note", "pyserial is missing", str(error))
-    words = ", ".join(f"{port.name} ({port.description})" for port in found) or "none"
-    return Check("serial ports", "good" if found else "note", words, "" if found else "plug the device in")
+    words = ", ".join(f"{port.name} ({port.description})" for port in serial_ports) or "none"
+    return Check(
+        "serial ports", "good" if serial_ports else "note", words, "" if serial_ports else "plug the device in"
+    )
 
 
 def _study(path: Path) -> tuple[Check, Any]:
@@ -182,11 +184,11 @@ def _device(connect: Callable[[float | None], Any], study: Any) -> Iterator[Chec
         yield Check("device", "bad", str(error), "connect it, or try --device sim")
         return
     with device:
-        said = device.device
-        yield Check("device", "good", f"{device.link.name}: {said.tick_rate_Hz} ticks a second, {device.state().name}")
+        about = device.device
+        yield Check("device", "good", f"{device.link.name}: {about.tick_rate_Hz} ticks a second, {device.state().name}")
         yield _loopback(device)
         if needs is not None:
-            yield _damping(said.damping_N_s_per_m, needs)
+            yield _damping(about.damping_N_s_per_m, needs)
 
 
 def _loopback(device: Any) -> Check:

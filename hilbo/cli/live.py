@@ -145,7 +145,7 @@ def _claimed(logs: Path, participant: str, name: str):
 def _need_extra() -> None:
     import importlib.util
 
-    if any(importlib.util.find_spec(part) is None for part in ("starlette", "uvicorn", "segno")):
+    if any(importlib.util.find_spec(package) is None for package in ("starlette", "uvicorn", "segno")):
         raise InputError(_EXTRA)
 
 
@@ -161,15 +161,15 @@ def doctor(
     start()
     from hilbo.cli.doctor import checks
 
-    found = []
+    results = []
     marks = {"good": "ok  ", "note": "note", "bad": "BAD "}
     for check in checks(study, line.open, logs, port):
-        found.append(check)
+        results.append(check)
         mend = f"\n       -> {check.mend}" if check.mend else ""
         print(f"{marks[check.level]}  {check.name}: {check.words}{mend}", file=sys.stderr, flush=True)
     if as_json:
-        print(json.dumps([check._asdict() for check in found], indent=2))
-    if any(check.level == "bad" for check in found):
+        print(json.dumps([check._asdict() for check in results], indent=2))
+    if any(check.level == "bad" for check in results):
         raise typer.Exit(1)
 
 

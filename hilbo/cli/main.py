@@ -147,9 +147,9 @@ def robustness(
         from hilbo.study.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
-        found = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
+        comparison = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
         say("maps, figures and report")
-        content = write_robustness(chosen, cohort, found, folder, seed)
+        content = write_robustness(chosen, cohort, comparison, folder, seed)
     finish(content, out, as_json)
 
 
@@ -173,8 +173,8 @@ def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) 
 
     data = files("hilbo") / "data"
     with results(out, force) as folder, progress() as say:
-        for part in PARTS:
-            (folder / part).mkdir()
+        for name in PARTS:
+            (folder / name).mkdir()
         chosen, cohort = _read(Path(str(data / "video_quality.csv")), Path(str(data / "video_quality.toml")), None, say)
         real = _aggregate(chosen, cohort, folder / PARTS[0], seed, say)
         simulated = cli_study.simulated_report(folder / PARTS[1], seed, say)["materials"][""]
@@ -248,8 +248,10 @@ def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
 
     source = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if study is None else study
     with progress() as say:
-        found = cli_live.live(source, out, phase, seconds, seed, say)
-    print(json.dumps(found, indent=2) if as_json else f"{found['answers']} answers in {found['seconds']} s: {out}")
+        summary = cli_live.live(source, out, phase, seconds, seed, say)
+    print(
+        json.dumps(summary, indent=2) if as_json else f"{summary['answers']} answers in {summary['seconds']} s: {out}"
+    )
 
 
 def _print_demo(real, simulated, out) -> None:
@@ -272,8 +274,8 @@ def _print_demo(real, simulated, out) -> None:
     for head in ("", "K1, B1, alpha", "with K0", "passive by", "the paper"):
         table.add_column(head, justify="right" if head else "left", no_wrap=True)
 
-    def row(name, key, found, paper):
-        miss, margin = truth["nrmse"][key], found["passivity_margin"]
+    def row(name, key, optimum, paper):
+        miss, margin = truth["nrmse"][key], optimum["passivity_margin"]
         passive = f"{'yes' if margin >= 0 else 'no'}, {margin:+.3f}"
         table.add_row(name, f"{100 * miss['nrmse']:.1f} %", f"{100 * miss['nrmse_with_K0']:.1f} %", passive, paper)
 
@@ -289,5 +291,5 @@ def _print_demo(real, simulated, out) -> None:
     console.print("Individuals: median and quartiles. Passive by so many N.s/m of damping more than the least.")
     top = truth["top_answers"]
     console.print(f'"close" answers of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)\n')
-    for part in PARTS:
-        console.print(str(out / part / "report.html"))
+    for name in PARTS:
+        console.print(str(out / name / "report.html"))

@@ -49,16 +49,16 @@ def identify(
         from hilbo.identification.material_tables import read_material
         from hilbo.report import material as report_material
 
-        found = read_material(table, material, begin=begin, only=only, longest=longest)
-        measured = found.tests[0].kind in MEASURED
+        measurements = read_material(table, material, begin=begin, only=only, longest=longest)
+        measured = measurements.tests[0].kind in MEASURED
         chosen = _model(measured, model, weights, taps, period, memory)
         choices = memory_selection.CHOICES if measured and compare else ()
-        result = characterise.characterise(found.tests, chosen, seed, choices, say)
+        result = characterise.characterise(measurements.tests, chosen, seed, choices, say)
         say("figures and report")
         content = report_material.identification_result(
-            table.name, found.tests, result, found.stiffness_unit, found.notes, damping
+            table.name, measurements.tests, result, measurements.stiffness_unit, measurements.notes, damping
         )
-        report_material.write_identification(found.tests, result, content, folder, damping)
+        report_material.write_identification(measurements.tests, result, content, folder, damping)
     finish(content, out, as_json)
 
 
@@ -103,15 +103,15 @@ def passivity(
     from hilbo.viscoelastic import FOSLS, K0_from_effective_stiffness
 
     given = {"N": taps, "T": period, "memory": memory, "K_eff": K_eff, "damping": damping}
-    known = _renderer(study) | {name: value for name, value in given.items() if value is not None}
-    place = known["N"], known["T"]
+    renderer = _renderer(study) | {name: value for name, value in given.items() if value is not None}
+    sampling = renderer["N"], renderer["T"]
     if K0 is None:
         _order(alpha)
-        K0 = float(K0_from_effective_stiffness(K1, B1, alpha, known["K_eff"], *place, memory=known["memory"]))
+        K0 = float(K0_from_effective_stiffness(K1, B1, alpha, renderer["K_eff"], *sampling, memory=renderer["memory"]))
     elif K_eff is not None:
         raise InputError("--K0 and --K-eff are both given; one follows from the other, leave one out.")
-    model = FOSLS(K0, K1, B1, alpha, *place, memory=known["memory"])
-    content = report_material.passivity_result(model, known["damping"])
+    model = FOSLS(K0, K1, B1, alpha, *sampling, memory=renderer["memory"])
+    content = report_material.passivity_result(model, renderer["damping"])
     if out is not None:
         with results(out, force) as folder:
             report_material.write_passivity(model, content, folder)
@@ -140,9 +140,9 @@ def _order(alpha):
         raise InputError(f"alpha is {alpha}, it must be above 0 and at most 1: the order of the fractional element.")
 
 
-def _one_of(name, value, known):
-    if value not in known:
-        raise InputError(f'--{name} is "{value}"; it must be {" or ".join(str(k) for k in known if k)}.')
+def _one_of(name, value, allowed):
+    if value not in allowed:
+        raise InputError(f'--{name} is "{value}"; it must be {" or ".join(str(k) for k in allowed if k)}.')
 
 
 def _positive(name, value):

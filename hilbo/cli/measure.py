@@ -28,16 +28,18 @@ def selftest(
     from hilbo.identification import device_tests
 
     with progress() as say, opened(line, finger="none") as device:
-        found = device_tests.selftest(device, say, echoes)
+        result = device_tests.selftest(device, say, echoes)
         hold = device.device.hold_ticks
-    good = found.echoes == found.asked and found.watchdog_ticks <= found.watchdog_limit and found.force_after_N == 0
-    words = (
-        f"loopback   {found.echoes} of {found.asked} came back whole\n"
-        f"latency    median {found.median_ms:.2f} ms, 99 % below {found.p99_ms:.2f} ms, {found.retries} retries\n"
-        f"watchdog   HOLD {found.watchdog_ticks} ticks after the last heartbeat (at most {found.watchdog_limit}),"
-        f" force {abs(found.force_after_N):g} N {hold} ticks later"
+    good = (
+        result.echoes == result.asked and result.watchdog_ticks <= result.watchdog_limit and result.force_after_N == 0
     )
-    print_result(found._asdict() | {"passed": good}, words, as_json)
+    words = (
+        f"loopback   {result.echoes} of {result.asked} came back whole\n"
+        f"latency    median {result.median_ms:.2f} ms, 99 % below {result.p99_ms:.2f} ms, {result.retries} retries\n"
+        f"watchdog   HOLD {result.watchdog_ticks} ticks after the last heartbeat (at most {result.watchdog_limit}),"
+        f" force {abs(result.force_after_N):g} N {hold} ticks later"
+    )
+    print_result(result._asdict() | {"passed": good}, words, as_json)
     if not good:
         fail("The device has not passed; do not use it with people.", 1)
 
@@ -48,19 +50,22 @@ def measure_damping(line: Line, seed: Seed = 0, as_json: Json = False) -> None:
     from hilbo.identification import device_tests
 
     with progress() as say, opened(line, rate="lockstep", finger="none") as device:
-        found = device_tests.measure_damping(device, say, seed)
+        friction = device_tests.measure_damping(device, say, seed)
         reported = device.device.damping_N_s_per_m
     rows = (("damping", "N.s/m"), ("coulomb", "N"), ("mass", "kg"), ("constant", "N"))
-    content = {name: getattr(found, name)._asdict() | {"unit": unit} for name, unit in rows}
-    words = [
-        f"{n:9} {getattr(found, n).value:9.5f}  {getattr(found, n).lower:9.5f} to {getattr(found, n).upper:9.5f}  {u}"
-        for n, u in rows
-    ]
-    believed = found.damping.lower
+    estimates = [(name, getattr(friction, name), unit) for name, unit in rows]
+    content = {name: estimate._asdict() | {"unit": unit} for name, estimate, unit in estimates}
+    words = [f"{name:9} {x.value:9.5f}  {x.lower:9.5f} to {x.upper:9.5f}  {unit}" for name, x, unit in estimates]
+    believed = friction.damping.lower
     words.append(f"The device reports {reported:.4g} N.s/m; plan studies with at most {min(believed, reported):.4g}.")
-    if reported > found.damping.upper:
+    if reported > friction.damping.upper:
         print("hilbo: the device reports more damping than it has; mend its configuration.", file=sys.stderr)
-    rest = {"residual_N": found.residual, "sweeps": found.sweeps, "periods": found.periods, "reported": reported}
+    rest = {
+        "residual_N": friction.residual,
+        "sweeps": friction.sweeps,
+        "periods": friction.periods,
+        "reported": reported,
+    }
     print_result(content | rest, "\n".join(words), as_json)
 
 

@@ -142,12 +142,12 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
     from hilbo.study.cohort import cohort_of
     from hilbo.study.trial_table import read_trials
 
-    found = {}
+    sets = {}
     for material, path in paths.items():
         here = study.material(material) if material else study
         result = plan_sets.read_result(path, here)
         if kind == "aggregate-best":
-            found[material] = plan_sets.aggregate_best_sets(here, result)
+            sets[material] = plan_sets.aggregate_best_sets(here, result)
             continue
         plan_sets.check_participants(result, people, source)
         if trials is None:
@@ -157,8 +157,8 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
             table = read_log_trials(trials, study, material or None, note=remark)
         else:
             table = read_trials(trials, here, material or None)
-        found[material] = plan_sets.validation_sets(here, result, cohort_of(table, here), source, people)
-    return found
+        sets[material] = plan_sets.validation_sets(here, result, cohort_of(table, here), source, people)
+    return sets
 
 
 def _by_material(materials, given) -> dict[str, Path]:

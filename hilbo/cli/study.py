@@ -75,7 +75,7 @@ def power(
 
 def _numbers(text: str, option: str) -> tuple[int, ...]:
     try:
-        return tuple(sorted(int(part) for part in text.split(",")))
+        return tuple(sorted(int(number) for number in text.split(",")))
     except ValueError:
         raise InputError(f'{option} is "{text}"; write whole numbers separated by commas, as in 6,12,24.') from None
 
@@ -120,11 +120,11 @@ def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: i
     say("simulating")
     study, population, _, _ = simulate_folder(folder, "paper", count, seed)
     (material,) = read_folder(folder).materials
-    found = analyse(material.study, material.cohort, seed, say)
-    if found.sets is not None:
+    analysis = analyse(material.study, material.cohort, seed, say)
+    if analysis.sets is not None:
         say("simulated validation sessions")
-        own = np.asarray(found.aggregate.individuals.x)
-        sets = sets_table(study, found.sets, own, found.cohort.names)
+        individual_optima = np.asarray(analysis.aggregate.individuals.x)
+        sets = sets_table(study, analysis.sets, individual_optima, analysis.cohort.names)
         sets.to_csv(folder / "sets.csv", index=False)
         validation_table(study, population, sets, seed=seed).to_csv(folder / "validation.csv", index=False)
-    return write_study(read_folder(folder), folder, seed, say, {material.name: found}, comparison=False)
+    return write_study(read_folder(folder), folder, seed, say, {material.name: analysis}, comparison=False)

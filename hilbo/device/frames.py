@@ -62,13 +62,13 @@ class Receiver:
         """The frames that these bytes complete."""
         *whole, rest = (self._held + data).split(b"\0")
         self._held = rest[: LONGEST + 1]  # one byte too many is enough to know that it is too long
-        found = []
+        frames = []
         for frame in filter(None, whole):
             try:
-                found.append(opened(frame))
+                frames.append(opened(frame))
             except WireError:
                 self.dropped += 1
-        return found
+        return frames
 
 
 def _unstuffed(frame: bytes) -> bytes:

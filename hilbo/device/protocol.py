@@ -199,7 +199,7 @@ def _unpack_rows(kind, layout, values, rest):
     if len(rest) % row.size or (kind is SetStates and len(rest) != values["count"] * row.size):
         raise WireError(f"{name_of(kind)} ends in the middle of what repeats")
     make = Exponential if kind is SetStates else Sample
-    return tuple(make(*found) for found in row.iter_unpack(rest))
+    return tuple(make(*numbers) for numbers in row.iter_unpack(rest))
 
 
 def encode(message: Message, seq: int) -> bytes:

@@ -70,10 +70,10 @@ class Simulator:
 
     def ticks(self, count: int) -> str:
         """Run so many ticks, in lockstep. Raises `DeviceError` if the process has ended."""
-        said = self.tell(f"tick {count}")
-        if not said.startswith("tick "):
+        answer = self.tell(f"tick {count}")
+        if not answer.startswith("tick "):
             raise DeviceError("The simulated device has ended; open a new one.")
-        return said
+        return answer
 
     def close(self) -> str:
         """End the process; its last words say how many ticks it ran, and how many were late."""
@@ -106,8 +106,8 @@ def built() -> Path:
             "This system has no pseudo-terminals for the simulated device; use WSL, or a device on a port."
         )
     root, compiler = _sources(), _compiler()
-    files = [path for part in _PARTS for path in sorted((root / part).glob("*.[ch]"))]
-    flags = [*_FLAGS, f"-DHB_FIRMWARE_HASH={_firmware_hash(root)}U", *(f"-I{part}" for part in _PARTS)]
+    files = [path for folder in _PARTS for path in sorted((root / folder).glob("*.[ch]"))]
+    flags = [*_FLAGS, f"-DHB_FIRMWARE_HASH={_firmware_hash(root)}U", *(f"-I{folder}" for folder in _PARTS)]
     version = subprocess.run([compiler, "--version"], capture_output=True).stdout
     digest = hashlib.sha256(repr((compiler, flags)).encode() + version)
     for path in files:
@@ -151,9 +151,9 @@ def _sources() -> Path:
 
 def _compiler() -> str:
     for name in (os.environ.get("CC", ""), *_COMPILERS):
-        found = shutil.which(name) if name else None
-        if found:
-            return found
+        path = shutil.which(name) if name else None
+        if path:
+            return path
     install = "xcode-select --install" if sys.platform == "darwin" else "on Debian: apt install gcc"
     raise DeviceError(
         f"The simulated device is built once from C, and there is no C compiler; install one ({install}), or use a"
@@ -171,13 +171,13 @@ def _cache() -> Path:
 
 
 def _arguments(options: dict[str, Any]) -> list[str]:
-    found = []
+    arguments = []
     for name, value in options.items():
         if name == "sensor":
-            found += [] if value else ["--no-sensor"]
+            arguments += [] if value else ["--no-sensor"]
         elif value is True:
-            found.append(f"--{name.replace('_', '-')}")
+            arguments.append(f"--{name.replace('_', '-')}")
         elif value is not None and value is not False:
             text = ",".join(map(str, value)) if isinstance(value, tuple | list) else str(value)
-            found += [f"--{name.replace('_', '-')}", text]
-    return found
+            arguments += [f"--{name.replace('_', '-')}", text]
+    return arguments
