@@ -6,7 +6,7 @@ ran to the edge of the search, and *not identifiable* if the data set no end at 
 coordinates; their intervals are quantiles under the normal approximation in those.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -63,63 +63,65 @@ def characterise(
 ) -> Characterisation:
     """Fit tests by one parameter set and judge it; `choices` are the memories to compare (none: no comparison)."""
     say("fitting")
-    found = fit(tests, model)
+    best_fit = fit(tests, model)
     say("profile intervals")
-    sides = intervals.profile_intervals(found)
+    sides = intervals.profile_intervals(best_fit)
     for _ in range(_RESTARTS):
-        if not bool(sides.lowest < found.solution.cost * (1 - 1e-6)):
+        if not bool(sides.lowest < best_fit.solution.cost * (1 - 1e-6)):
             break
-        found = polish(found, sides.lowest_q)
-        sides = intervals.profile_intervals(found)
-    around = intervals.spread(found)
+        best_fit = polish(best_fit, sides.lowest_q)
+        sides = intervals.profile_intervals(best_fit)
+    sampling = intervals.spread(best_fit)
     boot = None
     if min(test.repeats for test in tests) >= intervals.FEWEST_REPEATS:
         say("bootstrap over repeats")
-        boot = intervals.block_bootstrap(found, jax.random.key(seed))
-    estimates = _estimates(found, sides, around, seed)
-    damping = _minimum_damping(found)
-    residuals = {kind.kind: row for kind, row in zip(tests, _noise(found, tests), strict=True)}
+        boot = intervals.block_bootstrap(best_fit, jax.random.key(seed))
+    estimates = _estimates(best_fit, sides, sampling, seed)
+    damping = _minimum_damping(best_fit)
+    residuals = {test.kind: row for test, row in zip(tests, _noise(best_fit, tests), strict=True)}
     if choices:
         say("memory")
     rows = select_memory(tests, model.T, choices) if choices else ()
-    words = _warnings(found, sides, estimates, residuals, tests)
-    ends = None if boot is None else [np.asarray(found.model.natural(end)) for end in boot]
+    words = _warnings(best_fit, sides, estimates, residuals, tests)
+    ends = None if boot is None else [np.asarray(best_fit.model.natural(end)) for end in boot]
     named = (
         None
         if ends is None
-        else dict(zip(found.model.labels, zip(*map(np.ndarray.tolist, ends), strict=True), strict=True))
+        else dict(zip(best_fit.model.labels, zip(*map(np.ndarray.tolist, ends), strict=True), strict=True))
     )
     return Characterisation(
-        found, estimates, named, residuals, nrmse(found), float(around.freedom), damping, rows, words
+        best_fit, estimates, named, residuals, nrmse(best_fit), float(sampling.freedom), damping, rows, words
     )
 
 
-def _estimates(found, sides, around, seed):
-    model, labels, held = found.model, found.model.labels, np.asarray(found.held())
+def _estimates(best_fit: Fit, sides: intervals.Intervals, sampling: intervals.Spread, seed: int) -> dict[str, Estimate]:
+    """Every parameter and coordinate by name: coordinates from their profiles, the others by `_quantiles`."""
+    model, labels, held = best_fit.model, best_fit.model.labels, np.asarray(best_fit.held())
     open_lower, open_upper = np.asarray(sides.open_lower), np.asarray(sides.open_upper)
     ok = np.asarray(sides.found) & np.isfinite(np.asarray(sides.lower)) & np.isfinite(np.asarray(sides.upper))
-    value, lower, upper = (np.asarray(model.natural(q)) for q in (found.q, sides.lower, sides.upper))
+    value, lower, upper = (np.asarray(model.natural(q)) for q in (best_fit.q, sides.lower, sides.upper))
     estimates = {}
     for j, name in enumerate(labels):
-        status = _status(ok[j] and bool(found.solution.converged), open_lower[j], open_upper[j], held[j])
+        status = _status(ok[j] and bool(best_fit.solution.converged), open_lower[j], open_upper[j], held[j])
         low = float(lower[j]) if ok[j] and not open_lower[j] else None
         high = float(upper[j]) if ok[j] and not open_upper[j] else None
         estimates[name] = Estimate(float(value[j]), low, high, status)
     whole = all(estimate.known for estimate in estimates.values())
-    derived = _quantiles(found, around, seed) if whole else {}
-    rest = {
-        name: _derived(number, derived.get(name)) for name, number in found.parameters().items() if name not in labels
-    }
+    derived = _quantiles(best_fit, sampling, seed) if whole else {}
+    others = {name: number for name, number in best_fit.parameters().items() if name not in labels}
+    rest = {name: _derived(number, derived.get(name)) for name, number in others.items()}
     return rest | estimates
 
 
-def _derived(value, ends):
+def _derived(value: float, ends: tuple[float, ...] | None) -> Estimate:
+    """What follows from all coordinates: known where all of them are."""
     if ends is None:
         return Estimate(value, None, None, "not identifiable")
     return Estimate(value, ends[0], ends[1], "identified")
 
 
-def _status(ok, open_lower, open_upper, held):
+def _status(ok, open_lower, open_upper, held) -> str:
+    """What an estimate is worth, in the words of this module's head; `ok`: both searches for an end came to one."""
     if held:
         return "at bound"
     if not ok:
@@ -129,48 +131,54 @@ def _status(ok, open_lower, open_upper, held):
     return "one-sided" if open_lower or open_upper else "identified"
 
 
-def _quantiles(found, around, seed):
+def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str, tuple[float, ...]]:
     """95 % of what follows from all coordinates, over draws of these."""
     rng = np.random.default_rng(seed)
-    draws = rng.multivariate_normal(np.asarray(found.q), np.asarray(around.covariance), _DRAWS, method="eigh")
-    sets = jax.vmap(found.model.parameters)(jnp.asarray(draws))
+    draws = rng.multivariate_normal(np.asarray(best_fit.q), np.asarray(sampling.covariance), _DRAWS, method="eigh")
+    sets = jax.vmap(best_fit.model.parameters)(jnp.asarray(draws))
     return {name: tuple(np.quantile(np.asarray(v), [0.025, 0.975]).tolist()) for name, v in sets.items()}
 
 
-def _noise(found, tests):
+def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
     """What the residuals of each test look like, and how they compare with the noise of the repeats."""
-    for test, part in zip(tests, intervals.noise(found), strict=True):
+    for test, autoregression in zip(tests, intervals.noise(best_fit), strict=True):
         row = {
-            "autocorrelation": float(part.lag_one),
-            "order": int(part.order),
-            "effective_samples": float(part.effective),
+            "autocorrelation": float(autoregression.lag_one),
+            "order": int(autoregression.order),
+            "effective_samples": float(autoregression.effective),
             "samples": test.time.size,
             "repeats": test.repeats,
         }
         if test.repeats > 1:
             scatter = np.sqrt(np.mean(np.var(test.output, axis=0, ddof=1)) / test.repeats)
-            size = float(part.rms) * np.ptp(test.output.mean(axis=0))
+            size = float(autoregression.rms) * np.ptp(test.output.mean(axis=0))
             row["over_repeat_noise"] = float(size / scatter) if scatter > 0 else np.inf
         yield row
 
 
-def _minimum_damping(found):
+def _minimum_damping(best_fit: Fit) -> float | None:
     """Smallest passive damping of the set, N·s/m; None for an even number of taps (closed form too low) and moduli."""
-    model, values = found.model, found.parameters()
+    model, values = best_fit.model, best_fit.parameters()
     if not isinstance(model, Sampled):
         return None
     if model.memory == "short" and int(model.N) % 2 == 0:
         return None
-    place = values["K1"], values["B1"], values["alpha"], values["K_eff"]
-    return float(passivity.minimum_damping(*place, int(model.N), model.T, memory=model.memory))
+    parameters = values["K1"], values["B1"], values["alpha"], values["K_eff"]
+    return float(passivity.minimum_damping(*parameters, int(model.N), model.T, memory=model.memory))
 
 
-def _warnings(found, sides, estimates, residuals, tests):
+def _warnings(
+    best_fit: Fit,
+    sides: intervals.Intervals,
+    estimates: dict[str, Estimate],
+    residuals: dict[str, dict[str, Any]],
+    tests: Sequence[Test],
+) -> tuple[str, ...]:
     """Sentences for a person who would otherwise trust the digits."""
     words = []
-    if not bool(found.solution.converged):
+    if not bool(best_fit.solution.converged):
         words.append("The fit did not come to an end: the cost is flat in some direction, so no digits are printed.")
-    elif float(sides.lowest) < float(found.solution.cost) * (1 - 1e-4):
+    elif float(sides.lowest) < float(best_fit.solution.cost) * (1 - 1e-4):
         words.append("A search for an interval found a better fit than the fit itself; the data have several optima.")
     for name, estimate in estimates.items():
         if estimate.status == "at bound":
@@ -184,7 +192,7 @@ def _warnings(found, sides, estimates, residuals, tests):
                 f"The residuals of the {kind} test are {row['over_repeat_noise']:.0f} times the noise of its repeats:"
                 " the model misses part of the curve, and the intervals take that as correlated noise."
             )
-    T = getattr(found.model, "T", np.inf)
+    T = getattr(best_fit.model, "T", np.inf)
     coarse = [t.kind for t in tests if np.median(np.diff(t.time)) > 1.001 * T]
     if coarse:
         words.append(

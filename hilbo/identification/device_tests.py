@@ -43,22 +43,22 @@ class SelfTest(NamedTuple):
 def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: float = _MOST) -> Any:
     """The first true value of `done`. Raises `DeviceError` when `what` has not come after `seconds`."""
     give_up = device.link.now() + seconds
-    while not (found := done()):
+    while not (value := done()):
         if device.link.now() > give_up:
             raise DeviceError(f"The device has not {what} within {seconds:g} s; check it, then try again.")
         device.link.pause(0.005)
-    return found
+    return value
 
 
 def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: float = 0.0, **times: float) -> Samples:
     """Let the device move by itself, and return the samples of it. Raises `DeviceError` if it does not finish."""
     device.samples(0.0)
     device.drive(mode, shape, offset, amplitude, **times)
-    begun, parts = device.status().tick, [device.samples(times["duration"])]
-    while not _ended(parts[-1], begun):
-        parts.append(device.samples(0.05))
+    begun, arrived = device.status().tick, [device.samples(times["duration"])]
+    while not _ended(arrived[-1], begun):
+        arrived.append(device.samples(0.05))
     wait_until(device, lambda: device.state() != State.STOPPING, "stopped")
-    whole = Samples(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+    whole = Samples(*(np.concatenate(column) for column in zip(*arrived, strict=True)))
     driving = (whole.flags & SampleFlag.DRIVING) != 0
     if driving.sum() * device.divisor < round(times["duration"] / device.tick_s) - device.divisor:
         status = device.status()
@@ -82,10 +82,10 @@ def measure_damping(device: Renderer, say: Callable[[str], None], seed: int = 0)
     Nothing may touch the handle. Raises `InputError` where the stroke is too short, `DeviceError` where something
     touches it.
     """
-    said, rng = device.device, np.random.default_rng(seed)
-    low, high = said.position_low_mm, said.position_high_mm
-    middle, most, found = (low + high) / 2, 0.3 * (high - low), []
-    fastest = min(_FASTEST, 0.2 * said.velocity_limit_mm_per_s, 0.7 * most / _SETTLE)
+    about, rng = device.device, np.random.default_rng(seed)
+    low, high = about.position_low_mm, about.position_high_mm
+    middle, most, stretches = (low + high) / 2, 0.3 * (high - low), []
+    fastest = min(_FASTEST, 0.2 * about.velocity_limit_mm_per_s, 0.7 * most / _SETTLE)
     # No two periods alike: what encoder and servo do wrong at one speed, they do again at the same speed.
     for count, speed in enumerate(rng.permutation(np.geomspace(min(_SLOWEST, fastest / 4), fastest, _SWEEPS))):
         say(f"sweep {count + 1} of {_SWEEPS}: {speed:.0f} mm/s")
@@ -95,8 +95,8 @@ def measure_damping(device: Renderer, say: Callable[[str], None], seed: int = 0)
         if np.mean(np.abs(seen.sensed_N)) > _FREE:  # false without a sensor
             raise DeviceError("Something touches the handle; take it away, damping is measured on the free device.")
         tick = device.tick_s * device.divisor
-        found += sweeps(seen.position_mm, -seen.force_N, tick, period, _SETTLE, count)
-    return friction(found, seed)
+        stretches += sweeps(seen.position_mm, -seen.force_N, tick, period, _SETTLE, count)
+    return friction(stretches, seed)
 
 
 def characterise(
@@ -122,13 +122,13 @@ def characterise(
         raise InputError("Repeats, depth, force and hold must be above 0.")
     away = max(low / 2, -1.0)
     spread = _SPREAD * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
-    begin = {"relaxation": away, "creep": -step}
+    position_before = {"relaxation": away, "creep": -step}
     last = {"relaxation": hold, "creep": 2 * hold}
-    found: dict[str, list[Pressed]] = {"relaxation": [], "creep": []}
+    presses: dict[str, list[Pressed]] = {"relaxation": [], "creep": []}
     for repeat in range(repeats):
-        for kind, tests in found.items():
+        for kind, tests in presses.items():
             say(f"{kind} {repeat + 1} of {repeats}")
-            free = drive(device, "position", "hold", begin[kind], duration=rest)
+            free = drive(device, "position", "hold", position_before[kind], duration=rest)
             if kind == "relaxation":
                 seen = drive(device, "position", "hold", depth * (1 + spread[repeat]), duration=hold + 0.5)
             else:
@@ -136,7 +136,7 @@ def characterise(
                 seen = drive(device, "force", "step", *loads, period=hold, duration=2 * hold + 0.1)
             tests.append(pressed(seen, kind, bool(device.can & Capability.FORCE_SENSOR), _noise(free)))
     drive(device, "position", "hold", away, duration=0.5)
-    return table_of(found, last, device.tick_s * device.divisor)
+    return table_of(presses, last, device.tick_s * device.divisor)
 
 
 def _noise(free: Samples) -> float:
@@ -169,7 +169,7 @@ def selftest(device: Renderer, say: Callable[[str], None], echoes: int = 300) ->
     )
 
 
-def _watchdog(device) -> tuple[int, float]:
+def _watchdog(device: Renderer) -> tuple[int, float]:
     """Ticks from the last heartbeat that the device can have heard to its HOLD, and the force (N) after the ramp."""
     if not device.can & Capability.DRIVE:
         raise InputError(

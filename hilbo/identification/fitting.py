@@ -66,8 +66,8 @@ class Test(eqx.Module):
         if (self.input is None) == (self.kind in MEASURED):
             needs = "needs the recorded input beside the output" if self.input is None else "has no input"
             raise InputError(f"A {self.kind} test {needs}.")
-        parts = (self.time, self.output) if self.input is None else (self.time, self.output, self.input)
-        if not all(np.all(np.isfinite(part)) for part in parts):
+        recorded = (self.time, self.output) if self.input is None else (self.time, self.output, self.input)
+        if not all(np.all(np.isfinite(values)) for values in recorded):
             raise InputError(f"The {self.kind} test has numbers that are not finite; leave those rows out.")
         if not np.ptp(self.output.mean(axis=0)) > 0:
             raise InputError(f"The output of the {self.kind} test does not change; there is nothing to fit.")
@@ -175,12 +175,13 @@ def polish(found: Fit, start: Float[Array, " p"]) -> Fit:
 
 
 @eqx.filter_jit
-def _polished(found, start):
+def _polished(current: Fit, start: Float[Array, " p"]) -> Solution:
+    """The minimum that the search comes to from another start."""
     return least_squares(
-        lambda q: residuals(found.model, found.curves, found.weights, q),
+        lambda q: residuals(current.model, current.curves, current.weights, q),
         start,
-        found.lower,
-        found.upper,
+        current.lower,
+        current.upper,
         max_steps=_LONGEST,
     )
 

@@ -71,7 +71,7 @@ def sweeps(
     that recordings can be joined.
     """
     half, skip = round(period / 2 / tick), round(settle / tick)
-    found, starts = [], range(round(period / 4 / tick), position.size - half + 1, half)  # where the triangle turns
+    recorded, starts = [], range(round(period / 4 / tick), position.size - half + 1, half)  # where the triangle turns
     if half < 2 * skip:
         raise InputError(f"The sweeps are too short: {half * tick:.3g} s, and the first {settle:.3g} s are the turn.")
     for count, start in enumerate(starts):
@@ -79,12 +79,12 @@ def sweeps(
         # The handle turns later than the triangle, and rests there for as long as friction holds it.
         rests = np.flatnonzero(way == (way.max() if way[0] > way[-1] else way.min()))
         turn = start + int(rests[-1]) + round(_CREEPS / tick)
-        for begin, end in ((turn, turn + skip), (turn + skip, start + half)):
-            found.append(_sweep(position[begin:end], force[begin:end], tick, number + count // 2))
-    return found
+        for first, end in ((turn, turn + skip), (turn + skip, start + half)):
+            recorded.append(_sweep(position[first:end], force[first:end], tick, number + count // 2))
+    return recorded
 
 
-def _sweep(x, force, tick, period) -> Sweep:
+def _sweep(x: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], tick: float, period: int) -> Sweep:
     """The integrals over ∫w = L/2; a force is held from its sample to the next."""
     turns = 2 * np.pi * np.arange(x.size) / (x.size - 1)
     length, held = (x.size - 1) * tick, (turns[:-1] + turns[1:]) / 2

@@ -17,6 +17,7 @@ Biometrika 77:485 (scaled likelihood ratios under correlation); Efron & Tibshira
 Bootstrap, section 12.5 (studentised intervals).
 """
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import equinox as eqx
@@ -26,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Fit, curve_residuals, residuals
-from hilbo.numerics.least_squares import least_squares, solve_symmetric
+from hilbo.numerics.least_squares import Solution, least_squares, solve_symmetric
 
 __all__ = ["Intervals", "Noise", "Spread", "block_bootstrap", "noise", "profile_intervals", "refits", "spread"]
 
@@ -82,7 +83,7 @@ class Intervals(eqx.Module):
 @eqx.filter_jit
 def noise(found: Fit) -> tuple[Noise, ...]:
     """The autoregressions of the residuals, curve by curve."""
-    return tuple(_autoregression(r) for r in _parts(found, found.q))
+    return tuple(_autoregression(r) for r in _residuals(found, found.q))
 
 
 def spread(found: Fit, quantile: float = 1.959964) -> Spread:
@@ -91,34 +92,35 @@ def spread(found: Fit, quantile: float = 1.959964) -> Spread:
 
 
 @eqx.filter_jit
-def _spread(found, quantile):
-    q = found.q
-    parts = _parts(found, q)
-    slopes = jax.jacfwd(lambda x: _parts(found, x))(q)
-    meat, effective = jnp.zeros_like(found.solution.normal), jnp.zeros_like(q[0])
-    unscaled = _inverse(found.solution.normal, _free(found))
-    for r, J in zip(parts, slopes, strict=True):
+def _spread(fit: Fit, quantile: float) -> Spread:
+    q = fit.q
+    slopes = jax.jacfwd(lambda x: _residuals(fit, x))(q)
+    meat, effective = jnp.zeros_like(fit.solution.normal), jnp.zeros_like(q[0])
+    unscaled = _inverse(fit.solution.normal, _free(fit))
+    for r, J in zip(_residuals(fit, q), slopes, strict=True):
         model = _autoregression(r)
         shape = _filtered(J, model)  # Jᵀ Γ J / γ_0
         lost = jnp.sum(unscaled * shape)
         variance = r @ r / (r.size - lost)
         meat, effective = meat + variance * shape, effective + model.effective
-    rows = jax.vmap(lambda own: _inverse(found.solution.normal, _free(found) | own))(jnp.eye(q.size, dtype=bool))
+    rows = jax.vmap(lambda turn: _inverse(fit.solution.normal, _free(fit) | turn))(jnp.eye(q.size, dtype=bool))
     inverse = jnp.diagonal(rows, axis1=0, axis2=1).T
     covariance = inverse @ meat @ inverse.T
     freedom = jnp.maximum(effective - q.size, 1)
-    wider, own = _across(found, slopes, jnp.diag(covariance), freedom)
+    wider, freedoms = _across(fit, slopes, jnp.diag(covariance), freedom)
     covariance = wider[:, None] * covariance * wider[None, :]
-    cut = _student(quantile, own) ** 2 * jnp.diag(covariance) / jnp.diag(inverse)
+    cut = _student(quantile, freedoms) ** 2 * jnp.diag(covariance) / jnp.diag(inverse)
     return Spread(covariance, inverse, cut, freedom)
 
 
-def _across(found, slopes, variance, freedom):
+def _across(
+    fit: Fit, slopes: tuple[Float[Array, "_ p"], ...], variance: Float[Array, " p"], freedom: Float[Array, ""]
+) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
     """How many times wider the repeats scatter than residuals tell, at least 1; and its degrees of freedom."""
-    if min(w.size for w in found.weights) < FEWEST_REPEATS:
+    if min(w.size for w in fit.weights) < FEWEST_REPEATS:
         return jnp.ones_like(variance), jnp.broadcast_to(freedom, variance.shape)
-    more = sum(_variance_of_mean(u, 0) for u in _influences(found, slopes)) / variance
-    few = float(sum(w.size - 1 for w in found.weights))
+    more = sum(_variance_of_mean(u, 0) for u in _influences(fit, slopes)) / variance
+    few = float(sum(w.size - 1 for w in fit.weights))
     return jnp.sqrt(jnp.maximum(more, 1)), jnp.where(more > 1, few, freedom)
 
 
@@ -144,29 +146,30 @@ class _Search(NamedTuple):
 
 
 @eqx.filter_jit
-def _profile(found, around):
-    size = found.q.size
-    which, side = jnp.repeat(jnp.arange(size), 2), jnp.tile(jnp.array([-1.0, 1.0], found.q.dtype), size)
+def _profile(fit: Fit, sampling: Spread) -> Intervals:
+    """Both ends of every coordinate's interval."""
+    size = fit.q.size
+    which, side = jnp.repeat(jnp.arange(size), 2), jnp.tile(jnp.array([-1.0, 1.0], fit.q.dtype), size)
     # One after the other: together, all would wait for the slowest.
-    ends = jax.lax.map(lambda at: _end(found, around, *at), (which, side))
+    ends = jax.lax.map(lambda j_and_sign: _end(fit, sampling, *j_and_sign), (which, side))
     place, open_, done = (leaf.reshape(size, 2) for leaf in (ends.place, ends.open, ends.done))
     found_both = jnp.all(done & jnp.isfinite(place), axis=1)
-    lower, upper = found.q - place[:, 0], found.q + place[:, 1]
+    lower, upper = fit.q - place[:, 0], fit.q + place[:, 1]
     best = jnp.argmin(ends.lowest)
     return Intervals(lower, upper, open_[:, 0], open_[:, 1], found_both, ends.lowest[best], ends.lowest_q[best])
 
 
-def _end(found, around, j, sign):
+def _end(fit: Fit, sampling: Spread, j: Int[Array, ""], sign: Float[Array, ""]) -> _Search:
     """Walk away from the estimate of coordinate j until the profile has risen by the cut."""
-    q, cut, row = found.q, around.cut[j], around.inverse[j]
-    room = jnp.where(sign > 0, found.upper[j] - q[j], q[j] - found.lower[j])
-    own = jnp.arange(q.size) == j
+    q, cut, row = fit.q, sampling.cut[j], sampling.inverse[j]
+    room = jnp.where(sign > 0, fit.upper[j] - q[j], q[j] - fit.lower[j])
+    is_j = jnp.arange(q.size) == j
 
-    def fixed(distance, start):
+    def fitted_beside(distance, start):
         value = q[j] + sign * distance
-        lower, upper = (jnp.where(own, value, bound) for bound in (found.lower, found.upper))
+        lower, upper = (jnp.where(is_j, value, bound) for bound in (fit.lower, fit.upper))
         return least_squares(
-            lambda x: residuals(found.model, found.curves, found.weights, x),
+            lambda x: residuals(fit.model, fit.curves, fit.weights, x),
             start,
             lower,
             upper,
@@ -176,20 +179,27 @@ def _end(found, around, j, sign):
 
     def step(state: _Search) -> _Search:
         distance = jnp.minimum(state.place, room)
-        start = jnp.where(own, q + sign * distance, state.q)  # beside the best point known to be inside
-        solution = fixed(distance, start)
-        rise = solution.cost - found.solution.cost
+        start = jnp.where(is_j, q + sign * distance, state.q)  # beside the best point known to be inside
+        solution = fitted_beside(distance, start)
+        rise = solution.cost - fit.solution.cost
         return _narrowed(state, distance, jnp.sqrt(jnp.maximum(rise, 0) / cut), solution, q, distance >= room)
 
     zero, infinite = jnp.zeros_like(cut), jnp.full_like(cut, jnp.inf)
     guess = jnp.sqrt(cut * row[j])
-    start = jnp.where(own, q, q + sign * guess * row / row[j])
+    start = jnp.where(is_j, q, q + sign * guess * row / row[j])
     bad = ~jnp.isfinite(guess)
     first = _Search(guess, zero, zero, infinite, infinite, start, infinite, q, jnp.asarray(0), bad, jnp.zeros_like(bad))
     return jax.lax.while_loop(lambda s: ~s.done & (s.steps < _SEARCH_STEPS), step, first)
 
 
-def _narrowed(state: _Search, distance, root, solution, q, at_wall) -> _Search:
+def _narrowed(
+    state: _Search,
+    distance: Float[Array, ""],
+    root: Float[Array, ""],
+    solution: Solution,
+    q: Float[Array, " p"],
+    at_wall: Bool[Array, ""],
+) -> _Search:
     """The next state after a look at `distance` from the estimate q, where rise over cut has the root `root`."""
     outside = root > 1
     inner, inner_root = _pick(outside, (state.inside, state.inside_root), (distance, root))
@@ -208,7 +218,8 @@ def _narrowed(state: _Search, distance, root, solution, q, at_wall) -> _Search:
     return _Search(place, inner, inner_root, outer, outer_root, kept, lowest, lowest_q, steps, done, unbounded)
 
 
-def _pick(condition, yes, no):
+def _pick(condition: Bool[Array, ""], yes: tuple[Array, ...], no: tuple[Array, ...]) -> Iterator[Array]:
+    """Each of `yes` where the condition holds, else of `no`."""
     return (jnp.where(condition, a, b) for a, b in zip(yes, no, strict=True))
 
 
@@ -239,50 +250,53 @@ def block_bootstrap(
 
 
 @eqx.filter_jit
-def _bootstrap(found, key, resamples, quantile, exact):
-    keys = jax.random.split(key, len(found.weights))
-    draws = tuple(
-        jax.random.randint(k, (resamples, w.size), 0, w.size) for k, w in zip(keys, found.weights, strict=True)
-    )
-    influences = _influences(found, jax.jacfwd(lambda x: _parts(found, x))(found.q))
+def _bootstrap(
+    fit: Fit, key: PRNGKeyArray, resamples: int, quantile: float, exact: bool
+) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
+    keys = jax.random.split(key, len(fit.weights))
+    draws = tuple(jax.random.randint(k, (resamples, w.size), 0, w.size) for k, w in zip(keys, fit.weights, strict=True))
+    influences = _influences(fit, jax.jacfwd(lambda x: _residuals(fit, x))(fit.q))
     moved = sum(jnp.mean(u[d], axis=1) - jnp.mean(u, axis=0)[None, :] for u, d in zip(influences, draws, strict=True))
     errors = jnp.sqrt(sum(_variance_of_mean(u[d], 1) for u, d in zip(influences, draws, strict=True)))
-    own = jnp.sqrt(sum(_variance_of_mean(u, 0) for u in influences))
+    standard_error = jnp.sqrt(sum(_variance_of_mean(u, 0) for u in influences))
     if exact:
         weights = tuple(
             jax.vmap(lambda row, n=w.size: jnp.bincount(row, length=n) / n)(d)
-            for w, d in zip(found.weights, draws, strict=True)
+            for w, d in zip(fit.weights, draws, strict=True)
         )
-        moved = refits(found, weights) - found.q[None, :]
+        moved = refits(fit, weights) - fit.q[None, :]
     tail = jax.scipy.special.ndtr(-quantile)
     low, high = jnp.quantile(moved / errors, jnp.stack([tail, 1 - tail]), axis=0)
-    return found.q - high * own, found.q - low * own
+    return fit.q - high * standard_error, fit.q - low * standard_error
 
 
-def _variance_of_mean(values, axis):
+def _variance_of_mean(values: Float[Array, "*m p"], axis: int) -> Float[Array, "..."]:
+    """Variance of the mean along an axis of repeats."""
     return jnp.var(values, axis=axis, ddof=1) / values.shape[axis]
 
 
-def _influences(found, slopes):
+def _influences(fit: Fit, slopes: tuple[Float[Array, "_ p"], ...]) -> tuple[Float[Array, "_ p"], ...]:
     """For each curve, (R, p): how far each repeat alone pulls the estimate."""
-    inverse = _inverse(found.solution.normal, _free(found))
+    inverse = _inverse(fit.solution.normal, _free(fit))
     pulls = []
-    for curve, J in zip(found.curves, slopes, strict=True):
+    for curve, J in zip(fit.curves, slopes, strict=True):
         count = curve.output.shape[0]
-        alone = jax.vmap(lambda w, c=curve: curve_residuals(found.model, c, w, found.q))(jnp.eye(count, dtype=J.dtype))
+        alone = jax.vmap(lambda w, c=curve: curve_residuals(fit.model, c, w, fit.q))(jnp.eye(count, dtype=J.dtype))
         pulls.append(-alone @ J @ inverse)
     return tuple(pulls)
 
 
-def _parts(found, q):
-    return tuple(curve_residuals(found.model, c, w, q) for c, w in zip(found.curves, found.weights, strict=True))
+def _residuals(fit: Fit, q: Float[Array, " p"]) -> tuple[Float[Array, " _"], ...]:
+    """Those of each curve, under the weights of the fit."""
+    return tuple(curve_residuals(fit.model, c, w, q) for c, w in zip(fit.curves, fit.weights, strict=True))
 
 
-def _free(found):
-    return ~found.held()
+def _free(fit: Fit) -> Bool[Array, " p"]:
+    """Coordinates that are not held at a bound."""
+    return ~fit.held()
 
 
-def _inverse(normal, free):
+def _inverse(normal: Float[Array, "p p"], free: Bool[Array, " p"]) -> Float[Array, "p p"]:
     """Inverse over the free coordinates, 0 elsewhere."""
     both = free[:, None] & free[None, :]
     scale = jnp.sqrt(jnp.where(free, jnp.diag(normal), 1))
@@ -292,8 +306,8 @@ def _inverse(normal, free):
     return jnp.where(both, columns / outer, 0)
 
 
-def _autoregression(r) -> Noise:
-    """Yule-Walker by Levinson's recursion, the order by BIC."""
+def _autoregression(r: Float[Array, " m"]) -> Noise:
+    """Of one curve's residuals: Yule-Walker by Levinson's recursion, the order by BIC."""
     m = r.size
     lags = jnp.stack([r[: m - k] @ r[k:] for k in range(LONGEST_MEMORY + 1)])
     rho = lags / lags[0]
@@ -312,18 +326,18 @@ def _autoregression(r) -> Noise:
     return Noise(order, a, rho[1], m * (1 - jnp.sum(a)) ** 2 / innovation, jnp.sqrt(lags[0]), innovation)
 
 
-def _filtered(slopes, model):
+def _filtered(slopes: Float[Array, "m p"], model: Noise) -> Float[Array, "p p"]:
     """Jᵀ Γ J for the autocovariance Γ of variance 1, by its spectrum."""
     length = 2 * slopes.shape[0]
     response = jnp.fft.rfft(jnp.concatenate([jnp.ones(1, slopes.dtype), -model.coefficients]), length)
     density = model.innovation / jnp.abs(response) ** 2
     twice = jnp.full(density.size, 2.0, density.dtype).at[0].set(1).at[-1].set(1)
     waves = jnp.fft.rfft(slopes, length, axis=0)
-    parts = (density * twice / length)[:, None]
-    return waves.real.T @ (parts * waves.real) + waves.imag.T @ (parts * waves.imag)
+    weight = (density * twice / length)[:, None]
+    return waves.real.T @ (weight * waves.real) + waves.imag.T @ (weight * waves.imag)
 
 
-def _student(quantile, freedom):
+def _student(quantile: float, freedom: Float[Array, "*p"]) -> Float[Array, "*p"]:
     """Student's quantile from the normal one, by two terms of the Cornish-Fisher expansion (freedom from 5 up)."""
     z, f = quantile, freedom
     return z + (z**3 + z) / (4 * f) + (5 * z**5 + 16 * z**3 + 3 * z) / (96 * f**2)

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Test
@@ -103,14 +104,14 @@ def _columns(text, source):
         quantity = _QUANTITY.get(match[1].lower()) if match else None
         if match is None or quantity is None:
             continue
-        unit = next((part.strip() for part in match.groups()[1:] if part is not None), "").replace("µ", "u")
+        unit = next((group.strip() for group in match.groups()[1:] if group is not None), "").replace("µ", "u")
         unit = unit.replace("μ", "u")
         if unit not in _UNITS[quantity]:
-            known = ", ".join(_UNITS[quantity])
+            allowed = ", ".join(_UNITS[quantity])
             says = f'has the unit "{unit}"' if unit else "has no unit"
             example = f"{match[1]} ({next(iter(_UNITS[quantity]))})"
             raise InputError(
-                f'{place(source)}column "{column}" {says}; write it like "{example}", with one of {known}.'
+                f'{place(source)}column "{column}" {says}; write it like "{example}", with one of {allowed}.'
             )
         if quantity in columns:
             raise InputError(
@@ -146,44 +147,45 @@ def _kinds(text, columns, source):
     return kinds
 
 
-def _test(kind, values, repeats, source, begin, longest, notes):
+def _test(kind, values, repeats, source, start, longest, notes):
     """One kind of test, its repeats on common times."""
     output = {"relaxation": "force", "creep": "position"}.get(kind, kind)
     put = {"relaxation": "position", "creep": "force"}.get(kind)
-    parts = [values[repeats == name] for name in repeats.unique()]
-    for part in parts:
-        falls = part["time"].diff() <= 0
+    tables = [values[repeats == name] for name in repeats.unique()]
+    for table in tables:
+        falls = table["time"].diff() <= 0
         refuse(falls, source, lambda row: "time does not increase from the row before; sort the rows of each repeat.")
     if put is None:
         refuse(values["time"] <= 0, source, lambda row: "time is not above 0; moduli are counted from the step.")
         refuse(values[output] <= 0, source, lambda row: f"{output} is not above 0.")
-    first = [0.0 if put is None else part["time"].iloc[0] for part in parts]
-    times = [part["time"].to_numpy() - zero for part, zero in zip(parts, first, strict=True)]
-    times, parts = _shortened(times, parts, longest)
+    first = [0.0 if put is None else table["time"].iloc[0] for table in tables]
+    times = [table["time"].to_numpy() - zero for table, zero in zip(tables, first, strict=True)]
+    times, tables = _shortened(times, tables, longest)
     time, resampled = _common(times)
     if resampled:
         notes.append(
             f"The repeats of the {kind} test have different times; they were interpolated to those of the first."
         )
     columns = [output] + ([put] if put else [])
-    stacked = {c: np.stack([np.interp(time, t, p[c]) for t, p in zip(times, parts, strict=True)]) for c in columns}
+    stacked = {c: np.stack([np.interp(time, t, p[c]) for t, p in zip(times, tables, strict=True)]) for c in columns}
     try:
-        return Test(kind, time, stacked[output], stacked.get(put) if put else None, "rest" if put is None else begin)
+        return Test(kind, time, stacked[output], stacked.get(put) if put else None, "rest" if put is None else start)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
 
 
-def _shortened(times, parts, longest):
+def _shortened(times: list, tables: list, longest: float | None) -> tuple[list, list]:
+    """Times (s) of each repeat and its rows, up to `longest` s."""
     if longest is None:
-        return times, parts
+        return times, tables
     kept = [t <= longest for t in times]
-    return [t[k] for t, k in zip(times, kept, strict=True)], [p[k] for p, k in zip(parts, kept, strict=True)]
+    return [t[k] for t, k in zip(times, kept, strict=True)], [p[k] for p, k in zip(tables, kept, strict=True)]
 
 
-def _common(times):
+def _common(times: list[Float[np.ndarray, " _"]]) -> tuple[Float[np.ndarray, " m"], bool]:
     """Times that all repeats have, and whether interpolation is needed."""
     first = times[0]
     if all(t.size == first.size and np.allclose(t, first, rtol=0, atol=1e-9 * first[-1]) for t in times):
         return first, False
-    begin, end = max(t[0] for t in times), min(t[-1] for t in times)
-    return first[(first >= begin) & (first <= end)], True
+    earliest, latest = max(t[0] for t in times), min(t[-1] for t in times)
+    return first[(first >= earliest) & (first <= latest)], True

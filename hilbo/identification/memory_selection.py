@@ -35,8 +35,8 @@ def select_memory(tests: Sequence[Test], T: float = 1e-3, choices: Sequence[int 
         raise InputError("There is no number of taps to choose from.")
     rows = []
     for N in choices:
-        found = fit(tests, Sampled(T=T, memory="full") if N is None else Sampled(N, T))
-        rows.append(Row(N, found, nrmse(found)))
+        best_fit = fit(tests, Sampled(T=T, memory="full") if N is None else Sampled(N, T))
+        rows.append(Row(N, best_fit, nrmse(best_fit)))
     return tuple(rows)
 
 

@@ -129,19 +129,21 @@ class FractionalMaxwell(eqx.Module):
         return {"G": jnp.exp(q[0] + beta * q[1]), "V": jnp.exp(q[0] + alpha * q[1]), "alpha": alpha, "beta": beta}
 
 
-def _prepare(test, weights):
+def _prepare(test: Test, weights: Weights) -> Curve:
+    """The curve of a test of moduli, its residuals over its range or over each value."""
     mean = test.output.mean(axis=0)
     scale = mean if weights == "relative" else np.full(mean.size, np.ptp(mean))
     zero = jnp.zeros(test.repeats, scale.dtype)
     return Curve(test.kind, jnp.asarray(test.time), jnp.asarray(test.output), zero, jnp.asarray(scale))
 
 
-def _largest(test):
+def _largest(test: Test) -> float:
     """Largest modulus, as the data have it."""
     mean = test.output.mean(axis=0)
     return float(mean.max() if test.kind == "modulus" else 1 / mean.min())
 
 
-def _smallest(test):
+def _smallest(test: Test) -> float:
+    """Smallest modulus, as the data have it."""
     mean = test.output.mean(axis=0)
     return float(mean.min() if test.kind == "modulus" else 1 / mean.max())

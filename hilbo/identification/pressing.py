@@ -47,13 +47,13 @@ def pressed(seen: Samples, kind: str, sensed: bool, noise: float) -> Pressed:
     return Pressed(position, np.where((position > 0) & ~off, force, 0.0), off)
 
 
-def _left(force, noise) -> np.ndarray:
+def _left(force: Float[np.ndarray, " n"], noise: float) -> Bool[np.ndarray, " n"]:
     """Samples without contact, in stays of `_STAY` or more, after the force was first felt."""
     smooth = np.convolve(force, np.ones(_STAY) / _STAY, "same")
     off = smooth < max(_SURE * noise / np.sqrt(_STAY), _LEAST)
     edges = np.flatnonzero(np.diff(off, prepend=True, append=False))  # begins and ends of what is felt and not felt
-    for begin, end in zip(edges[1::2], edges[2::2], strict=False):
-        off[begin:end] = end - begin >= _STAY
+    for first, end in zip(edges[1::2], edges[2::2], strict=False):
+        off[first:end] = end - first >= _STAY
     off[: edges[0]] = False
     return off
 
@@ -75,7 +75,7 @@ def table_of(tests: Mapping[str, Sequence[Pressed]], last: Mapping[str, float], 
     return pd.concat(parts, ignore_index=True)
 
 
-def _within(off):
+def _within(off: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     """All samples of each stay but its first and its last."""
     inner = off.copy()
     inner[1:] &= off[:-1]

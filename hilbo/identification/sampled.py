@@ -14,13 +14,13 @@ Units: N, mm, s; B1 N·s^α/mm.
 """
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import MEASURED, Curve, Test
@@ -73,9 +73,9 @@ class Sampled(eqx.Module):
         lower, upper = self.box(tests)
         scales = [jnp.asarray(np.ptp(test.output.mean(axis=0)) * _unit_of_force(test)) for test in tests]
         grid = jnp.asarray(np.stack(np.meshgrid(_LOG_KAPPA, _LOGIT_ALPHA, indexing="ij"), axis=-1))
-        costs, stiffness = (np.asarray(part) for part in _screen(self, curves, scales, grid))
-        found = [np.concatenate([stiffness[at], np.asarray(grid[at])]) for at in _separate(costs, 5)]
-        return np.clip(np.stack(found), lower, upper)
+        costs, stiffness = (np.asarray(values) for values in _screen(self, curves, scales, grid))
+        places = [np.concatenate([stiffness[index], np.asarray(grid[index])]) for index in _separate(costs, 5)]
+        return np.clip(np.stack(places), lower, upper)
 
     def prepare(self, test: Test) -> Curve:
         """Inputs on the grid of the model, transformed; positions between grid points by linear interpolation."""
@@ -111,10 +111,10 @@ class Sampled(eqx.Module):
         spectrum = weights.astype(curve.spectra.dtype) @ curve.spectra
         spectrum = spectrum / H if creep else spectrum * H
         growth = _circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
-        found = jnp.fft.irfft(spectrum, curve.length)[: curve.length // 2] * growth
+        response = jnp.fft.irfft(spectrum, curve.length)[: curve.length // 2] * growth
         rest = weights @ curve.offset
         rest = rest / q[1] if creep else rest * q[1]
-        return rest + found[curve.before] * (1 - curve.share) + found[curve.before + 1] * curve.share
+        return rest + response[curve.before] * (1 - curve.share) + response[curve.before + 1] * curve.share
 
     def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
         """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them."""
@@ -142,7 +142,7 @@ class Sampled(eqx.Module):
         ends = K0 + K1 / (1 + kappa), K0 + K1 * S / (kappa + S)
         return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha))])
 
-    def _transfer(self, q, length):
+    def _transfer(self, q: Float[Array, " 4"], length: int) -> Complex[Array, " {length//2+1}"]:
         """H on the circle, at the upper half of `length` points."""
         kappa, alpha = jnp.exp(q[2]), jax.nn.sigmoid(q[3])
         radius = _circle(length, q.dtype)
@@ -155,11 +155,11 @@ class Sampled(eqx.Module):
             taps = taps[: length // 2]  # those beyond the data act through S only
             C = jnp.fft.rfft(taps * radius ** -jnp.arange(taps.size, dtype=q.dtype), length)
         K_eff, size, S, kappa = (
-            part.astype(C.dtype) for part in (q[1], (q[0] - q[1]) * (1 + kappa) / (1 - S), S, kappa)
+            value.astype(C.dtype) for value in (q[1], (q[0] - q[1]) * (1 + kappa) / (1 - S), S, kappa)
         )
         return K_eff + size * (C - S) / (kappa + C)
 
-    def _taps(self, alpha):
+    def _taps(self, alpha: Float[Array, ""]) -> tuple[Float[Array, " taps"], Float[Array, ""]]:
         """c_0 … c_N, zero beyond, and S = C(1), by products of positive numbers."""
         if self.memory == "full":
             return jnp.ones(1, alpha.dtype), jnp.zeros_like(alpha)
@@ -169,32 +169,35 @@ class Sampled(eqx.Module):
         return jnp.concatenate([jnp.ones(1, alpha.dtype), -taps]), sums[-1]
 
 
-def _force_and_position(test):
+def _force_and_position(test: Test) -> tuple[Any, Any]:
+    """Both (R, m), whichever was applied."""
     return (test.output, test.input) if test.kind == "relaxation" else (test.input, test.output)
 
 
-def _position_driven(test):
+def _position_driven(test: Test) -> Test:
     """The test with force as its output."""
     force, position = _force_and_position(test)
     return Test("relaxation", test.time, force, position, test.start)
 
 
-def _unit_of_force(test):
+def _unit_of_force(test: Test) -> float:
     """What turns the scale of an output into one of force: the mean stiffness for positions."""
     return _mean_secant(test) if test.kind == "creep" else 1.0
 
 
 @eqx.filter_jit
-def _screen(model, curves, scales, grid):
+def _screen(
+    model: Sampled, curves: tuple[Curve, ...], scales: list[Float[Array, ""]], grid: Float[Array, "K A 2"]
+) -> tuple[Float[Array, "K A"], Float[Array, "K A 2"]]:
     """Cost and stiffnesses (K_inst, K_eff) of the best combination at each place of the grid."""
     weights = [jnp.full(c.output.shape[0], 1 / c.output.shape[0], c.scale.dtype) for c in curves]
     ends = jnp.eye(2, dtype=grid.dtype)
 
-    def place(at):
+    def best_at(kappa_alpha):
         normal, right, total = jnp.zeros((2, 2), grid.dtype), jnp.zeros(2, grid.dtype), jnp.zeros((), grid.dtype)
         for curve, scale, w in zip(curves, scales, weights, strict=True):
-            parts = [model.predict(jnp.concatenate([end, at]), curve, w) for end in ends]
-            basis = jnp.stack(parts) / (scale * np.sqrt(curve.time.size))
+            responses = [model.predict(jnp.concatenate([end, kappa_alpha]), curve, w) for end in ends]
+            basis = jnp.stack(responses) / (scale * np.sqrt(curve.time.size))
             goal = w @ curve.output / (scale * np.sqrt(curve.time.size))
             normal, right, total = normal + basis @ basis.T, right + basis @ goal, total + goal @ goal
         a, b, c = normal[0, 0], normal[0, 1], normal[1, 1]
@@ -202,12 +205,12 @@ def _screen(model, curves, scales, grid):
         stiffness = jnp.stack([(right[0] - b * K_eff) / a, K_eff])
         return total - 2 * right @ stiffness + stiffness @ normal @ stiffness, stiffness
 
-    costs, stiffness = jax.lax.map(place, grid.reshape(-1, 2))
+    costs, stiffness = jax.lax.map(best_at, grid.reshape(-1, 2))
     return costs.reshape(grid.shape[:-1]), stiffness.reshape(grid.shape)
 
 
-def _separate(costs, count):
-    """Places of the lowest costs, none beside another."""
+def _separate(costs: Float[np.ndarray, "K A"], count: int) -> list[tuple]:
+    """Indices of the lowest costs, none beside another."""
     left, places = np.where(np.isfinite(costs), costs, np.inf), []
     while len(places) < count and np.isfinite(left).any():
         i, j = np.unravel_index(np.argmin(left), left.shape)
@@ -216,24 +219,25 @@ def _separate(costs, count):
     return places
 
 
-def _secant(test):
-    """Largest force over largest position."""
+def _secant(test: Test) -> float:
+    """Largest force over largest position, N/mm."""
     force, position = _force_and_position(test)
     return float(np.max(np.abs(force)) / np.max(np.abs(position)))
 
 
-def _mean_secant(test):
+def _mean_secant(test: Test) -> float:
+    """Mean force over mean position, N/mm."""
     force, position = _force_and_position(test)
     return float(np.mean(np.abs(force)) / np.mean(np.abs(position)))
 
 
-def _transform_length(count):
+def _transform_length(count: int) -> int:
     """A length that transforms fast, at least three times as long as the data."""
     from scipy.fft import next_fast_len
 
     return 2 * next_fast_len((3 * count + 1) // 2)
 
 
-def _circle(length, dtype):
+def _circle(length: int, dtype: Any) -> float:
     """Radius of the circle on which `length` points damp what wraps around to eps^0.8."""
     return float(np.finfo(dtype).eps ** (-0.8 / length))
