@@ -28,7 +28,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.hyperparameters.laplace_evidence import Conditioned, Evidence, certified, conditioned
-from hilbo.inference.ep_search import Cavities, Joint, Tilted, coupling, find, residual_of, sites_of, solve
+from hilbo.inference.ep_search import Cavities, find, residual_of
+from hilbo.inference.ep_sites import Joint, Tilted, coupling, sites_of, solve
 
 __all__ = ["ep_evidence"]
 

@@ -32,10 +32,11 @@ exponential families". The elimination of the mean is derived in docs/design.md,
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from hilbo.gaussian import GaussianPosterior, certify, factor, inverse_and_log_determinant, square_root, still
-from hilbo.inference.ep_search import Joint, Tilted, coupling, find, joint_of, sites_of
+from hilbo.inference.ep_search import Found, find
+from hilbo.inference.ep_sites import Joint, Sites, Tilted, coupling, joint_of, sites_of
 from hilbo.numerics.linalg import one_at_a_time
 
 __all__ = ["ep", "fixed_point", "gaussian", "inverse_of", "settled"]
@@ -65,7 +66,13 @@ def ep(
     return gaussian(terms, covariance, *fixed_point(terms, covariance, start, max_steps))
 
 
-def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
+def gaussian(
+    terms: Tilted,
+    covariance: Float[Array, "n n"],
+    mean: Float[Array, " n"],
+    variance: Float[Array, " n"],
+    found: Found,
+) -> GaussianPosterior:
     """The posterior that belongs to the cavities `fixed_point` ended at."""
     _, slope, precision = terms(mean, variance)
     inverse, _ = inverse_and_log_determinant(covariance, precision)
@@ -94,25 +101,34 @@ def gaussian(terms, covariance, mean, variance, found) -> GaussianPosterior:
 
 
 @eqx.filter_custom_jvp
-def fixed_point(terms, covariance, start, max_steps):
+def fixed_point(
+    terms: Tilted, covariance: Float[Array, "n n"], start: Float[Array, " n"] | None, max_steps: int
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
     """Cavity means and variances, and how they were found."""
     return find(terms, covariance, start, max_steps)
 
 
 @jax.custom_jvp
-def _joint(covariance, precision, root):
+def _joint(
+    covariance: Float[Array, "n n"], precision: Float[Array, " n"], root: Float[Array, "n n"]
+) -> Float[Array, "n n"]:
     """S from the root R of K, without the difference K - K C K; its derivative needs none of R's."""
     return joint_of(covariance, root, precision).covariance
 
 
 @_joint.defjvp
-def _joint_jvp(primals, tangents):
+def _joint_jvp(
+    primals: tuple[Array, ...], tangents: tuple[Array, ...]
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
+    """dS = (I - S T) dK (I - S T)' - S dT S."""
     joint = _joint(*primals)
     transfer = jnp.eye(joint.shape[0], dtype=joint.dtype) - joint * primals[1][None, :]
     return joint, transfer @ tangents[0] @ transfer.T - (joint * tangents[1][None, :]) @ joint
 
 
-def settled(covariance, sites, variance):
+def settled(
+    covariance: Float[Array, "n n"], sites: Sites, variance: Float[Array, " n"]
+) -> tuple[Joint, Float[Array, "n n"]]:
     """At the fixed point, written so that it can be differentiated: S and its kin, and I - S T."""
     root, _ = square_root(jax.lax.stop_gradient(covariance))
     joint = _joint(covariance, sites.precision, root)
@@ -127,13 +143,15 @@ def inverse_of(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 @inverse_of.defjvp
-def _inverse_of_jvp(primals, tangents):
+def _inverse_of_jvp(
+    primals: tuple[Array, ...], tangents: tuple[Array, ...]
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]]:
     inverse = inverse_of(*primals)
     return inverse, -inverse @ tangents[0] @ inverse
 
 
 @fixed_point.def_jvp
-def _fixed_point_jvp(primals, tangents):
+def _fixed_point_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
     """Both conditions differentiated: with P = I - K C = I - S T,
 
     dm = W dv + (1 + v t) [P (dK a - v da) + S da],    J dv = diag(P dK P') / left^2 - Q (dt/dm (dm - W dv) + dt),
@@ -141,7 +159,7 @@ def _fixed_point_jvp(primals, tangents):
     where da and dt are the changes of slopes and precisions at fixed cavities.
     """
     terms, covariance, _, _ = primals
-    mean, variance, found = fixed_point(*primals)
+    mean, variance, search = fixed_point(*primals)
     sites = sites_of(terms, mean, variance)
     posterior, transfer = settled(covariance, sites, variance)
     joint, ratio = posterior.covariance, 1.0 / posterior.left
@@ -152,19 +170,23 @@ def _fixed_point_jvp(primals, tangents):
         moved = transfer @ (covariance @ sites.slope - variance * slope) + joint @ slope
         return moved, precision, jnp.sum((transfer @ covariance) * transfer, axis=1)
 
-    at, tangent = eqx.filter_jvp(changes, (terms, covariance), tangents[:2])
+    values, tangent = eqx.filter_jvp(changes, (terms, covariance), tangents[:2])
     # What does not depend on the side that moves has no tangent at all.
-    moved, d_precision, widened = (jnp.zeros_like(a) if t is None else t for a, t in zip(at, tangent, strict=True))
+    moved, d_precision, widened = (
+        jnp.zeros_like(value) if change is None else change for value, change in zip(values, tangent, strict=True)
+    )
     free = ratio * moved
     dv = inverse_of(matrix) @ (widened * ratio**2 - spread @ (sites.precision_m * free + d_precision))
-    return (mean, variance, found), (free + follow @ dv, dv, jax.tree.map(lambda _: None, found))
+    return (mean, variance, search), (free + follow @ dv, dv, jax.tree.map(lambda _: None, search))
 
 
 # --- the evidence
 
 
 @eqx.filter_custom_jvp
-def _log_evidence(terms, covariance, mean, variance):
+def _log_evidence(
+    terms: Tilted, covariance: Float[Array, "n n"], mean: Float[Array, " n"], variance: Float[Array, " n"]
+) -> Float[Array, ""]:
     values, slope, precision = terms(mean, variance)
     _, log_determinant = inverse_and_log_determinant(covariance, precision)
     joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
@@ -172,7 +194,9 @@ def _log_evidence(terms, covariance, mean, variance):
 
 
 @_log_evidence.def_jvp
-def _log_evidence_jvp(primals, tangents):
+def _log_evidence_jvp(
+    primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]
+) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
     """At the fixed point the evidence is stationary in the cavities: their tangents have no part."""
     terms, covariance, mean, variance = primals
     _, slope, precision = terms(mean, variance)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 
 from hilbo.gaussian import GaussianPosterior
 from hilbo.inference.ep import fixed_point, gaussian, inverse_of, settled
-from hilbo.inference.ep_search import Tilted, coupling, sites_of
+from hilbo.inference.ep_sites import Tilted, coupling, sites_of
 from hilbo.numerics.linalg import cholesky
 
 __all__ = ["ep_corrected"]
@@ -45,42 +45,46 @@ def ep_corrected(
 
     Arguments, certificate and derivatives are as there. Not converged, too, where the corrected covariance is none.
     """
-    mean, variance, found = fixed_point(terms, covariance, start, max_steps)
-    plain = gaussian(terms, covariance, mean, variance, found)
+    mean, variance, search = fixed_point(terms, covariance, start, max_steps)
+    uncorrected = gaussian(terms, covariance, mean, variance, search)
     sites = sites_of(terms, mean, variance)
     posterior, transfer = settled(covariance, sites, variance)
     follow, spread, matrix = coupling(sites, posterior, variance)
     response = inverse_of(matrix)
-    skew, moved = _skewness(terms, mean, variance)
-    joint = _Joint(skew, moved, posterior.covariance, sites.precision_m, sites.precision_v)
+    skew, skew_slopes = _skewness(terms, mean, variance)
+    cumulants = _Cumulants(skew, skew_slopes, posterior.covariance, sites.precision_m, sites.precision_v)
 
-    r_mean, r_variance = _slopes(joint)
+    r_mean, r_variance = _correction_slopes(cumulants)
     through = spread.T @ (response.T @ (follow.T @ r_mean + r_variance))
-    weights = plain.weights + transfer.T @ (r_mean / posterior.left - skew * through)
+    weights = uncorrected.weights + transfer.T @ (r_mean / posterior.left - skew * through)
     widened = -0.5 * posterior.left[:, None] ** 2 * (response @ spread)
     scaled = skew[:, None] * transfer
-    inverse = plain.inverse + scaled.T @ widened @ scaled
-    root = _root(jax.lax.stop_gradient((plain.factor, sites.precision, skew, widened)))
-    log_evidence = plain.log_evidence + _correction(joint)
-    held = jnp.all(jnp.isfinite(root)) & jnp.isfinite(log_evidence)
-    certificate = eqx.tree_at(lambda c: c.converged, plain.certificate, plain.certificate.converged & held)
+    inverse = uncorrected.inverse + scaled.T @ widened @ scaled
+    root = _corrected_factor(*jax.lax.stop_gradient((uncorrected.factor, sites.precision, skew, widened)))
+    log_evidence = uncorrected.log_evidence + _correction(cumulants)
+    finite = jnp.all(jnp.isfinite(root)) & jnp.isfinite(log_evidence)
+    certificate = eqx.tree_at(
+        lambda c: c.converged, uncorrected.certificate, uncorrected.certificate.converged & finite
+    )
     return GaussianPosterior(covariance @ weights, weights, root, inverse, log_evidence, certificate)
 
 
-class _Joint(eqx.Module):
+class _Cumulants(eqx.Module):
     """What the correction depends on: e and its slopes (in mean and variance), S, and the slopes of t."""
 
     skew: Float[Array, " n"]
-    moved: tuple[Float[Array, " n"], Float[Array, " n"]]
+    skew_slopes: tuple[Float[Array, " n"], Float[Array, " n"]]
     covariance: Float[Array, "n n"]
     precision_m: Float[Array, " n"]
     precision_v: Float[Array, " n"]
 
 
-def _skewness(terms, mean, variance):
+def _skewness(
+    terms: Tilted, mean: Float[Array, " n"], variance: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], tuple[Float[Array, " n"], Float[Array, " n"]]]:
     """e, and its slopes in cavity mean and variance."""
 
-    def skew(mean, variance):
+    def skew(mean: Float[Array, " n"], variance: Float[Array, " n"]) -> Float[Array, " n"]:
         (_, _, precision), (_, _, slope) = jax.jvp(lambda m: terms(m, variance), (mean,), (jnp.ones_like(mean),))
         return slope * (1.0 + variance * precision)
 
@@ -89,27 +93,30 @@ def _skewness(terms, mean, variance):
     return value, (push(ones, zeros), push(zeros, ones))
 
 
-def _others(covariance):
+def _between_answers(covariance: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The covariances of different answers: 0 on the diagonal."""
     return covariance - jnp.diag(jnp.diagonal(covariance))
 
 
-def _correction(joint):
-    return joint.skew @ (_others(joint.covariance) ** 3 @ joint.skew) / 12.0
+def _correction(cumulants: _Cumulants) -> Float[Array, ""]:
+    """R, what the log evidence lacks."""
+    return cumulants.skew @ (_between_answers(cumulants.covariance) ** 3 @ cumulants.skew) / 12.0
 
 
-def _slopes(joint):
+def _correction_slopes(cumulants: _Cumulants) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """dR/dm and dR/dv, the part that goes through S included: dS = -S dT S."""
-    covariance = _others(joint.covariance)
-    by_skew = covariance**3 @ joint.skew / 6.0
-    pairs = joint.skew[:, None] * covariance**2 * joint.skew[None, :]
-    by_precision = -0.25 * jnp.sum((joint.covariance @ pairs) * joint.covariance, axis=1)
-    in_mean = by_skew * joint.moved[0] + by_precision * joint.precision_m
-    return in_mean, by_skew * joint.moved[1] + by_precision * joint.precision_v
+    covariance = _between_answers(cumulants.covariance)
+    by_skew = covariance**3 @ cumulants.skew / 6.0
+    pairs = cumulants.skew[:, None] * covariance**2 * cumulants.skew[None, :]
+    by_precision = -0.25 * jnp.sum((cumulants.covariance @ pairs) * cumulants.covariance, axis=1)
+    in_mean = by_skew * cumulants.skew_slopes[0] + by_precision * cumulants.precision_m
+    return in_mean, by_skew * cumulants.skew_slopes[1] + by_precision * cumulants.precision_v
 
 
-def _root(parts):
+def _corrected_factor(
+    factor: Float[Array, "n n"], precision: Float[Array, " n"], skew: Float[Array, " n"], widened: Float[Array, "n n"]
+) -> Float[Array, "n n"]:
     """V with V'V = the corrected C: a factor of I + A X A' (near I) times EP's own, so that no digit is lost."""
-    factor, precision, skew, widened = parts
     informed = precision > 0
     ratio = jnp.where(informed, skew / jnp.where(informed, precision, 1.0), 0.0)
     around = factor * ratio[None, :]

@@ -11,16 +11,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from hilbo.gaussian import factorise, square_root
+from hilbo.gaussian import square_root
+from hilbo.inference.ep_sites import Joint, Sites, Tilted, coupling, joint_of, sites_of, solve
 from hilbo.laplace import plain_mode
-from hilbo.numerics.linalg import cholesky, one_at_a_time, solve_lower
+from hilbo.numerics.linalg import one_at_a_time
 
-__all__ = ["Cavities", "Found", "Joint", "Tilted", "coupling", "find", "joint_of", "residual_of", "sites_of", "solve"]
-
-Tilted = Callable[
-    [Float[Array, " n"], Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]
+__all__ = [
+    "Cavities",
+    "Found",
+    "Joint",
+    "Sites",
+    "Tilted",
+    "coupling",
+    "find",
+    "joint_of",
+    "residual_of",
+    "sites_of",
+    "solve",
 ]
-"""Cavity means and variances -> L_i, its slopes in the mean, and the sites' precisions t_i >= 0, elementwise."""
 
 _QUICK_STEPS = 20
 _BASIN = 3.0  # a mismatch, in posterior sds, below which Newton's step is tried
@@ -48,7 +56,7 @@ class Found(NamedTuple):
     changed: Float[Array, ""]
 
 
-class _Search(eqx.Module):
+class _State(eqx.Module):
     mean: Float[Array, " n"]  # of the cavities, as is the variance
     variance: Float[Array, " n"]
     residual: Float[Array, ""]
@@ -60,7 +68,13 @@ class _Search(eqx.Module):
     steps: Int[Array, ""]
 
 
-def find(terms, covariance, start, max_steps, hasty=False):
+def find(
+    terms: Tilted,
+    covariance: Float[Array, "n n"],
+    start: Float[Array, " n"] | Cavities | None,
+    max_steps: int,
+    hasty: bool | Bool[Array, ""] = False,
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
     """Cavity means and variances, and how they were found. `start`: weights, or cavities, or nothing.
 
     A `hasty` search spares the sweep that would only see that the last step of Newton's was the last.
@@ -69,92 +83,109 @@ def find(terms, covariance, start, max_steps, hasty=False):
     """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
-    def with_root(terms, covariance, begin):
+    def with_root(terms, covariance, initial):
         root, changed = square_root(covariance)
-        return _searched(terms, covariance, root, begin(root), max_steps, changed, jnp.asarray(False))
+        return _search(terms, covariance, root, initial(root), max_steps, changed, jnp.asarray(False))
 
     def safe(arrays, covariance, start, hasty):
         del hasty
         terms = eqx.combine(arrays, rest)
-        return with_root(terms, covariance, lambda root: _begin(terms, covariance, root, start))
+        return with_root(terms, covariance, lambda root: _initial(terms, covariance, root, start))
 
     def quick(arrays, covariance, start, hasty):
         terms = eqx.combine(arrays, rest)
         none = jnp.zeros_like(covariance[0, 0])
-        begun, spent = _first(terms, covariance, start)
-        mean, variance, end = _searched(terms, covariance, None, begun, min(max_steps, _QUICK_STEPS), none, hasty)
-        found = mean, variance, end._replace(iterations=end.iterations + spent)
+        initial, spent = _initial_without_root(terms, covariance, start)
+        mean, variance, end = _search(terms, covariance, None, initial, min(max_steps, _QUICK_STEPS), none, hasty)
+        fixed_point = mean, variance, end._replace(iterations=end.iterations + spent)
         met = (end.residual <= end.tolerance) | (hasty & jnp.isinf(end.residual))
         _, _, precision = terms(mean, variance)
         # s = K - KCK errs by eps K, and the cavity's variance by this share:
         blur = jnp.finfo(none.dtype).eps * jnp.max(jnp.diagonal(covariance) * precision * (1.0 + precision * variance))
 
-        def anew(root):
-            prior = _begin(terms, covariance, root, None)
+        def restart(root):
+            prior = _initial(terms, covariance, root, None)
             return jax.tree.map(lambda a, b: jnp.where(met, a, b), (mean, variance), prior)
 
-        def further():
-            mean, variance, last = with_root(terms, covariance, anew)
-            return mean, variance, last._replace(iterations=last.iterations + jnp.where(met, found[2].iterations, 0))
+        def continued():
+            mean, variance, last = with_root(terms, covariance, restart)
+            spent_before = jnp.where(met, fixed_point[2].iterations, 0)
+            return mean, variance, last._replace(iterations=last.iterations + spent_before)
 
-        return jax.lax.cond(met & (blur <= 0.1 * end.tolerance), lambda: found, further)
+        return jax.lax.cond(met & (blur <= 0.1 * end.tolerance), lambda: fixed_point, continued)
 
     return one_at_a_time(quick, safe)(arrays, covariance, start, jnp.asarray(hasty))
 
 
-class _AtPoints(eqx.Module):
+class _PointTerms(eqx.Module):
     """The terms at single values, which are cavities of no width: Laplace's terms."""
 
     terms: Tilted
 
-    def __call__(self, eta):
+    def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
         return self.terms(eta, jnp.zeros_like(eta))
 
 
-def _searched(terms, covariance, root, begun, max_steps, changed, hasty):
+def _search(
+    terms: Tilted,
+    covariance: Float[Array, "n n"],
+    root: Float[Array, "n n"] | None,
+    initial: tuple[Float[Array, " n"], Float[Array, " n"]],
+    max_steps: int,
+    changed: Float[Array, ""],
+    hasty: Bool[Array, ""],
+) -> tuple[Float[Array, " n"], Float[Array, " n"], Found]:
+    """From `initial` means and variances to the fixed point; `changed` goes into the record of the search."""
     largest = jnp.asarray(jnp.inf, covariance.dtype)
     count = jnp.zeros((), jnp.int32)
     basin = jnp.full_like(largest, _BASIN)
-    mean, variance = begun
-    begin = _Search(mean, variance, largest, jnp.zeros_like(largest), largest, largest, basin, count, count)
+    mean, variance = initial
+    begin = _State(mean, variance, largest, jnp.zeros_like(largest), largest, largest, basin, count, count)
 
-    def unseen(search):
+    def unmeasured(search):
         return hasty & (search.ahead <= 0.1 * search.tolerance)
 
     def unfinished(search):
         # One step at least: Laplace's mode may be the fixed point, but only to the digits of its own variances.
         done = (search.residual <= search.tolerance) & ((search.steps > 1) | (search.residual == 0.0))
-        return (search.steps < max_steps) & ~done & ~unseen(search) & ~jnp.isnan(search.mismatch)
+        return (search.steps < max_steps) & ~done & ~unmeasured(search) & ~jnp.isnan(search.mismatch)
 
     end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
-    residual = jnp.where(unseen(end) & (end.residual > end.tolerance), jnp.inf, end.residual)
+    residual = jnp.where(unmeasured(end) & (end.residual > end.tolerance), jnp.inf, end.residual)
     return end.mean, end.variance, Found(residual, end.tolerance, end.steps, changed)
 
 
-def _first(terms, covariance, start):
+def _initial_without_root(
+    terms: Tilted, covariance: Float[Array, "n n"], start: Float[Array, " n"] | Cavities | None
+) -> tuple[tuple[Float[Array, " n"], Float[Array, " n"]], Int[Array, ""]]:
     """Where the search without a root begins, at Laplace's mode if nothing is known, and the steps that took."""
 
     def from_mode():
-        mode = plain_mode(_AtPoints(terms), covariance, jnp.zeros_like(covariance[0]), _QUICK_STEPS)
-        begun = _begin(terms, covariance, None, _AtPoints(terms)(mode.eta)[1])
-        return begun, mode.steps.astype(jnp.int32) - 1
+        mode = plain_mode(_PointTerms(terms), covariance, jnp.zeros_like(covariance[0]), _QUICK_STEPS)
+        initial = _initial(terms, covariance, None, _PointTerms(terms)(mode.eta)[1])
+        return initial, mode.steps.astype(jnp.int32) - 1
 
     nothing = jnp.zeros((), jnp.int32)
     if start is None:
         return from_mode()
     if isinstance(start, Cavities):
         return jax.lax.cond(start.known, lambda: (tuple(start), nothing), from_mode)
-    return _begin(terms, covariance, None, start), nothing
+    return _initial(terms, covariance, None, start), nothing
 
 
-def _begin(terms, covariance, root, start):
+def _initial(
+    terms: Tilted,
+    covariance: Float[Array, "n n"],
+    root: Float[Array, "n n"] | None,
+    start: Float[Array, " n"] | Cavities | None,
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """The prior's cavities; or those around the mean K start, with the sites' precisions at that mean."""
     prior = jnp.diagonal(covariance)
     if start is None:
         return jnp.zeros_like(prior), prior
     if isinstance(start, Cavities):
-        known = start.known
-        return jnp.where(known, start.mean, 0.0), jnp.where(known, start.variance, prior)
+        usable = start.known
+        return jnp.where(usable, start.mean, 0.0), jnp.where(usable, start.variance, prior)
     mean = covariance @ start
     _, _, precision = terms(mean, jnp.zeros_like(mean))
     posterior = joint_of(covariance, root, precision)
@@ -162,67 +193,31 @@ def _begin(terms, covariance, root, start):
     return mean - variance * start, variance
 
 
-class _Sites(eqx.Module):
-    """Slopes and precisions of the sites, and how they change with the cavities (elementwise)."""
-
-    slope: Float[Array, " n"]
-    precision: Float[Array, " n"]
-    slope_v: Float[Array, " n"]
-    precision_m: Float[Array, " n"]
-    precision_v: Float[Array, " n"]
-
-
-def sites_of(terms, mean, variance):
-    (_, slope, precision), push = jax.linearize(terms, mean, variance)
-    ones, zeros = jnp.ones_like(mean), jnp.zeros_like(mean)  # the terms are independent: one tangent serves them all
-    _, _, precision_m = push(ones, zeros)
-    _, slope_v, precision_v = push(zeros, ones)
-    return _Sites(slope, precision, slope_v, precision_m, precision_v)
-
-
-class Joint(eqx.Module):
-    covariance: Float[Array, "n n"]  # S = (K^-1 + T)^-1
-    variance: Float[Array, " n"]
-    left: Float[Array, " n"]  # 1 - t s: the share of the variance that is left when the site joins its cavity
-
-
-def joint_of(covariance, root, precision):
-    """S = G'G with L G = R', LL' = I + R'TR: a sum of squares, no inverse of K or T; without R, S = K - K C K."""
-    if root is None:
-        scale, _, lower = factorise(covariance, precision)
-        through = solve_lower(lower, scale[:, None] * covariance)
-        joint = covariance - through.T @ through
-        variance = jnp.diagonal(covariance) - jnp.sum(through**2, axis=0)
-        return Joint(joint, variance, 1.0 - precision * variance)
-    matrix = jnp.eye(root.shape[0], dtype=root.dtype) + (root.T * precision[None, :]) @ root
-    half = solve_lower(cholesky(matrix), root.T)
-    variance = jnp.sum(half**2, axis=0)
-    return Joint(half.T @ half, variance, 1.0 - precision * variance)
-
-
-def _advance(terms, covariance, root, search):
+def _advance(
+    terms: Tilted, covariance: Float[Array, "n n"], root: Float[Array, "n n"] | None, search: _State
+) -> _State:
     """Evaluate the mismatch of the cavities and move them, by Newton's step or a damped update."""
     m, v = search.mean, search.variance
     sites = sites_of(terms, m, v)
     posterior = joint_of(covariance, root, sites.precision)
     tilted = m + v * sites.slope
     natural = sites.slope + sites.precision * tilted
-    matched = posterior.covariance @ natural
+    means = _Means(tilted, natural, posterior.covariance @ natural)
     cavity = posterior.variance / posterior.left
-    residual, tolerance, mismatch = _mismatch(covariance, root, search, sites, posterior, (tilted, natural, matched))
+    residual, tolerance, mismatch = _mismatch(covariance, root, search, sites, posterior, means)
 
     failed = mismatch > 0.5 * search.mismatch
     basin = jnp.where(failed, jnp.minimum(0.3 * search.basin, 0.9 * mismatch), search.basin)
     newton = mismatch < basin
     share = 0.5 / (1 + search.updates // 8).astype(v.dtype)
-    target = matched - cavity * (natural - sites.precision * matched)
+    target = means.matched - cavity * (natural - sites.precision * means.matched)
     dm, dv = jax.lax.cond(
         newton & ~((residual <= tolerance) & (search.steps > 0)),  # the end needs no further step
-        lambda: _newton_step(sites, posterior, v, matched - tilted, cavity - v),
+        lambda: _newton_step(sites, posterior, v, means.matched - tilted, cavity - v),
         lambda: (jnp.zeros_like(m), jnp.zeros_like(v)),
     )
     growth = jnp.clip(dv / v, -1.0, 1.0)
-    return _Search(
+    return _State(
         mean=jnp.where(newton, m + dm, m + share * (target - m)),
         variance=jnp.where(newton, v * jnp.exp(growth), v * (cavity / v) ** share),
         residual=residual,
@@ -236,7 +231,22 @@ def _advance(terms, covariance, root, search):
     )
 
 
-def _mismatch(covariance, root, search, sites, posterior, means):
+class _Means(NamedTuple):
+    """Means of the tilted distributions, a + t of these, and the means that the joint posterior has instead."""
+
+    tilted: Float[Array, " n"]
+    natural: Float[Array, " n"]
+    matched: Float[Array, " n"]
+
+
+def _mismatch(
+    covariance: Float[Array, "n n"],
+    root: Float[Array, "n n"] | None,
+    search: _State,
+    sites: Sites,
+    posterior: Joint,
+    means: _Means,
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Residual and tolerance of the worse of mean and variance, and the mismatch in posterior sds that steers."""
     tilted, natural, matched = means
     epsilon = jnp.finfo(tilted.dtype).eps
@@ -255,7 +265,13 @@ def _mismatch(covariance, root, search, sites, posterior, means):
     return residuals[worse], tolerances[worse], mismatch
 
 
-def residual_of(covariance, cavities, weights, precision, posterior):
+def residual_of(
+    covariance: Float[Array, "n n"],
+    cavities: Cavities,
+    weights: Float[Array, " n"],
+    precision: Float[Array, " n"],
+    posterior: tuple[Float[Array, " n"], Callable[[Float[Array, " n"]], Float[Array, " n"]]],
+) -> Float[Array, ""]:
     """What the search would see at these cavities; `posterior`: its variances, and what multiplies by C.
 
     With P = I - K C the means differ by P (K a - m - v a), and the cavities' variances should be s / (1 - t s).
@@ -268,10 +284,13 @@ def residual_of(covariance, cavities, weights, precision, posterior):
     return jnp.max(jnp.where(precision > 0, jnp.maximum(apart, stretched), 0.0))
 
 
-# --- how cavities move together
-
-
-def _newton_step(sites, posterior, variance, apart, wider):
+def _newton_step(
+    sites: Sites,
+    posterior: Joint,
+    variance: Float[Array, " n"],
+    apart: Float[Array, " n"],
+    wider: Float[Array, " n"],
+) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """Changes of m and v that close the gaps `apart` of the means and `wider` of the cavity variances, to first order.
 
     dm = W dv + (1 + v t) apart,      J dv = wider - Q (dt/dm (1 + v t) apart).
@@ -280,23 +299,3 @@ def _newton_step(sites, posterior, variance, apart, wider):
     free = (1.0 + variance * sites.precision) * apart
     dv = solve(matrix, wider - spread @ (sites.precision_m * free))
     return free + follow @ dv, dv
-
-
-def coupling(sites, posterior, variance):
-    """W: how the means follow the cavity variances; Q: how these follow the precisions; J = I + Q (dt/dv + dt/dm W).
-
-    The means' equation has the inverse diag(1 + v t) (I - S T); dv_i = -(s_i / left_i s_i)^2 sum_{j != i} S_ij^2 dt_j.
-    """
-    eye = jnp.eye(variance.shape[0], dtype=variance.dtype)
-    moved = posterior.covariance * sites.slope_v[None, :]
-    held = (eye - posterior.covariance * sites.precision[None, :]) * (variance * sites.slope_v + sites.slope)[None, :]
-    follow = (1.0 + variance * sites.precision)[:, None] * (moved - held)
-    spread = posterior.covariance**2 * (1.0 - eye) / (posterior.left**2)[:, None]
-    matrix = eye + spread * sites.precision_v[None, :] + spread @ (sites.precision_m[:, None] * follow)
-    return follow, spread, matrix
-
-
-@one_at_a_time
-def solve(matrix: Float[Array, "n n"], right: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """X with `matrix` X = `right`, by elimination."""
-    return jnp.linalg.solve(matrix, right)

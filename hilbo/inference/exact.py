@@ -21,11 +21,12 @@ for the order of the variables.
 """
 
 from collections.abc import Callable
+from typing import NoReturn
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from hilbo.errors import InputError
 from hilbo.inference.tilting import Box, Tilt, accepted, ordered_box, propose, tilting
@@ -97,9 +98,9 @@ class ExactPosterior(eqx.Module):
         """Standard errors of the posterior means and variances at m points."""
 
         def one(along):
-            at = jnp.tensordot(along, self.samples, 1)
-            mean, error = _weighted(self.shares, at)
-            return error, _weighted(self.shares, (at - mean) ** 2)[1]
+            values = jnp.tensordot(along, self.samples, 1)
+            mean, error = _weighted(self.shares, values)
+            return error, _weighted(self.shares, (values - mean) ** 2)[1]
 
         return jax.lax.map(one, (self.box.half @ cross).T)
 
@@ -162,21 +163,32 @@ def exact(
 
 
 @exact.def_jvp
-def _exact_jvp(primals, tangents):
+def _exact_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> NoReturn:
     raise InputError('inference "exact" is sampled and has no derivatives; use "ep" where they are needed.')
 
 
-def _narrowed(x, shares, mean, answered):
+def _narrowed(
+    x: Float[Array, "n R B"], shares: Float[Array, "R B"], mean: Float[Array, " n"], answered: Bool[Array, " n"]
+) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
     """A root of I - Cov[x], and the largest eigenvalue of Cov[x] - I: the box is convex, so that all beyond 0 is
     sampling error."""
-    apart = x - mean[:, None, None]
-    lessened = jnp.diag(answered.astype(x.dtype)) - jnp.tensordot(apart * shares[None], apart, [(1, 2), (1, 2)])
+    centred = x - mean[:, None, None]
+    lessened = jnp.diag(answered.astype(x.dtype)) - jnp.tensordot(centred * shares[None], centred, [(1, 2), (1, 2)])
     eigenvalues, vectors = eigh(lessened)
     root = jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[:, None] * vectors.T
     return root, jnp.where(eigenvalues[0] < 0, -eigenvalues[0], 0.0)
 
 
-def _certificate(covariance, box, tilt, x, shares, excess, rounding):
+def _certificate(
+    covariance: Float[Array, "n n"],
+    box: Box,
+    tilt: Tilt,
+    x: Float[Array, "n R B"],
+    shares: Float[Array, "R B"],
+    excess: Float[Array, ""],
+    rounding: Float[Array, ""],
+) -> SamplingCertificate:
+    """`excess`: by how much a sampled variance exceeded 1; `rounding`: of the log evidence."""
     total = jnp.sum(shares, axis=1)
     log_error = jnp.hypot(jnp.std(total, ddof=1) / jnp.mean(total) / total.shape[0] ** 0.5, rounding)
     latent = jnp.moveaxis(x, 0, -1) @ (box.half @ covariance)
@@ -195,22 +207,29 @@ def _certificate(covariance, box, tilt, x, shares, excess, rounding):
     )
 
 
-def _unless_resolved(certificate, covariance, half, answered):
+def _unless_resolved(
+    certificate: SamplingCertificate,
+    covariance: Float[Array, "n n"],
+    half: Float[Array, "n n"],
+    answered: Bool[Array, " n"],
+) -> SamplingCertificate:
     """Not converged where the rounding of an asked point's variance given z hides that variance, near noise^2."""
     prior = jnp.diagonal(covariance)
-    left = prior - jnp.sum((half @ covariance) ** 2, axis=0)
-    least = jnp.finfo(prior.dtype).eps * prior.shape[0] ** 0.5 * jnp.max(prior)
-    resolved = jnp.all(~answered | (left >= least))
+    variance = prior - jnp.sum((half @ covariance) ** 2, axis=0)
+    resolution = jnp.finfo(prior.dtype).eps * prior.shape[0] ** 0.5 * jnp.max(prior)
+    resolved = jnp.all(~answered | (variance >= resolution))
     residual = jnp.where(resolved, certificate.residual, jnp.inf)
     return eqx.tree_at(lambda c: (c.residual, c.converged), certificate, (residual, certificate.converged & resolved))
 
 
-def _weighted(shares, values):
+def _weighted(
+    shares: Float[Array, "R B"], values: Float[Array, "R B *out"]
+) -> tuple[Float[Array, "*out"], Float[Array, "*out"]]:
     """Weighted mean of `values` (R, B, ...) and its standard error, from the replicates, as of a ratio of two means."""
     weight = shares.reshape(shares.shape + (1,) * (values.ndim - 2))
-    above = jnp.sum(weight * values, axis=1)
-    mean = jnp.sum(above, axis=0)
+    numerator = jnp.sum(weight * values, axis=1)
+    mean = jnp.sum(numerator, axis=0)
     replicates = shares.shape[0]
-    below = jnp.sum(weight, axis=1)
-    apart = above - mean[None] * below  # in units of 1 / replicates
-    return mean, jnp.sqrt(jnp.sum(apart**2, axis=0) * replicates / (replicates - 1))
+    denominator = jnp.sum(weight, axis=1)
+    deviation = numerator - mean[None] * denominator  # in units of 1 / replicates
+    return mean, jnp.sqrt(jnp.sum(deviation**2, axis=0) * replicates / (replicates - 1))

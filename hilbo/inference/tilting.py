@@ -5,10 +5,12 @@ variable i in units of that diagonal is (lower_i, upper_i) less what the earlier
 Equations and references: `hilbo.inference.exact`.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.likelihoods import confined_normal
 from hilbo.numerics.linalg import cholesky, one_at_a_time, solve_lower
@@ -29,6 +31,8 @@ class Box(eqx.Module):
 
 
 class Tilt(eqx.Module):
+    """The saddle point of psi: the means that make the weights of samples vary least."""
+
     mu: Float[Array, " n"]
     highest: Float[Array, ""]
     """psi*, which psi(x, mu) never exceeds."""
@@ -36,14 +40,29 @@ class Tilt(eqx.Module):
     iterations: Int[Array, ""]
 
 
-def ordered_box(covariance, lower, upper, noise, answered):
+class _Ordering(NamedTuple):
+    """The first variables placed: columns of the root of S, expected values, and which variables they are."""
+
+    columns: Float[Array, "n n"]
+    values: Float[Array, " n"]
+    order: Int[Array, " n"]
+    placed: Bool[Array, " n"]
+
+
+def ordered_box(
+    covariance: Float[Array, "n n"],
+    lower: Float[Array, " n"],
+    upper: Float[Array, " n"],
+    noise: Float[Array, ""],
+    answered: Bool[Array, " n"],
+) -> Box:
     """Interval after interval the least probable one, given the expected values of those before it."""
     n = covariance.shape[0]
     both = answered[:, None] & answered[None, :]
     matrix = jnp.where(both, covariance, 0.0) + jnp.diag(jnp.where(answered, noise**2, 1.0))
     lower, upper = jnp.where(answered, lower, -jnp.inf), jnp.where(answered, upper, jnp.inf)
 
-    def next_variable(k, state):
+    def next_variable(k, state: _Ordering) -> _Ordering:
         columns, values, order, placed = state
         spread = jnp.sqrt(jnp.diagonal(matrix) - jnp.sum(columns**2, axis=1))
         shift = columns @ values
@@ -52,30 +71,35 @@ def ordered_box(covariance, lower, upper, noise, answered):
         row = jnp.argmin(jnp.where(placed, 2.0, jnp.where(answered, log_mass, 1.0))).astype(order.dtype)
         column = (matrix[:, row] - columns @ columns[row]) / spread[row]
         column = jnp.where(placed, 0.0, column).at[row].set(spread[row])
-        return (columns.at[:, k].set(column), values.at[k].set(mean[row]), order.at[k].set(row),
-                placed.at[row].set(True))  # fmt: skip
+        return _Ordering(
+            columns.at[:, k].set(column), values.at[k].set(mean[row]), order.at[k].set(row), placed.at[row].set(True)
+        )
 
-    state = jnp.zeros_like(matrix), jnp.zeros_like(lower), jnp.zeros(n, jnp.int32), jnp.zeros(n, bool)
-    order = jax.lax.fori_loop(0, n, next_variable, state)[2]
+    state = _Ordering(jnp.zeros_like(matrix), jnp.zeros_like(lower), jnp.zeros(n, jnp.int32), jnp.zeros(n, bool))
+    order = jax.lax.fori_loop(0, n, next_variable, state).order
     root = cholesky(matrix[order][:, order])
     diagonal = jnp.diagonal(root)
     half = solve_lower(root, jnp.eye(n, dtype=root.dtype))
-    known = answered[order]
-    half = jnp.zeros_like(half).at[:, order].set(jnp.where(known[:, None], half, 0.0))
+    answered_in_order = answered[order]
+    half = jnp.zeros_like(half).at[:, order].set(jnp.where(answered_in_order[:, None], half, 0.0))
     below = jnp.tril(root / diagonal[:, None], -1)
-    return Box(lower[order] / diagonal, upper[order] / diagonal, below, half, known)
+    return Box(lower[order] / diagonal, upper[order] / diagonal, below, half, answered_in_order)
 
 
-def _intervals(mean, lower, upper, answered):
+def _intervals(
+    mean: Float[Array, "*n"], lower: Float[Array, "*n"], upper: Float[Array, "*n"], answered: Bool[Array, "*n"]
+) -> tuple[Float[Array, "*n"], Float[Array, "*n"], Float[Array, "*n"]]:
     """`confined_normal` of every variable; where there is no answer there is no interval, and all is 0."""
     lower = jnp.where(answered, lower, 0.0)
-    parts = jnp.vectorize(confined_normal, signature="(),(),()->(),(),()")(
+    log_mass, shift, curvature = jnp.vectorize(confined_normal, signature="(),(),()->(),(),()")(
         mean, lower, jnp.where(answered, upper, jnp.inf)
     )
-    return tuple(jnp.where(answered, part, 0.0) for part in parts)
+    return jnp.where(answered, log_mass, 0.0), jnp.where(answered, shift, 0.0), jnp.where(answered, curvature, 0.0)
 
 
 class _Saddle(eqx.Module):
+    """A point of the search for the saddle, and Newton's step from it."""
+
     x: Float[Array, " n"]
     mu: Float[Array, " n"]
     gradient: Float[Array, " 2*n"]  # in x and in mu
@@ -87,14 +111,14 @@ class _Saddle(eqx.Module):
     count: Int[Array, ""]
 
 
-def tilting(box, max_steps=100):
+def tilting(box: Box, max_steps: int = 100) -> Tilt:
     """The saddle point of psi by Newton's method.
 
     A step is shortened until the simplified step that would follow, by the same matrix, is the shorter one: a test that
     does not depend on the units of x and mu, which conflicting repeats stretch by sd / noise (Deuflhard 2011, 3.3).
     """
     n = box.lower.shape[0]
-    begin = _saddle(box, _expected(box), jnp.zeros_like(box.lower))
+    initial = _saddle(box, _expected(box), jnp.zeros_like(box.lower))
     small = jnp.finfo(box.lower.dtype).eps ** 0.5
 
     def unfinished(state):
@@ -108,11 +132,11 @@ def tilting(box, max_steps=100):
         taken = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, refused)
         return eqx.tree_at(lambda s: s.count, taken, state.count + 1)
 
-    end = jax.lax.while_loop(unfinished, advance, begin)
+    end = jax.lax.while_loop(unfinished, advance, initial)
     return Tilt(end.mu, end.psi, end.size, end.count)
 
 
-def _expected(box):
+def _expected(box: Box) -> Float[Array, " n"]:
     """x, each at its expected value given those before it, without tilting: inside the box, and psi flat in mu."""
 
     def one(x, k):
@@ -123,7 +147,7 @@ def _expected(box):
     return jax.lax.scan(one, jnp.zeros_like(box.lower), jnp.arange(box.lower.shape[0]))[0]
 
 
-def _saddle(box, x, mu):
+def _saddle(box: Box, x: Float[Array, " n"], mu: Float[Array, " n"]) -> _Saddle:
     """psi, its gradient, in x and in mu, and Newton's step at a point."""
     shift = box.below @ x + mu
     log_mass, mean, curvature = _intervals(shift, box.lower, box.upper, box.answered)
@@ -146,7 +170,9 @@ def _solve(matrix: Float[Array, "n n"], right: Float[Array, " n"]) -> Float[Arra
 # --- sampling
 
 
-def propose(box, mu, uniform):
+def propose(
+    box: Box, mu: Float[Array, " n"], uniform: Float[Array, "n N"]
+) -> tuple[Float[Array, "n N"], Float[Array, " N"]]:
     """x (n, N) from the tilted sequence of confined normals, and psi (N,), from uniform numbers (n, N)."""
     n, count = uniform.shape
 
@@ -161,7 +187,9 @@ def propose(box, mu, uniform):
     return jax.lax.scan(one, start, jnp.arange(n))[0]
 
 
-def _confined(uniform, lower, upper):
+def _confined(
+    uniform: Float[Array, " N"], lower: Float[Array, " N"], upper: Float[Array, " N"]
+) -> tuple[Float[Array, " N"], Float[Array, " N"]]:
     """Quantile of a standard normal confined to (lower, upper), and log of the mass of that interval.
 
     Reflected so that lower + upper >= 0. With Q the upper tail and R = Q(high) / Q(low), the quantile t has
@@ -185,24 +213,32 @@ def _confined(uniform, lower, upper):
     fallen = -jnp.log1p(-uniform * far_share)  # log Q(low) - log Q(t)
     t = jnp.sqrt(low_**2 + 2.0 * fallen)
     for _ in range(3):
-        at = t + excess_hazard(t)
-        t = t - (fallen - 0.5 * (t - low_) * (t + low_) - jnp.log(at / hazard)) / -at
+        hazard_t = t + excess_hazard(t)
+        t = t - (fallen - 0.5 * (t - low_) * (t + low_) - jnp.log(hazard_t / hazard)) / -hazard_t
     value = jnp.where(far, t, near)
     log_near = jnp.log(tail * near_share)
     log_far = -0.5 * low_**2 - HALF_LOG_2PI - jnp.log(hazard) + jnp.log(far_share)
     return jnp.where(mirrored, -value, value), jnp.where(far, log_far, log_near)
 
 
-def accepted(key, box, tilt, count):
+class _Draws(NamedTuple):
+    """Accepted draws, the first `filled` rows; the others are NaN."""
+
+    key: PRNGKeyArray
+    kept: Float[Array, "count n"]
+    filled: Int[Array, ""]
+    rounds: Int[Array, ""]
+
+
+def accepted(key: PRNGKeyArray, box: Box, tilt: Tilt, count: int) -> Float[Array, "count n"]:
     """`count` independent draws of x (count, n); proposals are taken with probability exp(psi - psi*)."""
     n, batch = box.lower.shape[0], 2 * count
-    found = tilt.gradient <= 1e-3
+    tilted = tilt.gradient <= 1e-3
 
-    def more(state):
-        _, _, filled, rounds = state
-        return (filled < count) & (rounds < 1000) & found
+    def unfilled(state: _Draws):
+        return (state.filled < count) & (state.rounds < 1000) & tilted
 
-    def more_draws(state):
+    def more_draws(state: _Draws) -> _Draws:
         key, kept, filled, rounds = state
         key, first, second = jax.random.split(key, 3)
         tiny = jnp.finfo(kept.dtype).tiny
@@ -210,8 +246,9 @@ def accepted(key, box, tilt, count):
         taken = jnp.log(jax.random.uniform(second, (batch,), kept.dtype, minval=tiny)) < psi - tilt.highest
         place = jnp.where(taken, filled + jnp.cumsum(taken, dtype=filled.dtype) - 1, count)
         x = jnp.where(box.answered[:, None], x, 0.0)
-        return key, kept.at[place].set(x.T, mode="drop"), filled + jnp.sum(taken, dtype=filled.dtype), rounds + 1
+        filled_now = filled + jnp.sum(taken, dtype=filled.dtype)
+        return _Draws(key, kept.at[place].set(x.T, mode="drop"), filled_now, rounds + 1)
 
-    nothing = jnp.full((count, n), jnp.nan, box.lower.dtype)
-    begin = key, nothing, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32)
-    return jax.lax.while_loop(more, more_draws, begin)[1]
+    empty = jnp.full((count, n), jnp.nan, box.lower.dtype)
+    initial = _Draws(key, empty, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+    return jax.lax.while_loop(unfilled, more_draws, initial).kept
