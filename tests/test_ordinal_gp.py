@@ -1,7 +1,6 @@
 """The model of one participant: gradients against 40 digits, padding, batches, dtypes, and what it refuses."""
 
 import dataclasses
-from functools import cache
 
 import equinox as eqx
 import jax
@@ -10,17 +9,16 @@ import numpy as np
 import pytest
 from datasets import near_separable, repeated, repeated_19, separated
 from helpers import assert_traces_once, check_grad
-from mpmath import mp
+from oracles import oracle
 from reference_laplace import mpmath_laplace
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit, ordinal_gp
 from hilbo.errors import InputError
 from hilbo.gaussian import shortfall
 from hilbo.ordinal_gp import InferenceError
+from tests.vectors.laplace import CASES, PER_DIMENSION, SCALAR, hyperparameters, unpack
 
 CAPACITY = 25
-SCALAR, PER_DIMENSION = 3.0, (3.0, 2.0, 1.2)
-CASES = [(repeated, SCALAR), (repeated, PER_DIMENSION), (near_separable, SCALAR)]
 
 
 def model(data, theta=None) -> OrdinalGP:
@@ -32,17 +30,6 @@ def answers(data, capacity: int = CAPACITY) -> Trials:
     return Trials.from_arrays(data.x, data.q, capacity)
 
 
-def hyperparameters(data, theta) -> jax.Array:
-    """One vector (theta..., variance, noise, thresholds...)."""
-    parts = theta, data.variance, data.noise, data.thresholds
-    return jnp.concatenate([jnp.atleast_1d(jnp.asarray(part, float)) for part in parts])
-
-
-def unpack(h):
-    *theta, variance, noise, first, second = h
-    return theta[0] if len(theta) == 1 else theta, variance, noise, (first, second)
-
-
 def values(h, trials, x_new):
     """(7,): log evidence, and posterior mean and variance at the first three new points."""
     theta, variance, noise, thresholds = unpack(h)
@@ -50,25 +37,6 @@ def values(h, trials, x_new):
     gp = OrdinalGP(kernel, OrdinalProbit(jnp.stack(thresholds), noise))
     posterior = fit(gp, trials, throw=False)
     return jnp.concatenate([posterior.log_evidence[None], *posterior.predict(x_new[:3])])
-
-
-def exact_values(h, data):
-    theta, variance, noise, thresholds = unpack(h)
-    solved = mpmath_laplace(data.x, data.q, theta, variance, thresholds, noise, data.x_new[:3], digits=40)
-    return np.array([solved["log_evidence"], *solved["mean"], *solved["variance"]], object)
-
-
-@cache
-def exact_jacobian(make, theta):
-    """(7, p), by central differences at 40 digits."""
-    data, columns = make(), []
-    with mp.workdps(45):
-        h = [mp.mpf(float(v)) for v in hyperparameters(data, theta)]
-        for j, value in enumerate(h):
-            step = value * mp.mpf(10) ** -12
-            moved = [exact_values([*h[:j], value + s, *h[j + 1 :]], data) for s in (step, -step)]
-            columns.append((moved[0] - moved[1]) / (2 * step))
-    return np.stack(columns, axis=1).astype(float)
 
 
 reverse = jax.jit(jax.jacrev(values))
@@ -79,16 +47,18 @@ evidence_hessian = jax.jit(jax.jacfwd(jax.grad(lambda *args: values(*args)[0])))
 
 def arguments(make, theta):
     data = make()
-    return hyperparameters(data, theta), answers(data), jnp.asarray(data.x_new)
+    return jnp.asarray(hyperparameters(data, theta)), answers(data), jnp.asarray(data.x_new)
 
 
-@pytest.mark.parametrize(("make", "theta"), CASES)
-def test_gradients_in_every_hyperparameter(make, theta):
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[pytest.mark.deep] * ("per dimension" in name)) for name in CASES]
+)
+def test_gradients_in_every_hyperparameter(name):
     """Of evidence, means and variances, with exactly repeated stimuli, by both modes under jit."""
-    expected = exact_jacobian(make, theta)
+    expected = oracle("laplace_slopes")[name]
     assert np.all(np.max(np.abs(expected), axis=0) > 1e-3)  # no hyperparameter is without effect
     for derivative in (reverse, forward):
-        found = np.asarray(derivative(*arguments(make, theta)))
+        found = np.asarray(derivative(*arguments(*CASES[name])))
         scale = np.maximum(np.abs(expected), 1e-3 * np.max(np.abs(expected), axis=0))
         assert np.max(np.abs(found - expected) / scale) < 1e-8
 
@@ -99,11 +69,12 @@ def test_gradients_under_vmap():
     batch = jax.jit(jax.vmap(jax.jacrev(values), in_axes=(0, None, None)))(several, trials, x_new)
     for row, one in zip(batch, several, strict=True):
         np.testing.assert_allclose(row, reverse(one, trials, x_new), rtol=1e-10, atol=1e-11)
-    np.testing.assert_allclose(batch[0], exact_jacobian(repeated, SCALAR), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(batch[0], oracle("laplace_slopes")["repeated"], rtol=1e-6, atol=1e-9)
 
 
-def test_second_derivatives_of_the_evidence():
-    h, trials, x_new = arguments(repeated, PER_DIMENSION)
+@pytest.mark.parametrize("theta", [SCALAR, pytest.param(PER_DIMENSION, marks=pytest.mark.deep)])
+def test_second_derivatives_of_the_evidence(theta):
+    h, trials, x_new = arguments(repeated, theta)
     found = np.asarray(evidence_hessian(h, trials, x_new))
     steps = 1e-5 * np.asarray(h)
     expected = np.stack(
@@ -146,7 +117,7 @@ def test_no_answers_give_exactly_the_prior():
     np.testing.assert_array_equal(posterior.class_probabilities(x)[0], gp.likelihood.class_probabilities(0.0, 1.7))
     assert posterior.certificate.converged
     assert posterior.certificate.iterations <= 1
-    slopes = np.asarray(reverse(hyperparameters(data, SCALAR), Trials.empty(CAPACITY, 3), x))
+    slopes = np.asarray(reverse(jnp.asarray(hyperparameters(data, SCALAR)), Trials.empty(CAPACITY, 3), x))
     np.testing.assert_array_equal(slopes, np.outer([0, 0, 0, 0, 1, 1, 1], [0, 1, 0, 0, 0]))
 
 
@@ -166,29 +137,7 @@ def test_one_category_only(category):
     np.testing.assert_allclose(posterior.log_evidence, float(exact["log_evidence"]), rtol=1e-12)
 
 
-def test_growing_data_are_traced_once():
-    data = repeated_19()
-    gp, trials, whole = model(data), Trials.empty(27, 3), answers(data, 27)
-
-    @jax.jit
-    def append_one(trials, x, q):
-        return trials.append(x, q)
-
-    x_new, weights = jnp.asarray(data.x_new), None
-    with assert_traces_once(ordinal_gp._fit, ordinal_gp._predict, append_one):
-        for count, (x, q) in enumerate(zip(data.x, data.q, strict=True), start=1):
-            trials = append_one(trials, jnp.asarray(x), jnp.asarray(q))
-            posterior = fit(gp, trials, start=jnp.zeros(27) if weights is None else weights)
-            weights = posterior.latent.weights
-            posterior.predict(x_new)
-            kept = whole.first(count)
-            np.testing.assert_array_equal(trials.mask, kept.mask)
-            np.testing.assert_array_equal(trials.x[:count], kept.x[:count])
-            np.testing.assert_array_equal(trials.q[:count], kept.q[:count])
-    assert_same(posterior, fit(gp, whole), rtol=1e-11)
-
-
-@pytest.mark.parametrize("make", [repeated, near_separable])
+@pytest.mark.parametrize("make", [repeated, pytest.param(near_separable, marks=pytest.mark.deep)])
 def test_padded_equals_unpadded(make):
     data = make()
     bare = fit(model(data), answers(data, len(data.q)))
@@ -320,3 +269,28 @@ def test_the_rounding_of_the_log_posterior_stops_no_search(seed, theta, noise):
     trials = Trials.from_arrays(x, (away < 0.6).astype(int) + (away < 0.3), 25)
     certificate = fit(OrdinalGP(RBF(theta, 1.0), OrdinalProbit((-0.5, 0.5), noise)), trials).certificate
     assert certificate.residual <= certificate.tolerance and certificate.iterations <= 60
+
+
+# --- last, because it empties JAX's caches
+
+
+def test_growing_data_are_traced_once():
+    data = repeated_19()
+    gp, trials, whole = model(data), Trials.empty(27, 3), answers(data, 27)
+
+    @jax.jit
+    def append_one(trials, x, q):
+        return trials.append(x, q)
+
+    x_new, weights = jnp.asarray(data.x_new), None
+    with assert_traces_once(ordinal_gp._fit, ordinal_gp._predict, append_one):
+        for count, (x, q) in enumerate(zip(data.x, data.q, strict=True), start=1):
+            trials = append_one(trials, jnp.asarray(x), jnp.asarray(q))
+            posterior = fit(gp, trials, start=jnp.zeros(27) if weights is None else weights)
+            weights = posterior.latent.weights
+            posterior.predict(x_new)
+            kept = whole.first(count)
+            np.testing.assert_array_equal(trials.mask, kept.mask)
+            np.testing.assert_array_equal(trials.x[:count], kept.x[:count])
+            np.testing.assert_array_equal(trials.q[:count], kept.q[:count])
+    assert_same(posterior, fit(gp, whole), rtol=1e-11)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tests.vectors import evidence
+from tests.vectors import evidence, exact, laplace
 
 __all__ = ["ORACLES", "Oracle", "leaves"]
 
@@ -25,7 +25,12 @@ class Oracle(NamedTuple):
     atol: float
 
 
-ORACLES = {"evidence": Oracle(evidence.make, 1e-10, 1e-10)}
+ORACLES = {
+    "evidence": Oracle(evidence.make, 1e-10, 1e-10),
+    "exact": Oracle(exact.make, 1e-8, 1e-10),
+    "laplace_digits": Oracle(laplace.make_digits, 1e-14, 0.0),
+    "laplace_slopes": Oracle(laplace.make_slopes, 1e-14, 0.0),
+}
 
 
 def leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
@@ -38,7 +43,9 @@ def leaves(node, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], 
 
 
 def _plain(node):
-    return {key: _plain(child) for key, child in node.items()} if isinstance(node, dict) else np.asarray(node).tolist()
+    if isinstance(node, dict):
+        return {key: _plain(child) for key, child in node.items()}
+    return np.asarray(node).tolist()
 
 
 def main() -> None:
