@@ -23,7 +23,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
@@ -87,7 +87,7 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
     value = _log_evidence(gp.likelihood, answers.counts, mode, system)
     tolerance = _tolerance(gp.likelihood, share, covariance, answers.counts, mode)
     # One step more would change the evidence by so much; what is left is of the size of that change or smaller.
-    last = _step(gp.likelihood, share, covariance, answers.counts, mode)
+    last = _newton_step(gp.likelihood, share, covariance, answers.counts, mode)
     beyond = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta)[2])
     error = jnp.abs(_log_evidence(gp.likelihood, answers.counts, last, beyond) - value)
     every = jnp.concatenate([share**0.5 * weights[None, :], (1.0 - share) ** 0.5 * mode.weights])
@@ -118,11 +118,11 @@ def evidence(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> tuple[F
     found."""
     covariance = gram(gp.kernel, answers.x, answers.x)
     fixed = jax.lax.stop_gradient((gp.likelihood, share, covariance))
-    found, residual, _ = _mode(*fixed, answers.counts)
-    found = jax.lax.stop_gradient(found)
-    last = _step(gp.likelihood, share, covariance, answers.counts, found)
+    mode, residual, _ = _mode(*fixed, answers.counts)
+    mode = jax.lax.stop_gradient(mode)
+    last = _newton_step(gp.likelihood, share, covariance, answers.counts, mode)
     system = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta)[2])
-    arrived = residual <= _tolerance(*fixed, answers.counts, found)
+    arrived = residual <= _tolerance(*fixed, answers.counts, mode)
     return _log_evidence(gp.likelihood, answers.counts, last, system), arrived
 
 
@@ -147,7 +147,13 @@ class _System(NamedTuple):
     condition: Float[Array, ""]
 
 
-def _tolerance(likelihood, share, covariance, counts, state):
+def _tolerance(
+    likelihood: OrdinalProbit,
+    share: Float[Array, ""],
+    covariance: Float[Array, "m m"],
+    counts: Float[Array, "M m C"],
+    state: _State,
+) -> Float[Array, ""]:
     """eps^(2/3), or the rounding error of the residual where that is larger, as in `laplace`."""
     epsilon = jnp.finfo(covariance.dtype).eps
     _, slope, curvature = _expand(likelihood, counts, state.eta)
@@ -157,13 +163,17 @@ def _tolerance(likelihood, share, covariance, counts, state):
     return jnp.clip(4.0 * epsilon * jnp.sqrt(rounding), epsilon ** (2 / 3), epsilon**0.25)
 
 
-def _latent(share, covariance, weights):
+def _latent(
+    share: Float[Array, ""], covariance: Float[Array, "m m"], weights: Float[Array, "M m"]
+) -> Float[Array, "M m"]:
     """Prior covariance times weights: everybody's latent values (M, m)."""
     together = share * jnp.sum(weights, axis=0)
     return (together[None, :] + (1.0 - share) * weights) @ covariance
 
 
-def _mode(likelihood, share, covariance, counts):
+def _mode(
+    likelihood: OrdinalProbit, share: Float[Array, ""], covariance: Float[Array, "m m"], counts: Float[Array, "M m C"]
+) -> tuple[_State, Float[Array, ""], Int[Array, ""]]:
     """Full Newton steps on the weights from 0; the mode, its distance from stationarity, and the steps taken."""
     start = jnp.zeros(counts.shape[:2], covariance.dtype)
 
@@ -173,8 +183,8 @@ def _mode(likelihood, share, covariance, counts):
 
     def forward(carry):
         state, _, steps = carry
-        full = _step(likelihood, share, covariance, counts, state)
-        state = _taken(likelihood, counts, state, full)
+        full = _newton_step(likelihood, share, covariance, counts, state)
+        state = _damped(likelihood, counts, state, full)
         return state, residual_of(state), steps + 1
 
     def going(carry):
@@ -185,38 +195,48 @@ def _mode(likelihood, share, covariance, counts):
     return jax.lax.while_loop(going, forward, (first, residual_of(first), jnp.asarray(0)))
 
 
-def _step(likelihood, share, covariance, counts, state) -> _State:
+def _newton_step(
+    likelihood: OrdinalProbit,
+    share: Float[Array, ""],
+    covariance: Float[Array, "m m"],
+    counts: Float[Array, "M m C"],
+    state: _State,
+) -> _State:
     """a <- a + (I + W K)^-1 r, r = slope - a, of all people by way of g: an error of the step is one of r's size."""
     eta = _latent(share, covariance, state.weights)  # not state.eta: derivatives come through here
     _, slope, curvature = _expand(likelihood, counts, eta)
     system = _system(share, covariance, curvature)
     off = slope - state.weights
-    own = _own_solve(system, _latent(share, covariance, off))
+    person_terms = _solve_people(system, _latent(share, covariance, off))
     # (S + (p K)^-1)^-1 s = p K L (I + p L'K L)^-1 L^-1 s: nothing is subtracted
     solve = jax.scipy.linalg.solve_triangular
-    said = solve(system.sum_root + jnp.diag(jnp.where(system.asked, 0.0, 1.0)), jnp.sum(own, axis=0), lower=True)
-    moved = share * covariance @ (system.factor.T @ solve(system.lower, said, lower=True))
-    weights = state.weights + off - own + _own_solve(system, jnp.broadcast_to(moved[None, :], own.shape))
+    shared_term = solve(
+        system.sum_root + jnp.diag(jnp.where(system.asked, 0.0, 1.0)), jnp.sum(person_terms, axis=0), lower=True
+    )
+    moved = share * covariance @ (system.factor.T @ solve(system.lower, shared_term, lower=True))
+    weights = (
+        state.weights + off - person_terms + _solve_people(system, jnp.broadcast_to(moved[None, :], person_terms.shape))
+    )
     return _State(weights, _latent(share, covariance, weights))
 
 
-def _taken(likelihood, counts, state, full):
+def _damped(likelihood: OrdinalProbit, counts: Float[Array, "M m C"], state: _State, full: _State) -> _State:
     """The largest of a few shares of a step at which the log posterior has not fallen, beyond its rounding."""
     scales = 0.5 ** jnp.arange(_HALVINGS, dtype=full.eta.dtype)
 
-    def at(scale):
+    def height_at(scale):
         between = jax.tree.map(lambda a, b: a + scale * (b - a), state, full)
         value = jnp.sum(_expand(likelihood, counts, between.eta)[0])
         return value - 0.5 * jnp.sum(between.weights * between.eta), jnp.abs(value)
 
-    heights, sizes = jax.vmap(at)(scales)
-    height, size = at(jnp.zeros_like(scales[0]))
+    heights, sizes = jax.vmap(height_at)(scales)
+    height, size = height_at(jnp.zeros_like(scales[0]))
     slack = 8.0 * jnp.finfo(size.dtype).eps * (size + sizes)
     scale = scales[jnp.argmax((heights >= height - slack).at[-1].set(True))]
     return jax.tree.map(lambda a, b: jnp.where(scale == 1.0, b, a + scale * (b - a)), state, full)
 
 
-def _own_solve(system, right):
+def _solve_people(system: _System, right: Float[Array, "M m"]) -> Float[Array, "M m"]:
     """D_j r_j for everybody, (M, m)."""
 
     def one(person):
@@ -227,7 +247,8 @@ def _own_solve(system, right):
     return jax.lax.map(one, (system.own, system.root, right))
 
 
-def _system(share, covariance, curvature) -> _System:
+def _system(share: Float[Array, ""], covariance: Float[Array, "m m"], curvature: Float[Array, "M m"]) -> _System:
+    """Factors of everybody's (1 - p) K + W_j^-1, and of what all people add up to."""
     size = covariance.shape[0]
     unit = jnp.eye(size, dtype=covariance.dtype)
     held = curvature > 0
@@ -238,29 +259,34 @@ def _system(share, covariance, curvature) -> _System:
         half = jax.scipy.linalg.solve_triangular(lower, jnp.diag(root), lower=True)
         return total + half.T @ half, lower
 
-    total, own = jax.lax.scan(add, jnp.zeros_like(covariance), root)
+    total, person_factors = jax.lax.scan(add, jnp.zeros_like(covariance), root)
     asked = jnp.any(held, axis=0)  # a point at which nobody answered stands apart from the rest
     sum_root = jnp.linalg.cholesky(total + jnp.diag(jnp.where(asked, 0.0, 1.0)))
     sum_root = jnp.where(asked[:, None], sum_root, 0.0)
     matrix = unit + share * sum_root.T @ covariance @ sum_root
     lower = jnp.linalg.cholesky(matrix)
     factor = jax.scipy.linalg.solve_triangular(lower, sum_root.T, lower=True)
-    each = jnp.sum(jnp.log(jnp.diagonal(own, axis1=1, axis2=2)))
+    each = jnp.sum(jnp.log(jnp.diagonal(person_factors, axis1=1, axis2=2)))
     log_determinant = 2.0 * (each + jnp.sum(jnp.log(jnp.diagonal(lower))))
-    return _System(own, root, sum_root, asked, lower, factor, log_determinant, jnp.linalg.norm(matrix))
+    return _System(person_factors, root, sum_root, asked, lower, factor, log_determinant, jnp.linalg.norm(matrix))
 
 
-def _expand(likelihood: OrdinalProbit, counts, eta):
+def _expand(
+    likelihood: OrdinalProbit, counts: Float[Array, "M m C"], eta: Float[Array, "M m"]
+) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, "M m"]]:
     """Sums of log-likelihood terms, slopes and curvatures at everybody's latent values (M, m)."""
 
-    def at(f, count):
+    def expand_point(f, count):
         parts = jax.vmap(lambda q: jnp.stack(likelihood.expand(f, q)))(jnp.arange(count.shape[0]))
         return jnp.sum(jnp.where(count[:, None] > 0, count[:, None] * parts, 0.0), axis=0)
 
-    parts = jax.vmap(jax.vmap(at))(eta, counts)
+    parts = jax.vmap(jax.vmap(expand_point))(eta, counts)
     return parts[..., 0], parts[..., 1], parts[..., 2]
 
 
-def _log_evidence(likelihood, counts, state, system):
+def _log_evidence(
+    likelihood: OrdinalProbit, counts: Float[Array, "M m C"], state: _State, system: _System
+) -> Float[Array, ""]:
+    """Laplace's approximation: log likelihood and log prior at the mode, less half of log|I + K_all W|."""
     values = _expand(likelihood, counts, state.eta)[0]
     return jnp.sum(values) - 0.5 * jnp.sum(state.weights * state.eta) - 0.5 * system.log_determinant

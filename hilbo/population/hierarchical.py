@@ -124,8 +124,11 @@ def shared_posterior(posterior: Posterior) -> Posterior:
     What answers say of g, their weights and C, is what they say of everybody: g's covariance with f_j is p k.
     """
     kernel, trials, latent = posterior.gp.kernel, posterior.trials, posterior.latent
-    own = kernel.kernel
-    shared = OrdinalGP(RBF(own.theta, kernel.share.astype(own.variance.dtype) * own.variance), posterior.gp.likelihood)
+    person_kernel = kernel.kernel
+    shared = OrdinalGP(
+        RBF(person_kernel.theta, kernel.share.astype(person_kernel.variance.dtype) * person_kernel.variance),
+        posterior.gp.likelihood,
+    )
     return Posterior(shared, Trials(trials.x[:, :-1], trials.q, trials.mask), latent)
 
 
@@ -142,13 +145,13 @@ def share_from(
     The evidence is computed at Chebyshev points of [0, 1], 9, 17 or 33 of them, and interpolated: it is smooth in p,
     and so the whole curve, its maximum and its intervals come at a small cost.
     """
-    known: dict[int, tuple[float, bool]] = {}  # by place among the finest nodes, in which the coarser ones are
+    evaluated: dict[int, tuple[float, bool]] = {}  # by place among the finest nodes, in which the coarser ones are
     for step in (4, 2, 1):
-        for node in (i for i in range(0, _NODES, step) if i not in known):
+        for node in (i for i in range(0, _NODES, step) if i not in evaluated):
             value, held = evidence(jnp.asarray((1 + _nodes()[node]) / 2, dtype))
-            known[node] = float(value), bool(held)
-        every = sorted(known)
-        fitted = np.array([known[i][0] for i in every])
+            evaluated[node] = float(value), bool(held)
+        every = sorted(evaluated)
+        fitted = np.array([evaluated[i][0] for i in every])
         coefficients = np.polynomial.chebyshev.chebfit(_nodes()[every], fitted, len(every) - 1)
         error = np.abs(coefficients[-2:]).sum()
         if error < _ENOUGH:
@@ -164,7 +167,7 @@ def share_from(
         mean=jnp.asarray(np.trapezoid(weight * grid) / np.trapezoid(weight)),
         interval=jnp.asarray(np.interp([0.025, 0.975], area / area[-1], grid)),
         interpolation_error=jnp.asarray(error),
-        converged=jnp.asarray(all(good for _, good in known.values())),
+        converged=jnp.asarray(all(good for _, good in evaluated.values())),
     )
 
 

@@ -7,7 +7,7 @@ model's evidence, at 0 the sum of everybody's own. The search is L-BFGS on exact
 log theta, log variance, log noise, first threshold, log gaps, logit p.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -54,42 +54,54 @@ def learn_people(
     `tolerance`: of the log evidence per answer, at which the search ends.
     """
     count = float(jnp.sum(answers.counts))
-    begin = {name: value for name, value in _coordinates(gp, share).items() if name in _fields(learn)}
-    flat, rebuild = jax.flatten_util.ravel_pytree(begin)
-    held = jnp.asarray(share, flat.dtype)  # an array: another number is no other function to compile
+    coordinates = {name: value for name, value in _coordinates(gp, share).items() if name in _coordinates_of(learn)}
+    flat, rebuild = jax.flatten_util.ravel_pytree(coordinates)
+    fixed_share = jnp.asarray(share, flat.dtype)  # an array: another number is no other function to compile
 
     def cost(z):
-        value, slope, good = _cost(jnp.asarray(z, flat.dtype), rebuild, gp, held, answers)
-        if not good:  # no mode, no evidence: the line search is to turn back
+        value, slope, usable = _cost(jnp.asarray(z, flat.dtype), rebuild, gp, fixed_share, answers)
+        if not usable:  # no mode, no evidence: the line search is to turn back
             return _REFUSED, np.zeros(len(z))
         return float(value) / count, np.asarray(slope, float) / count
 
     start = np.asarray(flat, float)
     bounds = [(z - _REACH, z + _REACH) for z in start]
     options = {"maxiter": max_steps, "ftol": tolerance, "gtol": 1e-6}
-    found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    best = jnp.asarray(found.x, flat.dtype)
-    value, _, good = _cost(best, rebuild, gp, held, answers)
-    model, part = _model(rebuild(best), gp, held)
-    return LearntPeople(model, part, -value, int(found.nit), jnp.asarray(bool(found.success) and bool(good)))
+    result = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    best = jnp.asarray(result.x, flat.dtype)
+    value, _, usable = _cost(best, rebuild, gp, fixed_share, answers)
+    model, learnt_share = _model(rebuild(best), gp, fixed_share)
+    return LearntPeople(
+        model, learnt_share, -value, int(result.nit), jnp.asarray(bool(result.success) and bool(usable))
+    )
 
 
 @eqx.filter_jit
-def _cost(z, rebuild, gp, share, answers):
+def _cost(
+    z: Float[Array, " z"],
+    rebuild: Callable[[Array], dict[str, Array]],
+    gp: OrdinalGP,
+    share: Float[Array, ""],
+    answers: Counts,
+) -> tuple[Float[Array, ""], Float[Array, " z"], Bool[Array, ""]]:
+    """Minus the log evidence, its gradient, and whether both may be used."""
+
     def value(z):
-        model, part = _model(rebuild(z), gp, share)
-        found, arrived = evidence(model, part, answers)
-        return -found, arrived
+        model, learnt_share = _model(rebuild(z), gp, share)
+        negative_evidence, arrived = evidence(model, learnt_share, answers)
+        return -negative_evidence, arrived
 
-    (found, arrived), slope = jax.value_and_grad(value, has_aux=True)(z)
-    return found, slope, arrived & jnp.isfinite(found) & jnp.all(jnp.isfinite(slope))
+    (negative_evidence, arrived), slope = jax.value_and_grad(value, has_aux=True)(z)
+    return negative_evidence, slope, arrived & jnp.isfinite(negative_evidence) & jnp.all(jnp.isfinite(slope))
 
 
-def _fields(learn):
+def _coordinates_of(learn: Sequence[str]) -> set[str]:
+    """Which coordinates belong to the names of hyperparameters."""
     return {field for name in learn for field in ({"first", "gaps"} if name == "thresholds" else {name})}
 
 
-def _coordinates(gp, share):
+def _coordinates(gp: OrdinalGP, share: float) -> dict[str, Float[Array, "..."]]:
+    """A model and a share in the coordinates of the search."""
     thresholds, inner = gp.likelihood.thresholds, min(max(share, 1e-3), 1 - 1e-3)
     return {
         "theta": jnp.log(gp.kernel.theta),
@@ -101,12 +113,15 @@ def _coordinates(gp, share):
     }
 
 
-def _model(z, gp, share):
+def _model(
+    z: dict[str, Float[Array, "..."]], gp: OrdinalGP, share: Float[Array, ""]
+) -> tuple[OrdinalGP, Float[Array, ""]]:
+    """The model and the share at some coordinates; what is not among them stays as it is."""
     positive = {"theta": gp.kernel.theta, "variance": gp.kernel.variance, "noise": gp.likelihood.noise}
     positive |= {name: jnp.exp(z[name]) for name in positive if name in z}
     thresholds = gp.likelihood.thresholds
     if "first" in z:
         thresholds = jnp.cumsum(jnp.concatenate([z["first"][None], jnp.exp(z["gaps"])]))
-    part = jax.nn.sigmoid(z["share"]) if "share" in z else jnp.asarray(share, thresholds.dtype)
+    learnt_share = jax.nn.sigmoid(z["share"]) if "share" in z else jnp.asarray(share, thresholds.dtype)
     model = OrdinalGP(RBF(positive["theta"], positive["variance"]), OrdinalProbit(thresholds, positive["noise"]))
-    return model, part
+    return model, learnt_share

@@ -66,9 +66,11 @@ def joint_map(posteriors: Posterior, x: Float[Array, "m d"]) -> JointMap:
     def add(total, posterior):
         precision, weighted = total
         cross = whitener @ gram(kernel, x, posterior.trials.x)
-        known = posterior.latent.factor @ cross.T
-        lower = cholesky(jnp.eye(known.shape[0], dtype=known.dtype) - known @ known.T)
-        half = solve_lower(lower, known)
+        explained_root = posterior.latent.factor @ cross.T
+        lower = cholesky(
+            jnp.eye(explained_root.shape[0], dtype=explained_root.dtype) - explained_root @ explained_root.T
+        )
+        half = solve_lower(lower, explained_root)
         mean = cross @ posterior.latent.weights
         return (precision + half.T @ half, weighted + mean + half.T @ (half @ mean)), None
 
@@ -80,7 +82,7 @@ def joint_map(posteriors: Posterior, x: Float[Array, "m d"]) -> JointMap:
     return JointMap(root @ mean, solve_lower(lower, root.T).T)
 
 
-def _roots(covariance):
+def _roots(covariance: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[Array, "m m"]]:
     """R with R R' = K and its pseudo-inverse, both m x m, with zeros for the directions that are left out."""
     eigenvalues, vectors = eigh(covariance)
     size = covariance.shape[0]
@@ -95,7 +97,7 @@ def posterior_map(posterior: Posterior, x: Float[Array, "m d"]) -> JointMap:
     """One posterior at points (m, d) as a joint Gaussian: of the hierarchical model's shared function, say."""
     kernel = posterior.gp.kernel
     cross = gram(kernel, posterior.trials.x, x)
-    known = posterior.latent.factor @ cross
-    eigenvalues, vectors = eigh(gram(kernel, x, x) - known.T @ known)
+    explained_root = posterior.latent.factor @ cross
+    eigenvalues, vectors = eigh(gram(kernel, x, x) - explained_root.T @ explained_root)
     scale = jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))  # below 0 by rounding
     return JointMap(posterior.latent.weights @ cross, vectors * scale[None, :])

@@ -75,10 +75,12 @@ def leave_one_out(
     rows, maps = [], []
     for person in range(people):
         rest = np.delete(np.arange(people), person)
-        known = None if posteriors is None else jax.tree.map(lambda leaf, rest=rest: leaf[rest], posteriors)
-        found = rule_map(gp, without(trials, person), rule, posteriors=known, share=share, inference=inference)
-        rows.append(np.asarray(_chances(gp, found, trials.x[person]))[mask[person]])
-        maps.append(found)
+        others_posteriors = None if posteriors is None else jax.tree.map(lambda leaf, rest=rest: leaf[rest], posteriors)
+        map_without = rule_map(
+            gp, without(trials, person), rule, posteriors=others_posteriors, share=share, inference=inference
+        )
+        rows.append(np.asarray(_newcomer_probabilities(gp, map_without, trials.x[person]))[mask[person]])
+        maps.append(map_without)
     person = np.nonzero(mask)[0]
     return LeftOut(person, q[mask].astype(int), np.concatenate(rows)), maps
 
@@ -86,7 +88,7 @@ def leave_one_out(
 def influence(whole: RuleMap, parts: list[RuleMap], x: Float[Array, "m d"]) -> Float[np.ndarray, " M"]:
     """Root mean square change of the map's mean at x, in its standard deviations, when each person is left out."""
     mean, variance = _predict(whole, x)
-    moved = [_predict(part, x)[0] - mean for part in parts]
+    moved = [_predict(map_without, x)[0] - mean for map_without in parts]
     return np.array([float(jnp.sqrt(jnp.mean(move**2 / variance))) for move in moved])
 
 
@@ -140,10 +142,10 @@ def reliability(found: LeftOut, bins: int = 10) -> list[dict[str, float]]:
 
 
 @eqx.filter_jit
-def _predict(found, x):
-    return found.predict(x)
+def _predict(population_map: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    return population_map.predict(x)
 
 
 @eqx.filter_jit
-def _chances(gp, found, x):
-    return jax.vmap(gp.likelihood.class_probabilities)(*found.newcomer(x))
+def _newcomer_probabilities(gp: OrdinalGP, population_map: RuleMap, x: Float[Array, "m d"]) -> Float[Array, "m C"]:
+    return jax.vmap(gp.likelihood.class_probabilities)(*population_map.newcomer(x))

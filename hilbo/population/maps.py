@@ -70,7 +70,7 @@ class RuleMap(eqx.Module):
         return self.share * self.prior
 
     def newcomer(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new person's function, of which answers are foretold."""
+        """Mean and variance (m,) of a new person's function, from which answers are predicted."""
         mean, variance = self.predict(x)
         return mean, variance + self.apart
 
@@ -104,12 +104,12 @@ def rule_map(
     prior = jnp.asarray(gp.kernel.variance)
     one = jnp.ones_like(prior)
     if rule == "hierarchical":
-        part = jnp.asarray(share_of(gp, trials, inference).mean if share is None else share, prior.dtype)
-        shared = _together(gp, trials, part, inference, largest)
+        map_share = jnp.asarray(share_of(gp, trials, inference).mean if share is None else share, prior.dtype)
+        shared = _shared_function(gp, trials, map_share, inference, largest)
         if shared is not None:
-            return RuleMap(rule, "exact", None, shared, part, prior)
+            return RuleMap(rule, "exact", None, shared, map_share, prior)
     else:
-        part, shared = one, None
+        map_share, shared = one, None
     if rule == "pooled":
         shared = _pooled(gp, trials, inference, largest)
         if shared is None:
@@ -121,7 +121,7 @@ def rule_map(
         return RuleMap(rule, "exact", None, shared, one, prior)
     if posteriors is None:
         posteriors = _experts(gp, trials, inference)
-    return RuleMap(rule, "by points", posteriors, None, part, prior)
+    return RuleMap(rule, "by points", posteriors, None, map_share, prior)
 
 
 def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest: int = _SHARE) -> Share:
@@ -134,7 +134,7 @@ def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest:
         )
     inference = "ep" if inference == "exact" else inference
     trials = even_choice(jax.tree.map(lambda leaf: leaf[answered], trials), largest)
-    counts = _counts(gp, trials, inference)
+    counts = _counts_if_cheaper(gp, trials, inference)
     if counts is None:
         return learn_share(gp, of_people(trials), inference=inference)
     return share_from(lambda share: _evidence(gp, counts, share), trials.x.dtype)
@@ -155,38 +155,40 @@ def _evidence(gp: OrdinalGP, counts: Counts, share: Float[Array, ""]) -> tuple[F
     return evidence(gp, share, counts)
 
 
-def _experts(gp, trials, inference) -> Posterior:
+def _experts(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
     """Everybody's own posterior, stacked; from counts where many answers are at the same points."""
     if inference == "laplace":
         counts = counts_of(trials, gp.likelihood.categories)
         if 2 * counts.x.shape[0] < trials.mask.shape[1]:
-            return _counted(gp, counts)
-    return _fitted(gp, trials, inference)
+            return _fit_people_from_counts(gp, counts)
+    return _fit_people_from_trials(gp, trials, inference)
 
 
 @eqx.filter_jit
-def _counted(gp, counts):
+def _fit_people_from_counts(gp: OrdinalGP, counts: Counts) -> Posterior:
     one = jnp.ones_like(gp.kernel.variance)
-    return jax.lax.map(lambda own: fit_counts(gp, one, Counts(counts.x, own[None])), counts.counts)
+    return jax.lax.map(lambda person_counts: fit_counts(gp, one, Counts(counts.x, person_counts[None])), counts.counts)
 
 
 @eqx.filter_jit
-def _fitted(gp, trials, inference):
+def _fit_people_from_trials(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
     return jax.vmap(lambda person: fit(gp, person, inference=inference, throw=False))(trials)
 
 
-def _counts(gp, trials, inference) -> Counts | None:
+def _counts_if_cheaper(gp: OrdinalGP, trials: Trials, inference: str) -> Counts | None:
     """The answers as counts, where that is Laplace's model of them and the cheaper form of it."""
     if inference != "laplace":
         return None
     answers = int(np.asarray(trials.mask).sum())
-    found = counts_of(trials, gp.likelihood.categories)
-    return found if 4 * found.people * found.x.shape[0] ** 3 < answers**3 else None
+    counts = counts_of(trials, gp.likelihood.categories)
+    return counts if 4 * counts.people * counts.x.shape[0] ** 3 < answers**3 else None
 
 
-def _together(gp, trials, share, inference, largest) -> Posterior | None:
+def _shared_function(
+    gp: OrdinalGP, trials: Trials, share: Float[Array, ""], inference: str, largest: int
+) -> Posterior | None:
     """The shared function's posterior from all answers at once; None if they are too many."""
-    posterior = _from_counts(gp, _counts(gp, trials, inference), share, largest)
+    posterior = _from_counts(gp, _counts_if_cheaper(gp, trials, inference), share, largest)
     if posterior is not None:
         return posterior
     if inference == "exact" or int(np.asarray(trials.mask).sum()) > largest:
@@ -196,7 +198,7 @@ def _together(gp, trials, share, inference, largest) -> Posterior | None:
 
 def _pooled(gp: OrdinalGP, trials: Trials, inference: str, largest: int) -> Posterior | None:
     """One GP on everybody's answers, as if from one person; None if they are too many."""
-    counts = _counts(gp, trials, inference)
+    counts = _counts_if_cheaper(gp, trials, inference)
     one = jnp.ones_like(gp.kernel.variance)
     posterior = _from_counts(gp, None if counts is None else one_person(counts), one, largest)
     mask = np.asarray(trials.mask)

@@ -91,8 +91,8 @@ def aggregate(
     prior = jnp.broadcast_to(jnp.asarray(prior_variance, means.dtype), means.shape[1:])
     if rule == "average":
         return bcm.average(means, prior[None, :] - explained, mask=mask)
-    part = jnp.ones((), means.dtype) if share is None else jnp.asarray(share, means.dtype)
-    each = terms(rule, means, explained, prior[None, :], part)
+    common_share = jnp.ones((), means.dtype) if share is None else jnp.asarray(share, means.dtype)
+    each = terms(rule, means, explained, prior[None, :], common_share)
     present = jnp.ones(means.shape[0], bool) if mask is None else mask
     sums = Sums(*(jnp.sum(jnp.where(present[:, None], leaf, 0.0), axis=0) for leaf in each))
-    return sums.merge(prior, jnp.sum(present, dtype=means.dtype), rule, part)
+    return sums.merge(prior, jnp.sum(present, dtype=means.dtype), rule, common_share)

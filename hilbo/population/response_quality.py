@@ -31,7 +31,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import binomtest, chi2
 
@@ -85,7 +85,7 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
     `surprise` is the mean of -log p_i, in nats, the person's own model being asked; what cannot be said is NaN.
     """
     model = OrdinalGP(_Levelled(gp.kernel), gp.likelihood)
-    mean, variance, probabilities = (np.asarray(part) for part in _left_out(model, trials))
+    mean, variance, probabilities = (np.asarray(leaf) for leaf in _left_out(model, trials))
     scale, rows = float(np.sqrt(gp.kernel.variance)), []
     scaled = OrdinalProbit(gp.likelihood.thresholds / scale, gp.likelihood.noise / scale)
     for j, name in enumerate(names):
@@ -94,8 +94,8 @@ def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, nea
         row = {"participant": name, "trials": len(q), "categories": len(np.unique(q))}
         row |= _consistency(x, q, near)
         given = probabilities[j][mask][np.arange(len(q)), q]
-        row |= _named("lapse", lapse(given, probabilities.shape[-1]))
-        row |= _named("drift", drift(scaled, mean[j][mask] / scale, variance[j][mask] / scale**2, q))
+        row |= _estimate_columns("lapse", lapse(given, probabilities.shape[-1]))
+        row |= _estimate_columns("drift", drift(scaled, mean[j][mask] / scale, variance[j][mask] / scale**2, q))
         rows.append(row | {"surprise": float(-np.log(given).mean()) if len(q) else np.nan})
     return pd.DataFrame(rows, columns=["participant", *MEASURES])
 
@@ -111,16 +111,16 @@ def left_out(
     covariance, latent = gram(gp.kernel, trials.x, trials.x), posterior.latent
     inverse = jnp.diagonal(latent.inverse)
     shared = jnp.sum(latent.inverse * covariance, axis=1)
-    said = trials.mask & (inverse > 0)
+    answered = trials.mask & (inverse > 0)
     mean, explained = posterior.predict_explained(trials.x)
     full = jax.vmap(gp.kernel.diagonal)(trials.x) - explained
-    variance = jnp.where(said, shared / jnp.where(said, inverse, jnp.ones_like(inverse)), full)
-    mean = mean - jnp.where(said, variance * latent.weights, jnp.zeros_like(mean))
+    variance = jnp.where(answered, shared / jnp.where(answered, inverse, jnp.ones_like(inverse)), full)
+    mean = mean - jnp.where(answered, variance * latent.weights, jnp.zeros_like(mean))
     return mean, variance, jax.vmap(gp.likelihood.class_probabilities)(mean, variance)
 
 
 @eqx.filter_jit
-def _left_out(gp, trials):
+def _left_out(gp: OrdinalGP, trials: Trials) -> tuple[Float[Array, "M n"], Float[Array, "M n"], Float[Array, "M n C"]]:
     return jax.lax.map(lambda t: left_out(gp, t), trials)
 
 
@@ -166,8 +166,8 @@ def drift(
 
     def log_likelihood(shift):
         centre = mean + shift * progress
-        said = _log_between((edges[q] - centre) / width, (edges[q + 1] - centre) / width)
-        return float(np.sum(np.logaddexp(attentive + said, guess), axis=1).max())
+        log_chances = _log_between((edges[q] - centre) / width, (edges[q + 1] - centre) / width)
+        return float(np.sum(np.logaddexp(attentive + log_chances, guess), axis=1).max())
 
     best, low, high = _profile(log_likelihood, -_DRIFT, _DRIFT)
     return best, -np.inf if low <= -_DRIFT else low, np.inf if high >= _DRIFT else high
@@ -179,7 +179,7 @@ def excluded(table: pd.DataFrame, rule: str) -> dict[str, str]:
     A rule is one or more conditions joined by "or"; each names a measure, <, <=, > or >=, and a number. A measure that
     is NaN fulfils nothing. Raises `InputError` for another rule.
     """
-    conditions = [_condition(part) for part in rule.split(" or ")] if rule.strip() else []
+    conditions = [_condition(condition) for condition in rule.split(" or ")] if rule.strip() else []
     reasons = {}
     for row in table.to_dict("records"):
         for measure, words, holds in conditions:
@@ -189,18 +189,19 @@ def excluded(table: pd.DataFrame, rule: str) -> dict[str, str]:
     return reasons
 
 
-def _condition(text) -> tuple[str, str, Callable[[float], bool]]:
-    found = _RULE.match(text)
-    if found is None or found[1] not in MEASURES:
+def _condition(text: str) -> tuple[str, str, Callable[[float], bool]]:
+    """A condition of a rule: the measure it is about, the condition in words, and whether a value fulfils it."""
+    matched = _RULE.match(text)
+    if matched is None or matched[1] not in MEASURES:
         raise InputError(
             f'exclusion rule: "{text.strip()}" is no condition; write for example "trials < 10 or lapse_low > 0.3", of'
             f" {', '.join(MEASURES)}."
         )
-    measure, sign = found[1], found[2]
+    measure, sign = matched[1], matched[2]
     try:
-        limit = float(found[3])
+        limit = float(matched[3])
     except ValueError:
-        raise InputError(f'exclusion rule: "{found[3]}" is no number.') from None
+        raise InputError(f'exclusion rule: "{matched[3]}" is no number.') from None
     holds = {
         "<": lambda v: v < limit,
         "<=": lambda v: v <= limit,
@@ -210,23 +211,24 @@ def _condition(text) -> tuple[str, str, Callable[[float], bool]]:
     return measure, f"{measure} {sign} {limit:g}", holds
 
 
-def _consistency(x, q, near):
+def _consistency(x: Float[np.ndarray, "n d"], q: Int[np.ndarray, " n"], near: float) -> dict[str, float | int]:
+    """The columns of a person that come from repeated renderings."""
     pairs = repeats(x, near)
-    found = {"pairs": len(pairs), "consistency": np.nan, "consistency_low": 0.0, "consistency_high": 1.0}
-    found["chance"] = np.nan
+    row = {"pairs": len(pairs), "consistency": np.nan, "consistency_low": 0.0, "consistency_high": 1.0}
+    row["chance"] = np.nan
     if len(pairs):
-        found["chance"] = float(np.sum((np.bincount(q[pairs.ravel()]) / pairs.size) ** 2))
+        row["chance"] = float(np.sum((np.bincount(q[pairs.ravel()]) / pairs.size) ** 2))
         agree = int(np.sum(q[pairs[:, 0]] == q[pairs[:, 1]]))
         ends = binomtest(agree, len(pairs)).proportion_ci()
-        found |= {"consistency": agree / len(pairs), "consistency_low": ends.low, "consistency_high": ends.high}
-    return found
+        row |= {"consistency": agree / len(pairs), "consistency_low": ends.low, "consistency_high": ends.high}
+    return row
 
 
-def _named(name, found):
-    return dict(zip((name, f"{name}_low", f"{name}_high"), map(float, found), strict=True))
+def _estimate_columns(name: str, estimate: tuple[float, float, float]) -> dict[str, float]:
+    return dict(zip((name, f"{name}_low", f"{name}_high"), map(float, estimate), strict=True))
 
 
-def _profile(log_likelihood, low, high):
+def _profile(log_likelihood: Callable[[float], float], low: float, high: float) -> tuple[float, float, float]:
     """Maximum of a concave function within bounds, and where twice it has fallen by the 95 % point of chi^2."""
     best = minimize_scalar(lambda v: -log_likelihood(v), bounds=(low, high), method="bounded").x
     best = max((low, float(best), high), key=log_likelihood)
@@ -240,7 +242,7 @@ def _profile(log_likelihood, low, high):
     return best, end(low), end(high)
 
 
-def _log_between(a, b):
+def _log_between(a: Float[np.ndarray, "*s"], b: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
     """log(Phi(b) - Phi(a)), in whichever tail keeps its digits."""
     from scipy.special import log_ndtr
 

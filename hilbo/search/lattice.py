@@ -115,16 +115,16 @@ def screen(
     values = _Values(kernel.diagonal(x[0]), factor, weights, score)
     columns = _Columns(*_factors(kernel, x, lattice), usable, values)
     beside = values(gram(kernel, x, lattice.extra.astype(x.dtype)))
-    others, others_hopes = (jnp.where(may, part, -jnp.inf) for part in beside)
-    found = _best_first(columns, jnp.max(others, initial=-jnp.inf))
-    at_top = lattice.points(*found.top)
+    others, others_hopes = (jnp.where(may, scores, -jnp.inf) for scores in beside)
+    search = _best_first(columns, jnp.max(others, initial=-jnp.inf))
+    at_top = lattice.points(*search.top)
     if lattice.extra.shape[0]:
-        at_top = jnp.where(found.top[0] < 0, lattice.extra[jnp.argmax(others)], at_top)
-    first = jnp.where(found.highest > -jnp.inf, jnp.inf, found.highest)
-    at_rows = lattice.points(found.rows, jnp.arange(usable.shape[1]))
+        at_top = jnp.where(search.top[0] < 0, lattice.extra[jnp.argmax(others)], at_top)
+    first = jnp.where(search.highest > -jnp.inf, jnp.inf, search.highest)
+    at_rows = lattice.points(search.rows, jnp.arange(usable.shape[1]))
     return Screened(
-        found.highest,
-        jnp.concatenate([first[None], found.hopes, others_hopes]),
+        search.highest,
+        jnp.concatenate([first[None], search.hopes, others_hopes]),
         jnp.concatenate([at_top[None, :], at_rows, lattice.extra]),
     )
 
@@ -137,30 +137,30 @@ class _Found(NamedTuple):
     rows: Int[Array, " c"]  # and where it is
 
 
-def _best_first(columns, highest) -> _Found:
+def _best_first(columns: "_Columns", highest: Float[Array, ""]) -> _Found:
     """Columns get variances, the largest bounds first, while they may hold a value above the `highest` yet."""
 
-    def step(found):
-        _, chosen = jax.lax.top_k(found.bounds, min(_BATCH, found.bounds.shape[0]))
+    def step(state):
+        _, chosen = jax.lax.top_k(state.bounds, min(_BATCH, state.bounds.shape[0]))
         value, hope = columns.evaluate(chosen)
         best = jnp.max(value, axis=0)
         column = jnp.argmax(best)
-        higher = best[column] > found.highest
-        row, at = found.top
+        higher = best[column] > state.highest
+        row, top_column = state.top
         return _Found(
-            found.bounds.at[chosen].set(-jnp.inf),
-            jnp.where(higher, best[column], found.highest),
-            (jnp.where(higher, _first_largest(value[:, column]), row), jnp.where(higher, chosen[column], at)),
-            found.hopes.at[chosen].set(jnp.max(hope, axis=0)),
-            found.rows.at[chosen].set(_first_largest(hope)),
+            state.bounds.at[chosen].set(-jnp.inf),
+            jnp.where(higher, best[column], state.highest),
+            (jnp.where(higher, _first_largest(value[:, column]), row), jnp.where(higher, chosen[column], top_column)),
+            state.hopes.at[chosen].set(jnp.max(hope, axis=0)),
+            state.rows.at[chosen].set(_first_largest(hope)),
         )
 
     bounds, none = columns.bounds(), jnp.asarray(-1, jnp.int32)
-    begun = _Found(bounds, highest, (none, none), jnp.full_like(bounds, -jnp.inf), jnp.zeros(bounds.shape, jnp.int32))
-    return jax.lax.while_loop(lambda found: jnp.max(found.bounds) > found.highest, step, begun)
+    start = _Found(bounds, highest, (none, none), jnp.full_like(bounds, -jnp.inf), jnp.zeros(bounds.shape, jnp.int32))
+    return jax.lax.while_loop(lambda state: jnp.max(state.bounds) > state.highest, step, start)
 
 
-def _first_largest(values):
+def _first_largest(values: Float[Array, "r *c"]) -> Int[Array, "*c"]:
     """`argmax` down the first axis; XLA makes faster code of a maximum and a minimum than of one `argmax`."""
     last = values.shape[0] - 1
     index = jnp.arange(last + 1, dtype=jnp.int32).reshape(-1, *[1] * (values.ndim - 1))
@@ -189,8 +189,8 @@ class _Columns(eqx.Module):
         """Values and hopes of some columns."""
         across = self.across[:, chosen][:, None, :]
         cross = jnp.concatenate([self.down.T[:, :, None] * across, self.ends[:, :, chosen] * across], axis=1)
-        found = self.values(cross.reshape(len(cross), -1))
-        value, hope = (jnp.where(self.usable[:, chosen], part.reshape(-1, len(chosen)), -jnp.inf) for part in found)
+        scores = self.values(cross.reshape(len(cross), -1))
+        value, hope = (jnp.where(self.usable[:, chosen], score.reshape(-1, len(chosen)), -jnp.inf) for score in scores)
         return value, hope
 
 
@@ -209,9 +209,9 @@ def screen_points(
     def evaluate(state):
         bounds, values = state
         _, chosen = jax.lax.top_k(bounds, min(batch, bounds.shape[0]))
-        found, _ = value_of(gram(kernel, x, points[chosen]))
+        chosen_values, _ = value_of(gram(kernel, x, points[chosen]))
         # A point that comes twice, because all bounds are used up, keeps its value.
-        return bounds.at[chosen].set(-jnp.inf), values.at[chosen].set(found)
+        return bounds.at[chosen].set(-jnp.inf), values.at[chosen].set(chosen_values)
 
     bounds = value_of.bound(gram(kernel, points, x) @ weights)
     first = evaluate((bounds, jnp.full_like(bounds, -jnp.inf)))
@@ -237,18 +237,20 @@ class _Values(eqx.Module):
         mean, left = product[-1], self.prior - jnp.sum(product[:-1] ** 2, axis=0)
         # Rounding may leave less than nothing of a variance, and these numbers only rank; what is none ranks last.
         value = self.score(mean, jnp.where(left > 0, left, 0.0))
-        known = value > -jnp.inf
+        possible = value > -jnp.inf
         hope = value + _PROMISE * (self.score.optimistic(mean, self.prior) - value)
-        return jnp.where(known, value, -jnp.inf), jnp.where(known, hope, -jnp.inf)
+        return jnp.where(possible, value, -jnp.inf), jnp.where(possible, hope, -jnp.inf)
 
 
-def _factors(kernel, x, lattice):
+def _factors(
+    kernel: RBF, x: Float[Array, "n d"], lattice: Lattice
+) -> tuple[Float[Array, "g n"], Float[Array, "n c"], Float[Array, "n e c"]]:
     """Covariances as products: (g, n) along the columns, (n, c) across them, and (n, e, c) at their ends."""
     nodes, ends = lattice.nodes.astype(x.dtype), lattice.ends.astype(x.dtype)
     across = kernel.diagonal(x[0]) * jnp.ones_like(x[:, :1])
     for i in range(lattice.dim):
         if i != lattice.along:
             across = (across[:, :, None] * kernel.along(i, x[:, i], nodes)[:, None, :]).reshape(x.shape[0], -1)
-    at = x[:, lattice.along]
-    at_ends = kernel.along(lattice.along, at, ends.reshape(-1))
-    return kernel.along(lattice.along, nodes, at), across, at_ends.reshape(x.shape[0], *ends.shape)
+    asked = x[:, lattice.along]
+    at_ends = kernel.along(lattice.along, asked, ends.reshape(-1))
+    return kernel.along(lattice.along, nodes, asked), across, at_ends.reshape(x.shape[0], *ends.shape)

@@ -20,7 +20,7 @@ device that checks passivity again in float32 never refuses a proposal.
 import functools
 import math
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -31,8 +31,8 @@ from jaxtyping import Array, Bool, Float, Real
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
 from hilbo.mechanics.exponentials import STATES
-from hilbo.mechanics.memory import Memory, span, sums
-from hilbo.search.space_filling import latin_chunks, sobol_chunks, take, wall_chunks
+from hilbo.mechanics.memory import Memory, Span, span, sums
+from hilbo.search.space_filling import Chunks, latin_chunks, sobol_chunks, take, wall_chunks
 
 __all__ = ["COLUMNS", "ROWS", "SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace", "column_ends", "column_table"]
 
@@ -136,7 +136,7 @@ class SearchSpace(eqx.Module):
         if self.mechanics is not None:
             self._check_mechanics(self.mechanics)
 
-    def _check_mechanics(self, mechanics):
+    def _check_mechanics(self, mechanics: Mechanics) -> None:
         missing = [name for name in ("K1", "B1", "alpha") if name not in self.names]
         if missing:
             raise InputError(f"parameters.{missing[0]} is missing, the renderer's model needs K1, B1 and alpha.")
@@ -147,7 +147,7 @@ class SearchSpace(eqx.Module):
         alpha = self.parameters[self._index("alpha")]
         if alpha.high >= 1:
             raise InputError(f"parameters.alpha.high is {alpha.high}, it must be below 1 for the FO-SLS.")
-        if not _column_table(self)[0][-1] > 0:
+        if not _cumulative_volume(self)[0][-1] > 0:
             if mechanics.effective_damping is not None:
                 raise InputError(
                     f"renderer.effective_damping leaves no parameter set: none is passive with renderer.damping = "
@@ -227,7 +227,11 @@ class SearchSpace(eqx.Module):
         m = self.mechanics
         if m is None:
             return {}
-        return {"K0": viscoelastic.K0_from_effective_stiffness(*_set(physical), m.K_eff, m.N, m.T, memory=m.memory)}
+        return {
+            "K0": viscoelastic.K0_from_effective_stiffness(
+                *_model_parameters(physical), m.K_eff, m.N, m.T, memory=m.memory
+            )
+        }
 
     def passivity_margin(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."] | None:
         """Damping of the device less the smallest passive one, N·s/m; None without mechanics."""
@@ -235,16 +239,16 @@ class SearchSpace(eqx.Module):
 
     def volume(self) -> float:
         """Share of the unit cube that is feasible: the mean width of its columns, on a grid; 1 without mechanics."""
-        return 1.0 if self.mechanics is None else float(_column_table(self)[0][-1])
+        return 1.0 if self.mechanics is None else float(_cumulative_volume(self)[0][-1])
 
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol')."""
-        return _take(self, m, sobol_chunks(self.dim, m, seed))
+        return _take_feasible(self, m, sobol_chunks(self.dim, m, seed))
 
     def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points on the walls, edges and corners of the feasible set, the passive boundary included."""
         count = 2 ** max(m - 1, 0).bit_length()
-        return _take(self, m, sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed))
+        return _take_feasible(self, m, sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed))
 
     def latin_hypercube(self, n: int, seed: int) -> Float[np.ndarray, "n d"]:
         """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
@@ -252,15 +256,15 @@ class SearchSpace(eqx.Module):
         Points that fall outside the feasible set (a few, at the foot of infeasible columns) are replaced from further
         hypercubes, at the price of the even spread.
         """
-        return _take(self, n, latin_chunks(self.dim, n, seed))
+        return _take_feasible(self, n, latin_chunks(self.dim, n, seed))
 
-    def _index(self, name):
+    def _index(self, name: str) -> int:
         return self.names.index(name)
 
-    def _split(self, physical):
+    def _split(self, physical: Float[Array, "*batch d"]) -> dict[str, Float[Array, "*batch"]]:
         return {name: physical[..., i] for i, name in enumerate(self.names)}
 
-    def _limit(self, m, x):
+    def _limit(self, m: Mechanics, x: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
         """Width of the column of each point: the largest feasible x_K1, 0 where there is none."""
         K1 = self.parameters[self._index("K1")]
         B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
@@ -268,7 +272,9 @@ class SearchSpace(eqx.Module):
         largest = passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory)
         return K1.to_unit(jnp.clip(largest, K1.low, K1.high))
 
-    def _interval(self, m, x):
+    def _interval(
+        self, m: Mechanics, x: Float[Array, "*batch d"]
+    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
         """Start and width of the column of each point, in x_K1, with a range of effective damping."""
         K1 = self.parameters[self._index("K1")]
         B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
@@ -278,48 +284,55 @@ class SearchSpace(eqx.Module):
         return low, jnp.maximum(high - low, 0)
 
 
-def _K1_range(m, B1, alpha):
+def _K1_range(
+    m: Mechanics, B1: Float[Array, "*batch"], alpha: Float[Array, "*batch"]
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """The K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
+    assert m.effective_damping is not None
     memory = span(m.memory, m.N, m.states)
-    return tuple(viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
+    low, high = (viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
+    return low, high
 
 
-def _K1_of(span, damping, B1, alpha, T):
+def _K1_of(
+    span: Span, damping: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
+) -> Float[Array, ""]:
     """The K1 with this effective damping."""
-    beta, found = B1 * T**-alpha, sums(alpha, span)
-    square = damping / (1000 * T * beta * found.moment)
+    beta, kernel_sums = B1 * T**-alpha, sums(alpha, span)
+    square = damping / (1000 * T * beta * kernel_sums.moment)
     possible = (square > 0) & (square < 1)
     share = jnp.sqrt(jnp.where(possible, square, 0.25))
-    K1 = beta * found.at_dc * share / (1 - share)
+    K1 = beta * kernel_sums.at_dc * share / (1 - share)
     return jnp.where(possible, K1, jnp.where(square > 0, jnp.inf, 0))
 
 
-def _effective_damping(m, physical):
-    return viscoelastic.effective_damping(*_set(physical), m.N, m.T, memory=m.memory, states=m.states)
+def _effective_damping(m: Mechanics, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."]:
+    return viscoelastic.effective_damping(*_model_parameters(physical), m.N, m.T, memory=m.memory, states=m.states)
 
 
-def _floating(x):
+def _floating(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
     return jnp.asarray(x, jnp.result_type(1.0, x))
 
 
-def _set(physical):
+def _model_parameters(physical: Mapping[str, Real[ArrayLike, "..."]]) -> tuple[Any, Any, Any]:
     return physical["K1"], physical["B1"], physical["alpha"]
 
 
-def _minimum_damping(m, physical):
-    return passivity.minimum_damping(*_set(physical), m.K_eff, m.N, m.T, memory=m.memory)
+def _minimum_damping(m: Mechanics, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."]:
+    return passivity.minimum_damping(*_model_parameters(physical), m.K_eff, m.N, m.T, memory=m.memory)
 
 
 @functools.lru_cache(maxsize=16)
-def column_table(space):
+def column_table(space: SearchSpace) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
     """Both ends of the columns, (B1, α), on a grid: at the x_B1 `ROWS` and the x_alpha `COLUMNS`."""
     x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
     x[..., space._index("B1")], x[..., space._index("alpha")] = ROWS[:, None], COLUMNS
-    return tuple(np.asarray(end, float) for end in column_ends(space, x))
+    low, high = column_ends(space, x)
+    return np.asarray(low, float), np.asarray(high, float)
 
 
 @functools.lru_cache(maxsize=16)
-def _column_table(space):
+def _cumulative_volume(space: SearchSpace) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "cells c"]]:
     """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
     low, high = column_table(space)
     node = high - low
@@ -331,11 +344,11 @@ def _column_table(space):
     return np.pad(np.cumsum(total), (1, 0)), within
 
 
-def _rosenblatt(space, uniform):
+def _rosenblatt(space: SearchSpace, uniform: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     """Uniform numbers (n, d) to box coordinates in which a column is as likely as it is wide."""
     if space.mechanics is None:
         return uniform
-    rows, within = _column_table(space)
+    rows, within = _cumulative_volume(space)
     B1, alpha = space._index("B1"), space._index("alpha")
     w = uniform.copy()
     w[:, B1] = np.interp(uniform[:, B1] * rows[-1], rows, ROWS)
@@ -347,22 +360,28 @@ def _rosenblatt(space, uniform):
 
 
 @eqx.filter_jit
-def column_ends(space, x):
+def column_ends(
+    space: SearchSpace, x: Float[ArrayLike, "*batch d"]
+) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
     """Both ends (...,) of the column of each point (..., d) of the unit cube, in x_K1; equal where none is feasible."""
-    if space.mechanics.effective_damping is None:
-        high = space._limit(space.mechanics, x)
+    x, mechanics = _floating(x), space.mechanics
+    assert mechanics is not None
+    if mechanics.effective_damping is None:
+        high = space._limit(mechanics, x)
         return jnp.zeros_like(high), high
-    low, width = space._interval(space.mechanics, x)
+    low, width = space._interval(mechanics, x)
     return low, low + width
 
 
 @eqx.filter_jit
-def _from_box(space, w):
+def _from_box(space: SearchSpace, w: Float[ArrayLike, "n d"]) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
     x = space.from_box(w)
     return x, space.feasible(x)
 
 
-def _take(space, count, chunks, hold=None):
+def _take_feasible(
+    space: SearchSpace, count: int, chunks: Chunks, hold: Chunks | None = None
+) -> Float[np.ndarray, "count d"]:
     """The first `count` feasible points out of chunks of uniform numbers, some coordinates held at an end."""
 
     def place(uniform):
@@ -370,11 +389,13 @@ def _take(space, count, chunks, hold=None):
         if hold is not None:
             ends = next(hold)
             w = np.where(np.isnan(ends), w, ends)
-        return _from_box(space, w)
+        x, feasible = _from_box(space, w)
+        return np.asarray(x), np.asarray(feasible)
 
-    kept, found, tried = take(count, chunks, place)
-    if found < count:
+    kept, count_feasible, tried = take(count, chunks, place)
+    if count_feasible < count:
         raise InputError(
-            f"renderer.effective_damping leaves {found} of {tried} passive points, too few to search; widen it."
+            f"renderer.effective_damping leaves {count_feasible} of {tried} passive points, too few to search;"
+            " widen it."
         )
     return np.concatenate(kept) if kept else np.zeros((0, space.dim))

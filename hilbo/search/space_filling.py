@@ -27,12 +27,12 @@ def take(
     `place` turns a chunk into points and says which are usable. Fewer than `count` are found only where less than
     `LEAST_SHARE` is usable.
     """
-    kept, found, tried = [], 0, 0
-    while found < count and not (tried > 10 / LEAST_SHARE and found < LEAST_SHARE * tried):
+    kept, usable_count, tried = [], 0, 0
+    while usable_count < count and not (tried > 10 / LEAST_SHARE and usable_count < LEAST_SHARE * tried):
         points, usable = map(np.asarray, place(next(chunks)))
-        kept.append(points[usable][: count - found])
-        found, tried = found + len(kept[-1]), tried + len(points)
-    return kept, found, tried
+        kept.append(points[usable][: count - usable_count])
+        usable_count, tried = usable_count + len(kept[-1]), tried + len(points)
+    return kept, usable_count, tried
 
 
 def sobol_chunks(dim: int, count: int, seed: int) -> Chunks:
