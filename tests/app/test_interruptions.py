@@ -114,6 +114,9 @@ def test_a_rendering_that_a_break_cut_off_is_felt_again_before_it_is_asked_about
         assert shown == [("reference", True), ("reference", False), ("a", True)] * 2
 
 
+QUIET = 1.5  # s that a page may be silent here
+
+
 class Page:
     """A participant's window without a browser: a cookie, a stream, and signs of life as long as it is told to."""
 
@@ -132,15 +135,16 @@ class Page:
 
 def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tmp_path, monkeypatch):
     monkeypatch.setattr(watchers, "_SILENT", 0.0)  # no program counts
+    monkeypatch.setattr(watchers, "_QUIET", QUIET)
     with Live(tmp_path, seconds=60.0) as live:
         page = Page(live)
         live.until(lambda v: v["phase"] == "hello", live.whole)
         page.post("begin")
         live.until(lambda v: v["phase"] == "step", live.whole)
-        end = time.monotonic() + 5.0  # longer than a page may be silent
+        end = time.monotonic() + 1.5 * QUIET
         while time.monotonic() < end:
             page.post("here")
-            time.sleep(0.5)
+            time.sleep(0.1 * QUIET)
         view = live.whole()
         assert view["participant_here"]
         assert view["phase"] == "step"
