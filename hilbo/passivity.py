@@ -78,29 +78,46 @@ def largest_K1(
 
 
 def _closed(memory: Memory, N: int) -> Span:
+    """The memory of a model, where the closed forms hold for it."""
     if memory == "short" and N % 2 == 0:
         raise ValueError(f"N is {N}, it must be odd: the closed passivity bound is too low for an even number of taps.")
     return span(memory, N)
 
 
-def _minimum_damping(span, K1, B1, alpha, K_eff, T):
+def _minimum_damping(
+    span: Span,
+    K1: Float[Array, ""],
+    B1: Float[Array, ""],
+    alpha: Float[Array, ""],
+    K_eff: Float[Array, ""],
+    T: Float[Array, ""],
+) -> Float[Array, ""]:
+    """b_min of this module's head, N·s/m; 500·T is T/2 for stiffness in N/mm."""
     beta = B1 * T**-alpha
-    found = sums(alpha, span)
-    fast, slow = share(K1, beta * found.at_nyquist), share(K1, beta * found.at_dc)
-    stiffness = K_eff + beta * found.spread * fast * slow
+    gl = sums(alpha, span)
+    fast, slow = share(K1, beta * gl.at_nyquist), share(K1, beta * gl.at_dc)
+    stiffness = K_eff + beta * gl.spread * fast * slow
     return jnp.where(K_eff < 0, jnp.inf, 500 * T * stiffness)
 
 
-def _largest_K1(span, B1, alpha, b, K_eff, T):
+def _largest_K1(
+    span: Span,
+    B1: Float[Array, ""],
+    alpha: Float[Array, ""],
+    b: Float[Array, ""],
+    K_eff: Float[Array, ""],
+    T: Float[Array, ""],
+) -> Float[Array, ""]:
+    """K1max of this module's head, N/mm, and its two limits."""
     beta = B1 * T**-alpha
-    found = sums(alpha, span)
+    gl = sums(alpha, span)
     room = b / (500 * T) - K_eff  # Y
-    excess = beta * found.spread - room  # A
+    excess = beta * gl.spread - room  # A
     impossible = (room <= 0) | (K_eff < 0)
     unlimited = excess <= 0
     limited = ~impossible & ~unlimited
     # The root is taken of harmless numbers where it is not used, so that its derivative cannot turn into NaN.
     room, excess = jnp.where(limited, room, 1), jnp.where(limited, excess, 1)
-    half = room * (found.at_nyquist + found.at_dc)
-    root = jnp.sqrt(half**2 + 4 * excess * room * found.at_nyquist * found.at_dc)
+    half = room * (gl.at_nyquist + gl.at_dc)
+    root = jnp.sqrt(half**2 + 4 * excess * room * gl.at_nyquist * gl.at_dc)
     return jnp.where(impossible, 0, jnp.where(unlimited, jnp.inf, beta * (half + root) / (2 * excess)))

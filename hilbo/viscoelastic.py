@@ -123,26 +123,42 @@ def elementwise(function: Callable, span: Span, *args: Real[ArrayLike, "..."]):
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def _compiled(function, span, *args):
+def _compiled(function: Callable, span: Span, *args: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.vectorize(partial(function, span))(*args)
 
 
-def _gl_sum(span, alpha):
+def _gl_sum(span: Span, alpha: Float[Array, ""]) -> Float[Array, ""]:
     return sums(alpha, span).at_dc
 
 
-def _gl_alternating_sum(span, alpha):
+def _gl_alternating_sum(span: Span, alpha: Float[Array, ""]) -> Float[Array, ""]:
     return sums(alpha, span).at_nyquist
 
 
-def _K0(span, K1, B1, alpha, K_eff, T):
+def _K0(
+    span: Span,
+    K1: Float[Array, ""],
+    B1: Float[Array, ""],
+    alpha: Float[Array, ""],
+    K_eff: Float[Array, ""],
+    T: Float[Array, ""],
+) -> Float[Array, ""]:
     return K_eff - series(K1, B1 * T**-alpha * sums(alpha, span).at_dc)
 
 
-def _dc_gain(span, K0, K1, B1, alpha, T):
+def _dc_gain(
+    span: Span,
+    K0: Float[Array, ""],
+    K1: Float[Array, ""],
+    B1: Float[Array, ""],
+    alpha: Float[Array, ""],
+    T: Float[Array, ""],
+) -> Float[Array, ""]:
     return K0 + series(K1, B1 * T**-alpha * sums(alpha, span).at_dc)
 
 
-def _effective_damping(span, K1, B1, alpha, T):
-    beta, found = B1 * T**-alpha, sums(alpha, span)
-    return 1000 * T * beta * found.moment * share(K1, beta * found.at_dc) ** 2
+def _effective_damping(
+    span: Span, K1: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
+) -> Float[Array, ""]:
+    beta, gl = B1 * T**-alpha, sums(alpha, span)
+    return 1000 * T * beta * gl.moment * share(K1, beta * gl.at_dc) ** 2

@@ -190,11 +190,11 @@ def test_a_cell_is_bounded_from_below_and_closely():
         p = rng.normal(size=8)
         rows = passivity_certificate._rows(jnp.asarray(p), 9)
         taylor = passivity_certificate._on_grid(rows, cells)
-        np.testing.assert_allclose(taylor, passivity_certificate._at(rows, jnp.asarray(nodes)), atol=1e-12)
+        np.testing.assert_allclose(taylor, passivity_certificate._at_angles(rows, jnp.asarray(nodes)), atol=1e-12)
         bound = np.asarray(passivity_certificate._lowest(taylor, jnp.asarray(radius), rows))
         least = np.polynomial.chebyshev.chebval(np.cos(inside), p).min(axis=1)
         assert np.all(bound <= least + 1e-12) and np.max(least - bound) < 2 * np.abs(p).sum()
-        fine = passivity_certificate._at(rows, jnp.asarray(nodes))
+        fine = passivity_certificate._at_angles(rows, jnp.asarray(nodes))
         bound = np.asarray(passivity_certificate._lowest(fine, jnp.asarray(1e-3), rows))
         ends = np.polynomial.chebyshev.chebval(np.cos(nodes[:, None] + np.array([[-1e-3, 0, 1e-3]])), p).min(axis=1)
         assert np.all(bound <= ends + 1e-12) and np.max(ends - bound) < 1e-4

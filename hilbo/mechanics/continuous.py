@@ -9,6 +9,8 @@ The second form of J holds at K0 = 0 too, where creep has no end. Units: N/mm, N
 (2010), Fractional Calculus and Waves in Linear Viscoelasticity, section 3.4.
 """
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax.scipy.special import gammaln
@@ -51,17 +53,21 @@ def creep_compliance(
     return _elementwise(_creep, t, K0, K1, B1, alpha)
 
 
-def _elementwise(function, *args):
+def _elementwise(function: Callable, *args: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
+    """`function` of scalars over broadcast arguments, in their common floating dtype."""
     dtype = jnp.result_type(1.0, *args)
     return jnp.vectorize(function)(*(jnp.asarray(arg, dtype) for arg in args))
 
 
-def _power(t, alpha):
+def _power(t: Float[Array, ""], alpha: Float[Array, ""]) -> Float[Array, ""]:
     """t^α with finite derivatives at t = 0."""
     return jnp.where(t > 0, jnp.where(t > 0, t, 1) ** alpha, 0)
 
 
-def _relaxation(t, K0, K1, B1, alpha):
+def _relaxation(
+    t: Float[Array, ""], K0: Float[Array, ""], K1: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""]
+) -> Float[Array, ""]:
+    """G(t), and the spring-pot's where K1 is infinite."""
     power = _power(t, alpha)
     rigid = jnp.isinf(K1)
     spring = jnp.where(rigid, 1, K1)
@@ -72,8 +78,11 @@ def _relaxation(t, K0, K1, B1, alpha):
     return K0 + jnp.where(rigid, pot, branch)
 
 
-def _creep(t, K0, K1, B1, alpha):
+def _creep(
+    t: Float[Array, ""], K0: Float[Array, ""], K1: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""]
+) -> Float[Array, ""]:
+    """J(t) in the second form of this module's head."""
     power = _power(t, alpha)
-    part = share(K1, K0)  # K1/(K0 + K1)
-    instant = jnp.where(jnp.isinf(K1), 0, part / jnp.where(jnp.isinf(K1), 1, K1))
-    return instant + part**2 / B1 * power * mittag_leffler_increment(alpha, K0 * part / B1 * power)
+    ratio = share(K1, K0)  # K1/(K0 + K1)
+    instant = jnp.where(jnp.isinf(K1), 0, ratio / jnp.where(jnp.isinf(K1), 1, K1))
+    return instant + ratio**2 / B1 * power * mittag_leffler_increment(alpha, K0 * ratio / B1 * power)

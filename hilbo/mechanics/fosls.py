@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 from jax.core import Tracer
 from jax.typing import ArrayLike
-from jaxtyping import Array, Complex, Float, Real
+from jaxtyping import Array, Complex, Float, Inexact, Real
 
 from hilbo.errors import InputError
 from hilbo.mechanics.memory import Memory, Span, gl_coefficients, response, span, sums
@@ -112,8 +112,8 @@ class FOSLS(eqx.Module):
 
     def effective_damping(self) -> Float[Array, ""]:
         """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1."""
-        found = sums(self.alpha, self.span)
-        return 1000 * self.T * self.beta * found.moment * share(self.K1, self.beta * found.at_dc) ** 2
+        gl = sums(self.alpha, self.span)
+        return 1000 * self.T * self.beta * gl.moment * share(self.K1, self.beta * gl.at_dc) ** 2
 
     def simulate(
         self, x: Real[ArrayLike, " n"], *, start: Start = "rest", unilateral: bool = False, block: int = BLOCK
@@ -147,7 +147,7 @@ class FOSLS(eqx.Module):
         return find(self, jnp.asarray(fraction, self.K0.dtype))
 
 
-def series(K1, pot):
+def series(K1: Float[Array, "..."], pot: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
     """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`."""
     firm = (jnp.abs(pot) <= K1) & (K1 > 0)
     compliance = (1 / jnp.where(firm, K1, 1)).astype(pot.dtype)
@@ -155,7 +155,7 @@ def series(K1, pot):
     return jnp.where(firm, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
 
 
-def share(K1, pot):
+def share(K1: Float[Array, "..."], pot: Float[Array, "..."]) -> Float[Array, "..."]:
     """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf."""
     firm = (pot <= K1) & (K1 > 0)
     ratio = jnp.where(firm, 0, K1) / jnp.where(firm | (pot == 0), 1, pot)
@@ -163,13 +163,13 @@ def share(K1, pot):
 
 
 @eqx.filter_jit
-def _frequency_response(model, omega):
+def _frequency_response(model: FOSLS, omega: Float[Array, "*w"]) -> Complex[Array, "*w"]:
     pot = response(model.alpha, omega * model.T, model.span)
     return model.K0.astype(pot.dtype) + series(model.K1, model.beta.astype(pot.dtype) * pot)
 
 
 @eqx.filter_jit
-def _force(model, x, start, unilateral, block):
+def _force(model: FOSLS, x: Float[Array, " n"], start: Start, unilateral: bool, block: int) -> Float[Array, " n"]:
     beta = model.beta
     gain, stiffness = share(model.K1, beta), series(model.K1, beta)
     x = jnp.maximum(x, 0) if unilateral else x
@@ -182,7 +182,7 @@ def _force(model, x, start, unilateral, block):
 
 
 @eqx.filter_jit
-def _position(model, F, start, block):
+def _position(model: FOSLS, F: Float[Array, " n"], start: Start, block: int) -> Float[Array, " n"]:
     beta = model.beta
     gain, stiffness = share(model.K1, beta), series(model.K1, beta)
     total = model.K0 + stiffness
@@ -194,11 +194,11 @@ def _position(model, F, start, block):
 
 
 @eqx.filter_jit
-def _short_settling(model, fraction):
+def _short_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""]:
     """First sample n with s_n >= fraction·s_inf after a unit step: the force relaxes as s grows, and s only grows."""
-    beta, found = model.beta, sums(model.alpha, model.span)
+    beta, gl = model.beta, sums(model.alpha, model.span)
     gain, feedback = share(model.K1, beta), share(beta, model.K1)
-    goal = fraction * (1 - found.at_dc) * share(model.K1, beta * found.at_dc)
+    goal = fraction * (1 - gl.at_dc) * share(model.K1, beta * gl.at_dc)
     taps = -gl_coefficients(model.alpha, model.N)[1:]
 
     def unfinished(carry):
@@ -215,7 +215,7 @@ def _short_settling(model, fraction):
 
 
 @eqx.filter_jit
-def _full_settling(model, fraction):
+def _full_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""]:
     """z with E_α(-z) = 1 - fraction by bisection of log z, and the time it stands for."""
 
     def halve(_, ends):
@@ -229,7 +229,7 @@ def _full_settling(model, fraction):
     return jnp.where(fraction > 0, jnp.exp((log_z + jnp.log(model.B1) - jnp.log(model.K1)) / model.alpha), 0)
 
 
-def _check_values(K0, K1, B1, alpha, memory):
+def _check_values(K0: float, K1: float, B1: float, alpha: float, memory: Memory) -> None:
     if not 0 < alpha <= 1:
         raise InputError(f"alpha is {alpha}, it must be above 0 and at most 1: the order of the fractional element.")
     for name, value, most in (("K1", K1, math.inf), ("B1", B1, math.nextafter(math.inf, 0))):

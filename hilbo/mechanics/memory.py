@@ -14,6 +14,7 @@ that of (1 - z^{-1})^α itself is infinite.
 Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Literal, NamedTuple
 
@@ -78,7 +79,10 @@ def response(alpha: Real[ArrayLike, ""], angle: Real[Array, "*w"], span: Span) -
     return jnp.vectorize(lambda d: jnp.sum(weight * d / (loss + (1 - loss) * d)))(difference)
 
 
-def _short_response(alpha, angle, difference, N):
+def _short_response(
+    alpha: Float[Array, ""], angle: Float[Array, "*w"], difference: Complex[Array, "*w"], N: int
+) -> Complex[Array, "*w"]:
+    """C as (1 - z^{-1})·Σ_{i<N} S_i z^{-i} + S_N z^{-N}; `difference` is 1 - z^{-1}."""
     delay = jax.lax.complex(jnp.cos(angle), -jnp.sin(angle))
 
     def add(carry, i):
@@ -105,7 +109,7 @@ def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
-def _gl_sums_jet(alpha, N, order):
+def _gl_sums_jet(alpha: Float[Array, ""], N: int, order: int) -> tuple[GLSums, ...]:
     """The sums and their derivatives by α up to that order, in one loop, however many directions α moves in.
 
     Without this rule a Hessian carries every direction through the N additions, at ten times the time; and the rule
@@ -120,14 +124,15 @@ def _gl_sums_jet(alpha, N, order):
 @_gl_sums_jet.defjvp
 def _gl_sums_jet_jvp(N, order, primals, tangents):
     longer = _gl_sums_jet(*primals, N, order + 1)
-    return longer[:-1], jax.tree.map(lambda part: part * tangents[0], longer[1:])
+    return longer[:-1], jax.tree.map(lambda slope: slope * tangents[0], longer[1:])
 
 
-def _first_of_jet(function):
+def _first_of_jet(function: Callable) -> Callable:
+    """The jet of order 0: the values alone."""
     return lambda alpha: (function(alpha),)
 
 
-def _longer(jet):
+def _longer(jet: Callable) -> Callable:
     """The jet with one derivative more."""
 
     def extended(alpha):
@@ -137,7 +142,9 @@ def _longer(jet):
     return extended
 
 
-def _gl_sums(alpha, N):
+def _gl_sums(alpha: Float[Array, ""], N: int) -> GLSums:
+    """The sums in one loop over the taps."""
+
     def add(sums, i):
         following, tap = _tap(alpha, sums.at_dc, i)
         odd = i % 2 == 1
@@ -152,10 +159,13 @@ def _gl_sums(alpha, N):
     return jax.lax.scan(add, GLSums(one, one, zero, zero), _indices(alpha, N))[0]
 
 
-def _tap(alpha, partial_sum, i):
+def _tap(
+    alpha: Float[Array, ""], partial_sum: Float[Array, ""], i: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """From S_{i-1} to S_i and |c_i|."""
     return partial_sum * (1 - alpha / i), alpha / i * partial_sum
 
 
-def _indices(alpha, N):
+def _indices(alpha: Float[Array, ""], N: int) -> Float[Array, " {N}"]:
+    """1 … N, in the dtype of `alpha`."""
     return jnp.arange(1, N + 1, dtype=alpha.dtype)

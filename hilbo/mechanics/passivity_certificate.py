@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Real
+from jaxtyping import Array, Bool, Complex, Float, Real
 
 from hilbo.mechanics.exponentials import exponentials
 from hilbo.mechanics.fosls import FOSLS, series, share
@@ -103,13 +103,14 @@ def certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
     return Certificate(b - scale * high, b - scale * low, model.dc_gain(), angle / model.T)
 
 
-def _full_enclosure(model):
+def _full_enclosure(model: FOSLS) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """As `_short_enclosure`, for full memory: the Nyquist frequency binds, and only rounding is open."""
     stiffness = model.high_frequency_gain()
     error = 4 * jnp.finfo(stiffness.dtype).eps * stiffness
     return stiffness - error, stiffness + error, jnp.asarray(jnp.pi, stiffness.dtype)
 
 
-def _short_enclosure(model):
+def _short_enclosure(model: FOSLS) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Bounds of max φ over all angles, and the angle of the largest φ found."""
     A, B, least = _polynomials(model)
     cells = 2 ** math.ceil(math.log2(_CELLS_PER_TAP * model.N + _LEAST_CELLS))
@@ -117,22 +118,22 @@ def _short_enclosure(model):
     value = _on_grid(_rows(B, 1), cells)[0] / _on_grid(_rows(A, 1), cells)[0]  # φ - K0
     best = jnp.argmax(value)
     peak = _climb(A, B, best.astype(A.dtype) * width, width)
-    found = jnp.maximum(value[best], _ratio(A, B, peak)[0])
+    largest = jnp.maximum(value[best], _ratio(A, B, peak)[0])
 
-    rounding = _ROUNDING * jnp.finfo(A.dtype).eps * (jnp.sum(jnp.abs(A)) * jnp.abs(found) + jnp.sum(jnp.abs(B)))
-    p = _rows((found + 4 * rounding) * A - B, _ORDER + 1)
+    rounding = _ROUNDING * jnp.finfo(A.dtype).eps * (jnp.sum(jnp.abs(A)) * jnp.abs(largest) + jnp.sum(jnp.abs(B)))
+    p = _rows((largest + 4 * rounding) * A - B, _ORDER + 1)
     beside = jnp.abs(jnp.arange(cells + 1) - best) <= 1
     cell = _lowest(_on_grid(p, cells), jnp.asarray(width / 2, A.dtype), p)
     ring = 2 * width * 0.5 ** jnp.arange(_RINGS, dtype=A.dtype)
     centre = jnp.concatenate([0.75 * ring, -0.75 * ring, jnp.zeros_like(ring[:1])])
     radius = jnp.concatenate([0.25 * ring, 0.25 * ring, 0.5 * ring[-1:]])
-    near = _lowest(_at(p, peak + centre), radius, p)
+    near = _lowest(_at_angles(p, peak + centre), radius, p)
     lowest = jnp.minimum(jnp.min(jnp.where(beside, jnp.inf, cell)), jnp.min(near)) - rounding
-    high = found + 4 * rounding + jnp.maximum(-lowest, 0) / least
-    return model.K0 + found - 4 * rounding, model.K0 + high, peak
+    high = largest + 4 * rounding + jnp.maximum(-lowest, 0) / least
+    return model.K0 + largest - 4 * rounding, model.K0 + high, peak
 
 
-def _polynomials(model):
+def _polynomials(model: FOSLS) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, ""]]:
     """Cosine coefficients of A and B, and the least value of A."""
     beta = model.beta
     k = series(model.K1, beta)
@@ -148,7 +149,7 @@ def _polynomials(model):
     return A, k * (g * V + h * square), (g + h * last) ** 2
 
 
-def _rows(p, count):
+def _rows(p: Float[Array, " n"], count: int) -> Float[Array, "{count} n"]:
     """p_j·(j/N)^m/m! for m < `count`: with cos, -sin, -cos, sin of jθ in turn, Taylor terms of p in units of 1/N."""
     j = jnp.arange(p.shape[0], dtype=p.dtype) / (p.shape[0] - 1)
     rows = [p]
@@ -157,21 +158,21 @@ def _rows(p, count):
     return jnp.stack(rows)
 
 
-def _on_grid(rows, cells):
+def _on_grid(rows: Float[Array, "m n"], cells: int) -> Float[Array, "m {cells+1}"]:
     """Taylor terms at the angles πi/cells, i = 0 … cells, as (m, i)."""
     turn = jnp.asarray([1j**m for m in range(len(rows))], jax.lax.complex(rows, rows).dtype)
     half = jax.lax.complex(rows.at[:, 0].multiply(2), jnp.zeros_like(rows)) * turn[:, None]
     return cells * jnp.fft.irfft(half, 2 * cells, axis=1)[:, : cells + 1]
 
 
-def _at(rows, angles):
+def _at_angles(rows: Float[Array, "m n"], angles: Float[Array, " i"]) -> Float[Array, "m i"]:
     """Taylor terms at any angles, as (m, i)."""
     turned = jnp.arange(rows.shape[1], dtype=angles.dtype)[:, None] * angles[None, :]
     cos, sin = rows @ jnp.cos(turned), rows @ jnp.sin(turned)
     return jnp.stack([(cos[m], -sin[m], -cos[m], sin[m])[m % 4] for m in range(len(rows))])
 
 
-def _lowest(taylor, radius, rows):
+def _lowest(taylor: Float[Array, "m i"], radius: Float[Array, "..."], rows: Float[Array, "m n"]) -> Float[Array, " i"]:
     """Least value that p can take within `radius` of each angle; the last of the `rows` bounds the remainder."""
     order, scaled = len(rows) - 1, radius * (rows.shape[1] - 1)
     term = [taylor[m] * scaled**m for m in range(order)]
@@ -183,14 +184,16 @@ def _lowest(taylor, radius, rows):
     return term[0] - jnp.where(inside, slope**2 / (4 * jnp.where(inside, bend, 1)), slope - bend)
 
 
-def _ratio(A, B, angle):
+def _ratio(
+    A: Float[Array, " n"], B: Float[Array, " n"], angle: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """B/A, with the slope and bend of (B/A)·A - B for the number B/A, per 1/N."""
-    a, b = (_at(_rows(p, 3), angle[None])[:, 0] for p in (A, B))
+    a, b = (_at_angles(_rows(p, 3), angle[None])[:, 0] for p in (A, B))
     value = b[0] / a[0]
     return value, value * a[1] - b[1], 2 * (value * a[2] - b[2])
 
 
-def _climb(A, B, start, width):
+def _climb(A: Float[Array, " n"], B: Float[Array, " n"], start: Float[Array, ""], width: float) -> Float[Array, ""]:
     """The angle of the largest B/A within a cell's width of `start`: Newton, kept inside."""
     N = A.shape[0] - 1
     low, high = jnp.maximum(start - width, 0), jnp.minimum(start + width, jnp.pi)
@@ -229,11 +232,11 @@ def witness(model: FOSLS, b: float) -> Witness | None:
     return Witness(force, x, 2 * math.pi * float(turns) / model.T, lost, lost + np.sum(force * np.diff(x)))
 
 
-def _fractional(model, y):
+def _fractional(model: FOSLS, y: Complex[np.ndarray, " n"]) -> Complex[np.ndarray, " n"]:
     """Σ c_i y_{n-i} of a periodic y, by the taps or the exponentials themselves."""
     if model.memory == "short":
         c = np.asarray(gl_coefficients(model.alpha, model.N))
-        return sum(c[i] * np.roll(y, i) for i in range(len(c)))
+        return sum((c[i] * np.roll(y, i) for i in range(len(c))), np.zeros_like(y))
     weight, loss = (np.asarray(value)[:, None] for value in exponentials(model.alpha, model.states))
     # m_n = loss·Σ_{i>=1} λ^{i-1} y_{n-i}, over one period and its repetitions.
     n = len(y)

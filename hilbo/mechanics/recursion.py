@@ -14,6 +14,9 @@ in which every term is positive where a, ρ and u are. That is the same sum in a
 sample by sample, which is the recursion that a device runs (m = 1).
 """
 
+from collections.abc import Callable
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -25,6 +28,15 @@ __all__ = ["BLOCK", "past_of"]
 
 BLOCK = 32
 """Samples at once."""
+
+
+class _History(NamedTuple):
+    """What a block of m samples needs of a memory with a state of s numbers."""
+
+    taps: Float[Array, " m"]  # |c_1| … |c_m|
+    carry: Float[Array, "m s"]  # how the state acts on each sample
+    write: Callable[[Array, Array], Array]  # the next state, from the state and y of the block
+    state: Float[Array, " s"]  # before the first block
 
 
 def past_of(
@@ -43,21 +55,21 @@ def past_of(
     blocks = -(-u.shape[0] // block)
     driven = gain * jnp.zeros(blocks * block, u.dtype).at[: u.shape[0]].set(u).reshape(blocks, block)
     describe = _taps if span.memory == "short" else _means
-    taps, carry, write, state = describe(alpha, before, span, block)
-    impulse, echo = _impulse(taps, feedback)
-    carry = _toeplitz(impulse) @ carry
+    history = describe(alpha, before, span, block)
+    impulse, echo = _impulse(history.taps, feedback)
+    carry = _toeplitz(impulse) @ history.carry
 
     def advance(state, inputs):
-        own, driven = inputs
-        past = carry @ state + own
-        return write(state, driven + feedback * past), past
+        echoed, driven = inputs
+        past = carry @ state + echoed
+        return history.write(state, driven + feedback * past), past
 
-    _, past = jax.lax.scan(advance, state, (driven @ _toeplitz(echo).T, driven))
+    _, past = jax.lax.scan(advance, history.state, (driven @ _toeplitz(echo).T, driven))
     return past.reshape(-1)[: u.shape[0]]
 
 
-def _taps(alpha, before, span, block):
-    """Taps |c_1| … |c_m|; the last values of y, the newest last, how they act on a block, and how they move on."""
+def _taps(alpha: Float[Array, ""], before: Float[Array, ""], span: Span, block: int) -> _History:
+    """Short memory: the state is the last values of y, the newest last."""
     N, length = span.N, max(span.N, block)
     taps = jnp.zeros(length + block, alpha.dtype).at[:N].set(-gl_coefficients(alpha, N)[1:])
     delay = jnp.arange(block)[:, None] + length - jnp.arange(length)[None, :]
@@ -65,11 +77,11 @@ def _taps(alpha, before, span, block):
     def write(state, y):
         return jnp.concatenate([state[block:], y])
 
-    return taps[:block], taps[delay - 1], write, jnp.full(length, before)
+    return _History(taps[:block], taps[delay - 1], write, jnp.full(length, before))
 
 
-def _means(alpha, before, span, block):
-    """The same for exponentials: |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
+def _means(alpha: Float[Array, ""], before: Float[Array, ""], span: Span, block: int) -> _History:
+    """Full memory: the state is one mean for each exponential, |c_i| = Σ p_k (1 - λ_k) λ_k^{i-1}."""
     weight, loss = exponentials(alpha, span.states)
     # As products, which have derivatives at λ = 0.
     powers = jnp.cumprod(jnp.concatenate([jnp.ones_like(loss)[None], jnp.tile(1 - loss, (block - 1, 1))]), axis=0)
@@ -79,10 +91,10 @@ def _means(alpha, before, span, block):
     def write(state, y):
         return state + (entry @ y - decay * state)
 
-    return carry @ loss, carry, write, jnp.full(span.states, before)
+    return _History(carry @ loss, carry, write, jnp.full(span.states, before))
 
 
-def _impulse(taps, feedback):
+def _impulse(taps: Float[Array, " m"], feedback: Float[Array, ""]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """d_0 … d_{m-1}, and (d - 1)/ρ = Σ |c_i| d_{j-i}, which is the echo of an input in s."""
 
     def add(backwards, _):
@@ -95,7 +107,7 @@ def _impulse(taps, feedback):
     return jnp.concatenate([jnp.ones_like(taps[:1]), later]), jnp.concatenate([jnp.zeros_like(taps[:1]), echo])
 
 
-def _toeplitz(column):
+def _toeplitz(column: Float[Array, " m"]) -> Float[Array, "m m"]:
     """Lower triangular matrix with this first column."""
     size = column.shape[0]
     delay = jnp.arange(size)[:, None] - jnp.arange(size)[None, :]
