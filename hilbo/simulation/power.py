@@ -8,7 +8,7 @@ drift over the study's own number of trials), so that a short session drifts les
 For every (m, t) a study is merged by the study's rule, and two errors are taken:
   optimum: NRMSE of the population optimum to the truth, in units of the search ranges;
   map: root mean square, over feasible points, of the difference between the probability of the highest answer that the
-       map foretells for a new person and the one that the simulated population has (the mean over many people, in
+       map predicts for a new person and the one that the simulated population has (the mean over many people, in
        closed form).
 Studies are dealt to processes, one core each; the numbers do not depend on how many there are.
 """
@@ -16,7 +16,7 @@ Studies are dealt to processes, one core each; the numbers do not depend on how 
 import contextlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
@@ -24,12 +24,12 @@ import equinox as eqx
 import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.special import ndtr
 from scipy.stats import binomtest
 
 from hilbo.errors import InputError
-from hilbo.population.maps import LARGEST_EXACT, rule_map
+from hilbo.population.maps import LARGEST_EXACT, RuleMap, rule_map
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import Person, Population, people, simulate_study
 from hilbo.study.aggregate import fit_cohort, map_optimum
@@ -92,11 +92,11 @@ def simulate_power(
     blocks: dict[int, pd.DataFrame] = {}
     if jobs == 1:
         for index in range(plan.studies):
-            blocks[index] = _by_itself(content, population_, plan, index)
+            blocks[index] = _study_in_process(content, population_, plan, index)
             say(len(blocks))
     else:
         with _pool(jobs, begin) as pool:
-            work = {pool.submit(_by_itself, content, population_, plan, i): i for i in range(plan.studies)}
+            work = {pool.submit(_study_in_process, content, population_, plan, i): i for i in range(plan.studies)}
             for done in as_completed(work):
                 blocks[work[done]] = done.result()
                 say(len(blocks))
@@ -109,12 +109,12 @@ def cores() -> int:
 
 
 @contextlib.contextmanager
-def _pool(jobs, begin):
+def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[ProcessPoolExecutor]:
     """Fresh processes with one core each, told by XLA's flags in the environment that they start with."""
     before = os.environ.get("XLA_FLAGS")
     os.environ["XLA_FLAGS"] = f"{before or ''} {_ONE_CORE}".strip()
     try:
-        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=begin) as pool:
+        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=initializer) as pool:
             yield pool
     finally:
         if before is None:
@@ -123,7 +123,7 @@ def _pool(jobs, begin):
             os.environ["XLA_FLAGS"] = before
 
 
-def _by_itself(content, population_, plan, index):
+def _study_in_process(content: str, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
     """One study, from what can be sent to another process."""
     study = Study.from_dict({"schema": 1} | json.loads(content))
     return one_study(study, population_, plan, index)
@@ -133,7 +133,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     """The errors of simulated study number `index`."""
     most, longest = max(plan.participants), max(plan.trials)
     seed = int(np.random.default_rng([plan.seed, index]).integers(2**31))
-    staged = _of_length(study, longest)
+    staged = _with_trials(study, longest)
     # A drift over the study's own session, told per trial, is this much over the longest one.
     scale = longest / study.selection.trials
     persons = people(staged, population_, most, seed)
@@ -150,24 +150,25 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
         posteriors = fit_cohort(staged, so_far)
         for m in plan.participants:
             some, given = jax.tree.map(lambda leaf, m=m: leaf[:m], (posteriors, so_far.trials))
-            merged = rule_map(study.gp, given, study.rule, posteriors=some, inference=study.inference)
-            x = np.asarray(map_optimum(study, merged, candidates).x)
-            found = np.asarray(_foretold(study, merged, points))
-            rows.append((index, m, count, _rms(x - truth), _rms(found - target)))
+            map_ = rule_map(study.gp, given, study.rule, posteriors=some, inference=study.inference)
+            x = np.asarray(map_optimum(study, map_, candidates).x)
+            probabilities = np.asarray(_map_top_probability(study, map_, points))
+            rows.append((index, m, count, _rms(x - truth), _rms(probabilities - target)))
     return pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
 
 
-def _rms(difference):
+def _rms(difference: Float[np.ndarray, "..."]) -> float:
     return float(np.sqrt(np.mean(difference**2)))
 
 
 @eqx.filter_jit
-def _foretold(study, merged, points):
-    mean, variance = merged.newcomer(points)
+def _map_top_probability(study: Study, map_: RuleMap, points: Float[Array, "m d"]) -> Float[Array, " m"]:
+    """Probability of a new person's highest answer that the map predicts."""
+    mean, variance = map_.newcomer(points)
     return jax.vmap(study.gp.likelihood.class_probabilities)(mean, variance)[:, -1]
 
 
-def _of_length(study, trials):
+def _with_trials(study: Study, trials: int) -> Study:
     """The study with another number of trials."""
     content = json.loads(study.content)
     content.setdefault("selection", {})["trials"] = trials

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials
@@ -114,13 +114,16 @@ def simulate_study(study: Study, persons: Person, seed: int) -> Trials:
     """
     count = persons.noise.shape[0]
     plan = design(study, seed)
-    own = [study.space.latin_hypercube(len(plan.initial), 1 + seed * count + i) for i in range(count)]
+    hypercubes = [study.space.latin_hypercube(len(plan.initial), 1 + seed * count + i) for i in range(count)]
     keys = jax.random.split(plan.key, count)
-    return _simulate(study, plan, jnp.asarray(np.stack(own)), persons, keys)
+    return _simulate(study, plan, jnp.asarray(np.stack(hypercubes)), persons, keys)
 
 
 @eqx.filter_jit
-def _simulate(study: Study, plan: Design, initial, persons, keys):
+def _simulate(
+    study: Study, plan: Design, initial: Float[Array, "M k d"], persons: Person, keys: Key[Array, " M"]
+) -> Trials:
+    """Everybody's session at once: the trials `initial` first, then those that the acquisition chooses."""
     trials = study.selection.trials
 
     def answered(state, point, trial):
@@ -163,9 +166,9 @@ def to_table(study: Study, trials: Trials) -> pd.DataFrame:
 
 def truth_table(study: Study, population: Population, persons: Person) -> pd.DataFrame:
     """The optima that were simulated, in physical units: the population's, and everybody's own."""
-    own = np.asarray(study.space.to_physical(persons.optimum))
-    width = max(2, len(str(len(own))))
+    individual_sets = np.asarray(study.space.to_physical(persons.optimum))
+    width = max(2, len(str(len(individual_sets))))
     centre = [population.truth[name] for name in study.space.names]
-    table = pd.DataFrame(np.vstack([centre, own]), columns=list(study.space.names))
-    table.insert(0, "source", ["population", *(f"individual:P{i + 1:0{width}d}" for i in range(len(own)))])
+    table = pd.DataFrame(np.vstack([centre, individual_sets]), columns=list(study.space.names))
+    table.insert(0, "source", ["population", *(f"individual:P{i + 1:0{width}d}" for i in range(len(individual_sets)))])
     return table

@@ -46,9 +46,11 @@ def validation_table(
     rng = np.random.default_rng([seed, 1])
     crowd = people(study, population, participants + judges, seed + 7_919)
     x = {row["set_id"]: _unit(study, row) for _, row in table.iterrows()}
-    own = [name for name, source in zip(table["set_id"], table["source"], strict=True) if source != "aggregate"]
+    individual_sets = [
+        name for name, source in zip(table["set_id"], table["source"], strict=True) if source != "aggregate"
+    ]
     pairs = [list(combinations(("best", "mid", "worst"), 2)) * _TIMES] * participants
-    pairs += [[("best", name) for name in own] * _TWICE] * judges
+    pairs += [[("best", name) for name in individual_sets] * _TWICE] * judges
     rows = []
     for person, asked in enumerate(pairs):
         model = person < participants
@@ -62,11 +64,19 @@ def validation_table(
     return pd.DataFrame(rows)
 
 
-def _unit(study, row):
+def _unit(study: Study, row: pd.Series) -> Float[np.ndarray, " d"]:
+    """A row of a sets table in the unit cube."""
     return np.asarray(study.space.to_unit(np.array([float(row[name]) for name in study.space.names])))
 
 
-def _answer(study, crowd: Person, person, x, y, rng):
+def _answer(
+    study: Study,
+    crowd: Person,
+    person: int,
+    x: Float[np.ndarray, " d"],
+    y: Float[np.ndarray, " d"],
+    rng: np.random.Generator,
+) -> tuple[list[str], int]:
     """Classes of two renderings, and which of them is preferred."""
     optimum, tolerance = np.asarray(crowd.optimum[person]), np.asarray(crowd.tolerance[person])
     felt = np.array([np.sqrt(np.sum(((point - optimum) / tolerance) ** 2)) for point in (x, y)])

@@ -19,7 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from hilbo import acquisition, bcm
-from hilbo.ordinal_gp import OrdinalGP, Posterior, fit
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, rule_map, share_of
@@ -84,15 +84,15 @@ class Aggregate(eqx.Module):
     @property
     def certificates(self) -> dict[str, np.ndarray]:
         """Everybody's certificate, (M,) for each of its figures."""
-        found = self.posteriors.certificate
-        return {name: np.asarray(getattr(found, name)) for name in found.__dataclass_fields__}
+        certificate = self.posteriors.certificate
+        return {name: np.asarray(getattr(certificate, name)) for name in certificate.__dataclass_fields__}
 
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube."""
         return predict_map(self.map, jnp.asarray(x))
 
     def newcomer(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new person's function at points of the unit cube: what answers are foretold
+        """Mean and variance (m,) of a new person's function at points of the unit cube: what answers are predicted
         from. By the hierarchical rule it differs from the map, which is the function that people share."""
         mean, variance = self.surface(x)
         return mean, variance + self.map.apart
@@ -112,7 +112,7 @@ def fit_cohort(
 
 
 @eqx.filter_jit
-def _fit_cohort(study, trials, gps, inference=None):
+def _fit_cohort(study: Study, trials: Trials, gps: OrdinalGP | None, inference: Inference | None = None) -> Posterior:
     inference = study.inference if inference is None else inference
     if gps is None:
         return jax.vmap(lambda t: fit(study.gp, t, inference=inference, throw=False))(trials)
@@ -160,7 +160,7 @@ def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -
     return _optimum(study, lambda x: predict_map(found, x), candidates, found.apart)
 
 
-def _optimum(study: Study, predict: Callable, candidates, apart) -> Optimum:
+def _optimum(study: Study, predict: Callable, candidates: Float[Array, "m d"], apart: ArrayLike) -> Optimum:
     """`apart`: variance of one person's function about the map's."""
     choice = acquisition.maximise(
         predict(candidates)[0],

@@ -6,8 +6,8 @@ tolerance intervals under the study's hyperparameters and under those of maximum
 people. What cannot be had from these answers is a sentence in `limits`, not an error.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -15,7 +15,8 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.hyperparameters.maximum_evidence import Learned, maximise_shared_evidence
-from hilbo.population.maps import point_rule
+from hilbo.ordinal_gp import Trials
+from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, aggregate_cohort, nrmse
@@ -101,47 +102,47 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     """Results of one material from all its participants' answers. Raises `InputError` if the rule leaves nobody."""
     say("consistency, lapses and drift of everybody")
     people = measure_people(study.gp, everybody.trials, everybody.names)
-    left = excluded(people, study.exclude)
-    if len(left) == len(everybody.names):
+    left_out = excluded(people, study.exclude)
+    if len(left_out) == len(everybody.names):
         raise InputError(
-            f'the rule "{study.exclude}" leaves out all {len(left)} participants; there is nothing to merge.'
+            f'the rule "{study.exclude}" leaves out all {len(left_out)} participants; there is nothing to merge.'
         )
-    cohort = everybody.of([name for name in everybody.names if name not in left]) if left else everybody
+    cohort = everybody.of([name for name in everybody.names if name not in left_out]) if left_out else everybody
     population = analyse_population(study, cohort, seed, say)
     aggregate = population.aggregate
     say("hyperparameters by maximum evidence")
-    learned, optimised = _optimised(study, cohort, seed)
+    learned, learned_study, optimised = _optimised(study, cohort, seed)
     say("reading the maps")
-    sets, words = _sets(study, aggregate, seed)
-    limits = (*limits_of(study, cohort), *words, *_substitute(aggregate))
+    sets, sentences = _best_mid_worst(study, aggregate, seed)
+    limits = (*limits_of(study, cohort), *sentences, *_merged_otherwise(aggregate.map))
     if bool(learned.runaway) or not bool(learned.converged):
         limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
     return Analysis(
         population,
-        _read(study, aggregate, seed),
-        _read(optimised[0], optimised[1], seed),
+        _reading(study, aggregate, seed),
+        _reading(learned_study, optimised, seed),
         learned,
         sets,
         people,
-        left,
+        left_out,
         limits,
     )
 
 
 def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     """What these answers cannot say, in sentences."""
-    counts, found = cohort.counts(), []
+    counts, sentences = cohort.counts(), []
     if len(cohort.names) == 1:
         map_ = "is that person's own, shrunk towards the prior" if study.rule == "rbcm" else "is that person's own"
-        found.append(
+        sentences.append(
             f"{cohort.names[0]} is the only participant: the population map {map_}, and nothing is known of how people"
             " differ."
         )
     few = [name for name, count in zip(cohort.names, counts, strict=True) if count < 5]
     if few:
-        found.append(f"Fewer than 5 answers were given by {', '.join(few)}; their maps are nearly the prior.")
+        sentences.append(f"Fewer than 5 answers were given by {', '.join(few)}; their maps are nearly the prior.")
     if counts.min() != counts.max():
-        found.append(
+        sentences.append(
             f"Participants gave between {counts.min()} and {counts.max()} answers; after n trials, those with fewer"
             " enter with what they have."
         )
@@ -152,25 +153,26 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
         if len(np.unique(q[j][mask[j]])) == 1
     ]
     if one:
-        found.append(f"One answer only was ever given by {', '.join(one)}: that is no map of where to go.")
+        sentences.append(f"One answer only was ever given by {', '.join(one)}: that is no map of where to go.")
     planned = study.selection.trials
     if counts.max() < planned:
-        found.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
-    return tuple(found)
+        sentences.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
+    return tuple(sentences)
 
 
-def _optimised(study, cohort, seed):
+def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Learned, Study, Aggregate]:
+    """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
     learned = _learn(study, cohort.trials)
-    again = eqx.tree_at(lambda s: s.gp, study, learned.gp)
-    return learned, (again, aggregate_cohort(again, cohort, seed, alternatives=False))
+    learned_study = eqx.tree_at(lambda s: s.gp, study, learned.gp)
+    return learned, learned_study, aggregate_cohort(learned_study, cohort, seed, alternatives=False)
 
 
 @eqx.filter_jit
-def _learn(study, trials):
+def _learn(study: Study, trials: Trials) -> Learned:
     return maximise_shared_evidence(study.gp, trials, _LEARN, weak_priors=True, inference=study.inference)
 
 
-def _read(study, aggregate, seed):
+def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
     """Tolerance intervals through the map's optimum, along every parameter."""
     x = aggregate.optimum.x
     rule, share = point_rule(study.rule, aggregate.map.share)
@@ -187,21 +189,22 @@ def _read(study, aggregate, seed):
     )
 
 
-def _sets(study, aggregate, seed):
+def _best_mid_worst(study: Study, aggregate: Aggregate, seed: int) -> tuple[Sets | None, tuple[str, ...]]:
+    """The three sets; where the map has none, the sentence that says why."""
     try:
-        points = search_points(study.space, seed)
-        return best_mid_worst(study, aggregate.surface, points, prior=aggregate.map.map_prior), ()
+        candidates = search_points(study.space, seed)
+        return best_mid_worst(study, aggregate.surface, candidates, prior=aggregate.map.map_prior), ()
     except InputError as error:
         return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
 
 
-def _substitute(aggregate):
+def _merged_otherwise(map_: RuleMap) -> Iterator[str]:
     """A sentence where what stands beside the map is merged otherwise."""
-    how = in_place(aggregate.map)
+    how = in_place(map_)
     if how:
         yield (
-            f"The map is merged by the rule {aggregate.map.rule} from all answers at once; maps of fewer trials, and"
-            f" those of people drawn again for the ends of tolerance intervals, are merged {how}, so that their last"
+            f"The map is merged by the rule {map_.rule} from all answers at once; maps of fewer trials, and"
+            f" those of bootstrap resamples for the ends of tolerance intervals, are merged {how}, so that their last"
             " optimum need not be the map's."
         )
 

@@ -19,11 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import PartitionSpec
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
 
-from hilbo.gaussian import factor, mean_and_explained
+from hilbo.gaussian import Certificate, factor, mean_and_explained
 from hilbo.kernels import RBF, gram
-from hilbo.ordinal_gp import Trials, fit
+from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.pointwise import Rule, Sums, terms
 from hilbo.study.aggregate import Optimum, individual_optima
 from hilbo.study.cohort import Cohort
@@ -112,22 +113,22 @@ def block_size(people: int, platform: str = "cpu") -> int:
 def refit(population: Population, points: Float[np.ndarray, "m d"], individuals: bool = False) -> Fitted:
     """Fit everybody and add up what they say at points (m, d); `individuals`: and find everybody's own optimum, the
     points being its candidates."""
-    words = "participants fitted, each with an optimum of their own (--no-individuals leaves these out)"
-    words = words if individuals else "participants fitted"
-    found, people = _pass(population, "individuals" if individuals else "first", points, words)
-    fitted = dataclasses.replace(population, modes=people.get("modes"))
-    optima = Optimum(*map(jnp.asarray, people["optima"])) if individuals else None
-    return Fitted(fitted, found, people["certificate"], optima)
+    progress_words = "participants fitted, each with an optimum of their own (--no-individuals leaves these out)"
+    progress_words = progress_words if individuals else "participants fitted"
+    total, per_person = _sum_over_people(population, "individuals" if individuals else "first", points, progress_words)
+    fitted = dataclasses.replace(population, modes=per_person.get("modes"))
+    optima = Optimum(*map(jnp.asarray, per_person["optima"])) if individuals else None
+    return Fitted(fitted, total, per_person["certificate"], optima)
 
 
 def sums(population: Population, points: Float[np.ndarray, "m d"], words: str = "participants merged") -> Sums:
     """The sums over people at points (m, d)."""
-    return _pass(population, "sums", points, words)[0]
+    return _sum_over_people(population, "sums", points, words)[0]
 
 
 def jets(population: Population, points: Float[np.ndarray, "s d"], words: str = "participants merged") -> Jets:
     """The sums over people at points (s, d), with two derivatives."""
-    return _pass(population, "jets", points, words)[0]
+    return _sum_over_people(population, "jets", points, words)[0]
 
 
 # --- one pass over all people
@@ -135,27 +136,31 @@ def jets(population: Population, points: Float[np.ndarray, "s d"], words: str = 
 _Task = Literal["first", "individuals", "sums", "jets"]
 
 
-def _pass(population, task: _Task, points, words) -> Any:
+def _sum_over_people(
+    population: Population, task: _Task, points: Float[np.ndarray, "m d"], words: str
+) -> tuple[Any, Any]:
     """Block sums added in the order of the blocks, and what is kept of everybody in the order of people."""
     crew, people, size = population.crew, population.people, population.block
-    together = crew.devices * population.group * size
+    per_round = crew.devices * population.group * size
     total, kept = None, []
-    for begin in range(0, people, together):
-        rows = slice(begin, min(begin + together, people))
-        count = rows.stop - begin
-        blocks = crew.deal(_padded(population, rows))
+    for first in range(0, people, per_round):
+        rows = slice(first, min(first + per_round, people))
+        count = rows.stop - first
+        blocks = crew.deal(_padded_blocks(population, rows))
         by = population.rule, population.share
-        found = _round(population.study, np.asarray(points), blocks, task, population.inference, crew, by)
-        block_sums, each = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), found)
+        on_devices = _blocks_on_devices(
+            population.study, np.asarray(points), blocks, task, population.inference, crew, by
+        )
+        block_sums, per_person = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), on_devices)
         for i in range(-(-count // size)):
             block = jax.tree.map(lambda leaf, i=i: leaf[i], block_sums)
             total = block if total is None else jax.tree.map(np.add, total, block)
-        kept.append(jax.tree.map(lambda leaf, n=count: leaf.reshape(-1, *leaf.shape[2:])[:n], each))
+        kept.append(jax.tree.map(lambda leaf, n=count: leaf.reshape(-1, *leaf.shape[2:])[:n], per_person))
         population.say(words, rows.stop, people)
     return total, jax.tree.map(lambda *leaves: np.concatenate(leaves), *kept)
 
 
-def _padded(population, rows):
+def _padded_blocks(population: Population, rows: slice) -> tuple[Trials, np.ndarray | None]:
     """Trials and modes of some rows as (devices, group, block, ...), filled up with people who gave no answer."""
     shape = population.crew.devices, population.group, population.block
 
@@ -168,13 +173,21 @@ def _padded(population, rows):
 
 
 @eqx.filter_jit
-def _round(study, points, blocks, task, inference, crew, by):
+def _blocks_on_devices(
+    study: Study,
+    points: Float[ArrayLike, "m d"],
+    blocks: tuple[Trials, Float[Array, "devices group block n"] | None],
+    task: _Task,
+    inference: Inference,
+    crew: Crew,
+    by: tuple[Rule, float],
+) -> tuple[Any, Any]:
     """A group of blocks on each device, one after the other; everything comes back to everybody."""
 
     def on_device(study, points, blocks):
         def make(block):
             trials, modes = block
-            return _block(study, points, trials, modes, task, inference, crew.platform, by)
+            return _one_block(study, points, trials, modes, task, inference, crew.platform, by)
 
         out = jax.lax.map(make, jax.tree.map(lambda leaf: leaf[0], blocks))
         return jax.tree.map(lambda leaf: leaf[None], out)
@@ -186,14 +199,24 @@ def _round(study, points, blocks, task, inference, crew, by):
     return jax.lax.with_sharding_constraint(spread(study, points, blocks), crew.everywhere)
 
 
-def _block(study, points, trials, modes, task, inference, platform, by=("bcm", 1.0)):
+def _one_block(
+    study: Study,
+    points: Float[Array, "m d"],
+    trials: Trials,
+    modes: Float[Array, "block n"] | None,
+    task: _Task,
+    inference: Inference,
+    platform: str,
+    by: tuple[Rule, float] = ("bcm", 1.0),
+) -> tuple[Any, dict[str, Any]]:
+    """Sums over the people of one block at the points, and what is kept of each of them."""
     if task in ("sums", "jets"):
-        say = _sums_of if task == "sums" else _jets_of
-        experts = _each(lambda person: _expert(study, inference, *person), (trials, modes), platform)
-        return _added(lambda expert: say(expert, points, by), experts, platform), {}
-    posteriors = _each(lambda person: fit(study.gp, person, inference=inference, throw=False), trials, platform)
-    total = _added(lambda posterior: _sums_of(_of(posterior), points, by), posteriors, platform)
-    kept: dict[str, Any] = {"certificate": _fields(posteriors.certificate)}
+        person_terms = _person_sums if task == "sums" else _person_jets
+        predictors = _map_people(lambda person: _predictor_again(study, inference, *person), (trials, modes), platform)
+        return _sum_of_block(lambda predictor: person_terms(predictor, points, by), predictors, platform), {}
+    posteriors = _map_people(lambda person: fit(study.gp, person, inference=inference, throw=False), trials, platform)
+    total = _sum_of_block(lambda posterior: _person_sums(_predictor(posterior), points, by), posteriors, platform)
+    kept: dict[str, Any] = {"certificate": _as_dict(posteriors.certificate)}
     if inference == "laplace":
         kept["modes"] = posteriors.latent.mode
     if task == "individuals":
@@ -202,7 +225,7 @@ def _block(study, points, trials, modes, task, inference, platform, by=("bcm", 1
     return total, kept
 
 
-class _Expert(eqx.Module):
+class _Predictor(eqx.Module):
     """What it takes of a posterior to predict."""
 
     kernel: RBF
@@ -212,57 +235,60 @@ class _Expert(eqx.Module):
     inverse: Float[Array, "n n"]
 
 
-def _of(posterior):
+def _predictor(posterior: Posterior) -> _Predictor:
     latent = posterior.latent
-    return _Expert(posterior.gp.kernel, posterior.trials.x, latent.weights, latent.factor, latent.inverse)
+    return _Predictor(posterior.gp.kernel, posterior.trials.x, latent.weights, latent.factor, latent.inverse)
 
 
-def _expert(study, inference, trials, mode):
+def _predictor_again(study: Study, inference: Inference, trials: Trials, mode: Float[Array, " n"] | None) -> _Predictor:
     """One person's: Laplace's from the mode, the same numbers as the fit's; else by another fit."""
     if mode is None or inference != "laplace":
-        return _of(fit(study.gp, trials, inference=inference, throw=False))
+        return _predictor(fit(study.gp, trials, inference=inference, throw=False))
     kernel = study.gp.kernel
     _, slope, curvature = jax.vmap(study.gp.likelihood.expand)(mode, trials.q)
-    weights, curvature = (jnp.where(trials.mask, part, jnp.zeros_like(part)) for part in (slope, curvature))
+    weights, curvature = (jnp.where(trials.mask, values, jnp.zeros_like(values)) for values in (slope, curvature))
     root, _ = factor(gram(kernel, trials.x, trials.x), curvature)
-    return _Expert(kernel, trials.x, weights, root, root.T @ root)
+    return _Predictor(kernel, trials.x, weights, root, root.T @ root)
 
 
-def _fields(record):
+def _as_dict(record: Certificate) -> dict[str, Array]:
     return {name: getattr(record, name) for name in record.__dataclass_fields__}
 
 
-def _each(function, people, platform):
+def _map_people(of_person: Callable, people: PyTree, platform: str) -> PyTree:
     """A function of one person for all: one after the other on a CPU, at once elsewhere."""
-    return jax.lax.map(function, people) if platform == "cpu" else jax.vmap(function)(people)
+    return jax.lax.map(of_person, people) if platform == "cpu" else jax.vmap(of_person)(people)
 
 
-def _added(function, people, platform):
+def _sum_of_block(of_person: Callable, people: PyTree, platform: str) -> PyTree:
     """The sum of a function of one person over all people of a block."""
     count = jax.tree.leaves(people)[0].shape[0]
-    together = 1 if platform == "cpu" else min(count, _TOGETHER)
-    groups = jax.tree.map(lambda leaf: leaf.reshape(count // together, together, *leaf.shape[1:]), people)
+    group_size = 1 if platform == "cpu" else min(count, _TOGETHER)
+    groups = jax.tree.map(lambda leaf: leaf.reshape(count // group_size, group_size, *leaf.shape[1:]), people)
 
     def of_group(group):
-        if together == 1:
-            return function(jax.tree.map(lambda leaf: leaf[0], group))
-        return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), jax.vmap(function)(group))
+        if group_size == 1:
+            return of_person(jax.tree.map(lambda leaf: leaf[0], group))
+        return jax.tree.map(lambda leaf: jnp.sum(leaf, axis=0), jax.vmap(of_person)(group))
 
     shapes = jax.eval_shape(of_group, jax.tree.map(lambda leaf: leaf[0], groups))
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    return jax.lax.scan(lambda total, group: (jax.tree.map(jnp.add, total, of_group(group)), None), nothing, groups)[0]
+    zero = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    return jax.lax.scan(lambda total, group: (jax.tree.map(jnp.add, total, of_group(group)), None), zero, groups)[0]
 
 
-def _sums_of(expert, points, by):
+def _person_sums(predictor: _Predictor, points: Float[Array, "m d"], by: tuple[Rule, float]) -> Sums:
+    """What one person adds to the sums of a rule at the points."""
     rule, share = by
-    cross = gram(expert.kernel, expert.x, points)
-    means, explained = mean_and_explained(expert.weights, expert.factor, expert.inverse, cross)
-    return terms(rule, means, explained, jax.vmap(expert.kernel.diagonal)(points), share)
+    cross = gram(predictor.kernel, predictor.x, points)
+    means, explained = mean_and_explained(predictor.weights, predictor.factor, predictor.inverse, cross)
+    return terms(rule, means, explained, jax.vmap(predictor.kernel.diagonal)(points), share)
 
 
-def _jets_of(expert, points, by):
-    def at(x):
-        return jax.tree.map(lambda leaf: leaf[0], _sums_of(expert, x[None, :], by))
+def _person_jets(predictor: _Predictor, points: Float[Array, "s d"], by: tuple[Rule, float]) -> Jets:
+    """The same with gradient and Hessian at each point."""
 
-    slope = jax.jacrev(at)
-    return jax.vmap(lambda x: Jets(at(x), slope(x), jax.jacfwd(slope)(x)))(points)
+    def sums_at(x):
+        return jax.tree.map(lambda leaf: leaf[0], _person_sums(predictor, x[None, :], by))
+
+    gradient_at = jax.jacrev(sums_at)
+    return jax.vmap(lambda x: Jets(sums_at(x), gradient_at(x), jax.jacfwd(gradient_at)(x)))(points)

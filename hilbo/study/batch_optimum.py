@@ -9,12 +9,14 @@ under it. Usually one pass is left to do, in which the whole population corrects
 """
 
 import dataclasses
+from typing import NoReturn
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.errors import InputError
 from hilbo.numerics.newton import TrustRegionNewton
@@ -111,40 +113,48 @@ def optima_from(
     """The maximum of the map by each rule in the feasible set, from the sums at candidates (m, d)."""
     prior = np.asarray(jax.vmap(population.study.gp.kernel.diagonal)(jnp.asarray(candidates)))
     maps = {rule: found.merge(prior, population.people, rule, population.share) for rule in rules}
-    rows = {rule: _spread(maps[rule][0], candidates) for rule in rules}
+    rows = {rule: _separate_rows(maps[rule][0], candidates) for rule in rules}
     starts = np.concatenate([candidates[rows[rule]] for rule in rules])
     reached = optimum_near(population, starts, tuple(rule for rule in rules for _ in range(_STARTS)))
     feasible = np.asarray(_feasible(population.study, np.stack([optimum.x for optimum in reached])))
     best = {}
     for i, rule in enumerate(rules):
         chosen = slice(i * _STARTS, (i + 1) * _STARTS)
-        usable = [optimum for optimum, may in zip(reached[chosen], feasible[chosen], strict=True) if may]
+        usable = [optimum for optimum, allowed in zip(reached[chosen], feasible[chosen], strict=True) if allowed]
         top = rows[rule][0]
-        mean, variance = (part[top] for part in maps[rule])
-        candidate = _optimum(population.study, candidates[top], mean, variance, _apart(population, rule))
+        mean, variance = (moment[top] for moment in maps[rule])
+        candidate = _optimum_at(
+            population.study, candidates[top], mean, variance, _variance_apart(population.study, rule, population.share)
+        )
         best[rule] = max([candidate, *usable], key=lambda optimum: float(optimum.mean))
     return best
 
 
 @eqx.filter_jit
-def _feasible(study, x):
+def _feasible(study: Study, x: Float[ArrayLike, "s d"]) -> Bool[Array, " s"]:
     return study.space.feasible(x)
 
 
 @eqx.filter_jit
-def _optimum(study, x, mean, variance, apart):
+def _optimum_at(
+    study: Study,
+    x: Float[ArrayLike, " d"],
+    mean: Float[ArrayLike, ""],
+    variance: Float[ArrayLike, ""],
+    apart: Float[ArrayLike, ""],
+) -> Optimum:
     mean, variance = jnp.asarray(mean), jnp.asarray(variance)
     chances = study.gp.likelihood.class_probabilities(mean, variance + apart)
     return Optimum(jnp.asarray(x), mean, jnp.sqrt(variance), chances)
 
 
-def _apart(population, rule):
+def _variance_apart(study: Study, rule: Rule, share: float) -> ArrayLike:
     """Variance of one person's function about the map's, as `RuleMap.apart`."""
-    prior = np.asarray(population.study.gp.kernel.variance)
-    return prior * np.asarray(1.0 - population.share if rule == "hierarchical" else 0.0, prior.dtype)
+    prior = np.asarray(study.gp.kernel.variance)
+    return prior * np.asarray(1.0 - share if rule == "hierarchical" else 0.0, prior.dtype)
 
 
-def _spread(values, candidates):
+def _separate_rows(values: Float[np.ndarray, " m"], candidates: Float[np.ndarray, "m d"]) -> list[int]:
     """Rows of good candidates from different places: the best, the best apart from it, and so on."""
     rows, remaining = [], values.copy()
     for _ in range(_STARTS):
@@ -154,19 +164,21 @@ def _spread(values, candidates):
     return rows
 
 
-def _by_other_inference(population, best):
+def _by_other_inference(population: Population, best: Optimum) -> Optimum:
     """The optimum nearby under the other inference."""
-    study, at = population.study, np.asarray(best.x)[None, :]
+    study, starts = population.study, np.asarray(best.x)[None, :]
     other = other_inference(study)
     pilot = population.every(min(_PILOT, population.people // _PILOT_SHARE))
     if pilot.people >= _FEWEST:
-        (own,), (moved,) = (optimum_near(p, at, (population.rule,)) for p in (pilot, pilot.by(other)))
+        (pilot_optimum,), (pilot_other,) = (
+            optimum_near(p, starts, (population.rule,)) for p in (pilot, pilot.by(other))
+        )
         box = study.space.to_box
-        begin = jnp.clip(box(best.x) + box(moved.x) - box(own.x), 0.0, 1.0)
-        at = np.asarray(study.space.from_box(begin))[None, :]
+        shifted = jnp.clip(box(best.x) + box(pilot_other.x) - box(pilot_optimum.x), 0.0, 1.0)
+        starts = np.asarray(study.space.from_box(shifted))[None, :]
     name = {"ep": "expectation propagation", "laplace": "Laplace"}[other]
     words = f"participants fitted by {name} for comparison"
-    return optimum_near(population.by(other), at, (population.rule,), tolerance=_SETTLED, words=words)[0]
+    return optimum_near(population.by(other), starts, (population.rule,), tolerance=_SETTLED, words=words)[0]
 
 
 def optimum_near(
@@ -182,32 +194,38 @@ def optimum_near(
     Ends when every start is stationary, or would move by `tolerance` of the search ranges or less; the step is then
     taken, and the map there read off the last expansion.
     """
-    study, asked = population.study, len(rules)
-    slots = _STARTS * -(-asked // _STARTS)  # few shapes, few compilations
-    rows = np.arange(slots) % asked
+    study, count = population.study, len(rules)
+    slots = _STARTS * -(-count // _STARTS)  # few shapes, few compilations
+    rows = np.arange(slots) % count
     plain = np.array([rule == "average" for rule in rules])[rows]
-    w, state = _begin(study, np.asarray(starts)[rows])
+    by: tuple[Rule, float] = population.rule, population.share
+    w, state = _start_newton(study, np.asarray(starts)[rows])
     for _ in range(_STEPS):
-        at = _ahead(study, w, state)
-        there = jets(population, np.asarray(at), words)
-        people, by = jnp.asarray(float(population.people)), (population.rule, population.share)
-        w, state, finished, last = _advance(study, w, state, there, at, plain, people, by)
+        points = _next_points(study, w, state)
+        expansions = jets(population, np.asarray(points), words)
+        people = jnp.asarray(float(population.people))
+        w, state, finished, last = _newton_step(study, w, state, expansions, points, plain, people, by)
         if bool(jnp.all(finished | (jnp.max(jnp.abs(state.move), axis=1) <= tolerance))):
             break
     x, mean, variance = last if tolerance else state.here.aux
-    return [_optimum(study, x[i], mean[i], variance[i], _apart(population, rules[i])) for i in range(asked)]
+    return [
+        _optimum_at(study, x[i], mean[i], variance[i], _variance_apart(study, rules[i], population.share))
+        for i in range(count)
+    ]
 
 
 _SOLVER = TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION)
 
 
-def _nowhere(w, _):
+def _nowhere(w: Float[Array, " d"], _: None) -> NoReturn:
     """The solver does not look at its function before the first step."""
     raise NotImplementedError
 
 
 @eqx.filter_jit
-def _begin(study, starts):
+def _start_newton(study: Study, starts: Float[ArrayLike, "s d"]) -> tuple[Float[Array, "s d"], PyTree]:
+    """Each start in the optimiser's coordinates, and the solver's state there."""
+
     def one(x):
         w = study.space.to_box(x)
         number = jax.ShapeDtypeStruct((), w.dtype)
@@ -218,24 +236,37 @@ def _begin(study, starts):
 
 
 @eqx.filter_jit
-def _ahead(study, w, state):
+def _next_points(study: Study, w: Float[Array, "s d"], state: PyTree) -> Float[Array, "s d"]:
     """The points (s, d) of the unit cube at which the next step wants the map."""
     return jax.vmap(study.space.from_box)(w + state.move)
 
 
 @eqx.filter_jit
-def _advance(study, w, state, jets, at, plain, people, by):
+def _newton_step(
+    study: Study,
+    w: Float[Array, "s d"],
+    state: PyTree,
+    jets: Jets,
+    points: Float[Array, "s d"],
+    plain: Bool[ArrayLike, " s"],
+    people: Float[Array, ""],
+    by: tuple[Rule, float],
+) -> tuple[
+    Float[Array, "s d"], PyTree, Bool[Array, " s"], tuple[Float[Array, "s d"], Float[Array, " s"], Float[Array, " s"]]
+]:
     """A step of the solver, whose function is the map expanded at the point it asks for."""
     bounds = {"lower": jnp.zeros(w.shape[1:], w.dtype), "upper": jnp.ones(w.shape[1:], w.dtype)}
 
-    def one(w, state, jets, at, plain):
+    def one(w, state, jets, point, plain):
         def expanded(w, _):
             x = study.space.from_box(w)
-            off, prior = x - at, study.gp.kernel.diagonal(x)
-            there = jax.tree.map(lambda v, g, h: v + g @ off + 0.5 * off @ h @ off, *jets)
+            off, prior = x - point, study.gp.kernel.diagonal(x)
+            expanded_sums = jax.tree.map(lambda v, g, h: v + g @ off + 0.5 * off @ h @ off, *jets)
             mean, variance = (
                 jnp.where(plain, *both)
-                for both in zip(there.merge(prior, people, "average"), there.merge(prior, people, *by), strict=True)
+                for both in zip(
+                    expanded_sums.merge(prior, people, "average"), expanded_sums.merge(prior, people, *by), strict=True
+                )
             )
             return -mean, (x, mean, variance)
 
@@ -243,4 +274,4 @@ def _advance(study, w, state, jets, at, plain, people, by):
         done, _ = _SOLVER.terminate(expanded, w, None, bounds, state, frozenset())
         return w, state, done, expanded(w + state.move, None)[1]
 
-    return jax.vmap(one)(w, state, Jets(*jets), at, plain)
+    return jax.vmap(one)(w, state, Jets(*jets), points, plain)

@@ -7,10 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from jaxtyping import Int
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials
+from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
 
 __all__ = ["Cohort", "cohort_of"]
@@ -32,8 +34,8 @@ class Cohort(eqx.Module):
 
     def of(self, names: Sequence[str]) -> "Cohort":
         """Only these participants."""
-        known = set(self.names)
-        unknown = [name for name in names if name not in known]
+        present = set(self.names)
+        unknown = [name for name in names if name not in present]
         if unknown:
             raise InputError(
                 f'participant "{unknown[0]}" is not in the table, which has {len(self.names)} participants.'
@@ -76,6 +78,6 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
 
 
 @eqx.filter_jit
-def _to_unit(space, physical):
+def _to_unit(space: SearchSpace, physical: Float[ArrayLike, "M n d"]) -> Float[Array, "M n d"]:
     """Person by person, as `session.ask_tell.physical_trials` does for one: the same bits."""
     return jax.lax.map(space.to_unit, jnp.asarray(physical))

@@ -184,12 +184,12 @@ class Study(eqx.Module):
     def material(self, name: str) -> "Study":
         """The study of one material: its overrides of [renderer] and [parameters] applied."""
         if name not in self.materials:
-            known = ", ".join(self.materials) or "there are none"
-            raise InputError(f"{prefix(self.source)}materials.{name} is not in the study, its materials: {known}.")
-        return _checked(_override({"schema": 1} | json.loads(self.content), name), self.source, "")
+            listed = ", ".join(self.materials) or "there are none"
+            raise InputError(f"{prefix(self.source)}materials.{name} is not in the study, its materials: {listed}.")
+        return _checked(_of_material({"schema": 1} | json.loads(self.content), name), self.source, "")
 
 
-def _plain(raw):
+def _plain(raw: Any) -> Any:
     """With Python's own numbers, lists and dicts in place of NumPy's and other mappings."""
     if isinstance(raw, Mapping):
         return {key: _plain(value) for key, value in raw.items()}
@@ -198,14 +198,14 @@ def _plain(raw):
     return raw.tolist() if hasattr(raw, "tolist") else raw
 
 
-def _checked(raw, source, text):
+def _checked(raw: Mapping[str, Any], source: str, text: str) -> Study:
     """Build the study and, to find mistakes now, that of each material; name the place of a mistake."""
     place = ""
     try:
         study = _study(raw, source)
         for name in study.materials:
             place = f"materials.{name}."
-            _study(_override(raw, name), source)
+            _study(_of_material(raw, name), source)
     except InputError as error:
         lines = lines_of(text)
         where = next((lines[key] for key in enclosing(place + str(error).split()[0], place) if key in lines), None)
@@ -213,7 +213,8 @@ def _checked(raw, source, text):
     return study
 
 
-def _study(raw, source):
+def _study(raw: Mapping[str, Any], source: str) -> Study:
+    """The study itself, without its materials' overrides."""
     content = _read(raw)
     space = _space(content)
     labels, thresholds, theta = content.study.responses, content.gp.thresholds, content.gp.theta
@@ -249,7 +250,8 @@ def _study(raw, source):
     )
 
 
-def _space(content):
+def _space(content: _Content) -> SearchSpace:
+    """The search space of [parameters] and [renderer]."""
     parameters = tuple(Parameter(name, **msgspec.structs.asdict(p)) for name, p in content.parameters.items())
     if content.renderer is None:
         return SearchSpace(parameters)
@@ -264,7 +266,7 @@ def _space(content):
     return SearchSpace(parameters, Mechanics(**renderer))
 
 
-def _read(raw):
+def _read(raw: Mapping[str, Any]) -> _Content:
     """The parsed file as records, every key known and of its type."""
     check_keys(raw, "", _KEYS, _REQUIRED)
     if raw["schema"] is True or raw["schema"] != 1:
@@ -283,15 +285,16 @@ def _read(raw):
     return _Content(parameters=parameters, materials=dict(materials), **tables)
 
 
-def _override(raw, name):
+def _of_material(raw: Mapping[str, Any], name: str) -> dict[str, Any]:
     """The file as it is for one material."""
-    merged = {key: value for key, value in raw.items() if key != "materials"}
+    tables = {key: value for key, value in raw.items() if key != "materials"}
     for table, changes in raw["materials"][name].items():
-        merged[table] = _merged(merged.get(table, {}), changes)
-    return merged
+        tables[table] = _merged(tables.get(table, {}), changes)
+    return tables
 
 
-def _merged(base, changes):
+def _merged(base: Any, changes: Any) -> Any:
+    """Changes over what they change, table within table."""
     if not (isinstance(base, Mapping) and isinstance(changes, Mapping)):
         return changes
     return {**base, **{key: _merged(base.get(key, {}), value) for key, value in changes.items()}}

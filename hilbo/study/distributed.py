@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import PyTree
+from jaxtyping import PyTree, UInt8
 
 from hilbo.errors import InputError
 
@@ -93,7 +93,7 @@ class Crew(NamedTuple):
                 " same command on the same files."
             )
 
-    def _exchange(self, text):
+    def _exchange(self, text: str) -> UInt8[np.ndarray, "count 8"]:
         """A mark of everybody's text, (count, 8); 0 for an empty one."""
         mark = np.frombuffer(hashlib.sha256(text.encode()).digest()[:8], np.uint8) if text else np.zeros(8, np.uint8)
         if self.count == 1:
@@ -131,7 +131,8 @@ def crew(
     jax.distributed.shutdown()
 
 
-def _meet(coordinator, processes, process):
+def _meet(coordinator: str | None, processes: int | None, process: int | None) -> None:
+    """Find the other processes. Raises `InputError` where they cannot be found."""
     if processes is not None and process is not None and not 0 <= process < processes:
         raise InputError(f"--process-id is {process}; it must be from 0 to {processes - 1}, another for each process.")
     if coordinator is not None and not (coordinator.rpartition(":")[0] and coordinator.rpartition(":")[2].isdigit()):
@@ -156,7 +157,7 @@ def _meet(coordinator, processes, process):
         raise InputError(f"--distributed: the processes did not meet within {_MEETING} s ({reason}).") from error
 
 
-def _leave(sentence, rank, count, code, wait=True):
+def _leave(sentence: str, rank: int, count: int, code: int, wait: bool = True) -> None:
     """Say why, and end this process; an error that only this one knows of ends it without the others' leave."""
     try:
         print(f"hilbo: process {rank} of {count}: {sentence}", file=sys.stderr, flush=True)
@@ -168,9 +169,9 @@ def _leave(sentence, rank, count, code, wait=True):
 
 def digest(*parts: PyTree) -> str:
     """A short text that differs where the parts do: records of arrays, texts, numbers."""
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for leaf in jax.tree.leaves(parts):
         is_array = isinstance(leaf, jax.Array | np.ndarray)
-        found.update(np.ascontiguousarray(leaf).tobytes() if is_array else repr(leaf).encode())
-    found.update(repr(jax.tree.structure(parts)).encode())  # with what records hold besides arrays
-    return found.hexdigest()
+        hasher.update(np.ascontiguousarray(leaf).tobytes() if is_array else repr(leaf).encode())
+    hasher.update(repr(jax.tree.structure(parts)).encode())  # with what records hold besides arrays
+    return hasher.hexdigest()

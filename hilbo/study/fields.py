@@ -53,16 +53,18 @@ def read_table(kind: type[_T], raw: Any, path: str) -> _T:
     """A parsed table as its record. Raises `InputError` with the key's path first."""
     fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
     check_keys(raw, path, fields, [key for key, field in fields.items() if field.required])
-    return kind(**{key: _field(fields[key].type, value, f"{path}.{key}") for key, value in raw.items()})
+    return kind(**{key: _read_field(fields[key].type, value, f"{path}.{key}") for key, value in raw.items()})
 
 
-def _field(kind, raw, path):
+def _read_field(kind: Any, raw: Any, path: str) -> Any:
+    """A value as its type: a table within the table, or a value of its own."""
     if isinstance(kind, type) and issubclass(kind, Table):
         return read_table(kind, raw, path)
-    return _value(kind, raw, path)
+    return _read_value(kind, raw, path)
 
 
-def _value(kind, raw, path):
+def _read_value(kind: Any, raw: Any, path: str) -> Any:
+    """A checked value; the sentence where it is none is made of the words of its annotation."""
     try:
         value = msgspec.convert(raw, kind)
         if all(math.isfinite(v) for v in (value if isinstance(value, tuple) else (value,)) if isinstance(v, float)):
@@ -124,5 +126,6 @@ def lines_of(text: str) -> dict[str, int]:
     return lines
 
 
-def _path(key):
-    return ".".join(part.strip().strip("\"'") for part in key.split("."))
+def _path(key: str) -> str:
+    """A key as it stands in the file, without its quotes and blanks."""
+    return ".".join(word.strip().strip("\"'") for word in key.split("."))

@@ -10,6 +10,7 @@ tables' column `material` alone, when they share everything. Whatever is wrong i
 """
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -55,23 +56,27 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: is no folder; hilbo report wants one with study.toml and trials.csv.")
-    study = _ruled(Study.load(folder / "study.toml"), exclude)
-    trials = _tables(folder, "trials")
+    study = _with_exclusion(Study.load(folder / "study.toml"), exclude)
+    trials = _table_paths(folder, "trials")
     if not trials:
         raise InputError(f"{folder}: holds no trials.csv (nor .parquet, nor trials-*.csv); put the trial table there.")
-    validation = [_validation(path, study) for path in _tables(folder, "validation")]
+    validation = [_validation(path, study) for path in _table_paths(folder, "validation")]
     sets_path, truth_path = folder / "sets.csv", folder / "truth.csv"
     sets = sets_frame(sets_path, study.space.names) if sets_path.exists() else None
-    truth = _truth(truth_path, study) if truth_path.exists() else None
+    truth = _read_truth(truth_path, study) if truth_path.exists() else None
     compared = pd.concat(validation, ignore_index=True) if validation else None
-    names = _names(study, trials)
-    told = {folder / "validation.csv": compared, sets_path: _of(sets, "sysid"), truth_path: _of(truth, "population")}
-    _told_apart(names, told)
+    names = _material_names(study, trials)
+    tables = {
+        folder / "validation.csv": compared,
+        sets_path: _rows_of_source(sets, "sysid"),
+        truth_path: _rows_of_source(truth, "population"),
+    }
+    _check_materials_named(names, tables)
     materials = [_material(name, study, trials, compared, sets, truth) for name in names]
-    return StudyFolder(study, materials, sets, _limits(materials, compared, sets))
+    return StudyFolder(study, materials, sets, _missing_tables(materials, compared, sets))
 
 
-def _ruled(study, exclude):
+def _with_exclusion(study: Study, exclude: str | None) -> Study:
     """The study with another rule of exclusion."""
     if exclude is None:
         return study
@@ -80,22 +85,23 @@ def _ruled(study, exclude):
     return Study.from_dict(content, study.source)
 
 
-def _tables(folder, stem):
-    found = [
+def _table_paths(folder: Path, stem: str) -> list[Path]:
+    """Files STEM.csv and STEM-*.csv, or .parquet."""
+    paths = [
         p
         for p in folder.iterdir()
         if p.suffix in (".csv", ".parquet") and (p.stem == stem or p.stem.startswith(f"{stem}-"))
     ]
-    return sorted(found)
+    return sorted(paths)
 
 
-def _validation(path, study):
+def _validation(path: Path, study: Study) -> pd.DataFrame:
     return check_validation(
         read_cells(path, "a validation table needs a header and a comparison"), study.responses, str(path)
     )
 
 
-def _names(study, paths):
+def _material_names(study: Study, paths: list[Path]) -> list[str]:
     """Materials in the study's order, then in that of the tables; [""] if none is named anywhere."""
     named = []
     for path in paths:
@@ -108,17 +114,17 @@ def _names(study, paths):
         raise InputError(f"{paths[0]}: some rows name a material and some do not; name it in every row of every table.")
     unknown = [name for name in ordered if name and study.materials and name not in study.materials]
     if unknown:
-        known = ", ".join(study.materials)
-        raise InputError(f'{paths[0]}: material "{unknown[0]}" is not in the study file, which has {known}.')
+        listed = ", ".join(study.materials)
+        raise InputError(f'{paths[0]}: material "{unknown[0]}" is not in the study file, which has {listed}.')
     return ordered
 
 
-def _of(table, source):
+def _rows_of_source(table: pd.DataFrame | None, source: str) -> pd.DataFrame | None:
     """A sets table's rows of one source."""
     return None if table is None else table[table["source"] == source]
 
 
-def _told_apart(names, tables):
+def _check_materials_named(names: list[str], tables: Mapping[Path, pd.DataFrame | None]) -> None:
     """Every row of these tables must name its material where there are several, or where another row does."""
     for path, table in tables.items():
         if table is None or table.empty or ("material" not in table and len(names) == 1):
@@ -128,24 +134,32 @@ def _told_apart(names, tables):
             raise InputError(f'{path}: rows without a material; name it in a column "material" in every row{of}.')
 
 
-def _material(name, study, paths, compared, sets, truth):
-    own = study.material(name) if name in study.materials else study
+def _material(
+    name: str,
+    study: Study,
+    paths: list[Path],
+    compared: pd.DataFrame | None,
+    sets: pd.DataFrame | None,
+    truth: pd.DataFrame | None,
+) -> Material:
+    """One material's rows of all tables, and its reference."""
+    material_study = study.material(name) if name in study.materials else study
     tables = []
     for path in paths:
         cells = read_cells(path)
         here = set(cells["material"]) if "material" in cells else {""}
         if name in here:
-            tables.append(read_trials(path, own, name or None, others=False))
+            tables.append(read_trials(path, material_study, name or None, others=False))
     table = pd.concat(tables, ignore_index=True)
-    _once(table, paths[0])
+    _check_answers_once(table, paths[0])
     if compared is not None and name and "material" in compared:
         compared = compared[compared["material"] == name]
-    reference, words = _reference(own, name, sets, truth)
+    reference, words = _reference(material_study, name, sets, truth)
     validation = None if compared is None or compared.empty else compared
-    return Material(name, own, cohort_of(table, own), validation, reference, words)
+    return Material(name, material_study, cohort_of(table, material_study), validation, reference, words)
 
 
-def _once(table, path):
+def _check_answers_once(table: pd.DataFrame, path: Path) -> None:
     """Several tables must not hold the same answer twice."""
     key = [column for column in ("participant", "session", "phase", "trial") if column in table]
     again = table.duplicated(key)
@@ -156,7 +170,8 @@ def _once(table, path):
         )
 
 
-def _truth(path, study):
+def _read_truth(path: Path, study: Study) -> pd.DataFrame:
+    """The table of truth of a simulated study, its parameters as numbers."""
     cells = read_cells(path, "a table of truth needs a header and a row")
     missing = [name for name in ("source", *study.space.names) if name not in cells]
     if missing:
@@ -167,10 +182,12 @@ def _truth(path, study):
     )
 
 
-def _reference(study, name, sets, truth):
+def _reference(
+    study: Study, name: str, sets: pd.DataFrame | None, truth: pd.DataFrame | None
+) -> tuple[Float[np.ndarray, " d"] | None, str]:
     """What the optimum is held against: the sets table's system identification, else the simulation's truth."""
     for table, source, words in ((sets, "sysid", "system identification"), (truth, "population", "the truth")):
-        rows = _of(table, source)
+        rows = _rows_of_source(table, source)
         if rows is None:
             continue
         rows = rows[rows["material"] == name] if name and "material" in rows else rows
@@ -185,15 +202,18 @@ def _reference(study, name, sets, truth):
     return None, ""
 
 
-def _limits(materials, compared, sets):
-    found = []
+def _missing_tables(
+    materials: list[Material], compared: pd.DataFrame | None, sets: pd.DataFrame | None
+) -> tuple[str, ...]:
+    """What the folder's tables cannot say, in sentences."""
+    sentences = []
     if compared is None:
-        found.append(
+        sentences.append(
             "There is no validation table: nothing here says whether people agree with the map when asked again."
         )
     for material in materials:
         if compared is not None and material.validation is None:
-            found.append(f"No validation session compared renderings of {material.name}.")
+            sentences.append(f"No validation session compared renderings of {material.name}.")
     if sets is None and compared is not None:
-        found.append("There is no sets table: sets are known by their names in the validation table only.")
-    return tuple(found)
+        sentences.append("There is no sets table: sets are known by their names in the validation table only.")
+    return tuple(sentences)

@@ -35,7 +35,7 @@ def share_content(share: Share) -> dict[str, Any]:
 
 
 def in_place(found: RuleMap) -> str:
-    """How maps of fewer trials, or of people drawn again, are merged where that is not as the map is; else nothing."""
+    """How maps of fewer trials, or of bootstrap resamples, are merged where that is not as the map is; else nothing."""
     if found.rule not in RULES:
         return "by bcm"
     return "" if found.method == "by points" else f"by the rule {found.rule} point by point"
@@ -43,15 +43,15 @@ def in_place(found: RuleMap) -> str:
 
 def rule_warnings(study: Study, aggregate: Any) -> list[str]:
     """A sentence where the study's rule takes people to be alike and the answers say that they are not."""
-    found = aggregate.share
-    if found is None or study.rule not in _ALIKE or float(found.against_one) < _SURE:
+    share = aggregate.share
+    if share is None or study.rule not in _ALIKE or float(share.against_one) < _SURE:
         return []
-    low, high = (float(end) for end in found.interval)
+    low, high = (float(end) for end in share.interval)
     words = (
-        f"People differ: of the prior variance they share {float(found.mean):.2f} (95 % from {low:.2f} to {high:.2f}),"
+        f"People differ: of the prior variance they share {float(share.mean):.2f} (95 % from {low:.2f} to {high:.2f}),"
         f' and the rule "{study.rule}" takes that to be 1'
     )
-    ratio = _ratio(aggregate)
+    ratio = _sd_ratio(aggregate)
     if ratio is not None and ratio >= _TOO_SURE:
         words += (
             f"; at its optimum the map says a standard deviation of {float(aggregate.optimum.sd):.2f}, the hierarchical"
@@ -60,7 +60,7 @@ def rule_warnings(study: Study, aggregate: Any) -> list[str]:
     return [words + '. Where intervals matter, use rule = "hierarchical"; its optimum stands among the alternatives.']
 
 
-def _ratio(aggregate):
+def _sd_ratio(aggregate: Any) -> float | None:
     """The hierarchical map's standard deviation over the map's, at the optimum."""
     if aggregate.hierarchical is None:
         return None

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
+from jaxtyping import Array, Float, Int, Key
 
 from hilbo.kernels import gram
 from hilbo.numerics.linalg import eigh
@@ -34,7 +35,7 @@ def groups(
 ) -> dict[str, xr.Dataset]:
     """The groups by name; `draws` independent draws, as one chain. Values where nobody answered are NaN or -1."""
     keys = jax.random.split(jax.random.key(seed), len(cohort.names))
-    f, response, log_likelihood = (np.moveaxis(np.asarray(part), 0, 1)[None] for part in _draw(posteriors, keys, draws))
+    f, response, log_likelihood = (np.moveaxis(np.asarray(leaf), 0, 1)[None] for leaf in _draw(posteriors, keys, draws))
     mask = np.asarray(cohort.trials.mask)
     coords = {"participant": list(cohort.names), "trial": np.arange(1, mask.shape[1] + 1)}
     chains = coords | {"chain": [0], "draw": np.arange(draws)}
@@ -74,15 +75,17 @@ def predictive_shares(found: dict[str, xr.Dataset], categories: int) -> tuple[np
 
 
 @eqx.filter_jit
-def _draw(posteriors, keys, draws):
+def _draw(
+    posteriors: Posterior, keys: Key[Array, " M"], draws: int
+) -> tuple[Float[Array, "M draws n"], Int[Array, "M draws n"], Float[Array, "M draws n"]]:
     """Latent scores, answers and log-likelihoods (M, draws, n)."""
 
     def one(person):
         posterior, key = person
         trials, kernel = posterior.trials, posterior.gp.kernel
         covariance = gram(kernel, trials.x, trials.x)
-        known = posterior.latent.factor @ covariance
-        values, vectors = eigh(covariance - known.T @ known)
+        explained_root = posterior.latent.factor @ covariance
+        values, vectors = eigh(covariance - explained_root.T @ explained_root)
         root = vectors * jnp.sqrt(jnp.where(values > 0, values, jnp.zeros_like(values)))[None, :]
         mean = covariance @ posterior.latent.weights
         first, second = jax.random.split(key)

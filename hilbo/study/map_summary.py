@@ -74,11 +74,11 @@ def best_mid_worst(
     nothing well enough, or has nothing in between.
     """
     candidates = jnp.asarray(candidates)
-    mean, sd = _at(predict, candidates)
+    mean, sd = _mean_and_sd(predict, candidates)
     limit = known * jnp.sqrt(study.gp.kernel.diagonal(candidates[0]) if prior is None else prior)
-    best = _optimum(study, predict, candidates, mean)
+    best = _highest(study, predict, candidates, mean)
     minima = _minima(study, predict, candidates, jnp.where(sd <= limit, mean, jnp.inf))
-    depth, doubt = _at(predict, minima)
+    depth, doubt = _mean_and_sd(predict, minima)
     usable = np.asarray((doubt <= limit) & study.space.feasible(minima))
     if not usable.any():
         raise InputError(
@@ -87,7 +87,7 @@ def best_mid_worst(
         )
     worst = minima[int(np.argmin(np.where(usable, depth, np.inf)))]
     ends = jnp.stack([best, worst])
-    middle = jnp.mean(_at(predict, ends)[0])
+    middle = jnp.mean(_mean_and_sd(predict, ends)[0])
     far = jnp.min(jnp.linalg.norm(candidates[:, None] - ends[None], axis=-1), axis=1) >= apart
     fits = np.asarray(far & (sd <= limit))
     if not fits.any():
@@ -97,7 +97,7 @@ def best_mid_worst(
         )
     mid = candidates[int(np.argmin(np.where(fits, np.abs(np.asarray(mean - middle)), np.inf)))]
     x = jnp.stack([best, mid, worst])
-    return Sets(x, *_at(predict, x))
+    return Sets(x, *_mean_and_sd(predict, x))
 
 
 def dominant(study: Study, predict: Predict, x: Float[Array, "m d"]) -> Bool[Array, " m"]:
@@ -125,7 +125,7 @@ def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: 
     index = study.space.names.index(parameter)
     here = float(x[index])
     grid = np.unique(np.append(np.linspace(0.0, 1.0, _GRID), here))
-    inside, passive = _inside(study, predict, x, parameter, jnp.asarray(grid, x.dtype))
+    inside, passive = _tolerated(study, predict, x, parameter, jnp.asarray(grid, x.dtype))
     middle = int(np.searchsorted(grid, here))
     if not inside[middle]:
         return None
@@ -141,20 +141,23 @@ def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: 
         kind: End = "other answer" if passive[beyond] else "passive boundary"
         ends.append((_bisect(study, predict, x, parameter, grid[last], grid[beyond]), kind))
     to_physical = study.space.parameters[index].to_physical
-    (low, low_end), (high, high_end) = ((float(to_physical(jnp.asarray(at))), kind) for at, kind in ends)
+    (low, low_end), (high, high_end) = ((float(to_physical(jnp.asarray(end))), kind) for end, kind in ends)
     return Tolerance(parameter, low, high, low_end, high_end)
 
 
-def _inside(study, predict, x, parameter, values):
+def _tolerated(
+    study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, values: Float[Array, " m"]
+) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
+    """Of values of a parameter: where the highest answer is the likeliest and feasible, and where it is feasible."""
     points, feasible = slice_through(study, x, parameter, values)
     return np.asarray(feasible & dominant(study, predict, points)), np.asarray(feasible)
 
 
-def _bisect(study, predict, x, parameter, inner, outer):
+def _bisect(study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, inner: float, outer: float) -> float:
     """The end of an interval between a value inside it and one outside."""
     for _ in range(_HALVINGS):
         middle = (inner + outer) / 2
-        if _inside(study, predict, x, parameter, jnp.asarray([middle], x.dtype))[0][0]:
+        if _tolerated(study, predict, x, parameter, jnp.asarray([middle], x.dtype))[0][0]:
             inner = middle
         else:
             outer = middle
@@ -162,24 +165,28 @@ def _bisect(study, predict, x, parameter, inner, outer):
 
 
 @eqx.filter_jit
-def _lead(study, predict, x):
+def _lead(study: Study, predict: Predict, x: Float[Array, "m d"]) -> Float[Array, " m"]:
     """Probability of the highest answer less that of the likeliest other one."""
     p = jax.vmap(study.gp.likelihood.class_probabilities)(*predict(x))
     return p[:, -1] - jnp.max(p[:, :-1], axis=1)
 
 
 @eqx.filter_jit
-def _at(predict, x):
+def _mean_and_sd(predict: Predict, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     mean, variance = predict(x)
     return mean, jnp.sqrt(variance)
 
 
 @eqx.filter_jit
-def _optimum(study, predict, candidates, mean):
+def _highest(
+    study: Study, predict: Predict, candidates: Float[Array, "m d"], mean: Float[Array, " m"]
+) -> Float[Array, " d"]:
     return _maximum(study, lambda x: predict(x[None, :])[0][0], candidates, mean, starts=3).x
 
 
-def _minima(study, predict, candidates, depth):
+def _minima(
+    study: Study, predict: Predict, candidates: Float[Array, "m d"], depth: Float[Array, " m"]
+) -> Float[Array, "s d"]:
     """Local minima (s, d) of the mean, downhill from the lowest candidates of different places."""
     points, left = np.asarray(candidates), np.asarray(depth).copy()
     rows = []
@@ -193,14 +200,23 @@ def _minima(study, predict, candidates, depth):
 
 
 @eqx.filter_jit
-def _downhill(study, predict, begin):
+def _downhill(study: Study, predict: Predict, starts: Float[Array, "s d"]) -> Float[Array, "s d"]:
+    """The local minimum of the mean below each start."""
+
     def one(x):
         return _maximum(study, lambda x: -predict(x[None, :])[0][0], x[None, :], jnp.zeros(1, x.dtype), 1).x
 
-    return jax.lax.map(one, begin)
+    return jax.lax.map(one, starts)
 
 
-def _maximum(study, height, candidates, values, starts):
+def _maximum(
+    study: Study,
+    height: Callable[[Float[Array, " d"]], Float[Array, ""]],
+    candidates: Float[Array, "m d"],
+    values: Float[Array, " m"],
+    starts: int,
+) -> acquisition.Choice:
+    """The maximum of a function of one point, from those of the candidates where it is highest."""
     space = study.space
     return acquisition.maximise(
         values,

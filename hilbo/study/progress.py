@@ -48,21 +48,21 @@ class Progress(NamedTuple):
 
     def person(self, row: int) -> dict[int, Posterior]:
         """One participant's posterior at each of the moments."""
-        return {count: jax.tree.map(lambda leaf: leaf[row], found.experts) for count, found in self.maps.items()}
+        return {count: jax.tree.map(lambda leaf: leaf[row], map_.experts) for count, map_ in self.maps.items()}
 
     def to_end(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
         """NRMSE of the population's and of everybody's running optimum to the final one; a person's is NaN beyond their
         last answer, where it cannot move."""
         population = np.sqrt(np.mean((self.population - self.population[-1]) ** 2, axis=1))
-        own = np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
-        return population, np.where(self.counts[:, None] <= self.ends[None, :], own, np.nan)
+        individual = np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
+        return population, np.where(self.counts[:, None] <= self.ends[None, :], individual, np.nan)
 
     def settled(self, within: float) -> list[int | None]:
         """Of everybody the trial from which their own optimum stayed within this NRMSE of its final place; None where
         that cannot be said."""
-        _, own = self.to_end()
+        _, individual = self.to_end()
         lasts = np.searchsorted(self.counts, self.ends, side="right")
-        return [settled(self.counts[:k], own[:k, j], within) for j, k in enumerate(lasts)]
+        return [settled(self.counts[:k], individual[:k, j], within) for j, k in enumerate(lasts)]
 
 
 def follow(study: Study, aggregate: Aggregate, seed: int = 0, counts: Sequence[int] | None = None) -> Progress:
@@ -76,17 +76,17 @@ def follow(study: Study, aggregate: Aggregate, seed: int = 0, counts: Sequence[i
     longest = int(ends.max())
     asked = _counts(ends) if counts is None else np.unique([*counts, longest])
     candidates = search_points(study.space, seed)
-    population, own, maps = [], [], {}
+    population, individual, maps = [], [], {}
     for count in asked.tolist():
         last = count == longest
         posteriors = aggregate.posteriors if last else fit_cohort(study, cohort.first(count))
         map_ = _map_by_points(study, aggregate.map.share, posteriors)
         population.append(np.asarray(map_optimum(study, map_, candidates).x))
         optima = aggregate.individuals if last else individual_optima(study, posteriors, candidates)
-        own.append(np.asarray(optima.x))
+        individual.append(np.asarray(optima.x))
         if last or count in _MOMENTS:
             maps[count] = map_
-    return Progress(asked, np.stack(population), np.stack(own), ends, maps)
+    return Progress(asked, np.stack(population), np.stack(individual), ends, maps)
 
 
 def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], within: float = _SETTLED) -> int | None:
@@ -98,9 +98,11 @@ def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], with
 
 def _map_by_points(study: Study, share: Float[Array, ""], posteriors: Posterior) -> RuleMap:
     """The map of these posteriors by the study's rule, or by bcm where the rule takes all answers at once."""
-    rule, part = point_rule(study.rule, share)
+    rule, rule_share = point_rule(study.rule, share)
     prior = jnp.asarray(study.gp.kernel.variance)
-    return RuleMap(rule, "by points", posteriors, None, jnp.ones_like(prior) if part is None else part, prior)
+    return RuleMap(
+        rule, "by points", posteriors, None, jnp.ones_like(prior) if rule_share is None else rule_share, prior
+    )
 
 
 def _counts(ends: Int[np.ndarray, " M"]) -> Int[np.ndarray, " p"]:

@@ -99,14 +99,14 @@ class SessionTable(Table, frozen=True):
 
     def check(self, responses: Sequence[str]) -> None:
         """Refuse texts that nobody asks for, and steps that do not show what is asked about. Raises `InputError`."""
-        for name, table, known in (
+        for name, table, allowed in (
             ("texts", self.texts, tuple(TEXTS)),
             ("labels", self.labels, tuple(responses)),
             ("definitions", self.definitions, tuple(responses)),
         ):
             for key in table:
-                if key not in known:
-                    raise InputError(f"session.{name}.{key} is no text of a session, those are {', '.join(known)}.")
+                if key not in allowed:
+                    raise InputError(f"session.{name}.{key} is no text of a session, those are {', '.join(allowed)}.")
         for phase in PHASES:
             _check_steps(phase, protocol(self, phase))
 
@@ -130,11 +130,12 @@ def protocol(session: SessionTable, phase: Phase) -> Protocol:
     return msgspec.structs.replace(_PRESETS[phase], **changes)
 
 
-def _check_steps(phase, found):
+def _check_steps(phase: Phase, changed: Protocol) -> None:
+    """Refuse steps that do not show what is asked about."""
     path = f"session.{phase.replace('-', '_')}.steps"
-    shows = [step.show for step in found.steps]
-    if "a" not in shows or ("b" in shows) != ("preferred" in found.asks):
-        needs = '"a" and "b"' if "preferred" in found.asks else '"a" and not "b"'
+    shows = [step.show for step in changed.steps]
+    if "a" not in shows or ("b" in shows) != ("preferred" in changed.asks):
+        needs = '"a" and "b"' if "preferred" in changed.asks else '"a" and not "b"'
         raise InputError(f"{path} is {shown(shows)}, it must show {needs}.")
     felt = ""
     for show in shows:

@@ -22,7 +22,7 @@ from hilbo.hyperparameters.maximum_evidence import (
     maximise_shared_evidence,
     optimum_sensitivity,
 )
-from hilbo.ordinal_gp import Posterior, fit
+from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.maps import point_rule, share_of
 from hilbo.population.pointwise import Rule
 from hilbo.search.candidates import search_points
@@ -126,13 +126,13 @@ def robustness(
     )
 
 
-def _share(study, cohort):
+def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:
     """What people have in common, where the study's rule asks for it."""
     return share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
 
 
 @eqx.filter_jit
-def _learn(study, trials, learn, shared, weak_priors):
+def _learn(study: Study, trials: Trials, learn: tuple[str, ...], shared: bool, weak_priors: bool) -> Learned:
     settings = {"weak_priors": weak_priors, "inference": study.inference}
     if shared:
         return maximise_shared_evidence(study.gp, trials, learn, **settings)
@@ -140,7 +140,16 @@ def _learn(study, trials, learn, shared, weak_priors):
 
 
 @eqx.filter_jit
-def _sensitivity(study, trials, x, learn, rule, share):
+def _sensitivity(
+    study: Study,
+    trials: Trials,
+    x: Float[Array, " d"],
+    learn: tuple[str, ...],
+    rule: Rule,
+    share: Float[Array, ""] | None,
+) -> dict[str, Float[Array, "..."]]:
+    """Derivatives of the population optimum x, as `Robustness.sensitivity`."""
+
     def refit(gp):
         return jax.vmap(lambda t: fit(gp, t, inference=study.inference, throw=False))(trials)
 

@@ -55,20 +55,20 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0) -> dict[str, Any]
     x = candidates[: min(_POINTS, len(candidates))]
     posteriors = jax.tree.map(lambda leaf: leaf[answered], aggregate.posteriors)
     share = aggregate.share or share_of(study.gp, cohort.trials, study.inference)
-    known = aggregate.maps if len(answered) == len(aggregate.cohort.names) else {}
-    maps = {rule: known.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in ALL_RULES}
+    fitted = aggregate.maps if len(answered) == len(aggregate.cohort.names) else {}
+    maps = {rule: fitted.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in ALL_RULES}
     pooled = maps["pooled"]
     rules: dict[str, Any] = {}
     left: dict[str, LeftOut] = {}
-    for rule, found in maps.items():
-        if isinstance(found, str):
-            rules[rule] = {"refused": found}
+    for rule, map_ in maps.items():
+        if isinstance(map_, str):
+            rules[rule] = {"refused": map_}
             continue
         left[rule], folds = leave_one_out(
             study.gp, cohort.trials, rule, share=share.mean, posteriors=posteriors, inference=study.inference
         )
         rules[rule] = calibration(left[rule], seed) | {"reliability": reliability(left[rule])}
-        rules[rule] |= _one(study, cohort, posteriors, found, folds, pooled, candidates, x, seed)
+        rules[rule] |= _map_content(study, cohort, posteriors, map_, folds, pooled, candidates, x, seed)
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
     return content | {"rules": rules, "recommendation": recommendation(left, rules, share, len(answered))}
 
@@ -83,81 +83,96 @@ def _map(study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: 
         return str(error)
 
 
-def _one(study, cohort, posteriors, found, maps, pooled, candidates, x, seed):
-    best = map_optimum(study, found, candidates)
-    mean, variance = found.predict(x)
-    moved = influence(found, maps, x)
+def _map_content(
+    study: Study,
+    cohort: Cohort,
+    posteriors: Posterior,
+    map_: RuleMap,
+    folds: list[RuleMap],
+    pooled: RuleMap | str,
+    candidates: Float[Array, "m d"],
+    x: Float[Array, "p d"],
+    seed: int,
+) -> dict[str, Any]:
+    """What one rule's map says; `folds`: its maps without each person, `x`: points at which maps are compared."""
+    best = map_optimum(study, map_, candidates)
+    mean, variance = map_.predict(x)
+    moved = influence(map_, folds, x)
     return {
-        "method": found.method,
+        "method": map_.method,
         "optimum": _parameters(study, best.x),
         "optimum_sd": float(best.sd),
-        "covered": float(jnp.mean(jnp.sqrt(variance / found.map_prior) < KNOWN)),
+        "covered": float(jnp.mean(jnp.sqrt(variance / map_.map_prior) < KNOWN)),
         "influence": dict(zip(cohort.names, moved.tolist(), strict=True)),
         "agreement_with_pooled": None if isinstance(pooled, str) else _agreement(mean, pooled.predict(x)[0]),
         "from_pooled": None
         if isinstance(pooled, str)
         else float(nrmse(best.x, map_optimum(study, pooled, candidates).x)),
-        "optimum_by_draws": _by_draws(study, found, posteriors, x, seed),
-        "optimum_by_bootstrap": _by_bootstrap(study, found, posteriors, x, seed),
+        "optimum_by_draws": _by_draws(study, map_, posteriors, x, seed),
+        "optimum_by_bootstrap": _by_bootstrap(study, map_, posteriors, x, seed),
     }
 
 
-def _agreement(mean, other):
+def _agreement(mean: Float[Array, " p"], other: Float[Array, " p"]) -> float:
     """Correlation over the points: the scales of two maps need not be the same."""
     return float(jnp.corrcoef(mean, other)[0, 1])
 
 
-def _by_draws(study, found: RuleMap, posteriors, x, seed):
+def _by_draws(
+    study: Study, map_: RuleMap, posteriors: Posterior, x: Float[Array, "p d"], seed: int
+) -> dict[str, list[float]] | None:
     """Quantiles of where joint draws of the map are largest; None where the map has no joint posterior."""
-    if found.method == "exact" and found.shared is not None:
-        joint = posterior_map(found.shared, x)
-    elif found.rule == "bcm":
+    if map_.method == "exact" and map_.shared is not None:
+        joint = posterior_map(map_.shared, x)
+    elif map_.rule == "bcm":
         joint = joint_map(posteriors, x)
     else:
         return None
     return _quantiles(study, x, np.asarray(joint.optima(jax.random.key(seed), _DRAWS)))
 
 
-def _by_bootstrap(study, found: RuleMap, posteriors, x, seed):
+def _by_bootstrap(
+    study: Study, map_: RuleMap, posteriors: Posterior, x: Float[Array, "p d"], seed: int
+) -> dict[str, list[float]] | None:
     """Quantiles of where the map of people drawn with replacement is largest; None for rules that take all at once."""
-    if found.rule not in RULES:
+    if map_.rule not in RULES:
         return None
     means, explained = jax.vmap(lambda person: person.predict_explained(x))(posteriors)
     people = means.shape[0]
     rows = np.random.default_rng(seed).integers(0, people, (_DRAWS // 4, people))
-    share = found.share if found.rule == "hierarchical" else None
+    share = map_.share if map_.rule == "hierarchical" else None
 
     def top(rows):
-        mean, _ = pointwise.aggregate(found.rule, means[rows], explained[rows], found.prior, share=share)  # type: ignore[arg-type]
+        mean, _ = pointwise.aggregate(map_.rule, means[rows], explained[rows], map_.prior, share=share)  # type: ignore[arg-type]
         return jnp.argmax(mean)
 
-    at = np.asarray(jax.jit(lambda rows: jax.lax.map(top, rows))(jnp.asarray(rows)))
-    return _quantiles(study, x, np.bincount(at, minlength=x.shape[0]) / len(at))
+    rows_of_optima = np.asarray(jax.jit(lambda rows: jax.lax.map(top, rows))(jnp.asarray(rows)))
+    return _quantiles(study, x, np.bincount(rows_of_optima, minlength=x.shape[0]) / len(rows_of_optima))
 
 
-def _quantiles(study, x, weight):
+def _quantiles(study: Study, x: Float[Array, "p d"], weight: Float[np.ndarray, " p"]) -> dict[str, list[float]]:
     """5, 50 and 95 % of each parameter, in its unit, over weighted points."""
     physical = np.asarray(study.space.to_physical(np.asarray(x)))
-    found = {}
+    quantiles = {}
     for i, name in enumerate(study.space.names):
         order = np.argsort(physical[:, i])
         total = np.cumsum(weight[order])
-        at = np.searchsorted(total, np.array([0.05, 0.5, 0.95]) * total[-1])
-        found[name] = physical[order[np.minimum(at, len(order) - 1)], i].tolist()
-    return found
+        places = np.searchsorted(total, np.array([0.05, 0.5, 0.95]) * total[-1])
+        quantiles[name] = physical[order[np.minimum(places, len(order) - 1)], i].tolist()
+    return quantiles
 
 
-def _parameters(study, x: Float[Array, " d"]) -> dict[str, float]:
+def _parameters(study: Study, x: Float[Array, " d"]) -> dict[str, float]:
     return dict(zip(study.space.names, np.asarray(study.space.to_physical(np.asarray(x))).tolist(), strict=True))
 
 
 def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Share, people: int) -> str:
-    """Which rule to use, and why, in a few sentences; `left`: what each rule foretold of everybody's answers.
+    """Which rule to use, and why, in a few sentences; `left`: what each rule predicted of everybody's answers.
 
     Two rules are near if the difference of their costs, answer by answer, is within two of its errors by person: people
-    are foretold well or badly by all rules alike, which the error of one rule's mean cost would take for doubt.
+    are predicted well or badly by all rules alike, which the error of one rule's mean cost would take for doubt.
     """
-    scored = {rule: found for rule, found in rules.items() if "negative_log_density" in found}
+    scored = {rule: scores for rule, scores in rules.items() if "negative_log_density" in scores}
     best = min(scored, key=lambda rule: scored[rule]["negative_log_density"])
     low, high = (float(end) for end in share.interval)
     differ = float(share.against_one)
@@ -169,9 +184,9 @@ def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Sh
         f" Bayes factor against people who are alike {differ:+.1f}). Of people left out, {best} predicts best"
         f" ({scored[best]['negative_log_density']:.3f} ± {scored[best]['negative_log_density_error']:.3f})"
     )
-    own = scored.get("hierarchical")
+    hierarchical = scored.get("hierarchical")
     chosen = best
-    if own is not None:
+    if hierarchical is not None:
         gap, error = clustered(left["hierarchical"].cost - left[best].cost, left[best].person)
         near = not math.isfinite(error) or gap <= 2 * error
         if near and (differ > 3 or best == "hierarchical"):

@@ -1,8 +1,8 @@
 """Tolerance intervals with their uncertainty: how far a parameter may move, had other people of this kind been asked.
 
-`map_summary.tolerance` reads the interval from a population map. Here people are drawn again with replacement, the map
-is merged anew from the same posteriors, and the interval through the same optimum is read off a grid; percentiles of
-its ends over these draws are what the choice of participants leaves open. A draw in which the highest answer is not the
+`map_summary.tolerance` reads the interval from a population map. Here people are resampled (a bootstrap), the map is
+merged anew from the same posteriors, and the interval through the same optimum is read off a grid; percentiles of its
+ends over these draws are what the choice of participants leaves open. A draw in which the highest answer is not the
 likeliest at the optimum has no interval, and counts as such. Nothing is refitted: a merge is a sum over people.
 """
 
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.pointwise import Rule, aggregate
@@ -56,7 +56,7 @@ def tolerance_ends(
     means, explained, prior = _predictions(posteriors, points)
     count = means.shape[0]
     rows = jax.random.randint(jax.random.key(seed), (draws, count), 0, count)
-    inside = np.asarray(_inside(study, means, explained, prior, rows, rule, share)) & np.asarray(feasible)
+    inside = np.asarray(_dominant_in_draws(study, means, explained, prior, rows, rule, share)) & np.asarray(feasible)
     ends = [_ends(row, middle) for row in inside if row[middle]]
     if not ends:
         return None
@@ -67,14 +67,25 @@ def tolerance_ends(
 
 
 @eqx.filter_jit
-def _predictions(posteriors, x):
+def _predictions(
+    posteriors: Posterior, x: Float[Array, "m d"]
+) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
+    """Everybody's means and explained variances at points, and the prior variance there."""
     means, explained = jax.lax.map(lambda p: p.predict_explained(x), posteriors)
     kernel = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel
     return means, explained, jax.vmap(kernel.diagonal)(x)
 
 
 @eqx.filter_jit
-def _inside(study, means, explained, prior, rows, rule, share):
+def _dominant_in_draws(
+    study: Study,
+    means: Float[Array, "M m"],
+    explained: Float[Array, "M m"],
+    prior: Float[Array, " m"],
+    rows: Int[Array, "draws M"],
+    rule: Rule,
+    share: ArrayLike | None,
+) -> Bool[Array, "draws m"]:
     """Whether the highest answer is the likeliest one, (draws, m)."""
 
     def one(chosen):
@@ -86,8 +97,9 @@ def _inside(study, means, explained, prior, rows, rule, share):
     return jax.lax.map(one, rows)
 
 
-def _ends(inside, middle):
+def _ends(inside: Bool[np.ndarray, " m"], middle: int) -> tuple[int, int]:
     """First and last place of the connected run through `middle`."""
     outside = np.flatnonzero(~inside)
     below, above = outside[outside < middle], outside[outside > middle]
-    return (below[-1] + 1 if len(below) else 0), (above[0] - 1 if len(above) else len(inside) - 1)
+    first = int(below[-1]) + 1 if len(below) else 0
+    return first, int(above[0]) - 1 if len(above) else len(inside) - 1

@@ -8,13 +8,14 @@ A table is read piece by piece, and a piece's text is gone when its numbers are 
 
 import csv
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
+from hilbo.search.space import Parameter
 from hilbo.study.config import Study
 
 __all__ = ["NOT_FITTED", "numbers", "of_material", "place", "read_cells", "read_trials", "refuse", "write_trials"]
@@ -41,10 +42,10 @@ def read_trials(
     `material` selects the rows of one material, and must be given if there are several. `others`: keep the columns that
     are nobody's business. `say` is told how many rows have been read. Raises `InputError`.
     """
-    source, known, pieces, rows = str(path), {}, [], 0
+    source, texts, pieces, rows = str(path), {}, [], 0
     for text in _pieces(path):
         _check_columns(text, study, source)
-        pieces.append(_checked(text, study, source, others, known))
+        pieces.append(_checked(text, study, source, others, texts))
         say(rows := rows + len(text))
     if not rows:
         raise InputError(f"{source}: has no rows; a trial table needs at least one answer.")
@@ -61,7 +62,7 @@ def read_trials(
     return order.drop(columns=["_person", "_session"])
 
 
-def _checked(text, study, source, others, known):
+def _checked(text: pd.DataFrame, study: Study, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
     """A piece with its numbers as numbers and its texts as one object each, and `_fitted`: which rows count."""
     numeric = {"trial", *study.space.names}
     table = pd.DataFrame(index=text.index)
@@ -69,12 +70,12 @@ def _checked(text, study, source, others, known):
         if column in numeric:
             table[column] = np.nan  # its place among the columns
         elif others or column in _KEY:
-            table[column] = [known.setdefault(cell, cell) for cell in text[column]]
+            table[column] = [texts.setdefault(cell, cell) for cell in text[column]]
     whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
     table["trial"] = whole.astype(int)
     refuse(text["participant"] == "", source, lambda row: "participant is empty; give each row a participant.")
     for parameter in study.space.parameters:
-        table[parameter.name] = _parameter(text, parameter, source)
+        table[parameter.name] = _parameter_values(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
     table["_fitted"] = ~_flags(text, "voided", source) & (~text["phase"].isin(NOT_FITTED) if "phase" in text else True)
     return table
@@ -102,7 +103,9 @@ def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a head
     return pd.concat(_pieces(path, needs))
 
 
-def _pieces(path, needs="a trial table needs a header and an answer") -> Iterator[pd.DataFrame]:
+def _pieces(
+    path: str | os.PathLike, needs: str = "a trial table needs a header and an answer"
+) -> Iterator[pd.DataFrame]:
     """The cells of a table as text, some rows at a time; at least one piece, which may have none."""
     source, path = str(path), Path(path)
     try:
@@ -120,54 +123,55 @@ def _pieces(path, needs="a trial table needs a header and an answer") -> Iterato
         raise InputError(f"{source}: is not a table that can be read ({reason}); save it as CSV or Parquet.") from error
 
 
-def _parquet_pieces(path):
+def _parquet_pieces(path: Path) -> Iterator[pd.DataFrame]:
+    """The first piece is empty: a table without rows has columns too."""
     from pyarrow.parquet import ParquetFile
 
     with ParquetFile(path) as file:
-        begin = 1
-        yield _as_text(file.schema_arrow.empty_table().to_pandas(), begin)
+        first_row = 1
+        yield _as_text(file.schema_arrow.empty_table().to_pandas(), first_row)
         for batch in file.iter_batches(_PIECE):
-            yield _as_text(batch.to_pandas(), begin)
-            begin += batch.num_rows
+            yield _as_text(batch.to_pandas(), first_row)
+            first_row += batch.num_rows
 
 
-def _as_text(frame, begin):
+def _as_text(frame: pd.DataFrame, first_row: int) -> pd.DataFrame:
     columns = {i: _column_as_text(frame.iloc[:, i]) for i in range(frame.shape[1])}  # a name may stand there twice
-    index = np.arange(begin, begin + len(frame))
+    index = np.arange(first_row, first_row + len(frame))
     return pd.DataFrame(columns, index=index, dtype=object).set_axis(frame.columns, axis=1)
 
 
-def _column_as_text(column):
+def _column_as_text(column: pd.Series) -> list[str]:
     if column.dtype.kind == "f":
         return [repr(v) for v in column.tolist()]
     return ["" if v is None or v is pd.NA else repr(v) if isinstance(v, float) else str(v) for v in column.tolist()]
 
 
-def _csv_pieces(path, source, needs):
+def _csv_pieces(path: Path, source: str, needs: str) -> Iterator[pd.DataFrame]:
     """By Python's csv module: it knows the line of a row, and a row that is too long is no reason to guess."""
     with path.open(newline="", encoding="utf-8-sig") as file:
         reader = csv.reader(file, skipinitialspace=True, strict=True)
-        rows, lines, header, begin, pieces = [], [], [], 1, 0
+        rows, lines, header, line, pieces = [], [], [], 1, 0
         for row in reader:
             if any(row):  # not an empty line, nor a spreadsheet's row of commas
                 header = header or row
                 if len(row) != len(header):
                     raise InputError(
-                        f"{source}:{begin}: has {len(row)} cells, the header has {len(header)}; mend that line."
+                        f"{source}:{line}: has {len(row)} cells, the header has {len(header)}; mend that line."
                     )
                 rows.append(row)
-                lines.append(begin)
+                lines.append(line)
                 if len(rows) > _PIECE:
                     yield _piece(rows, lines, header, pieces)
                     rows, lines, pieces = [], [], pieces + 1
-            begin = reader.line_num + 1
+            line = reader.line_num + 1
         if not header:
             raise InputError(f"{source}: is empty; {needs}.")
         if rows:
             yield _piece(rows, lines, header, pieces)
 
 
-def _piece(rows, lines, header, pieces):
+def _piece(rows: list[list[str]], lines: list[int], header: list[str], pieces: int) -> pd.DataFrame:
     skip = 0 if pieces else 1  # the first row of the first piece is the header
     return pd.DataFrame(rows[skip:], index=lines[skip:], columns=header, dtype=object)
 
@@ -179,7 +183,7 @@ def place(source: str, row: object = None) -> str:
     return f"{source}:{1 if row is None else row}: "
 
 
-def _check_columns(text, study, source):
+def _check_columns(text: pd.DataFrame, study: Study, source: str) -> None:
     needed = ("participant", "trial", "response", *study.space.names)
     missing = [name for name in needed if name not in text.columns]
     if missing:
@@ -193,29 +197,29 @@ def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> 
 
     cells = text[column].tolist()
     try:
-        found = [] if "_" in "".join(cells) else [float(cell) for cell in cells]
+        floats = [] if "_" in "".join(cells) else [float(cell) for cell in cells]
     except ValueError:
-        found = []
-    values = pd.Series(found if len(found) == len(cells) else [_number(c) for c in cells], text.index, dtype=float)
+        floats = []
+    values = pd.Series(floats if len(floats) == len(cells) else [_number(c) for c in cells], text.index, dtype=float)
     wrong = ~(np.isfinite(values) & valid(values))
     refuse(wrong, source, lambda row: f'{column} is "{text.at[row, column]}"; it must be {words}.')
     return values
 
 
-def _number(cell):
+def _number(cell: str) -> float:
     try:
         return np.nan if "_" in cell else float(cell)  # Python reads 1_5 as 15
     except ValueError:
         return np.nan
 
 
-def _parameter(text, parameter, source):
+def _parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> pd.Series:
     unit = f" {parameter.unit}" if parameter.unit else ""
     words = f"a number from {parameter.low:g} to {parameter.high:g}{unit}, the study's range"
     return numbers(text, parameter.name, source, words, lambda v: (v >= parameter.low) & (v <= parameter.high))
 
 
-def _categories(cells, responses, source):
+def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.Series:
     """Categories from 0: labels compared as text; ranks from 1 only if no label of the study reads as an integer."""
     ranks_allowed = not any(label.strip().lstrip("+-").isdigit() for label in responses)
     lookup = {label: i for i, label in enumerate(responses)}
@@ -231,7 +235,8 @@ def _categories(cells, responses, source):
     return categories.astype(int)
 
 
-def _flags(text, column, source):
+def _flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:
+    """A column of 1 and 0; all 0 where there is none."""
     if column not in text:
         return pd.Series(False, text.index)
     cells = text[column].str.strip().str.lower()
@@ -239,7 +244,7 @@ def _flags(text, column, source):
     return cells.isin(_TRUE)
 
 
-def _check_duplicates(table, source):
+def _check_duplicates(table: pd.DataFrame, source: str) -> None:
     key = [column for column in _KEY if column in table]
     again = table.duplicated(key)
     if again.any():
@@ -258,11 +263,13 @@ def of_material(table: pd.DataFrame, material: str | None, source: str) -> pd.Da
         if material is not None:
             raise InputError(f'{place(source)}column "material" is missing; without it no material can be chosen.')
         return table
-    found = list(table["material"].unique())
-    if material is None and len(found) > 1:
-        raise InputError(f"{source}: holds {len(found)} materials ({', '.join(found)}); choose one with --material.")
-    if material is not None and material not in found:
-        raise InputError(f'{source}: holds no material "{material}"; it has {", ".join(found)}.')
+    materials = list(table["material"].unique())
+    if material is None and len(materials) > 1:
+        raise InputError(
+            f"{source}: holds {len(materials)} materials ({', '.join(materials)}); choose one with --material."
+        )
+    if material is not None and material not in materials:
+        raise InputError(f'{source}: holds no material "{material}"; it has {", ".join(materials)}.')
     return table if material is None else table[table["material"] == material]
 
 

@@ -84,13 +84,15 @@ def check_validation(
 
 def of_material(table: pd.DataFrame, material: str | None, source: str = "validation table") -> pd.DataFrame:
     """The rows of one material, which must be named if there are several."""
-    found = list(table["material"].unique()) if "material" in table else []
+    materials = list(table["material"].unique()) if "material" in table else []
     if material is None:
-        if len(found) > 1:
-            raise InputError(f"{source}: holds {len(found)} materials ({', '.join(found)}); choose one of them.")
+        if len(materials) > 1:
+            raise InputError(
+                f"{source}: holds {len(materials)} materials ({', '.join(materials)}); choose one of them."
+            )
         return table
-    if material not in found:
-        has = f"it has {', '.join(found)}" if found else 'it has no column "material"'
+    if material not in materials:
+        has = f"it has {', '.join(materials)}" if materials else 'it has no column "material"'
         raise InputError(f'{source}: holds no comparisons of material "{material}"; {has}.')
     return table[table["material"] == material]
 
@@ -102,22 +104,23 @@ def sets_frame(path: str | os.PathLike, parameters: Sequence[str] = ()) -> pd.Da
     return frame.fillna(dict.fromkeys(text, ""))
 
 
-def _classes(text, column, responses, source):
+def _classes(text: pd.DataFrame, column: str, responses: Sequence[str], source: str) -> pd.Series:
+    """Labels of the responses, from labels or ranks; `NONE` where nothing was asked."""
     lookup = {label: label for label in responses} | {"": NONE}
     ranks = ""
     if not any(label.strip().lstrip("+-").isdigit() for label in responses):
         lookup = {form: label for i, label in enumerate(responses, 1) for form in (str(i), f"{i}.0")} | lookup
         ranks = f", a rank from 1 to {len(responses)}"
-    found = text[column].map(lookup)
+    labels = text[column].map(lookup)
     refuse(
-        found.isna(),
+        labels.isna(),
         source,
         lambda row: f'{column} is "{text.at[row, column]}"; it must be one of {", ".join(responses)}{ranks}, or empty.',
     )
-    return found
+    return labels
 
 
-def _chosen(text, column, others, source):
+def _chosen(text: pd.DataFrame, column: str, others: tuple[str, ...], source: str) -> pd.Series:
     """One of the two sets by its name or as "a" or "b", or one of `others`."""
     cells = text[column].mask(text[column] == "a", text["set_a"]).mask(text[column] == "b", text["set_b"])
     good = (cells == text["set_a"]) | (cells == text["set_b"]) | cells.isin((NONE, *others))
@@ -133,7 +136,7 @@ def _chosen(text, column, others, source):
     return cells
 
 
-def _check_duplicates(table, source):
+def _check_duplicates(table: pd.DataFrame, source: str) -> None:
     key = [column for column in _KEY if column in table]
     again = table.duplicated(key)
     refuse(

@@ -17,11 +17,11 @@ from hilbo.population.pointwise import RULES
 from hilbo.report.figures import study as plotting_study
 from hilbo.study import analysis
 from hilbo.study.aggregate import fit_cohort, map_optimum, population
-from hilbo.study.batch_optimum import _apart, _optimum
+from hilbo.study.batch_optimum import _optimum_at, _variance_apart
 from hilbo.study.cohort import Cohort
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.progress import _map_by_points
-from hilbo.study.tolerance_intervals import _inside
+from hilbo.study.tolerance_intervals import _dominant_in_draws
 
 STUDY = plain()
 SHARE, PEOPLE = 0.4, 3
@@ -67,9 +67,8 @@ def test_class_probabilities_of_an_optimum_are_a_new_persons(posteriors):
 
 
 def test_a_stream_of_people_says_the_same():
-    people = SimpleNamespace(study=STUDY, share=SHARE)
     for rule, apart in (("hierarchical", 1.0 - SHARE), ("average", 0.0)):
-        found = _optimum(STUDY, np.zeros(2), np.asarray(0.7), np.asarray(0.3), _apart(people, rule))
+        found = _optimum_at(STUDY, np.zeros(2), np.asarray(0.7), np.asarray(0.3), _variance_apart(STUDY, rule, SHARE))
         np.testing.assert_allclose(found.class_probabilities, chances(0.7, 0.3 + apart), rtol=1e-12)
         assert float(found.sd) == pytest.approx(np.sqrt(0.3))
 
@@ -79,7 +78,7 @@ def test_draws_of_tolerance_intervals_are_a_new_persons(posteriors):
     x = jnp.asarray(STUDY.space.candidates(400, 3))
     means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors[True])
     rows, share = jnp.arange(PEOPLE)[None, :], jnp.asarray(SHARE)
-    inside = np.asarray(_inside(STUDY, 3 * means, explained, jnp.ones(400), rows, "hierarchical", share))[0]
+    inside = np.asarray(_dominant_in_draws(STUDY, 3 * means, explained, jnp.ones(400), rows, "hierarchical", share))[0]
     mean, variance = population(posteriors[True], x, "hierarchical", share)
     expected, sure = (
         np.array([chances(m, v + more).argmax() == 2 for m, v in zip(3 * mean, variance, strict=True)])
@@ -92,19 +91,17 @@ def test_draws_of_tolerance_intervals_are_a_new_persons(posteriors):
 def test_what_stands_in_place_of_a_map_is_said(posteriors):
     """Of a rule that takes all answers at once, maps of fewer trials and of other people are merged otherwise."""
     for rule in ("bcm", "average", "hierarchical"):
-        assert in_place(of_rule(rule, posteriors[True])) == "" and not list(_substitute(of_rule(rule, None)))
+        assert in_place(of_rule(rule, posteriors[True])) == "" and not list(
+            analysis._merged_otherwise(of_rule(rule, None))
+        )
     one = jax.tree.map(lambda leaf: leaf[0], posteriors[True])  # any posterior will do
     for rule, how in (("hierarchical", "by the rule hierarchical point by point"), ("pooled", "by bcm")):
         whole = RuleMap(rule, "exact", None, one, jnp.asarray(SHARE), jnp.asarray(1.0))
-        (words,) = _substitute(whole)
+        (words,) = analysis._merged_otherwise(whole)
         assert in_place(whole) == how and f"are merged {how}" in words and f"by the rule {rule} from" in words
     share = jnp.asarray(SHARE)
     assert point_rule("hierarchical", share) == ("hierarchical", share)
     assert point_rule("bcm", share) == ("bcm", None) and point_rule("pooled", share) == ("bcm", None)
-
-
-def _substitute(found):
-    return analysis._substitute(SimpleNamespace(map=found))
 
 
 def test_maps_of_fewer_trials_are_merged_as_their_stars(posteriors):
@@ -128,7 +125,7 @@ def test_readings_are_of_new_people(monkeypatch):
     )
     monkeypatch.setattr(analysis, "tolerance", lambda study, predict, x, name: predict)
     monkeypatch.setattr(analysis, "tolerance_ends", lambda *args, **named: None)
-    read = analysis._read(STUDY, aggregate, 0)
+    read = analysis._reading(STUDY, aggregate, 0)
     assert all(found[0] is aggregate.newcomer for found in read.tolerances.values())
     np.testing.assert_allclose(plotting_study._probabilities(read, jnp.zeros((1, 2)))[0], chances(0.0, 3.0), rtol=1e-12)
 

@@ -15,7 +15,7 @@ from hilbo.population.pointwise import Sums
 from hilbo.search.candidates import search_points
 from hilbo.study import distributed
 from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population, population_optimum
-from hilbo.study.batch import _block, block_size, jets, population_of, refit, sums
+from hilbo.study.batch import _one_block, block_size, jets, population_of, refit, sums
 from hilbo.study.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.study.cohort import cohort_of
 
@@ -166,7 +166,8 @@ def test_a_block_made_at_once_is_one_made_person_by_person(task):
     modes = None if task == "individuals" else jnp.asarray(fitted().population.modes[:32])
     points = jnp.asarray(candidates()[:40])
     found = [
-        eqx.filter_jit(_block)(STUDY, points, trials, modes, task, "laplace", platform) for platform in ("cpu", "gpu")
+        eqx.filter_jit(_one_block)(STUDY, points, trials, modes, task, "laplace", platform)
+        for platform in ("cpu", "gpu")
     ]
     jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9), *[total for total, _ in found])
     if task == "individuals":
