@@ -20,6 +20,9 @@ from scipy.special import log_ndtr
 from hilbo.likelihoods import OrdinalProbit
 
 DTYPES = [np.float64, np.float32]
+FEW, MANY = 4, 22
+"""Points of each width, noise and category: MANY take half a minute to compute at high precision."""
+PARTS = [FEW, pytest.param(MANY, marks=pytest.mark.deep)]
 NOISES = (1e-3, 0.1, 0.5, 0.7, math.pi, 10.0)
 WIDTHS = (1e-3, 1e-2, 0.1, 0.5, 0.99, 1.01, 2.0, 5.0, 30.0, 1e3)
 DISTANCES = np.array([0, 1e-9, 1e-3, 0.1, 0.5, 1, 2, 3, 4, 6, 8.3, 12, 20, 37.5, 38.6, 50, 75, 100])
@@ -43,8 +46,8 @@ def evaluate(f, q, thresholds, noise):
 
 
 @cache
-def grid(dtype):
-    """Arrays (f, q, thresholds, noise) of about 8,000 cases: every width and noise in every category."""
+def grid(dtype, part):
+    """Arrays (f, q, thresholds, noise), `part` points of every width and noise in every category."""
     rng = np.random.default_rng(2)
     cases = []
     for noise in map(dtype, NOISES):
@@ -53,15 +56,15 @@ def grid(dtype):
                 t = np.array([first, first + width * noise], dtype)
                 z = np.concatenate([DISTANCES, 10 ** rng.uniform(-2, 2, 8)])
                 f = np.concatenate([edge + side * noise * z for edge in t for side in (-1, 1)]).astype(dtype)
-                cases += [(s, q, t, noise) for q in range(3) for s in rng.choice(f, 22, replace=False)]
+                cases += [(s, q, t, noise) for q in range(3) for s in rng.choice(f, part, replace=False)]
     return tuple(map(np.array, zip(*cases, strict=True)))
 
 
 @cache
-def exact(dtype):
+def exact(dtype, part):
     """Of each case on the grid: log p, gradient and curvature as mpf, and the distance in noise units to its edge."""
     values = []
-    for f, q, t, noise in zip(*grid(dtype), strict=True):
+    for f, q, t, noise in zip(*grid(dtype, part), strict=True):
         lower, upper = np.array([-np.inf, *t, np.inf])[q : q + 2]
         nearest = min(abs(float(edge) - float(f)) for edge in (lower, upper)) / float(noise)
         values.append((*ordinal_log_prob_mp(f, lower, upper, noise, 25), nearest))
@@ -69,44 +72,48 @@ def exact(dtype):
 
 
 @cache
-def found(dtype):
-    return [np.asarray(v) for v in evaluate(*map(jnp.asarray, grid(dtype)))]
+def found(dtype, part):
+    return [np.asarray(v) for v in evaluate(*map(jnp.asarray, grid(dtype, part)))]
 
 
 def distance(value, target) -> float:
     return float(abs(mp.mpf(float(value)) - target))
 
 
+@pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_log_prob_against_mpmath(dtype):
+def test_log_prob_against_mpmath(dtype, part):
     smallest = np.finfo(dtype).tiny
-    for value, (target, _, _, z) in zip(found(dtype)[0], exact(dtype), strict=True):
+    for value, (target, _, _, z) in zip(found(dtype, part)[0], exact(dtype, part), strict=True):
         if abs(target) >= smallest:
             bound = 1e-12 if dtype is np.float64 else 1e-5 * max(1.0, z**2 / 100)
             assert distance(value, target) <= bound * abs(target)
 
 
+@pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-4)])
-def test_gradient_against_mpmath(dtype, tolerance):
-    noise = grid(dtype)[3].astype(float)
-    for value, (_, target, *_), c in zip(found(dtype)[1], exact(dtype), noise, strict=True):
+def test_gradient_against_mpmath(dtype, tolerance, part):
+    noise = grid(dtype, part)[3].astype(float)
+    for value, (_, target, *_), c in zip(found(dtype, part)[1], exact(dtype, part), noise, strict=True):
         assert distance(value, target) <= tolerance * max(abs(target), 1 / c)
 
 
+@pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 1e-3)])
-def test_curvature_against_mpmath(dtype, tolerance):
-    noise = grid(dtype)[3].astype(float)
-    for value, (_, _, target, _), c in zip(found(dtype)[2], exact(dtype), noise, strict=True):
+def test_curvature_against_mpmath(dtype, tolerance, part):
+    noise = grid(dtype, part)[3].astype(float)
+    for value, (_, _, target, _), c in zip(found(dtype, part)[2], exact(dtype, part), noise, strict=True):
         assert distance(value, target) <= tolerance / c**2
 
 
+@pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize("dtype", DTYPES)
-def test_curvature_is_that_of_a_log_concave_function_and_all_is_finite(dtype):
-    noise = grid(dtype)[3].astype(float)
-    scaled = found(dtype)[2] * noise**2
+def test_curvature_is_that_of_a_log_concave_function_and_all_is_finite(dtype, part):
+    noise = grid(dtype, part)[3].astype(float)
+    scaled = found(dtype, part)[2] * noise**2
     assert scaled.min() >= 0.0
     assert scaled.max() <= 1 + 4 * np.finfo(dtype).eps
-    assert all(np.all(np.isfinite(values)) for values in found(dtype))
+    assert all(np.all(np.isfinite(values)) for values in found(dtype, part))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 1e-4)])
@@ -139,9 +146,10 @@ def exact_slopes(f, q, t, noise):
     return slopes[1], slopes[2], by_noise
 
 
+@pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-4)])
-def test_gradients_in_thresholds_and_noise_against_mpmath(dtype, tolerance):
-    cases = list(zip(*grid(dtype), *found(dtype)[4:], strict=True))[::7]
+def test_gradients_in_thresholds_and_noise_against_mpmath(dtype, tolerance, part):
+    cases = list(zip(*grid(dtype, part), *found(dtype, part)[4:], strict=True))[::7]
     for f, q, t, noise, by_thresholds, by_noise in cases:
         *slopes, slope = exact_slopes(f, q, t, noise)
         steepest = max(map(abs, slopes))  # a narrow category pulls its edges apart with much more than 1/noise
@@ -150,9 +158,10 @@ def test_gradients_in_thresholds_and_noise_against_mpmath(dtype, tolerance):
         assert distance(by_noise, slope) <= tolerance * max(abs(slope), steepest, 1 / float(noise))
 
 
+@pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-8), (np.float32, 1e-2)])
-def test_third_derivative_against_differences_at_40_digits(dtype, tolerance):
-    for f, q, t, noise, value in list(zip(*grid(dtype), found(dtype)[3], strict=True))[::37]:
+def test_third_derivative_against_differences_at_40_digits(dtype, tolerance, part):
+    for f, q, t, noise, value in list(zip(*grid(dtype, part), found(dtype, part)[3], strict=True))[::37]:
         edges, c = [-mp.inf, *t, mp.inf], float(noise)
         with mp.workdps(60):
             step = mp.mpf(c) * mp.mpf(10) ** -12
@@ -185,14 +194,15 @@ def test_second_and_third_derivatives_in_everything(q):
         np.testing.assert_allclose(curvatures(h, q), expected, rtol=1e-7, atol=1e-7 * np.max(np.abs(expected)))
 
 
-def test_the_oracle_agrees_with_a_plain_difference_at_2500_digits():
-    f, q, t, noise = grid(np.float64)
-    for i in range(5, len(f), 701):
+@pytest.mark.parametrize("apart", [400, pytest.param(40, marks=pytest.mark.deep)])
+def test_the_oracle_agrees_with_a_plain_difference_at_2500_digits(apart):
+    f, q, t, noise = grid(np.float64, FEW)
+    for i in range(5, len(f), apart):
         lower, upper = [-mp.inf, *t[i], mp.inf][q[i] : q[i] + 2]
         with mp.workdps(2500):
             a, b = ((mp.mpf(edge) - mp.mpf(f[i])) / mp.mpf(noise[i]) for edge in (lower, upper))
             log_p = mp.log(mp.ncdf(b) - mp.ncdf(a))
-            assert abs(exact(np.float64)[i][0] / log_p - 1) < mp.mpf(10) ** -24
+            assert abs(exact(np.float64, FEW)[i][0] / log_p - 1) < mp.mpf(10) ** -24
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -215,7 +225,9 @@ def test_nothing_is_lost_far_outside(dtype, noise):
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-15), (np.float32, 1e-6)])
-@pytest.mark.parametrize("categories", range(2, 11))
+@pytest.mark.parametrize(
+    "categories", [pytest.param(count, marks=[pytest.mark.deep] * (count not in (2, 3, 10))) for count in range(2, 11)]
+)
 def test_class_probabilities_sum_to_one(dtype, tolerance, categories):
     rng = np.random.default_rng(categories)
     n, narrowest = 4000, -3 if dtype is np.float64 else -1
@@ -233,12 +245,12 @@ def test_class_probabilities_sum_to_one(dtype, tolerance, categories):
 
 def test_class_probabilities_against_mpmath():
     t, noise = (-0.5, 0.4, 1.3), 0.7
-    likelihood = OrdinalProbit(t, noise)
+    class_probabilities = jax.jit(lambda *moments: OrdinalProbit(t, noise).class_probabilities(*moments))
     for mean, variance in ((0.1, 0.0), (-2.3, 0.9), (30.0, 0.01), (0.8, 1e4)):
         spread = mp.sqrt(mp.mpf(noise) ** 2 + mp.mpf(variance))
         edges = [mp.ncdf((s - mp.mpf(mean)) / spread) for s in (-mp.inf, *map(mp.mpf, t), mp.inf)]
         expected = np.diff(np.array(edges, object)).astype(float)
-        np.testing.assert_allclose(likelihood.class_probabilities(mean, variance), expected, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(class_probabilities(mean, variance), expected, rtol=1e-12, atol=1e-15)
 
 
 def test_a_blurred_answer_is_the_average_over_the_blur():
@@ -246,7 +258,7 @@ def test_a_blurred_answer_is_the_average_over_the_blur():
     likelihood = OrdinalProbit((-0.5, 0.5), 0.5)
     nodes, weights = np.polynomial.hermite_e.hermegauss(80)
     f = jnp.asarray(0.2 + math.sqrt(0.6) * nodes)
-    p = jax.vmap(lambda s: jnp.exp(jax.vmap(lambda q: likelihood.log_prob(s, q))(jnp.arange(3))))(f)
+    p = jax.jit(jax.vmap(lambda s: jnp.exp(jax.vmap(lambda q: likelihood.log_prob(s, q))(jnp.arange(3)))))(f)
     averaged = weights @ np.asarray(p) / math.sqrt(2 * math.pi)
     np.testing.assert_allclose(likelihood.class_probabilities(0.2, 0.6), averaged, rtol=1e-10)
 
@@ -284,11 +296,11 @@ def test_mirror_symmetry(z, width, noise, q):
 
 
 def test_two_categories_are_the_probit():
-    likelihood = OrdinalProbit((0.2,), 0.8)
+    probit = jax.jit(jax.vmap(OrdinalProbit((0.2,), 0.8).log_prob, in_axes=(0, None)))
     f = jnp.linspace(-30.0, 30.0, 61)
     for q, sign in ((0, -1.0), (1, 1.0)):
         expected = log_ndtr(sign * (np.asarray(f) - 0.2) / 0.8)
-        np.testing.assert_allclose(jax.vmap(lambda s, q=q: likelihood.log_prob(s, q))(f), expected, rtol=1e-12)
+        np.testing.assert_allclose(probit(f, q), expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("thresholds", "noise"), [((0.5, -0.5), 0.5), ((-0.5, 0.5), -0.5), ((-0.5, 0.5), 0.0)])

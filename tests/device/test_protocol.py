@@ -108,11 +108,12 @@ def test_bytes_may_arrive_in_any_pieces(drawn, cuts):
 
 @pytest.mark.parametrize("rate", [1e-3, 1e-2])
 @pytest.mark.parametrize("fault", ["flip", "drop", "insert"])
-def test_damage_costs_the_frames_it_hits_and_no_more(fault, rate):
+@pytest.mark.parametrize("frames_sent", [2_000, pytest.param(20_000, marks=pytest.mark.deep)])
+def test_damage_costs_the_frames_it_hits_and_no_more(fault, rate, frames_sent):
     rng = random.Random(f"{fault}{rate}")
     receiver, sent, hit, got = Receiver(), 0, 0, 0
     last_hit = False
-    for n in range(20_000):
+    for n in range(frames_sent):
         message = protocol.Echo(data=rng.randbytes(n % 30))
         whole = encode(message, n % 256)
         damaged = bytearray()

@@ -26,7 +26,7 @@ def edges_of(data):
     return edges[data.q], edges[data.q + 1]
 
 
-@pytest.mark.parametrize("make", SMALL)
+@pytest.mark.parametrize("make", [pytest.param(make, marks=[pytest.mark.deep] * (make is noisy)) for make in SMALL])
 def test_against_the_textbook(make):
     """Another algorithm, other formulas, moments by quadrature: the same fixed point."""
     data = make()
@@ -44,7 +44,7 @@ def test_against_the_textbook(make):
 @pytest.mark.parametrize("noise", [0.05, 0.5, 3.0])
 def test_one_answer_is_exact(category, noise):
     likelihood = OrdinalProbit((-0.5, 0.7), noise)
-    trials = Trials.from_arrays(np.array([[0.3]]), np.array([category]), 25)
+    trials = Trials.from_arrays(np.full((1, 3), 0.3), np.array([category]), 25)
     posterior = fit(OrdinalGP(RBF(5.0, 1.7), likelihood), trials, inference="ep")
     edges = (-np.inf, -0.5, 0.7, np.inf)
     log_z, mean, variance, _ = tilted_moments(0.0, 1.7, edges[category], edges[category + 1], noise)
@@ -161,7 +161,7 @@ def assert_same(one, other, rtol=1e-12):
     np.testing.assert_allclose(one.predict(x), other.predict(x), rtol=rtol, atol=rtol)
 
 
-@pytest.mark.parametrize("make", [repeated, near_separable])
+@pytest.mark.parametrize("make", [repeated, pytest.param(near_separable, marks=pytest.mark.deep)])
 def test_padded_equals_unpadded(make):
     data = make()
     bare = by_ep(data, len(data.q))
@@ -268,5 +268,5 @@ def test_a_failed_fit_says_so():
     assert not fit(gp, answers(data), inference="ep", throw=False).certificate.converged
     kernel, full = model(data).kernel, answers(data)
     terms = ordinal_gp.TiltedTerms(model(data).likelihood, full.q, full.mask)
-    stopped = ep(gram(kernel, full.x, full.x), terms, max_steps=2).certificate
+    stopped = jax.jit(lambda covariance: ep(covariance, terms, max_steps=2))(gram(kernel, full.x, full.x)).certificate
     assert stopped.iterations == 2 and not stopped.converged and stopped.residual > stopped.tolerance

@@ -46,7 +46,7 @@ def test_against_the_textbook(make):
     assert abs(along @ plain.latent.inverse[:n, :n] @ along + bend) > 2e-4 * abs(bend)
 
 
-@pytest.mark.parametrize("make", SMALL)
+@pytest.mark.parametrize("make", [pytest.param(make, marks=[pytest.mark.deep] * (make is noisy)) for make in SMALL])
 def test_nearer_to_the_truth_in_every_respect(make):
     """Within .0006 in the mean (RMS) and .003 in the evidence at noise 0.5 or more; .0015 and .02 at noise 0.1."""
     data, gp, x = make(), model(make()), jnp.asarray(make().x)
