@@ -46,6 +46,7 @@ ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
 COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
 # The map puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse them.
 _ROUNDING = 64
+_Batch = Float[Array, "*batch"]
 
 
 class Parameter(eqx.Module):
@@ -272,9 +273,7 @@ class SearchSpace(eqx.Module):
         largest = passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory)
         return K1.to_unit(jnp.clip(largest, K1.low, K1.high))
 
-    def _interval(
-        self, m: Mechanics, x: Float[Array, "*batch d"]
-    ) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+    def _interval(self, m: Mechanics, x: Float[Array, "*batch d"]) -> tuple[_Batch, _Batch]:
         """Start and width of the column of each point, in x_K1, with a range of effective damping."""
         K1 = self.parameters[self._index("K1")]
         B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
@@ -284,9 +283,7 @@ class SearchSpace(eqx.Module):
         return low, jnp.maximum(high - low, 0)
 
 
-def _K1_range(
-    m: Mechanics, B1: Float[Array, "*batch"], alpha: Float[Array, "*batch"]
-) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+def _K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
     """The K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
     assert m.effective_damping is not None
     memory = span(m.memory, m.N, m.states)
@@ -360,9 +357,7 @@ def _rosenblatt(space: SearchSpace, uniform: Float[np.ndarray, "n d"]) -> Float[
 
 
 @eqx.filter_jit
-def column_ends(
-    space: SearchSpace, x: Float[ArrayLike, "*batch d"]
-) -> tuple[Float[Array, "*batch"], Float[Array, "*batch"]]:
+def column_ends(space: SearchSpace, x: Float[ArrayLike, "*batch d"]) -> tuple[_Batch, _Batch]:
     """Both ends (...,) of the column of each point (..., d) of the unit cube, in x_K1; equal where none is feasible."""
     x, mechanics = _floating(x), space.mechanics
     assert mechanics is not None
