@@ -46,10 +46,10 @@ def write_comparison(study: Study, aggregate: Aggregate, folder: Path, seed: int
 def comparison_table(content: dict[str, Any]) -> pd.DataFrame:
     """A row for each rule."""
     rows = []
-    for rule, found in content["rules"].items():
-        row = {"rule": rule} | {name: found.get(name) for name in _COLUMNS}
-        row |= {"covered": found.get("covered"), "optimum_sd": found.get("optimum_sd")} | found.get("optimum", {})
-        influence = found.get("influence") or {}
+    for rule, entry in content["rules"].items():
+        row = {"rule": rule} | {name: entry.get(name) for name in _COLUMNS}
+        row |= {"covered": entry.get("covered"), "optimum_sd": entry.get("optimum_sd")} | entry.get("optimum", {})
+        influence = entry.get("influence") or {}
         row["most_influential"] = max(influence, key=lambda name: influence[name]) if influence else None
-        rows.append(row | {"refused": found.get("refused")})
+        rows.append(row | {"refused": entry.get("refused")})
     return pd.DataFrame(rows)

@@ -89,33 +89,33 @@ def _side(good: bool) -> Side:
 
 
 def _individuals(results):
-    found, study = results.found, results.found.study
-    counts = found.progress.counts
-    top, people = study.responses[-1], len(found.cohort.names)
+    analysis, study = results.found, results.found.study
+    counts = analysis.progress.counts
+    top, people = study.responses[-1], len(analysis.cohort.names)
     if len(counts) > 2:
-        known = [n for n in found.progress.settled(_NEAR) if n is not None]
+        settled_from = [n for n in analysis.progress.settled(_NEAR) if n is not None]
+        median = f", the median of these from trial {np.median(settled_from):.0f} on" if settled_from else ""
         yield Evidence(
-            _side(len(known) > people / 2),
-            f"{len(known)} of {people} individual optima stayed within {100 * _NEAR:.0f} % (NRMSE) of their final place"
-            " before their last trial"
-            f"{f', the median of these from trial {np.median(known):.0f} on' if known else ''} (for: more than half).",
+            _side(len(settled_from) > people / 2),
+            f"{len(settled_from)} of {people} individual optima stayed within {100 * _NEAR:.0f} % (NRMSE) of their"
+            f" final place before their last trial{median} (for: more than half).",
         )
-    answers = np.asarray(found.cohort.trials.q) == len(study.responses) - 1
-    mask = np.asarray(found.cohort.trials.mask)
+    answers = np.asarray(analysis.cohort.trials.q) == len(study.responses) - 1
+    mask = np.asarray(analysis.cohort.trials.mask)
     totals = (answers & mask).sum(axis=1)
     spread = f" ± {totals.std(ddof=1):.2f}" if people > 1 else ""
-    longest = int(found.cohort.counts().max())
+    longest = int(analysis.cohort.counts().max())
     third = max(longest // 3, 1)
     early, late = (
-        float((answers & mask)[:, part].sum() / max(mask[:, part].sum(), 1))
-        for part in (slice(0, third), slice(longest - third, longest))
+        float((answers & mask)[:, columns].sum() / max(mask[:, columns].sum(), 1))
+        for columns in (slice(0, third), slice(longest - third, longest))
     )
     yield Evidence(
         _side(late > early) if longest >= 6 else "open",
         f'Of {longest} trials, {totals.mean():.2f}{spread} were answered "{top}"; in the first third of the session'
         f" {100 * early:.0f} % of the answers, in the last third {100 * late:.0f} % (for: more than in the first).",
     )
-    chances = np.asarray(found.aggregate.individuals.class_probabilities)
+    chances = np.asarray(analysis.aggregate.individuals.class_probabilities)
     likeliest = int((chances.argmax(axis=1) == chances.shape[1] - 1).sum())
     yield Evidence(
         _side(likeliest > people / 2),
@@ -125,13 +125,13 @@ def _individuals(results):
 
 
 def _population(results):
-    found, study = results.found, results.found.study
-    best = found.aggregate.optimum
+    analysis, study = results.found, results.found.study
+    best = analysis.aggregate.optimum
     if results.reference is not None:
         ours, _ = misses(study, best.x, results.reference)
-        own, _ = misses(study, found.aggregate.individuals.x, results.reference)
-        mean, _ = misses(study, found.aggregate.mean_of_optima, results.reference)
-        low, middle, high = np.percentile(own, [25, 50, 75])
+        individual_misses, _ = misses(study, analysis.aggregate.individuals.x, results.reference)
+        mean, _ = misses(study, analysis.aggregate.mean_of_optima, results.reference)
+        low, middle, high = np.percentile(individual_misses, [25, 50, 75])
         yield Evidence(
             _side(bool(ours < middle and ours < mean)),
             f"From {results.reference_name} the population optimum is {100 * ours:.1f} % away (NRMSE), the individual"
@@ -182,14 +182,14 @@ def _validation(validated, responses):
 
 
 def _convergence(results):
-    found = results.found
-    counts, (merged, own) = found.progress.counts, found.progress.to_end()
-    people = len(found.cohort.names)
+    analysis = results.found
+    counts, (population_errors, individual_errors) = analysis.progress.counts, analysis.progress.to_end()
+    people = len(analysis.cohort.names)
     if len(counts) <= 2 or people < 2:
         yield Evidence("open", "It takes several participants and trials to say.")
         return
-    first = settled(counts, merged, _NEAR)
-    how = in_place(found.aggregate.map)
+    first = settled(counts, population_errors, _NEAR)
+    how = in_place(analysis.aggregate.map)
     how = f" (merged {how})" if how else ""
     if first is None:
         yield Evidence(
@@ -197,8 +197,8 @@ def _convergence(results):
             f"The population optimum{how} still moved by more than {100 * _NEAR:.0f} % before the last trial.",
         )
         return
-    at = int(np.searchsorted(counts, first))
-    answering, open_ = int(np.isfinite(own[at]).sum()), int((own[at] > _NEAR).sum())
+    row = int(np.searchsorted(counts, first))
+    answering, open_ = int(np.isfinite(individual_errors[row]).sum()), int((individual_errors[row] > _NEAR).sum())
     yield Evidence(
         _side(open_ > 0),
         f"From trial {first} on the population optimum{how} stayed within {100 * _NEAR:.0f} % (NRMSE) of its final"
@@ -207,8 +207,8 @@ def _convergence(results):
     )
     if results.reference is not None:
         miss = [
-            float(misses(found.study, x, results.reference)[0])
-            for x in (found.progress.population[at], found.progress.population[-1])
+            float(misses(analysis.study, x, results.reference)[0])
+            for x in (analysis.progress.population[row], analysis.progress.population[-1])
         ]
         yield Evidence(
             _side(miss[0] <= miss[1] + _NEAR),
@@ -229,13 +229,13 @@ def _materials(results):
 def _near(one):
     if one.reference is None:
         return
-    found = one.found
-    ours = float(misses(found.study, found.aggregate.optimum.x, one.reference)[0])
-    own = float(np.median(misses(found.study, found.aggregate.individuals.x, one.reference)[0]))
+    analysis = one.found
+    ours = float(misses(analysis.study, analysis.aggregate.optimum.x, one.reference)[0])
+    individual_miss = float(np.median(misses(analysis.study, analysis.aggregate.individuals.x, one.reference)[0]))
     yield Evidence(
-        _side(ours < own),
+        _side(ours < individual_miss),
         f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference_name}, the median individual one"
-        f" {100 * own:.0f} % (for: nearer than that).",
+        f" {100 * individual_miss:.0f} % (for: nearer than that).",
     )
 
 

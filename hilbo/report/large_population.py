@@ -51,27 +51,27 @@ def write_population(
     return content
 
 
-def _figures(study, merged, grid):
+def _figures(study, aggregate, grid):
     """Name -> figure, title, caption."""
     from hilbo.report.figures import maps
 
-    found, best = {}, np.asarray(merged.optimum.x)
+    figures, best = {}, np.asarray(aggregate.optimum.x)
     if study.space.dim <= 3:
-        some = _some(merged.cohort)
+        some = _some(aggregate.cohort)
         caption = (
             f"The {study.attribute} of each rendering, as far as people's answers tell, from the grid of map.nc:"
             f" brighter is better, and the star is the optimum. Dots are answers of {len(some.names)} participants,"
             f' orange where one answered "{study.responses[-1]}".'
         )
         white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
-        found["map"] = (maps.map_slices(study, _from(grid), best, some), "The population map", caption + white)
-    if merged.individuals is not None and study.space.dim > 1:
-        x = np.asarray(merged.individuals.x)
+        figures["map"] = (maps.map_slices(study, _from(grid), best, some), "The population map", caption + white)
+    if aggregate.individuals is not None and study.space.dim > 1:
+        x = np.asarray(aggregate.individuals.x)
         rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), _DOTS)).round().astype(int))
-        marks = {"population map": best, "mean of optima": np.asarray(merged.mean_of_optima)}
+        marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
         caption = f"Each dot is one participant's own optimum; {len(rows):,} of {len(x):,} are shown."
-        found["optima"] = (maps.optima_scatter(study, x[rows], marks), "Individual optima", caption)
-    return found
+        figures["optima"] = (maps.optima_scatter(study, x[rows], marks), "Individual optima", caption)
+    return figures
 
 
 def _some(cohort: Cohort) -> Cohort:
@@ -88,7 +88,7 @@ def _from(grid):
     between = RegularGridInterpolator(sides, values, method="cubic")
 
     def surface(x):
-        found = between(np.asarray(x))
-        return found[:, 0], found[:, 1]
+        values = between(np.asarray(x))
+        return values[:, 0], values[:, 1]
 
     return surface

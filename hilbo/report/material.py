@@ -226,19 +226,19 @@ def _residual_row(kind, row):
     return [*cells, f"{row['effective_samples']:.0f}", "" if over is None else f"{over:.1f}"]
 
 
-def _passivity_words(found):
-    if found is None:
+def _passivity_words(passivity):
+    if passivity is None:
         return ""
-    words = f"The set is passive on devices with a damping of at least {found['minimum_damping']:.4g} N·s/m"
-    if found["margin"] is None:
+    words = f"The set is passive on devices with a damping of at least {passivity['minimum_damping']:.4g} N·s/m"
+    if passivity["margin"] is None:
         return words + "; give the device's own with --damping."
-    kind = "more than that" if found["margin"] >= 0 else "less than that: it is not passive there"
-    return words + f"; the device has {found['damping']:g} N·s/m, {abs(found['margin']):.3f} {kind}."
+    kind = "more than that" if passivity["margin"] >= 0 else "less than that: it is not passive there"
+    return words + f"; the device has {passivity['damping']:g} N·s/m, {abs(passivity['margin']):.3f} {kind}."
 
 
 def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
     """What `hilbo passivity` prints: status and margin by certificate, binding frequency, largest K1, a witness."""
-    found = passivity.certify(model, b)
+    certificate = passivity.certify(model, b)
     odd, K_eff = model.memory == "full" or model.N % 2 == 1, float(model.dc_gain())
     largest = (
         float(passivity.largest_K1(model.B1, model.alpha, b, K_eff, model.N, model.T, memory=model.memory))
@@ -246,11 +246,11 @@ def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
         else None
     )
     content: dict[str, Any] = {
-        "status": found.status,
-        "margin": [float(found.lower), float(found.upper)],
-        "minimum_damping": b - 0.5 * (float(found.lower) + float(found.upper)),
+        "status": certificate.status,
+        "margin": [float(certificate.lower), float(certificate.upper)],
+        "minimum_damping": b - 0.5 * (float(certificate.lower) + float(certificate.upper)),
         "damping": b,
-        "binding_frequency": float(found.frequency) / (2 * np.pi),
+        "binding_frequency": float(certificate.frequency) / (2 * np.pi),
         "largest_K1": None if largest is None or math.isinf(largest) else largest,
         "every_K1": largest is not None and math.isinf(largest),
         "set": {name: float(getattr(model, name)) for name in ("K0", "K1", "B1", "alpha")},
@@ -259,7 +259,7 @@ def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
         "N": model.N if model.memory == "short" else None,
         "T": model.T,
     }
-    if found.status == "violated" and (cycle := passivity.witness(model, b)) is not None:
+    if certificate.status == "violated" and (cycle := passivity.witness(model, b)) is not None:
         content["witness"] = {"frequency": cycle.frequency / (2 * np.pi), "energy_per_cycle": cycle.energy}
     return content
 

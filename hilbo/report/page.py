@@ -170,14 +170,14 @@ def _comparison(study, content):
     words = {"average": "plain average of the latent functions", "pooled": "one model of all answers"}
     words |= {"ep": "population map, expectation propagation", "laplace": "population map, Laplace"}
     words |= {"hierarchical": "people who differ (hierarchical)", "bcm": "committee machine (bcm)"}
-    claims |= {words[name]: (name, found) for name, found in content["alternatives"].items()}
+    claims |= {words[name]: (name, optimum) for name, optimum in content["alternatives"].items()}
     if content["mean_of_optima"] is not None:
         claims["mean of the individual optima"] = ("mean_of_optima", content["mean_of_optima"])
     rows = []
-    for words_, (name, found) in claims.items():
-        row = [words_, *(_number(v) for v in found["parameters"].values())]
-        if found["passivity_margin"] is not None:
-            row.append(f"{found['passivity_margin']:+.3f}")
+    for words_, (name, optimum) in claims.items():
+        row = [words_, *(_number(v) for v in optimum["parameters"].values())]
+        if optimum["passivity_margin"] is not None:
+            row.append(f"{optimum['passivity_margin']:+.3f}")
         if truth:
             row.append(f"{100 * truth['nrmse'][name]['nrmse']:.1f} %")
         rows.append(row)
@@ -214,8 +214,12 @@ def robustness_page(study: Study, content: dict[str, Any], pictures: list[dict[s
         figures=pictures,
         head=["", *(_head(study, name) for name in content["fixed"]["parameters"]), "f"],
         optima=[
-            [label, *(_number(v) for v in found["parameters"].values()), f"{found['mean']:.2f} ± {found['sd']:.2f}"]
-            for label, found in (("fixed", content["fixed"]), ("by evidence", content["optimised"]))
+            [
+                label,
+                *(_number(v) for v in optimum["parameters"].values()),
+                f"{optimum['mean']:.2f} ± {optimum['sd']:.2f}",
+            ]
+            for label, optimum in (("fixed", content["fixed"]), ("by evidence", content["optimised"]))
         ],
         learned="; ".join(f"{name} {_numbers(learned[name])}" for name in ("theta", "noise", "thresholds"))
         if learned["shared"]

@@ -64,10 +64,14 @@ class People(NamedTuple):
 
 def people_of(study: Study, aggregate: Any) -> People:
     """The participants of an `Aggregate` or of a `Merged`."""
-    found = aggregate.individuals
-    sets, margins = (None, None) if found is None else parameter_sets(study, np.asarray(found.x))
+    individuals = aggregate.individuals
+    sets, margins = (None, None) if individuals is None else parameter_sets(study, np.asarray(individuals.x))
     cohort = aggregate.cohort
-    optima = None if found is None else {name: np.asarray(getattr(found, name)) for name in found.__dataclass_fields__}
+    optima = (
+        None
+        if individuals is None
+        else {name: np.asarray(getattr(individuals, name)) for name in individuals.__dataclass_fields__}
+    )
     return People(cohort.names, cohort.counts(), aggregate.certificates, study.responses, optima, sets, margins)
 
 
@@ -76,10 +80,10 @@ def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str,
     (N.s/m), None without mechanics."""
     if len(x) > _TOGETHER:
         padded = np.concatenate([x, np.repeat(x[-1:], -len(x) % _TOGETHER, axis=0)])  # one compilation
-        parts = [parameter_sets(study, part) for part in padded.reshape(-1, _TOGETHER, x.shape[1])]
-        sets = {name: np.concatenate([part[0][name] for part in parts])[: len(x)] for name in parts[0][0]}
-        found = [margin for _, margin in parts if margin is not None]
-        return sets, np.concatenate(found)[: len(x)] if found else None
+        parts = [parameter_sets(study, block) for block in padded.reshape(-1, _TOGETHER, x.shape[1])]
+        sets = {name: np.concatenate([block[0][name] for block in parts])[: len(x)] for name in parts[0][0]}
+        block_margins = [margin for _, margin in parts if margin is not None]
+        return sets, np.concatenate(block_margins)[: len(x)] if block_margins else None
     physical, derived, margins = _mechanics(study, x)
     named = {name: np.asarray(physical)[:, i] for i, name in enumerate(study.space.names)}
     return {name: np.asarray(v) for name, v in derived.items()} | named, None if margins is None else np.asarray(

@@ -76,7 +76,7 @@ def _page(study, summary, plan, error, cost, pictures, content):
         tables.append(
             (caption, head, [[str(m), *map(words, row)] for m, row in zip(cells.index, cells.to_numpy(), strict=True)])
         )
-    found = [
+    enough_trials = [
         f"{row['participants']:.0f} participants: {row['trials']:.0f} trials" if row["trials"] == row["trials"]
         else f"{row['participants']:.0f} participants: more than {max(plan.trials)} trials"
         for row in content["enough"]
@@ -85,7 +85,7 @@ def _page(study, summary, plan, error, cost, pictures, content):
         title=f"{study.name}: how many participants and trials",
         lead=f"{plan.studies} studies of the simulated population “{cost['preset']}” were run and merged by the rule"
         f" {study.rule}. For at least {100 * _CHANCE:.0f} % of studies to miss the optimum by {100 * error:g} % of the"
-        f" search ranges or less, it takes {'; '.join(found)}.",
+        f" search ranges or less, it takes {'; '.join(enough_trials)}.",
         warnings=[],
         figures=pictures,
         tables=tables,

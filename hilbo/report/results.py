@@ -54,20 +54,20 @@ def misses(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """NRMSE of points to the truth by search range: over the searched parameters, and with the derived K0."""
     x = np.asarray(x)
-    own = np.asarray(np.sqrt(np.mean((x - truth) ** 2, axis=-1)))
+    errors = np.asarray(np.sqrt(np.mean((x - truth) ** 2, axis=-1)))
     if study.space.mechanics is None:
-        return own, None
-    K0 = np.array([set_of(study.space, row)["K0"] for row in x.reshape(-1, x.shape[-1])]).reshape(own.shape)
+        return errors, None
+    K0 = np.array([set_of(study.space, row)["K0"] for row in x.reshape(-1, x.shape[-1])]).reshape(errors.shape)
     K0_error = (K0 - set_of(study.space, truth)["K0"]) / K0_range(study.space)
     d = x.shape[-1]
-    return own, np.asarray(np.sqrt((d * own**2 + K0_error**2) / (d + 1)))
+    return errors, np.asarray(np.sqrt((d * errors**2 + K0_error**2) / (d + 1)))
 
 
 def versions() -> dict[str, str]:
     """What made a result."""
     packages = ("hilbo", "jax", "jaxlib", "numpy", "equinox", "optimistix")
-    found = {name: importlib.metadata.version(name) for name in packages}
-    return found | {
+    installed = {name: importlib.metadata.version(name) for name in packages}
+    return installed | {
         "python": platform.python_version(),
         "device": str(jax.devices()[0]),
         "dtype": str(jnp.zeros(0).dtype),
@@ -87,7 +87,7 @@ def result(
     content = {
         "optimum": optimum_content(study, best),
         "participants": people if isinstance(aggregate, Merged) else list(people.entries()),
-        "alternatives": {name: optimum_content(study, found) for name, found in aggregate.alternatives.items()},
+        "alternatives": {name: optimum_content(study, optimum) for name, optimum in aggregate.alternatives.items()},
         "mean_of_optima": None
         if mean is None
         else {"parameters": set_of(study.space, mean), "passivity_margin": margin_of(study.space, mean)},
@@ -143,17 +143,19 @@ def optimum_content(study: Study, found: Optimum) -> dict[str, Any]:
 
 def _truth(study, aggregate, truth):
     """Misses of everything that claims to be the optimum, where the truth is known."""
-    own, own_K0 = misses(study, aggregate.individuals.x, truth)
-    quartiles = np.percentile(own, [25, 50, 75]).tolist()
+    individual_misses, individual_misses_with_K0 = misses(study, aggregate.individuals.x, truth)
+    quartiles = np.percentile(individual_misses, [25, 50, 75]).tolist()
     claims = {"aggregate": aggregate.optimum.x, "mean_of_optima": aggregate.mean_of_optima}
-    claims |= {name: found.x for name, found in aggregate.alternatives.items()}
+    claims |= {name: optimum.x for name, optimum in aggregate.alternatives.items()}
     table = {}
     for name, x in claims.items():
         plain, with_K0 = misses(study, x, truth)
         table[name] = {"nrmse": float(plain), "nrmse_with_K0": None if with_K0 is None else float(with_K0)}
     individuals = {
         "quartiles": quartiles,
-        "with_K0": None if own_K0 is None else np.percentile(own_K0, [25, 50, 75]).tolist(),
+        "with_K0": None
+        if individual_misses_with_K0 is None
+        else np.percentile(individual_misses_with_K0, [25, 50, 75]).tolist(),
     }
     top = np.asarray((aggregate.cohort.trials.q == len(study.responses) - 1) & aggregate.cohort.trials.mask).sum(axis=1)
     return {
@@ -204,7 +206,7 @@ def save_figures(figures: Mapping[str, tuple[Any, str, str]], folder: Path) -> l
 def optima_table(content: dict[str, Any], people: People) -> pd.DataFrame:
     """What optima.csv holds: the population's, the alternatives' and everybody's own."""
     rows = [{"source": "aggregate"} | content["optimum"]["parameters"]]
-    rows += [{"source": name} | found["parameters"] for name, found in content["alternatives"].items()]
+    rows += [{"source": name} | optimum["parameters"] for name, optimum in content["alternatives"].items()]
     return pd.concat([pd.DataFrame(rows), people.table()])
 
 

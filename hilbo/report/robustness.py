@@ -31,17 +31,17 @@ def write_robustness(study: Study, cohort: Cohort, found: Robustness, folder: Pa
     return content
 
 
-def _figures(study, cohort, found):
+def _figures(study, cohort, check):
     """Name -> figure, title, caption."""
     from hilbo.report.figures import maps as plotting
 
     limit = f"{100 * LIMIT:.0f} %"
     maps = plotting.maps_beside(
         study,
-        dict(zip(("fixed hyperparameters", "by maximum evidence"), found.maps(), strict=True)),
-        np.stack([found.fixed.x, found.optimised.x]),
+        dict(zip(("fixed hyperparameters", "by maximum evidence"), check.maps(), strict=True)),
+        np.stack([check.fixed.x, check.optimised.x]),
     )
-    moves = plotting.moved_optima(cohort.names, found.individual_nrmse, float(found.nrmse), LIMIT)
+    moves = plotting.moved_optima(cohort.names, check.individual_nrmse, float(check.nrmse), LIMIT)
     return {
         "maps": (
             maps,
@@ -61,7 +61,7 @@ def _figures(study, cohort, found):
 def robustness_result(study: Study, cohort: Cohort, found: Robustness, seed: int) -> dict[str, Any]:
     """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
     learned, people = found.learned, len(cohort.names)
-    stacked = [np.broadcast_to(np.asarray(part), (people,)) for part in (learned.converged, learned.runaway)]
+    stacked = [np.broadcast_to(np.asarray(flags), (people,)) for flags in (learned.converged, learned.runaway)]
     rows = [
         {
             "participant": name,
@@ -95,10 +95,10 @@ def robustness_result(study: Study, cohort: Cohort, found: Robustness, seed: int
     }
 
 
-def _warnings(found, stacked):
+def _warnings(check, stacked):
     """What the learnt hyperparameters themselves say against the comparison, in sentences."""
     converged, runaway = stacked
-    theta = float(np.median(found.learned.gp.kernel.theta))
+    theta = float(np.median(check.learned.gp.kernel.theta))
     alike = float(np.exp(-theta * _TENTH**2))
     sentences = []
     if alike < _UNRELATED:
@@ -108,6 +108,6 @@ def _warnings(found, stacked):
         )
     for state, words in ((~converged, "did not converge"), (runaway, "found no maximum of the evidence in reach")):
         if state.any():
-            whose = "The search" if found.shared else f"{state.sum()} of {len(state)} searches"
+            whose = "The search" if check.shared else f"{state.sum()} of {len(state)} searches"
             sentences.append(f"{whose} for hyperparameters {words}.")
     return sentences

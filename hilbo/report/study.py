@@ -57,14 +57,14 @@ def write_study(
         def tell(text, words=words):
             say(f"{text}{words}")
 
-        found = analyses.get(material.name) or analyse(material.study, material.cohort, seed, tell)
+        analysis = analyses.get(material.name) or analyse(material.study, material.cohort, seed, tell)
         validated = _validated(material, folder, seed, tell)
-        results.append(Results(material.name, found, validated, material.reference, material.reference_name))
-        part = out / slug(material.name) if len(folder.materials) > 1 else out
-        part.mkdir(exist_ok=True)
-        compared = _compared(found, seed, tell) if comparison else None
+        results.append(Results(material.name, analysis, validated, material.reference, material.reference_name))
+        material_folder = out / slug(material.name) if len(folder.materials) > 1 else out
+        material_folder.mkdir(exist_ok=True)
+        comparison_content = _compared(analysis, seed, tell) if comparison else None
         tell("figures and tables")
-        content, section = _write_material(material, found, validated, compared, part, seed)
+        content, section = _write_material(material, analysis, validated, comparison_content, material_folder, seed)
         contents[material.name] = content
         sections.append(section)
     claims = hypotheses(results)
@@ -97,56 +97,56 @@ def _validated(material: Material, folder: StudyFolder, seed, say) -> Validated 
     return validate(material.validation, folder.sets, material.study.responses, name, seed=seed)
 
 
-def _compared(found: Analysis, seed, say) -> dict[str, Any] | None:
+def _compared(analysis: Analysis, seed, say) -> dict[str, Any] | None:
     """Every rule beside the study's; None where people are too few."""
-    if np.sum(found.cohort.counts() > 0) < _FEWEST:
+    if np.sum(analysis.cohort.counts() > 0) < _FEWEST:
         return None
     say("comparing the rules of aggregation")
-    return compare(found.study, found.aggregate, seed)
+    return compare(analysis.study, analysis.aggregate, seed)
 
 
-def _write_material(material, found: Analysis, validated, compared, part: Path, seed):
+def _write_material(material, analysis: Analysis, validated, compared, folder: Path, seed):
     """Files of one material; its content for result.json, and its section of the page."""
-    study, people = found.study, people_of(found.study, found.aggregate)
+    study, people = analysis.study, people_of(analysis.study, analysis.aggregate)
     truth = material.reference if material.reference_name == "the truth" else None
-    content = result(study, found.aggregate, seed, truth, people)
-    data = groups(study, found.cohort, found.aggregate.posteriors, seed=seed)
-    write_groups(data, part / "inference.nc")
-    grid = map_dataset(study, found.aggregate.surface, found.aggregate.optimum.x)
+    content = result(study, analysis.aggregate, seed, truth, people)
+    data = groups(study, analysis.cohort, analysis.aggregate.posteriors, seed=seed)
+    write_groups(data, folder / "inference.nc")
+    grid = map_dataset(study, analysis.aggregate.surface, analysis.aggregate.optimum.x)
     grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
-    grid.to_netcdf(part / "map.nc", engine="h5netcdf")
+    grid.to_netcdf(folder / "map.nc", engine="h5netcdf")
     tables = {
         "optima": optima_table(content, people),
-        "table_I": table_1(found, material.reference),
-        "convergence": convergence_table(found),
-        "tolerance": tolerance_table(found),
-        "people": found.people.assign(left_out=found.people["participant"].map(found.left_out)),
-        "passivity": passivity_table(found),
+        "table_I": table_1(analysis, material.reference),
+        "convergence": convergence_table(analysis),
+        "tolerance": tolerance_table(analysis),
+        "people": analysis.people.assign(left_out=analysis.people["participant"].map(analysis.left_out)),
+        "passivity": passivity_table(analysis),
     }
     shares = predictive_shares(data, len(study.responses))
-    pictures = save_figures(study_figures(found, material, shares), part)
+    pictures = save_figures(study_figures(analysis, material, shares), folder)
     if compared is not None:
         tables["comparison"] = comparison_table(compared)
-        pictures += save_figures(comparison_figures(compared), part)
+        pictures += save_figures(comparison_figures(compared), folder)
     if validated is not None:
         content["validation"] = validation.validation_content(validated)
         tables |= validation.validation_csv(validated)
-        pictures += save_figures(validation.validation_figures(validated), part)
+        pictures += save_figures(validation.validation_figures(validated), folder)
     for name, table in tables.items():
-        table.to_csv(part / f"{name}.csv", index=False)
+        table.to_csv(folder / f"{name}.csv", index=False)
     content |= {
-        "left_out": found.left_out,
-        "limits": list(found.limits),
+        "left_out": analysis.left_out,
+        "limits": list(analysis.limits),
         "optimised": {
-            "theta": np.asarray(found.learned.gp.kernel.theta).tolist(),
-            "noise": float(found.learned.gp.likelihood.noise),
-            "thresholds": np.asarray(found.learned.gp.likelihood.thresholds).tolist(),
-            "nrmse": moved_by_evidence(found),
+            "theta": np.asarray(analysis.learned.gp.kernel.theta).tolist(),
+            "noise": float(analysis.learned.gp.likelihood.noise),
+            "thresholds": np.asarray(analysis.learned.gp.likelihood.thresholds).tolist(),
+            "nrmse": moved_by_evidence(analysis),
         },
         "tolerance": tables["tolerance"].to_dict("records"),
         "comparison": compared,
     }
-    return content, _section(material, found, validated, tables, pictures, content)
+    return content, _section(material, analysis, validated, tables, pictures, content)
 
 
 def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
@@ -154,12 +154,12 @@ def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
     table I): `parameter`, `reference`, `aggregate`, `error_percent`, `mean_of_optima`, `sd_of_optima`, ..."""
     study, aggregate = found.study, found.aggregate
     mean, best = aggregate.mean_of_optima, aggregate.optimum.x
-    own = pd.DataFrame([set_of(study.space, x) for x in np.asarray(aggregate.individuals.x)])
+    individual_sets = pd.DataFrame([set_of(study.space, x) for x in np.asarray(aggregate.individuals.x)])
     ours, theirs = set_of(study.space, best), set_of(study.space, mean)
     table = pd.DataFrame(
         {"parameter": list(ours), "aggregate": list(ours.values()), "mean_of_optima": list(theirs.values())}
     )
-    table["sd_of_optima"] = [own[name].std(ddof=1) if len(own) > 1 else np.nan for name in ours]
+    table["sd_of_optima"] = [individual_sets[name].std(ddof=1) if len(individual_sets) > 1 else np.nan for name in ours]
     if reference is not None:
         table.insert(1, "reference", list(set_of(study.space, reference).values()))
         for name, x in (("error_percent", best), ("mean_error_percent", mean)):
@@ -173,11 +173,11 @@ def convergence_table(found: Analysis) -> pd.DataFrame:
     (median, quartiles, of those who gave as many answers), and answers in the highest category so far (paper, figures 5
     and 7b)."""
     study, counts = found.study, found.progress.counts
-    merged, own = found.progress.to_end()
+    population_errors, individual_errors = found.progress.to_end()
     top = np.asarray((found.cohort.trials.q == len(study.responses) - 1) & found.cohort.trials.mask)
     so_far = np.cumsum(top, axis=1)[:, counts - 1]
-    table = pd.DataFrame({"trials": counts, "population": merged})
-    for name, values in (("individuals", own.T), ("top_answers", so_far)):
+    table = pd.DataFrame({"trials": counts, "population": population_errors})
+    for name, values in (("individuals", individual_errors.T), ("top_answers", so_far)):
         table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.nanpercentile(values, [25, 50, 75], axis=0).T
     return table
 
@@ -233,18 +233,18 @@ def passivity_table(found: Analysis) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _section(material, found, validated, tables, pictures: list[dict[str, str]], content) -> dict[str, Any]:
+def _section(material, analysis, validated, tables, pictures: list[dict[str, str]], content) -> dict[str, Any]:
     """What the template needs of one material."""
     compared = content["comparison"]
-    study, counts = found.study, found.cohort.counts()
+    study, counts = analysis.study, analysis.cohort.counts()
     by_name = {picture["name"]: picture for picture in pictures}
     section: dict[str, Any] = {
         "name": material.name,
-        "lead": f"{len(found.cohort.names)} participants gave {int(counts.sum())} answers"
+        "lead": f"{len(analysis.cohort.names)} participants gave {int(counts.sum())} answers"
         f" ({', '.join(study.responses)}).",
-        "limits": found.limits,
+        "limits": analysis.limits,
         "warnings": content["warnings"],
-        "left_out": [f"{name}: {why}" for name, why in found.left_out.items()],
+        "left_out": [f"{name}: {why}" for name, why in analysis.left_out.items()],
         "rule": study.exclude,
         "figures": by_name,
         "table_1": _shown(tables["table_I"], _words_of_table_1(material)),
@@ -252,7 +252,7 @@ def _section(material, found, validated, tables, pictures: list[dict[str, str]],
         "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
         "robust": "Under the hyperparameters of maximum evidence the optimum moves by"
-        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges." + _without(found),
+        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges." + _without(analysis),
         "comparison": None if compared is None else _comparison(compared),
     }
     if validated is not None:
@@ -269,12 +269,12 @@ def _comparison(compared):
     }
 
 
-def _without(found):
+def _without(analysis):
     """Under which hyperparameters there is no tolerance interval at all."""
-    top = found.study.responses[-1]
+    top = analysis.study.responses[-1]
     names = [
         name
-        for name, reading in (("fixed", found.fixed), ("optimised", found.optimised))
+        for name, reading in (("fixed", analysis.fixed), ("optimised", analysis.optimised))
         if all(interval is None for interval, _ in reading.tolerances.values())
     ]
     if not names:
@@ -313,7 +313,7 @@ def _tolerances(table):
         ends = [
             [
                 f"{_cell(row[end])} ({row[f'{end}_end']})",
-                " to ".join(_cell(row[f"{end}_{at}"], _DIGITS) for at in ("from", "to")),
+                " to ".join(_cell(row[f"{end}_{side}"], _DIGITS) for side in ("from", "to")),
             ]
             if np.isfinite(row[end])
             else ["–", "–"]

@@ -35,24 +35,24 @@ def comparison_figures(content: dict[str, Any]) -> Figures:
     return {
         "comparison": (
             plotting.rules_figure(content),
-            "How every rule foretells people left out",
+            "How every rule predicts people left out",
             "Left: mean negative log density of their answers, lower is better. Right: share of their answers within"
-            " the central 95 % of what was foretold; the line is a calibrated map. Bars: standard errors by person.",
+            " the central 95 % of what was predicted; the line is a calibrated map. Bars: standard errors by person.",
         ),
         "reliability": (
             plotting.reliability_figure(content),
             "Reliability of the class probabilities",
-            "How often answers came that were foretold with a probability; on the line, as often as foretold.",
+            "How often answers came that were predicted with a probability; on the line, as often as predicted.",
         ),
     }
 
 
-def _individuals(found: Analysis) -> Figures:
+def _individuals(analysis: Analysis) -> Figures:
     """How single participants came to their optima."""
     from hilbo.report.figures import study as plotting_study
 
-    study, cohort, progress, top = found.study, found.cohort, found.progress, found.study.responses[-1]
-    who = plotting_study.typical_person(found)
+    study, cohort, progress, top = analysis.study, analysis.cohort, analysis.progress, analysis.study.responses[-1]
+    who = plotting_study.typical_person(analysis)
     return {
         "progression": (
             plotting_study.posterior_progress(study, cohort, progress, who),
@@ -70,16 +70,21 @@ def _individuals(found: Analysis) -> Figures:
     }
 
 
-def _population_map(found: Analysis) -> Figures:
+def _population_map(analysis: Analysis) -> Figures:
     """The population's map from all answers, and from the first ones."""
     from hilbo.report.figures import maps
     from hilbo.report.figures import study as plotting_study
 
-    study, cohort, of = found.study, found.cohort, found.aggregate
+    study, cohort, aggregate = analysis.study, analysis.cohort, analysis.aggregate
     return {
         "map": (
             plotting_study.sets_on_map(
-                study, of.surface, found.sets, np.asarray(of.optimum.x), cohort, of.map.map_prior
+                study,
+                aggregate.surface,
+                analysis.sets,
+                np.asarray(aggregate.optimum.x),
+                cohort,
+                aggregate.map.map_prior,
             ),
             "The population map and its best, mid and worst sets (paper, figure 6a)",
             f"Brighter: higher {study.attribute}. Hatched: hardly sampled, the map's sd there is above"
@@ -87,56 +92,57 @@ def _population_map(found: Analysis) -> Figures:
             f" slice, and may lie in its white.{_white(study)}",
         ),
         "maps-after": (
-            maps.slices_after(study, found.progress),
+            maps.slices_after(study, analysis.progress),
             "The population map after fewer trials (paper, figure 7a)",
-            f"From everybody's first answers only, each through its own optimum, the star.{_white(study)}{_how(found)}",
+            f"From everybody's first answers only, each through its own optimum, the star.{_white(study)}"
+            f"{_how(analysis)}",
         ),
     }
 
 
-def _population_convergence(found: Analysis, references: dict[str, Any]) -> Figures:
+def _population_convergence(analysis: Analysis, references: dict[str, Any]) -> Figures:
     from hilbo.report.figures import study as plotting_study
 
     return {
         "population-convergence": (
-            plotting_study.population_convergence(found.progress, references),
+            plotting_study.population_convergence(analysis.progress, references),
             "Convergence of the population optimum (paper, figure 7b)",
             "How far the optimum of the map from everybody's first trials is from the optimum of the whole map"
             + "".join(f", and from {name}" for name in references)
-            + f".{_how(found)}",
+            + f".{_how(analysis)}",
         ),
     }
 
 
-def _classes(found: Analysis) -> Figures:
+def _classes(analysis: Analysis) -> Figures:
     from hilbo.report.figures import study as plotting_study
 
-    regions = {"fixed hyperparameters": found.fixed, "optimised hyperparameters": found.optimised}
+    regions = {"fixed hyperparameters": analysis.fixed, "optimised hyperparameters": analysis.optimised}
     return {
         "classes": (
             plotting_study.class_regions(regions),
             "Where each answer is the likeliest (paper, figure 8)",
             "The most probable answer on slices through each optimum (star). Lines: how far a parameter may move while"
-            f' "{found.study.responses[-1]}" stays the likeliest answer, on the nearest slice that may be rendered; the'
-            f" paper's figure uses optimised hyperparameters.{_white(found.study)}",
+            f' "{analysis.study.responses[-1]}" stays the likeliest answer, on the nearest slice that may be rendered;'
+            f" the paper's figure uses optimised hyperparameters.{_white(analysis.study)}",
         ),
     }
 
 
-def _answers(found: Analysis, shares: tuple[np.ndarray, np.ndarray]) -> Figures:
+def _answers(analysis: Analysis, shares: tuple[np.ndarray, np.ndarray]) -> Figures:
     """How people used the answers, and whether the model would give the same ones."""
     from hilbo.report.figures import study as plotting_study
 
     return {
         "people": (
-            plotting_study.people_figure(found.people, found.left_out),
+            plotting_study.people_figure(analysis.people, analysis.left_out),
             "How people answered",
             "With 95 % intervals: how often a participant gave the same answer to the same rendering; how much of the"
             " answers that person's own map cannot tell from chance; and whether the criterion moved during the"
             " session (negative: stricter). Crosses: left out by the study's rule.",
         ),
         "predictive": (
-            plotting_study.predictive_check(found.study.responses, *shares),
+            plotting_study.predictive_check(analysis.study.responses, *shares),
             "Posterior predictive check",
             "Bars: shares of the answers given. Dots: shares of answers that everybody's own posterior would give again"
             " at the same renderings, with 95 % of the draws.",
@@ -144,17 +150,20 @@ def _answers(found: Analysis, shares: tuple[np.ndarray, np.ndarray]) -> Figures:
     }
 
 
-def _optima(found: Analysis, references: dict[str, Any]) -> Figures:
+def _optima(analysis: Analysis, references: dict[str, Any]) -> Figures:
     """Of more than one parameter only: a scatter of one is none."""
     from hilbo.report.figures import maps
 
-    if found.study.space.dim == 1:
+    if analysis.study.space.dim == 1:
         return {}
-    of = found.aggregate
-    marks = {"population map": np.asarray(of.optimum.x), "mean of optima": np.asarray(of.mean_of_optima)} | references
+    aggregate = analysis.aggregate
+    marks = {
+        "population map": np.asarray(aggregate.optimum.x),
+        "mean of optima": np.asarray(aggregate.mean_of_optima),
+    } | references
     return {
         "optima": (
-            maps.optima_scatter(found.study, np.asarray(of.individuals.x), marks),
+            maps.optima_scatter(analysis.study, np.asarray(aggregate.individuals.x), marks),
             "Individual optima",
             "Each dot is one participant's own optimum.",
         ),
@@ -166,7 +175,7 @@ def _white(study) -> str:
     return " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
 
 
-def _how(found: Analysis) -> str:
+def _how(analysis: Analysis) -> str:
     """How maps were merged, where that needs saying."""
-    how = in_place(found.aggregate.map)
+    how = in_place(analysis.aggregate.map)
     return f" These maps are merged {how}." if how else ""

@@ -60,8 +60,8 @@ class Validated(NamedTuple):
 
     def regressions(self) -> dict[str, Regression]:
         """Tables II to IV by their number, those that there are."""
-        found = {"II": self.tables.table_2, "III": self.tables.table_3, "IV": self.tables.table_4}
-        return {number: table for number, table in found.items() if table is not None}
+        by_number = {"II": self.tables.table_2, "III": self.tables.table_3, "IV": self.tables.table_4}
+        return {number: table for number, table in by_number.items() if table is not None}
 
 
 def materials_of(table: pd.DataFrame) -> list[str | None]:
@@ -92,11 +92,11 @@ def validate(
 
 def _person(name, rows):
     wins, losses = (int((rows["preferred"] == word).sum()) for word in ("Aggregate-Best", "individual"))
-    found = {"name": name, "wins": wins, "losses": losses, "ties": len(rows) - wins - losses}
+    row = {"name": name, "wins": wins, "losses": losses, "ties": len(rows) - wins - losses}
     if not wins + losses:
-        return found | {"rate": np.nan, "low": 0.0, "high": 1.0}
+        return row | {"rate": np.nan, "low": 0.0, "high": 1.0}
     ends = binomtest(wins, wins + losses).proportion_ci()
-    return found | {"rate": wins / (wins + losses), "low": ends.low, "high": ends.high}
+    return row | {"rate": wins / (wins + losses), "low": ends.low, "high": ends.high}
 
 
 def safest(table: Regression) -> pd.DataFrame:
@@ -231,21 +231,21 @@ def write_validation(
     """Write the folder of `hilbo validate`; returns the content of result.json."""
     say("reading")
     table = _read(path, study, material)
-    known = None if sets is None else sets_frame(sets, study.space.names)
+    sets_by_id = None if sets is None else sets_frame(sets, study.space.names)
     contents, sections = [], []
     names = materials_of(table)
     for name in names:
         say(f"validation sessions{'' if name is None else f' of {name}'}")
-        found = validate(table, known, study.responses, name, seed=seed)
-        part = folder if len(names) == 1 else folder / slug(str(name))
-        part.mkdir(exist_ok=True)
-        for file, frame in validation_csv(found).items():
-            frame.to_csv(part / f"{file}.csv", index=False)
-        pictures = save_figures(validation_figures(found), part)
-        contents.append(validation_content(found))
-        sections.append(validation_section(found, study.responses, pictures))
+        validated = validate(table, sets_by_id, study.responses, name, seed=seed)
+        material_folder = folder if len(names) == 1 else folder / slug(str(name))
+        material_folder.mkdir(exist_ok=True)
+        for file, frame in validation_csv(validated).items():
+            frame.to_csv(material_folder / f"{file}.csv", index=False)
+        pictures = save_figures(validation_figures(validated), material_folder)
+        contents.append(validation_content(validated))
+        sections.append(validation_section(validated, study.responses, pictures))
     content = {"materials": contents, "study": study.hash, "seed": seed, "versions": versions()}
-    content["warnings"] = [w for part in contents for w in part["warnings"]]
+    content["warnings"] = [w for entry in contents for w in entry["warnings"]]
     (folder / "result.json").write_text(as_json(content), encoding="utf-8")
     page = template("validation.html").render(
         title=f"{study.name}: validation sessions",
@@ -272,4 +272,4 @@ def _read(path: Path, study: Study, material: str | None) -> pd.DataFrame:
 def slug(name: str) -> str:
     """A name as part of a file's name."""
     kept = "".join(c if c.isalnum() else "-" for c in name.lower())
-    return "-".join(part for part in kept.split("-") if part) or "material"
+    return "-".join(word for word in kept.split("-") if word) or "material"

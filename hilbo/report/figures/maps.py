@@ -133,17 +133,17 @@ def progress_figure(study: Study, population: Population, truth: Float[np.ndarra
     """How the optima settle (left, NRMSE to the last trial's, or to the truth), and answers in the top category."""
     progress, cohort = population.progress, population.cohort
     trials = progress.counts
-    to_end, own = progress.to_end()
+    to_end, individual_errors = progress.to_end()
     from_goal = to_end
     if truth is not None:
         from_goal = np.sqrt(np.mean((progress.population - truth) ** 2, axis=1))
-        own = np.sqrt(np.mean((progress.own - truth) ** 2, axis=2))
+        individual_errors = np.sqrt(np.mean((progress.own - truth) ** 2, axis=2))
     top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
         goal = "the final optimum" if truth is None else "the truth"
-        band(left, trials, 100 * own.T, BLUE, "individuals: median, quartiles")
+        band(left, trials, 100 * individual_errors.T, BLUE, "individuals: median, quartiles")
         left.plot(trials, 100 * from_goal, color=RED, marker="o", markersize=3, label="population map")
         if truth is not None:
             left.plot(trials, 100 * to_end, color=GREY, linestyle="--", label="population map, to its final optimum")
@@ -252,9 +252,11 @@ def _curve_axes(study):
 def _map_curve(study, surface, optimum, cohort):
     with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
-        at, mean, sd = _curve(study, surface)
-        axes.fill_between(at, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label="± standard deviation")
-        axes.plot(at, mean, color=BLUE, label="population map")
+        physical, mean, sd = _curve(study, surface)
+        axes.fill_between(
+            physical, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0, label="± standard deviation"
+        )
+        axes.plot(physical, mean, color=BLUE, label="population map")
         axes.autoscale(axis="y")
         mask = np.asarray(cohort.trials.mask)
         answers = np.asarray(study.space.to_physical(np.asarray(cohort.trials.x)[mask]))[:, 0]
@@ -272,10 +274,10 @@ def _curves_beside(study, maps, optima):
     with mpl.rc_context(STYLE):
         figure, axes = _curve_axes(study)
         for (name, surface), x, colour in zip(maps.items(), optima, (ORANGE, GREEN, BLUE, RED), strict=False):
-            at, mean, _ = _curve(study, surface)
-            axes.plot(at, mean, color=colour, label=name)
+            physical, mean, _ = _curve(study, surface)
+            axes.plot(physical, mean, color=colour, label=name)
             best = float(np.asarray(study.space.to_physical(np.asarray(x)))[0])
-            axes.plot(best, np.interp(best, at, mean), "*", color=colour, markersize=11, markeredgecolor="white")
+            axes.plot(best, np.interp(best, physical, mean), "*", color=colour, markersize=11, markeredgecolor="white")
         axes.autoscale(axis="y")
         axes.legend(frameon=False)
     return figure

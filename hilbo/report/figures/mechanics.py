@@ -54,8 +54,8 @@ def curves_figure(
         for (upper, lower), test in zip(panels.T, tests, strict=True):
             _measured(upper, test)
             lower.axhline(0, color=GREY, linewidth=0.6)
-            for found, colour, dash, width, name in lines:
-                curve = predicted(found, test.kind)
+            for fit, colour, dash, width, name in lines:
+                curve = predicted(fit, test.kind)
                 upper.plot(test.time, curve, color=colour, linestyle=dash, linewidth=width, label=name)
                 left = test.output.mean(axis=0) - curve
                 lower.plot(test.time, left, color=colour, linestyle=dash, linewidth=0.6 * width)
@@ -80,8 +80,8 @@ def _measured(axes, test):
         axes.plot(test.time, mean, ".", color=GREY, markersize=2, label="measured")
 
 
-def _fit_name(found):
-    model = found.model
+def _fit_name(fit):
+    model = fit.model
     if getattr(model, "memory", None) == "short":
         return f"fit, N = {int(model.N)}"
     return "fit, full memory" if hasattr(model, "memory") else "fit"
@@ -145,11 +145,11 @@ def passivity_figure(model: FOSLS, b: float) -> Figure:
         left.set_title("passive if the curve stays left of the device's b")
         right.semilogx(frequency, near_curve.real, color=BLUE, label="needed by the rendering")
         right.axhline(b, color="black", linewidth=1, label=f"device, b = {b:.4g} N·s/m")
-        at = frequency[int(np.argmax(near_curve.real))]
-        right.plot([at, at], [b, curve.real[worst]], color=colour, linewidth=2.5)
-        right.plot(at, curve.real[worst], "o", color=colour, markersize=5, clip_on=False)
+        binding_frequency = frequency[int(np.argmax(near_curve.real))]
+        right.plot([binding_frequency, binding_frequency], [b, curve.real[worst]], color=colour, linewidth=2.5)
+        right.plot(binding_frequency, curve.real[worst], "o", color=colour, markersize=5, clip_on=False)
         right.set(xlabel="frequency (Hz)", ylabel="damping (N·s/m)", ylim=(-2 * most, 1.5 * most))
-        right.set_title(f"{word} {abs(margin):.3f} N·s/m at {at:.0f} Hz")
+        right.set_title(f"{word} {abs(margin):.3f} N·s/m at {binding_frequency:.0f} Hz")
         right.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         right.xaxis.set_major_formatter(FormatStrFormatter("%g"))
         right.xaxis.set_minor_formatter(NullFormatter())
@@ -161,7 +161,7 @@ def passive_set_figure(model: FOSLS, b: float, K_eff: float) -> Figure:
     """Largest passive K1 over (B1, α) of the paper's box, and slices of the passive set through it; odd N or full."""
     B1, alpha = np.geomspace(0.1, 32, 121), np.linspace(0.01, 0.99, 121)
     limit = np.asarray(_largest(model, B1[None, :], alpha[:, None], b, K_eff))
-    own = float(model.B1), float(model.alpha), float(model.K1)
+    this_set = float(model.B1), float(model.alpha), float(model.K1)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.4, 3.2), layout="constrained")
         left, right = figure.subplots(1, 2)
@@ -170,18 +170,18 @@ def passive_set_figure(model: FOSLS, b: float, K_eff: float) -> Figure:
             B1, alpha, np.where(limit < 1, np.nan, shown), cmap="cividis", vmin=1, vmax=32, rasterized=True
         )
         figure.colorbar(picture, ax=left, label="largest passive $K_1$ (N/mm; 32: the box)")
-        left.plot(own[0], own[1], "*", color=RED, markersize=12, markeredgecolor="white")
+        left.plot(this_set[0], this_set[1], "*", color=RED, markersize=12, markeredgecolor="white")
         left.set(xscale="log", xlabel="$B_1$ (N·s$^α$/mm)", ylabel="α", xlim=(0.1, 32))
         left.set_title("white: no $K_1$ from 1 N/mm up is passive")
         for order, (colour, dash) in zip(
-            (0.1, own[1], 0.35, 0.6), ((ORANGE, "--"), (BLUE, "-"), (GREEN, "-."), (GREY, ":")), strict=True
+            (0.1, this_set[1], 0.35, 0.6), ((ORANGE, "--"), (BLUE, "-"), (GREEN, "-."), (GREY, ":")), strict=True
         ):
             line = np.asarray(_largest(model, B1, np.full_like(B1, order), b, K_eff))
-            width = 2.0 if order == own[1] else 1.2
+            width = 2.0 if order == this_set[1] else 1.2
             right.plot(
                 B1, np.minimum(line, 64), color=colour, linestyle=dash, linewidth=width, label=f"α = {order:.3g}"
             )
-        right.plot(own[0], own[2], "*", color=RED, markersize=12, markeredgecolor="white", label="this set")
+        right.plot(this_set[0], this_set[2], "*", color=RED, markersize=12, markeredgecolor="white", label="this set")
         right.set(xscale="log", xlabel="$B_1$ (N·s$^α$/mm)", ylabel="$K_1$ (N/mm)", xlim=(0.1, 32), ylim=(0, 32))
         right.set_title(f"passive below the line; b = {b:g} N·s/m")
         right.legend(frameon=False)

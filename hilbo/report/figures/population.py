@@ -19,7 +19,7 @@ _CELLS = 61
 
 def rules_figure(content: dict[str, Any]) -> Figure:
     """How every rule predicts people left out: density (lower is better), and the share within the central 95 %."""
-    rules = {rule: found for rule, found in content["rules"].items() if "negative_log_density" in found}
+    rules = {rule: entry for rule, entry in content["rules"].items() if "negative_log_density" in entry}
     order = sorted(rules, key=lambda rule: -rules[rule]["negative_log_density"])
     rows = np.arange(len(order))
     with mpl.rc_context(STYLE):

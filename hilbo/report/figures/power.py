@@ -31,14 +31,14 @@ def power_figure(summary: pd.DataFrame, error: float) -> Figure:
         for i, (count, rows) in enumerate(summary.groupby("participants")):
             colour, marker, dashes = _LOOKS[i % len(_LOOKS)]
             look = {"color": colour, "marker": marker, "linestyle": dashes, "markersize": 4, "linewidth": 1.2}
-            at, label = rows["trials"], f"{count} participants"
-            left.plot(at, 100 * rows["optimum_median"], label=label, **look)
-            left.vlines(at + shift * (i - 1), 100 * rows["optimum_low"], 100 * rows["optimum_high"], color=colour,
+            trials, label = rows["trials"], f"{count} participants"
+            left.plot(trials, 100 * rows["optimum_median"], label=label, **look)
+            left.vlines(trials + shift * (i - 1), 100 * rows["optimum_low"], 100 * rows["optimum_high"], color=colour,
                         linewidth=0.8, alpha=0.7)  # fmt: skip
             below, above = rows["reached"] - rows["reached_low"], rows["reached_high"] - rows["reached"]
             bars = 100 * np.maximum([below, above], 0.0)  # 0 and 1 end their own intervals, to rounding
-            middle.errorbar(at, 100 * rows["reached"], yerr=bars, capsize=2, **look)
-            right.plot(at, rows["map_median"], **look)
+            middle.errorbar(trials, 100 * rows["reached"], yerr=bars, capsize=2, **look)
+            right.plot(trials, rows["map_median"], **look)
         left.axhline(100 * error, color=GREY, linewidth=0.8)
         left.set(ylabel="error of the optimum, NRMSE (%)", ylim=(0, None))
         middle.set(ylabel=f"studies within {100 * error:g} % (%)", ylim=(0, 100))

@@ -71,14 +71,14 @@ def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: in
 
     Paper, figure 4.
     """
-    person, own = cohort.rows(np.array([row])), progress.own[progress.at(progress.moments), row]
+    person, optima = cohort.rows(np.array([row])), progress.own[progress.at(progress.moments), row]
     maps = {f"{count} trials": posterior.predict for count, posterior in progress.person(row).items()}
     if study.space.dim == 1:
-        return maps_beside(study, maps, own)
-    third = float(own[-1][2]) if study.space.dim > 2 else None
-    grids = [grid_slice(study, predict, own[-1], third) for predict in maps.values()]
+        return maps_beside(study, maps, optima)
+    third = float(optima[-1][2]) if study.space.dim > 2 else None
+    grids = [grid_slice(study, predict, optima[-1], third) for predict in maps.values()]
     figure, panels, draw = map_panels(study, grids)
-    for axes, name, n, x, values in zip(panels, maps, progress.moments, own, grids, strict=True):
+    for axes, name, n, x, values in zip(panels, maps, progress.moments, optima, grids, strict=True):
         draw(axes, values)
         mark_trials(axes, study, person.first(n), third)
         star(axes, study, x)
@@ -93,12 +93,12 @@ def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> 
 
     Median and quartiles over people. Paper, figure 5.
     """
-    trials, (_, own) = progress.counts, progress.to_end()
+    trials, (_, errors) = progress.counts, progress.to_end()
     top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 2.8), layout="constrained")
         left, right = figure.subplots(1, 2)
-        band(left, trials, 100 * own.T, BLUE, "median, quartiles")
+        band(left, trials, 100 * errors.T, BLUE, "median, quartiles")
         left.set(xlabel="trials", ylabel="NRMSE to the final optimum (%)", ylim=(0, None))
         left.legend(frameon=False)
         band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
@@ -186,11 +186,11 @@ def _sets_on_curve(study, surface, points):
         figure = Figure(figsize=(4.5, 3.0), layout="constrained")
         axes = figure.subplots()
         side = jnp.linspace(0.0, 1.0, _CELLS)
-        mean, variance = (np.asarray(part) for part in surface(side[:, None]))
-        at, sd = np.asarray(study.space.parameters[0].to_physical(side)), np.sqrt(variance)
+        mean, variance = (np.asarray(moment) for moment in surface(side[:, None]))
+        physical_side, sd = np.asarray(study.space.parameters[0].to_physical(side)), np.sqrt(variance)
         label_axes(axes, study, 0, 0)
-        axes.fill_between(at, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0)
-        axes.plot(at, mean, color=BLUE)
+        axes.fill_between(physical_side, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0)
+        axes.plot(physical_side, mean, color=BLUE)
         for name, x in points.items():
             marker, size, colour = _MARKS[name]
             physical = np.asarray(study.space.to_physical(np.asarray(x)))
@@ -253,10 +253,10 @@ def _interval(axes, reading, index, i, j):
     """The tolerance interval of a parameter as a line along the slice it was read on, with a bar at each end."""
     study = reading.study
     parameter = study.space.parameters[index]
-    found, _ = reading.tolerances[parameter.name]
-    if found is None:
+    interval, _ = reading.tolerances[parameter.name]
+    if interval is None:
         return
-    ends = np.asarray(parameter.to_unit(jnp.asarray([found.low, found.high])))
+    ends = np.asarray(parameter.to_unit(jnp.asarray([interval.low, interval.high])))
     points, _ = slice_through(study, reading.aggregate.optimum.x, parameter.name, jnp.linspace(ends[0], ends[1], 65))
     physical = np.asarray(study.space.to_physical(points))
     axes.plot(physical[:, i], physical[:, j], color=RED, linewidth=2, solid_capstyle="butt")
@@ -266,13 +266,13 @@ def _interval(axes, reading, index, i, j):
 def _class_curves(axes, reading, shades):
     study = reading.study
     side = jnp.linspace(0.0, 1.0, _CELLS)
-    at = np.asarray(study.space.parameters[0].to_physical(side))
+    physical_side = np.asarray(study.space.parameters[0].to_physical(side))
     chances = np.asarray(_probabilities(reading, side[:, None])).T
     label_axes(axes, study, 0, 0)
-    axes.stackplot(at, chances, colors=[shades(k) for k in range(len(chances))])
-    found, _ = reading.tolerances[study.space.parameters[0].name]
-    if found is not None:
-        axes.hlines(0.5, found.low, found.high, color=RED, linewidth=2)
+    axes.stackplot(physical_side, chances, colors=[shades(k) for k in range(len(chances))])
+    interval, _ = reading.tolerances[study.space.parameters[0].name]
+    if interval is not None:
+        axes.hlines(0.5, interval.low, interval.high, color=RED, linewidth=2)
     axes.set(yscale="linear", ylabel="probability of each answer", ylim=(0, 1))
 
 
@@ -291,17 +291,17 @@ def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
         words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
         for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
             value, low, high = (people[f"{measure}{end}"].to_numpy(float) for end in ("", "_low", "_high"))
-            known = np.isfinite(value)
+            finite = np.isfinite(value)
             limits = (-3.5, 3.5) if measure == "drift" else (-0.03, 1.03)
             axes.hlines(
-                rows[known],
-                np.maximum(low, limits[0])[known],
-                np.minimum(high, limits[1])[known],
+                rows[finite],
+                np.maximum(low, limits[0])[finite],
+                np.minimum(high, limits[1])[finite],
                 color=BLUE,
                 linewidth=1,
             )
-            axes.scatter(value[known & ~out], rows[known & ~out], s=16, color=BLUE, zorder=3)
-            axes.scatter(value[known & out], rows[known & out], s=26, marker="x", color=RED, zorder=3)
+            axes.scatter(value[finite & ~out], rows[finite & ~out], s=16, color=BLUE, zorder=3)
+            axes.scatter(value[finite & out], rows[finite & out], s=26, marker="x", color=RED, zorder=3)
             axes.set(xlabel=label, xlim=limits)
         panels[2].axvline(0, color=GREY, linestyle="--", linewidth=1)
         panels[0].set_yticks(rows, list(people["participant"]), fontsize=6)
@@ -312,17 +312,23 @@ def predictive_check(
     responses: Sequence[str], observed: Float[np.ndarray, " C"], predicted: Float[np.ndarray, "draws C"]
 ) -> Figure:
     """Shares of the answers given, and of those that the posterior would give again."""
-    at = np.arange(len(responses))
+    positions = np.arange(len(responses))
     low, middle, high = 100 * np.percentile(predicted, [2.5, 50, 97.5], axis=0)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(4.2, 2.7), layout="constrained")
         axes = figure.subplots()
         axes.bar(
-            at, 100 * observed, width=0.6, color="#c9d9e8", edgecolor="black", linewidth=0.6, label="answers given"
+            positions,
+            100 * observed,
+            width=0.6,
+            color="#c9d9e8",
+            edgecolor="black",
+            linewidth=0.6,
+            label="answers given",
         )
-        axes.vlines(at, low, high, color=RED, linewidth=2)
-        axes.scatter(at, middle, s=26, color=RED, zorder=3, label="would be given again")
-        axes.set_xticks(at, list(responses))
+        axes.vlines(positions, low, high, color=RED, linewidth=2)
+        axes.scatter(positions, middle, s=26, color=RED, zorder=3, label="would be given again")
+        axes.set_xticks(positions, list(responses))
         axes.set(ylabel="share of the answers (%)", ylim=(0, None))
         figure.legend(loc="outside upper center", ncols=2, frameon=False)
     return figure
