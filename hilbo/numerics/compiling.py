@@ -15,15 +15,16 @@ _TRIED = (0, 10)  # the last version known to have the flag; XLA ends the proces
 
 def compiler_options() -> dict[str, bool]:
     """For one function: `jax.jit(f, compiler_options=compiler_options())`."""
-    return {_FLAG: False} if _known() else {}
+    return {_FLAG: False} if _flag_exists() else {}
 
 
 def set_flags() -> None:
     """For a whole process, which has computed nothing yet; what the environment says of it already holds."""
     flags = os.environ.get("XLA_FLAGS", "")
-    if _known() and _FLAG not in flags:
+    if _flag_exists() and _FLAG not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --{_FLAG}=false".strip()
 
 
-def _known():
+def _flag_exists() -> bool:
+    """Whether this jaxlib is one that is known to have the flag."""
     return tuple(map(int, version("jaxlib").split(".")[:2])) <= _TRIED

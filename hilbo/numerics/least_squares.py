@@ -16,6 +16,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.numerics import linalg
@@ -37,15 +38,23 @@ class Solution(eqx.Module):
     converged: Bool[Array, ""]
 
 
+class _Evaluation(NamedTuple):
+    """|r|², Jᵀr and JᵀJ at a point."""
+
+    cost: Float[Array, ""]
+    gradient: Float[Array, " p"]
+    normal: Float[Array, "p p"]
+
+
 class _State(NamedTuple):
-    q: Array
-    cost: Array
-    gradient: Array
-    normal: Array
-    damping: Array
-    growth: Array  # of the damping at the next failure
-    steps: Array
-    done: Array
+    q: Float[Array, " p"]
+    cost: Float[Array, ""]
+    gradient: Float[Array, " p"]
+    normal: Float[Array, "p p"]
+    damping: Float[Array, ""]
+    growth: Float[Array, ""]  # of the damping at the next failure
+    steps: Int[Array, ""]
+    done: Bool[Array, ""]
 
 
 def least_squares(
@@ -66,10 +75,10 @@ def least_squares(
     eps = jnp.finfo(start.dtype).eps
     tiny, least = eps**0.6, eps**0.75 if enough is None else enough
 
-    def evaluate(q):
+    def evaluate(q: Float[Array, " p"]) -> _Evaluation:
         r, forward = jax.linearize(residuals, q)
         rows = jax.vmap(forward)(jnp.eye(q.size, dtype=q.dtype))
-        return r @ r, rows @ r, rows @ rows.T
+        return _Evaluation(r @ r, rows @ r, rows @ rows.T)
 
     def step(state: _State) -> _State:
         q = jnp.clip(state.q + _direction(state, lower, upper), lower, upper)
@@ -83,9 +92,9 @@ def least_squares(
     return Solution(last.q, last.cost, last.normal, last.gradient, last.steps, ended)
 
 
-def _judged(state: _State, q, there, tiny, least) -> _State:
-    """The step to q taken or not; `there`: cost, gradient and normal matrix at q."""
-    cost, gradient, normal = there
+def _judged(state: _State, q: Float[Array, " p"], trial: _Evaluation, tiny: ArrayLike, least: ArrayLike) -> _State:
+    """The step to q taken or not; `trial`: what was evaluated at q."""
+    cost, gradient, normal = trial
     moved = q - state.q
     better = cost < state.cost
     gain = -(2 * state.gradient + state.normal @ moved) @ moved  # predicted
@@ -101,7 +110,7 @@ def _judged(state: _State, q, there, tiny, least) -> _State:
     return jax.tree.map(lambda new, old: jnp.where(better, new, old), tried, stayed)
 
 
-def _direction(state, lower, upper):
+def _direction(state: _State, lower: Float[Array, " p"], upper: Float[Array, " p"]) -> Float[Array, " p"]:
     """The damped step of the free parameters; the others have 0."""
     held = ((state.q <= lower) & (state.gradient >= 0)) | ((state.q >= upper) & (state.gradient <= 0))
     free = ~held & (lower < upper)

@@ -21,6 +21,8 @@ from jaxtyping import Array, Float, Real
 
 __all__ = ["mittag_leffler", "mittag_leffler_increment", "mittag_leffler_two"]
 
+_Nodes = tuple[np.ndarray, np.ndarray]  # places x and their weights
+
 _ONE = np.arange(-37.5, 4.0, 0.15), np.full(277, 0.15)
 _Y = np.arange(-13.0, 4.0, 0.05)
 _TWO = _Y - np.exp(-_Y - 4), 0.05 * (1 + np.exp(-_Y - 4))
@@ -54,7 +56,8 @@ def mittag_leffler_increment(alpha: Real[ArrayLike, "..."], z: Real[ArrayLike, "
     return jnp.vectorize(_increment)(jnp.asarray(alpha, dtype), jnp.asarray(z, dtype))
 
 
-def _increment(alpha, z):
+def _increment(alpha: Float[Array, ""], z: Float[Array, ""]) -> Float[Array, ""]:
+    """By its power series where z is small, else from E_α itself."""
     small = z < _SMALL
     large = jnp.where(small, 1, z)
     orders = jnp.arange(1, _TERMS + 1, dtype=z.dtype)
@@ -62,13 +65,14 @@ def _increment(alpha, z):
     return jnp.where(small, series, (1 - _safe(alpha, jnp.ones_like(alpha), large, _ONE)) / large)
 
 
-def _safe(a, b, z, nodes):
+def _safe(a: Float[Array, ""], b: Float[Array, ""], z: Float[Array, ""], nodes: _Nodes) -> Float[Array, ""]:
     """The value at z = 0 apart, where the logarithm is infinite."""
     at_zero = jnp.where(b == 1, 1, 1 / gamma(b))
     return jnp.where(z > 0, _integral(a, b, jnp.where(z > 0, z, 1), nodes), at_zero)
 
 
-def _integral(a, b, z, nodes):
+def _integral(a: Float[Array, ""], b: Float[Array, ""], z: Float[Array, ""], nodes: _Nodes) -> Float[Array, ""]:
+    """The integral of the module's text, for z > 0."""
     x, step = (jnp.asarray(value, z.dtype) for value in nodes)
     # The integral does not depend on φ, so its derivative need not know how φ was chosen.
     phi = jax.lax.stop_gradient(jnp.pi / 4 - jnp.minimum(jnp.pi / 2 * (1 - a) / a, jnp.pi / 4))
@@ -83,7 +87,9 @@ def _integral(a, b, z, nodes):
     return jnp.sum(weight * (factor_real * angle + factor_imag * log_size)) / (jnp.pi * a)
 
 
-def _log_one_plus(log_u, psi):
+def _log_one_plus(
+    log_u: Float[Array, " nodes"], psi: Float[Array, ""]
+) -> tuple[Float[Array, " nodes"], Float[Array, " nodes"]]:
     """log(1 + u·e^{iψ}) as real part and angle, 0 < ψ < π, for u of any size."""
     big = log_u > 0
     u = jnp.exp(-jnp.abs(log_u))

@@ -12,7 +12,7 @@ References: Nocedal & Wright (2006), chapter 4; Bertsekas (1982), SIAM J. Contro
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -44,8 +44,8 @@ def expanded(
 ) -> Expansion:
     """The expansion of a function of value and aux by automatic differentiation."""
 
-    def slope(at):
-        value, pull, aux = jax.vjp(function, at, has_aux=True)
+    def slope(point):
+        value, pull, aux = jax.vjp(function, point, has_aux=True)
         (gradient,) = pull(jnp.ones_like(value))
         return gradient, (value, gradient, aux)
 
@@ -54,6 +54,8 @@ def expanded(
 
 
 class _State(eqx.Module):
+    """The best point so far, and the step from it that is evaluated next."""
+
     here: Expansion
     move: Float[Array, " p"]  # the next step,
     promised: Float[Array, ""]  # and by how much it lowers the quadratic model
@@ -88,39 +90,41 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         del fn, args, f_struct, tags
         flat, _ = ravel_pytree(y)
         if "begun" in options:
-            here = options["begun"]
-            return _State(here, *_plan(here, flat, jnp.full_like(flat[0], _FIRST_RADIUS), *_bounds(options)))
+            expansion = options["begun"]
+            return _plan(expansion, flat, jnp.full_like(flat[0], _FIRST_RADIUS), *_bounds(options))
         infinite = jnp.full_like(flat, jnp.inf)
         aux = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
-        here = Expansion(infinite[0], infinite, jnp.zeros((flat.size, flat.size), flat.dtype), aux)
+        nowhere = Expansion(infinite[0], infinite, jnp.zeros((flat.size, flat.size), flat.dtype), aux)
         zero = jnp.zeros_like(flat[0])
-        return _State(here, jnp.zeros_like(flat), zero, zero + _FIRST_RADIUS, infinite[0], infinite[0])
+        return _State(nowhere, jnp.zeros_like(flat), zero, zero + _FIRST_RADIUS, infinite[0], infinite[0])
 
     def step(self, fn, y, args, options, state, tags):
         """Evaluate the step decided on before, take it or not, and decide on the next."""
         del tags
         flat, restore = ravel_pytree(y)
-        ahead = flat + state.move
+        trial = flat + state.move
         expand = options.get("expand")
-        there = (
-            expanded(lambda at: fn(restore(at), args), ahead)
+        expansion = (
+            expanded(lambda point: fn(restore(point), args), trial)
             if expand is None
-            else expand(restore(ahead), state.here.aux)
+            else expand(restore(trial), state.here.aux)
         )
-        achieved = state.here.value - there.value
+        achieved = state.here.value - expansion.value
         taken = achieved > _ENOUGH * state.promised  # never if it is not a number
         good = taken & jnp.isfinite(achieved) & (achieved > _GOOD * state.promised)
         radius = state.radius * jnp.where(good, 2.0, jnp.where(taken, 1.0, 0.25))
-        here = jax.tree.map(lambda new, old: jnp.where(taken, new, old), there, state.here)
-        flat = jnp.where(taken, ahead, flat)
-        return restore(flat), _State(here, *_plan(here, flat, radius, *_bounds(options))), here.aux
+        best = jax.tree.map(lambda new, old: jnp.where(taken, new, old), expansion, state.here)
+        flat = jnp.where(taken, trial, flat)
+        return restore(flat), _plan(best, flat, radius, *_bounds(options)), best.aux
 
     def terminate(self, fn, y, args, options, state, tags):
         """Stationary within the box, or stuck, or on the way to a known end."""
         del fn, args, tags
         ended = (state.pressing <= self.atol) | (state.ahead < self.gain) | (state.radius < self.resolution)
-        known = options.get("known")
-        return (ended if known is None else ended | arrives(y, state.move, known)), optx.RESULTS.successful
+        earlier_ends = options.get("known")
+        if earlier_ends is not None:
+            ended |= arrives(y, state.move, earlier_ends)
+        return ended, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Nothing to add."""
@@ -130,34 +134,42 @@ class TrustRegionNewton(optx.AbstractMinimiser):
 
 def arrives(y: PyTree, move: Float[Array, " p"], known: Float[Array, "k p"]) -> Bool[Array, ""]:
     """Whether this step from `y` goes to one of the known ends."""
-    ahead = ravel_pytree(y)[0] + move
-    return jnp.any(jnp.max(jnp.abs(known - ahead[None, :]), axis=1) < _SAME)
+    target = ravel_pytree(y)[0] + move
+    return jnp.any(jnp.max(jnp.abs(known - target[None, :]), axis=1) < _SAME)
 
 
-def _bounds(options):
-    return (ravel_pytree(options[side])[0] if side in options else None for side in ("lower", "upper"))
+def _bounds(options: dict[str, Any]) -> tuple[Float[Array, " p"] | None, Float[Array, " p"] | None]:
+    """Lower and upper, as vectors."""
+    lower, upper = (ravel_pytree(options[side])[0] if side in options else None for side in ("lower", "upper"))
+    return lower, upper
 
 
-def _plan(here, at, radius, lower, upper):
-    """The state from the next step on: that step, what the quadratic model promises of it, and so on."""
-    held = jnp.zeros(at.shape, bool)
+def _plan(
+    expansion: Expansion,
+    point: Float[Array, " p"],
+    radius: Float[Array, ""],
+    lower: Float[Array, " p"] | None,
+    upper: Float[Array, " p"] | None,
+) -> _State:
+    """The state at `point`: the next step, what the quadratic model promises of it, and so on."""
+    held = jnp.zeros(point.shape, bool)
     if lower is not None:
-        held |= (at <= lower) & (here.gradient >= 0)
+        held |= (point <= lower) & (expansion.gradient >= 0)
     if upper is not None:
-        held |= (at >= upper) & (here.gradient <= 0)
-    gradient = jnp.where(held, 0.0, here.gradient)
-    hessian = jnp.where(held[:, None] | held[None, :], jnp.eye(at.size, dtype=at.dtype), here.hessian)
+        held |= (point >= upper) & (expansion.gradient <= 0)
+    gradient = jnp.where(held, 0.0, expansion.gradient)
+    hessian = jnp.where(held[:, None] | held[None, :], jnp.eye(point.size, dtype=point.dtype), expansion.hessian)
     eigenvalues, vectors = eigh(hessian)
     turned = gradient @ vectors
     steepness = jnp.linalg.norm(turned)
     stiffness = jnp.abs(eigenvalues) + steepness / radius
     # No gradient, no step; only then may the stiffness be 0.
     move = -vectors @ (turned / jnp.where(stiffness > 0, stiffness, 1.0))
-    ahead = at + move
-    ahead = ahead if lower is None else jnp.maximum(ahead, lower)
-    ahead = ahead if upper is None else jnp.minimum(ahead, upper)
-    move = ahead - at
+    target = point + move
+    target = target if lower is None else jnp.maximum(target, lower)
+    target = target if upper is None else jnp.minimum(target, upper)
+    move = target - point
     promised = -(gradient @ move + 0.5 * move @ hessian @ move)
     slow = jnp.abs(eigenvalues) + steepness
     fall = 0.5 * jnp.sum(turned**2 / jnp.where(slow > 0, slow, 1.0))
-    return move, promised, radius, jnp.max(jnp.abs(gradient)), fall
+    return _State(expansion, move, promised, radius, jnp.max(jnp.abs(gradient)), fall)
