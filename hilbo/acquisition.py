@@ -14,6 +14,7 @@ an improvement is unlikely.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -90,7 +91,7 @@ class Mean(eqx.Module):
         return mean
 
 
-def _log_improvement(z):
+def _log_improvement(z: Float[Array, "*m"]) -> Float[Array, "*m"]:
     """log(phi(z) + z Phi(z)). For z < 0 it is phi(z) (1 - |z| Q/phi) = phi(z) * excess / hazard: no cancellation."""
     below = jnp.where(z < 0, -z, 0.0)
     excess = excess_hazard(below)
@@ -145,7 +146,7 @@ def maximise(
     if allowed is not None:
         values = jnp.where(jax.vmap(allowed)(candidates), values, -jnp.inf)
     rows = spread(values, candidates, max(starts, 1))
-    found = climb(
+    choice = climb(
         candidates[rows],
         values[rows] > -jnp.inf,
         score,
@@ -156,7 +157,7 @@ def maximise(
         steps=steps if starts else 0,
         gain=gain,
     )
-    return eqx.tree_at(lambda c: c.candidate, found, rows[found.candidate])
+    return eqx.tree_at(lambda c: c.candidate, choice, rows[choice.candidate])
 
 
 def climb(
@@ -185,30 +186,30 @@ def climb(
 
     def along_the_wall(x, outside):
         aside = from_box(jnp.clip(to_box(outside), 0.0, 1.0))
-        begin = jnp.where(score(aside) > score(x), aside, x)
-        w, value = _polish(lambda w: score(from_box(w)), to_box(begin), steps, gain, {})
+        start = jnp.where(score(aside) > score(x), aside, x)
+        w, value = _polish(lambda w: score(from_box(w)), to_box(start), steps, gain, {})
         end = from_box(w)
         return end, jnp.where(may_end(end), value, -jnp.inf)
 
     def one(state, start):
-        (highest, known), (x, may, index) = state, start
-        begun = jnp.where(may, score(x), -jnp.inf)
+        (highest, earlier_ends), (x, may, index) = state, start
+        start_value = jnp.where(may, score(x), -jnp.inf)
         if steps == 0:
-            return state, (x, begun, begun)
-        straight, height = _polish(score, x, steps, gain, {"known": known})
+            return state, (x, start_value, start_value)
+        straight, height = _polish(score, x, steps, gain, {"known": earlier_ends})
         w = to_box(straight)
         inside = jnp.all((w >= 0.0) & (w <= 1.0)) & may_end(straight)
         end, value = jax.lax.cond(
             inside | (height <= highest), lambda: (straight, height), lambda: along_the_wall(x, straight)
         )
-        risen = may & (value > begun) & (inside | (height > highest))
-        end, value = jnp.where(risen, end, x), jnp.where(risen, value, begun)
-        return (jnp.maximum(highest, value), known.at[index].set(straight)), (end, value, begun)
+        risen = may & (value > start_value) & (inside | (height > highest))
+        end, value = jnp.where(risen, end, x), jnp.where(risen, value, start_value)
+        return (jnp.maximum(highest, value), earlier_ends.at[index].set(straight)), (end, value, start_value)
 
-    nothing = jnp.full((), -jnp.inf, starts.dtype), jnp.full_like(starts, jnp.nan)
-    _, (ends, values, begun) = jax.lax.scan(one, nothing, (starts, usable, jnp.arange(len(starts))))
-    best, first = jnp.argmax(values), jnp.argmax(begun)
-    return Choice(ends[best], values[best], first, begun[first])
+    no_ends = jnp.full((), -jnp.inf, starts.dtype), jnp.full_like(starts, jnp.nan)
+    _, (ends, values, start_values) = jax.lax.scan(one, no_ends, (starts, usable, jnp.arange(len(starts))))
+    best, best_start = jnp.argmax(values), jnp.argmax(start_values)
+    return Choice(ends[best], values[best], best_start, start_values[best_start])
 
 
 def spread(values: Float[Array, " m"], candidates: Float[Array, "m d"], count: int, apart: float = 0.1):
@@ -222,13 +223,19 @@ def spread(values: Float[Array, " m"], candidates: Float[Array, "m d"], count: i
     return jax.lax.scan(pick, values, None, length=count)[1]
 
 
-def _polish(score, begin, steps, gain, known):
-    """Newton's method within the unit cube from `begin`: where it ends, and the score there."""
+def _polish(
+    score: Callable[[Float[Array, " d"]], Float[Array, ""]],
+    start: Float[Array, " d"],
+    steps: int,
+    gain: Any,
+    options: dict[str, Float[Array, "s d"]],
+) -> tuple[Float[Array, " d"], Float[Array, ""]]:
+    """Newton's method within the unit cube from `start`: where it ends, and the score there."""
     solution = optx.minimise(
         lambda w, _: -score(w),
         TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION, gain=gain),
-        begin,
-        options={"lower": jnp.zeros_like(begin), "upper": jnp.ones_like(begin)} | known,
+        start,
+        options={"lower": jnp.zeros_like(start), "upper": jnp.ones_like(start)} | options,
         max_steps=steps,
         throw=False,
     )

@@ -95,22 +95,22 @@ def stream(
     """
     count = jax.tree.leaves(experts)[0].shape[0]
     if block == 1:
-        whole, left = count, 0
+        whole, remaining = count, 0
         head, tail = experts, None
     else:
-        whole, left = divmod(count, block)
+        whole, remaining = divmod(count, block)
         head = jax.tree.map(lambda leaf: leaf[: whole * block].reshape(whole, block, *leaf.shape[1:]), experts)
         tail = jax.tree.map(lambda leaf: leaf[whole * block :], experts)
 
-    def evidence_of(part):
-        means, explained = ([p[None] for p in expert(part)]) if block == 1 else jax.vmap(expert)(part)
+    def evidence_of(experts):
+        means, explained = ([row[None] for row in expert(experts)]) if block == 1 else jax.vmap(expert)(experts)
         return _evidence(means, explained, jnp.broadcast_to(prior_variance, means.shape[1:]), None)
 
-    shape = jax.eval_shape(evidence_of, tail if left else jax.tree.map(lambda leaf: leaf[0], head))
+    shape = jax.eval_shape(evidence_of, tail if remaining else jax.tree.map(lambda leaf: leaf[0], head))
     total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
     if whole:
-        total, _ = jax.lax.scan(lambda sums, part: (_add(sums, evidence_of(part)), None), total, head)
-    return _add(total, evidence_of(tail)) if left else total
+        total, _ = jax.lax.scan(lambda sums, experts: (_add(sums, evidence_of(experts)), None), total, head)
+    return _add(total, evidence_of(tail)) if remaining else total
 
 
 def average(
@@ -124,11 +124,16 @@ def average(
     return share @ means, share**2 @ variances
 
 
-def _evidence(means, explained, prior, mask) -> Evidence:
+def _evidence(
+    means: Float[Array, "M m"],
+    explained: Float[Array, "M m"],
+    prior: Float[Array, " m"],
+    mask: Bool[Array, " M"] | None,
+) -> Evidence:
     remaining = prior[None, :] - explained
     added, weighted = explained / (prior[None, :] * remaining), means / remaining
     if mask is not None:
-        added, weighted = (jnp.where(mask[:, None], part, 0.0) for part in (added, weighted))
+        added, weighted = (jnp.where(mask[:, None], by_person, 0.0) for by_person in (added, weighted))
     return Evidence(jnp.sum(added, axis=0), jnp.sum(weighted, axis=0))
 
 
@@ -136,7 +141,8 @@ def _add(left: Evidence, right: Evidence) -> Evidence:
     return jax.tree.map(jnp.add, left, right)
 
 
-def _checked_prior(prior_variance, means):
+def _checked_prior(prior_variance: ArrayLike, means: Float[Array, "M m"]) -> Float[Array, " m"]:
+    """One value per point."""
     prior = jnp.asarray(prior_variance, means.dtype)
     if prior.ndim > 1 or (prior.ndim == 1 and prior.shape != means.shape[1:]):
         raise ValueError(
@@ -146,13 +152,15 @@ def _checked_prior(prior_variance, means):
     return jnp.broadcast_to(prior, means.shape[1:])
 
 
-def _invalid(explained, prior, mask):
+def _invalid(
+    explained: Float[Array, "M m"], prior: Float[Array, " m"], mask: Bool[Array, " M"] | None
+) -> Bool[Array, " m"]:
     """Points at which some expert's variance is not positive (or NaN)."""
     wrong = ~(prior[None, :] - explained > 0.0)
     return jnp.any(wrong if mask is None else wrong & mask[:, None], axis=0)
 
 
-def _raise_if(invalid, evidence):
+def _raise_if(invalid: Bool[Array, " m"], evidence: Evidence) -> Evidence:
     message = (
         "bcm: an expert's variance is not positive, or the experts' variances exceed the prior's so far that no"
         " positive precision is left; check that prior_variance is the one all experts were fitted with"

@@ -105,9 +105,9 @@ def certify(
     rounding = evidence_rounding(covariance, weights[None, :])
     smallest = jnp.min(jnp.where(curvature > 0, variance, largest))
     resolution = epsilon * largest * weights.shape[0] ** 0.5
-    apart = jnp.abs(mode - covariance @ weights)
-    found = (search["residual"] <= search["tolerance"]) & jnp.all(apart <= epsilon**0.25 * sd)
-    sure = evidence_known(log_evidence, error, rounding)
+    difference = jnp.abs(mode - covariance @ weights)
+    met = (search["residual"] <= search["tolerance"]) & jnp.all(difference <= epsilon**0.25 * sd)
+    evidence_close = evidence_known(log_evidence, error, rounding)
     return Certificate(
         **search,
         smallest_variance=smallest,
@@ -115,7 +115,7 @@ def certify(
         evidence_error=error,
         evidence_tolerance=evidence_tolerance(log_evidence),
         evidence_rounding=rounding,
-        converged=found & sure & (smallest >= resolution),
+        converged=met & evidence_close & (smallest >= resolution),
     )
 
 
@@ -172,26 +172,30 @@ def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:
 def shortfall(certificate: Any, log_evidence: Float[Array, ""]) -> str:
     """What a certificate that does not hold says, in words, and what may help. A sampled posterior's has a residual,
     and says no by that alone."""
-    away, residual = "use a larger noise, float64", f"{float(certificate.residual):.3g}"
+    remedy, residual = "use a larger noise, float64", f"{float(certificate.residual):.3g}"
     if not bool(certificate.residual <= certificate.tolerance):
         steps, tolerance = int(certificate.iterations), float(certificate.tolerance)
         return (
-            f"not found: its residual is {residual} after {steps} steps and should be at most {tolerance:.3g}; {away}"
+            f"not found: its residual is {residual} after {steps} steps and should be at most {tolerance:.3g}; {remedy}"
         )
     if not bool(jnp.isfinite(log_evidence)):
         return (
             f"not found: its log evidence is not finite, though its residual is {residual}; check that the thresholds"
             " rise"
         )
-    found = f"found (residual {residual}), but"
+    beginning = f"found (residual {residual}), but"
     if bool(certificate.smallest_variance < certificate.variance_resolution):
         return (
-            f"{found} the answers leave a variance too small a part of the prior's for this precision to tell; {away}"
+            f"{beginning} the answers leave a variance too small a part of the prior's for this precision to tell;"
+            f" {remedy}"
         )
     error, rounding = certificate.evidence_error, certificate.evidence_rounding
     if not bool(evidence_known(log_evidence, error, rounding)):
-        return f"{found} not closely enough for its evidence, which may be off by {float(error + rounding):.3g}; {away}"
-    return f"{found} not closely enough for the mean, which comes out differently in another order of sums; {away}"
+        off = f"{float(error + rounding):.3g}"
+        return f"{beginning} not closely enough for its evidence, which may be off by {off}; {remedy}"
+    return (
+        f"{beginning} not closely enough for the mean, which comes out differently in another order of sums; {remedy}"
+    )
 
 
 def still(terms: Terms) -> Terms:
@@ -216,7 +220,9 @@ def mean_and_explained(
 
 
 @mean_and_explained.defjvp
-def _mean_and_explained_jvp(primals, tangents):
+def _mean_and_explained_jvp(
+    primals: tuple[Array, ...], tangents: tuple[Array, ...]
+) -> tuple[tuple[Float[Array, " m"], Float[Array, " m"]], tuple[Float[Array, " m"], Float[Array, " m"]]]:
     weights, _, inverse, cross = primals
     d_weights, _, d_inverse, d_cross = tangents
     d_mean = d_weights @ cross + weights @ d_cross
@@ -236,8 +242,8 @@ def square_root(covariance: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], F
     root = jnp.zeros_like(covariance).at[:, 0].set(shared)
     if covariance.shape[0] > 1:
         eigenvalues, vectors = eigh(covariance[1:, 1:] - shared[1:, None] * shared[None, 1:])
-        own = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
-        root = root.at[1:, 1:].set(own)
+        remaining = vectors * jnp.sqrt(jnp.where(eigenvalues > 0, eigenvalues, 0.0))[None, :]
+        root = root.at[1:, 1:].set(remaining)
     return root, jnp.max(jnp.abs(root @ root.T - covariance))
 
 
@@ -269,7 +275,9 @@ def inverse_and_log_determinant(
 
 
 @inverse_and_log_determinant.defjvp
-def _inverse_and_log_determinant_jvp(primals, tangents):
+def _inverse_and_log_determinant_jvp(
+    primals: tuple[Array, ...], tangents: tuple[Array, ...]
+) -> tuple[tuple[Float[Array, "n n"], Float[Array, ""]], tuple[Float[Array, "n n"], Float[Array, ""]]]:
     """With T = I - C K: dC = -C dK C + T dW T' and d log|B| = tr(C dK) + tr(K T dW); no 1/W, no W^(1/2)."""
     covariance, _ = primals
     d_covariance, d_curvature = tangents

@@ -70,7 +70,7 @@ def gram(kernel: Kernel, x: Float[Array, "n d"], y: Float[Array, "m d"]) -> Floa
     return jax.vmap(lambda p: jax.vmap(lambda r: kernel(p, r))(y))(x)
 
 
-def _float_dtype(value) -> jnp.dtype:
+def _float_dtype(value: ArrayLike | Sequence[float | int]) -> jnp.dtype:
     """The dtype of an inexact array; the default float dtype for Python numbers, integers and sequences."""
     dtype = getattr(value, "dtype", None)
     return jnp.dtype(dtype if dtype is not None and jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float))

@@ -25,7 +25,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix as optx
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.gaussian import (
     GaussianPosterior,
@@ -52,11 +52,11 @@ class Pointwise(eqx.Module):
 
     log_likelihood: Callable[[Float[Array, " n"]], Float[Array, " n"]]
 
-    def __call__(self, eta):
+    def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
         ones = jnp.ones_like(eta)  # the terms are independent: one tangent serves them all
 
-        def value_and_slope(at):
-            return jax.jvp(self.log_likelihood, (at,), (ones,))
+        def value_and_slope(eta):
+            return jax.jvp(self.log_likelihood, (eta,), (ones,))
 
         (value, slope), (_, second) = jax.jvp(value_and_slope, (eta,), (ones,))
         return value, slope, -second
@@ -117,7 +117,7 @@ class Mode(NamedTuple):
 
 
 @eqx.filter_custom_jvp
-def find_mode(terms, covariance, start, max_steps) -> Mode:
+def find_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
     """The mode, sought from weights `start` and then, if need be, from 0.
 
     Under `vmap` one matrix after the other on CPUs, each stopping when it is done; elsewhere all at once in v.
@@ -128,9 +128,9 @@ def find_mode(terms, covariance, start, max_steps) -> Mode:
         return _whitened_mode(eqx.combine(arrays, rest), covariance, jnp.zeros_like(start), max_steps)
 
     def quick(arrays, covariance, start):
-        found = plain_mode(eqx.combine(arrays, rest), covariance, start, min(max_steps, _PLAIN_STEPS))
-        done = found.residual <= found.tolerance
-        return jax.lax.cond(done, lambda *_: found, safe, arrays, covariance, start)
+        mode = plain_mode(eqx.combine(arrays, rest), covariance, start, min(max_steps, _PLAIN_STEPS))
+        done = mode.residual <= mode.tolerance
+        return jax.lax.cond(done, lambda *_: mode, safe, arrays, covariance, start)
 
     return one_at_a_time(quick, safe)(arrays, covariance, start)
 
@@ -144,12 +144,12 @@ class _PlainState(NamedTuple):
     risen: Bool[Array, ""]
 
 
-def plain_mode(terms, covariance, start, max_steps) -> Mode:
+def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
     """Full Newton steps on the weights, as long as the log posterior rises."""
     epsilon = jnp.finfo(start.dtype).eps
     tolerance = jnp.asarray(epsilon ** (2 / 3), start.dtype)
 
-    def step(state):
+    def step(state: _PlainState) -> _PlainState:
         weights = state.following
         eta = covariance @ weights
         values, slope, curvature = terms(eta)
@@ -175,8 +175,8 @@ def plain_mode(terms, covariance, start, max_steps) -> Mode:
     return Mode(last.eta, last.residual, tolerance, last.steps, jnp.zeros_like(tolerance))
 
 
-def _whitened_mode(terms, covariance, start, max_steps) -> Mode:
-    """Damped Newton steps in v."""
+def _whitened_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
+    """Damped Newton steps in v, from the weights `start`."""
     root, changed = square_root(covariance)
     solution = optx.root_find(
         _stationarity,
@@ -193,29 +193,30 @@ def _whitened_mode(terms, covariance, start, max_steps) -> Mode:
 
 
 @find_mode.def_jvp
-def find_mode_jvp(primals, tangents):
+def find_mode_jvp(primals: tuple[PyTree, ...], tangents: tuple[PyTree, ...]) -> tuple[Mode, Mode]:
     """eta = K grad l(eta), hence (I + K W) d eta = d(K grad l) at fixed eta, and (I + K W)^-1 = I - K C."""
     terms, covariance, _, _ = primals
-    found = find_mode(*primals)
-    mode = found.eta
+    mode = find_mode(*primals)
 
     def image(terms, matrix):
-        _, slope, curvature = terms(mode)
+        _, slope, curvature = terms(mode.eta)
         return matrix @ slope, curvature
 
     (_, curvature), (moved, _) = eqx.filter_jvp(image, (terms, covariance), tangents[:2])
     inverse, _ = inverse_and_log_determinant(covariance, curvature)
     nothing: Any = None  # the rest has no derivative
-    return found, Mode(moved - covariance @ (inverse @ moved), nothing, nothing, nothing, nothing)
+    return mode, Mode(moved - covariance @ (inverse @ moved), nothing, nothing, nothing, nothing)
 
 
-def _stationarity(eta, args):
+def _stationarity(eta: Float[Array, " n"], args: tuple[Terms, Float[Array, "n n"]]) -> Float[Array, " n"]:
     """eta - K grad l(eta), zero at the mode: what the solver is asked for."""
     terms, covariance = args
     return eta - covariance @ terms(eta)[1]
 
 
 class _NewtonState(eqx.Module):
+    """The best point so far, and the step from it that is evaluated next."""
+
     v: Float[Array, " n"]  # the mode in whitened coordinates, eta = R v
     direction: Float[Array, " n"]
     scale: Float[Array, ""]  # of the next step along `direction`
@@ -263,7 +264,9 @@ class _DampedNewton(optx.AbstractRootFinder):
         return y, aux, {}
 
 
-def _newton_state(terms, root, v):
+def _newton_state(
+    terms: Terms, root: Float[Array, "n n"], v: Float[Array, " n"]
+) -> tuple[_NewtonState, Float[Array, ""]]:
     """Everything at `v`: objective, residual and what it can resolve, next direction; and the objective's rounding."""
     values, slope, curvature = terms(root @ v)
     uphill = root.T @ slope - v

@@ -29,7 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
 
@@ -105,7 +105,9 @@ class OrdinalProbit(eqx.Module):
         blurred = OrdinalProbit(self.thresholds, jnp.sqrt(self.noise**2 + variance.astype(self.noise.dtype)))
         return jnp.exp(jax.vmap(lambda q: blurred.log_prob(mean, q))(jnp.arange(self.categories)))
 
-    def _edges(self, f, q):
+    def _edges(
+        self, f: ArrayLike, q: ArrayLike
+    ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`."""
         f = jnp.asarray(f, dtype=self.thresholds.dtype if isinstance(f, int | float) else None)
         ends = jnp.full((1,), jnp.inf, f.dtype)
@@ -126,16 +128,18 @@ def confined_normal(
 class _Truncated(NamedTuple):
     """A standard normal confined to (a, b): log of its mass, edge densities over mass, and cumulants."""
 
-    log_mass: Array
-    density_lower: Array  # phi(a) / p
-    density_upper: Array  # phi(b) / p
-    mean: Array  # k_1
-    curvature: Array  # 1 - k_2, in [0, 1]
-    skew: Array  # k_3
+    log_mass: Float[Array, ""]
+    density_lower: Float[Array, ""]  # phi(a) / p
+    density_upper: Float[Array, ""]  # phi(b) / p
+    mean: Float[Array, ""]  # k_1
+    curvature: Float[Array, ""]  # 1 - k_2, in [0, 1]
+    skew: Float[Array, ""]  # k_3
 
 
 @jax.custom_jvp
-def _truncated(f, lower, upper, noise) -> _Truncated:
+def _truncated(
+    f: Float[Array, ""], lower: Float[Array, ""], upper: Float[Array, ""], noise: Float[Array, ""]
+) -> _Truncated:
     """The truncated normal of a latent value and an interval; all arguments scalars, edges may be infinite."""
     a, b = _standardise(lower, f, noise), _standardise(upper, f, noise)
     mirrored = sum(a) + sum(b) < 0
@@ -155,20 +159,20 @@ def _truncated(f, lower, upper, noise) -> _Truncated:
         _centre(low, far_out, excess, wide_width, wide_product),
     )
     in_tail = low.short + low.rest >= 0
-    chosen = [narrow, ~narrow & in_tail]
-    mass, near, far, mean, curvature, skew = (_choose(chosen, parts) for parts in zip(*regimes, strict=True))
+    conditions = narrow, ~narrow & in_tail
+    reflected = _Truncated(*(_choose(conditions, values) for values in zip(*regimes, strict=True)))
     return _Truncated(
-        mass,
-        jnp.where(mirrored, far, near),
-        jnp.where(mirrored, near, far),
-        jnp.where(mirrored, -mean, mean),
-        curvature,
-        jnp.where(mirrored, -skew, skew),
+        reflected.log_mass,
+        jnp.where(mirrored, reflected.density_upper, reflected.density_lower),
+        jnp.where(mirrored, reflected.density_lower, reflected.density_upper),
+        jnp.where(mirrored, -reflected.mean, reflected.mean),
+        reflected.curvature,
+        jnp.where(mirrored, -reflected.skew, reflected.skew),
     )
 
 
 @_truncated.defjvp
-def _truncated_jvp(primals, tangents):
+def _truncated_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[_Truncated, _Truncated]:
     """Each output's derivative in terms of the outputs; derivations in docs/design.md, "Ordinal likelihood"."""
     f, lower, upper, noise = primals
     out = _truncated(f, lower, upper, noise)
@@ -178,14 +182,14 @@ def _truncated_jvp(primals, tangents):
     shift = tangents[0] / noise
     da = jnp.where(jnp.isinf(lower), 0.0, tangents[1] - a * tangents[3]) / noise
     db = jnp.where(jnp.isinf(upper), 0.0, tangents[2] - b * tangents[3]) / noise
-    into, out_of = out.density_upper * db, out.density_lower * da
+    gained, lost = out.density_upper * db, out.density_lower * da
     x, y = a - out.mean, b - out.mean
     variance = 1.0 - out.curvature
-    d_mass = out.mean * shift + into - out_of
+    d_mass = out.mean * shift + gained - lost
 
     def moved(at_lower, at_upper):
         """Change of a truncated moment as its edges move; `at_*` is its excess at the edge."""
-        return into * at_upper - out_of * at_lower
+        return gained * at_upper - lost * at_lower
 
     def shifted(at_lower, at_upper):
         """The same when f moves, which shifts both edges by -df / noise."""
@@ -203,25 +207,29 @@ def _truncated_jvp(primals, tangents):
     return out, d_out
 
 
-def _choose(conditions, values):
+def _choose(
+    conditions: tuple[Bool[Array, ""], Bool[Array, ""]],
+    values: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]],
+) -> Float[Array, ""]:
+    """The first value where the first condition holds, the second where the second does, else the third."""
     return jnp.where(conditions[0], values[0], jnp.where(conditions[1], values[1], values[2]))
 
 
 class _Edges(NamedTuple):
     """Something at each of the edges, whose sizes are what the tail and the centre go by."""
 
-    low: Array
-    high: Array
+    low: Float[Array, ""]
+    high: Float[Array, ""]
 
 
 class _Standard(NamedTuple):
     """A standardised edge to twice the working precision: short is a multiple of 1/16 (or infinite), rest small."""
 
-    short: Array
-    rest: Array
+    short: Float[Array, ""]
+    rest: Float[Array, ""]
 
 
-def _standardise(edge, f, noise) -> _Standard:
+def _standardise(edge: Float[Array, ""], f: Float[Array, ""], noise: Float[Array, ""]) -> _Standard:
     """(edge - f) / noise as a short number and its exact remainder.
 
     In the far tail p ~ exp(-z^2 / 2) turns a relative rounding error e of z into e * z^2 of p; the short number has an
@@ -240,26 +248,26 @@ def _standardise(edge, f, noise) -> _Standard:
     return _Standard(jnp.where(finite, short, edge), jnp.where(finite, rest, 0.0))
 
 
-def _narrow(middle, width, product):
+def _narrow(middle: Float[Array, ""], width: Float[Array, ""], product: Float[Array, ""]) -> _Truncated:
     """Intervals over which the density changes by a bounded factor; `product` = width * middle."""
     steps = 0.5 * width * jnp.asarray(_NODES, middle.dtype)
     heights = jnp.asarray(_WEIGHTS, middle.dtype) * 0.5 * jnp.exp(-middle * steps - 0.5 * steps**2)
     height = jnp.sum(heights)
     share = heights / height
     offset = jnp.sum(share * steps)
-    around = steps - offset
+    centred = steps - offset
     edge = jnp.exp(-0.125 * width**2) / (width * height)
-    return (
+    return _Truncated(
         jnp.log(width * height) - 0.5 * middle**2 - HALF_LOG_2PI,
         edge * jnp.exp(0.5 * product),
         edge * jnp.exp(-0.5 * product),
         middle + offset,
-        1.0 - jnp.sum(share * around**2),
-        jnp.sum(share * around**3),
+        1.0 - jnp.sum(share * centred**2),
+        jnp.sum(share * centred**3),
     )
 
 
-def _tail(edges, excesses, width, product):
+def _tail(edges: _Edges, excesses: _Edges, width: Float[Array, ""], product: Float[Array, ""]) -> _Truncated:
     """0 <= low: p = Q(low) (1 - R), with E = phi(high) / phi(low) and R = Q(high) / Q(low)."""
     (low, high), (excess, excess_high) = edges, excesses
     hazard = low + excess
@@ -269,7 +277,7 @@ def _tail(edges, excesses, width, product):
     remaining = 1.0 - falloff * (1.0 - gap)  # 1 - R = 1 - E (1 - gap), gap = 1 - hazard(low) / hazard(high)
     offset = (excess * (1.0 - falloff) - low * falloff * gap) / remaining  # mean - low
     far = falloff * hazard / remaining
-    return (
+    return _Truncated(
         -0.5 * low**2 - HALF_LOG_2PI - jnp.log(hazard) + jnp.log(remaining),
         hazard / remaining,
         far,
@@ -277,7 +285,9 @@ def _tail(edges, excesses, width, product):
     )
 
 
-def _centre(low, edges, excesses, width, product):
+def _centre(
+    low: _Standard, edges: _Edges, excesses: _Edges, width: Float[Array, ""], product: Float[Array, ""]
+) -> _Truncated:
     """low < 0 <= high, -low <= high: the mass outside is a sum of tails, so log p = log1p(-outside) is precise."""
     short, rest = jnp.abs(low.short), jnp.where(low.short < 0, -low.rest, low.rest)
     density = jnp.exp(-0.5 * short**2) * jnp.exp(-rest * (short + 0.5 * rest) - HALF_LOG_2PI)
@@ -290,10 +300,12 @@ def _centre(low, edges, excesses, width, product):
     far = falloff * near
     mean = near * -jnp.expm1(-product)  # not low + (mean - low): a certain answer keeps the digits of its small slope
     log_mass = jnp.where(outside > 0.25, jnp.log(1.0 - outside), jnp.log1p(-outside))  # XLA's log1p errs near -0.4
-    return log_mass, near, far, *_cumulants(mean, mean - sum(low), far, jnp.where(bounded, width, 0.0))
+    return _Truncated(log_mass, near, far, *_cumulants(mean, mean - sum(low), far, jnp.where(bounded, width, 0.0)))
 
 
-def _cumulants(mean, offset, far, width):
+def _cumulants(
+    mean: Float[Array, ""], offset: Float[Array, ""], far: Float[Array, ""], width: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
     """Mean, 1 - variance (a sum of non-negative terms) and third cumulant; `width` is 0 where `far` is."""
     curvature = mean * offset + width * far
     skew = curvature * offset - mean * (1.0 - curvature) - width * far * (width - offset)

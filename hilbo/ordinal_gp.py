@@ -110,7 +110,7 @@ class Trials(eqx.Module):
         return Trials(self.x, self.q, self.mask & keep)
 
 
-def _check_arrays(points, answers):
+def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
     if points.ndim != 2 or answers.ndim != 1 or len(points) != len(answers):
         raise InputError(
             f"Trials: x has shape {points.shape} and q has shape {answers.shape}; give x as (n, d) and q as (n,)."
@@ -131,7 +131,7 @@ class OrdinalTerms(eqx.Module):
 
     def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
         expansion = jax.vmap(self.likelihood.expand)(eta, self.q)
-        value, slope, curvature = (jnp.where(self.mask, part, jnp.zeros_like(part)) for part in expansion)
+        value, slope, curvature = (jnp.where(self.mask, term, jnp.zeros_like(term)) for term in expansion)
         return value, slope, curvature
 
 
@@ -146,7 +146,7 @@ class TiltedTerms(eqx.Module):
         self, mean: Float[Array, " n"], variance: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
         smoothed = jax.vmap(self.likelihood.smoothed)(mean, variance, self.q)
-        value, slope, precision = (jnp.where(self.mask, part, jnp.zeros_like(part)) for part in smoothed)
+        value, slope, precision = (jnp.where(self.mask, term, jnp.zeros_like(term)) for term in smoothed)
         return value, slope, precision
 
 
@@ -204,47 +204,50 @@ class Posterior(eqx.Module):
 
     def draw(self, key: PRNGKeyArray, x: Float[Array, "m d"], count: int) -> Float[Array, "count m"]:
         """Independent draws (count, m) of the latent function from the exact posterior, jointly at all points."""
-        _sampled(self, "draw")
         return _draw(self, key, x, count)
 
 
 @functools.partial(jax.jit, static_argnames="count")
-def _draw(posterior, key, x, count):
-    kernel = posterior.gp.kernel
-    return posterior.latent.draw(key, gram(kernel, posterior.trials.x, x), gram(kernel, x, x), count)
+def _draw(posterior: Posterior, key: PRNGKeyArray, x: Float[Array, "m d"], count: int) -> Float[Array, "{count} m"]:
+    kernel, latent = posterior.gp.kernel, _sampled(posterior, "draw")
+    return latent.draw(key, gram(kernel, posterior.trials.x, x), gram(kernel, x, x), count)
 
 
-def _sampled(posterior, wanted) -> ExactPosterior:
+def _sampled(posterior: Posterior, wanted: str) -> ExactPosterior:
+    """The latent posterior, if it is sampled; `wanted` is the method that asks."""
     if not isinstance(posterior.latent, ExactPosterior):
         raise InputError(f'Posterior.{wanted}: this posterior is not sampled; fit with inference="exact".')
     return posterior.latent
 
 
 @jax.jit
-def _sampled_probabilities(posterior, x):
+def _sampled_probabilities(
+    posterior: Posterior, x: Float[Array, "m d"]
+) -> tuple[Float[Array, "m categories"], Float[Array, "m categories"]]:
     """Class probabilities (m, C) and their standard errors, point by point."""
+    latent = _sampled(posterior, "class_probabilities")
 
     def one(point):
         cross = gram(posterior.gp.kernel, posterior.trials.x, point[None, :])[:, 0]
-        of = posterior.gp.likelihood.class_probabilities
-        return posterior.latent.expectation(of, cross, posterior.gp.kernel.diagonal(point))
+        probabilities = posterior.gp.likelihood.class_probabilities
+        return latent.expectation(probabilities, cross, posterior.gp.kernel.diagonal(point))
 
     return jax.lax.map(one, x)
 
 
 @jax.jit
-def _mean(posterior, x):
+def _mean(posterior: Posterior, x: Float[Array, "m d"]) -> Float[Array, " m"]:
     return gram(posterior.gp.kernel, x, posterior.trials.x) @ posterior.latent.weights
 
 
 @jax.jit
-def _predict(posterior, x):
+def _predict(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     mean, explained = _mean_and_explained(posterior, x)
     return mean, jax.vmap(posterior.gp.kernel.diagonal)(x) - explained
 
 
 @jax.jit
-def _mean_and_explained(posterior, x):
+def _mean_and_explained(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     latent, count = posterior.latent, x.shape[0]
     # Many points go in parts whose covariances stay in a core's cache; no scan, which would drop derivative rules. Each
     # coordinate lies in one piece, for loops over points that take several at a time.
@@ -255,9 +258,9 @@ def _mean_and_explained(posterior, x):
             latent.weights,
             latent.factor,
             latent.inverse,
-            gram(posterior.gp.kernel, posterior.trials.x, x[begin : begin + size]),
+            gram(posterior.gp.kernel, posterior.trials.x, x[first : first + size]),
         )
-        for begin in range(0, max(count, 1), size)
+        for first in range(0, max(count, 1), size)
     ]
     return parts[0] if len(parts) == 1 else jax.tree.map(lambda *pieces: jnp.concatenate(pieces), *parts)
 
@@ -293,18 +296,19 @@ def fit(
 
 
 @functools.partial(jax.jit, static_argnames="inference")
-def _fit(gp, trials, start, inference):
+def _fit(gp: OrdinalGP, trials: Trials, start: Float[Array, " n"] | None, inference: str) -> Posterior:
     covariance = gram(gp.kernel, trials.x, trials.x)
     if inference in ("ep", "ep_corrected"):
         tilted = TiltedTerms(gp.likelihood, trials.q, trials.mask)
         return Posterior(gp, trials, (ep if inference == "ep" else ep_corrected)(covariance, tilted, start=start))
     if inference == "exact":
-        return Posterior(gp, trials, _exactly(gp.likelihood, trials, covariance))
+        return Posterior(gp, trials, _exact_latent(gp.likelihood, trials, covariance))
     terms = OrdinalTerms(gp.likelihood, trials.q, trials.mask)
     return Posterior(gp, trials, laplace(covariance, terms, start=start))
 
 
-def _exactly(likelihood, trials, covariance):
+def _exact_latent(likelihood: OrdinalProbit, trials: Trials, covariance: Float[Array, "n n"]) -> ExactPosterior:
+    """By sampling; the samples are the same ones in every fit."""
     ends = jnp.full((1,), jnp.inf, covariance.dtype)
     edges = jnp.concatenate([-ends, likelihood.thresholds.astype(covariance.dtype), ends])
     noise = likelihood.noise.astype(covariance.dtype)

@@ -140,7 +140,7 @@ def _search(
     count = jnp.zeros((), jnp.int32)
     basin = jnp.full_like(largest, _BASIN)
     mean, variance = initial
-    begin = _State(mean, variance, largest, jnp.zeros_like(largest), largest, largest, basin, count, count)
+    first = _State(mean, variance, largest, jnp.zeros_like(largest), largest, largest, basin, count, count)
 
     def unmeasured(search):
         return hasty & (search.ahead <= 0.1 * search.tolerance)
@@ -150,7 +150,7 @@ def _search(
         done = (search.residual <= search.tolerance) & ((search.steps > 1) | (search.residual == 0.0))
         return (search.steps < max_steps) & ~done & ~unmeasured(search) & ~jnp.isnan(search.mismatch)
 
-    end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), begin)
+    end = jax.lax.while_loop(unfinished, lambda search: _advance(terms, covariance, root, search), first)
     residual = jnp.where(unmeasured(end) & (end.residual > end.tolerance), jnp.inf, end.residual)
     return end.mean, end.variance, Found(residual, end.tolerance, end.steps, changed)
 
