@@ -1,6 +1,7 @@
 """How often the 95 % intervals of tables II to IV hold the truth, in simulated studies whose participants differ.
 
-    python benchmarks/coverage_statistics.py [--studies 1000] [--people 8 24] [--cases differ unequal alike] [--write]
+    python benchmarks/coverage_statistics.py [--studies 1000] [--people 4 6 8 24] [--cases differ unequal alike]
+                                             [--write]
 
 Classes: a logistic variable with the set's level, a participant's effect and a participant's effect on the set; 12
 comparisons each. Preferences: effects of participants and of 24 individual sets, each pair of them shown twice. The
@@ -22,23 +23,18 @@ from scipy.special import expit, logit
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
-from hilbo.statistics.cluster_robust import ways  # noqa: E402
 from hilbo.statistics.logits import binary_logit, ordered_logit  # noqa: E402
-from hilbo.statistics.ordered_logit import design  # noqa: E402
 from hilbo.statistics.preferences import rate  # noqa: E402
-from hilbo.statistics.wild_bootstrap import p_value, wild  # noqa: E402
 
 # Levels of best, mid, worst, and edges between close, similar, different: with these effects, shares like the paper's.
 LEVELS, EDGES = np.array([-4.8, 0.0, 3.4]), np.array([-2.0, 2.1])
 PERSON, PERSON_SET = 0.8, 0.6  # sd in logits
 JUDGE, SET, EFFECT = 0.6, 0.4, 1.05  # table IV: sd of participants and of sets, and the preference
 SHOWN, SETS, TWICE = 8, 24, 2
-WIDTHS = 100  # studies whose bootstrap intervals are found; of the others only whether they hold the truth
 CASES = {"differ": (1.0, False), "unequal": (1.0, True), "alike": (0.0, False)}  # scale of effects; unequal
-PERSONS = ["iid", "clustered by participant", "wild bootstrap by participant"]
-WAYS = ["set", "participant and set"]
+PERSONS = ["iid", "clustered by participant"]
 KINDS = {"II": PERSONS, "III": PERSONS, "rate": ["Wilson", "exact"]}
-KINDS["IV"] = PERSONS + [f"{kind} by {way}" for way in WAYS for kind in ("clustered", "wild bootstrap")]
+KINDS["IV"] = [*PERSONS, "clustered by set", "clustered by participant and set"]
 NODES, WEIGHTS = hermegauss(60)
 WEIGHTS = WEIGHTS / WEIGHTS.sum()
 START, END = "<!-- coverage -->", "<!-- end of coverage -->"
@@ -56,8 +52,8 @@ def class_truth(scale):
     def loss(theta):
         shift = np.array([theta[0], 0.0, theta[1]])
         inner = expit(theta[None, 2:] - shift[:, None])
-        found = np.diff(np.hstack([np.zeros((3, 1)), inner, np.ones((3, 1))]), axis=1)
-        return -np.sum(shares * np.log(found))
+        probabilities = np.diff(np.hstack([np.zeros((3, 1)), inner, np.ones((3, 1))]), axis=1)
+        return -np.sum(shares * np.log(probabilities))
 
     near = minimize(
         loss, [-4.0, 3.0, *EDGES], method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-13, "maxiter": 9999}
@@ -88,33 +84,19 @@ def there(who, participants, turn, turns, unequal):
     return turn * participants < (who + 1) * turns if unequal else np.full(who.shape, True)
 
 
-def study(rng, participants, case, truths, widths):
+def study(rng, participants, case, truths):
     """Every interval of one study: table, term, errors, whether it holds the truth, its width, whether separated."""
     scale, unequal = CASES[case]
     category, shown, people = classes(rng, participants, scale, unequal)
     best, worst = (shown == 0).astype(float), (shown == 2).astype(float)
     won, pairs = preferences(rng, participants, scale, unequal)
-    one = np.ones(len(category))
-    designs = {
-        "II": (design((category == 0).astype(int), np.column_stack([one, best]), np.zeros((1, 0))), people),
-        "III": (design(category, np.column_stack([best, worst]), np.eye(2)), people),
-        "IV": (design(won.astype(int), np.ones((len(won), 1)), np.zeros((1, 0))), pairs),
+    tables = {
+        "II": binary_logit(category == 0, {"Best": best}, people).table,
+        "III": ordered_logit(category, {"Best": best, "Worst": worst}, people).table,
+        "IV": binary_logit(won, None, pairs, intercept="Aggregate-Best").table,
+        "rate": rate(won, pairs).query("errors in ('Wilson', 'exact')").assign(term="rate"),
     }
-    fits = {
-        "II": lambda wild: binary_logit(category == 0, {"Best": best}, people, bootstrap=wild),
-        "III": lambda wild: ordered_logit(category, {"Best": best, "Worst": worst}, people, bootstrap=wild),
-        "IV": lambda wild: binary_logit(won, None, pairs, bootstrap=wild, intercept="Aggregate-Best"),
-    }
-    rows = []
-    for name, fit in fits.items():
-        table = fit(widths).table
-        separated = (table["errors"] == "profile likelihood").any()
-        table = fit(True).table if separated and not widths else table
-        rows += intervals(name, table, truths[name])
-        if not widths and not separated:
-            rows += bootstrapped(name, *designs[name], table, truths[name])
-    shares = rate(won, pairs, bootstrap=False).query("errors in ('Wilson', 'exact')").assign(term="rate")
-    return rows + intervals("rate", shares, truths["rate"])
+    return [row for name, table in tables.items() for row in intervals(name, table, truths[name])]
 
 
 def intervals(name, table, truths):
@@ -123,31 +105,15 @@ def intervals(name, table, truths):
     for term, truth in truths.items():
         mine = table[table["term"] == term].set_index("errors")
         separated = "profile likelihood" in mine.index
-        found = {
+        ends = {
             kind: mine.loc["profile likelihood" if separated else kind, ["low", "high"]]
             for kind in KINDS[name]
             if separated or kind in mine.index
         }
-        sure = {kind: ends for kind, ends in found.items() if kind == "iid" or kind.startswith("clustered")}
-        if sure:
-            found["the largest of iid and clustered"] = max(sure.values(), key=lambda ends: np.nan_to_num(np.ptp(ends)))
-        for kind, (low, high) in found.items():
+        if "iid" in ends:
+            ends["the largest of iid and clustered"] = max(ends.values(), key=lambda pair: np.nan_to_num(np.ptp(pair)))
+        for kind, (low, high) in ends.items():
             rows.append((name, term, kind, bool(low <= truth <= high), high - low, separated))
-    return rows
-
-
-def bootstrapped(name, model, clusters, table, truths):
-    """Whether the wild intervals hold the truth, which is whether the truth is not rejected."""
-    rows, terms = [], list(table["term"].unique())
-    theta = table.drop_duplicates("term")["estimate"].to_numpy()
-    for kind in [kind for kind in table["errors"].unique() if kind.startswith("clustered")]:
-        errors = table.loc[table["errors"] == kind, "std_error"].to_numpy()
-        labels = [clusters[way] for way in kind.removeprefix("clustered by ").split(" and ")]
-        test = wild(model, theta, errors, ways(*labels))
-        for term, truth in truths.items():
-            j = terms.index(term)
-            held = bool(np.isfinite(errors[j])) and p_value(test, j, float(truth)) > 0.05
-            rows.append((name, term, kind.replace("clustered", "wild bootstrap"), held, np.nan, False))
     return rows
 
 
@@ -162,11 +128,11 @@ def measure(participants, case, studies):
     truths, begin, blocks = truths_of(scale), time.perf_counter(), []
     for index in range(studies):
         rng = np.random.default_rng([participants, int(10 * scale), index])
-        blocks += study(rng, participants, case, truths, index < WIDTHS)
+        blocks += study(rng, participants, case, truths)
         if index % 100 == 99:
             print(f"{participants}, {case}: {index + 1}, {time.perf_counter() - begin:.0f} s", file=sys.stderr)
-    found = pd.DataFrame(blocks, columns=["table", "term", "errors", "held", "width", "separated"])
-    return found.groupby(["table", "term", "errors"], sort=False).agg(
+    rows = pd.DataFrame(blocks, columns=["table", "term", "errors", "held", "width", "separated"])
+    return rows.groupby(["table", "term", "errors"], sort=False).agg(
         held=("held", "mean"), separated=("separated", "sum"), width=("width", "median")
     )
 
@@ -189,14 +155,14 @@ def page(results, studies):
                 cells.append("")
                 continue
             row = summary.loc[(table, term, errors)]
-            gone = f" ({int(row['separated'])})" if row["separated"] else ""
-            cells.append(f"{100 * row['held']:.1f}{gone}, {row['width']:.2f}")
+            one_sided = f" ({int(row['separated'])})" if row["separated"] else ""
+            cells.append(f"{100 * row['held']:.1f}{one_sided}, {row['width']:.2f}")
         lines.append(f"| {table} | {term} | {errors} | " + " | ".join(cells) + " |")
     return "\n".join(lines) + "\n"
 
 
 def order(name):
-    for place, begin in enumerate(("II", "III", "IV", "rate", "iid", "clustered", "the largest", "wild", "profile")):
+    for place, begin in enumerate(("II", "III", "IV", "rate", "iid", "clustered", "the largest", "profile")):
         if name == begin or (place > 3 and name.startswith(begin)):
             return place, name
     return 99, name
@@ -205,7 +171,7 @@ def order(name):
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--studies", type=int, default=1000)
-    options.add_argument("--people", type=int, nargs="*", default=[8, 24])
+    options.add_argument("--people", type=int, nargs="*", default=[4, 6, 8, 24])
     options.add_argument("--cases", nargs="*", choices=CASES, default=list(CASES))
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()

@@ -47,10 +47,7 @@ MAY_IMPORT = {
 MATHS = {
     *("kernels", "bcm", "numerics", "acquisition", "likelihoods", "gaussian", "laplace", "inference", "ordinal_gp"),
     *("hyperparameters", "population", "mechanics", "viscoelastic", "passivity", "search"),
-    *(
-        f"statistics.{name}"
-        for name in ("ordered_logit", "separation", "cluster_robust", "wild_bootstrap", "regression")
-    ),
+    *(f"statistics.{name}" for name in ("ordered_logit", "separation", "cluster_robust", "regression")),
     *(f"identification.{name}" for name in ("fitting", "sampled", "moduli", "intervals", "characterise")),
     *("study.map_summary", "study.tolerance_intervals", "session.selection", "session.ask_tell", "simulation.simulate"),
 }

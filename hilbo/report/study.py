@@ -58,7 +58,7 @@ def write_study(
             say(f"{text}{words}")
 
         analysis = analyses.get(material.name) or analyse(material.study, material.cohort, seed, tell)
-        validated = _validated(material, folder, seed, tell)
+        validated = _validated(material, folder, tell)
         results.append(Results(material.name, analysis, validated, material.reference, material.reference_name))
         material_folder = out / slug(material.name) if len(folder.materials) > 1 else out
         material_folder.mkdir(exist_ok=True)
@@ -89,12 +89,12 @@ def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
     }
 
 
-def _validated(material: Material, folder: StudyFolder, seed, say) -> Validated | None:
+def _validated(material: Material, folder: StudyFolder, say) -> Validated | None:
     if material.validation is None:
         return None
     say("validation sessions")
     name = material.name if "material" in material.validation and material.name else None
-    return validate(material.validation, folder.sets, material.study.responses, name, seed=seed)
+    return validate(material.validation, folder.sets, material.study.responses, name)
 
 
 def _compared(analysis: Analysis, seed, say) -> dict[str, Any] | None:

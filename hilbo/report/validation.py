@@ -3,8 +3,8 @@
 `validate` computes one material; `write_validation` makes the folder of `hilbo validate` with one section for each
 material: result.json, the tables as CSV, the figures, and one page. `hilbo report` uses the same parts.
 
-Of every coefficient the page shows the widest of the iid, clustered and (up to 12 clusters) wild bootstrap intervals,
-which docs/statistics.md finds the safest; all kinds of error are in the CSV tables.
+Of every coefficient the page shows the widest of the iid and clustered intervals, which docs/statistics.md finds the
+safest; all kinds of error are in the CSV tables.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from hilbo.report.page import template
 from hilbo.report.results import as_json, save_figures, versions
 from hilbo.statistics.paper_tables import PaperTables, aggregate_comparisons, paper_tables, set_sources
 from hilbo.statistics.preferences import rate
-from hilbo.statistics.regression import FEW_CLUSTERS, Regression
+from hilbo.statistics.regression import Regression
 from hilbo.study.config import Study
 from hilbo.study.trial_table import read_cells
 from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
@@ -74,17 +74,14 @@ def validate(
     sets: pd.DataFrame | None = None,
     responses: Sequence[str] = RESPONSES,
     material: str | None = None,
-    *,
-    seed: int = 0,
-    bootstrap: bool = True,
 ) -> Validated:
     """The statistics of one material's comparisons. Raises `InputError` for a bad table."""
     chosen = of_material(check_validation(table, responses), material)
-    tables = paper_tables(chosen, sets, responses=responses, bootstrap=bootstrap, seed=seed)
+    tables = paper_tables(chosen, sets, responses=responses)
     rows = aggregate_comparisons(chosen, set_sources(chosen, sets)[0])
     decided = rows[rows["preferred"] != TIE]
     won = (decided["preferred"] != "individual").to_numpy()
-    overall = rate(won, decided[["participant", "set"]], bootstrap=bootstrap, seed=seed) if len(won) else None
+    overall = rate(won, decided[["participant", "set"]]) if len(won) else None
     people = pd.DataFrame([_person(name, mine) for name, mine in rows.groupby("participant", sort=False)])
     count = chosen["participant"].nunique()
     return Validated(material or "", tables, overall, people if len(people) else None, count, len(chosen))
@@ -100,15 +97,12 @@ def _person(name, rows):
 
 
 def safest(table: Regression) -> pd.DataFrame:
-    """Of every coefficient the row with the widest interval among iid and clustered errors, of few clusters among the
-    wild bootstrap too; or its profile."""
-    few = min(table.clusters.values(), default=FEW_CLUSTERS + 1) <= FEW_CLUSTERS
+    """Of every coefficient the row with the widest interval among iid and clustered errors; or its profile."""
     rows = []
     for _, mine in table.table.groupby("term", sort=False):
-        plain = mine if few else mine[~mine["errors"].str.startswith("wild")]
-        width = (plain["high"] - plain["low"]).where(np.isfinite(plain["std_error"]), -1.0)
-        separated = plain["errors"] == "profile likelihood"
-        rows.append(plain[separated].iloc[0] if separated.any() else plain.loc[width.idxmax()])
+        width = (mine["high"] - mine["low"]).where(np.isfinite(mine["std_error"]), -1.0)
+        separated = mine["errors"] == "profile likelihood"
+        rows.append(mine[separated].iloc[0] if separated.any() else mine.loc[width.idxmax()])
     return pd.DataFrame(rows)
 
 
@@ -236,7 +230,7 @@ def write_validation(
     names = materials_of(table)
     for name in names:
         say(f"validation sessions{'' if name is None else f' of {name}'}")
-        validated = validate(table, sets_by_id, study.responses, name, seed=seed)
+        validated = validate(table, sets_by_id, study.responses, name)
         material_folder = folder if len(names) == 1 else folder / slug(str(name))
         material_folder.mkdir(exist_ok=True)
         for file, frame in validation_csv(validated).items():

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from jaxtyping import Float
 from scipy.special import logit
 
 from hilbo.errors import InputError
@@ -30,13 +31,11 @@ def binary_logit(
     *,
     intercept: str = "Intercept",
     level: float = 0.95,
-    bootstrap: bool = True,
-    seed: int = 0,
 ) -> Regression:
     """Logit of a yes/no outcome (n,) on an intercept and the columns of `predictors`.
 
     `clusters`: up to two columns that name the cluster of every answer, participants say. An outcome that never
-    changes has no finite intercept and is answered with a one-sided interval. `seed` is that of the bootstrap.
+    changes has no finite intercept and is answered with a one-sided interval.
     """
     success = np.asarray(outcome)
     if success.ndim != 1 or not success.size or not np.isin(success, (0, 1)).all():
@@ -45,7 +44,7 @@ def binary_logit(
     x = np.column_stack([np.ones(len(success)), x])
     model = likelihood.design(success.astype(int), x, np.zeros((1, 0)))
     start = np.zeros(x.shape[1])
-    return regress(model, [intercept, *names], start, clusters, level=level, bootstrap=bootstrap, seed=seed)
+    return regress(model, [intercept, *names], start, clusters, level=level)
 
 
 def ordered_logit(
@@ -55,8 +54,6 @@ def ordered_logit(
     *,
     categories: Sequence[str] | None = None,
     level: float = 0.95,
-    bootstrap: bool = True,
-    seed: int = 0,
 ) -> Regression:
     """Ordered logit of categories (n,), ints from 0, on the columns of `predictors` (no constant).
 
@@ -77,8 +74,7 @@ def ordered_logit(
     model = likelihood.design(ranks.ravel(), x, np.eye(len(edges)))
     below = np.cumsum(np.bincount(ranks.ravel()))[:-1] / len(answers)
     start = np.concatenate([np.zeros(x.shape[1]), logit(below)])
-    options = {"nuisance": len(edges), "level": level, "bootstrap": bootstrap, "seed": seed}
-    return regress(model, [*names, *edges], start, clusters, **options)
+    return regress(model, [*names, *edges], start, clusters, nuisance=len(edges), level=level)
 
 
 def tied_preferences(
@@ -90,8 +86,6 @@ def tied_preferences(
     reference: str | None = None,
     order: Sequence | np.ndarray | None = None,
     level: float = 0.95,
-    bootstrap: bool = True,
-    seed: int = 0,
 ) -> Regression:
     """Strengths of sets from paired comparisons with ties, by the model of Rao & Kupper (1967).
 
@@ -119,10 +113,10 @@ def tied_preferences(
     model = likelihood.design(won, x, np.array([[-1.0], [1.0]]) if ties else np.zeros((1, 0)))
     start = np.concatenate([np.zeros(x.shape[1]), np.ones(int(ties))])
     terms = [*sets, *(["tie"] if ties else [])]
-    return regress(model, terms, start, clusters, nuisance=int(ties), level=level, bootstrap=bootstrap, seed=seed)
+    return regress(model, terms, start, clusters, nuisance=int(ties), level=level)
 
 
-def _matrix(predictors, n):
+def _matrix(predictors: Predictors | None, n: int) -> tuple[list[str], Float[np.ndarray, "n p"]]:
     """Names and columns (n, p) of the predictors, as finite numbers."""
     columns = {} if predictors is None else {str(name): np.asarray(predictors[name], float) for name in predictors}
     for name, values in columns.items():

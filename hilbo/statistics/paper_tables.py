@@ -47,8 +47,6 @@ def paper_tables(
     responses: Sequence[str] = RESPONSES,
     material: str | None = None,
     level: float = 0.95,
-    bootstrap: bool = True,
-    seed: int = 0,
 ) -> PaperTables:
     """Every statistic of the paper's validation sessions, of one material.
 
@@ -62,21 +60,20 @@ def paper_tables(
     staged["preferred"] = [roles.get(name, name) for name in table["preferred"]]
     staged = staged[staged["set_a"].isin(_ROLES) & staged["set_b"].isin(_ROLES) & (staged["set_a"] != staged["set_b"])]
     answers, limits = classifications(staged, responses), []
-    options = {"level": level, "bootstrap": bootstrap, "seed": seed}
-    found = {
-        "II": lambda: _table_2(answers, responses, options),
-        "III": lambda: _table_3(answers, responses, options),
-        "IV": lambda: _table_4(table, sources, options),
+    makers = {
+        "II": lambda: _table_2(answers, responses, level),
+        "III": lambda: _table_3(answers, responses, level),
+        "IV": lambda: _table_4(table, sources, level),
     }
     tables = {}
-    for number, make in found.items():
+    for number, make in makers.items():
         try:
             tables[number] = make()
         except InputError as error:
             tables[number] = None
             limits.append(f"Table {number} is missing: {error}")
     counts = confusion(staged, responses, _ROLES)
-    rates = preference_rates(staged, _ROLES, **options)
+    rates = preference_rates(staged, _ROLES, level=level)
     return PaperTables(tables["II"], tables["III"], tables["IV"], counts, rates, tuple(limits))
 
 
@@ -92,29 +89,29 @@ def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[st
     return {name: str(sets.at[name, "source"]) for name in used}, {name: str(roles[name]) for name in used}
 
 
-def _table_2(answers, responses, options):
+def _table_2(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
     _need(answers, ("best",))
     close = (answers["class"] == responses[-1]).astype(int)
     best = {"Best": (answers["set"] == "best").astype(float)}
-    return binary_logit(close, best, answers[["participant"]], **options)
+    return binary_logit(close, best, answers[["participant"]], level=level)
 
 
-def _table_3(answers, responses, options):
+def _table_3(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
     _need(answers, _ROLES)
     shifts = {name.capitalize(): (answers["set"] == name).astype(float) for name in ("best", "worst")}
     ranks, names = len(responses) - 1 - answers["category"], list(responses)[::-1]
-    return ordered_logit(ranks, shifts, answers[["participant"]], categories=names, **options)
+    return ordered_logit(ranks, shifts, answers[["participant"]], categories=names, level=level)
 
 
-def _table_4(table, sources, options):
+def _table_4(table: pd.DataFrame, sources: Mapping[str, str], level: float) -> Regression:
     rows = aggregate_comparisons(table, sources)
     if rows.empty:
         raise InputError("no comparison of an aggregate's set with an individual's holds a preference.")
     clusters, preferred = rows[["participant", "set"]], rows["preferred"].to_numpy()
     if (preferred != TIE).all():
-        return binary_logit(preferred == _OURS, None, clusters, intercept=_OURS, **options)
+        return binary_logit(preferred == _OURS, None, clusters, intercept=_OURS, level=level)
     one, other = np.full(len(rows), _OURS), np.full(len(rows), _THEIRS)
-    return tied_preferences(one, other, preferred, clusters, reference=_THEIRS, **options)
+    return tied_preferences(one, other, preferred, clusters, reference=_THEIRS, level=level)
 
 
 def aggregate_comparisons(table: pd.DataFrame, sources: Mapping[str, str]) -> pd.DataFrame:
@@ -130,7 +127,7 @@ def aggregate_comparisons(table: pd.DataFrame, sources: Mapping[str, str]) -> pd
     return pd.DataFrame({"participant": rows["participant"].to_numpy(), "set": theirs, "preferred": words})
 
 
-def _need(answers, roles):
+def _need(answers: pd.DataFrame, roles: Sequence[str]) -> None:
     absent = [name for name in roles if name not in set(answers["set"])]
     if absent:
         raise InputError(f'no comparison classifies the set "{absent[0]}".')

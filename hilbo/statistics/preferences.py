@@ -1,9 +1,9 @@
 """What a validation session counted: classes of each set, preferences of each pair, rates with every kind of interval.
 
 The rate of a pair is wins/(wins + losses); ties are counted beside it, and modelled by `logits.tied_preferences`.
-Wilson and Clopper-Pearson ("exact") intervals take all answers as independent. The clustered and bootstrapped ones are
-those of the logit's intercept, mapped to rates, so that they stay within 0 and 1. Where one set always won there is
-nothing to cluster; then the exact interval of the participants, all of whom agreed, stands beside that of the answers.
+Wilson and Clopper-Pearson ("exact") intervals take all answers as independent. The clustered ones are those of
+the logit's intercept, mapped to rates, so that they stay within 0 and 1. Where one set always won there is nothing to
+cluster; then the exact interval of the participants, all of whom agreed, stands beside that of the answers.
 """
 
 from collections.abc import Sequence
@@ -46,8 +46,6 @@ def rate(
     clusters: Clusters | None = None,
     *,
     level: float = 0.95,
-    bootstrap: bool = True,
-    seed: int = 0,
 ) -> pd.DataFrame:
     """Share of successes (n,) with each kind of interval.
 
@@ -64,15 +62,15 @@ def rate(
     if hits.min() == hits.max():
         rows += _unanimous(hits, clusters, level)
     elif clusters is not None and len(list(clusters)):
-        fitted = binary_logit(hits, None, clusters, level=level, bootstrap=bootstrap, seed=seed).table
+        fitted = binary_logit(hits, None, clusters, level=level).table
         fitted = fitted[fitted["errors"] != "iid"]
         rows += list(
             zip(fitted["errors"], expit(fitted["low"]), expit(fitted["high"]), fitted["p_value"], fitted["assumes"],
                 strict=True)
         )  # fmt: skip
-    found = pd.DataFrame(rows, columns=["errors", "low", "high", "p_value", "assumes"])
-    found.insert(0, "rate", float(hits.mean()))
-    return found
+    table = pd.DataFrame(rows, columns=["errors", "low", "high", "p_value", "assumes"])
+    table.insert(0, "rate", float(hits.mean()))
+    return table
 
 
 def preference_rates(
@@ -80,8 +78,6 @@ def preference_rates(
     sets: Sequence[str] = (),
     *,
     level: float = 0.95,
-    bootstrap: bool = True,
-    seed: int = 0,
 ) -> pd.DataFrame:
     """Of each pair of sets, how often the first was preferred: one row per pair and kind of interval.
 
@@ -101,13 +97,12 @@ def preference_rates(
         won = (decided["preferred"] == names[a]).to_numpy()
         counts = {"set": names[a], "over": names[b], "comparisons": len(rows), "wins": int(won.sum())}
         counts |= {"losses": int((~won).sum()), "ties": len(rows) - len(decided)}
-        options = {"level": level, "bootstrap": bootstrap, "seed": seed}
-        found = rate(won, decided[["participant"]], **options) if len(won) else pd.DataFrame({"rate": [np.nan]})
-        blocks.append(pd.DataFrame([counts] * len(found)).join(found))
+        rates = rate(won, decided[["participant"]], level=level) if len(won) else pd.DataFrame({"rate": [np.nan]})
+        blocks.append(pd.DataFrame([counts] * len(rates)).join(rates))
     return pd.concat(blocks, ignore_index=True) if blocks else pd.DataFrame()
 
 
-def _unanimous(hits, clusters, level):
+def _unanimous(hits: np.ndarray, clusters: Clusters | None, level: float) -> list[tuple[str, float, float, float, str]]:
     """All agreed: how many people would, from the people who did."""
     rows = []
     columns = {} if clusters is None else {str(name): np.asarray(clusters[name]) for name in clusters}

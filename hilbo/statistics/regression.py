@@ -5,10 +5,10 @@
 | iid | every answer independent of every other |
 | clustered by A | A's clusters independent, and many; t with G - 1 degrees of freedom |
 | clustered by A and B | answers that share neither independent; t with the smaller G - 1 |
-| wild bootstrap by A | A's clusters independent; made for few of them |
 | profile likelihood | as iid; for a coefficient that has no finite estimate |
 
-`docs/statistics.md` says which to trust when, from their coverage in simulated studies.
+`docs/statistics.md` says which to trust when, from their coverage in simulated studies. statsmodels fits and clusters;
+the table, its warnings and the separated coefficients are what it does not have.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,19 +17,19 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import stats
 
 from hilbo.errors import InputError
-from hilbo.statistics import ordered_logit, wild_bootstrap
-from hilbo.statistics.cluster_robust import Covariance, Ways, iid, sandwich, ways
-from hilbo.statistics.ordered_logit import Design
+from hilbo.statistics import ordered_logit
+from hilbo.statistics.cluster_robust import Covariance, clustered
+from hilbo.statistics.ordered_logit import Design, Fit
 from hilbo.statistics.separation import Separation, decisive, independent, profile, separation
 
-__all__ = ["FEW_CLUSTERS", "Clusters", "Errors", "Regression", "regress"]
+__all__ = ["Clusters", "Errors", "Regression", "regress"]
 
 Clusters = Mapping[str, Any] | pd.DataFrame  # a column for each way, n entries each
-FEW_CLUSTERS = 12
+_FEW_CLUSTERS = 12
 _NO_SPREAD = 1e-8  # of the iid error: clusters that agree to rounding
 _NOTHING_LEFT = (
     "nothing is left to estimate an error from (clusters agree exactly, or the two-way variance is negative)"
@@ -59,12 +59,16 @@ class Regression(eqx.Module):
 
 
 class Errors(eqx.Module):
-    """One kind of error: its name, what it assumes, its covariance, and the clusters if it has any."""
+    """One kind of error: its name, what it assumes, and its covariance."""
 
     name: str
     assumes: str
     covariance: Covariance
-    clusters: Ways | None = None
+
+    @property
+    def std_errors(self) -> Float[np.ndarray, " k"]:
+        """Of every coefficient."""
+        return np.sqrt(np.diag(self.covariance.matrix))
 
 
 def regress(
@@ -75,46 +79,45 @@ def regress(
     *,
     nuisance: int = 0,
     level: float = 0.95,
-    bootstrap: bool = True,
-    seed: int = 0,
 ) -> Regression:
     """Fit `model` and put every kind of error beside the estimates.
 
-    The last `nuisance` coefficients (edges of categories) get no bootstrap and no profile. `start` has its edges in
-    order. Raises `InputError` for coefficients that depend on each other and for more than two ways of clustering.
+    The last `nuisance` coefficients (edges of categories) get no profile. `start` has its edges in order. Raises
+    `InputError` for coefficients that depend on each other and for more than two ways of clustering.
     """
-    n, names = len(model.upper), list(terms)
-    labels = _labels(clusters, n)
+    names, effects = list(terms), len(terms) - nuisance
+    labels = _labels(clusters, len(model.upper))
     _check_independent(model, names, nuisance)
-    found = separation(model)
-    warnings = [_separated(names, found, nuisance)] if found.infinite.any() else []
+    separated = separation(model)
+    warnings = [_separated_sentence(names, separated, effects)] if separated.infinite.any() else []
     rows, covariances, log_likelihood = [], {}, 0.0
-    if not found.certain.all():
-        rest, keep, begin = decisive(model, start, found)
-        theta = ordered_logit.fit(rest, begin)
-        log_likelihood = ordered_logit.log_likelihood(rest, theta)
-        kinds, said = _kinds(rest, theta, {name: codes[~found.certain] for name, codes in labels.items()})
-        finite = {j: names[i] for j, i in enumerate(np.flatnonzero(keep)) if not found.infinite[i]}
-        warnings += [*said, *_below_iid(kinds, finite)]
+    if not separated.certain.all():
+        rest, keep, rest_start = decisive(model, start, separated)
+        fitted = ordered_logit.fit(rest, rest_start)
+        log_likelihood = fitted.log_likelihood
+        kinds, refused = _kinds(fitted, {name: codes[~separated.certain] for name, codes in labels.items()})
+        finite = {j: names[i] for j, i in enumerate(np.flatnonzero(keep)) if not separated.infinite[i]}
+        warnings += [*refused, *_below_iid(kinds, finite)]
         covariances = {kind.name: _covariance(kind, finite) for kind in kinds}
-        rows += [_wald(term, theta[j], j, kind, kinds[0], level) for j, term in finite.items() for kind in kinds]
-        if bootstrap:
-            tested = {j: term for j, term in finite.items() if term in names[: len(names) - nuisance]}
-            rows += _bootstrapped(rest, theta, kinds, tested, level, seed)
+        least = kinds[0].std_errors
+        rows += [_wald(term, fitted.estimate[j], j, kind, least, level) for j, term in finite.items() for kind in kinds]
     rows += [
-        _profiled(model, j, names[j], start, found, level, j >= len(names) - nuisance)
-        for j in np.flatnonzero(found.infinite).tolist()
+        _profiled(model, j, names[j], start, separated, level if j < effects else None)
+        for j in np.flatnonzero(separated.infinite).tolist()
     ]
     counts = {name: len(np.unique(codes)) for name, codes in labels.items()}
-    return Regression(_tidy(rows, names, nuisance), covariances, log_likelihood, n, counts, tuple(warnings))
+    table = _tidy(rows, names, effects)
+    return Regression(table, covariances, log_likelihood, len(model.upper), counts, tuple(warnings))
 
 
-def _covariance(kind, terms):
+def _covariance(kind: Errors, terms: Mapping[int, str]) -> pd.DataFrame:
+    """The covariance of these coefficients, by name."""
     shown = list(terms.values())
     return pd.DataFrame(kind.covariance.matrix[np.ix_(list(terms), list(terms))], shown, shown)
 
 
-def _labels(clusters, n):
+def _labels(clusters: Clusters | None, n: int) -> dict[str, Int[np.ndarray, " n"]]:
+    """The number of every answer's cluster, by each way. Raises `InputError`."""
     columns = {} if clusters is None else {str(name): np.asarray(clusters[name]) for name in clusters}
     if len(columns) > 2:
         raise InputError(f"errors can be clustered by one way or two, not by {len(columns)} ({', '.join(columns)}).")
@@ -126,7 +129,7 @@ def _labels(clusters, n):
     return {name: np.unique(codes, return_inverse=True)[1].ravel() for name, codes in columns.items()}
 
 
-def _check_independent(model, names, nuisance):
+def _check_independent(model: Design, names: list[str], nuisance: int) -> None:
     order = np.roll(np.arange(len(names)), nuisance)  # edges first: a constant predictor is at fault, not an edge
     good = independent(model.columns(order))
     if not good.all():
@@ -136,126 +139,107 @@ def _check_independent(model, names, nuisance):
         )
 
 
-def _kinds(model, theta, labels):
-    """Every kind of error that these answers allow, and a sentence for those that they do not."""
-    scores, information = ordered_logit.scores(model, theta), ordered_logit.information(model, theta)
-    kinds, warnings = [Errors("iid", "all answers are independent", iid(information))], []
-    usable = {name: codes for name, codes in labels.items() if len(np.unique(codes)) > 1}
-    warnings += [f"There is one {name} only: no error can be clustered by it." for name in labels if name not in usable]
-    if usable and len(scores) <= len(theta):
-        warnings.append(f"{len(scores)} answers decide {len(theta)} coefficients: no error can be clustered.")
+def _kinds(fitted: Fit, labels: Mapping[str, Int[np.ndarray, " n"]]) -> tuple[list[Errors], list[str]]:
+    """Every kind of error that these answers allow, iid first, and a sentence for those that they do not."""
+    kinds = [Errors("iid", "all answers are independent", Covariance(fitted.covariance, np.inf, 0.0))]
+    counts = {name: len(np.unique(codes)) for name, codes in labels.items()}
+    usable = [name for name, count in counts.items() if count > 1]
+    warnings = [f"There is one {name} only: no error can be clustered by it." for name in labels if name not in usable]
+    n, k = fitted.scores.shape
+    if usable and n <= k:
+        warnings.append(f"{n} answers decide {k} coefficients: no error can be clustered.")
         return kinds, warnings
-    chosen = [[name] for name in usable] + ([list(usable)] if len(usable) == 2 else [])
-    for names in chosen:
+    for names in [[name] for name in usable] + ([usable] if len(usable) == 2 else []):
         both = " and ".join(names)
-        clusters = ways(*(usable[name] for name in names))
-        covariance = sandwich(scores, information, clusters)
-        counts = " and ".join(f"{count} of {name}" for count, name in zip(clusters.counts, names, strict=True))
-        assumes = f"answers that share no {both.replace(' and ', ' or ')} are independent; clusters: {counts}"
-        kinds.append(Errors(f"clustered by {both}", assumes, covariance, clusters))
+        covariance = clustered(fitted, *(labels[name] for name in names))
+        sizes = " and ".join(f"{counts[name]} of {name}" for name in names)
+        assumes = f"answers that share no {' or '.join(names)} are independent; clusters: {sizes}"
+        kinds.append(Errors(f"clustered by {both}", assumes, covariance))
         if covariance.repaired:
             warnings.append(
                 f"The covariance clustered by {both} was indefinite (worst eigenvalue {-covariance.repaired:.1%} of the"
                 " largest of the one-way terms) and was repaired; its errors may be too small."
             )
-    few = min((kind.clusters.degrees_of_freedom + 1 for kind in kinds if kind.clusters is not None), default=99)
-    if few <= FEW_CLUSTERS:
-        warnings.append(
-            f"There are {few} clusters by one way: report the wider of the clustered and the wild bootstrap interval."
-        )
+    few = min((counts[name] for name in usable), default=_FEW_CLUSTERS + 1)
+    if few <= _FEW_CLUSTERS:
+        warnings.append(f"There are {few} clusters by one way: report the widest of the iid and clustered intervals.")
     return kinds, warnings
 
 
-def _below_iid(kinds, terms):
+def _below_iid(kinds: list[Errors], terms: Mapping[int, str]) -> list[str]:
     """A sentence for each kind of clustered error that is below the iid one in some coefficient."""
-    reference, said = np.sqrt(np.diag(kinds[0].covariance.matrix)), []
+    reference, sentences = kinds[0].std_errors, []
     for kind in kinds[1:]:
-        errors = np.sqrt(np.diag(kind.covariance.matrix))
+        errors = kind.std_errors
         below = [
             f"{name} ({errors[j]:.3g} against {reference[j]:.3g})"
             for j, name in terms.items()
             if errors[j] < reference[j]
         ]
         if below:
-            said.append(
+            sentences.append(
                 f"Errors {kind.name} are below the iid ones for {', '.join(below)}: by chance, or because answers"
                 " within a cluster differ more than chance allows; report the larger."
             )
-    return said
+    return sentences
 
 
-def _wald(term, estimate, j, kind, reference, level):
-    error, least = (float(np.sqrt(c.matrix[j, j])) for c in (kind.covariance, reference.covariance))
-    dof = kind.covariance.degrees_of_freedom
-    if error <= _NO_SPREAD * least:
-        assumes = f"{kind.assumes}; {_NOTHING_LEFT}"
-        return _row(term, estimate, kind.name, assumes, dof=dof)
+def _wald(
+    term: str, estimate: float, j: int, kind: Errors, iid_errors: Float[np.ndarray, " k"], level: float
+) -> dict[str, Any]:
+    """The row of coefficient j with one kind of error, by t (normal for iid)."""
+    error, dof = float(kind.std_errors[j]), kind.covariance.degrees_of_freedom
+    if error <= _NO_SPREAD * iid_errors[j]:
+        return _row(term, estimate, kind.name, f"{kind.assumes}; {_NOTHING_LEFT}", degrees_of_freedom=dof)
     reach = float(stats.t.ppf((1 + level) / 2, dof)) * error
-    p_value = float(2 * stats.t.sf(abs(estimate) / error, dof))
     return _row(
         term,
         estimate,
         kind.name,
         kind.assumes,
-        error,
-        estimate / error,
-        dof,
-        p_value,
-        estimate - reach,
-        estimate + reach,
+        std_error=error,
+        statistic=estimate / error,
+        degrees_of_freedom=dof,
+        p_value=float(2 * stats.t.sf(abs(estimate) / error, dof)),
+        low=estimate - reach,
+        high=estimate + reach,
     )
 
 
-def _bootstrapped(model, theta, kinds, tested, level, seed):
-    """Rows of the wild bootstrap by every way that has an error; by two ways the smaller one carries the weights."""
-    rows, least = [], np.sqrt(np.diag(kinds[0].covariance.matrix))
-    for kind in kinds[1:]:
-        errors = np.sqrt(np.diag(kind.covariance.matrix))
-        test = wild_bootstrap.wild(model, theta, errors, kind.clusters, seed)
-        for j, term in tested.items():
-            name = kind.name.replace("clustered", "wild bootstrap")
-            if errors[j] <= _NO_SPREAD * least[j]:
-                rows.append(_row(term, theta[j], name, f"{kind.assumes}; {_NOTHING_LEFT}"))
-                continue
-            low, high = wild_bootstrap.interval(test, j, level)
-            p_value = wild_bootstrap.p_value(test, j, 0.0)
-            statistic = theta[j] / errors[j]
-            error = float(errors[j])
-            rows.append(_row(term, theta[j], name, kind.assumes, error, statistic, np.nan, p_value, low, high))
-    return rows
-
-
-def _profiled(model, j, term, start, found, level, nuisance):
-    low, high, p_value = (np.nan,) * 3 if nuisance else profile(model, j, start, found, level)
-    both = found.rises[j] and found.falls[j]
-    estimate = np.nan if both else np.inf if found.rises[j] else -np.inf
+def _profiled(
+    model: Design, j: int, term: str, start: Float[np.ndarray, " k"], separated: Separation, level: float | None
+) -> dict[str, Any]:
+    """The row of a coefficient without a finite estimate; without a level no interval."""
+    low, high, p_value = (np.nan,) * 3 if level is None else profile(model, j, start, separated, level)
+    both = separated.rises[j] and separated.falls[j]
+    estimate = np.nan if both else np.inf if separated.rises[j] else -np.inf
     assumes = "all answers are independent; no finite estimate"
     return _row(term, estimate, "profile likelihood", assumes, p_value=p_value, low=low, high=high)
 
 
-def _separated(names, found: Separation, nuisance):
-    shown = [name for name, gone in zip(names, found.infinite, strict=True) if gone]
-    shown = [name for name in shown if name in names[: len(names) - nuisance]] or shown
+def _separated_sentence(names: list[str], separated: Separation, effects: int) -> str:
+    infinite = [name for name, without in zip(names, separated.infinite, strict=True) if without]
+    shown = [name for name in infinite if name in names[:effects]] or infinite
     return (
-        f"{', '.join(shown)} cannot be estimated: {int(found.certain.sum())} answers are separated (a cell of 0 or"
+        f"{', '.join(shown)} cannot be estimated: {int(separated.certain.sum())} answers are separated (a cell of 0 or"
         " 100 %, or a combination that is). The one-sided interval of the profile likelihood is given, which takes all"
         " answers as independent."
     )
 
 
-def _row(
-    term, estimate, errors, assumes, error=np.nan, statistic=np.nan, dof=np.nan, p_value=np.nan, low=np.nan, high=np.nan
-):
-    found = {"term": str(term), "estimate": float(estimate), "errors": errors, "std_error": error}
-    found |= {"statistic": statistic, "degrees_of_freedom": dof, "p_value": p_value, "low": low, "high": high}
+def _row(term: str, estimate: float, errors: str, assumes: str, **numbers: float) -> dict[str, Any]:
+    """A row of the table, in its columns' order; what is not given is missing."""
+    columns = ("std_error", "statistic", "degrees_of_freedom", "p_value", "low", "high")
+    row = {"term": str(term), "estimate": float(estimate), "errors": errors}
+    row |= dict.fromkeys(columns, np.nan) | numbers
     with np.errstate(over="ignore"):  # an odds ratio beyond 1e308 is inf
-        odds = {"odds_ratio": np.exp(estimate), "odds_low": np.exp(low), "odds_high": np.exp(high)}
-    return found | odds | {"assumes": assumes}
+        odds = {"odds_ratio": estimate, "odds_low": row["low"], "odds_high": row["high"]}
+        return row | {name: np.exp(value) for name, value in odds.items()} | {"assumes": assumes}
 
 
-def _tidy(rows, names, nuisance):
+def _tidy(rows: list[dict[str, Any]], names: list[str], effects: int) -> pd.DataFrame:
+    """The rows in the order of their terms; edges of categories have no odds ratio."""
     table = pd.DataFrame(rows)
-    edges = table["term"].isin(names[len(names) - nuisance :])
-    table.loc[edges, ["odds_ratio", "odds_low", "odds_high"]] = np.nan
+    table.loc[table["term"].isin(names[effects:]), ["odds_ratio", "odds_low", "odds_high"]] = np.nan
     order = {name: place for place, name in enumerate(names)}
     return table.sort_values("term", key=lambda terms: terms.map(order), kind="stable").reset_index(drop=True)

@@ -5,7 +5,7 @@ and no lower edge rises: U·δ >= 0 and L·δ <= 0 in every answer. If such a di
 separated (a cell of 0 or 100 %, or a combination of predictors that is), and the maximum lies at infinity (Albert &
 Anderson 1984). Edges that move along some such direction are open in the limit; the others alone decide the
 coefficients that no such direction touches, and the supremum of the likelihood is theirs. An answer without an edge
-left is certain.
+left is certain. Written here because statsmodels has nothing for it: it warns of perfect prediction and goes on.
 
 Reference: Konis (2007), Computational algorithms for detecting separation (linear programming), D.Phil., Oxford.
 """
@@ -69,22 +69,23 @@ def independent(model: Design) -> Bool[np.ndarray, " k"]:
     rank = 0
     for column in range(len(keep)):
         keep[column] = True
-        found = np.linalg.matrix_rank(rows[:, keep]) if len(rows) else 0
-        keep[column], rank = found > rank, found
+        rank_with = np.linalg.matrix_rank(rows[:, keep]) if len(rows) else 0
+        keep[column], rank = rank_with > rank, rank_with
     return keep
 
 
-def supremum(model: Design, start: Float[np.ndarray, " k"], found: Separation) -> float:
+def supremum(model: Design, start: Float[np.ndarray, " k"], separated: Separation) -> float:
     """The supremum of the log-likelihood, reached or not."""
-    if found.certain.all():
+    if separated.certain.all():
         return 0.0
-    rest, _, begin = decisive(model, start, found)
-    theta = ordered_logit.fit(rest, begin) if len(begin) else begin
-    return ordered_logit.log_likelihood(rest, theta)
+    rest, _, rest_start = decisive(model, start, separated)
+    if not len(rest_start):
+        return ordered_logit.log_likelihood(rest, rest_start)
+    return ordered_logit.fit(rest, rest_start).log_likelihood
 
 
 def decisive(
-    model: Design, start: Float[np.ndarray, " k"], found: Separation
+    model: Design, start: Float[np.ndarray, " k"], separated: Separation
 ) -> tuple[Design, Bool[np.ndarray, " k"], Float[np.ndarray, " j"]]:
     """The answers that are not certain, with as many coefficients as they decide, which these are, and a start.
 
@@ -92,19 +93,19 @@ def decisive(
     through the others only.
     """
     rest = Design(
-        np.where(found.upper[:, None], 0.0, model.upper),
-        np.where(found.lower[:, None], 0.0, model.lower),
-        np.where(found.upper, np.inf, model.upper_offset),
-        np.where(found.lower, -np.inf, model.lower_offset),
-    ).rows(~found.certain)
+        np.where(separated.upper[:, None], 0.0, model.upper),
+        np.where(separated.lower[:, None], 0.0, model.lower),
+        np.where(separated.upper, np.inf, model.upper_offset),
+        np.where(separated.lower, -np.inf, model.lower_offset),
+    ).rows(~separated.certain)
     keep = independent(rest)
     rows = _constraints(rest)
-    begin = np.linalg.lstsq(rows[:, keep], rows @ start, rcond=None)[0]  # the same edges as at `start`
-    return rest.columns(keep), keep, begin
+    rest_start = np.linalg.lstsq(rows[:, keep], rows @ start, rcond=None)[0]  # the same edges as at `start`
+    return rest.columns(keep), keep, rest_start
 
 
 def profile(
-    model: Design, column: int, start: Float[np.ndarray, " k"], found: Separation, level: float
+    model: Design, column: int, start: Float[np.ndarray, " k"], separated: Separation, level: float
 ) -> tuple[float, float, float]:
     """Profile-likelihood interval of a coefficient that has no finite estimate, and the p-value of 0.
 
@@ -113,15 +114,15 @@ def profile(
     answers as extreme as these, so that for a rate of 0 or 1 the interval and p are those of Clopper & Pearson; the
     quantile of χ² would leave out up to 15 % there.
     """
-    if found.falls[column] and found.rises[column]:
+    if separated.falls[column] and separated.rises[column]:
         return -np.inf, np.inf, 1.0
-    sign = 1.0 if found.rises[column] else -1.0
-    top = supremum(model, start, found)
+    sign = 1.0 if separated.rises[column] else -1.0
+    top = supremum(model, start, separated)
     others = np.arange(len(start)) != column
-    at_a_value = separation(model.fixed(column, 0.0))  # the same for every value
+    separated_others = separation(model.fixed(column, 0.0))  # the same for every value
 
-    def drop(size):
-        return 2 * (top - supremum(model.fixed(column, sign * size), start[others], at_a_value))
+    def drop(size: float) -> float:
+        return 2 * (top - supremum(model.fixed(column, sign * size), start[others], separated_others))
 
     quantile = -2 * np.log((1 - level) / 2)
     high = low = 1.0  # in `size`, along which the drop falls to 0
@@ -134,22 +135,22 @@ def profile(
     return (sign * end, np.inf, p_value) if sign > 0 else (-np.inf, sign * end, p_value)
 
 
-def _constraints(model):
+def _constraints(model: Design) -> Float[np.ndarray, "r k"]:
     """Rows a with a·δ >= 0 for every direction along which nothing is lost: upper edges, then lower ones."""
     has_upper, has_lower = np.isfinite(model.upper_offset), np.isfinite(model.lower_offset)
     return np.vstack([model.upper[has_upper], -model.lower[has_lower]])
 
 
-def _largest_support(rows):
+def _largest_support(rows: Float[np.ndarray, "r k"]) -> Bool[np.ndarray, " r"]:
     """Which rows some feasible direction moves: maximise Σ min(a·δ, 1); sums of directions are directions."""
     count, k = rows.shape
     cost = np.concatenate([np.zeros(k), -np.ones(count)])
     bounds = [(None, None)] * k + [(0, 1)] * count
-    found = linprog(cost, A_ub=np.hstack([-rows, np.eye(count)]), b_ub=np.zeros(count), bounds=bounds)
-    return found.x[k:] > 0.5
+    direction_and_moves = linprog(cost, A_ub=np.hstack([-rows, np.eye(count)]), b_ub=np.zeros(count), bounds=bounds).x
+    return direction_and_moves[k:] > 0.5
 
 
-def _reach(rows, column, sign):
+def _reach(rows: Float[np.ndarray, "r k"], column: int, sign: int) -> float:
     """How far a direction in the unit cube that loses nothing can move a coefficient."""
     cost = np.zeros(rows.shape[1])
     cost[column] = -sign

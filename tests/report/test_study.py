@@ -90,7 +90,7 @@ def test_who_stopped_early_has_not_converged_for_that():
 
 def test_other_materials_are_the_others():
     """H1 to H3 are of the first material, and its figures are no evidence for H4."""
-    study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
+    study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20))
     optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.9, 0.5]]))
     found = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
     parts = {"found": found, "reference_name": "the truth"}

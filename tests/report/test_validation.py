@@ -59,20 +59,18 @@ def test_what_one_comparison_can_say():
 
 @pytest.mark.parametrize(("people", "few"), [(9, True), (14, False)])
 def test_what_is_shown_is_what_the_warning_says_to_report(people, few):
-    """Of few clusters the wider of the clustered and the wild bootstrap interval, as the table's own warning has it."""
+    """The widest of the iid and clustered intervals; few clusters are warned about."""
     answers = paper_counts(np.random.default_rng(1))
     names = answers["participant"].unique()[:people]
     table = validate(answers[answers["participant"].isin(names)]).regressions()["II"]
-    assert any("wild bootstrap interval" in words for words in table.warnings) == few
-    kinds = table.table[few | ~table.table["errors"].str.startswith("wild")]
-    widest = (kinds["high"] - kinds["low"]).groupby(kinds["term"]).max()
+    assert any("report the widest of the iid and clustered" in words for words in table.warnings) == few
+    widest = (table.table["high"] - table.table["low"]).groupby(table.table["term"]).max()
     rows = safest(table).set_index("term")
     np.testing.assert_array_equal(rows["high"] - rows["low"], widest[rows.index])
-    assert rows["errors"].str.startswith("wild").any() == few
 
 
 def test_ties_are_kept_apart():
-    found = validate(paper_counts(np.random.default_rng(4), ties=20), bootstrap=False)
+    found = validate(paper_counts(np.random.default_rng(4), ties=20))
     assert found.people["ties"].sum() == 20 and found.people["wins"].sum() == 279
     assert found.overall["rate"].iloc[0] == pytest.approx(279 / 364)
 
@@ -81,7 +79,7 @@ def test_a_pair_that_was_only_tied_is_drawn():
     rows = [("A", 1, "best", "mid", "close", "similar", "tie"), ("A", 2, "mid", "worst", "similar", "different", "a")]
     rows += [("B", 1, "mid", "worst", "similar", "different", "b")]
     table = pd.DataFrame(rows, columns=COLUMNS)
-    assert set(validation_figures(validate(table, bootstrap=False))) == {"validation"}
+    assert set(validation_figures(validate(table))) == {"validation"}
 
 
 def test_words():
@@ -96,6 +94,6 @@ def test_simulated_judges_prefer_what_is_nearer():
     x = jnp.stack([jnp.asarray(near), jnp.asarray(near) + 0.1, jnp.array([0.05, 0.95, 0.9])])
     sets = sets_table(study, Sets(x, jnp.zeros(3), jnp.ones(3)), np.asarray(x)[2:], ("P01",))
     assert sets["set_id"].tolist() == ["best", "mid", "worst", "own-P01"] and sets["N"].eq(101).all()
-    found = validate(validation_table(study, PRESETS["paper"], sets, seed=3), sets.set_index("set_id"), bootstrap=False)
+    found = validate(validation_table(study, PRESETS["paper"], sets, seed=3), sets.set_index("set_id"))
     rates = found.tables.preferences.drop_duplicates(["set", "over"]).set_index(["set", "over"])["rate"]
     assert rates["best", "worst"] > 0.8 and rates["mid", "worst"] > 0.8 and found.comparisons == 20 * 12 + 8 * 2

@@ -99,7 +99,7 @@ def test_two_validation_tables_are_read_as_one(tmp_path):
     first, second = (VALIDATION + row.format(*cells) for cells in (("A", "a"), ("B", "b")))
     folder = folder_with(tmp_path, trials__csv=HEAD + ROW, **{"validation-1__csv": first, "validation-2__csv": second})
     (material,) = read_folder(folder).materials
-    found = validate(material.validation, bootstrap=False)
+    found = validate(material.validation)
     assert found.people["wins"].tolist() == [1, 0] and found.comparisons == 2
     twice = aggregate_comparisons(
         pd.concat([material.validation] * 2), {"aggregate": "aggregate", "individual:B": "individual:B"}

@@ -1,11 +1,11 @@
-"""Logits, sandwiches and the wild bootstrap once more, written otherwise: mpmath derivatives, plain sums, exact rays.
+"""Logits and sandwiches once more, written otherwise: mpmath derivatives, plain sums, exact rays.
 
 The likelihood is the difference of two logistic functions as it stands in a textbook, differentiated numerically with
-50 digits; covariances are loops over clusters; the bootstrap fits the linearised model to every set of signs by hand.
+50 digits; covariances are loops over clusters.
 """
 
 from collections import Counter
-from itertools import combinations, product
+from itertools import combinations
 
 import mpmath
 import numpy as np
@@ -76,23 +76,19 @@ class Reference:
         ]
         return gradient, [[hessian[min(i, j)][max(i, j)] for j in k] for i in k]
 
-    def fit(self, start, fixed=None):
-        """Newton's method with 50 digits; `fixed` = (coefficient, value) holds one of them."""
-        theta = [mp.mpf(float(t)) for t in start]
-        if fixed is not None:
-            theta[fixed[0]] = mp.mpf(float(fixed[1]))
-        free = [i for i in range(self.size) if fixed is None or i != fixed[0]]
-        for _ in range(60 if free else 0):
-            total, square = mp.zeros(len(free), 1), mp.zeros(len(free))
+    def fit(self, start):
+        """Newton's method with 50 digits."""
+        theta, k = [mp.mpf(float(t)) for t in start], range(self.size)
+        for _ in range(60):
+            total, square = mp.zeros(self.size, 1), mp.zeros(self.size)
             for (row, c), count in self.distinct.items():
                 gradient, hessian = self.derivatives(theta, row, c)
-                for a, i in enumerate(free):
-                    total[a] += count * gradient[i]
-                    for b, j in enumerate(free):
-                        square[a, b] -= count * hessian[i][j]
+                for i in k:
+                    total[i] += count * gradient[i]
+                    for j in k:
+                        square[i, j] -= count * hessian[i][j]
             step = mp.lu_solve(square, total)
-            for a, i in enumerate(free):
-                theta[i] += step[a]
+            theta = [theta[i] + step[i] for i in k]
             if mp.norm(step) < mp.mpf(10) ** -15:
                 break
         return theta
@@ -115,26 +111,6 @@ class Reference:
         if len(ways) == 2:
             pairs.append((-1, list(zip(*ways, strict=True))))
         return sum(sign * bread @ meat(score, labels) @ bread for sign, labels in pairs)
-
-    def wild(self, theta, j, value, *ways):
-        """|t| and every |t*| of the hypothesis, signs of the clusters of the smaller way in every combination."""
-        tilde = self.fit(theta, (j, value))
-        score, information = self.pieces(tilde)
-        inverse = np.linalg.inv(information.sum(axis=0))
-        small = min(ways, key=lambda way: len(set(way)))
-        names, found = sorted(set(small)), []
-        for signs in product((-1, 1), repeat=len(names)):
-            sign = dict(zip(names, signs, strict=True))
-            flipped = np.array([sign[g] * s for g, s in zip(small, score, strict=True)])
-            delta = inverse @ flipped.sum(axis=0)
-            left = np.array([s - h @ delta for s, h in zip(flipped, information, strict=True)])
-            pairs = [(1, list(way)) for way in ways]
-            if len(ways) == 2:
-                pairs.append((-1, list(zip(*ways, strict=True))))
-            variance = sum(s * (inverse @ meat(left, labels) @ inverse)[j, j] for s, labels in pairs)
-            found.append(abs(delta[j]) / np.sqrt(variance) if variance > 0 else np.inf)
-        error = np.sqrt(self.covariance(theta, *ways)[j, j])
-        return abs(float(theta[j]) - value) / error, np.array(found)
 
 
 def meat(score, labels):
