@@ -47,7 +47,7 @@ def model_at(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
 
 def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Float[Array, ""]:
     """Log density of the weak priors at `gp`, up to a constant; `centre` is where they are centred."""
-    here, there = coordinates_of(gp, learn), coordinates_of(centre, learn)
-    scale = dict.fromkeys(here, 1.0) | {"first": jnp.sqrt(centre.kernel.variance)}
-    parts = [jnp.sum(((here[k] - there[k]) / (_PRIOR_SD[k] * scale[k])) ** 2) for k in here]
-    return -0.5 * jnp.sum(jnp.stack(parts))
+    coordinates, centres = coordinates_of(gp, learn), coordinates_of(centre, learn)
+    scale = dict.fromkeys(coordinates, 1.0) | {"first": jnp.sqrt(centre.kernel.variance)}
+    squares = [jnp.sum(((coordinates[k] - centres[k]) / (_PRIOR_SD[k] * scale[k])) ** 2) for k in coordinates]
+    return -0.5 * jnp.sum(jnp.stack(squares))

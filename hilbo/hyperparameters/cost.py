@@ -9,6 +9,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jax.typing import DTypeLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.hyperparameters.coordinates import OF_THE_LIKELIHOOD, Coordinates, coordinates_of, log_prior, model_at
@@ -17,7 +18,7 @@ from hilbo.hyperparameters.laplace_evidence import Evidence, laplace_evidence
 from hilbo.kernels import gram
 from hilbo.numerics.linalg import one_at_a_time
 from hilbo.numerics.newton import Expansion, expanded
-from hilbo.ordinal_gp import OrdinalGP, OrdinalTerms, TiltedTerms, Trials, fit
+from hilbo.ordinal_gp import OrdinalGP, OrdinalProbit, OrdinalTerms, TiltedTerms, Trials, fit
 
 __all__ = ["Seen", "divisor", "evidence_cost", "person_ep_evidence", "person_evidence"]
 
@@ -37,8 +38,8 @@ def evidence_cost(
 ) -> tuple[Callable[[Coordinates, Seen], Expansion], Seen]:
     """The expansion of the cost of stacked `trials`, from coordinates and what was seen before, with what is seen
     there; and what was seen at first: nothing."""
-    begin = ravel_pytree(coordinates_of(gp, learn))[0]
-    zero = jnp.zeros((), begin.dtype)
+    initial = ravel_pytree(coordinates_of(gp, learn))[0]
+    zero = jnp.zeros((), initial.dtype)
     answers = divisor(trials)
     evidence = _differentiated if inference == "ep_corrected" else _closed
 
@@ -46,12 +47,12 @@ def evidence_cost(
         value, gradient, hessian, seen = evidence(gp, trials, inference, coordinates, last)
         if weak_priors:
             flat, restore = ravel_pytree(coordinates)
-            prior = expanded(lambda at: (log_prior(model_at(restore(at), gp), gp, learn), None), flat)
+            prior = expanded(lambda flat: (log_prior(model_at(restore(flat), gp), gp, learn), None), flat)
             value, gradient, hessian = value + prior.value, gradient + prior.gradient, hessian + prior.hessian
         return Expansion(-value / answers, -gradient / answers, -hessian / answers, seen)
 
-    place, moved = _unknown(trials, begin, inference)
-    return expand, Seen(zero, jnp.zeros((), bool), begin, place, moved)
+    place, moved = _unknown(trials, initial, inference)
+    return expand, Seen(zero, jnp.zeros((), bool), initial, place, moved)
 
 
 def divisor(trials: Trials) -> Float[Array, ""]:
@@ -60,13 +61,25 @@ def divisor(trials: Trials) -> Float[Array, ""]:
     return jnp.sum(trials.mask, dtype=trials.x.dtype) + 1.0
 
 
-def _unknown(trials, begin, inference):
-    none = jnp.zeros(trials.q.shape, begin.dtype)
+def _unknown(
+    trials: Trials, initial: Float[Array, " p"], inference: str
+) -> tuple[PyTree[Float[Array, "M n"]], PyTree[Float[Array, "M n p"]]]:
+    """Where posteriors are before any was sought, and how they move: a start that is none."""
+    none = jnp.zeros(trials.q.shape, initial.dtype)
     place = {"laplace": none, "ep": (none, none - jnp.inf)}.get(inference, ())
-    return place, jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, begin.size), leaf.dtype), place)
+    return place, jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape, initial.size), leaf.dtype), place)
 
 
-def _differentiated(gp, trials, inference, coordinates, last):
+class _Summed(NamedTuple):
+    """The log evidence of all people with its derivatives, and what was seen on the way."""
+
+    value: Float[Array, ""]
+    gradient: Float[Array, " p"]
+    hessian: Float[Array, "p p"]
+    seen: Seen
+
+
+def _differentiated(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> _Summed:
     """Value, gradient and Hessian of the summed evidence by automatic differentiation."""
     del last
     flat, restore = ravel_pytree(coordinates)
@@ -79,23 +92,24 @@ def _differentiated(gp, trials, inference, coordinates, last):
         evidences, converged = jax.vmap(one, in_axes=(None, 0))(model_at(restore(flat), gp), trials)
         return jnp.sum(evidences), jnp.all(converged)
 
-    found = expanded(summed, flat)
-    return *found[:3], Seen(found.value, found.aux, flat, (), ())
+    evidence = expanded(summed, flat)
+    return _Summed(*evidence[:3], Seen(evidence.value, evidence.aux, flat, (), ()))
 
 
-def _closed(gp, trials, inference, coordinates, last):
+def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordinates, last: Seen) -> _Summed:
     """The same by closed derivatives; the posteriors are sought from where the last ones point."""
     expansion = {"laplace": person_evidence, "ep": person_ep_evidence}[inference]
     flat, _ = ravel_pytree(coordinates)
-    ahead = flat - last.at
-    starts = jax.tree.map(lambda place, moved: place + moved @ ahead, last.place, last.moved)
+    step = flat - last.at
+    starts = jax.tree.map(lambda place, moved: place + moved @ step, last.place, last.moved)
     if trials.q.shape[0] > 1:
-        found = jax.vmap(expansion, in_axes=(None, None, 0, 0))(gp, coordinates, trials, starts)
+        evidence = jax.vmap(expansion, in_axes=(None, None, 0, 0))(gp, coordinates, trials, starts)
     else:
         alone = expansion(gp, coordinates, *jax.tree.map(lambda leaf: leaf[0], (trials, starts)))
-        found = jax.tree.map(lambda leaf: leaf[None], alone)
-    value, gradient, hessian = (jnp.sum(part, axis=0) for part in found[:3])
-    return value, gradient, hessian, Seen(value, jnp.all(found.certified), flat, found.place, found.moved)
+        evidence = jax.tree.map(lambda leaf: leaf[None], alone)
+    value, gradient, hessian = (jnp.sum(per_person, axis=0) for per_person in evidence[:3])
+    seen = Seen(value, jnp.all(evidence.certified), flat, evidence.place, evidence.moved)
+    return _Summed(value, gradient, hessian, seen)
 
 
 @one_at_a_time
@@ -104,9 +118,13 @@ def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, sta
 
     `start`: weights near which the mode is sought.
     """
-    covariance, likelihood, own, shape = _parts(gp, coordinates, trials, start.dtype)
+    split = _split(gp, coordinates, trials, start.dtype)
     return laplace_evidence(
-        covariance, lambda at: OrdinalTerms(likelihood(at), trials.q, trials.mask), own, shape, start
+        split.covariance,
+        lambda own: OrdinalTerms(split.likelihood(own), trials.q, trials.mask),
+        split.of_likelihood,
+        split.of_kernel,
+        start,
     )
 
 
@@ -115,20 +133,35 @@ def person_ep_evidence(
     gp: OrdinalGP, coordinates: Coordinates, trials: Trials, start: tuple[Float[Array, " n"], Float[Array, " n"]]
 ) -> Evidence:
     """The same by expectation propagation; `start`: means and log variances of cavities, as in [`ep_evidence`][]."""
-    covariance, likelihood, own, shape = _parts(gp, coordinates, trials, start[0].dtype)
-    return ep_evidence(covariance, lambda at: TiltedTerms(likelihood(at), trials.q, trials.mask), own, shape, start)
+    split = _split(gp, coordinates, trials, start[0].dtype)
+    return ep_evidence(
+        split.covariance,
+        lambda own: TiltedTerms(split.likelihood(own), trials.q, trials.mask),
+        split.of_likelihood,
+        split.of_kernel,
+        start,
+    )
 
 
-def _parts(gp, coordinates, trials, dtype):
+class _Split(NamedTuple):
     """K as a function of the kernel's coordinates, the likelihood as one of its own, and both as vectors."""
-    own = {name: value for name, value in coordinates.items() if name in OF_THE_LIKELIHOOD}
-    shape = {name: value for name, value in coordinates.items() if name not in OF_THE_LIKELIHOOD}
-    (flat_own, restore_own), (flat_shape, restore_shape) = ravel_pytree(own), ravel_pytree(shape)
 
-    def covariance(at):
-        return gram(model_at(own | restore_shape(at), gp).kernel, trials.x, trials.x)
+    covariance: Callable[[Float[Array, " k"]], Float[Array, "n n"]]
+    likelihood: Callable[[Float[Array, " l"]], OrdinalProbit]
+    of_likelihood: Float[Array, " l"]
+    of_kernel: Float[Array, " k"]
 
-    def likelihood(at):
-        return model_at(restore_own(at) | shape, gp).likelihood
 
-    return covariance, likelihood, flat_own.astype(dtype), flat_shape.astype(dtype)
+def _split(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, dtype: DTypeLike) -> _Split:
+    of_likelihood = {name: value for name, value in coordinates.items() if name in OF_THE_LIKELIHOOD}
+    of_kernel = {name: value for name, value in coordinates.items() if name not in OF_THE_LIKELIHOOD}
+    flat_likelihood, restore_likelihood = ravel_pytree(of_likelihood)
+    flat_kernel, restore_kernel = ravel_pytree(of_kernel)
+
+    def covariance(flat: Float[Array, " k"]) -> Float[Array, "n n"]:
+        return gram(model_at(of_likelihood | restore_kernel(flat), gp).kernel, trials.x, trials.x)
+
+    def likelihood(flat: Float[Array, " l"]) -> OrdinalProbit:
+        return model_at(restore_likelihood(flat) | of_kernel, gp).likelihood
+
+    return _Split(covariance, likelihood, flat_likelihood.astype(dtype), flat_kernel.astype(dtype))

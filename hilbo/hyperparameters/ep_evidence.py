@@ -50,13 +50,17 @@ def ep_evidence(
     save a quarter of the steps that variances take.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
-    here = terms(own)
-    (mean, variance), post, met = _settled(here, matrix, Cavities(start[0], jnp.exp(start[1])))
-    values, weights, precision = here(mean, variance)
-    moves = _moves(terms, own, (mean, variance), post, slopes)
+    tilted = terms(own)
+    settled = _settled(tilted, matrix, Cavities(start[0], jnp.exp(start[1])))
+    (mean, variance), post = settled.cavities, settled.post
+    values, weights, precision = tilted(mean, variance)
+    moves = _moves(terms, own, settled.cavities, post, slopes)
 
     def explicit(own):
         return jnp.sum(terms(own)(mean, variance)[0])
+
+    def curvature_at(eta):
+        return tilted(eta - variance * weights, variance)[2]
 
     def paired(shape):
         return jnp.sum(covariance(shape) * pairing)
@@ -70,34 +74,38 @@ def ep_evidence(
     joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
     value = joined - 0.5 * weights @ mean - 0.5 * post.log_determinant
     gaussian = mean + variance * weights, weights, precision
-    sure = met & certified(value, matrix, gaussian, post, lambda eta: here(eta - variance * weights, variance)[2])
+    sure = settled.met & certified(value, matrix, gaussian, post, curvature_at)
     place, moved = (mean, jnp.log(variance)), (moves.mean, moves.variance / variance[:, None])
     return Evidence(value, gradient, hessian, place, moved, sure)
 
 
 class _Attempt(NamedTuple):
+    """A fixed point, its posterior, and whether the residual was met."""
+
     cavities: Cavities
     post: Conditioned
     met: Bool[Array, ""]
     left: Int[Array, ""]  # attempts
 
 
-def _settled(terms, matrix, start):
-    """The fixed point and its posterior, and whether the residual was met: in haste, or else once more without."""
+def _settled(terms: Tilted, matrix: Float[Array, "n n"], start: Cavities) -> _Attempt:
+    """The fixed point, in haste, or else once more without."""
 
-    def attempt(last):
-        *cavities, found = find(terms, matrix, last.cavities, _STEPS, last.left == 2)
+    def attempt(last: _Attempt) -> _Attempt:
+        mean, variance, search = find(terms, matrix, last.cavities, _STEPS, last.left == 2)
+        cavities = Cavities(mean, variance)
         _, weights, precision = terms(*cavities)
         post = conditioned(matrix, precision)
         posterior = post.variance, lambda y: post.inverse @ y
-        seen = residual_of(matrix, Cavities(*cavities), weights, precision, posterior)
-        unseen = jnp.isinf(found.residual)
-        met = jnp.where(unseen, seen, found.residual) <= found.tolerance
-        return _Attempt(Cavities(*cavities), post, met, jnp.where(met | ~unseen, 0, last.left - 1))
+        measured = residual_of(matrix, cavities, weights, precision, posterior)
+        unmeasured = jnp.isinf(search.residual)
+        met = jnp.where(unmeasured, measured, search.residual) <= search.tolerance
+        return _Attempt(cavities, post, met, jnp.where(met | ~unmeasured, 0, last.left - 1))
 
-    post = jax.tree.map(lambda part: jnp.zeros(part.shape, part.dtype), jax.eval_shape(conditioned, matrix, start.mean))
-    begin = _Attempt(start, post, jnp.asarray(False), jnp.asarray(2))
-    return jax.lax.while_loop(lambda last: last.left > 0, attempt, begin)[:3]
+    shapes = jax.eval_shape(conditioned, matrix, start.mean)
+    post = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+    initial = _Attempt(start, post, jnp.asarray(False), jnp.asarray(2))
+    return jax.lax.while_loop(lambda last: last.left > 0, attempt, initial)
 
 
 class _Moves(NamedTuple):
@@ -113,7 +121,14 @@ class _Moves(NamedTuple):
     widened: Float[Array, "n p"]
 
 
-def _moves(terms, own, cavities, post, slopes):
+def _moves(
+    terms: Callable[[Float[Array, " l"]], Tilted],
+    own: Float[Array, " l"],
+    cavities: Cavities,
+    post: Conditioned,
+    slopes: Float[Array, "n n k"],
+) -> _Moves:
+    """`slopes`: dK/dx of the covariance's hyperparameters, which come after the terms' `own`."""
     mean, variance = cavities
     sites = sites_of(terms(own), mean, variance)
     ratio = (1.0 + variance * sites.precision)[:, None]
@@ -122,7 +137,8 @@ def _moves(terms, own, cavities, post, slopes):
 
     without = jnp.zeros((mean.size, slopes.shape[2]), mean.dtype)
     slope_x, precision_x = (
-        jnp.concatenate([part, without], axis=1) for part in jax.jacfwd(lambda own: terms(own)(mean, variance)[1:])(own)
+        jnp.concatenate([by_own, without], axis=1)
+        for by_own in jax.jacfwd(lambda own: terms(own)(mean, variance)[1:])(own)
     )
     fixed = jnp.zeros((mean.size, own.size), mean.dtype)
     pulled = jnp.concatenate([fixed, jnp.einsum("ijk,j->ik", slopes, sites.slope)], axis=1)
@@ -138,16 +154,18 @@ def _moves(terms, own, cavities, post, slopes):
     return _Moves(by_mean, by_variance, slope, precision, slope_x, precision_x, pulled, widened)
 
 
-def _bilinear(weights, precision, variance, moves):
+def _bilinear(
+    weights: Float[Array, " n"], precision: Float[Array, " n"], variance: Float[Array, " n"], moves: _Moves
+) -> Float[Array, "p p"]:
     """Products of two first derivatives; symmetric but for rounding, which is shared out."""
     stretch = (1.0 + variance * precision)[:, None]
     by_variance = weights[:, None] * moves.slope_x - 0.5 * moves.precision_x / stretch**2
-    own = moves.slope_x.T @ moves.mean + by_variance.T @ moves.variance
-    shape = moves.pulled.T @ moves.slope - 0.5 * moves.widened.T @ moves.precision
-    return 0.5 * (own + shape + (own + shape).T)
+    by_terms = moves.slope_x.T @ moves.mean + by_variance.T @ moves.variance
+    by_matrix = moves.pulled.T @ moves.slope - 0.5 * moves.widened.T @ moves.precision
+    return 0.5 * (by_terms + by_matrix + (by_terms + by_matrix).T)
 
 
-def _twice(post, slopes):
+def _twice(post: Conditioned, slopes: Float[Array, "n n k"]) -> Float[Array, "k k"]:
     """tr(C K_k C K_j) / 2."""
     through = jnp.einsum("ij,jlk->kil", post.inverse, slopes)
     return 0.5 * jnp.einsum("kil,jli->kj", through, through)

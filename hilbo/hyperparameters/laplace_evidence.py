@@ -102,32 +102,32 @@ def laplace_evidence(
     `start`: weights near which the mode is sought; where that fails it is sought anew.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
-    here = terms(own)
-    found = find_mode(here, matrix, start, _STEPS)
-    values, weights, curvature = here(found.eta)
+    pointwise = terms(own)
+    mode = find_mode(pointwise, matrix, start, _STEPS)
+    values, weights, curvature = pointwise(mode.eta)
     post = conditioned(matrix, curvature)
-    paths = _paths(terms, own, found.eta, post, slopes, (matrix, weights, curvature))
+    paths = _paths(terms, own, mode.eta, post, slopes, (matrix, weights, curvature))
 
     bent = matrix @ paths.adjoint
 
     def along(step):
-        value, slope, curved = terms(own + step[: own.size])(found.eta + paths.mean @ step)
+        value, slope, curved = terms(own + step[: own.size])(mode.eta + paths.mean @ step)
         return jnp.sum(value - 0.5 * post.variance * curved + bent * slope)
 
-    def paired(at):
-        return jnp.sum(covariance(at) * pairing)
+    def paired(shape):
+        return jnp.sum(covariance(shape) * pairing)
 
     pairing = 0.5 * (weights + 2.0 * paths.adjoint)[:, None] * weights[None, :] - 0.5 * post.inverse
-    nowhere = jnp.zeros(own.size + shape.size, found.eta.dtype)
-    first, second = jax.jacfwd(along)(nowhere), jax.jacfwd(jax.jacfwd(along))(nowhere)
+    no_step = jnp.zeros(own.size + shape.size, mode.eta.dtype)
+    first, second = jax.jacfwd(along)(no_step), jax.jacfwd(jax.jacfwd(along))(no_step)
     # `along` moves eta too: what that adds, its slope a + lambda there times m, is no part of the gradient.
     gradient = first - (weights + paths.adjoint) @ paths.mean
     gradient = gradient.at[own.size :].add(jnp.einsum("ij,ijk->k", pairing, slopes))
     hessian = second + _bilinear(matrix, post, slopes, paths)
     hessian = hessian.at[own.size :, own.size :].add(jax.jacfwd(jax.jacfwd(paired))(shape))
-    value = jnp.sum(values) - 0.5 * weights @ found.eta - 0.5 * post.log_determinant
-    sure = certified(value, matrix, (found.eta, weights, curvature), post, lambda eta: here(eta)[2])
-    return Evidence(value, gradient, hessian, weights, paths.weights, (found.residual <= found.tolerance) & sure)
+    value = jnp.sum(values) - 0.5 * weights @ mode.eta - 0.5 * post.log_determinant
+    sure = certified(value, matrix, (mode.eta, weights, curvature), post, lambda eta: pointwise(eta)[2])
+    return Evidence(value, gradient, hessian, weights, paths.weights, (mode.residual <= mode.tolerance) & sure)
 
 
 class _Paths(NamedTuple):
@@ -139,8 +139,16 @@ class _Paths(NamedTuple):
     adjoint: Float[Array, " n"]
 
 
-def _paths(terms, own, eta, post, slopes, at):
-    matrix, weights, curvature = at
+def _paths(
+    terms: Callable[[Float[Array, " l"]], Terms],
+    own: Float[Array, " l"],
+    eta: Float[Array, " n"],
+    post: Conditioned,
+    slopes: Float[Array, "n n k"],
+    posterior: tuple[Float[Array, "n n"], Float[Array, " n"], Float[Array, " n"]],
+) -> _Paths:
+    """`slopes`: dK/dx of the covariance's hyperparameters; `posterior`: K, weights and curvatures at the mode."""
+    matrix, weights, curvature = posterior
 
     def nearby(own, shift):
         return terms(own)(eta + shift)[1:]
@@ -149,7 +157,7 @@ def _paths(terms, own, eta, post, slopes, at):
         jax.jacfwd(nearby, argnums=side)(own, jnp.zeros_like(weights[0])) for side in (0, 1)
     )
     unmoved = jnp.zeros((eta.size, slopes.shape[2]), eta.dtype)
-    slope_x, curvature_x = (jnp.concatenate([part, unmoved], axis=1) for part in (slope_own, curvature_own))
+    slope_x, curvature_x = (jnp.concatenate([by_own, unmoved], axis=1) for by_own in (slope_own, curvature_own))
     by_matrix = jnp.concatenate([matrix @ slope_own, jnp.einsum("ijk,j->ik", slopes, weights)], axis=1)
     mean = post.transfer.T @ by_matrix
     return _Paths(
@@ -160,16 +168,18 @@ def _paths(terms, own, eta, post, slopes, at):
     )
 
 
-def _bilinear(matrix, post, slopes, paths):
+def _bilinear(
+    matrix: Float[Array, "n n"], post: Conditioned, slopes: Float[Array, "n n k"], paths: _Paths
+) -> Float[Array, "p p"]:
     """What is left of the Hessian: products of two first derivatives."""
-    own, count = paths.mean.shape[1] - slopes.shape[2], slopes.shape[2]
+    terms_count, count = paths.mean.shape[1] - slopes.shape[2], slopes.shape[2]
     through = [post.inverse @ slopes[:, :, k] for k in range(count)]
     narrowed = [jnp.sum(post.transfer * (slopes[:, :, k] @ post.transfer), axis=0) for k in range(count)]
     nothing = jnp.zeros_like(paths.adjoint)
-    widened = jnp.stack([nothing] * own + narrowed, axis=1)
-    pulled = jnp.stack([nothing] * own + [slopes[:, :, k] @ paths.adjoint for k in range(count)], axis=1)
+    widened = jnp.stack([nothing] * terms_count + narrowed, axis=1)
+    pulled = jnp.stack([nothing] * terms_count + [slopes[:, :, k] @ paths.adjoint for k in range(count)], axis=1)
     crossed = pulled.T @ paths.weights - 0.5 * widened.T @ paths.curvature
     curved = 0.5 * paths.curvature.T @ (post.covariance**2 @ paths.curvature)
     hessian = crossed + crossed.T + curved - paths.weights.T @ matrix @ paths.weights
     twice = jnp.array([[jnp.sum(a * b.T) for a in through] for b in through]) if count else jnp.zeros((0, 0))
-    return hessian.at[own:, own:].add(0.5 * twice.astype(matrix.dtype))
+    return hessian.at[terms_count:, terms_count:].add(0.5 * twice.astype(matrix.dtype))

@@ -30,7 +30,7 @@ from hilbo.errors import InputError
 from hilbo.hyperparameters.coordinates import Coordinates, Learnable, coordinates_of, model_at
 from hilbo.hyperparameters.cost import divisor, evidence_cost
 from hilbo.numerics.linalg import eigh, one_at_a_time
-from hilbo.numerics.newton import TrustRegionNewton, arrives
+from hilbo.numerics.newton import Expansion, TrustRegionNewton, arrives
 from hilbo.ordinal_gp import OrdinalGP, Trials
 
 __all__ = ["Learned", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
@@ -93,18 +93,28 @@ def maximise_shared_evidence(
     return _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference)
 
 
-def _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference):
+def _maximise(
+    gp: OrdinalGP,
+    trials: Trials,
+    learn: Sequence[str],
+    weak_priors: bool,
+    starts: int,
+    max_steps: int,
+    inference: str,
+) -> Learned:
     learn = _checked(learn)
     if inference == "exact":
         raise InputError(
             'hyperparameters: inference "exact" has no derivatives to learn by; use "ep", which is near it.'
         )
-    options = _Search(learn, weak_priors, starts, max_steps, inference)
+    options = _Options(learn, weak_priors, starts, max_steps, inference)
     # Person by person on a CPU: each search stops when it is done, where a batch would wait for its slowest.
-    return one_at_a_time(lambda gp, trials: _searched(gp, trials, options))(gp, trials)
+    return one_at_a_time(lambda gp, trials: _search(gp, trials, options))(gp, trials)
 
 
-class _Search(NamedTuple):
+class _Options(NamedTuple):
+    """What is sought, and how; static."""
+
     learn: tuple[str, ...]
     weak_priors: bool
     starts: int
@@ -112,17 +122,18 @@ class _Search(NamedTuple):
     inference: str
 
 
-def _searched(gp, trials, options):
+def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> Learned:
+    """The best end of searches from several starts; `trials` are stacked."""
     expand, nothing = evidence_cost(gp, trials, options.learn, options.weak_priors, options.inference)
 
     def cost(coordinates, _):
         """The search asks this for shapes alone."""
-        there = expand(coordinates, nothing)
-        return there.value, there.aux
+        expansion = expand(coordinates, nothing)
+        return expansion.value, expansion.aux
 
     def ended(carry, start):
-        known, last = carry
-        begun = expand(start, last)
+        earlier_ends, last = carry
+        first = expand(start, last)
         solution = optx.minimise(
             cost,
             TrustRegionNewton(),
@@ -130,33 +141,36 @@ def _searched(gp, trials, options):
             has_aux=True,
             max_steps=options.max_steps,
             throw=False,
-            options={"expand": expand, "begun": begun, "known": known},
+            options={"expand": expand, "begun": first, "known": earlier_ends},
         )
         # An evidence without its certificate is no evidence: such an end never wins. Nor one that is known already.
-        end, joined = solution.state.here, arrives(solution.value, solution.state.move, known)
+        end, joined = solution.state.here, arrives(solution.value, solution.state.move, earlier_ends)
         certified = end.aux.certified
         value = jnp.where(certified & jnp.isfinite(end.value) & ~joined, end.value, jnp.inf)
         done = (solution.result == optx.RESULTS.successful) & certified
-        found = jnp.where(done & ~joined, end.aux.at, jnp.nan)
-        known = jnp.concatenate([known[1:], found[None, :]])
+        own_end = jnp.where(done & ~joined, end.aux.at, jnp.nan)
+        ends = jnp.concatenate([earlier_ends[1:], own_end[None, :]])
         steps = jnp.asarray(solution.stats["num_steps"]) + 1
-        return (known, begun.aux), _End(solution.value, value, end.aux.log_evidence, steps, done, _flat(end, trials))
+        flat = _flat(end, trials)
+        return (ends, first.aux), _End(solution.value, value, end.aux.log_evidence, steps, done, flat)
 
-    begin = coordinates_of(gp, options.learn)
+    initial = coordinates_of(gp, options.learn)
     # One search after the other: each stops when it is done, or on its way to where an earlier one ended; and its first
     # evidence is sought from the one before's.
-    unknown = jnp.full((options.starts, nothing.at.size), jnp.nan, nothing.at.dtype)
-    _, ends = jax.lax.scan(ended, (unknown, nothing), _spread(begin, options.starts))
+    no_ends = jnp.full((options.starts, nothing.at.size), jnp.nan, nothing.at.dtype)
+    _, ends = jax.lax.scan(ended, (no_ends, nothing), _spread(initial, options.starts))
     # The search from the model itself wins a tie: where there are no answers, and where no search ended well.
-    own_first = (jnp.arange(options.starts) + _own(options.starts)) % options.starts
-    best = own_first[jnp.argmin(ends.value[own_first])]
+    model_first = (jnp.arange(options.starts) + _row_of_model(options.starts)) % options.starts
+    best = model_first[jnp.argmin(ends.value[model_first])]
     end = jax.tree.map(lambda leaf: leaf[best], ends)
-    moved = [jnp.max(jnp.abs(end.at[k] - begin[k])) for k in begin if k != "first" and begin[k].size]
+    moved = [jnp.max(jnp.abs(end.at[k] - initial[k])) for k in initial if k != "first" and initial[k].size]
     runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | end.flat
     return Learned(model_at(end.at, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
 
 
 class _End(NamedTuple):
+    """Where a search ended; `value` is infinite where it does not count."""
+
     at: Coordinates
     value: Float[Array, ""]
     log_evidence: Float[Array, ""]
@@ -165,16 +179,17 @@ class _End(NamedTuple):
     flat: Bool[Array, ""]
 
 
-def _flat(end, trials):
+def _flat(end: Expansion, trials: Trials) -> Bool[Array, ""]:
+    """Whether the evidence leaves some hyperparameter open: its smallest curvature says so."""
     return eigh(end.hessian)[0][0] * divisor(trials) < _FLAT
 
 
-def _checked(learn):
+def _checked(learn: Sequence[str]) -> tuple[str, ...]:
     learn = tuple(learn)
     unknown = [name for name in learn if name not in get_args(Learnable)]
     if unknown or not learn:
-        found = f'"{unknown[0]}"' if unknown else "nothing"
-        raise InputError(f"hyperparameters: asked to learn {found}; choose from {', '.join(get_args(Learnable))}.")
+        asked = f'"{unknown[0]}"' if unknown else "nothing"
+        raise InputError(f"hyperparameters: asked to learn {asked}; choose from {', '.join(get_args(Learnable))}.")
     if {"variance", "noise", "thresholds"} <= set(learn):
         raise InputError(
             "hyperparameters: variance, noise and thresholds cannot all be learnt, because the scale of the latent"
@@ -183,18 +198,18 @@ def _checked(learn):
     return learn
 
 
-def _own(starts):
+def _row_of_model(starts: int) -> int:
     """Which of the starting points is the model itself."""
     return (starts - 1) // 2
 
 
-def _spread(begin: Coordinates, starts: int) -> Coordinates:
+def _spread(initial: Coordinates, starts: int) -> Coordinates:
     """Starting points in a row: theta (and noise, the other way) by rising powers of 2, the model itself amid them."""
-    power = (jnp.arange(starts) - _own(starts)).astype(begin[next(iter(begin))].dtype)
+    power = (jnp.arange(starts) - _row_of_model(starts)).astype(initial[next(iter(initial))].dtype)
     step = {"theta": 1.4, "noise": -0.7}  # 4 and 1/2, as logarithms
     return {
         name: value[None] + (step.get(name, 0.0) * power).reshape(-1, *(1,) * value.ndim)
-        for name, value in begin.items()
+        for name, value in initial.items()
     }
 
 
