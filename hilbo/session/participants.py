@@ -180,10 +180,10 @@ def _without(path, participant):
     theirs = {"participant": participant, "source": f"individual:{participant}"}
     wanted = [(head.index(column), value) for column, value in theirs.items() if column in head]
     kept = [row for row in rows[1:] if not any(len(row) > i and row[i] == value for i, value in wanted)]
-    gone = len(rows) - 1 - len(kept)
-    if wanted and gone:
+    removed = len(rows) - 1 - len(kept)
+    if wanted and removed:
         _replace(path, [head, *kept])
-        return gone
+        return removed
     return 0
 
 
@@ -200,8 +200,8 @@ def _netcdf_without(path, participant):
     for group in groups.values():
         if "participant" in group and group["participant"].dims in (("participant",), ("obs_id",)):
             keep[group["participant"].dims[0]] = group["participant"].values != participant
-    gone = max((int((~kept).sum()) for kept in keep.values()), default=0)
-    if gone:
+    removed = max((int((~kept).sum()) for kept in keep.values()), default=0)
+    if removed:
         here = {name: {dim: kept for dim, kept in keep.items() if dim in g.dims} for name, g in groups.items()}
         tree = xr.DataTree.from_dict({name: group.isel(here[name]).drop_encoding() for name, group in groups.items()})
         made = path.with_name(f".{path.name}-new")
@@ -210,4 +210,4 @@ def _netcdf_without(path, participant):
             os.replace(made, path)
         finally:
             made.unlink(missing_ok=True)
-    return gone
+    return removed

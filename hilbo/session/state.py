@@ -98,10 +98,11 @@ class LiveSession:
 
     def skipped(self, block: int) -> list[int]:
         """Planned trials that hold an excluded rendering and have no answer."""
-        gone = self.excluded(block)
-        if not gone:
+        excluded = self.excluded(block)
+        if not excluded:
             return []
-        names = {t.sets[side] for t in self.trials if t.block == block for side in t.sets if t.renderings[side] in gone}
+        here = [t for t in self.trials if t.block == block]
+        names = {t.sets[side] for t in here for side in t.sets if t.renderings[side] in excluded}
         have = {t.planned for t in self.answers(block)}
         plan = self.header.blocks[block].trials
         return [i for i, p in enumerate(plan) if i not in have and {p.a, p.b} & names]
@@ -110,8 +111,8 @@ class LiveSession:
         """The next planned trial without an answer; None where the block has enough, or none is left."""
         if len(self.answers(block)) >= self.quota(block):
             return None
-        gone = {t.planned for t in self.answers(block)} | set(self.skipped(block))
-        return next((i for i in range(len(self.header.blocks[block].trials)) if i not in gone), None)
+        done = {t.planned for t in self.answers(block)} | set(self.skipped(block))
+        return next((i for i in range(len(self.header.blocks[block].trials)) if i not in done), None)
 
     def full(self, block: int) -> bool:
         """Whether a block has all its answers, or nothing more to ask."""
@@ -233,8 +234,8 @@ def _made_void(state, trial, by, reason):
     sides = [trial.on] if trial.on in trial.renderings else sorted(trial.felt)  # what nobody felt is not to blame
     state = state.dropped() if changes else state
     state = state.with_trial(trial.id, status="void", on=None, voided={"by": by, "reason": reason, "sides": sides})
-    gone = state.excluded(trial.block)
-    if trial.repeats and not any(rendering in gone for rendering in trial.renderings.values()):
+    excluded = state.excluded(trial.block)
+    if trial.repeats and not any(rendering in excluded for rendering in trial.renderings.values()):
         state = replace(state, wanted=(trial.repeats, *state.wanted))
     return state
 
