@@ -1,4 +1,4 @@
-"""A new person's answers are foretold from the map and from how people differ about it; what a map knows is told by
+"""A new person's answers are predicted from the map and from how people differ about it; what a map knows is told by
 its own variance without answers."""
 
 import dataclasses

@@ -121,7 +121,7 @@ def test_a_search_that_may_end_early_reads_the_map_off_its_last_expansion():
 
 
 @pytest.mark.deep
-def test_a_streamed_optimum_foretells_a_new_person():
+def test_a_streamed_optimum_predicts_a_new_person():
     streamed = dataclasses.replace(fitted().population, rule="hierarchical", share=0.6)
     found = optima_from(streamed, candidates(), sums(streamed, candidates()), ("hierarchical", "average"))
     for rule, share in (("hierarchical", jnp.asarray(0.6)), ("average", None)):
