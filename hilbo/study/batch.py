@@ -22,7 +22,7 @@ from jax.sharding import PartitionSpec
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from hilbo.gaussian import Certificate, factor, mean_and_explained
+from hilbo.gaussian import factor, mean_and_explained
 from hilbo.kernels import RBF, gram
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.pointwise import Rule, Sums, terms
@@ -251,7 +251,7 @@ def _predictor_again(study: Study, inference: Inference, trials: Trials, mode: F
     return _Predictor(kernel, trials.x, weights, root, root.T @ root)
 
 
-def _as_dict(record: Certificate) -> dict[str, Array]:
+def _as_dict(record: eqx.Module) -> dict[str, Array]:
     return {name: getattr(record, name) for name in record.__dataclass_fields__}
 
 
