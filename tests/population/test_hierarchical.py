@@ -87,7 +87,7 @@ def test_the_shared_function_by_brute_force():
     np.testing.assert_allclose(variance, 0.4 - np.sum(0.4 * k(new, x) * solve[:, 1:].T, axis=1), rtol=1e-9)
 
 
-@pytest.mark.parametrize("share", [0.2, 0.9])
+@pytest.mark.parametrize("share", [0.2, pytest.param(0.9, marks=pytest.mark.deep)])
 def test_the_learnt_share_holds_the_true_one(share):
     found = learn_share(GP, of_people(simulated(12, 25, share, seed=3)))
     low, high = found.interval

@@ -53,7 +53,7 @@ def test_every_rule_is_the_papers(rule, count):
         np.testing.assert_allclose([mean[i], variance[i]], [float(e) for e in expected], rtol=1e-12)
 
 
-@given(st.integers(0, 1000), st.integers(1, 40))
+@given(st.integers(0, 1000), st.sampled_from([1, 2, 7, 40]))  # each count is a program of its own
 @settings(max_examples=25, deadline=None)
 def test_share_one_is_the_committee_machine(seed, count):
     means, explained = map(jnp.asarray, people(count, 3, seed))
