@@ -17,9 +17,9 @@ VIDEO = ["hilbo/data/video_quality.csv", "--study", "hilbo/data/video_quality.to
 HELP = """
 import sys
 sys.argv = ["hilbo", "--help"]
-from hilbo import cli
+from hilbo.cli.main import main
 try:
-    cli.main()
+    main()
 finally:
     assert "jax" not in sys.modules
 """
