@@ -32,6 +32,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
+from hilbo.numerics.tracing import traced_once
 
 __all__ = ["OrdinalProbit", "confined_normal"]
 
@@ -137,6 +138,7 @@ class _Truncated(NamedTuple):
 
 
 @jax.custom_jvp
+@traced_once
 def _truncated(
     f: Float[Array, ""], lower: Float[Array, ""], upper: Float[Array, ""], noise: Float[Array, ""]
 ) -> _Truncated:
@@ -172,6 +174,7 @@ def _truncated(
 
 
 @_truncated.defjvp
+@traced_once
 def _truncated_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[_Truncated, _Truncated]:
     """Each output's derivative in terms of the outputs; derivations in docs/design.md, "Ordinal likelihood"."""
     f, lower, upper, noise = primals

@@ -29,6 +29,7 @@ from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.tracing import traced_once
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "OrdinalTerms", "Posterior", "Trials", "fit"]
 
@@ -129,6 +130,7 @@ class OrdinalTerms(eqx.Module):
     q: Int[Array, " n"]
     mask: Bool[Array, " n"]
 
+    @traced_once
     def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
         expansion = jax.vmap(self.likelihood.expand)(eta, self.q)
         value, slope, curvature = (jnp.where(self.mask, term, jnp.zeros_like(term)) for term in expansion)
@@ -142,6 +144,7 @@ class TiltedTerms(eqx.Module):
     q: Int[Array, " n"]
     mask: Bool[Array, " n"]
 
+    @traced_once
     def __call__(
         self, mean: Float[Array, " n"], variance: Float[Array, " n"]
     ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:

@@ -34,7 +34,8 @@ settings.register_profile("fixed", deadline=None, derandomize=True)
 settings.register_profile("search", deadline=None, max_examples=500, print_blob=True)
 settings.load_profile("fixed")
 
-MANY_MAPPINGS = 15_000
+MANY_MAPPINGS = 30_000
+gc.set_threshold(200_000, 50, 1000)  # traces are many small objects: Python's own thresholds cost a sixth
 REQUIRE_ALL = os.environ.get("HILBO_REQUIRE_ALL", "") not in ("", "0")
 
 

@@ -156,7 +156,7 @@ def disagreements(count, N=101):
     return undecided.sum()
 
 
-@pytest.mark.parametrize("N", [1, 25, 101])
+@pytest.mark.parametrize("N", [101, *(pytest.param(N, marks=pytest.mark.deep) for N in (1, 25))])
 def test_the_certificate_agrees_with_the_closed_form(N):
     assert disagreements(256, N) == 0
 

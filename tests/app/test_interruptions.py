@@ -133,6 +133,7 @@ class Page:
         ask(self.live, f"/api/participant/{name}", data=b"{}", **headers).close()
 
 
+@pytest.mark.deep  # waits 7 s
 def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tmp_path, monkeypatch):
     monkeypatch.setattr(watchers, "_SILENT", 0.0)  # no program counts
     monkeypatch.setattr(watchers, "_QUIET", QUIET)

@@ -31,6 +31,7 @@ def test_help_answers_without_jax():
     assert "aggregate" in done.stdout
 
 
+@pytest.mark.deep  # compiles what test_results and `make demo` compile
 def test_aggregate_writes_everything(capsys, monkeypatch, tmp_path):
     out = tmp_path / "results"
     code, stdout, _ = run(

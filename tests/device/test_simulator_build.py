@@ -42,6 +42,7 @@ def test_sources_that_do_not_compile_are_one_sentence(monkeypatch, tmp_path):
     assert not list(tmp_path.glob("hilbo/*/*"))
 
 
+@pytest.mark.deep
 def test_two_that_build_at_once_do_no_harm(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     code = "from hilbo.device.simulator import built; print(built())"

@@ -103,7 +103,7 @@ def test_a_minute_of_motion_at_two_hundred_sets(memory, bound, record_property):
     assert error <= bound
 
 
-@pytest.mark.parametrize("states", [None, 8, 12])
+@pytest.mark.parametrize("states", [None, 12, pytest.param(8, marks=pytest.mark.deep)])
 def test_skipping_without_contact_changes_no_bit(tmp_path, states):
     """Long enough off the surface for a history of taps to end; the exponentials end only where they are cleared."""
     source = (CORE / "hb_renderer.c").read_text()

@@ -26,7 +26,7 @@ def reference(data, shift):
     return np.array(second_order(prior, edges[data.q] - shift, edges[data.q + 1] - shift, data.noise))
 
 
-@pytest.mark.parametrize("make", [repeated, near_separable])
+@pytest.mark.parametrize("make", [repeated, pytest.param(near_separable, marks=pytest.mark.deep)])
 def test_against_the_textbook(make):
     """Evidence by cumulants from quadrature; mean and covariance as the evidence's slope and bend in the prior mean,
     by finite differences: E f = h + K dlog Z/dh, Cov f = K + K d2 log Z_EP/dh2 K."""

@@ -55,7 +55,7 @@ def test_against_two_other_methods(make):
     assert np.max(errors_apart(posterior.predict(x)[0], mean, error, posterior.standard_errors(x)[0])) < 3
 
 
-@pytest.mark.parametrize("make", [repeated, repeated_19])
+@pytest.mark.parametrize("make", [repeated, pytest.param(repeated_19, marks=pytest.mark.deep)])
 def test_against_quadrature(make):
     """On three stimuli everything is an integral over three numbers: mean, variance, class probabilities, evidence."""
     data, posterior = make(), fitted(make)

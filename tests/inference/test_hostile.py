@@ -23,11 +23,10 @@ def complaints(cases, dtype) -> list[str]:
     return [f"{case.name}: {wrong}" for case in cases if (wrong := complaint(case, dtype))]
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_a_part_of_the_grid(dtype):
+def test_a_part_of_the_grid():
     part = CASES[::8]  # 8 and the 9 kinds of data have no common factor: every kind and every value occurs
     assert len(part) == 68
-    assert complaints(part, dtype) == []
+    assert complaints(part, np.float64) == []
 
 
 @pytest.mark.deep

@@ -80,7 +80,7 @@ def test_blocks_change_rounding_only(memory):
 
 
 @both
-@pytest.mark.parametrize("alpha", [0.203, 1.0])
+@pytest.mark.parametrize("alpha", [0.203, pytest.param(1.0, marks=pytest.mark.deep)])
 def test_gradients_match_finite_differences(memory, alpha):
     load = np.concatenate([np.linspace(0, 5, 8), np.full(8, 5.0)])
 

@@ -36,7 +36,7 @@ def test_counts_count_every_answer():
         assert float(found.counts[person, point, category]) == answered
 
 
-@pytest.mark.parametrize("share", [0.3, 1.0])
+@pytest.mark.parametrize("share", [0.3, pytest.param(1.0, marks=pytest.mark.deep)])
 def test_equals_the_model_of_every_answer(share):
     trials = cohort()
     dense = fit_people(GP, of_people(trials), share)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import msgspec
 import numpy as np
+import pytest
 from fits import count_fits
 from live import STUDY, header
 
@@ -18,6 +19,7 @@ def model(theta=10.0):
     return OrdinalGP(RBF(jnp.asarray(theta), jnp.asarray(1.0)), OrdinalProbit((-0.5, 0.5), noise=0.5))
 
 
+@pytest.mark.deep  # 5 s
 def test_a_fit_counts_in_every_row_and_padding_does_not():
     x = np.linspace(0.0, 0.9, 8).reshape(4, 2)
     people = [Trials.from_arrays(x[:count], np.arange(count) % 3, 4) for count in (0, 1, 2, 3)]

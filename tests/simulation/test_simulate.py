@@ -41,6 +41,7 @@ def test_drift_makes_people_stricter_in_time():
     assert jnp.all(answers(person(drift=0.8), [0.55, 0.5], progress=1.0) == 1)
 
 
+@pytest.mark.deep  # as `make demo` does
 def test_the_preset_makes_a_study():
     population = simulate.PRESETS["paper"]
     people = simulate.people(STUDY, population, 3, seed=1)
