@@ -29,7 +29,9 @@ from hilbo.session.event_log import LogError
 __all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
 
 PRESSES = ("begin", "break", "more", "here")
-COMMANDS = ("pause", "resume", "repeat", "undo", "void", "abort", "note", "estop", "clear", "invite")
+COMMANDS = (
+    *("pause", "resume", "repeat", "undo", "void", "restore", "skip", "abort", "note", "estop", "clear", "invite"),
+)
 
 
 class NotNowError(InputError):
@@ -208,6 +210,12 @@ class Hub:
             if not message.text.strip():
                 raise InputError("The note is empty; write something.")
             return lambda state, at: actions.note(state, message.text.strip(), at)
+        if what == "restore":
+            if message.trial is None:
+                raise InputError("An answer is restored by the id of its trial.")
+            return lambda state, at: actions.restore(state, message.trial, at)
+        if what == "skip":
+            return lambda state, at: actions.skip(state, message.reason, at, message.trial)
         if what in ("void", "undo"):
             return lambda state, at: _taken(state, what, message, at)
         if what == "abort":

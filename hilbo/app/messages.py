@@ -48,7 +48,8 @@ class Press(_Message, frozen=True):
 
 
 class Command(_Message, frozen=True):
-    """An experimenter's command. `trial`: the one that it is about, so that it never hits another (void, undo)."""
+    """An experimenter's command. `trial`: the one that it is about, so that it never hits another (void, undo, restore,
+    skip)."""
 
     reason: _Text = ""
     text: _Text = ""

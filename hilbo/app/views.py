@@ -9,7 +9,7 @@ import time
 from datetime import datetime
 from typing import Any
 
-from hilbo.session.actions import LiveSession, Trial, last_answered, voidable
+from hilbo.session.actions import LiveSession, Trial, last_answered, restorable, skippable, voidable
 from hilbo.session.views import experimenter_view, participant_view
 
 __all__ = ["experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
@@ -126,7 +126,11 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "log": [_log_line(event) for event in list(hub.recent)[:60]],
         "alert": hub.alert or (runner.trouble if runner.stage == "trouble" else None),
         "may": _may(hub),
-        "means": {"void": _meant(voidable(state)), "undo": _meant(last_answered(state))},
+        "means": {
+            "void": _meant(voidable(state)),
+            "undo": _meant(last_answered(state)),
+            "skip": _meant(skippable(state)),
+        },
         "map_version": map_version(state) + ("" if hub.draws else " later"),
         "participant_here": hub.watchers.participant_here,
         "all_delays": hub.delays[-1000:],
@@ -149,7 +153,7 @@ def _trial_rows(hub, trial):
     rows = []
     for i, block in enumerate(state.header.blocks):
         name = block.phase + (f", {block.material}" if block.material else "")
-        rows.append([("→ " if i == state.block else "") + name, f"{len(state.answers(i))} of {state.quota(i)}"])
+        rows.append([("→ " if i == state.block else "") + name, _how_far(state, i)])
     if trial is None:
         return rows
     for side, values in trial.renderings.items():
@@ -171,6 +175,16 @@ def _trial_rows(hub, trial):
     if hub.delays:
         rows.append(["Answer to device", f"{1000 * hub.delays[-1]['total']:.0f} ms"])
     return rows
+
+
+def _how_far(state: LiveSession, block: int) -> str:
+    """Answers of a block, and what the device keeps from being answered."""
+    words = [f"{len(state.answers(block))} of {state.quota(block)}"]
+    last, out, excluded = (len(f(block)) for f in (state.put_off, state.skipped, state.excluded))
+    words += [f"{last} put off to the end: stopped twice by the device"] if last else []
+    words += [f"{out} left out"] if out else []
+    words += [f"{excluded} not shown again: stopped twice by the device"] if excluded else []
+    return "; ".join(words)
 
 
 def _set_words(values):
@@ -204,6 +218,7 @@ def _may(hub):
     found += ["repeat"] if begun else []
     found += ["undo"] if answered else []
     found += ["void"] if answered or begun else []
+    found += ["skip"] if skippable(state) else []
     return [*found, "abort"]
 
 
@@ -229,7 +244,9 @@ def _table(state: LiveSession):
             cells = [place, " / ".join(trial.sets.values()), *[""] * (width - 1), answer or trial.status]
         else:
             cells = [place, *(trial.renderings["a"][name] for name in names), answer or trial.status]
-        rows.append({"kind": kind, "cells": cells})
+        row = {"kind": kind, "cells": cells}
+        voided = trial.status == "void" and trial.values is not None
+        rows.append(row | ({"restore": _meant(trial)} if voided and restorable(state, trial.id) else {}))
     return {"head": ["", *names, "answer"] if chosen else ["", "sets", "answer"], "rows": rows}
 
 

@@ -36,9 +36,12 @@ __all__ = [
     "present",
     "propose",
     "repeat",
+    "restorable",
     "restore",
     "resume",
     "sent",
+    "skip",
+    "skippable",
     "undo",
     "void",
     "voidable",
@@ -85,8 +88,10 @@ def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event
 
 
 def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> Event:
-    """A step of a trial begins (`on`) or ends."""
+    """A step of a trial begins (`on`) or ends. None begins in a break, or after the end."""
     found = _live(state, trial)
+    if on and state.screen != "trial":
+        raise RefusedError("paused", f"no step of trial {trial} begins now: the screen shows {state.screen}.")
     steps = steps_of(state, found)
     if not 0 <= step < len(steps):
         raise RefusedError("bad-answer", f"trial {trial} has {len(steps)} steps, none with the number {step}.")
@@ -150,7 +155,7 @@ def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
 
 
 def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
-    """A trial shall not count; its rendering is asked again."""
+    """A trial shall not count; its rendering is asked again. This excludes nothing, however often."""
     _running(state)
     found = state.trial(trial)
     if found.status not in ("pending", "answered"):
@@ -169,6 +174,31 @@ def restore(state: LiveSession, trial: int, at: float) -> Event:
         if taken or len(state.answers(found.block)) >= state.quota(found.block):
             raise RefusedError("nothing", f"the place of trial {trial} has been filled by a later one.")
     return _event(state, "restore", at, id=trial)
+
+
+def skip(state: LiveSession, reason: str, at: float, trial: int | None = None) -> Event:
+    """The pending planned trial is left out for good: one that the device has stopped twice. Raises RefusedError."""
+    _running(state)
+    found = skippable(state)
+    if found is None or trial not in (None, found.id):
+        raise RefusedError("nothing", "only a planned trial that the device has stopped twice can be left out.")
+    return _event(state, "skip", at, id=found.id, reason=reason)
+
+
+def skippable(state: LiveSession) -> Trial | None:
+    """The trial that may be left out now."""
+    trial = state.pending
+    good = trial is not None and trial.repeats is None and trial.planned in state.put_off(trial.block)
+    return trial if good else None
+
+
+def restorable(state: LiveSession, trial: int) -> bool:
+    """Whether `restore` would be accepted."""
+    try:
+        restore(state, trial, 0.0)
+    except RefusedError:
+        return False
+    return True
 
 
 def pause(state: LiveSession, by: str, at: float) -> Event:

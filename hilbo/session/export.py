@@ -44,7 +44,7 @@ _WORDS = {
     "trial": "Number of the trial, counted within participant, session, phase and material",
     "response": "The participant's answer",
     "voided": "1 if the answer does not count",
-    "status": "answered, undone, void, dropped or pending",
+    "status": "answered, undone, void, dropped, left out (by a person, after the device stopped it twice) or pending",
     "response_time": "Time from the question to the answer, s, by the browser's clock",
     "answered_at": "Time of the answer, s since 1970, by the server's clock",
     "set_a": "Parameter set on side a",

@@ -14,7 +14,7 @@ from hilbo.study.protocols import Phase
 
 __all__ = ["Block", "Event", "Header", "Need", "Planned", "RefusedError", "Status", "Trial"]
 
-Status = Literal["pending", "answered", "undone", "void", "dropped"]
+Status = Literal["pending", "answered", "undone", "void", "dropped", "left out"]
 
 
 class RefusedError(InputError):

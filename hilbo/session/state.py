@@ -3,12 +3,19 @@
 `LiveSession.fold(study, header, events)` is the state after a log, so that resuming is replaying. Renderings are in the
 events themselves: a fold computes no fit.
 
-Rules: a trial in which the device holds, stops or is lost after it began is void, and its rendering is asked again; a
-rendering voided twice is not proposed again. A repeated, voided, undone or interrupted presentation starts from its
-first step, and so does one that a pause cut off. Whatever changes the answers drops a proposal that was made from the
-old ones.
+Rules: a trial in which the device holds, stops or is lost after it began is void, and is asked again. A repeated,
+voided, undone or interrupted presentation starts from its first step, and so does one that a pause cut off. Whatever
+changes the answers drops a proposal that was made from the old ones.
+
+Twice: the device's stops count while a rendering is on, of that rendering alone; what a person voids never counts. In
+a block that chooses, a rendering in which the device stopped twice is not proposed again: another one takes its place.
+In a planned block stops count for each planned trial, whatever other trials hold the same set; one that was stopped
+twice is put off to the end of its block, and asked there until it is answered, or until a person leaves it out
+(`skip`) or ends the session. So every block reaches its quota, but for what a person left out or ended. A repetition
+that was stopped twice is not asked again.
 """
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -18,10 +25,12 @@ from hilbo.errors import InputError
 from hilbo.session.records import Event, Header, Need, RefusedError, Trial
 from hilbo.study.config import Study
 
-__all__ = ["LiveSession", "Screen"]
+__all__ = ["STOPS", "LiveSession", "Screen"]
 
 Screen = Literal["wait", "trial", "ready", "rest", "paused", "done", "ended"]
 _STOPPED = ("hold", "estop", "lost")
+STOPS = 2
+"""So often may the device stop in a rendering before it is not proposed again, or its planned trial put off."""
 
 
 @dataclass(frozen=True)
@@ -86,33 +95,39 @@ class LiveSession:
         """How many trials of a block are needed."""
         return self.header.blocks[block].count + self.extra.get(block, 0)
 
+    def stops(self, block: int) -> Counter[Any]:
+        """How often the device stopped while a rendering was on: by the place in the plan, or, in a block that
+        chooses, by the items of the rendering."""
+        here = (t for t in self.trials if t.block == block and t.voided is not None)
+        return Counter(_stop_key(t, side) for t in here for side in t.voided["sides"])
+
     def excluded(self, block: int) -> list[dict[str, float]]:
-        """Renderings of a block that were voided twice."""
-        counts: dict[tuple, int] = {}
-        for trial in self.trials:
-            if trial.block == block and trial.status == "void" and trial.voided is not None:
-                for side in trial.voided["sides"]:
-                    key = tuple(trial.renderings[side].items())
-                    counts[key] = counts.get(key, 0) + 1
-        return [dict(key) for key, count in counts.items() if count >= 2]
+        """Renderings in which the device stopped twice, of a block that chooses them; they are not proposed again."""
+        if self.header.blocks[block].trials:
+            return []
+        return [dict(key) for key, count in self.stops(block).items() if count >= STOPS]
+
+    def put_off(self, block: int) -> list[int]:
+        """Planned trials without an answer that the device stopped twice; they come last."""
+        if not self.header.blocks[block].trials:
+            return []
+        done = {t.planned for t in self.answers(block)} | set(self.skipped(block))
+        return sorted(k for k, count in self.stops(block).items() if count >= STOPS and k not in done)
 
     def skipped(self, block: int) -> list[int]:
-        """Planned trials that hold an excluded rendering and have no answer."""
-        excluded = self.excluded(block)
-        if not excluded:
-            return []
-        here = [t for t in self.trials if t.block == block]
-        names = {t.sets[side] for t in here for side in t.sets if t.renderings[side] in excluded}
+        """Planned trials without an answer that a person left out."""
         have = {t.planned for t in self.answers(block)}
-        plan = self.header.blocks[block].trials
-        return [i for i, p in enumerate(plan) if i not in have and {p.a, p.b} & names]
+        left_out = {t.planned for t in self.trials if t.block == block and t.status == "left out"}
+        return sorted(k for k in left_out - have if k is not None)
 
     def _next_planned(self, block: int) -> int | None:
         """The next planned trial without an answer; None where the block has enough, or none is left."""
         if len(self.answers(block)) >= self.quota(block):
             return None
         done = {t.planned for t in self.answers(block)} | set(self.skipped(block))
-        return next((i for i in range(len(self.header.blocks[block].trials)) if i not in done), None)
+        left = [i for i in range(len(self.header.blocks[block].trials)) if i not in done]
+        stops = self.stops(block)
+        return min(left, key=lambda i: (stops[i] if stops[i] >= STOPS else 0, i), default=None)
 
     def full(self, block: int) -> bool:
         """Whether a block has all its answers, or nothing more to ask."""
@@ -229,19 +244,30 @@ def _repeated(state, event):
     return replace(state, wanted=(*state.wanted, trial.id))
 
 
-def _made_void(state, trial, by, reason):
+def _stop_key(trial: Trial, side: str) -> Any:
+    """What a stop counts for."""
+    return tuple(trial.renderings[side].items()) if trial.planned is None else trial.planned
+
+
+def _made_void(state, trial, by, reason, sides=()):
+    """`sides`: the one that was on when the device stopped."""
     changes = trial.status == "answered" and not trial.repeats
-    sides = [trial.on] if trial.on in trial.renderings else sorted(trial.felt)  # what nobody felt is not to blame
     state = state.dropped() if changes else state
-    state = state.with_trial(trial.id, status="void", on=None, voided={"by": by, "reason": reason, "sides": sides})
-    excluded = state.excluded(trial.block)
-    if trial.repeats and not any(rendering in excluded for rendering in trial.renderings.values()):
+    voided = {"by": by, "reason": reason, "sides": list(sides)}
+    state = state.with_trial(trial.id, status="void", on=None, voided=voided)
+    stops = state.stops(trial.block)
+    if trial.repeats and not any(stops[_stop_key(trial, side)] >= STOPS for side in trial.renderings):
         state = replace(state, wanted=(trial.repeats, *state.wanted))
     return state
 
 
 def _voided(state, event):
     return _made_void(state, state.trial(event.data["id"]), "experimenter", event.data["reason"])
+
+
+def _skipped(state, event):
+    voided = {"by": "experimenter", "reason": event.data["reason"], "sides": []}
+    return state.with_trial(event.data["id"], status="left out", on=None, voided=voided)
 
 
 def _restored(state, event):
@@ -263,7 +289,7 @@ def _device(state, event):
     begun = trial is not None and trial.step is not None and trial.status in ("pending", "answered")
     if data["condition"] in _STOPPED and begun:
         reason = f"device: {data['condition']}" + (f" ({data['reason']})" if data.get("reason") else "")
-        state = _made_void(state, trial, "rule", reason)
+        state = _made_void(state, trial, "rule", reason, {trial.on} & set(trial.renderings))
     return replace(state, machine=data)
 
 
@@ -275,6 +301,7 @@ _APPLY = {
     "undo": _undone,
     "repeat": _repeated,
     "void": _voided,
+    "skip": _skipped,
     "restore": _restored,
     "pause": _paused,
     "resume": lambda state, event: replace(state, paused=None),

@@ -119,6 +119,7 @@ def experimenter_view(state: LiveSession) -> dict[str, Any]:
                 "done": len(state.answers(i)),
                 "of": state.quota(i),
                 "skipped": [msgspec.to_builtins(block.trials[k]) for k in state.skipped(i)],
+                "put_off": [_put_off(state, i, k) for k in state.put_off(i)],
                 "excluded": state.excluded(i),
             }
             for i, block in enumerate(header.blocks)
@@ -133,6 +134,11 @@ def experimenter_view(state: LiveSession) -> dict[str, Any]:
         "last": state.last,
         "participant": participant_view(state),
     }
+
+
+def _put_off(state, block, k):
+    """A planned trial that comes last, and how often the device stopped it."""
+    return msgspec.to_builtins(state.header.blocks[block].trials[k]) | {"stops": state.stops(block)[k]}
 
 
 def _whole_trial(state, trial: Trial):

@@ -123,10 +123,17 @@ def test_every_button_of_the_experimenter_is_an_event(pages):
     participant.window.wait_for_selector("#break:visible")
     participant.window.click("#break")
     participant.window.wait_for_selector("body[data-phase=paused]")
+    press(experimenter, "resume")
+    until_answered(participant, 3)
+    press(experimenter, "pause")
+    press(experimenter, "void", "a cough")
+    experimenter.click("button.restore")
+    experimenter.click("#sure button[value=yes]")
+    until_event(live, experimenter, "restore")
     press(experimenter, "abort", "enough")
     participant.window.wait_for_selector("body[data-phase=ended]")
     kinds = {event.kind for event in live.events()}
-    assert {"pause", "resume", "note", "repeat", "undo", "void", "abort"} <= kinds
+    assert {"pause", "resume", "note", "repeat", "undo", "void", "restore", "abort"} <= kinds
     live.replays()
 
 

@@ -138,7 +138,7 @@ def test_void_and_undo_mean_the_trial_that_their_sender_saw(live):
     live.begin()
     live.answer()
     view = live.until(lambda v: v["means"]["void"] and v["means"]["void"]["trial"] == 2, live.whole)
-    assert view["means"] == {"void": {"trial": 2, "name": "V2"}, "undo": {"trial": 1, "name": "V1"}}
+    assert view["means"] == {"void": {"trial": 2, "name": "V2"}, "undo": {"trial": 1, "name": "V1"}, "skip": None}
     live.answer()
     live.until(lambda v: v["means"]["undo"]["trial"] == 2 and v["means"]["void"]["trial"] == 3, live.whole)
     before = live.hub.state.trials[:2]
@@ -197,3 +197,41 @@ def test_another_one_and_begin_at_the_end_of_the_warm_up(tmp_path):
         live.participant.post("/api/participant/begin", {})
         live.answer(live.question())
         assert live.until(lambda v: v["phase"] == "done")
+
+
+def test_a_voided_answer_is_restored_from_its_row(tmp_path):
+    with Live(tmp_path, seconds=0.5) as live:
+        live.begin()
+        live.answer()
+        live.until(lambda view: view["phase"] != "answer")
+        live.command("pause")  # what is being felt begins again: void means the answer
+        assert live.until(lambda v: v["means"]["void"]["trial"] == 1, live.whole)
+        with refused(400, "by the id of its trial"):
+            live.command("restore")
+        with refused(409, "no voided answer"):
+            live.command("restore", trial=1)
+        live.command("void", trial=1, reason="a cough")
+        rows = live.whole()["table"]["rows"]
+        assert [row.get("restore") for row in rows if row["cells"][0] == "V1"] == [{"trial": 1, "name": "V1"}]
+        live.command("restore", trial=1)
+        assert live.hub.state.trials[0].status == "answered" and live.hub.state.skipped(0) == []
+        assert not any("restore" in row for row in live.whole()["table"]["rows"])
+        live.replays()
+
+
+def test_a_trial_that_the_device_always_stops_may_be_left_out(tmp_path):
+    blocks = (Block("validation", 1, (Planned("best", "mid"),)),)
+    with Live(tmp_path, blocks=blocks, seconds=0.3) as live:
+        with refused(409, "stopped twice"):
+            live.command("skip")
+        live.begin()
+        for _ in range(2):
+            live.until(lambda view: view["step"] and view["step"]["show"] == "a")
+            live.command("estop")
+            live.until(lambda view: "clear" in view["may"], live.whole)
+            live.command("clear")
+        view = live.until(lambda view: "skip" in view["may"], live.whole)
+        assert "1 put off to the end: stopped twice by the device" in view["trial"][0][1]
+        live.command("skip", trial=view["means"]["skip"]["trial"], reason="slips")
+        assert live.until(lambda view: view["phase"] == "done", live.whole)["trial"][0][1] == "0 of 1; 1 left out"
+        live.replays()

@@ -11,6 +11,7 @@ from live import CHOOSER, KINDS, SETS, STUDY, Driver, header
 from hilbo.errors import InputError
 from hilbo.session import actions as live
 from hilbo.session.actions import Header, LiveSession, RefusedError
+from hilbo.session.export import presentations_table
 from hilbo.session.views import experimenter_view, participant_view
 
 anything = st.lists(st.tuples(st.sampled_from(KINDS), st.integers(0, 1000)), max_size=60)
@@ -142,6 +143,92 @@ def test_a_hold_voids_what_has_begun_and_the_second_one_excludes_it():
     assert driver.state.excluded(1) == [point]
 
 
+def device_stops(driver, step):
+    """The pending trial is felt up to a step, in which the device holds."""
+    trial = driver.state.pending
+    for k in range(step + 1):
+        driver.log(live.present(driver.state, trial.id, k, True, 1.0))
+        if k < step:
+            driver.log(live.present(driver.state, trial.id, k, False, 1.0))
+    driver.log(live.device(driver.state, "hold", 1.0, reason="speed"))
+    driver.step()
+
+
+@pytest.mark.parametrize("kind", ["optimisation", "validation"])
+def test_voids_by_a_person_exclude_nothing_and_leave_the_quota(kind):
+    driver = to_first_answerable(kind)
+    asked = driver.state.pending
+    for _ in range(3):
+        driver.feel(driver.state.pending)
+        driver.do("void", 0)
+        assert driver.state.pending.renderings == asked.renderings
+    assert driver.state.excluded(1) == [] == driver.state.put_off(1)
+    driver.finish()
+    assert len(driver.state.answers(1)) == 6 and driver.state.skipped(1) == []
+
+
+def test_a_stop_counts_for_the_rendering_that_was_on_and_for_no_other():
+    driver = to_first_answerable()
+    point = driver.state.pending.renderings["a"]
+    for _ in range(3):  # the reference was on
+        device_stops(driver, 0)
+    driver.feel(driver.state.pending)
+    driver.log(live.device(driver.state, "hold", 1.0))  # nothing was on
+    driver.step()
+    assert driver.state.trials[-2].voided["sides"] == []
+    assert driver.state.excluded(1) == [] and driver.state.pending.renderings["a"] == point
+    for _ in range(2):
+        device_stops(driver, 1)
+    assert driver.state.excluded(1) == [point]
+
+
+def test_stops_of_two_planned_trials_with_the_same_set_are_no_reason_to_leave_any_out():
+    driver = to_first_answerable("validation")
+    for step in (1, 3):  # in trials 0 and 1 of the plan, each time with the same set on
+        device_stops(driver, step)
+        driver.do("answer", 0)
+    assert driver.state.put_off(1) == []
+    driver.finish()
+    assert sorted(t.planned for t in driver.state.answers(1)) == list(range(6))
+
+
+def test_a_planned_trial_that_the_device_stopped_twice_comes_at_the_end_of_its_block():
+    driver = to_first_answerable("validation")
+    for _ in range(2):
+        assert driver.state.pending.planned == 0
+        device_stops(driver, 1)
+    assert driver.state.put_off(1) == [0]
+    assert experimenter_view(driver.state)["blocks"][1]["put_off"] == [{"a": "D", "b": "E", "stops": 2}]
+    asked = []
+    while driver.state.screen == "trial":
+        asked.append(driver.state.pending.planned)
+        driver.do("answer", 0)
+    assert asked == [1, 2, 3, 4, 5, 0]
+    assert driver.state.screen == "done" and driver.state.put_off(1) == []
+
+
+def test_a_person_may_leave_out_what_the_device_always_stops():
+    driver = to_first_answerable("validation")
+    with pytest.raises(RefusedError, match="that the device has stopped twice"):
+        live.skip(driver.state, "", 1.0)
+    for _ in range(2):
+        device_stops(driver, 1)
+    for _ in range(5):
+        driver.do("answer", 0)
+    device_stops(driver, 3)
+    assert driver.state.pending.planned == 0
+    driver.log(live.skip(driver.state, "the finger slips off", 1.0))
+    assert driver.state.screen == "done" and driver.state.skipped(1) == [0]
+    assert [t.status for t in driver.state.trials[-2:]] == ["void", "left out"]
+    assert experimenter_view(driver.state)["blocks"][1]["skipped"] == [{"a": "D", "b": "E"}]
+    table = presentations_table([driver.state])
+    assert table.iloc[-1][["status", "voided_by", "voided_reason"]].tolist() == [
+        "left out",
+        "experimenter",
+        "the finger slips off",
+    ]
+
+
 def test_a_voided_answer_can_be_restored_until_its_place_is_filled():
     driver = to_first_answerable()
     trial = driver.state.pending.id
@@ -168,6 +255,13 @@ def test_a_pause_in_mid_trial_begins_the_trial_again():
     driver.do("resume", 0)
     again = driver.state.pending
     assert (again.id, again.presentation, again.step, again.felt) == (trial.id, 2, None, frozenset())
+
+
+def test_no_step_begins_in_a_pause():
+    driver = to_first_answerable("validation")
+    driver.do("pause", 0)
+    with pytest.raises(RefusedError, match="no step of trial"):
+        live.present(driver.state, driver.state.pending.id, 0, True, 1.0)
 
 
 @pytest.mark.parametrize("steps", [1, 2, 4])

@@ -28,13 +28,6 @@ def asked(state, chooser, at=0.0):
     return state.after(live.propose(state, chooser, at))
 
 
-def felt(state):
-    for step in range(len(live.steps_of(state, state.pending))):
-        for on in (True, False):
-            state = state.after(live.present(state, state.pending.id, step, on, 0.5))
-    return state
-
-
 def told(state, response, at=1.0):
     return state.after(live.answer(state, state.pending.id, f"c{state.seq}", {"class_a": response}, at, felt=False))
 
@@ -72,16 +65,15 @@ def test_renderings_are_those_of_a_session_and_no_fit_runs_after_an_answer(choos
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_rendering_voided_twice_is_replaced_by_a_feasible_one_apart(chooser, count):
+def test_a_rendering_stopped_twice_is_replaced_by_a_feasible_one_apart(chooser, count):
     state = start()
     for response in ANSWERS[:count]:
         state = told(asked(state, chooser), response)
     state = asked(state, chooser)
     point = state.pending.renderings["a"]
     for again in range(2):
-        state = felt(state)
-        state = state.after(live.void(state, state.pending.id, "noise", 1.0))
-        state = asked(state, chooser)
+        state = state.after(live.present(state, state.pending.id, 1, True, 0.5))
+        state = asked(state.after(live.device(state, "hold", 1.0)), chooser)
         assert (state.pending.renderings["a"] == point) == (again == 0)
     unit = [STUDY.space.to_unit(np.array([p["u"], p["v"]])) for p in (point, state.pending.renderings["a"])]
     assert np.linalg.norm(unit[0] - unit[1]) >= APART

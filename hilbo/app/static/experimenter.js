@@ -31,6 +31,7 @@ function draw() {
   drawDevice(); drawAlert(); drawAnswers(); drawLog();
   put("watch", view.participant_here ? "Connected." : "Not connected.");
   for (const b of document.querySelectorAll("[data-command]")) b.disabled = !view.may.includes(b.dataset.command);
+  at("skip").hidden = !view.may.includes("skip");
   for (const b of document.querySelectorAll(".stop")) b.disabled = !view.may.includes("estop");
   if (view.map_version !== mapOf) { mapOf = view.map_version; loadMap(); }
 }
@@ -70,8 +71,20 @@ function drawAnswers() {
     const row = document.createElement("tr");
     row.className = r.kind;
     row.append(...r.cells.map((cell) => Object.assign(document.createElement("td"), { textContent: number(cell) })));
+    if (r.restore) row.lastChild.append(" ", restoring(r.restore));
     return row;
   }));
+}
+
+// The button beside a voided answer.
+function restoring(meant) {
+  const button = Object.assign(document.createElement("button"), { textContent: "Restore", className: "restore" });
+  button.setAttribute("aria-label", `Restore the answer to trial ${meant.name}`);
+  button.addEventListener("click", async () => {
+    const more = await sure("restore", meant);
+    if (more) command("restore", more);
+  });
+  return button;
 }
 
 function drawLog() {
@@ -110,12 +123,14 @@ async function command(name, more = {}) {
 
 const SURE = { abort: () => "End the session here? What has been answered stays; nothing more is asked.",
                void: (name) => `Void trial ${name}? Its answer, if there is one, is not used; it stays in the log.`,
+               restore: (name) => `Restore the answer to trial ${name}? It counts again; the trial is not asked once more.`,
+               skip: (name) => `Leave trial ${name} out? It is not asked again, and the session ends with one answer less.`,
                undo: (name) => `Take the answer to trial ${name} back? The trial is asked again.` };
 
 // What to send along: the trial that was meant when it was asked, and the reason; null for "Go back".
-function sure(name) {
+function sure(name, meant = view.means[name]) {
   if (!SURE[name]) return Promise.resolve({});
-  const box = at("sure"), meant = view.means[name];
+  const box = at("sure");
   at("sure-why").value = "";
   put("sure-text", SURE[name](meant ? meant.name : ""));
   box.returnValue = "no";
