@@ -19,9 +19,11 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import log_paths, read_log
+from hilbo.session.explanation import described
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
 from hilbo.study.config import Study
+from hilbo.study.set_table import role_of, source_of
 from hilbo.study.trial_table import read_trials, write_trials
 
 __all__ = [
@@ -55,6 +57,11 @@ _WORDS = {
     "preferred": "The set that was preferred",
     "set_id": "Name of the parameter set",
     "source": "aggregate, sysid or individual:PARTICIPANT",
+    "role": "best, mid or worst of the map that the set was read from; empty for others",
+    "memory": "short or full: how the past is rendered",
+    "states": "Number of exponentials of full memory",
+    "N": "Number of past samples that are rendered",
+    "T": "Time between two samples, s",
 }
 
 
@@ -121,17 +128,25 @@ def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
     for state in sessions:
         for block in state.header.blocks:
             study = state.study if block.material is None else state.study.material(block.material)
-            mechanics = study.space.mechanics
-            extra = {} if mechanics is None else {"N": mechanics.N, "T": float(mechanics.T)}
-            for name in (n for p in block.trials if p.b is not None for n in (p.a, p.b)):
-                source = _source(name.removeprefix(f"{block.material} "))
-                row = {"set_id": name, "source": source, **state.header.sets[name], **extra}
+            rendered = _rendered(study.space.mechanics)
+            for name in dict.fromkeys(n for p in block.trials if p.b is not None for n in (p.a, p.b)):
+                is_what = {"source": source_of(name, block.material), "role": role_of(name), "material": block.material}
+                values = described(study, state.header.sets[name]).parameters
+                row = {"set_id": name, **is_what, **values, **rendered}
                 if rows.setdefault(name, row) != row:
                     raise InputError(
                         f'the set "{name}" of participant {state.header.participant} is not the one that others felt'
                         " under this name; export the logs of one plan at a time."
                     )
-    return pd.DataFrame(list(rows.values()))
+    return _table(list(rows.values()))
+
+
+def _rendered(mechanics) -> dict[str, Any]:
+    """How all sets of a study are rendered; `states` only where there are any."""
+    if mechanics is None:
+        return {}
+    facts = {"N": mechanics.N, "T": float(mechanics.T), "memory": mechanics.memory}
+    return facts | ({"states": mechanics.states} if mechanics.memory == "full" else {})
 
 
 def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
@@ -266,13 +281,6 @@ def _table(rows):
         if column in table and table[column].isna().all():
             table = table.drop(columns=column)
     return table
-
-
-def _source(name):
-    if name.startswith("individual:"):
-        return name
-    person, _, kind = name.rpartition(" ")
-    return f"individual:{person}" if person and kind in ("best", "mid", "worst") else "aggregate"
 
 
 def _variable(column, words):

@@ -98,8 +98,8 @@ class LiveSession:
     def stops(self, block: int) -> Counter[Any]:
         """How often the device stopped while a rendering was on: by the place in the plan, or, in a block that
         chooses, by the items of the rendering."""
-        here = (t for t in self.trials if t.block == block and t.voided is not None)
-        return Counter(_stop_key(t, side) for t in here for side in t.voided["sides"])
+        voided = ((t, t.voided) for t in self.trials if t.block == block)
+        return Counter(_stop_key(t, side) for t, why in voided if why is not None for side in why["sides"])
 
     def excluded(self, block: int) -> list[dict[str, float]]:
         """Renderings in which the device stopped twice, of a block that chooses them; they are not proposed again."""
@@ -287,7 +287,7 @@ def _device(state, event):
     data = event.data
     trial = state.pending if data["trial"] is None else state.trial(data["trial"])
     begun = trial is not None and trial.step is not None and trial.status in ("pending", "answered")
-    if data["condition"] in _STOPPED and begun:
+    if data["condition"] in _STOPPED and trial is not None and begun:
         reason = f"device: {data['condition']}" + (f" ({data['reason']})" if data.get("reason") else "")
         state = _made_void(state, trial, "rule", reason, {trial.on} & set(trial.renderings))
     return replace(state, machine=data)

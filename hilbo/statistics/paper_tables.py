@@ -17,12 +17,11 @@ from hilbo.errors import InputError
 from hilbo.statistics.logits import binary_logit, ordered_logit, tied_preferences
 from hilbo.statistics.preferences import classifications, confusion, preference_rates
 from hilbo.statistics.regression import Regression
-from hilbo.study.set_table import source_kind
+from hilbo.study.set_table import ROLES, role_of, source_kind
 from hilbo.study.validation_table import NONE, RESPONSES, TIE, check_validation, of_material
 
 __all__ = ["PaperTables", "aggregate_comparisons", "paper_tables", "set_sources"]
 
-_ROLES = ("best", "mid", "worst")
 _OURS, _THEIRS = "Aggregate-Best", "individual"
 
 
@@ -51,14 +50,14 @@ def paper_tables(
     """Every statistic of the paper's validation sessions, of one material.
 
     `sets` is a sets table (`validation_table.sets_frame`); its column `role`, if it has one, says which sets are best,
-    mid and worst. Without it these are the sets' names, and the sets of table IV are named "aggregate" and
-    "individual:PARTICIPANT". Raises `InputError` for a bad table.
+    mid and worst. Without it the names say so, as plans give them: "best", "foam best", "foam P07 best"; and in table
+    IV "aggregate" and "individual:PARTICIPANT", with or without a material before. Raises `InputError` for a bad table.
     """
     table = of_material(check_validation(validation, responses), material)
     sources, roles = set_sources(table, sets)
     staged = table.assign(set_a=table["set_a"].map(roles), set_b=table["set_b"].map(roles))
     staged["preferred"] = [roles.get(name, name) for name in table["preferred"]]
-    staged = staged[staged["set_a"].isin(_ROLES) & staged["set_b"].isin(_ROLES) & (staged["set_a"] != staged["set_b"])]
+    staged = staged[staged["set_a"].isin(ROLES) & staged["set_b"].isin(ROLES) & (staged["set_a"] != staged["set_b"])]
     answers, limits = classifications(staged, responses), []
     makers = {
         "II": lambda: _table_2(answers, responses, level),
@@ -72,8 +71,8 @@ def paper_tables(
         except InputError as error:
             tables[number] = None
             limits.append(f"Table {number} is missing: {error}")
-    counts = confusion(staged, responses, _ROLES)
-    rates = preference_rates(staged, _ROLES, level=level)
+    counts = confusion(staged, responses, ROLES)
+    rates = preference_rates(staged, ROLES, level=level)
     return PaperTables(tables["II"], tables["III"], tables["IV"], counts, rates, tuple(limits))
 
 
@@ -81,11 +80,11 @@ def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[st
     """Source and role of every set of a validation table; without a sets table their names say both."""
     used = sorted({*table["set_a"], *table["set_b"]})
     if sets is None:
-        return {name: name for name in used}, {name: name for name in used}
+        return {name: name.rpartition(" ")[2] for name in used}, {name: role_of(name) or name for name in used}
     unknown = [name for name in used if name not in sets.index]
     if unknown:
         raise InputError(f'set "{unknown[0]}" of the validation table is not in the sets table; add it there.')
-    roles = sets["role"] if "role" in sets else pd.Series(sets.index, sets.index)
+    roles = sets["role"] if "role" in sets else pd.Series([role_of(str(n)) or str(n) for n in sets.index], sets.index)
     return {name: str(sets.at[name, "source"]) for name in used}, {name: str(roles[name]) for name in used}
 
 
@@ -97,7 +96,7 @@ def _table_2(answers: pd.DataFrame, responses: Sequence[str], level: float) -> R
 
 
 def _table_3(answers: pd.DataFrame, responses: Sequence[str], level: float) -> Regression:
-    _need(answers, _ROLES)
+    _need(answers, ROLES)
     shifts = {name.capitalize(): (answers["set"] == name).astype(float) for name in ("best", "worst")}
     ranks, names = len(responses) - 1 - answers["category"], list(responses)[::-1]
     return ordered_logit(ranks, shifts, answers[["participant"]], categories=names, level=level)

@@ -15,7 +15,10 @@ from typing import Any
 
 from hilbo.errors import InputError
 
-__all__ = ["read_sets", "source_kind"]
+__all__ = ["ROLES", "read_sets", "role_of", "source_kind", "source_of"]
+
+ROLES = ("best", "mid", "worst")
+"""What a set is in a validation, by the map that it was read from."""
 
 _NUMBERS = ("K0", "K1", "B1", "alpha", "force_limit")
 _WHOLE = ("N", "states")
@@ -64,6 +67,22 @@ def source_kind(text: str) -> str | None:
     if text in ("aggregate", "sysid"):
         return text
     return "individual" if text.startswith(_INDIVIDUAL) and len(text) > len(_INDIVIDUAL) else None
+
+
+def role_of(name: str) -> str:
+    """The role in a set's name as plans give it, `[MATERIAL ][PARTICIPANT ]ROLE`; empty where it names none."""
+    last = name.rpartition(" ")[2]
+    return last if last in ROLES else ""
+
+
+def source_of(name: str, material: str | None = None) -> str:
+    """The source in a set's name as plans give it: with a role its participant's or the population's map, else
+    `[MATERIAL ]aggregate` or `[MATERIAL ]individual:PARTICIPANT`. The population's where the name says none."""
+    own = name.removeprefix(f"{material} ") if material else name
+    before, _, last = own.rpartition(" ")
+    if last in ROLES:
+        return _INDIVIDUAL + before if before else "aggregate"
+    return last if source_kind(last) else "aggregate"
 
 
 def _table(path: Path, source: str) -> tuple[list[str], Iterator[tuple[int, list[str]]]]:
