@@ -3,8 +3,7 @@
 `LiveChooser.lookahead(state)` finds the next rendering for each answer that may come; `choose` then only looks it up.
 Each answer's posterior is fitted once, by the step that chooses (`hilbo.session.step`), and kept: it explains the
 choice, and the experimenter's page reads it. Optimisation renderings are `hilbo.session.ask_tell.Session`'s, bit for
-bit: they depend on the study, the seed and the answers that count. A rendering voided twice is replaced
-(`hilbo.session.excluded`). With a warm start (`hilbo.session.warm_start`, one for each material) there are no
+bit: they depend on the study, the seed (of the material: `plan.material_seed`) and the answers that count. With a warm start (`hilbo.session.warm_start`, one for each material) there are no
 space-filling trials: points come from it.
 """
 
@@ -19,6 +18,7 @@ from hilbo.errors import InputError
 from hilbo.session import excluded as apart
 from hilbo.session.ask_tell import Session
 from hilbo.session.explanation import Choice, described, explained
+from hilbo.session.plan import material_seed
 from hilbo.session.records import Need, Planned
 from hilbo.session.state import LiveSession
 from hilbo.session.step import Fitted
@@ -80,7 +80,7 @@ class LiveChooser:
         materials = {block.material for block in header.blocks}
         self._studies = {name: study if name is None else study.material(name) for name in materials}
         self._sessions = {
-            block.material: Session.start(self._studies[block.material], header.seed)
+            block.material: Session.start(self._studies[block.material], material_seed(header, block.material))
             for block in header.blocks
             if not block.trials
         }

@@ -28,6 +28,7 @@ __all__ = [
     "check_plan",
     "header_for",
     "make_plan",
+    "material_seed",
     "plan_hash",
     "planned_header",
     "reissue",
@@ -44,6 +45,16 @@ _PAIRS = (("best", "mid"), ("best", "worst"), ("mid", "worst"))
 def seed_of(seed: int, *place: int) -> int:
     """A seed below 2^31 for a place in a study, from the study's."""
     return int(np.random.SeedSequence([seed, *place]).generate_state(1)[0] >> 1)
+
+
+def material_seed(header: Header, material: str | None) -> int:
+    """The seed of what is chosen with a material. Where a session chooses with several, each has its own, from the
+    session's and its name: points that came again in the same order would be recognised, and no order balances that.
+    """
+    if len({block.material for block in header.blocks if not block.trials}) <= 1:
+        return header.seed
+    digest = hashlib.sha256((material or "").encode()).digest()
+    return seed_of(header.seed, int.from_bytes(digest[:4]))
 
 
 def warm_up(study: Study, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
