@@ -169,10 +169,8 @@ def restore(state: LiveSession, trial: int, at: float) -> Event:
     found = state.trial(trial)
     if found.status != "void" or found.values is None:
         raise RefusedError("nothing", f"trial {trial} has no voided answer.")
-    if found.repeats is None:
-        taken = found.planned is not None and any(t.planned == found.planned for t in state.answers(found.block))
-        if taken or len(state.answers(found.block)) >= state.quota(found.block):
-            raise RefusedError("nothing", f"the place of trial {trial} has been filled by a later one.")
+    if _filled(state, found):
+        raise RefusedError("nothing", f"the place of trial {trial} has been filled by a later one.")
     return _event(state, "restore", at, id=trial)
 
 
@@ -190,6 +188,19 @@ def skippable(state: LiveSession) -> Trial | None:
     trial = state.pending
     good = trial is not None and trial.repeats is None and trial.planned in state.put_off(trial.block)
     return trial if good else None
+
+
+def _filled(state: LiveSession, found: Trial) -> bool:
+    """Whether another answer counts in the place of a voided one."""
+    if found.repeats is not None:
+        pending = state.pending
+        waits = found.repeats in state.wanted or (pending is not None and pending.repeats == found.repeats)
+        later = (t for t in state.trials[found.id :] if t.repeats == found.repeats and t.status == "answered")
+        return bool(found.voided and found.voided.get("asked_again")) and not waits and any(later)
+    others = state.answers(found.block)
+    if found.planned is not None:
+        return len(others) >= state.quota(found.block) or any(t.planned == found.planned for t in others)
+    return len(others) >= state.quota(found.block) or any(t.renderings == found.renderings for t in others)
 
 
 def restorable(state: LiveSession, trial: int) -> bool:

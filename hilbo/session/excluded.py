@@ -1,7 +1,7 @@
-"""Choices that keep away from renderings that were voided twice; nothing is fitted here.
+"""Choices that keep away from renderings in which the device stopped twice; nothing is fitted here.
 
-In the space-filling trials such a rendering is replaced by the candidate farthest from all others, afterwards by the
-highest UCB that keeps a distance of `APART` from it in the unit cube, and so do choices from a population's map.
+At the end of the space-filling trials the candidate farthest from all others takes the place of such a rendering;
+afterwards the highest UCB that keeps a distance of `APART` from it in the unit cube; so do choices from a map.
 """
 
 import equinox as eqx
@@ -17,7 +17,7 @@ from hilbo.study.config import Study
 __all__ = ["APART", "is_near", "point_from_map", "point_kept_apart", "spread_point"]
 
 APART = 0.05
-"""Least distance in the unit cube from a rendering that was voided twice."""
+"""Least distance in the unit cube from a rendering in which the device stopped twice."""
 _ROOM, _FAR = 8, 9.0  # so many excluded points at least, those that are none far from the unit cube
 _SPREAD = 256  # candidates
 
@@ -31,15 +31,9 @@ def is_near(study: Study, point: Float[np.ndarray, " d"], excluded: Float[np.nda
 
 
 def spread_point(
-    study: Study,
-    point: Float[np.ndarray, " d"],
-    excluded: Float[np.ndarray, "k d"],
-    others: Float[np.ndarray, "m d"],
-    seed: int,
+    study: Study, excluded: Float[np.ndarray, "k d"], others: Float[np.ndarray, "m d"], seed: int
 ) -> Float[np.ndarray, " d"]:
-    """A space-filling point; in place of an excluded one, the candidate farthest from all points, physical units."""
-    if not any(np.array_equal(point, other) for other in excluded):
-        return point
+    """A space-filling point in place of an excluded one: the candidate farthest from all points, physical units."""
     candidates = study.space.candidates(_SPREAD, seed)
     taken = _to_unit(study, np.concatenate([others, excluded]))
     distance = np.linalg.norm(candidates[:, None] - taken[None], axis=2)

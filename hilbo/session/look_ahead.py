@@ -3,8 +3,9 @@
 `LiveChooser.lookahead(state)` finds the next rendering for each answer that may come; `choose` then only looks it up.
 Each answer's posterior is fitted once, by the step that chooses (`hilbo.session.step`), and kept: it explains the
 choice, and the experimenter's page reads it. Optimisation renderings are `hilbo.session.ask_tell.Session`'s, bit for
-bit: they depend on the study, the seed (of the material: `plan.material_seed`) and the answers that count. With a warm start (`hilbo.session.warm_start`, one for each material) there are no
-space-filling trials: points come from it.
+bit: they depend on the study, the seed (of the material: `plan.material_seed`) and the answers that count. A
+space-filling point without an answer that counts comes before all others. With a warm start
+(`hilbo.session.warm_start`, one for each material) there are no space-filling trials: points come from it.
 """
 
 import threading
@@ -176,12 +177,15 @@ class LiveChooser:
         study, session = self.study(answers.block), self._session(answers.block)
         warm = self._warm_starts.get(self._blocks[answers.block].material)
         excluded = _rows(situation.excluded, study)
-        count, initial = len(answers.categories), session.step.initial
         if warm is not None:
             return Choice(apart.point_from_map(study, warm, fitted.posterior, excluded), "map")
-        if count < len(initial):
+        initial, gone = session.step.initial, {*answers.points, *situation.excluded}
+        missing = [point for point in initial if tuple(point.tolist()) not in gone]
+        if missing:  # in their order; one whose answer was voided comes again
+            return Choice(missing[0], "latin hypercube")
+        if len(answers.points) < len(initial):
             others = np.concatenate([initial, _rows(answers.points, study)])
-            return Choice(apart.spread_point(study, initial[count], excluded, others, session.seed), "latin hypercube")
+            return Choice(apart.spread_point(study, excluded, others, session.seed), "latin hypercube")
         if apart.is_near(study, fitted.point, excluded):
             return Choice(apart.point_kept_apart(study, session.plan, fitted.posterior, excluded), "ucb, apart")
         return Choice(fitted.point, study.selection.acquisition)

@@ -201,8 +201,7 @@ def _proposed(state, event):
     trial = Trial(
         data["id"], data["block"], data["trial"], data, event.time, planned=data["planned"], repeats=data["repeats"]
     )
-    wanted = state.wanted[1:] if data["repeats"] is not None else state.wanted
-    return replace(state, trials=(*state.trials, trial), wanted=wanted)
+    return replace(state, trials=(*state.trials, trial), wanted=_without(state.wanted, data["repeats"]))
 
 
 def _sent(state, event):
@@ -227,10 +226,39 @@ def _answered(state, event):
     )
 
 
+def _without(wanted: tuple[int, ...], id: int | None) -> tuple[int, ...]:
+    """The trials to be felt once more without the first mention of one."""
+    place = wanted.index(id) if id in wanted else len(wanted)
+    return wanted[:place] + wanted[place + 1 :]
+
+
+def _taken_out(state, trial, **changes):
+    """An answer, or a proposal, does not count any more: what was made from it goes, and it is not repeated."""
+    state = state.with_trial(trial.id, on=None, **changes)
+    if trial.status != "answered" or trial.repeats:
+        return state
+    state = replace(state.dropped(), wanted=tuple(id for id in state.wanted if id != trial.id))
+    return _without_pending_repeat(state, trial.id)
+
+
+def _without_pending_repeat(state, id: int):
+    """The repetition of a trial that is being felt goes."""
+    pending = state.pending
+    if pending is None or pending.repeats != id:
+        return state
+    return state.with_trial(pending.id, status="dropped", on=None)
+
+
+def _counts(state, id: int) -> bool:
+    """Whether the answer to this trial counts."""
+    return state.trial(id).status == "answered"
+
+
 def _undone(state, event):
     trial = state.trial(event.data["id"])
-    state = state.with_trial(trial.id, status="undone")
-    return replace(state, wanted=(trial.repeats, *state.wanted)) if trial.repeats else state.dropped()
+    state = _taken_out(state, trial, status="undone")
+    again = trial.repeats and _counts(state, trial.repeats)
+    return replace(state, wanted=(trial.repeats, *state.wanted)) if again else state
 
 
 def _again(trial) -> dict[str, Any]:
@@ -250,15 +278,16 @@ def _stop_key(trial: Trial, side: str) -> Any:
 
 
 def _made_void(state, trial, by, reason, sides=()):
-    """`sides`: the one that was on when the device stopped."""
-    changes = trial.status == "answered" and not trial.repeats
-    state = state.dropped() if changes else state
+    """`sides`: the one that was on when the device stopped. `asked_again`: whether a repetition is."""
     voided = {"by": by, "reason": reason, "sides": list(sides)}
-    state = state.with_trial(trial.id, status="void", on=None, voided=voided)
+    state = _taken_out(state, trial, status="void", voided=voided)
+    if not trial.repeats:
+        return state
     stops = state.stops(trial.block)
-    if trial.repeats and not any(stops[_stop_key(trial, side)] >= STOPS for side in trial.renderings):
-        state = replace(state, wanted=(trial.repeats, *state.wanted))
-    return state
+    stopped_twice = any(stops[_stop_key(trial, side)] >= STOPS for side in trial.renderings)
+    again = not stopped_twice and _counts(state, trial.repeats)
+    state = state.with_trial(trial.id, voided=voided | {"asked_again": again})
+    return replace(state, wanted=(trial.repeats, *state.wanted)) if again else state
 
 
 def _voided(state, event):
@@ -272,8 +301,14 @@ def _skipped(state, event):
 
 def _restored(state, event):
     trial = state.trial(event.data["id"])
-    state = state if trial.repeats else state.dropped()
-    return state.with_trial(trial.id, status="answered", voided=None)
+    again, state = trial.voided, state.with_trial(trial.id, status="answered", voided=None)
+    if not trial.repeats:
+        return state.dropped()
+    if not again.get("asked_again"):
+        return state
+    if trial.repeats in state.wanted:
+        return replace(state, wanted=_without(state.wanted, trial.repeats))
+    return _without_pending_repeat(state, trial.repeats)
 
 
 def _paused(state, event):

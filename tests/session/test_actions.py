@@ -305,6 +305,63 @@ def test_an_answered_trial_can_be_repeated_and_does_not_count():
     assert len(driver.state.answers(1)) == 6
 
 
+@pytest.mark.parametrize("kind", ["optimisation", "validation"])
+def test_a_repetition_of_what_does_not_count_any_more_is_not_asked(kind):
+    driver = to_first_answerable(kind)
+    driver.do("answer", 0)
+    source = live.last_answered(driver.state).id
+    driver.do("again", source - 1)
+    assert driver.state.wanted == (source,)
+    driver.do("undo", 0)
+    assert driver.state.wanted == () and driver.state.pending.repeats is None
+    driver.do("answer", 0)
+    source = live.last_answered(driver.state).id
+    driver.do("again", source - 1)
+    driver.do("answer", 0)
+    assert driver.state.pending.repeats == source  # and while it is being felt
+    driver.do("void old", source - 1)
+    assert driver.state.pending.repeats is None and driver.state.wanted == ()
+    driver.finish()
+    assert len(driver.state.answers(1)) == 6
+
+
+@pytest.mark.parametrize("kind", ["optimisation", "validation"])
+def test_an_answer_that_was_asked_again_since_is_not_restored(kind):
+    driver = to_first_answerable(kind)
+    driver.do("answer", 0)
+    voided = live.last_answered(driver.state)
+    driver.do("void old", voided.id - 1)
+    assert driver.state.pending.renderings == voided.renderings
+    driver.do("answer", 1)
+    with pytest.raises(RefusedError, match="has been filled"):
+        live.restore(driver.state, voided.id, 1.0)
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_a_repetition_is_not_restored_beside_the_one_in_its_place(answered):
+    driver = to_first_answerable()
+    driver.do("answer", 0)
+    source = live.last_answered(driver.state).id
+    driver.do("again", source - 1)
+    driver.do("answer", 0)
+    driver.do("answer", 0)
+    repeat = live.last_answered(driver.state)
+    assert repeat.repeats == source
+    pending = driver.state.pending
+    driver.log(live.void(driver.state, repeat.id, "a cough", 1.0))
+    if answered:
+        driver.do("answer", 0)  # to what was pending meanwhile
+        driver.do("answer", 0)  # to the repetition
+        with pytest.raises(RefusedError, match="has been filled"):
+            live.restore(driver.state, repeat.id, 1.0)
+    else:
+        driver.log(live.restore(driver.state, repeat.id, 1.0))
+        assert driver.state.wanted == () and driver.state.pending == pending
+        driver.finish()
+    counted = [t for t in driver.state.trials if t.repeats == source and t.status == "answered"]
+    assert len(counted) == 1
+
+
 def test_the_warm_up_goes_on_for_as_long_as_one_likes():
     driver = Driver()
     driver.step()

@@ -75,9 +75,9 @@ def test_a_live_trial_fits_each_data_set_once():
 
         for response in ("similar", "different", "close"):  # two of them space-filling
             state = answered(trial(state), response)
-        for _ in range(2):  # voided twice: another rendering takes its place
+        for _ in range(2):  # the device stops twice: another rendering takes its place
             state = trial(state)
-            state = state.after(live.void(state, state.pending.id, "noise", 0.0))
+            state = state.after(live.device(state, "hold", 0.0))
         state = answered(trial(state), "close")
         state = state.after(live.repeat(state, 0.0, 3))
         state = answered(trial(state), "similar")  # the answer to a repeat is no data

@@ -197,3 +197,56 @@ def test_several_materials_have_studies_of_their_own():
     assert 5.0 <= state.pending.renderings["a"]["u"] <= 6.0
     state = asked(told(state, "close"), chooser)
     assert state.pending.data["material"] == "hard" and state.pending.renderings["a"]["u"] <= 1.0
+
+
+def optimising(study, *materials):
+    blocks = tuple(Block("optimisation", 2, material=m) for m in materials)
+    return LiveSession.start(study, msgspec.structs.replace(header(), study=study.hash, sets={}, blocks=blocks))
+
+
+def test_materials_have_space_filling_points_of_their_own_that_do_not_depend_on_their_order():
+    study = Study.from_dict(RAW | {"materials": {"soft": {}, "hard": {}}})
+    seen = {}
+    for order in (("soft", "hard"), ("hard", "soft"), ("soft",)):
+        state, points = optimising(study, *order), {}
+        chooser = LiveChooser(state)
+        while state.screen != "done":
+            state = asked(state, chooser)
+            points.setdefault(state.pending.data["material"], []).append(state.pending.renderings["a"])
+            state = told(state, "close")
+        seen[order] = points
+    assert seen["soft", "hard"] == seen["hard", "soft"]
+    both = seen["soft", "hard"]
+    assert not any(point in both["hard"] for point in both["soft"])
+    alone = Session.start(study.material("soft"), seed=0)  # one material keeps the points of the session's seed
+    assert seen[("soft",)]["soft"] == [alone.ask(), alone.tell("close").ask()]
+
+
+def test_a_voided_space_filling_trial_is_asked_again_and_no_other_one(chooser):
+    state = start()
+    for response in ANSWERS[:3]:
+        state = told(asked(state, chooser), response)
+    first, second, _ = (t.renderings["a"] for t in state.trials)
+    for answered in (2, 3):
+        here = state
+        if answered == 2:
+            here = here.after(live.undo(here, 1.0))
+        here = asked(here.after(live.void(here, 1, "a cough", 1.0)), chooser)
+        assert here.pending.renderings["a"] == first and here.pending.data["choice"]["by"] == "latin hypercube"
+        here = asked(told(here, "similar"), chooser)
+        assert here.pending.renderings["a"] not in (first, second)
+
+
+def test_a_space_filling_point_that_is_not_shown_again_is_replaced_once(chooser):
+    state = asked(start(), chooser)
+    point = state.pending.renderings["a"]
+    for _ in range(2):
+        state = state.after(live.present(state, state.pending.id, 1, True, 0.5))
+        state = asked(state.after(live.device(state, "hold", 1.0)), chooser)
+    by = []
+    for response in ANSWERS[:3]:
+        by.append(state.pending.data["choice"]["by"])
+        state = asked(told(state, response), chooser)
+    assert by == ["latin hypercube", "latin hypercube", "ucb"]
+    asked_for = [t.renderings["a"] for t in state.answers(0)]
+    assert point not in asked_for and asked_for[0] != asked_for[1]
