@@ -12,7 +12,7 @@ from typing import Any
 from hilbo.session.actions import LiveSession, Trial, last_answered, restorable, skippable, voidable
 from hilbo.session.views import experimenter_view, participant_view
 
-__all__ = ["experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
+__all__ = ["choice_rows", "experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
 
 _TEXTS = {
     "page_title": "title", "more": "another", "break": "break", "saving": "sent", "disconnected": "offline",
@@ -159,21 +159,31 @@ def _trial_rows(hub, trial):
     for side, values in trial.renderings.items():
         name = trial.sets.get(side)
         rows.append([f"Rendering {side.upper()}" + (f" ({name})" if name else ""), _set_words(values)])
-    choice = trial.data.get("choice", {})
-    if "mean" in choice:
-        rows.append(["Chosen by", f"{choice['by']}, mean {choice['mean']:.3f} ± {choice['sd']:.3f}"])
-        rows.append(["Answers", ", ".join(f"{n} {100 * p:.0f} %" for n, p in choice["probabilities"].items())])
-        certificate = choice["certificate"]
-        words = "fit converged" if certificate["converged"] else "fit NOT converged"
-        rows.append(["Certificate", f"{words}, residual {certificate['residual']:.1g}"])
-    margin = choice.get("margin")
-    if margin is not None:
-        many = margin if isinstance(margin, dict) else {"": margin}
-        rows.append(
-            ["Passivity margin", ", ".join(f"{k} {v:.4f} N·s/m".strip() for k, v in many.items() if v is not None)]
-        )
+    rows += choice_rows(trial.data.get("choice", {}))
     if hub.delays:
         rows.append(["Answer to device", f"{1000 * hub.delays[-1]['total']:.0f} ms"])
+    return rows
+
+
+def choice_rows(choice: dict[str, Any]) -> list[list[str]]:
+    """Why a rendering was chosen: name and value, of what is known (older logs hold null for what was no number)."""
+    rows = []
+    mean, sd = choice.get("mean"), choice.get("sd")
+    if "by" in choice and choice["by"] != "plan":
+        known = "" if mean is None or sd is None else f", mean {mean:.3f} ± {sd:.3f}"
+        rows.append(["Chosen by", choice["by"] + known])
+    chances = {name: p for name, p in (choice.get("probabilities") or {}).items() if p is not None}
+    if chances:
+        rows.append(["Answers", ", ".join(f"{name} {100 * p:.0f} %" for name, p in chances.items())])
+    certificate = choice.get("certificate") or {}
+    if certificate:
+        residual = certificate.get("residual")
+        words = "fit converged" if certificate.get("converged") else "fit NOT converged"
+        rows.append(["Certificate", words + ("" if residual is None else f", residual {residual:.1g}")])
+    margin = choice.get("margin")
+    margins = {k: v for k, v in (margin if isinstance(margin, dict) else {"": margin}).items() if v is not None}
+    if margins:
+        rows.append(["Passivity margin", ", ".join(f"{k} {v:.4f} N·s/m".strip() for k, v in margins.items())])
     return rows
 
 

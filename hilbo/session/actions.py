@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
+from hilbo.errors import InputError
 from hilbo.session.records import Block, Event, Header, Need, Planned, RefusedError, Trial
 from hilbo.session.state import LiveSession, Screen
 from hilbo.study.protocols import protocol
@@ -61,7 +62,7 @@ class Chooser(Protocol):
 
 
 def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
-    """The next trial: its renderings, and why these."""
+    """The next trial: its renderings, and why these. Raises InputError for a rendering that is no finite number."""
     if state.need is None:
         raise RefusedError("nothing", f"nothing is to be proposed now: the screen shows {state.screen}.")
     need = state.need
@@ -76,7 +77,11 @@ def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
         "planned": need.planned,
         "repeats": need.repeats,
     }
-    return _event(state, "propose", at, **data, **chooser.choose(state, need))
+    found = chooser.choose(state, need)
+    for name, value in ((n, v) for values in found["renderings"].values() for n, v in values.items()):
+        if not math.isfinite(value):
+            raise InputError(f"the next rendering is no number ({name} is {value}); undo or void the last answer.")
+    return _event(state, "propose", at, **data, **found)
 
 
 def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event:

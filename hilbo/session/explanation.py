@@ -1,10 +1,12 @@
 """Why a rendering is proposed: what its posterior and its space say of it, as the data of a proposal.
 
 `choice` has what chose the rendering, mean and sd of the latent score, the acquisition's value, the probabilities of
-the answers, the passivity margin (N.s/m) and the certificate of the fit. Nothing is fitted here.
+the answers, the passivity margin (N.s/m) and the certificate of the fit. Nothing is fitted here. What is no finite
+number (of a fit that failed, say) is left out: JSON has no word for it.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -49,7 +51,7 @@ def explained(study: Study, posterior: Posterior, choice: Choice) -> dict[str, A
     """`renderings` and `choice` of a proposal's data."""
     found: _Explanation = jax.device_get(_explanation(study, posterior, np.asarray(choice.point)))
     parameters = dict(zip(study.space.names, np.asarray(choice.point).tolist(), strict=True))
-    mean, sd = float(found.mean), float(np.sqrt(found.variance))
+    mean, sd = float(found.mean), math.sqrt(found.variance) if found.variance >= 0 else math.nan
     figures = {f.name: getattr(found.certificate, f.name).item() for f in dataclasses.fields(found.certificate)}
     words = {
         "by": choice.by,
@@ -62,7 +64,13 @@ def explained(study: Study, posterior: Posterior, choice: Choice) -> dict[str, A
         "certificate": figures,
     }
     derived = {name: float(value) for name, value in found.derived.items()}
-    return {"renderings": {"a": parameters | derived}, "choice": words}
+    return {"renderings": {"a": parameters | derived}, "choice": _numbers(words)}
+
+
+def _numbers(words: dict[str, Any]) -> dict[str, Any]:
+    """What is said, without what is no finite number."""
+    kept = {key: _numbers(value) if isinstance(value, dict) else value for key, value in words.items()}
+    return {key: value for key, value in kept.items() if not isinstance(value, float) or math.isfinite(value)}
 
 
 @eqx.filter_jit
@@ -79,7 +87,7 @@ def described(study: Study, values: Mapping[str, float]) -> Described:
     derived, margin = _facts(study, {name: np.asarray(values[name], float) for name in study.space.names})
     parameters = {name: float(values[name]) for name in study.space.names}
     parameters |= {name: float(value) for name, value in derived.items()}
-    return Described(parameters, None if margin is None else float(margin))
+    return Described(parameters, None if margin is None or not math.isfinite(margin) else float(margin))
 
 
 @eqx.filter_jit

@@ -53,7 +53,7 @@ class Answers(NamedTuple):
 
 
 class _Situation(NamedTuple):
-    """What a choice depends on beside study and seed: the answers, and the renderings voided twice."""
+    """What a choice depends on beside study and seed: the answers, and the renderings not to be shown again."""
 
     answers: Answers
     excluded: tuple[tuple[float, ...], ...]

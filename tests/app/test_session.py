@@ -8,6 +8,7 @@ import threading
 import pytest
 from live_server import PATIENCE, Live, ask, refused
 
+from hilbo.app.views import choice_rows
 from hilbo.session.export import validation_table
 from hilbo.session.records import Block, Planned
 
@@ -235,3 +236,20 @@ def test_a_trial_that_the_device_always_stops_may_be_left_out(tmp_path):
         live.command("skip", trial=view["means"]["skip"]["trial"], reason="slips")
         assert live.until(lambda view: view["phase"] == "done", live.whole)["trial"][0][1] == "0 of 1; 1 left out"
         live.replays()
+
+
+@pytest.mark.parametrize(
+    "choice",
+    [
+        {"by": "ucb"},
+        {"by": "ucb", "mean": None, "sd": None, "score": None, "probabilities": None, "margin": None},
+        {"by": "ucb", "mean": 0.5, "sd": 0.1, "certificate": {"converged": False, "residual": None}},
+        {"by": "ucb", "probabilities": {"close": None, "similar": 0.25}, "margin": {"a": None, "b": 0.5}},
+    ],
+)
+def test_the_page_shows_what_there_is_of_a_choice(choice):
+    rows = dict(choice_rows(choice))
+    assert rows["Chosen by"] == ("ucb, mean 0.500 ± 0.100" if choice.get("mean") else "ucb")
+    assert rows.get("Certificate") == ("fit NOT converged" if "certificate" in choice else None)
+    assert rows.get("Answers") == ("similar 25 %" if choice.get("probabilities") else None)
+    assert rows.get("Passivity margin") == ("b 0.5000 N·s/m" if choice.get("margin") else None)

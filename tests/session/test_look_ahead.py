@@ -1,5 +1,8 @@
 """What a live session shows next: the very renderings of `Session`, found before they are asked for."""
 
+import dataclasses
+
+import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
@@ -9,7 +12,9 @@ from hilbo import Session, Study
 from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
 from hilbo.session import actions as live
+from hilbo.session import explanation
 from hilbo.session.actions import Block, LiveSession
+from hilbo.session.event_log import EventLog, log_name, read_log
 from hilbo.session.excluded import APART
 from hilbo.session.logged_session import LoggedSession
 from hilbo.session.look_ahead import LiveChooser
@@ -250,3 +255,33 @@ def test_a_space_filling_point_that_is_not_shown_again_is_replaced_once(chooser)
     assert by == ["latin hypercube", "latin hypercube", "ucb"]
     asked_for = [t.renderings["a"] for t in state.answers(0)]
     assert point not in asked_for and asked_for[0] != asked_for[1]
+
+
+def test_numbers_that_are_none_stay_out_of_a_choice_and_of_the_log(monkeypatch, tmp_path):
+    def broken(study, posterior, point):
+        found, nan = real(study, posterior, point), jnp.asarray(np.nan)
+        figures = dataclasses.replace(found.certificate, residual=nan, condition=jnp.asarray(np.inf))
+        return found._replace(mean=nan, variance=jnp.asarray(-1e-18), certificate=figures)
+
+    real = explanation._explanation
+    monkeypatch.setattr(explanation, "_explanation", broken)
+    event = live.propose(start(), LiveChooser(start()), 0.0)
+    choice = event.data["choice"]
+    assert not {"mean", "sd"} & set(choice)
+    assert not {"residual", "condition"} & set(choice["certificate"]) and choice["certificate"]["converged"]
+    head = start().header
+    with EventLog.create(tmp_path / log_name(head), STUDY, head) as log:
+        log.append(event)
+        alive = log.state
+    header_, events, _ = read_log(tmp_path / log_name(head), STUDY)
+    assert LiveSession.fold(STUDY, header_, events) == alive
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_rendering_that_is_no_number_is_refused_where_it_is_proposed(value):
+    class Broken:
+        def choose(self, state, need):
+            return {"renderings": {"a": {"u": 0.5, "v": float(value)}}, "choice": {"by": "ucb"}}
+
+    with pytest.raises(InputError, match=r"v is (nan|inf)"):
+        live.propose(start(), Broken(), 0.0)
