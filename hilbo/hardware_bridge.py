@@ -105,6 +105,8 @@ class Renderer:
         try:
             if self._link.lost is None:
                 self._link.request(protocol.Stop())
+            else:
+                self._link.shout(protocol.Stop())
         finally:
             self._link.close()
             if self.simulator is not None:

@@ -8,7 +8,7 @@ const char *hb_error_sentence(enum hb_error error)
     case HB_OK:
         return "The config is in order.";
     case HB_ERROR_TICKS:
-        return "tick_rate_Hz must be 100 to 10000, watchdog_ticks 1 to 60000 and hold_ticks 1 to 1000.";
+        return "tick_rate_Hz must be 100 to 10000, watchdog_ticks 1 tick to 1 s and hold_ticks 1 tick to 0.1 s.";
     case HB_ERROR_MAXIMA:
         return "most_taps and most_states must be at most HB_MAX_TAPS and HB_MAX_STATES: build with larger maxima.";
     case HB_ERROR_CAPABILITIES:
@@ -47,7 +47,7 @@ static bool is_range(struct hb_range range, float low, float high)
 static bool ticks_are_good(const struct hb_config *c)
 {
     return c->tick_rate_Hz >= 100U && c->tick_rate_Hz <= 10000U && c->watchdog_ticks >= 1U &&
-           c->watchdog_ticks <= 60000U && c->hold_ticks >= 1U && c->hold_ticks <= 1000U;
+           c->watchdog_ticks <= c->tick_rate_Hz && c->hold_ticks >= 1U && c->hold_ticks * 10U <= c->tick_rate_Hz;
 }
 
 static bool limits_are_good(const struct hb_config *c)

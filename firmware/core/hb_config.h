@@ -7,6 +7,10 @@
 
 #include <stdint.h>
 
+#if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
+#error "build without -ffast-math: the checks against NaN and infinity are compiled away with it"
+#endif
+
 /* Compile-time maxima: they alone fix the size of struct hb_device. */
 #ifndef HB_MAX_TAPS
 #define HB_MAX_TAPS 255U /* past samples of short memory, odd */
@@ -37,8 +41,8 @@ struct hb_config {
     uint32_t firmware;       /* hash of the build, told in HELLO */
     uint32_t line_rate_baud; /* what the line carries; decides which STREAM fits */
     uint16_t tick_rate_Hz;   /* 100 to 10000 */
-    uint16_t watchdog_ticks; /* without a heartbeat: HOLD; 1 to 60000 */
-    uint16_t hold_ticks;     /* HOLD and STOP reach zero force within this; 1 to 1000 */
+    uint16_t watchdog_ticks; /* without a heartbeat: HOLD; at most 1 s */
+    uint16_t hold_ticks;     /* HOLD and STOP reach zero force within this; at most 0.1 s */
     uint16_t most_taps;      /* <= HB_MAX_TAPS */
     uint8_t most_states;     /* <= HB_MAX_STATES */
     uint8_t capabilities;    /* of enum hb_capability */
@@ -83,7 +87,7 @@ enum hb_error {
 /* One sentence: what is wrong, and what to write. Never NULL. */
 const char *hb_error_sentence(enum hb_error error);
 
-/* HB_OK, or the first fault in the order of the enum. */
+/* HB_OK, or the first fault in the order of the enum; `config` is not NULL. */
 enum hb_error hb_config_check(const struct hb_config *config);
 
 #endif

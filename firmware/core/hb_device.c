@@ -15,9 +15,11 @@ enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, 
 {
     enum hb_error error = hb_config_check(config);
     memset(device, 0, sizeof *device); /* in place: a literal of this size may pass over the stack */
-    device->config = config;
     device->boot_id = boot_id;
+    device->state = (uint8_t)HB_ESTOPPED;
+    device->cause = (uint8_t)HB_CAUSE_BOOT;
     if (error == HB_OK) {
+        device->config = config;
         device->heartbeat_age_ticks = config->watchdog_ticks;
         hb_enter(device, HB_STOPPED, HB_CAUSE_BOOT);
     }
@@ -27,6 +29,9 @@ enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, 
 size_t hb_receive(struct hb_device *device, const uint8_t *bytes, size_t size)
 {
     struct hb_frame frame;
+    if (device->config == NULL) {
+        return size;
+    }
     for (size_t i = 0U; i < size; i += 1U) {
         if (hb_receiver_push(&device->receiver, bytes[i], &frame)) {
             hb_handle(device, &frame);
@@ -41,46 +46,83 @@ size_t hb_transmit(struct hb_device *device, uint8_t *bytes, size_t room)
     return hb_output_take(&device->output, bytes, room);
 }
 
-/* The difference of two forces, taken back as fast as the slew limit allows beside the model's own movement. */
-static void fade(struct hb_device *device, float before_N)
+/* The largest force of a bank's set on this device. */
+static float limit(const struct hb_device *device, uint8_t bank)
+{
+    float set_limit_N = device->bank[bank].set.force_limit_N;
+    return set_limit_N < device->config->force_limit_N ? set_limit_N : device->config->force_limit_N;
+}
+
+/* What is felt of a bank's force. */
+static float felt(const struct hb_device *device, uint8_t bank, float force_N)
+{
+    return force_N > 0.0F ? hb_clamp(force_N, 0.0F, limit(device, bank)) : 0.0F;
+}
+
+/* The offset, taken back as fast as the slew limit allows beside the model's own movement to `felt_N`; and no further
+ * from 0 than `gap_N`, so that the force stays between those of the two sets while the hand moves. */
+static void fade(struct hb_device *device, float felt_N, float gap_N)
 {
     const struct hb_config *config = device->config;
     float step_N = config->slew_limit_N_per_s / (float)config->tick_rate_Hz;
-    float moved_N = before_N - device->safety.force_N;
+    float moved_N = felt_N + device->offset_N - device->safety.force_N;
     float along_N = device->offset_N > 0.0F ? -moved_N : moved_N;
-    float room_N = hb_clamp(step_N - along_N, 0.0F, step_N);
-    device->offset_N = hb_towards_zero(device->offset_N, room_N);
+    float offset_N = hb_towards_zero(device->offset_N, hb_clamp(step_N - along_N, 0.0F, step_N));
+    device->offset_N = gap_N > 0.0F ? hb_clamp(offset_N, 0.0F, gap_N) : hb_clamp(offset_N, gap_N, 0.0F);
 }
 
-/* The command while RUNNING, up to and with the slew limit. */
+/* From beyond the limit of the new set the force only falls. */
+static void keep_below_limit(struct hb_device *device, float felt_N)
+{
+    float most_N = limit(device, device->active);
+    most_N = device->safety.force_N > most_N ? device->safety.force_N : most_N;
+    if (felt_N + device->offset_N > most_N) {
+        device->offset_N = most_N - felt_N;
+    }
+}
+
+/* The force while RUNNING and in contact, up to and with the slew limit. `old_N`: of the set that was in force before,
+ * while the device goes on from it; otherwise 0. */
 static float run(struct hb_device *device, float model_N, float old_N)
 {
     const struct hb_config *config = device->config;
     struct hb_safety *safety = &device->safety;
-    float set_limit_N = device->bank[device->active].set.force_limit_N;
-    float limit_N = set_limit_N < config->force_limit_N ? set_limit_N : config->force_limit_N;
-    float force_N = model_N;
-    if (device->starting) {
-        device->offset_N = -model_N;
-    } else if (device->flipped) {
-        device->offset_N = old_N - model_N;
+    float felt_N = felt(device, device->active, model_N);
+    float gap_N = felt(device, (uint8_t)(1U - device->active), old_N) - felt_N;
+    if (model_N > felt_N) {
+        hb_mark_saturated(safety);
     }
-    float before_N = hb_clamp(model_N + device->offset_N, 0.0F, limit_N);
+    if (device->starting || device->flipped) {
+        device->offset_N = gap_N;
+    }
+    keep_below_limit(device, felt_N);
+    float before_N = felt_N + device->offset_N;
     bool switching = device->offset_N != 0.0F;
     if (switching) {
         safety->flags |= (uint16_t)HB_FLAG_SWITCHING;
         if (!device->starting && !device->flipped) {
-            fade(device, before_N);
+            fade(device, felt_N, gap_N);
         }
-        force_N = model_N + device->offset_N;
-        force_N = force_N > 0.0F ? force_N : 0.0F;
+    }
+    float force_N = felt_N + device->offset_N;
+    if ((config->capabilities & (uint8_t)HB_CAN_CONTROL_PASSIVITY) != 0U) {
+        float most_N = limit(device, device->active);
+        force_N = hb_clamp(hb_control(safety, config, force_N), 0.0F, force_N > most_N ? force_N : most_N);
+    }
+    return hb_slew(safety, config, force_N, switching ? before_N : force_N);
+}
+
+/* The command while RUNNING: nothing is felt out of contact, and what is left of a difference ends there. */
+static float render(struct hb_device *device, float model_N, float old_N)
+{
+    float force_N = 0.0F;
+    if (hb_in_contact(&device->safety)) {
+        force_N = run(device, model_N, old_N);
+    } else {
+        device->offset_N = 0.0F;
     }
     device->starting = false;
-    if ((config->capabilities & (uint8_t)HB_CAN_CONTROL_PASSIVITY) != 0U) {
-        force_N = hb_control(safety, config, force_N);
-    }
-    force_N = hb_saturate(safety, force_N, limit_N);
-    return hb_slew(safety, config, force_N, switching ? before_N : force_N);
+    return force_N;
 }
 
 static float drive(struct hb_device *device)
@@ -150,6 +192,9 @@ float hb_tick(struct hb_device *device, const struct hb_input *input)
 {
     const struct hb_config *config = device->config;
     struct hb_safety *safety = &device->safety;
+    if (config == NULL) {
+        return 0.0F;
+    }
     device->tick += 1U;
     safety->flags = 0U;
     if (device->heartbeat_age_ticks < config->watchdog_ticks) {
@@ -162,12 +207,10 @@ float hb_tick(struct hb_device *device, const struct hb_input *input)
     float old_N = 0.0F;
     float model_N = hb_render(device, hb_penetration_mm(safety, config), &old_N);
     bool finite = hb_is_finite(model_N) && hb_is_finite(old_N);
-    model_N = model_N > 0.0F ? model_N : 0.0F;
-    old_N = old_N > 0.0F ? old_N : 0.0F;
     hb_observe(safety, config);
     float wanted_N = 0.0F;
     if (hb_is_in(device, HB_RUNNING)) {
-        wanted_N = run(device, model_N, old_N);
+        wanted_N = render(device, model_N, old_N);
     } else if (hb_is_in(device, HB_DRIVING)) {
         wanted_N = drive(device);
     }

@@ -31,7 +31,7 @@
 
 /* Owned by the caller; only hb_init and the functions below write to it, whoever likes may read. */
 struct hb_device {
-    const struct hb_config *config;
+    const struct hb_config *config; /* NULL where hb_init refused it: such a device gives no force and no answer */
     uint32_t boot_id;
     uint32_t tick;
     uint8_t state;                /* enum hb_state */
@@ -48,7 +48,8 @@ struct hb_device {
     uint32_t warm_left;    /* ticks until the staged history is its own */
     bool flipped;          /* the next tick is the first of a set that follows another */
     bool starting;         /* the next tick is the first after START */
-    float offset_N;        /* what is left of the difference of two forces */
+    bool follows;          /* the offset is to the force of the idle bank, which was in force before; else to 0 */
+    float offset_N;        /* what is left of the difference of two forces; 0 out of contact */
 
     struct hb_safety safety;
     struct hb_drive drive;
@@ -63,9 +64,20 @@ struct hb_device {
     uint8_t answer[HB_MAX_FRAME];
 };
 
+/* The name of hb_init holds the maxima: a port that was compiled with others than the core does not link. */
+#define HB_JOIN(a, b, c) hb_init_##a##_##b##_##c
+#define HB_INIT(a, b, c) HB_JOIN(a, b, c)
+#define hb_init HB_INIT(HB_MAX_TAPS, HB_MAX_STATES, HB_OUTPUT_BYTES)
+
+#if defined(__GNUC__)
+#define HB_MUST_LOOK __attribute__((warn_unused_result))
+#else
+#define HB_MUST_LOOK
+#endif
+
 /* STOPPED, without a set, and a NOTICE of the start waiting for the line. `boot_id` differs at every start (a counter
- * in flash, a random number). On an error nothing else may be called. */
-enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, uint32_t boot_id);
+ * in flash, a random number). On an error the device stays in ESTOP: no force, no answer. */
+HB_MUST_LOOK enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, uint32_t boot_id);
 
 /* Take bytes from the line, up to the end of the first frame that is carried out. Returns how many were taken: all, or
  * call again with the rest. */

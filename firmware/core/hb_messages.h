@@ -91,7 +91,8 @@ enum hb_reason {
     HB_NACK_NO_HEARTBEAT = 26,
     HB_NACK_LINE_TOO_SLOW = 27,
     HB_NACK_NOT_CAPABLE = 28,
-    HB_NACK_DRIVE_RANGE = 29
+    HB_NACK_DRIVE_RANGE = 29,
+    HB_NACK_NO_INPUT = 30
 };
 
 /* Flags of a telemetry sample. */

@@ -52,8 +52,12 @@ enum hb_reason hb_start(struct hb_device *device, const struct hb_frame *frame, 
     if (device->heartbeat_age_ticks >= device->config->watchdog_ticks) {
         return HB_NACK_NO_HEARTBEAT;
     }
+    if (!hb_input_is_good(&device->safety)) {
+        return HB_NACK_NO_INPUT;
+    }
     hb_enter(device, HB_RUNNING, HB_CAUSE_NONE);
     device->starting = true;
+    device->follows = false;
     device->safety.energy = 0;
     return HB_ACCEPTED;
 }
@@ -79,6 +83,9 @@ enum hb_reason hb_drive(struct hb_device *device, const struct hb_frame *frame, 
     }
     if (device->heartbeat_age_ticks >= device->config->watchdog_ticks) {
         return HB_NACK_NO_HEARTBEAT;
+    }
+    if (!hb_input_is_good(&device->safety)) {
+        return HB_NACK_NO_INPUT;
     }
     hb_drive_begin(&device->drive, &request, hb_position_mm(&device->safety, device->config));
     hb_enter(device, HB_DRIVING, HB_CAUSE_NONE);
@@ -109,6 +116,10 @@ enum hb_reason hb_clear(struct hb_device *device, const struct hb_frame *frame, 
     }
     if (!hb_is_in(device, HB_HOLDING) && !hb_is_in(device, HB_ESTOPPED)) {
         return wrong_state(device, reply);
+    }
+    if (hb_is_in(device, HB_ESTOPPED) && device->safety.force_N != 0.0F) {
+        reply->nack.ticks = 1U; /* the tick that puts zero force out has not come yet */
+        return HB_NACK_BUSY;
     }
     if (hb_is_in(device, HB_HOLDING) && !hb_ramp_has_ended(&device->safety, device->config)) {
         reply->nack.ticks = (uint32_t)(device->config->hold_ticks - device->safety.ramp_ticks);

@@ -25,27 +25,42 @@ static bool is_plausible(const struct hb_safety *safety, const struct hb_config 
     return hb_absolute(step_mm) <= config->plausible_step_mm * (float)(safety->bad + 1U);
 }
 
+static void believe(struct hb_safety *safety, int32_t counts)
+{
+    safety->step_counts = safety->known ? counts - safety->counts : 0;
+    safety->step_ticks = (uint16_t)(safety->bad + 1U);
+    safety->counts = counts;
+    safety->known = true;
+    safety->lost = false;
+    safety->bad = 0U;
+    safety->loss = safety->loss > 0U ? (uint16_t)(safety->loss - 1U) : 0U;
+}
+
 bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input)
 {
     if (is_plausible(safety, config, input)) {
-        safety->step_counts = safety->known ? input->position_counts - safety->counts : 0;
-        safety->step_ticks = (uint16_t)(safety->bad + 1U);
-        safety->counts = input->position_counts;
-        safety->known = true;
-        safety->bad = 0U;
+        believe(safety, input->position_counts);
         return true;
     }
     hb_count_up(&safety->count.input_held);
     safety->flags |= (uint16_t)HB_FLAG_INPUT_HELD;
     safety->step_counts = 0;
     safety->step_ticks = 1U;
-    if (safety->bad + 1U < HB_BAD_POSITIONS) {
-        safety->bad = (uint16_t)(safety->bad + 1U);
+    safety->bad = (uint16_t)(safety->bad + 1U);
+    safety->loss = (uint16_t)(safety->loss + HB_LOSS_OF_BAD);
+    if (safety->loss < HB_LOSS_LIMIT) {
         return true;
     }
     safety->bad = 0U;
-    safety->known = false; /* lost: the next position within the stroke is a new beginning */
+    safety->loss = HB_LOSS_LIMIT;
+    safety->known = false; /* the next position within the stroke is a new beginning */
+    safety->lost = true;
     return false;
+}
+
+bool hb_input_is_good(const struct hb_safety *safety)
+{
+    return safety->bad == 0U && !safety->lost;
 }
 
 float hb_position_mm(const struct hb_safety *safety, const struct hb_config *config)
@@ -65,9 +80,11 @@ float hb_penetration_mm(const struct hb_safety *safety, const struct hb_config *
 
 void hb_observe(struct hb_safety *safety, const struct hb_config *config)
 {
-    if (hb_in_contact(safety) && safety->counts - safety->step_counts <= 0) {
+    bool touches = hb_in_contact(safety);
+    if (touches && !safety->touching) {
         safety->energy = 0;
     }
+    safety->touching = touches;
     float step_mm = (float)safety->step_counts * config->encoder_step_mm;
     int64_t taken = (int64_t)(safety->force_N * step_mm * ENERGY_SCALE);
     int64_t energy = safety->energy + taken;
@@ -89,8 +106,16 @@ float hb_control(struct hb_safety *safety, const struct hb_config *config, float
     }
     hb_count_up(&safety->count.controlled);
     safety->flags |= (uint16_t)HB_FLAG_CONTROLLED;
-    float controlled_N = force_N - hb_energy_mJ(safety) / step_mm;
-    return controlled_N > 0.0F ? controlled_N : 0.0F;
+    float rate_Hz = (float)config->tick_rate_Hz / (float)safety->step_ticks;
+    float most_N = config->damping_N_s_per_m * hb_absolute(step_mm) * rate_Hz / 1000.0F;
+    float added_N = hb_clamp(-hb_energy_mJ(safety) / step_mm, -force_N, most_N);
+    return force_N + added_N;
+}
+
+void hb_mark_saturated(struct hb_safety *safety)
+{
+    hb_count_up(&safety->count.saturated);
+    safety->flags |= (uint16_t)HB_FLAG_SATURATED;
 }
 
 float hb_saturate(struct hb_safety *safety, float force_N, float limit_N)
@@ -98,8 +123,7 @@ float hb_saturate(struct hb_safety *safety, float force_N, float limit_N)
     if (hb_absolute(force_N) <= limit_N) {
         return force_N;
     }
-    hb_count_up(&safety->count.saturated);
-    safety->flags |= (uint16_t)HB_FLAG_SATURATED;
+    hb_mark_saturated(safety);
     return hb_clamp(force_N, -limit_N, limit_N);
 }
 

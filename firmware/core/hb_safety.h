@@ -2,7 +2,8 @@
  *
  *     input check - model - passivity observer and controller - saturation - slew limit - velocity limit and overrun
  *
- * Whatever acts is counted and flagged. Input, velocity and overrun lead to HOLD, which the device decides. */
+ * Whatever acts is counted and flagged. Input, velocity and overrun lead to HOLD, which the device decides. While a
+ * model is rendered there is no force out of contact, whatever links came before: the slew limit does not hold it up. */
 #ifndef HB_SAFETY_H
 #define HB_SAFETY_H
 
@@ -37,7 +38,10 @@ struct hb_safety {
     int32_t step_counts; /* how it changed, over `step_ticks`; 0 while a position is held */
     uint16_t step_ticks;
     bool known;       /* there has been a position to compare with */
-    uint16_t bad;     /* bad positions in a row, up to HB_BAD_POSITIONS */
+    bool lost;        /* the input was lost, and no good position has come since */
+    uint16_t bad;     /* bad positions in a row */
+    uint16_t loss;    /* HB_LOSS_OF_BAD more for each bad position, 1 less for each good one */
+    bool touching;    /* in contact at the last tick */
     int64_t energy;   /* that went into the device during this touch, 2^-20 mJ */
     float force_N;    /* the last command */
     float ramp_N;     /* the command when HOLD or STOP began */
@@ -46,13 +50,19 @@ struct hb_safety {
     struct hb_counts count;
 };
 
-#define HB_BAD_POSITIONS 3U /* in a row: the input is lost */
+/* The input is lost at three bad positions in a row, and where more than one in eleven is bad for long: a position that
+ * is held makes the period of control longer than the one that passivity was certified for. */
+#define HB_LOSS_OF_BAD 10U
+#define HB_LOSS_LIMIT 30U
 
 /* One more, unless it is 65535. */
 void hb_count_up(uint16_t *counter);
 
 /* Believe the position, or keep the last one. False when the input is lost. */
 bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input);
+
+/* The last position was a good one, or none was asked for yet. */
+bool hb_input_is_good(const struct hb_safety *safety);
 
 /* The position that is believed (mm), and the part of it that the model sees: x >= 0. */
 float hb_position_mm(const struct hb_safety *safety, const struct hb_config *config);
@@ -63,8 +73,12 @@ bool hb_in_contact(const struct hb_safety *safety);
 void hb_observe(struct hb_safety *safety, const struct hb_config *config);
 float hb_energy_mJ(const struct hb_safety *safety);
 
-/* The force that brings a negative energy back to 0 in one period of the same motion, added to `force_N`. */
+/* In contact: with the force added that brings a negative energy back to 0 in one period of the same motion. It adds no
+ * more than the device's own damping once more, which passivity allows a sampled damper; it takes as much as there is. */
 float hb_control(struct hb_safety *safety, const struct hb_config *config, float force_N);
+
+/* More was asked for than a limit allows. */
+void hb_mark_saturated(struct hb_safety *safety);
 
 /* Within +-limit_N. */
 float hb_saturate(struct hb_safety *safety, float force_N, float limit_N);

@@ -194,6 +194,7 @@ enum hb_reason hb_commit(struct hb_device *device, const struct hb_confirmation 
         hb_renderer_rest(&device->bank[idle], 0.0F);
     }
     device->flipped = device->in_force;
+    device->follows = device->in_force;
     device->in_force = true;
     device->active = idle;
     device->staging = (uint8_t)HB_EMPTY;
@@ -215,7 +216,7 @@ float hb_render(struct hb_device *device, float x_mm, float *old_N)
 {
     struct hb_renderer *idle = idle_bank(device);
     *old_N = 0.0F;
-    if (device->flipped) {
+    if (device->follows && (device->flipped || device->offset_N != 0.0F)) {
         *old_N = hb_renderer_step(idle, x_mm);
     } else if (device->staging == (uint8_t)HB_WARMING) {
         (void)hb_renderer_step(idle, x_mm);

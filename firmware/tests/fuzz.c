@@ -28,6 +28,8 @@ struct rig {
     bool committed;
     uint32_t silent_ticks; /* since the last heartbeat with the right boot id */
     uint32_t ramp_ticks;
+    uint64_t held;   /* a bit for each of the last ticks whose position was not believed, the newest lowest; since it moves */
+    bool zero_owed;  /* ESTOP was heeded, and no tick has put out zero since */
     int32_t position;
     uint8_t seq;
 };
@@ -136,11 +138,16 @@ static void check_frame(struct rig *rig, const struct hb_frame *frame, const str
         must(frame->type == (uint8_t)HB_START && confirms && confirmation.crc == rig->confirmed.crc,
              "RUNNING without START");
     }
+    if (is_moving(device->state) && !is_moving(before->state)) {
+        must(!rig->zero_owed, "moves before ESTOP has put out zero");
+        must((rig->held & 1U) == 0U, "moves on a bad position");
+    }
     if (device->state == (uint8_t)HB_DRIVING && before->state != (uint8_t)HB_DRIVING) {
         must(frame->type == (uint8_t)HB_DRIVE, "DRIVING without DRIVE");
     }
     if (frame->type == (uint8_t)HB_ESTOP && frame->size == 0U) {
         must(device->state == (uint8_t)HB_ESTOPPED, "ESTOP not heeded");
+        rig->zero_owed = rig->zero_owed || device->safety.force_N != 0.0F;
     }
 }
 
@@ -179,20 +186,80 @@ static void drain(struct rig *rig, size_t room)
     must(rig->answers.dropped == 0U, "a broken frame went out");
 }
 
+/* What is felt of a bank alone at the next tick. */
+static float felt_N(const struct hb_device *before, uint8_t bank, float x_mm)
+{
+    static struct hb_renderer alone;
+    alone = before->bank[bank];
+    float most_N = fminf(alone.set.force_limit_N, before->config->force_limit_N);
+    return fmaxf(fminf(hb_renderer_step(&alone, x_mm), most_N), 0.0F);
+}
+
+/* While a set is rendered: nothing out of contact; in contact the force of the set, at a switch between those of both
+ * sets, at START between 0 and the set's; or one step of the slew limit on the way there. The passivity controller may
+ * give less, and more by the device's own damping. */
+static void check_rendering(const struct hb_device *before, const struct hb_device *after)
+{
+    const struct hb_safety *safety = &after->safety;
+    float step_N = 2.0F + 1e-4F;
+    if (safety->counts <= 0) {
+        must(safety->force_N == 0.0F, "force in free air");
+        return;
+    }
+    float x_mm = (float)safety->counts * after->config->encoder_step_mm;
+    float new_N = felt_N(before, before->active, x_mm);
+    bool switching = before->flipped || before->starting || before->offset_N != 0.0F;
+    float old_N = !switching ? new_N : before->follows ? felt_N(before, 1U - before->active, x_mm) : 0.0F;
+    bool controls = (after->config->capabilities & (uint8_t)HB_CAN_CONTROL_PASSIVITY) != 0U;
+    float damped_N = 0.95F * fabsf((float)safety->step_counts * 0.0127F) / (float)safety->step_ticks;
+    float low_N = controls ? 0.0F : fminf(old_N, new_N);
+    float high_N = fmaxf(old_N, new_N) + (controls ? damped_N : 0.0F);
+    must(safety->force_N <= fmaxf(high_N, before->safety.force_N - step_N) + 1e-4F, "more than either set");
+    must(safety->force_N >= fminf(low_N, before->safety.force_N + step_N) - 1e-4F, "less than either set");
+}
+
+static uint64_t ticks_checked;
+
+static void say_ticks(void)
+{
+    (void)fprintf(stderr, "%llu ticks checked\n", (unsigned long long)ticks_checked);
+}
+
+static void check_input(struct rig *rig)
+{
+    bool held = (rig->device.safety.flags & (uint16_t)HB_FLAG_INPUT_HELD) != 0U;
+    rig->held = (rig->held << 1) | (held ? 1U : 0U);
+    uint32_t bad = 0U;
+    for (uint32_t i = 0U; i < 33U; i += 1U) {
+        bad += (uint32_t)(rig->held >> i) & 1U;
+    }
+    must(!is_moving(rig->device.state) || ((rig->held & 7U) != 7U && bad <= 5U), "moves without an encoder");
+    rig->held &= is_moving(rig->device.state) ? UINT64_MAX : 1U;
+}
+
 static void tick(struct rig *rig, uint8_t flags)
 {
+    static struct hb_device earlier;
     struct hb_device *device = &rig->device;
     float before_N = device->safety.force_N;
     uint8_t state = device->state;
+    earlier = *device;
     struct hb_input input = {rig->position, (flags & 1U) == 0U, (flags & 2U) != 0U, (flags & 4U) != 0U ? NAN : 1.0F};
     float force_N = hb_tick(device, &input);
     rig->silent_ticks += rig->silent_ticks < rig->config.watchdog_ticks ? 1U : 0U;
     must(isfinite(force_N) && fabsf(force_N) <= rig->config.force_limit_N, "force is not finite, or beyond its limit");
     check_state(device);
+    ticks_checked += 1U;
+    check_input(rig);
+    if (state == (uint8_t)HB_RUNNING && device->state == (uint8_t)HB_RUNNING) {
+        check_rendering(&earlier, device);
+    }
+    must(!rig->zero_owed || force_N == 0.0F, "ESTOP is not zero at the next tick");
+    rig->zero_owed = false;
     if (is_moving(device->state)) {
         must(device->state == state, "moves by itself");
         must(rig->silent_ticks < rig->config.watchdog_ticks, "moves without a host");
-        must(fabsf(force_N - before_N) <= 2.0F + 1e-4F, "slew");
+        must(fabsf(force_N - before_N) <= 2.0F + 1e-4F || force_N == 0.0F, "slew");
         float limit_N = device->bank[device->active].set.force_limit_N;
         must(state != (uint8_t)HB_RUNNING || fabsf(force_N) <= fmaxf(limit_N, fabsf(before_N)), "limit of the set");
         rig->ramp_ticks = 0U;
@@ -360,6 +427,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size)
 {
     static struct rig rig;
     struct input input = {bytes, size};
+    static bool begun;
+    if (!begun) {
+        begun = atexit(say_ticks) == 0;
+    }
     start(&rig, next(&input) & 15U, 7U);
     while (input.left > 0U) {
         uint8_t action = next(&input);

@@ -8,6 +8,7 @@ import time
 from typing import SupportsFloat
 
 from hilbo.device import protocol
+from hilbo.device.heartbeat import BEAT
 from hilbo.device.link import DeviceError, Link
 from hilbo.device.messages import HelloReply
 from hilbo.device.reasons import State, held_because, meaning
@@ -17,6 +18,7 @@ __all__ = ["greet", "take_over"]
 
 _BOOT = 3.0  # s that a board may take to start when its port is opened
 _STOPPING = 2.0  # s
+_BEATS = 3  # heartbeats that must fit into the device's watchdog
 
 
 def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
@@ -37,6 +39,12 @@ def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
         raise DeviceError(
             f"{link.name}: the device speaks version {device.version} of the protocol, schema {device.schema:08x}, and"
             f" this hilbo version {protocol.VERSION}, schema {protocol.SCHEMA:08x}; install the one that belongs to it."
+        )
+    silence = device.watchdog_ticks / device.tick_rate_Hz
+    if silence < _BEATS * BEAT:
+        raise DeviceError(
+            f"{link.name}: the device lets go after {silence:g} s without a heartbeat, and they come every {BEAT:g} s;"
+            f" set its watchdog_ticks to {_BEATS * BEAT:g} s at least."
         )
     if damping is not None and _f32(float(damping)) > device.damping_N_s_per_m:
         raise InputError(

@@ -2,8 +2,9 @@
 
 One request is in flight at a time; without an answer the same bytes are sent again, three times in all. A thread reads
 beside the caller's, and a heart beats (`hilbo.device.heartbeat`): while a request waits, while this process computes,
-and for as long as it lives. When it dies, the device hears nothing any more and lets go. firmware/PROTOCOL.md has the
-rules and the bytes.
+and for as long as it lives. Whatever ends the conversation ends the heartbeats: the device then hears nothing any more
+and lets go. ESTOP waits for no other request, and STOP and ESTOP are tried on a line that is lost one way only.
+firmware/PROTOCOL.md has the rules and the bytes.
 """
 
 import contextlib
@@ -30,6 +31,7 @@ _ANSWER = {
     protocol.GetLimits: protocol.Limits,
     protocol.Echo: protocol.EchoReply,
 }
+_URGENT = frozenset({code_of(protocol.Stop), code_of(protocol.Estop)})
 _ALWAYS = (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop)  # are for restarted devices too
 
 
@@ -95,6 +97,10 @@ class Link:
 
     def request(self, message: Message) -> Message:
         """The answer to a request. Raises `RefusalError` or `DeviceError`, each with one sentence."""
+        if isinstance(message, protocol.Estop) and not self.lost:
+            self.shout(message)
+        if isinstance(message, protocol.Stop | protocol.Estop) and self.lost:
+            raise DeviceError(self._shouted_words(message, self.shout(message)))
         with self._asking:
             if (self.restarted or self.faint) and not self.lost and not isinstance(message, _ALWAYS):
                 raise DeviceError(self._restart_words() if self.restarted else self._faint_words())
@@ -130,6 +136,17 @@ class Link:
             self._expected = None
         return None
 
+    def shout(self, message: Message) -> bool:
+        """STOP or ESTOP onto the line at once: past every lock, and where the line is lost. Whether it took them.
+
+        The 0x00 in front ends whatever frame another thread has begun; the device obeys both in every state.
+        """
+        try:
+            self._port.write(b"\0" + protocol.encode(message, 0))
+        except OSError:
+            return False
+        return True
+
     def write(self, data: bytes) -> None:
         """Bytes onto the line, whole frames only. Raises `DeviceError` when the line is gone."""
         try:
@@ -143,17 +160,25 @@ class Link:
     def beat(self, boot_id: int | None) -> None:
         """From now on heartbeats for this start of the device, or with None no heartbeats."""
         self.boot_id = boot_id
-        if self._heart is not None:
-            self._heart.close()
-            self._heart = None
-        if boot_id is not None:
-            self.heartbeat()
-            if not self.ours:
-                frame = protocol.encode(protocol.Heartbeat(boot_id=boot_id), 0)
-                try:
-                    self._heart = heart_for(self._port, frame, self._beat_here, self._fainted)
-                except OSError as error:
-                    raise DeviceError(f"The process that sends heartbeats cannot be started: {error}.") from error
+        self._end_beats()
+        if boot_id is None:
+            return
+        self.heartbeat()
+        if self.ours:
+            return
+        frame = protocol.encode(protocol.Heartbeat(boot_id=boot_id), 0)
+        try:
+            self._heart = heart_for(self._port, frame, self._beat_here, self._fainted)
+        except OSError as error:
+            raise DeviceError(f"The process that sends heartbeats cannot be started: {error}.") from error
+        if self.lost:  # meanwhile
+            self._end_beats()
+
+    def _end_beats(self) -> None:
+        with self._news:
+            heart, self._heart = self._heart, None
+        if heart is not None:
+            heart.close()
 
     @contextlib.contextmanager
     def silence(self) -> Iterator[None]:
@@ -220,11 +245,21 @@ class Link:
             except OSError as error:
                 self._lose(error)
                 return
-            self.received += len(data)
-            if self._capture is not None and data:
-                self._capture(data)
-            for frame in self._receiver.feed(data):
-                self._take(frame)
+            try:
+                self._heard(data)
+            except Exception as error:  # of whoever takes what arrives: without a reader nobody may go on beating
+                self._end(
+                    f"{self.name}: what the device says cannot be taken ({error}); heartbeats have ended and the device"
+                    " stops by itself, mend that and connect again."
+                )
+                return
+
+    def _heard(self, data: bytes) -> None:
+        self.received += len(data)
+        if self._capture is not None and data:
+            self._capture(data)
+        for frame in self._receiver.feed(data):
+            self._take(frame)
 
     def _take(self, frame) -> None:
         try:
@@ -245,26 +280,26 @@ class Link:
     def _give(self, seq, message) -> None:
         """Hands an answer to the request that waits for it; others are counted and dropped."""
         with self._news:
-            if self._expected is None or self._answer is not None:
+            if self._expected is not None and self._answer is None and _fits(seq, message, self._expected):
+                self._answer = message
+                self._news.notify_all()
+            elif not (isinstance(message, Ack) and message.request in _URGENT and seq == 0):  # of a shout
                 self.stray += 1
-                return
-            wanted, request, kind = self._expected
-            acknowledges = isinstance(message, Ack | Nack) and message.request == request
-            if seq != wanted or not (acknowledges or (type(message) is kind and kind is not Ack)):
-                self.stray += 1
-                return
-            self._answer = message
-            self._news.notify_all()
 
-    def _lose(self, error) -> str:
+    def _lose(self, error: OSError) -> str:
+        return self._end(
+            f"{self.name}: the line to the device is gone ({error}); it stops by itself, check power and cable,"
+            " then connect again."
+        )
+
+    def _end(self, why: str) -> str:
+        """The conversation is over, and so are the heartbeats; returns why it ended first."""
         with self._news:
-            if self.lost is None:
-                self.lost = (
-                    f"{self.name}: the line to the device is gone ({error}); it stops by itself, check power and cable,"
-                    " then connect again."
-                )
+            self.lost = self.lost or why
             self._news.notify_all()
-            return self.lost
+            why = self.lost
+        self._end_beats()
+        return why
 
     def _refusal(self, nack, request) -> Exception:
         if nack.reason in (NackReason.BOOT_ID, NackReason.NO_HELLO) and request != "HELLO":
@@ -284,6 +319,11 @@ class Link:
             " the device lets go: connect again."
         )
 
+    def _shouted_words(self, message: Message, written: bool) -> str:
+        name = name_of(type(message))
+        how = "was written all the same; no answer can come" if written else "cannot be written"
+        return f"{self.lost} {name} {how}: see that the device rests."
+
     def _silence_words(self, request) -> str:
         if self.received == 0:
             why = "nothing at all comes back; check power, cable and port"
@@ -292,3 +332,10 @@ class Link:
         else:
             why = "check the line"
         return f"{self.name}: {request} has had no answer in {self.tries} tries; {why}."
+
+
+def _fits(seq: int, message: Message, expected: tuple[int, int, type]) -> bool:
+    """Whether a message answers the request that waits."""
+    wanted, request, kind = expected
+    acknowledges = isinstance(message, Ack | Nack) and message.request == request
+    return seq == wanted and (acknowledges or (type(message) is kind and kind is not Ack))

@@ -117,6 +117,7 @@ class NackReason(IntEnum):
     LINE_TOO_SLOW = 27
     NOT_CAPABLE = 28
     DRIVE_RANGE = 29
+    NO_INPUT = 30
 
 
 ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_TOO_SLOW, NackReason.DRIVE_RANGE}
@@ -125,7 +126,7 @@ ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_
 _HOLD = {
     HoldReason.NONE: "it was asked to",
     HoldReason.WATCHDOG: "it heard no heartbeat from the host",
-    HoldReason.INPUT: "three positions in a row were bad; check the encoder",
+    HoldReason.INPUT: "too many positions were bad; check the encoder",
     HoldReason.VELOCITY: "it moved faster than its velocity limit",
     HoldReason.OVERRUN: "a tick was missed or took too long",
     HoldReason.MODEL: "the model's force was not finite",
@@ -164,11 +165,12 @@ _NACK = {
     NackReason.NOTHING_STAGED: "The device has no set staged; send one first.",
     NackReason.SET_MISMATCH: "The device holds another set than the one named; send it again.",
     NackReason.NOT_READY: "The staged set's history needs {ticks} more ticks, or no contact; wait, or let go.",
-    NackReason.BUSY: "The device still takes back the difference of the last change, {ticks} ticks more; wait.",
+    NackReason.BUSY: "The device needs {ticks} more ticks for what it was asked before; wait.",
     NackReason.NO_SET: "The device has no set in force; send one first.",
     NackReason.NO_HEARTBEAT: "The device hears no heartbeat; check the line from host to device.",
     NackReason.LINE_TOO_SLOW: "The line is too slow for this telemetry; every {limit:g}th tick is the most it carries.",
     NackReason.NOT_CAPABLE: "The device cannot do {request}.",
+    NackReason.NO_INPUT: "The device's encoder gives no good position; check the encoder and its cable.",
     NackReason.DRIVE_RANGE: "The drive asks for {value:.7g}, beyond the device's limit of {limit:.7g}.",
 }
 

@@ -155,7 +155,7 @@ def test_a_device_that_goes_to_hold_is_a_failure(device, monkeypatch):
     monkeypatch.setattr(Renderer, "start", start)
     code, _, stderr = device("start", *A, "--seconds", 0.5, *FAST)
     assert code == 1
-    assert "three positions in a row were bad" in " ".join(stderr.split())
+    assert "too many positions were bad" in " ".join(stderr.split())
     assert "The device has gone to HOLD by itself" in stderr
 
 

@@ -58,8 +58,24 @@ def test_nothing_breaks_the_device(fuzzer, tmp_path):
         ("hb_device.c", "device->heartbeat_age_ticks += 1U;", ""),
         ("hb_motion.c", "return HB_NACK_NO_SET;", "(void)reply;"),
         ("hb_safety.c", "return safety->ramp_N * (", "return 1e-6F + safety->ramp_N * ("),
+        ("hb_device.c", "hb_in_contact(&device->safety)) {\n        force_N", "true) {\n        force_N"),
+        ("hb_device.c", "felt(device, (uint8_t)(1U - device->active), old_N) - felt_N", "old_N - felt_N"),
+        ("hb_motion.c", "device->safety.force_N != 0.0F) {", "false) {"),
+        ("hb_safety.c", "safety->bad == 0U && !safety->lost;", "safety->bad < 99U;"),
     ],
-    ids=["receiver", "other set", "other bank", "saturation", "watchdog", "no set", "hold"],
+    ids=[
+        "receiver",
+        "other set",
+        "other bank",
+        "saturation",
+        "watchdog",
+        "no set",
+        "hold",
+        "free air",
+        "switch",
+        "estop",
+        "start",
+    ],
 )
 def test_the_corpus_notices(tmp_path, file, old, new):
     core = tmp_path / "core"

@@ -125,6 +125,7 @@ def test_three_bad_positions_hold_and_fewer_are_bridged(pressed, bad, valid):
         status = pressed.status()
         assert (status["state"], status["input_held"]) == (1, held + number)
         assert status["position_mm"] == np.float32(300) * np.float32(STEP)
+        pressed.run([300] * 40)
     before = pressed.tick(300)
     forces = [pressed.tick(counts, valid=valid) for counts in bad]
     assert pressed.state == "HOLD" and cause(pressed) == "INPUT"

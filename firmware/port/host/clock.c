@@ -36,15 +36,14 @@ void clock_start(struct clock *clock, int64_t period_ns)
 int64_t clock_wait(struct clock *clock)
 {
     clock->deadline_ns += clock->period_ns;
-    const int64_t before_ns = now_ns();
-    if (before_ns < clock->deadline_ns) {
+    if (now_ns() < clock->deadline_ns) {
         sleep_until(clock->deadline_ns);
-        return 0;
     }
-    const int64_t missed = (before_ns - clock->deadline_ns) / clock->period_ns;
+    const int64_t awake_ns = now_ns(); /* which may be long after the deadline: sleep is at least as long as asked for */
+    const int64_t missed = (awake_ns - clock->deadline_ns) / clock->period_ns;
     clock->late += missed > 0 ? 1U : 0U;
     if (missed > MOST_TO_CATCH_UP) {
-        clock->deadline_ns = before_ns;
+        clock->deadline_ns = awake_ns;
     }
     return missed;
 }

@@ -11,7 +11,7 @@ enum { RING_SIZE = 256 };
 static struct {
     volatile uint8_t bytes[RING_SIZE];
     volatile uint32_t put; /* written by the interrupt alone */
-    uint32_t got;          /* and this by the loop */
+    volatile uint32_t got; /* and this by the loop */
 } received;
 
 static volatile uint32_t ticks_due;
@@ -32,8 +32,10 @@ void uart_received_interrupt(void)
     uint8_t byte = 0;
     while (board_uart_receive(&byte)) {
         const uint32_t put = received.put;
-        received.bytes[put % RING_SIZE] = byte; /* overwrites when full: its frame's CRC will tell */
-        received.put = put + 1U;
+        if (put - received.got < RING_SIZE) { /* a byte without room is lost: its frame's CRC will tell */
+            received.bytes[put % RING_SIZE] = byte;
+            received.put = put + 1U;
+        }
     }
 }
 
@@ -42,8 +44,9 @@ static bool receive(void)
     if (received.got == received.put) {
         return false;
     }
-    const uint8_t byte = received.bytes[received.got % RING_SIZE];
-    received.got++;
+    const uint32_t got = received.got;
+    const uint8_t byte = received.bytes[got % RING_SIZE];
+    received.got = got + 1U;
     (void)hb_receive(&rig.device, &byte, 1);
     return true;
 }

@@ -1,0 +1,118 @@
+"""However a conversation ends, heartbeats end with it; STOP and ESTOP wait for nobody and are tried to the last."""
+
+import errno
+import threading
+import time
+
+import pytest
+from peer import Peer
+
+from hilbo.device import protocol
+from hilbo.device.heartbeat import BEAT
+from hilbo.device.ports import SocketPort
+from hilbo.hardware_bridge import DeviceError
+
+PATIENT = {"patience": 30.0}
+
+
+class Deaf(SocketPort):
+    """A line that can still be written when `deaf` is set, and no longer read."""
+
+    def __init__(self, connected, name):
+        super().__init__(connected, name)
+        self.deaf = threading.Event()
+
+    def read(self):
+        if self.deaf.is_set():
+            raise OSError(errno.EIO, "input/output error")
+        return super().read()
+
+
+def until(done):
+    while not done():
+        time.sleep(0.005)
+
+
+@pytest.fixture(params=["helper", "thread"])
+def half(request, monkeypatch):
+    """A renderer on a line that has become deaf, and the device at its other end."""
+    peer, ports = Peer(), []
+
+    def made(connected, name):
+        ports.append(Deaf(connected, name))
+        return ports[-1]
+
+    monkeypatch.setattr("peer.SocketPort", made)
+    if request.param == "thread":
+        monkeypatch.setattr("hilbo.device.heartbeat.sys.executable", "")
+    device = peer.open(**PATIENT)
+    until(lambda: peer.heartbeats > 2)
+    ports[0].deaf.set()
+    until(lambda: device.link.lost)
+    yield peer, device
+    device.close()
+
+
+def silent(peer) -> bool:
+    """Whether no heartbeat comes any more: one may be on its way."""
+    time.sleep(2 * BEAT)
+    before = peer.heartbeats
+    time.sleep(6 * BEAT)
+    return peer.heartbeats == before
+
+
+def test_a_line_that_is_lost_one_way_hears_no_heartbeat_but_stop_and_estop(half):
+    peer, device = half
+    assert silent(peer)
+    for ask, message in ((device.stop, protocol.Stop), (device.estop, protocol.Estop)):
+        before = peer.done[message]
+        with pytest.raises(DeviceError, match="was written all the same; no answer can come: see that the device"):
+            ask()
+        until(lambda message=message, before=before: peer.done[message] > before)
+
+
+def test_closing_a_lost_line_still_says_stop(half):
+    peer, device = half
+    device.close()
+    until(lambda: peer.done[protocol.Stop])
+
+
+def test_a_capture_that_fails_ends_the_heartbeats(capsys):
+    peer, full = Peer(), threading.Event()
+
+    def capture(data):
+        if full.is_set():
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    with peer.open(**PATIENT, capture=capture) as device:
+        until(lambda: peer.heartbeats > 2)
+        full.set()
+        with pytest.raises(DeviceError, match="cannot be taken.*No space left"):
+            device.state()
+        assert silent(peer)
+        with pytest.raises(DeviceError, match="ESTOP was written"):
+            device.estop()
+        until(lambda: peer.done[protocol.Estop])
+    assert capsys.readouterr().err == ""
+
+
+def test_estop_waits_for_no_other_request():
+    peer = Peer()
+    with peer.open(patience=0.8) as device:
+        peer.swallow = 1
+        asking = threading.Thread(target=device.state)
+        asking.start()
+        until(lambda: peer.swallow == 0)
+        begun = time.monotonic()
+        stopping = threading.Thread(target=device.estop)
+        stopping.start()
+        until(lambda: peer.done[protocol.Estop])
+        assert asking.is_alive(), time.monotonic() - begun  # it waits 0.8 s for its answer
+        stopping.join()
+        asking.join()
+        assert device.link.stray == 0
+
+
+def test_a_device_whose_watchdog_is_too_short_for_the_heartbeats_is_refused():
+    with pytest.raises(DeviceError, match="lets go after 0.1 s without a heartbeat, and they come every 0.05 s"):
+        Peer(watchdog_ticks=100).open()
