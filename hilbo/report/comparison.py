@@ -17,9 +17,6 @@ __all__ = ["comparison_table", "write_comparison"]
 _COLUMNS = ("method", "negative_log_density", "negative_log_density_error", "central_95", "central_95_error", "z2")
 
 
-_CAPTION = "Errors are by person; the share of the rule hierarchical is learnt from everybody."
-
-
 def write_comparison(study: Study, aggregate: Aggregate, folder: Path, seed: int = 0) -> dict[str, Any]:
     """Write the comparison of all rules; returns the content of comparison.json."""
     from hilbo.report.figures import population as plotting
@@ -27,17 +24,11 @@ def write_comparison(study: Study, aggregate: Aggregate, folder: Path, seed: int
     content = compare(study, aggregate, seed)
     (folder / "comparison.json").write_text(as_json(content))
     comparison_table(content).to_csv(folder / "comparison.csv", index=False)
+    best, prior = np.asarray(aggregate.optimum.x), float(aggregate.map.map_prior)
     figures = {
-        "comparison": (plotting.rules_figure(content), "Every rule, each person left out", _CAPTION),
-        "reliability": (plotting.reliability_figure(content), "Reliability", "On the line: as often as predicted."),
-        "coverage": (
-            plotting.coverage_figure(
-                study, aggregate.surface, np.asarray(aggregate.optimum.x), float(aggregate.map.map_prior), KNOWN
-            ),
-            "What the answers cover",
-            f"By the rule {study.rule}; hatched: the map's standard deviation is more than {KNOWN:g} of what it is"
-            " without answers.",
-        ),
+        "comparison": plotting.rules_figure(content),
+        "reliability": plotting.reliability_figure(content),
+        "coverage": plotting.coverage_figure(study, aggregate.surface, best, prior, KNOWN),
     }
     save_figures(figures, folder)
     return content

@@ -5,6 +5,8 @@ thresholds are stated in the sentence; the verdict counts the items and is no te
 
     H1  individuals' parameters can be found by asking      H3  individuals need not have converged for that
     H2  a population's map has an optimum that people share  H4  it holds for other materials
+
+The page has the hypotheses in full.
 """
 
 from collections.abc import Sequence
@@ -45,7 +47,6 @@ class Hypothesis(NamedTuple):
     """A hypothesis, its evidence and what that comes to."""
 
     number: str
-    statement: str
     evidence: tuple[Evidence, ...]
 
     @property
@@ -63,24 +64,11 @@ class Hypothesis(NamedTuple):
 def hypotheses(results: Sequence[Results]) -> list[Hypothesis]:
     """H1 to H3 by the first material, H4 by the others."""
     first = results[0]
-    whose = f" (Of {first.name}.)" if len(results) > 1 else ""
     return [
-        Hypothesis(
-            "H1",
-            "The parameters can be found for individuals by Bayesian optimisation with qualitative answers." + whose,
-            tuple(_individuals(first)),
-        ),
-        Hypothesis(
-            "H2",
-            "Individuals' maps can be merged into one whose optimum people in general find realistic." + whose,
-            tuple(_population(first)),
-        ),
-        Hypothesis(
-            "H3",
-            "Individuals need not have converged for the merged map to have its optimum in the right place." + whose,
-            tuple(_convergence(first)),
-        ),
-        Hypothesis("H4", "The same holds for materials of other mechanical properties.", tuple(_materials(results))),
+        Hypothesis("H1", tuple(_individuals(first))),
+        Hypothesis("H2", tuple(_population(first))),
+        Hypothesis("H3", tuple(_convergence(first))),
+        Hypothesis("H4", tuple(_materials(results))),
     ]
 
 

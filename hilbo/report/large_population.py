@@ -46,32 +46,28 @@ def write_population(
     grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     grid.to_netcdf(folder / "map.nc", engine="h5netcdf")
     say("figures and report")
-    pictures = save_figures(_figures(study, merged, grid), folder)
-    (folder / "report.html").write_text(results_page(study, content, pictures, people), encoding="utf-8")
+    figures, drawn = _figures(study, merged, grid)
+    page = results_page(study, content, save_figures(figures, folder), people, drawn=drawn)
+    (folder / "report.html").write_text(page, encoding="utf-8")
     return content
 
 
 def _figures(study, aggregate, grid):
-    """Name -> figure, title, caption."""
+    """Name -> figure, and how many participants and individual optima they show."""
     from hilbo.report.figures import maps
 
-    figures, best = {}, np.asarray(aggregate.optimum.x)
+    figures, best, drawn = {}, np.asarray(aggregate.optimum.x), {}
     if study.space.dim <= 3:
         some = _some(aggregate.cohort)
-        caption = (
-            f"The {study.attribute} of each rendering, as far as people's answers tell, from the grid of map.nc:"
-            f" brighter is better, and the star is the optimum. Dots are answers of {len(some.names)} participants,"
-            f' orange where one answered "{study.responses[-1]}".'
-        )
-        white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
-        figures["map"] = (maps.map_slices(study, _from(grid), best, some), "The population map", caption + white)
+        figures["map"] = maps.map_slices(study, _from(grid), best, some)
+        drawn["participants"] = len(some.names)
     if aggregate.individuals is not None and study.space.dim > 1:
         x = np.asarray(aggregate.individuals.x)
         rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), _DOTS)).round().astype(int))
         marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
-        caption = f"Each dot is one participant's own optimum; {len(rows):,} of {len(x):,} are shown."
-        figures["optima"] = (maps.optima_scatter(study, x[rows], marks), "Individual optima", caption)
-    return figures
+        figures["optima"] = maps.optima_scatter(study, x[rows], marks)
+        drawn["optima"] = len(rows)
+    return figures, drawn
 
 
 def _some(cohort: Cohort) -> Cohort:

@@ -16,14 +16,11 @@ from hilbo.identification.characterise import Characterisation
 from hilbo.identification.fitting import Test
 from hilbo.identification.memory_selection import LIMIT, PAPER, smallest
 from hilbo.identification.sampled import Sampled
-from hilbo.report.page import template
+from hilbo.report.page import rendered
 from hilbo.report.results import as_json, save_figures, versions
 from hilbo.viscoelastic import FOSLS
 
 __all__ = ["identification_result", "passivity_result", "renderer_block", "write_identification", "write_passivity"]
-
-_UNITS = {"K0": "K", "K1": "K", "K_inst": "K", "K_eff": "K", "B1": "B", "G_c": "K", "tau": "s", "G": "G", "V": "V"}
-_SYMBOLS = {"alpha": "α", "kappa": "κ", "tau": "τ", "beta": "β", "beta/alpha": "β/α"}
 
 
 def identification_result(
@@ -102,15 +99,22 @@ def write_identification(
 
     (folder / "result.json").write_text(as_json(content))
     _curves(tests, result, plotting.predicted).to_csv(folder / "curves.csv", index=False)
-    unit = content["model"]["unit"]
-    figures = {"tests": (plotting.curves_figure(tests, result, unit), "Tests and fits", _TESTS)}
+    figures = {"tests": plotting.curves_figure(tests, result, content["model"]["unit"])}
     if result.rows:
-        figures["memory"] = (plotting.memory_figure(result.rows), "Error against memory", _MEMORY)
+        figures["memory"] = plotting.memory_figure(result.rows)
     if content["renderer"] is not None:
         (folder / "renderer.toml").write_text(content["renderer"])
         figures |= _set_figures(_model(result), damping or result.minimum_damping)
-    pictures = save_figures(figures, folder)
-    page = template("material.html").render(**_words(content, result), figures=pictures)
+    page = rendered(
+        "material.html",
+        content=content,
+        warnings=content["warnings"],
+        parameters=[_parameter(name, estimate, result.bootstrap) for name, estimate in result.estimates.items()],
+        limit=LIMIT,
+        paper=PAPER,
+        verdict="",
+        figures=save_figures(figures, folder),
+    )
     (folder / "report.html").write_text(page, encoding="utf-8")
 
 
@@ -126,12 +130,11 @@ def _set_figures(model, b):
     """Figures of one parameter set on a device."""
     from hilbo.report.figures import mechanics as plotting
 
-    figures = {"bode": (plotting.bode_figure(model), "Frequency response", _BODE)}
+    figures = {"bode": plotting.bode_figure(model)}
     if b is not None:
-        figures["passivity"] = (plotting.passivity_figure(model, b), "Passivity", _PASSIVITY)
+        figures["passivity"] = plotting.passivity_figure(model, b)
         if model.memory == "full" or model.N % 2:
-            K_eff = float(model.dc_gain())
-            figures["passive-set"] = (plotting.passive_set_figure(model, b, K_eff), "The passive set", _SET)
+            figures["passive-set"] = plotting.passive_set_figure(model, b, float(model.dc_gain()))
     return figures
 
 
@@ -145,53 +148,17 @@ def _curves(tests, result, predicted):
     return pd.concat(parts, ignore_index=True)
 
 
-def _words(content, result):
-    """What the page says."""
-    about, unit = content["model"], content["model"]["unit"]
-    title = "Identification" if about["name"] == "fosls" else f"Identification ({about['name']})"
-    errors = ", ".join(f"{100 * v:.2f} % on {kind}" for kind, v in content["nrmse"].items())
-    lead = f"{_model_words(about)} fitted to {content['source']}: NRMSE (of each curve's range) {errors}."
-    return {
-        "title": title,
-        "lead": lead,
-        "warnings": content["warnings"],
-        "parameters": [_parameter_row(n, e, unit, result.bootstrap) for n, e in result.estimates.items()],
-        "bootstrapped": result.bootstrap is not None,
-        "memory": _memory_table(content, result) if result.rows else None,
-        "residuals": [_residual_row(kind, row) for kind, row in content["residuals"].items()],
-        "renderer": content["renderer"],
-        "passivity": _passivity_words(content["passivity"]),
-        "versions": ", ".join(f"{k} {v}" for k, v in content["versions"].items()),
-    }
-
-
-def _model_words(about):
-    if "T" not in about:
-        return {"continuous": "The FO-SLS in continuous time", "fractionalmaxwell": "The fractional Maxwell model"}[
-            about["name"]
-        ]
-    memory = "full memory" if about["memory"] == "full" else f"N = {about['N']}"
-    return f"The FO-SLS ({memory}, T = {1000 * about['T']:g} ms)"
-
-
-def _parameter_row(name, estimate, unit, bootstrap):
-    kind = _UNITS.get(name, "")
-    shown = {
-        "K": unit,
-        "B": "N·sᵅ/mm" if unit == "N/mm" else f"{unit}·sᵅ",
-        "s": "s",
-        "G": f"{unit}·sᵝ",
-        "V": f"{unit}·sᵅ",
-    }
+def _parameter(name, estimate, bootstrap):
+    """A parameter's value, or why it has none, and its intervals, in as many digits as the data support."""
     value = _rounded(estimate.value, estimate.lower, estimate.upper) if estimate.known else estimate.status
     ends = [_rounded(end, estimate.lower, estimate.upper) if end is not None else "open" for end in estimate[1:3]]
-    interval = "" if estimate.lower is None and estimate.upper is None else f"{ends[0]} to {ends[1]}"
-    boot = (bootstrap or {}).get(name)
-    resampled = "" if boot is None else " to ".join(_rounded(end, *boot) for end in boot)
-    symbol = _SYMBOLS.get(name, name)
-    head = f"{symbol} ({shown[kind]})" if kind else symbol
-    row = [head, value, interval]
-    return row if bootstrap is None else [*row, resampled if estimate.known else ""]
+    resampled = (bootstrap or {}).get(name) if estimate.known else None
+    return {
+        "name": name,
+        "value": value,
+        "interval": None if estimate.lower is None and estimate.upper is None else ends,
+        "bootstrap": None if resampled is None else [_rounded(end, *resampled) for end in resampled],
+    }
 
 
 def _rounded(value, lower, upper):
@@ -200,40 +167,6 @@ def _rounded(value, lower, upper):
         return f"{value:.3g}"
     decimals = max(0, 1 - math.floor(math.log10(upper - lower)))
     return f"{value:.{decimals}f}"
-
-
-def _memory_table(content, result):
-    kinds = list(result.nrmse)
-    names = ("K0", "K1", "B1", "alpha")
-    rows = []
-    for row in content["memory"]:
-        label = "full" if row["N"] is None else str(row["N"])
-        errors = [f"{100 * row['nrmse'][k]:.2f} %" for k in kinds]
-        rows.append([label, *errors, *(f"{row['set'][n]:.3g}" for n in names)])
-    best = content["smallest_N"]
-    words = (
-        f"The smallest N with less than {100 * LIMIT:g} % on every test is {best}."
-        if best
-        else (f"No N that was tried stays below {100 * LIMIT:g} % on every test.")
-    )
-    paper = ", ".join(f"{100 * PAPER[k]:.2f} % ({k})" for k in kinds if k in PAPER)
-    return {"head": ["N", *kinds, "K0", "K1", "B1", "α"], "rows": rows, "words": words, "paper": paper}
-
-
-def _residual_row(kind, row):
-    over = row.get("over_repeat_noise")
-    cells = [kind, row["samples"], row["repeats"], f"{row['autocorrelation']:.2f}", row["order"]]
-    return [*cells, f"{row['effective_samples']:.0f}", "" if over is None else f"{over:.1f}"]
-
-
-def _passivity_words(passivity):
-    if passivity is None:
-        return ""
-    words = f"The set is passive on devices with a damping of at least {passivity['minimum_damping']:.4g} N·s/m"
-    if passivity["margin"] is None:
-        return words + "; give the device's own with --damping."
-    kind = "more than that" if passivity["margin"] >= 0 else "less than that: it is not passive there"
-    return words + f"; the device has {passivity['damping']:g} N·s/m, {abs(passivity['margin']):.3f} {kind}."
 
 
 def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
@@ -267,18 +200,12 @@ def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
 def write_passivity(model: FOSLS, content: dict[str, Any], folder: Path) -> None:
     """Write result.json and the figures of the set, with a page around them."""
     (folder / "result.json").write_text(as_json(content))
-    pictures = save_figures(_set_figures(model, content["damping"]), folder)
-    page = template("material.html").render(
-        title=f"Passivity: {content['status']}",
-        lead=passivity_words(content),
+    page = rendered(
+        "material.html",
+        content=content | {"versions": versions()},
         warnings=[],
-        parameters=None,
-        memory=None,
-        residuals=None,
-        renderer=None,
-        passivity="",
-        versions=", ".join(f"{k} {v}" for k, v in versions().items()),
-        figures=pictures,
+        verdict=passivity_words(content),
+        figures=save_figures(_set_figures(model, content["damping"]), folder),
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
 
@@ -301,21 +228,3 @@ def passivity_words(content: dict[str, Any]) -> str:
     if cycle is not None:
         words += f" A cycle at {cycle['frequency']:.4g} Hz creates {-cycle['energy_per_cycle']:.3g} mJ."
     return words
-
-
-_TESTS = (
-    "Grey: what was measured, mean and standard deviation of the repeats. Lines: the model's response to the measured"
-    " input, for the fit and for fits with other memories. Below, the fit's residuals; what is not noise there, the"
-    " model misses."
-)
-_MEMORY = "Each point is a fit of its own: parameters belong to their N and cannot be carried over to another."
-_PASSIVITY = (
-    "The rendering is passive where it needs less damping than the device has, at every frequency up to the Nyquist"
-    " frequency (Colgate & Schenkel). The dot is where the most is needed; without a device's damping the line is at"
-    " the least that is enough."
-)
-_SET = "Which K1 are passive for which B1 and α with this effective stiffness; the star is the set itself."
-_BODE = (
-    "The rendering, and the continuous model with the same numbers. Where they differ, it is the cut of the memory"
-    " (low frequencies) or the sampling (high)."
-)

@@ -20,7 +20,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Array, Float
 
-from hilbo.report.page import results_page
+from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, as_json, people_of
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import Aggregate, Optimum, nrmse, other_inference
@@ -183,23 +183,23 @@ def write_results(
     data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     data.to_netcdf(folder / "map.nc", engine="h5netcdf")
     say("figures and report")
-    pictures = save_figures(_figures(population, truth), folder)
-    (folder / "report.html").write_text(results_page(study, content, pictures, people), encoding="utf-8")
+    page = results_page(
+        study, content, save_figures(_figures(population, truth), folder), people, in_place(aggregate.map)
+    )
+    (folder / "report.html").write_text(page, encoding="utf-8")
     return content
 
 
-def save_figures(figures: Mapping[str, tuple[Any, str, str]], folder: Path) -> list[dict[str, str]]:
-    """Write name -> (figure, title, caption) as PNG and SVG; returns what a page needs to hold them."""
-    pictures = []
-    for name, (figure, title, caption) in figures.items():
+def save_figures(figures: Mapping[str, Any], folder: Path) -> Pictures:
+    """Write figures by name as PNG and SVG; returns what a page needs to hold them."""
+    pictures = {}
+    for name, figure in figures.items():
         figure.savefig(folder / f"{name}.svg")
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=200)
         (folder / f"{name}.png").write_bytes(buffer.getvalue())
         png = base64.b64encode(buffer.getvalue()).decode()
-        width = str(round(_PIXELS * figure.get_figwidth()))
-        words = {"title": title, "caption": caption, "alt": f"{title}. {caption}"}
-        pictures.append({"name": name, "png": png, "width": width} | words)
+        pictures[name] = {"png": png, "width": str(round(_PIXELS * figure.get_figwidth()))}
     return pictures
 
 
@@ -244,60 +244,19 @@ def map_dataset(
     )
 
 
-def _figures(population: Population, truth: Float[np.ndarray, " d"] | None) -> dict[str, tuple[Any, str, str]]:
-    """Name -> figure, title, caption."""
+def _figures(population: Population, truth: Float[np.ndarray, " d"] | None) -> dict[str, Any]:
+    """Name -> figure."""
     from hilbo.report.figures import maps
 
     study, aggregate = population.study, population.aggregate
     best = np.asarray(aggregate.optimum.x)
-    marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
-    marks |= {} if truth is None else {"truth": truth}
-    how = in_place(aggregate.map)
-    captions = _captions(study, truth, f" These maps are merged {how}." if how else "")
     figures = {
         "map": maps.map_slices(study, aggregate.surface, best, population.cohort),
         "progress": maps.progress_figure(study, population, truth),
         "slices": maps.slices_after(study, population.progress),
     }
     if study.space.dim > 1:
+        marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
+        marks |= {} if truth is None else {"truth": truth}
         figures["optima"] = maps.optima_scatter(study, np.asarray(aggregate.individuals.x), marks)
-    return {name: (figure, *captions[name]) for name, figure in figures.items()}
-
-
-def _captions(study, truth, how=""):
-    """Title and caption of each figure: what is to be seen, and how to read it; `how`: the maps of fewer trials."""
-    top, names = study.responses[-1], study.space.names
-    white = " White: not passive on the device, never rendered." if study.space.mechanics is not None else ""
-    third = ""
-    if study.space.dim > 2:
-        third = (
-            f" The slices are at the optimum's {names[2]} and on either side of it; an answer is drawn on every slice"
-            f" that is near its own {names[2]}, so that it may lie in another slice's white."
-        )
-    rest = f" Further parameters ({', '.join(names[3:])}) are those of the optimum." if study.space.dim > 3 else ""
-    settled = "where it ends" if truth is None else "the truth"
-    dashed = "" if truth is None else " Dashed: how far the map's optimum is from where it ends."
-    return {
-        "map": (
-            "The population map",
-            f"The {study.attribute} of each rendering, as far as people's answers tell: brighter is better, and the"
-            f" star is the optimum.{white} Dots are renderings that were asked, orange where somebody answered"
-            f' "{top}".{third}{rest}',
-        ),
-        "progress": (
-            "Progress of the optimum",
-            f"Left: how far the optimum after so many trials is from {settled}, in per cent of the search ranges, for"
-            f" the individuals and for the population map.{dashed} Right: how often people had answered"
-            f' "{top}" by then. Bands hold the middle half of the people.{how}',
-        ),
-        "slices": (
-            "The population map after fewer trials",
-            "The map from everybody's first answers only, each through its own optimum, the star; if the star and the"
-            f" bright region stay where they are, further trials only refine them.{white}{rest}{how}",
-        ),
-        "optima": (
-            "Individual optima",
-            "Each dot is one participant's own optimum. Where the dots scatter widely, their plain mean need not be"
-            " good for anybody.",
-        ),
-    }
+    return figures

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
-from hilbo.report.page import robustness_page
+from hilbo.report.page import Pictures, rendered
 from hilbo.report.results import as_json, map_dataset, optimum_content, save_figures, versions
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.robustness import LIMIT, Robustness
 
-__all__ = ["robustness_result", "write_robustness"]
+__all__ = ["robustness_page", "robustness_result", "write_robustness"]
 
 _TENTH = 0.1  # of every search range: two renderings that a person would hardly tell apart
 _UNRELATED = 0.1
@@ -31,30 +31,30 @@ def write_robustness(study: Study, cohort: Cohort, found: Robustness, folder: Pa
     return content
 
 
-def _figures(study, cohort, check):
-    """Name -> figure, title, caption."""
-    from hilbo.report.figures import maps as plotting
-
-    limit = f"{100 * LIMIT:.0f} %"
-    maps = plotting.maps_beside(
-        study,
-        dict(zip(("fixed hyperparameters", "by maximum evidence"), check.maps(), strict=True)),
-        np.stack([check.fixed.x, check.optimised.x]),
+def robustness_page(study: Study, content: dict[str, Any], figures: Pictures) -> str:
+    """One self-contained page of the robustness check."""
+    # Of each hyperparameter a list of columns: how each parameter moves with it, in search ranges.
+    sensitivity = {name: np.atleast_2d(np.asarray(block).T) for name, block in content["sensitivity"].items()}
+    return rendered(
+        "robustness.html",
+        study=study,
+        content=content,
+        warnings=content["warnings"],
+        figures=figures,
+        limit=LIMIT,
+        sensitivity=sensitivity,
     )
-    moves = plotting.moved_optima(cohort.names, check.individual_nrmse, float(check.nrmse), LIMIT)
+
+
+def _figures(study, cohort, check):
+    """Name -> figure."""
+    from hilbo.report.figures import maps
+
+    fixed, optimised = check.maps()
+    both = {"fixed hyperparameters": fixed, "by maximum evidence": optimised}
     return {
-        "maps": (
-            maps,
-            "The population map under both",
-            "Left under the study's own hyperparameters, right under those that make the answers most probable, each"
-            " through its own optimum, the star. What matters is whether the star stays; the heights may differ.",
-        ),
-        "moves": (
-            moves,
-            "How far the optima move",
-            f"Each dot is one participant's own optimum, the line the population's; what is right of {limit} is flagged"
-            " as not robust. People with few informative answers move most.",
-        ),
+        "maps": maps.maps_beside(study, both, np.stack([check.fixed.x, check.optimised.x])),
+        "moves": maps.moved_optima(cohort.names, check.individual_nrmse, float(check.nrmse), LIMIT),
     }
 
 

@@ -18,15 +18,15 @@ import pandas as pd
 from hilbo.report import validation
 from hilbo.report.comparison import comparison_table
 from hilbo.report.hypotheses import Results, hypotheses
-from hilbo.report.page import template
+from hilbo.report.page import Pictures, rendered
 from hilbo.report.participants import people_of
 from hilbo.report.results import as_json, map_dataset, moved, optima_table, result, save_figures, versions
 from hilbo.report.study_figures import comparison_figures, study_figures
-from hilbo.report.validation import HEAD, Validated, slug, validate
+from hilbo.report.validation import Validated, slug, validate
 from hilbo.search.rendering import margin_of, set_of
 from hilbo.study.analysis import Analysis, analyse, moved_by_evidence
-from hilbo.study.config import Study
 from hilbo.study.folder import Material, StudyFolder
+from hilbo.study.heterogeneity import in_place
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.rule_comparison import compare
 
@@ -71,7 +71,16 @@ def write_study(
     content = _content(folder, contents, claims, seed)
     (out / "result.json").write_text(as_json(content), encoding="utf-8")
     say("the page")
-    (out / "report.html").write_text(_page(folder, sections, claims, content), encoding="utf-8")
+    page = rendered(
+        "study.html",
+        study=folder.study,
+        content=content,
+        warnings=[*content["warnings"], *content["limits"]],
+        sections=sections,
+        people=sum(len(m.cohort.names) for m in folder.materials),
+        hypotheses=claims,
+    )
+    (out / "report.html").write_text(page, encoding="utf-8")
     return content
 
 
@@ -127,11 +136,11 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
     pictures = save_figures(study_figures(analysis, material, shares), folder)
     if compared is not None:
         tables["comparison"] = comparison_table(compared)
-        pictures += save_figures(comparison_figures(compared), folder)
+        pictures |= save_figures(comparison_figures(compared), folder)
     if validated is not None:
         content["validation"] = validation.validation_content(validated)
         tables |= validation.validation_csv(validated)
-        pictures += save_figures(validation.validation_figures(validated), folder)
+        pictures |= save_figures(validation.validation_figures(validated), folder)
     for name, table in tables.items():
         table.to_csv(folder / f"{name}.csv", index=False)
     content |= {
@@ -233,31 +242,34 @@ def passivity_table(found: Analysis) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _section(material, analysis, validated, tables, pictures: list[dict[str, str]], content) -> dict[str, Any]:
-    """What the template needs of one material."""
-    compared = content["comparison"]
-    study, counts = analysis.study, analysis.cohort.counts()
-    by_name = {picture["name"]: picture for picture in pictures}
-    section: dict[str, Any] = {
+def _section(material: Material, analysis: Analysis, validated, tables, pictures: Pictures, content) -> dict[str, Any]:
+    """What the page says of one material."""
+    from hilbo.report.figures.study import UNKNOWN, typical_person
+
+    readings = {"fixed": analysis.fixed, "optimised": analysis.optimised}
+    return {
         "name": material.name,
-        "lead": f"{len(analysis.cohort.names)} participants gave {int(counts.sum())} answers"
-        f" ({', '.join(study.responses)}).",
+        "study": analysis.study,
+        "participants": analysis.cohort.names,
+        "answers": int(analysis.cohort.counts().sum()),
         "limits": analysis.limits,
-        "warnings": content["warnings"],
-        "left_out": [f"{name}: {why}" for name, why in analysis.left_out.items()],
-        "rule": study.exclude,
-        "figures": by_name,
-        "table_1": _shown(tables["table_I"], _words_of_table_1(material)),
-        "passivity": _shown(tables["passivity"].dropna(axis=1, how="all"), {"p_top": f'P("{study.responses[-1]}")'}),
+        "left_out": analysis.left_out,
+        "figures": pictures,
+        "typical": analysis.cohort.names[typical_person(analysis)],
+        "unknown": UNKNOWN,
+        "how": in_place(analysis.aggregate.map),
+        "reference": None if material.reference is None else material.reference_name,
+        "table_1": _shown(tables["table_I"]),
+        "passivity": _shown(tables["passivity"].dropna(axis=1, how="all")),
         "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
-        "robust": "Under the hyperparameters of maximum evidence the optimum moves by"
-        f" {100 * content['optimised']['nrmse']:.1f} % of the search ranges." + _without(analysis),
-        "comparison": None if compared is None else _comparison(compared),
+        "moved": content["optimised"]["nrmse"],
+        "without": [
+            name for name, reading in readings.items() if all(i is None for i, _ in reading.tolerances.values())
+        ],
+        "comparison": None if content["comparison"] is None else _comparison(content["comparison"]),
+        "validation": None if validated is None else validation.validation_section(validated),
     }
-    if validated is not None:
-        section["validation"] = validation.validation_section(validated, study.responses, [])
-    return section
 
 
 def _comparison(compared):
@@ -269,41 +281,11 @@ def _comparison(compared):
     }
 
 
-def _without(analysis):
-    """Under which hyperparameters there is no tolerance interval at all."""
-    top = analysis.study.responses[-1]
-    names = [
-        name
-        for name, reading in (("fixed", analysis.fixed), ("optimised", analysis.optimised))
-        if all(interval is None for interval, _ in reading.tolerances.values())
+def _shown(table: pd.DataFrame, digits: int = 4) -> tuple[list[str], list[list[str]]]:
+    """Columns and cells of a table on the page, numbers with so many digits."""
+    return list(map(str, table.columns)), [
+        [_cell(value, digits) for value in row] for row in table.itertuples(index=False)
     ]
-    if not names:
-        return ""
-    return (
-        f' Under the {" and the ".join(names)} hyperparameters "{top}" is not the likeliest answer at the optimum, so'
-        " that there is no tolerance interval."
-    )
-
-
-def _words_of_table_1(material):
-    return {
-        "parameter": "",
-        "reference": material.reference_name,
-        "aggregate": "population map",
-        "error_percent": "error (%)",
-        "mean_of_optima": "mean of individual optima",
-        "sd_of_optima": "± sd",
-        "mean_error_percent": "its error (%)",
-    }
-
-
-def _shown(
-    table: pd.DataFrame, heads: Mapping[str, str] | None = None, digits: int = 4
-) -> tuple[list[str], list[list[str]]]:
-    """Head and cells of a table on the page, numbers with so many digits."""
-    heads = {} if heads is None else heads
-    head = [heads.get(str(name), str(name).replace("_", " ")) for name in table.columns]
-    return head, [[_cell(value, digits) for value in row] for row in table.itertuples(index=False)]
 
 
 def _tolerances(table):
@@ -322,7 +304,7 @@ def _tolerances(table):
         rows.append(
             [row["hyperparameters"], row["parameter"], *ends[0], *ends[1], f"{100 * row['draws_without']:.0f} %"]
         )
-    return ["hyperparameters", "parameter", "from", "95 % of draws", "to", "95 % of draws", "no interval"], rows
+    return rows
 
 
 def _cell(value, digits=4):
@@ -331,23 +313,3 @@ def _cell(value, digits=4):
     if isinstance(value, float | np.floating):
         return np.format_float_positional(value, precision=digits, unique=False, fractional=False, trim="-")
     return str(value)
-
-
-def _page(folder: StudyFolder, sections, claims, content) -> str:
-    study: Study = folder.study
-    return template("study.html").render(
-        title=f"{study.name}: results",
-        lead=f"What {sum(len(m.cohort.names) for m in folder.materials)} participants' answers say of"
-        f" {'one material' if len(sections) == 1 else f'{len(sections)} materials'}, in the order of the paper.",
-        warnings=[*content["warnings"], *content["limits"]],
-        sections=sections,
-        hypotheses=claims,
-        shorts=[[h.number, h.statement, h.verdict] for h in claims],
-        regression_head=HEAD,
-        many=len(sections) > 1,
-        study_hash=study.hash,
-        seed=content["seed"],
-        rule=study.rule,
-        inference=study.inference,
-        versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
-    )

@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import binomtest
 
-from hilbo.report.page import template
+from hilbo.report.page import rendered
 from hilbo.report.results import as_json, save_figures, versions
 from hilbo.statistics.paper_tables import PaperTables, aggregate_comparisons, paper_tables, set_sources
 from hilbo.statistics.preferences import rate
@@ -25,7 +25,6 @@ from hilbo.study.trial_table import read_cells
 from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
 
 __all__ = [
-    "HEAD",
     "Validated",
     "materials_of",
     "p_words",
@@ -38,12 +37,6 @@ __all__ = [
     "validation_section",
     "write_validation",
 ]
-
-_TITLES = {
-    "II": 'Table II: is the best set more often "{top}" than the others?',
-    "III": "Table III: answers to best and worst against mid (negative: towards “{top}”)",
-    "IV": "Table IV: is the aggregate's set preferred to individuals' own? (0: neither)",
-}
 
 
 class Validated(NamedTuple):
@@ -145,46 +138,29 @@ def validation_csv(found: Validated) -> dict[str, pd.DataFrame]:
     return files
 
 
-def validation_figures(found: Validated) -> dict[str, tuple[Any, str, str]]:
-    """Name -> figure, title, caption."""
+def validation_figures(found: Validated) -> dict[str, Any]:
+    """Name -> figure, those that there are."""
     from hilbo.report.figures import validation as plotting
 
     figures = {}
     if found.tables.confusion.to_numpy().any() or not found.tables.preferences.empty:
-        figures["validation"] = (
-            plotting.validation_figure(found.tables.confusion, found.tables.preferences),
-            "Validation sessions",
-            "Left: how often each of the three sets was put in each class, share and count; a map that orders them"
-            " rightly has the large shares on the diagonal. Right: of each pair, how often the first was preferred,"
-            " with the 95 % interval that takes account of who answered (where everybody agreed: the share of people"
-            " who would). Paper, figures 6b and 6c.",
-        )
+        figures["validation"] = plotting.validation_figure(found.tables.confusion, found.tables.preferences)
     if found.overall is not None and found.people is not None:
-        figures["aggregate-best"] = (
-            plotting.aggregate_best_figure(found.people, found.overall),
-            "Aggregate-best against individual-best",
-            "How often the population's set was preferred to individuals' own, by each participant and by all (ties"
-            " left out); dashed: no preference.",
-        )
+        figures["aggregate-best"] = plotting.aggregate_best_figure(found.people, found.overall)
     return figures
 
 
-def validation_section(found: Validated, responses: Sequence[str], pictures: list[dict[str, str]]) -> dict[str, Any]:
-    """What the template needs."""
-    top = responses[-1]
+def validation_section(found: Validated) -> dict[str, Any]:
+    """What the page says of one material."""
     return {
         "material": found.material,
-        "lead": f"{found.participants} participants made {found.comparisons} comparisons.",
+        "participants": found.participants,
+        "comparisons": found.comparisons,
         "limits": found.tables.limits,
-        "figures": pictures,
-        "regressions": [
-            {"title": _TITLES[number].format(top=top), "rows": _shown(table), "warnings": table.warnings}
-            for number, table in found.regressions().items()
-        ],
+        "regressions": {
+            number: {"rows": _shown(table), "warnings": table.warnings} for number, table in found.regressions().items()
+        },
     }
-
-
-HEAD = ["", "estimate", "std. error", "t-ratio", "degrees of freedom", "p-value", "95 % interval", "errors"]
 
 
 def _shown(table):
@@ -237,20 +213,11 @@ def write_validation(
             frame.to_csv(material_folder / f"{file}.csv", index=False)
         pictures = save_figures(validation_figures(validated), material_folder)
         contents.append(validation_content(validated))
-        sections.append(validation_section(validated, study.responses, pictures))
+        sections.append(validation_section(validated) | {"figures": pictures})
     content = {"materials": contents, "study": study.hash, "seed": seed, "versions": versions()}
     content["warnings"] = [w for entry in contents for w in entry["warnings"]]
     (folder / "result.json").write_text(as_json(content), encoding="utf-8")
-    page = template("validation.html").render(
-        title=f"{study.name}: validation sessions",
-        lead="People compared pairs of renderings, classified each, and said which was nearer to the real material.",
-        warnings=[],
-        sections=sections,
-        head=HEAD,
-        study_hash=study.hash,
-        seed=seed,
-        versions=", ".join(f"{k} {v}" for k, v in content["versions"].items()),
-    )
+    page = rendered("validation.html", study=study, content=content, warnings=[], sections=sections)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content
 

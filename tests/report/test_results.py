@@ -154,9 +154,9 @@ def test_a_failed_certificate_is_said_in_one_sentence():
     from hilbo.report.page import results_page
     from hilbo.report.participants import people_of
 
-    page = results_page(study, content, [], people_of(study, failed))
+    page = results_page(study, content, {}, people_of(study, failed))
     assert content["warnings"][0] in page and "committee" in page
-    other = results_page(study, content | {"rule": "hierarchical"}, [], people_of(study, failed))
+    other = results_page(study, content | {"rule": "hierarchical"}, {}, people_of(study, failed))
     assert "committee" not in other and "by the rule <code>hierarchical</code>" in other
 
 

@@ -107,16 +107,16 @@ def test_other_materials_are_the_others():
 
 def test_measures_have_the_digits_that_answers_give():
     head, rows = _shown(pd.DataFrame({"lapse_low": [0.12345], "trials": [25], "drift_high": [np.inf]}), digits=2)
-    assert (head, rows) == (["lapse low", "trials", "drift high"], [["0.12", "25", "∞"]])
+    assert (head, rows) == (["lapse_low", "trials", "drift_high"], [["0.12", "25", "∞"]])
     row = dict(hyperparameters="fixed", parameter="u", draws_without=0.0, low_end="range", high_end="range")
     row |= dict(low=1.0, high=12.346, low_from=1.0, low_to=1.2346, high_from=1.1, high_to=12.346)
-    _, ((*_, low, ends, _),) = _tolerances(pd.DataFrame([row]))
+    ((*_, low, ends, _),) = _tolerances(pd.DataFrame([row]))
     assert (low, ends) == ("12.35 (range)", "1.1 to 12")
 
 
 def test_verdicts_count_what_can_be_said():
     def verdict(*sides):
-        return Hypothesis("H1", "", tuple(Evidence(side, "") for side in sides)).verdict
+        return Hypothesis("H1", tuple(Evidence(side, "") for side in sides)).verdict
 
     assert verdict("open") == "These data cannot say."
     assert verdict("for", "open", "for") == "All that can be said (2 of 2) speaks for it."
@@ -238,4 +238,4 @@ def test_the_comparison_of_rules_is_shown():
     )
     assert "too many" in rows[2] and "–" in rows[2]
     figures = comparison_figures(content)
-    assert set(figures) == {"comparison", "reliability"} and len(figures["comparison"][0].axes) == 2
+    assert set(figures) == {"comparison", "reliability"} and len(figures["comparison"].axes) == 2

@@ -1,0 +1,73 @@
+"""Pages: a number that a template misses is an error, and what a page says of the same numbers told differently."""
+
+import re
+
+import numpy as np
+import pytest
+from jinja2 import UndefinedError
+from studies import plain_study
+
+from hilbo.report.page import rendered
+from hilbo.report.robustness import robustness_page
+from hilbo.search.rendering import set_of
+
+VERSIONS = {"hilbo": "1", "python": "3.11"}
+
+
+def words(page):
+    """What a reader sees of a page, in one line."""
+    return " ".join(re.sub(r"<[^>]*>", " ", page.split("</head>")[1]).split())
+
+
+def test_a_missing_number_is_an_error():
+    with pytest.raises(UndefinedError, match="is undefined"):
+        rendered("robustness.html", warnings=[])
+
+
+def test_a_caption_is_text_in_the_description_of_its_figure():
+    figure = {"png": "", "width": "10"}
+    content = {"materials": [], "study": "abc", "seed": 0, "versions": VERSIONS}
+    section = {"material": "<foam>", "participants": 1, "comparisons": 2, "limits": (), "regressions": {}}
+    study = plain_study(1)
+    for figures, count in (({"validation": figure}, 1), ({}, 0), ({"validation": figure, "aggregate-best": figure}, 2)):
+        page = rendered(
+            "validation.html", study=study, content=content, warnings=[], sections=[section | {"figures": figures}]
+        )
+        assert page.count("<img") == count and "&lt;foam&gt;" in page
+    assert "how often the first was preferred, with the 95 % interval" in words(page)
+    (alt,) = re.findall(r'alt="(Aggregate-best[^"]*)"', page)
+    assert alt.startswith("Aggregate-best against individual-best. How often the population&#39;s set was preferred to")
+
+
+def robust(shared, nrmse):
+    """The page of a robustness check of two people, the second of whom moved."""
+    study = plain_study(2)
+    optimum = {"parameters": set_of(study.space, np.full(2, 0.5)), "mean": 1.0, "sd": 0.25}
+    still = {"participant": "A", "nrmse": 0.01, "flagged": False, "converged": True, "runaway": False}
+    learned = {"parameters": ["theta", "noise"], "shared": shared, "theta": [5.0], "noise": 0.5, "thresholds": [0.0]}
+    content = {
+        "warnings": ["a < b"],
+        "fixed": optimum,
+        "optimised": optimum,
+        "nrmse": nrmse,
+        "flagged": nrmse >= 0.03,
+        "rule": "bcm",
+        "participants": [still, still | {"participant": "B", "nrmse": 0.2, "flagged": True, "converged": False}],
+        "learned": learned,
+        "sensitivity": {"theta": [0.1, -0.2], "gaps": [[0.1, 0.2], [0.3, 0.4]]},
+        "versions": VERSIONS,
+    }
+    return words(robustness_page(study, content, {}))
+
+
+def test_the_page_of_a_robustness_check():
+    page = robust(shared=True, nrmse=0.01)
+    assert (
+        "one set for all; learnt: theta, noise" in page and "1.0 % of the search ranges (NRMSE), less than 3 %:" in page
+    )
+    assert "Learnt: theta 5; noise 0.5; thresholds 0." in page and "a &lt; b" in page
+    assert "moved by 3 % or more: B." in page and "B 20.0 % flagged, search not converged" in page
+    assert "ln theta +1.00 % -2.00 %" in page and "ln gap 2 +2.00 % +4.00 %" in page
+    own = robust(shared=False, nrmse=0.03)
+    assert "each person's own" in own.replace("&#39;", "'") and "Learnt:" not in own
+    assert "which is 3 % or more: it is not robust" in own
