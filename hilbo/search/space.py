@@ -7,20 +7,18 @@ Three coordinates of one point:
 - *box* w: the optimiser's coordinates. With mechanics, x_K1 = w_K1 · x_K1max(B1, α), where K1max is the largest
   passive K1 (`passivity.largest_K1`), so that the feasible set is the whole of [0, 1]^d; without, w = x.
 
-With a range of effective damping B_eff the column starts above the lowest K1 too. B_eff = 1000·T·β·M1·(K1/(K1 + β·S))²
-rises with K1 from 0 to 1000·T·β·M1, so that the range is an interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are
-K1 = β·S·r/(1 - r), infinite for r >= 1; and x_K1 = start + w_K1 · width.
+With a range of effective damping the column starts above the lowest K1 too, and x_K1 = start + w_K1 · width
+(`feasibility` has both ends).
 
 A column (B1, α) with K1max below the lowest K1, or no K1 in the range, has width 0 and holds no feasible point. Points
 that fill the feasible set evenly come from uniform numbers by the Rosenblatt map whose density is the column's width;
-Rosenblatt (1952), Ann. Math. Stat. 23:470. The search keeps `SEARCH_MARGIN` away from the device's damping, so that a
-device that checks passivity again in float32 never refuses a proposal.
+Rosenblatt (1952), Ann. Math. Stat. 23:470.
 """
 
 import functools
 import math
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,24 +26,17 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
-from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
-from hilbo.mechanics.exponentials import STATES
-from hilbo.mechanics.memory import Memory, Span, span, sums
+from hilbo.search.feasibility import K0_of, K1_range, Mechanics, allowed, largest_K1, minimum_damping
 from hilbo.search.space_filling import Chunks, latin_chunks, sobol_chunks, take, wall_chunks
 
-__all__ = ["COLUMNS", "ROWS", "SEARCH_MARGIN", "Mechanics", "Parameter", "SearchSpace", "column_ends", "column_table"]
-
-SEARCH_MARGIN = 1e-3
-"""The search uses the damping b·(1 - SEARCH_MARGIN)."""
+__all__ = ["COLUMNS", "ROWS", "Parameter", "SearchSpace", "column_ends", "column_table"]
 
 # Cells of the table of column widths. At small B1 the width falls from all to little within 1/1000 of the range, so
 # the rows crowd there: with even rows the share of the first one alone would be off by a sixth.
 _CELLS = 256
 ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
 COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
-# The map puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse them.
-_ROUNDING = 64
 _Batch = Float[Array, "*batch"]
 
 
@@ -85,38 +76,6 @@ class Parameter(eqx.Module):
             width = self.high - self.low
             upwards, downwards = self.low + width * unit, self.high - width * (1 - unit)
         return jnp.where(unit < 0.5, upwards, downwards)
-
-
-class Mechanics(eqx.Module):
-    """What the renderer adds to the box: the FO-SLS, its memory and rate, and the device's damping.
-
-    `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
-    optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd) of short memory; `states`: exponentials of full memory,
-    for which alone the effective damping depends on them, and not on K1; `T`: s.
-    """
-
-    K_eff: float = eqx.field(static=True, converter=float)
-    damping: float = eqx.field(static=True, converter=float)
-    N: int = eqx.field(static=True, default=101)
-    T: float = eqx.field(static=True, converter=float, default=1e-3)
-    memory: Memory = eqx.field(static=True, default="short")
-    states: int = eqx.field(static=True, default=10)
-    effective_damping: tuple[float, float] | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        for key, least in (("damping", 0.0), ("T", 0.0), ("K_eff", -math.ulp(0.0))):
-            value = getattr(self, key)
-            if not least < value < math.inf:
-                raise InputError(f"renderer.{key} is {value}, it must be {'0 or' if least else 'a number'} above 0.")
-        if self.memory == "full" and self.states not in STATES:
-            raise InputError(f"renderer.states is {self.states}, it must be one of {', '.join(map(str, STATES))}.")
-        if self.memory == "short" and (self.N < 1 or self.N % 2 == 0):
-            raise InputError(f"renderer.N is {self.N}, it must be odd and at least 1; write for example N = 101.")
-        if self.effective_damping is not None and not 0 <= self.effective_damping[0] < self.effective_damping[1]:
-            raise InputError(
-                f"renderer.effective_damping is {list(self.effective_damping)}, it must be a lower end, 0 or above, "
-                "and a higher one; write for example effective_damping = [10, 80]."
-            )
 
 
 class SearchSpace(eqx.Module):
@@ -210,33 +169,17 @@ class SearchSpace(eqx.Module):
         """Whether points of the unit cube are in the box, passive with the search margin, and damped as asked for."""
         x = _floating(x)
         inside = jnp.all((x >= 0) & (x <= 1), axis=-1)
-        mechanics = self.mechanics
-        if mechanics is None:
+        if self.mechanics is None:
             return inside
-        physical = self._split(self.to_physical(x))
-        available = mechanics.damping * (1 - SEARCH_MARGIN) * (1 + _ROUNDING * float(jnp.finfo(x.dtype).eps))
-        inside &= _minimum_damping(mechanics, physical) <= available
-        if mechanics.effective_damping is not None:
-            low, high = mechanics.effective_damping
-            damping = _effective_damping(mechanics, physical)
-            slack = 4 * _ROUNDING * float(jnp.finfo(x.dtype).eps)
-            inside &= (low * (1 - slack) <= damping) & (damping <= high * (1 + slack))
-        return inside
+        return inside & allowed(self.mechanics, self._split(self.to_physical(x)))
 
     def derived(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> dict[str, Float[Array, "..."]]:
         """What follows from the parameters: K0 (N/mm) with mechanics, nothing without."""
-        m = self.mechanics
-        if m is None:
-            return {}
-        return {
-            "K0": viscoelastic.K0_from_effective_stiffness(
-                *_model_parameters(physical), m.K_eff, m.N, m.T, memory=m.memory
-            )
-        }
+        return {} if self.mechanics is None else {"K0": K0_of(self.mechanics, physical)}
 
     def passivity_margin(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."] | None:
         """Damping of the device less the smallest passive one, N·s/m; None without mechanics."""
-        return None if self.mechanics is None else self.mechanics.damping - _minimum_damping(self.mechanics, physical)
+        return None if self.mechanics is None else self.mechanics.damping - minimum_damping(self.mechanics, physical)
 
     def volume(self) -> float:
         """Share of the unit cube that is feasible: the mean width of its columns, on a grid; 1 without mechanics."""
@@ -269,54 +212,20 @@ class SearchSpace(eqx.Module):
         """Width of the column of each point: the largest feasible x_K1, 0 where there is none."""
         K1 = self.parameters[self._index("K1")]
         B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
-        b = m.damping * (1 - SEARCH_MARGIN)
-        largest = passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory)
-        return K1.to_unit(jnp.clip(largest, K1.low, K1.high))
+        return K1.to_unit(jnp.clip(largest_K1(m, B1, alpha), K1.low, K1.high))
 
     def _interval(self, m: Mechanics, x: Float[Array, "*batch d"]) -> tuple[_Batch, _Batch]:
         """Start and width of the column of each point, in x_K1, with a range of effective damping."""
         K1 = self.parameters[self._index("K1")]
         B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
-        first, last = _K1_range(m, B1, alpha)
+        first, last = K1_range(m, B1, alpha)
         low, high = K1.to_unit(jnp.clip(first, K1.low, K1.high)), K1.to_unit(jnp.clip(last, K1.low, K1.high))
         high = jnp.minimum(high, self._limit(m, x))
         return low, jnp.maximum(high - low, 0)
 
 
-def _K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
-    """The K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
-    assert m.effective_damping is not None
-    memory = span(m.memory, m.N, m.states)
-    low, high = (viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
-    return low, high
-
-
-def _K1_of(
-    span: Span, damping: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
-) -> Float[Array, ""]:
-    """The K1 with this effective damping."""
-    beta, kernel_sums = B1 * T**-alpha, sums(alpha, span)
-    square = damping / (1000 * T * beta * kernel_sums.moment)
-    possible = (square > 0) & (square < 1)
-    share = jnp.sqrt(jnp.where(possible, square, 0.25))
-    K1 = beta * kernel_sums.at_dc * share / (1 - share)
-    return jnp.where(possible, K1, jnp.where(square > 0, jnp.inf, 0))
-
-
-def _effective_damping(m: Mechanics, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."]:
-    return viscoelastic.effective_damping(*_model_parameters(physical), m.N, m.T, memory=m.memory, states=m.states)
-
-
 def _floating(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
     return jnp.asarray(x, jnp.result_type(1.0, x))
-
-
-def _model_parameters(physical: Mapping[str, Real[ArrayLike, "..."]]) -> tuple[Any, Any, Any]:
-    return physical["K1"], physical["B1"], physical["alpha"]
-
-
-def _minimum_damping(m: Mechanics, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."]:
-    return passivity.minimum_damping(*_model_parameters(physical), m.K_eff, m.N, m.T, memory=m.memory)
 
 
 @functools.lru_cache(maxsize=16)

@@ -22,7 +22,8 @@ from hilbo.errors import InputError
 from hilbo.mechanics.memory import Memory
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.population.maps import ALL_RULES, AnyRule
-from hilbo.search.space import Mechanics, Parameter, SearchSpace
+from hilbo.search.feasibility import Mechanics
+from hilbo.search.space import Parameter, SearchSpace
 from hilbo.study.fields import NotNegative as _NotNegative
 from hilbo.study.fields import Number as _Number
 from hilbo.study.fields import Positive as _Positive

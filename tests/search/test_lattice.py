@@ -11,7 +11,8 @@ import pytest
 from hilbo import acquisition
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.search import lattice
-from hilbo.search.space import Mechanics, Parameter, SearchSpace
+from hilbo.search.feasibility import Mechanics
+from hilbo.search.space import Parameter, SearchSpace
 from hilbo.search.space_lattice import lattice_of
 
 K1, B1, ALPHA = Parameter("K1", 1, 32), Parameter("B1", 0.001, 32), Parameter("alpha", 0.01, 0.99)

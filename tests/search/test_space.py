@@ -12,7 +12,8 @@ from scipy.stats import qmc
 
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
-from hilbo.search.space import SEARCH_MARGIN, Mechanics, Parameter, SearchSpace
+from hilbo.search.feasibility import SEARCH_MARGIN, Mechanics
+from hilbo.search.space import Parameter, SearchSpace
 
 K1 = Parameter("K1", 1, 32, "N/mm")
 B1 = Parameter("B1", 0.001, 32, "N.s^alpha/mm")

@@ -1,0 +1,118 @@
+"""What may be rendered: the renderer's mechanics and the device's damping, and which K1 they leave for B1 and α.
+
+A parameter set is passive for K1 up to `passivity.largest_K1`. With a range of effective damping B_eff there is a
+lowest K1 too: B_eff = 1000·T·β·M1·(K1/(K1 + β·S))² rises with K1 from 0 to 1000·T·β·M1, so that the range is an
+interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are K1 = β·S·r/(1 - r), infinite for r >= 1.
+
+The search keeps `SEARCH_MARGIN` away from the device's damping, so that a device that checks passivity again in
+float32 never refuses a proposal.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Real
+
+from hilbo import passivity, viscoelastic
+from hilbo.errors import InputError
+from hilbo.mechanics.exponentials import STATES
+from hilbo.mechanics.memory import Memory, Span, span, sums
+
+__all__ = ["SEARCH_MARGIN", "K0_of", "K1_range", "Mechanics", "allowed", "largest_K1", "minimum_damping"]
+
+SEARCH_MARGIN = 1e-3
+"""The search uses the damping b·(1 - SEARCH_MARGIN)."""
+# The search puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse
+# them.
+_ROUNDING = 64
+_Batch = Float[Array, "*batch"]
+_Physical = Mapping[str, Real[ArrayLike, "..."]]
+
+
+class Mechanics(eqx.Module):
+    """What the renderer adds to the box: the FO-SLS, its memory and rate, and the device's damping.
+
+    `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
+    optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd) of short memory; `states`: exponentials of full memory,
+    for which alone the effective damping depends on them, and not on K1; `T`: s.
+    """
+
+    K_eff: float = eqx.field(static=True, converter=float)
+    damping: float = eqx.field(static=True, converter=float)
+    N: int = eqx.field(static=True, default=101)
+    T: float = eqx.field(static=True, converter=float, default=1e-3)
+    memory: Memory = eqx.field(static=True, default="short")
+    states: int = eqx.field(static=True, default=10)
+    effective_damping: tuple[float, float] | None = eqx.field(static=True, default=None)
+
+    def __check_init__(self):
+        for key, least in (("damping", 0.0), ("T", 0.0), ("K_eff", -math.ulp(0.0))):
+            value = getattr(self, key)
+            if not least < value < math.inf:
+                raise InputError(f"renderer.{key} is {value}, it must be {'0 or' if least else 'a number'} above 0.")
+        if self.memory == "full" and self.states not in STATES:
+            raise InputError(f"renderer.states is {self.states}, it must be one of {', '.join(map(str, STATES))}.")
+        if self.memory == "short" and (self.N < 1 or self.N % 2 == 0):
+            raise InputError(f"renderer.N is {self.N}, it must be odd and at least 1; write for example N = 101.")
+        if self.effective_damping is not None and not 0 <= self.effective_damping[0] < self.effective_damping[1]:
+            raise InputError(
+                f"renderer.effective_damping is {list(self.effective_damping)}, it must be a lower end, 0 or above, "
+                "and a higher one; write for example effective_damping = [10, 80]."
+            )
+
+
+def allowed(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
+    """Whether parameter sets are passive with the search margin, and damped as asked for."""
+    eps = float(jnp.finfo(jnp.result_type(1.0, *_model_parameters(physical))).eps)
+    passive = minimum_damping(m, physical) <= m.damping * (1 - SEARCH_MARGIN) * (1 + _ROUNDING * eps)
+    if m.effective_damping is None:
+        return passive
+    low, high = m.effective_damping
+    damping = viscoelastic.effective_damping(*_model_parameters(physical), m.N, m.T, memory=m.memory, states=m.states)
+    slack = 4 * _ROUNDING * eps
+    return passive & (low * (1 - slack) <= damping) & (damping <= high * (1 + slack))
+
+
+def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
+    """The least damping (N·s/m) of a device on which parameter sets are passive."""
+    return passivity.minimum_damping(*_model_parameters(physical), m.K_eff, m.N, m.T, memory=m.memory)
+
+
+def K0_of(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
+    """K0 (N/mm) of parameter sets, from the effective stiffness."""
+    K1, B1, alpha = _model_parameters(physical)
+    return viscoelastic.K0_from_effective_stiffness(K1, B1, alpha, m.K_eff, m.N, m.T, memory=m.memory)
+
+
+def largest_K1(m: Mechanics, B1: _Batch, alpha: _Batch) -> _Batch:
+    """The largest K1 (N/mm) that is passive with the search margin."""
+    b = m.damping * (1 - SEARCH_MARGIN)
+    return passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory)
+
+
+def K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
+    """The K1 (N/mm) at both ends of the range of effective damping: 0 to inf."""
+    assert m.effective_damping is not None
+    memory = span(m.memory, m.N, m.states)
+    low, high = (viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
+    return low, high
+
+
+def _K1_of(
+    span: Span, damping: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
+) -> Float[Array, ""]:
+    """The K1 with this effective damping."""
+    beta, kernel_sums = B1 * T**-alpha, sums(alpha, span)
+    square = damping / (1000 * T * beta * kernel_sums.moment)
+    possible = (square > 0) & (square < 1)
+    share = jnp.sqrt(jnp.where(possible, square, 0.25))
+    K1 = beta * kernel_sums.at_dc * share / (1 - share)
+    return jnp.where(possible, K1, jnp.where(square > 0, jnp.inf, 0))
+
+
+def _model_parameters(physical: _Physical) -> tuple[Any, Any, Any]:
+    return physical["K1"], physical["B1"], physical["alpha"]
