@@ -175,7 +175,7 @@ def restore(state: LiveSession, trial: int, at: float) -> Event:
     if found.status != "void" or found.values is None:
         raise RefusedError("nothing", f"trial {trial} has no voided answer.")
     if _filled(state, found):
-        raise RefusedError("nothing", f"the place of trial {trial} has been filled by a later one.")
+        raise RefusedError("nothing", f"the place of trial {trial} has been filled by another one.")
     return _event(state, "restore", at, id=trial)
 
 
@@ -200,8 +200,7 @@ def _filled(state: LiveSession, found: Trial) -> bool:
     if found.repeats is not None:
         pending = state.pending
         waits = found.repeats in state.wanted or (pending is not None and pending.repeats == found.repeats)
-        later = (t for t in state.trials[found.id :] if t.repeats == found.repeats and t.status == "answered")
-        return bool(found.voided and found.voided.get("asked_again")) and not waits and any(later)
+        return bool(found.voided and found.voided.get("asked_again")) and not waits
     others = state.answers(found.block)
     if found.planned is not None:
         return len(others) >= state.quota(found.block) or any(t.planned == found.planned for t in others)

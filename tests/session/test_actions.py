@@ -362,6 +362,22 @@ def test_a_repetition_is_not_restored_beside_the_one_in_its_place(answered):
     assert len(counted) == 1
 
 
+def test_of_several_voided_repetitions_of_one_trial_one_is_restored():
+    driver = to_first_answerable()
+    driver.do("answer", 0)
+    source = live.last_answered(driver.state).id
+    driver.do("again", source - 1)
+    driver.do("answer", 0)
+    for _ in range(2):  # the second in the place of the first
+        driver.do("answer", 0)
+        driver.do("void old", live.last_answered(driver.state).id - 1)
+        driver.do("answer", 0)
+    first, second = (t.id for t in driver.state.trials if t.repeats == source and t.status == "void")
+    driver.do("restore", first - 1)
+    with pytest.raises(RefusedError, match="has been filled"):
+        live.restore(driver.state, second, 1.0)
+
+
 def test_the_warm_up_goes_on_for_as_long_as_one_likes():
     driver = Driver()
     driver.step()
