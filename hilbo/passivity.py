@@ -26,9 +26,10 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
+from hilbo.mechanics.fosls import pot_stiffness, share
 from hilbo.mechanics.memory import Memory, Span, span, sums
 from hilbo.mechanics.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
-from hilbo.viscoelastic import elementwise, share
+from hilbo.viscoelastic import elementwise
 
 __all__ = [
     "Certificate",
@@ -93,7 +94,7 @@ def _minimum_damping(
     T: Float[Array, ""],
 ) -> Float[Array, ""]:
     """b_min of this module's head, N·s/m; 500·T is T/2 for stiffness in N/mm."""
-    beta = B1 * T**-alpha
+    beta = pot_stiffness(B1, alpha, T)
     gl = sums(alpha, span)
     fast, slow = share(K1, beta * gl.at_nyquist), share(K1, beta * gl.at_dc)
     stiffness = K_eff + beta * gl.spread * fast * slow
@@ -109,7 +110,7 @@ def _largest_K1(
     T: Float[Array, ""],
 ) -> Float[Array, ""]:
     """K1max of this module's head, N/mm, and its two limits."""
-    beta = B1 * T**-alpha
+    beta = pot_stiffness(B1, alpha, T)
     gl = sums(alpha, span)
     room = b / (500 * T) - K_eff  # Y
     excess = beta * gl.spread - room  # A

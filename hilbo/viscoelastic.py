@@ -7,8 +7,8 @@ Continuous model H(s) = K0 + K1·B1·s^α / (K1 + B1·s^α), 0 < α <= 1. Sample
     H(z) = K0 + K1·β·C(z) / (K1 + β·C(z))
 
 The record `FOSLS` is in `fosls`, the exact continuous functions in `continuous`, presets, special cases and loads in
-`materials`, the change of sets in contact in `switching`; all of them are names of this module too. Here are the closed
-forms over arrays of parameters, which need S_N = C(1), M1 = -Σ i·c_i and C(-1) alone.
+`materials`, the change of sets in contact in `switching`; all of them are names of this module too. Here the closed
+forms, which need S_N = C(1), M1 = -Σ i·c_i and C(-1) alone, are taken over arrays of parameters.
 
 Units: stiffness N/mm, B1 N·s^α/mm, T s, damping N·s/m. N and T belong to a parameter set: α means another material
 under another N. Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (short memory).
@@ -23,7 +23,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hilbo.mechanics.continuous import creep_compliance, relaxation_modulus
-from hilbo.mechanics.fosls import FOSLS, series, share
+from hilbo.mechanics.fosls import FOSLS, pot_stiffness, slow_damping, slow_stiffness
 from hilbo.mechanics.materials import (
     PRESETS,
     Preset,
@@ -143,7 +143,7 @@ def _K0(
     K_eff: Float[Array, ""],
     T: Float[Array, ""],
 ) -> Float[Array, ""]:
-    return K_eff - series(K1, B1 * T**-alpha * sums(alpha, span).at_dc)
+    return K_eff - slow_stiffness(K1, pot_stiffness(B1, alpha, T), sums(alpha, span))
 
 
 def _dc_gain(
@@ -154,11 +154,10 @@ def _dc_gain(
     alpha: Float[Array, ""],
     T: Float[Array, ""],
 ) -> Float[Array, ""]:
-    return K0 + series(K1, B1 * T**-alpha * sums(alpha, span).at_dc)
+    return K0 + slow_stiffness(K1, pot_stiffness(B1, alpha, T), sums(alpha, span))
 
 
 def _effective_damping(
     span: Span, K1: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
 ) -> Float[Array, ""]:
-    beta, gl = B1 * T**-alpha, sums(alpha, span)
-    return 1000 * T * beta * gl.moment * share(K1, beta * gl.at_dc) ** 2
+    return slow_damping(K1, pot_stiffness(B1, alpha, T), sums(alpha, span), T)

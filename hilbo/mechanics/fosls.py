@@ -27,11 +27,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Inexact, Real
 
 from hilbo.errors import InputError
-from hilbo.mechanics.memory import Memory, Span, gl_coefficients, response, span, sums
+from hilbo.mechanics.memory import GLSums, Memory, Span, gl_coefficients, response, span, sums
 from hilbo.mechanics.recursion import BLOCK, past_of
 from hilbo.numerics.mittag_leffler import mittag_leffler
 
-__all__ = ["FOSLS", "Start", "series", "share"]
+__all__ = ["FOSLS", "Start", "pot_stiffness", "series", "share", "slow_damping", "slow_stiffness"]
 
 Start = Literal["rest", "equilibrium"]
 _LONGEST_RELAXATION = 1_000_000  # samples
@@ -85,7 +85,7 @@ class FOSLS(eqx.Module):
     @property
     def beta(self) -> Float[Array, ""]:
         """β = B1·T^{-α}, N/mm."""
-        return self.B1 * self.T**-self.alpha
+        return pot_stiffness(self.B1, self.alpha, self.T)
 
     def frequency_response(self, omega: Real[ArrayLike, "*w"]) -> Complex[Array, "*w"]:
         """H(e^{jωT}) (N/mm) at angular frequencies ω (rad/s) up to π/T."""
@@ -100,7 +100,7 @@ class FOSLS(eqx.Module):
 
     def dc_gain(self) -> Float[Array, ""]:
         """Static stiffness H(1), N/mm."""
-        return self.K0 + series(self.K1, self.beta * sums(self.alpha, self.span).at_dc)
+        return self.K0 + slow_stiffness(self.K1, self.beta, sums(self.alpha, self.span))
 
     def high_frequency_gain(self) -> Float[Array, ""]:
         """H(-1), N/mm: the stiffness at the Nyquist frequency."""
@@ -112,8 +112,7 @@ class FOSLS(eqx.Module):
 
     def effective_damping(self) -> Float[Array, ""]:
         """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1."""
-        gl = sums(self.alpha, self.span)
-        return 1000 * self.T * self.beta * gl.moment * share(self.K1, self.beta * gl.at_dc) ** 2
+        return slow_damping(self.K1, self.beta, sums(self.alpha, self.span), self.T)
 
     def simulate(
         self, x: Real[ArrayLike, " n"], *, start: Start = "rest", unilateral: bool = False, block: int = BLOCK
@@ -160,6 +159,25 @@ def share(K1: Float[Array, "..."], pot: Float[Array, "..."]) -> Float[Array, "..
     firm = (pot <= K1) & (K1 > 0)
     ratio = jnp.where(firm, 0, K1) / jnp.where(firm | (pot == 0), 1, pot)
     return jnp.where(firm, 1 / (1 + pot / jnp.where(firm, K1, 1)), ratio / (1 + ratio))
+
+
+def pot_stiffness(
+    B1: Float[Array, "..."], alpha: Float[Array, "..."], T: float | Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """β = B1·T^{-α}, N/mm: the stiffness of the spring-pot in the sample of a step."""
+    return B1 * T**-alpha
+
+
+def slow_stiffness(K1: Float[Array, ""], beta: Float[Array, ""], gl: GLSums) -> Float[Array, ""]:
+    """H(1) - K0, N/mm: what spring and spring-pot in series add to the static stiffness."""
+    return series(K1, beta * gl.at_dc)
+
+
+def slow_damping(
+    K1: Float[Array, ""], beta: Float[Array, ""], gl: GLSums, T: float | Float[Array, ""]
+) -> Float[Array, ""]:
+    """dH/ds at s = 0, N·s/m: T·K1²·β·M1/(K1 + β·S_N)²; 1000·T is T for stiffness in N/mm."""
+    return 1000 * T * beta * gl.moment * share(K1, beta * gl.at_dc) ** 2
 
 
 @eqx.filter_jit

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Real
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
 from hilbo.mechanics.exponentials import STATES
+from hilbo.mechanics.fosls import pot_stiffness
 from hilbo.mechanics.memory import Memory, Span, span, sums
 
 __all__ = ["SEARCH_MARGIN", "K0_of", "K1_range", "Mechanics", "allowed", "largest_K1", "minimum_damping"]
@@ -106,7 +107,7 @@ def _K1_of(
     span: Span, damping: Float[Array, ""], B1: Float[Array, ""], alpha: Float[Array, ""], T: Float[Array, ""]
 ) -> Float[Array, ""]:
     """The K1 with this effective damping."""
-    beta, kernel_sums = B1 * T**-alpha, sums(alpha, span)
+    beta, kernel_sums = pot_stiffness(B1, alpha, T), sums(alpha, span)
     square = damping / (1000 * T * beta * kernel_sums.moment)
     possible = (square > 0) & (square < 1)
     share = jnp.sqrt(jnp.where(possible, square, 0.25))
