@@ -16,10 +16,11 @@ _CHANCE = 0.8  # share of studies that must be within the error to call a design
 
 
 def enough(summary: pd.DataFrame, chance: float = _CHANCE) -> pd.DataFrame:
-    """For every number of participants the fewest trials from which on at least `chance` of the studies are within the
-    error, with all larger numbers simulated too; NaN if the largest does not reach it."""
+    """For every number of participants the fewest trials from which on at least `chance` of all studies are within the
+    error, with all larger numbers simulated too, as far as the simulated ones prove it (`reached_surely`); NaN if the
+    largest does not."""
     longest_first = summary.sort_values("trials", ascending=False)
-    holds = (longest_first["reached"] >= chance).groupby(longest_first["participants"]).cummin()
+    holds = (longest_first["reached_surely"] >= chance).groupby(longest_first["participants"]).cummin()
     good = longest_first[holds].groupby("participants")["trials"].min()
     return good.reindex(sorted(summary["participants"].unique())).rename("trials").reset_index()
 

@@ -192,7 +192,8 @@ def top_probability(persons: Person, categories: int, x: Float[np.ndarray, "m d"
 
 def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:
     """For every (m, t): median and quartiles of both errors, and the share of studies whose optimum misses by `error`
-    or less, with its 95 % interval (Wilson); columns end in `_median`, `_low`, `_high`; `reached`."""
+    or less, with its 95 % interval (Wilson); columns end in `_median`, `_low`, `_high`; `reached`. `reached_surely` is
+    the share that these studies prove: its exact (Clopper-Pearson) lower 95 % confidence bound, one-sided."""
     groups = errors.groupby(["participants", "trials"])
     table = pd.DataFrame({
         f"{name}_{word}": groups[name].quantile(q)
@@ -203,6 +204,8 @@ def summarise(errors: pd.DataFrame, error: float) -> pd.DataFrame:
     table["reached"] = within / count
     ends = [binomtest(k, n).proportion_ci(method="wilson") for k, n in zip(within, count, strict=True)]
     table["reached_low"], table["reached_high"] = [e.low for e in ends], [e.high for e in ends]
+    exact = [binomtest(k, n, alternative="greater").proportion_ci(0.95) for k, n in zip(within, count, strict=True)]
+    table["reached_surely"] = [e.low for e in exact]
     table["studies"] = count
     return table.reset_index()
 

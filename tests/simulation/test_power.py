@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import binom
 
 from hilbo import Study
 from hilbo.cli import main
@@ -44,7 +45,8 @@ def test_summaries_of_errors_that_are_known():
     assert power_table(table, "optimum_median").loc[1, 10] == pytest.approx(0.2)
     assert power_table(table, "reached").to_numpy().tolist() == [[0.6, 0.6], [1.0, 1.0]]
     assert power_table(table, "map_median").loc[2, 20] == pytest.approx(0.2)
-    assert enough(table)["trials"].tolist()[1] == 10 and np.isnan(enough(table)["trials"][0])
+    assert enough(table, 0.5)["trials"].tolist()[1] == 10 and np.isnan(enough(table, 0.5)["trials"][0])
+    assert enough(table)["trials"].isna().all()  # 5 of 5 are no proof of 80 %
     n, z = 5, 1.959963984540054  # all five within: Wilson's interval ends at 1 / (1 + z^2 / n)
     np.testing.assert_allclose(table[["reached_low", "reached_high"]].iloc[2], [1 / (1 + z**2 / n), 1.0])
     assert len(power_figure(table, 0.2).axes) == 3
@@ -57,13 +59,38 @@ def test_the_page_says_how_sure_a_share_is(tmp_path):
     content = write_power(study(), errors, Plan((2,), (10, 20), 5, 0), 0.25, cost, tmp_path)
     assert "60 % (23 to 88)" in (tmp_path / "report.html").read_text()
     assert content["summary"][0]["reached_low"] == pytest.approx(0.2307, abs=1e-4)
+    assert "2 participants: not shown by these 5 studies, up to 20 trials" in (tmp_path / "report.html").read_text()
 
 
 def test_enough_is_what_larger_numbers_hold_too():
     reached = {2: [0.9, 0.7, 0.8, 0.85], 3: [0.7, 0.9, 0.9, 0.79], 4: [0.8, 0.8, 0.8, 0.8]}
     rows = [(m, 10 + 5 * i, share) for m, shares in reached.items() for i, share in enumerate(shares)]
-    found = enough(pd.DataFrame(rows, columns=["participants", "trials", "reached"]))
+    found = enough(pd.DataFrame(rows, columns=["participants", "trials", "reached_surely"]))
     np.testing.assert_array_equal(found["trials"], [20, np.nan, 10])
+
+
+def test_a_design_that_is_too_short_is_seldom_called_enough():
+    """40 studies each of four designs, of which the first two are within the error too seldom."""
+    rng, shares, studies, runs = np.random.default_rng(3), [0.70, 0.75, 0.80, 0.90], 40, 400
+    within = rng.binomial(studies, shares, (runs, 4)).ravel()
+    errors = np.repeat(np.arange(studies)[:, None], len(within), axis=1) >= within
+    keys = {"participants": np.repeat(np.arange(runs), 4), "trials": np.tile([10, 15, 20, 25], runs)}
+    rows = {name: np.tile(values, studies) for name, values in keys.items()}
+    summary = summarise(pd.DataFrame(rows | {"optimum": errors.ravel().astype(float), "map": 0.0}), 0.5)
+    assert (enough(summary)["trials"] < 20).mean() < 0.05
+    assert (enough(summary.assign(reached_surely=summary["reached"]))["trials"] < 20).mean() > 0.2
+
+
+def test_the_surest_share_is_the_exact_bound():
+    errors = pd.DataFrame(
+        {"study": range(40), "participants": 2, "trials": 5, "map": 0.0, "optimum": [0.0] * 37 + [1.0] * 3}
+    )
+    k, n = 37, 40
+    bound = summarise(errors, 0.5)["reached_surely"][0]
+    assert binom.sf(k - 1, n, bound) == pytest.approx(0.05, abs=1e-12)  # so many, or more, one time in twenty
+    all_of_them = summarise(errors.assign(optimum=0.0), 0.5)["reached_surely"][0]
+    assert all_of_them == pytest.approx(0.05 ** (1 / 40), rel=1e-12)
+    assert summarise(errors.assign(optimum=1.0), 0.5)["reached_surely"][0] == 0.0
 
 
 def test_one_person_cannot_differ():
