@@ -52,7 +52,7 @@ struct hb_config {
     float position_low_mm;         /* stroke; a position outside is bad input */
     float position_high_mm;        /* at most 32767 encoder steps either way */
     float encoder_step_mm;         /* position of one count */
-    float slew_limit_N_per_s;      /* largest change of the force command */
+    float slew_limit_N_per_s;      /* largest rise of the force command; in DRIVE largest change */
     float velocity_limit_mm_per_s; /* faster: HOLD */
     float plausible_step_mm;       /* more than this in one tick is bad input; above velocity_limit / tick_rate */
 

@@ -109,6 +109,9 @@ static float run(struct hb_device *device, float model_N, float old_N)
         float most_N = limit(device, device->active);
         force_N = hb_clamp(hb_control(safety, config, force_N), 0.0F, force_N > most_N ? force_N : most_N);
     }
+    if (force_N < safety->force_N) {
+        return force_N; /* a force that was held up would give back more than the hand has put in */
+    }
     return hb_slew(safety, config, force_N, switching ? before_N : force_N);
 }
 

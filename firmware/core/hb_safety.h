@@ -3,7 +3,7 @@
  *     input check - model - passivity observer and controller - saturation - slew limit - velocity limit and overrun
  *
  * Whatever acts is counted and flagged. Input, velocity and overrun lead to HOLD, which the device decides. While a
- * model is rendered there is no force out of contact, whatever links came before: the slew limit does not hold it up. */
+ * model is rendered there is no force out of contact, and a force that falls is not slew-limited. */
 #ifndef HB_SAFETY_H
 #define HB_SAFETY_H
 

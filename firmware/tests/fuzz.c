@@ -196,8 +196,8 @@ static float felt_N(const struct hb_device *before, uint8_t bank, float x_mm)
 }
 
 /* While a set is rendered: nothing out of contact; in contact the force of the set, at a switch between those of both
- * sets, at START between 0 and the set's; or one step of the slew limit on the way there. The passivity controller may
- * give less, and more by the device's own damping. */
+ * sets, at START between 0 and the set's; or less, one step of the slew limit on the way there. The passivity controller
+ * may give less, and more by the device's own damping. */
 static void check_rendering(const struct hb_device *before, const struct hb_device *after)
 {
     const struct hb_safety *safety = &after->safety;
@@ -214,7 +214,7 @@ static void check_rendering(const struct hb_device *before, const struct hb_devi
     float damped_N = 0.95F * fabsf((float)safety->step_counts * 0.0127F) / (float)safety->step_ticks;
     float low_N = controls ? 0.0F : fminf(old_N, new_N);
     float high_N = fmaxf(old_N, new_N) + (controls ? damped_N : 0.0F);
-    must(safety->force_N <= fmaxf(high_N, before->safety.force_N - step_N) + 1e-4F, "more than either set");
+    must(safety->force_N <= high_N + 1e-4F, "more than either set");
     must(safety->force_N >= fminf(low_N, before->safety.force_N + step_N) - 1e-4F, "less than either set");
 }
 
@@ -259,7 +259,8 @@ static void tick(struct rig *rig, uint8_t flags)
     if (is_moving(device->state)) {
         must(device->state == state, "moves by itself");
         must(rig->silent_ticks < rig->config.watchdog_ticks, "moves without a host");
-        must(fabsf(force_N - before_N) <= 2.0F + 1e-4F || force_N == 0.0F, "slew");
+        bool drives = device->state == (uint8_t)HB_DRIVING;
+        must((drives ? fabsf(force_N - before_N) : force_N - before_N) <= 2.0F + 1e-4F, "slew");
         float limit_N = device->bank[device->active].set.force_limit_N;
         must(state != (uint8_t)HB_RUNNING || fabsf(force_N) <= fmaxf(limit_N, fabsf(before_N)), "limit of the set");
         rig->ramp_ticks = 0U;

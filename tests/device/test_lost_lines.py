@@ -87,7 +87,7 @@ def test_a_capture_that_fails_ends_the_heartbeats(capsys):
     with peer.open(**PATIENT, capture=capture) as device:
         until(lambda: peer.heartbeats > 2)
         full.set()
-        with pytest.raises(DeviceError, match="cannot be taken.*No space left"):
+        with pytest.raises(DeviceError, match=r"cannot be taken.*No space left"):
             device.state()
         assert silent(peer)
         with pytest.raises(DeviceError, match="ESTOP was written"):
@@ -114,5 +114,5 @@ def test_estop_waits_for_no_other_request():
 
 
 def test_a_device_whose_watchdog_is_too_short_for_the_heartbeats_is_refused():
-    with pytest.raises(DeviceError, match="lets go after 0.1 s without a heartbeat, and they come every 0.05 s"):
+    with pytest.raises(DeviceError, match=r"lets go after 0.1 s without a heartbeat, and they come every 0.05 s"):
         Peer(watchdog_ticks=100).open()

@@ -52,7 +52,7 @@ def test_a_switch_begins_at_the_force_that_was_given_not_at_the_model_s():
 @pytest.mark.parametrize("slew", [50.0, 2000.0])
 @pytest.mark.parametrize("stroke", ["sine", "lets go", "comes back", "half way out"])
 def test_a_switch_stays_between_the_two_forces(slew, stroke):
-    """Or moves there as fast as the slew limit allows. The forces of each set alone differ a little from those in a
+    """Or rises there as fast as the slew limit allows. The forces of each set alone differ a little from those in a
     session, in which the new set's history begins at an equilibrium."""
     t = np.arange(3500) / 1000
     since = np.maximum(t - FLIP / 1000, 0)
@@ -74,7 +74,7 @@ def test_a_switch_stays_between_the_two_forces(slew, stroke):
             forces[FLIP:],
         )
         slack = 0.03 * np.max(high)
-        assert np.all(after <= np.maximum(high + slack, before - slew / 1000 + 1e-5))
+        assert np.all(after <= high + slack)
         assert np.all(after >= np.minimum(low - slack, before + slew / 1000 - 1e-5))
         assert not np.any(forces[positions <= 0])
 
@@ -111,8 +111,7 @@ def test_the_slew_limit_holds_no_force_up_in_free_air():
     device.go(HARD)
     positions = counts(np.r_[np.linspace(0, 6, 300), np.full(100, 6.0), 6 - 0.89 * np.arange(1, 20)])
     forces, _ = device.run(positions)
-    assert forces[positions > 0][-1] > 1.0  # the last force in contact
-    assert not np.any(forces[positions <= 0])
+    assert forces[399] > 4 and not np.any(forces[positions <= 0])
     again, _ = device.run(counts(np.linspace(0, 1, 50)))
     assert np.all(np.diff(np.r_[0, again]) <= 0.5 + 1e-6)
 
@@ -130,8 +129,7 @@ def test_the_passivity_controller_acts_in_contact_and_adds_no_more_than_the_devi
     assert not np.any(with_it[positions <= 0])
     model = alone(HARD, positions, slew=1e5)
     velocity = np.maximum(np.diff(np.r_[0, positions]), 0) * STEP  # mm per tick: m/s
-    slewed = np.r_[0, with_it[:-1]] - 0.2
-    assert np.all(with_it <= np.maximum(model + 0.95 * velocity, slewed) + 1e-4)
+    assert np.all(with_it <= model + 0.95 * velocity + 1e-4)
 
 
 @pytest.mark.parametrize(("period", "good"), [(3, 1), (2, 1), (3, 2)], ids=["2 of 3 bad", "1 of 2 bad", "1 of 3 bad"])
