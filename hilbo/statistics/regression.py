@@ -65,6 +65,11 @@ class Errors(eqx.Module):
     assumes: str
     covariance: Covariance
 
+    def in_units(self, units: Float[np.ndarray, " k"]) -> "Errors":
+        """Of coefficients of columns that are so many times as large."""
+        matrix = self.covariance.matrix / np.outer(units, units)
+        return eqx.tree_at(lambda errors: errors.covariance.matrix, self, matrix)
+
     @property
     def std_errors(self) -> Float[np.ndarray, " k"]:
         """Of every coefficient."""
@@ -84,8 +89,13 @@ def regress(
 
     The last `nuisance` coefficients (edges of categories) get no profile. `start` has its edges in order. Raises
     `InputError` for coefficients that depend on each other and for more than two ways of clustering.
+
+    Everything is computed in units in which the largest entry of each column is about 1: ranks, linear programs and
+    the repair of covariances compare columns with each other. The units are powers of two, which cost no rounding.
     """
     names, effects = list(terms), len(terms) - nuisance
+    model, units = _in_own_units(model)
+    start = start * units
     labels = _labels(clusters, len(model.upper))
     _check_independent(model, names, nuisance)
     separated = separation(model)
@@ -96,18 +106,26 @@ def regress(
         fitted = ordered_logit.fit(rest, rest_start)
         log_likelihood = fitted.log_likelihood
         kinds, refused = _kinds(fitted, {name: codes[~separated.certain] for name, codes in labels.items()})
+        kinds, estimate = [kind.in_units(units[keep]) for kind in kinds], fitted.estimate / units[keep]
         finite = {j: names[i] for j, i in enumerate(np.flatnonzero(keep)) if not separated.infinite[i]}
         warnings += [*refused, *_below_iid(kinds, finite)]
         covariances = {kind.name: _covariance(kind, finite) for kind in kinds}
         least = kinds[0].std_errors
-        rows += [_wald(term, fitted.estimate[j], j, kind, least, level) for j, term in finite.items() for kind in kinds]
+        rows += [_wald(term, estimate[j], j, kind, least, level) for j, term in finite.items() for kind in kinds]
     rows += [
-        _profiled(model, j, names[j], start, separated, level if j < effects else None)
+        _profiled(model, j, names[j], start, separated, level if j < effects else None, units[j])
         for j in np.flatnonzero(separated.infinite).tolist()
     ]
     counts = {name: len(np.unique(codes)) for name, codes in labels.items()}
     table = _tidy(rows, names, effects)
     return Regression(table, covariances, log_likelihood, len(model.upper), counts, tuple(warnings))
+
+
+def _in_own_units(model: Design) -> tuple[Design, Float[np.ndarray, " k"]]:
+    """The design with columns whose largest entry is about 1, and the power of two that each was divided by."""
+    largest = np.abs(np.vstack([model.upper, model.lower])).max(axis=0)
+    units = 2.0 ** np.round(np.log2(np.where(largest > 0, largest, 1.0)))
+    return model._replace(upper=model.upper / units, lower=model.lower / units), units
 
 
 def _covariance(kind: Errors, terms: Mapping[int, str]) -> pd.DataFrame:
@@ -207,14 +225,20 @@ def _wald(
 
 
 def _profiled(
-    model: Design, j: int, term: str, start: Float[np.ndarray, " k"], separated: Separation, level: float | None
+    model: Design,
+    j: int,
+    term: str,
+    start: Float[np.ndarray, " k"],
+    separated: Separation,
+    level: float | None,
+    unit: float,
 ) -> dict[str, Any]:
-    """The row of a coefficient without a finite estimate; without a level no interval."""
+    """The row of a coefficient without a finite estimate; without a level no interval. `unit`: of its column."""
     low, high, p_value = (np.nan,) * 3 if level is None else profile(model, j, start, separated, level)
     both = separated.rises[j] and separated.falls[j]
     estimate = np.nan if both else np.inf if separated.rises[j] else -np.inf
     assumes = "all answers are independent; no finite estimate"
-    return _row(term, estimate, "profile likelihood", assumes, p_value=p_value, low=low, high=high)
+    return _row(term, estimate, "profile likelihood", assumes, p_value=p_value, low=low / unit, high=high / unit)
 
 
 def _separated_sentence(names: list[str], separated: Separation, effects: int) -> str:

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from reference_statistics import estimates
 from scipy import stats
-from scipy.special import logit
+from scipy.special import expit, logit
 from studies import BEST, MID, WORST, paper_counts
 
 from hilbo.errors import InputError
@@ -166,3 +166,27 @@ def test_a_category_that_never_occurs_has_no_edge():
     assert list(estimates(found).index) == ["x", "low|high"]
     binary = st.binary_logit([0, 1, 0, 1, 1], {"x": [0.0, 0, 1, 1, 0]})
     np.testing.assert_allclose(estimates(found)["x"], estimates(binary)["x"], rtol=1e-10)
+
+
+def in_units(scale, separated):
+    """A logit of two predictors, the first one in other units, back in its own; clustered both ways."""
+    rng = np.random.default_rng(4)
+    x, z = rng.normal(size=120), rng.normal(size=120)
+    chance = x > 0.2 if separated else rng.random(120) < expit(0.3 + 0.8 * x - 0.5 * z)
+    clusters = pd.DataFrame({"person": np.arange(120) % 9, "set": np.arange(120) // 9 % 5})
+    found = st.binary_logit(chance.astype(int), {"x": x * scale, "z": z}, clusters)
+    table = found.table.set_index(["term", "errors"])[["estimate", "std_error", "low", "high", "p_value"]]
+    table.loc["x", ["estimate", "std_error", "low", "high"]] *= scale
+    return table, found
+
+
+@pytest.mark.parametrize("separated", [False, True])
+@pytest.mark.parametrize("scale", [1e-20, 1e-8, 1e-3, 1e4, 1e8, 1e20])
+def test_the_units_of_a_predictor_do_not_matter(scale, separated):
+    table, found = in_units(scale, separated)
+    expected, own = in_units(1.0, separated)
+    pd.testing.assert_frame_equal(table, expected, rtol=1e-7, atol=1e-12)
+    assert [words.partition("(")[0] for words in found.warnings] == [words.partition("(")[0] for words in own.warnings]
+    for name, covariance in found.covariances.items():
+        if "x" in covariance:
+            assert covariance.loc["x", "x"] * scale**2 == pytest.approx(own.covariances[name].loc["x", "x"], rel=1e-7)
