@@ -11,6 +11,7 @@ from commands import run
 from material import FOAM, foam_tests
 
 from hilbo.report import material
+from hilbo.report.figures.mechanics import passivity_figure
 from hilbo.study.config import Study
 from hilbo.viscoelastic import FOSLS
 
@@ -28,6 +29,11 @@ def test_passivity_of_the_published_sets(capsys, monkeypatch):
     code, stdout, _ = run(capsys, monkeypatch, *set_a, "--damping", 0.7)
     assert stdout.startswith("violated: the device has 0.7 N·s/m, 0.05981 less than the 0.75981")
     assert "creates" in stdout
+
+
+def test_a_set_far_from_passive_has_its_figure_too():
+    figure = passivity_figure(FOSLS(-9.0, 5.58, 7.88, 0.176), 0.95)
+    assert len(figure.axes[1].lines[0].get_xdata()) > 10
 
 
 def test_an_even_number_of_taps_has_no_closed_form():

@@ -131,7 +131,8 @@ def passivity_figure(model: FOSLS, b: float) -> Figure:
     worst = int(np.argmax(curve.real))
     margin, most = b - curve.real[worst], max(b, curve.real[worst])
     colour, word = (GREEN, "margin") if margin >= 0 else (RED, "lacking")
-    near = curve.real > -2 * most  # far to the left, in slow motion, nothing is decided
+    lowest = min(-2 * most, curve.real[worst] - most)
+    near = curve.real > lowest  # far to the left, in slow motion, nothing is decided
     frequency, near_curve = frequency[near], curve[near]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.4, 3.2), layout="constrained")
@@ -140,7 +141,7 @@ def passivity_figure(model: FOSLS, b: float) -> Figure:
         left.plot(curve.real[worst], curve.imag[worst], "o", color=colour, markersize=5, clip_on=False)
         left.axvline(b, color="black", linewidth=1)
         left.axvspan(b, 1.5 * most, color=GREY, alpha=0.2, linewidth=0)
-        left.set(xlim=(-2 * most, 1.5 * most), ylim=(0, None))
+        left.set(xlim=(lowest, 1.5 * most), ylim=(0, None))
         left.set(xlabel="real part: damping needed (N·s/m)", ylabel="imaginary part (N·s/m)")
         left.set_title("passive if the curve stays left of the device's b")
         right.semilogx(frequency, near_curve.real, color=BLUE, label="needed by the rendering")
@@ -148,7 +149,7 @@ def passivity_figure(model: FOSLS, b: float) -> Figure:
         binding_frequency = frequency[int(np.argmax(near_curve.real))]
         right.plot([binding_frequency, binding_frequency], [b, curve.real[worst]], color=colour, linewidth=2.5)
         right.plot(binding_frequency, curve.real[worst], "o", color=colour, markersize=5, clip_on=False)
-        right.set(xlabel="frequency (Hz)", ylabel="damping (N·s/m)", ylim=(-2 * most, 1.5 * most))
+        right.set(xlabel="frequency (Hz)", ylabel="damping (N·s/m)", ylim=(lowest, 1.5 * most))
         right.set_title(f"{word} {abs(margin):.3f} N·s/m at {binding_frequency:.0f} Hz")
         right.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         right.xaxis.set_major_formatter(FormatStrFormatter("%g"))
