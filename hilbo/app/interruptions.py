@@ -37,10 +37,13 @@ class Interruptions:
         self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what it did, not yet on the disk
         self._saying = asyncio.Lock()
         self._tasks: list[asyncio.Task] = []
+        self._wall, self._steady = time.time(), time.monotonic()  # at the last look
+        self._here, self._absent = False, None  # whether the participant's page is, and since when it is not
 
     async def begin(self, seen: Snapshot) -> None:
         """Say how the device was found, and watch the time from now on."""
         await self._device_changed(seen, opening=True)
+        self._wall, self._steady = time.time(), time.monotonic()
         self._spawn(self._watch_time())
 
     def end(self) -> None:
@@ -55,7 +58,18 @@ class Interruptions:
     def _spawn(self, work) -> None:
         task = asyncio.ensure_future(work)
         self._tasks.append(task)
-        task.add_done_callback(self._tasks.remove)
+        task.add_done_callback(self._ended)
+
+    def _ended(self, task: asyncio.Task) -> None:
+        """Nothing ends silently."""
+        self._tasks.remove(task)
+        if not task.cancelled() and task.exception() is not None:
+            self._failed(task.exception())
+
+    def _failed(self, error: BaseException | None) -> None:
+        """The experimenter is told."""
+        self.hub.alert = f"A fault in watching what interrupts the session: {str(error) or type(error).__name__}."
+        self.hub.publish()
 
     async def _device_changed(self, seen: Snapshot, *, opening: bool = False) -> None:
         hub, condition = self.hub, _condition_of(seen)
@@ -82,27 +96,33 @@ class Interruptions:
                 self._unsaid.popleft()
 
     async def _watch_time(self) -> None:
-        """A laptop that slept, a page that was closed, and what the device did that is not in the log yet."""
-        hub, here, absent = self.hub, False, None
-        wall, steady = time.time(), time.monotonic()
+        """A laptop that slept, a page that was closed, and what the device did that is not in the log yet. A fault is
+        told, and the watch goes on."""
         while True:
             await asyncio.sleep(_LATER)
-            now, mono = time.time(), time.monotonic()
-            slept = max(abs((now - wall) - (mono - steady)), mono - steady - _LATER)
-            wall, steady = now, mono
-            if slept > _JUMP:
-                await self._interrupt(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
-            await self._say()
-            here, before = hub.watchers.participant_here, here
-            if here != before:
-                hub.publish()
-            if here or not hub.begun:
-                absent = None
-            elif absent is None:
-                absent = mono
-            elif mono - absent > _GONE:
-                absent = None
-                await self._interrupt("The participant's page is closed.")
+            try:
+                await self._look()
+            except Exception as error:
+                self._failed(error)
+
+    async def _look(self) -> None:
+        """At the clocks, at what is still to be said, and for the participant's page."""
+        hub, now, mono = self.hub, time.time(), time.monotonic()
+        slept = max(abs((now - self._wall) - (mono - self._steady)), mono - self._steady - _LATER)
+        self._wall, self._steady = now, mono
+        if slept > _JUMP:
+            await self._interrupt(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
+        await self._say()
+        self._here, before = hub.watchers.participant_here, self._here
+        if self._here != before:
+            hub.publish()
+        if self._here or not hub.begun:
+            self._absent = None
+        elif self._absent is None:
+            self._absent = mono
+        elif mono - self._absent > _GONE:
+            self._absent = None
+            await self._interrupt("The participant's page is closed.")
 
     async def _interrupt(self, why: str) -> None:
         """What was being felt is felt again from its beginning, once somebody presses Begin."""

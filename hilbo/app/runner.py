@@ -73,6 +73,7 @@ class Runner:
         hub = self.hub
         try:
             if hub.state.screen not in ("wait", "trial") or not hub.begun:
+                self.clock = {}  # what follows a rest does not follow an answer
                 await self._halt()
             while hub.state.screen in ("wait", "trial"):
                 if hub.state.screen == "wait":
@@ -213,6 +214,7 @@ class Runner:
             seen = self.hub.rig.snapshot
             if seen.lost is None and seen.state not in ("HOLD", "ESTOP"):
                 return
+            self.clock = {}
             self.trouble = seen.lost or f"The device is in {seen.state}."
             self._at("trouble")
             self._wake.clear()

@@ -5,9 +5,14 @@ and follows every other equally often: n orders for even n, a Latin square of n 
 (E. J. Williams 1949): 6 orders for three materials, 2 for two.
 
 `orders` deals them to participants in blocks, each a whole design in a seeded sequence, square by square, treatments
-renamed at random per seed. Over complete blocks the balance is exact. Whatever the number of participants, each order,
-and each treatment at each position, has been used the same number of times or once more; of the ordered neighbours
-this holds for even n, for odd n they may differ by two within a block, since half of it cannot balance them.
+renamed at random in each block. Over complete blocks positions and ordered neighbours are balanced exactly. Whatever
+the number of participants, each treatment has been at each position the same number of times or once more; of the
+ordered neighbours this holds for even n, for odd n they may differ by two within a block, since half of it cannot
+balance them. Orders: up to three treatments all n! are used equally often, or once more; from four on a block holds a
+few of them, which may come again in the next while others have not been used.
+
+All this is of the participants in the plan. Whoever drops out without being replaced leaves their order out, and
+neighbours balance what goes over from one treatment to the next only, not what two before it do.
 """
 
 import itertools

@@ -2,10 +2,11 @@
 
 With H the information, s_i the scores and s_g their sums over cluster g of G, the covariance by one way is
 
-    V = c·H⁻¹ (Σ_g s_g s_gᵀ) H⁻¹,   c = G/(G - 1) · (n - 1)/(n - k)     (Liang & Zeger 1986),
+    V = c·H⁻¹ (Σ_g s_g s_gᵀ) H⁻¹,   c = G/(G - 1) · (n - 1)/(n - k)
 
-and by two ways V_A + V_B - V_AB, AB being the cells in which they cross (Cameron, Gelbach & Miller 2011), each with
-its own c. statsmodels computes them. That difference may be indefinite, which statsmodels leaves as it is; its negative
+(Liang & Zeger 1986; c is linear regression's convention for small samples, and makes V unbiased for none), and by two
+ways V_A + V_B - V_AB, AB being the cells in which they cross (Cameron, Gelbach & Miller 2011), each with its own c.
+statsmodels computes them. That difference may be indefinite, which statsmodels leaves as it is; its negative
 eigenvalues are set to 0 here, as the authors propose, and `Covariance.repaired` says how large the worst was. t has
 G - 1 degrees of freedom, G of the smaller way.
 """

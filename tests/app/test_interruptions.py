@@ -97,6 +97,43 @@ def test_a_sleeping_laptop_begins_the_trial_again(tmp_path, monkeypatch):
         assert live.events("repeat")
 
 
+def test_the_watch_goes_on_after_a_fault_and_says_so(live, monkeypatch):
+    interruptions, looked = live.hub._interruptions, []
+
+    async def broken():
+        looked.append(1)
+        raise RuntimeError("no such thing")
+
+    monkeypatch.setattr("hilbo.app.interruptions._LATER", 0.05)
+    monkeypatch.setattr(interruptions, "_say", broken)
+    view = live.until(lambda v: v["alert"], live.whole)
+    assert "no such thing" in view["alert"] and "what interrupts the session" in view["alert"]
+    seen = len(looked)
+    live.until(lambda _: len(looked) > seen, lambda: "nobody looks any more")
+
+
+def test_an_interruption_that_cannot_be_told_is_said(live, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("no such device")
+
+    monkeypatch.setattr("hilbo.app.interruptions._condition_of", broken)
+    live.hub._loop.call_soon_threadsafe(live.hub._interruptions.device_changed, live.hub.rig.snapshot)
+    assert "no such device" in live.until(lambda v: v["alert"], live.whole)["alert"]
+
+
+def test_a_rest_is_no_part_of_the_time_from_answer_to_device(tmp_path):
+    one = (Planned("best", "mid"),)
+    with Live(tmp_path, blocks=(Block("validation", 1, one), Block("validation", 1, one, rest=1.0))) as live:
+        live.begin()
+        live.answer()
+        live.until(lambda view: view["phase"] == "rest")
+        live.command("resume")
+        live.question()
+        assert live.hub.delays == []
+        live.answer()
+        assert live.until(lambda view: view["phase"] == "done")
+
+
 SHORT_THEN_LONG = 'steps = [{show = "reference", seconds = 0.02}, {show = "a", seconds = 30}]'
 
 
