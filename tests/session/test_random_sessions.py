@@ -5,8 +5,11 @@ import contextlib
 import functools
 import itertools
 import json
+import subprocess
+import sys
 import zlib
 from collections import Counter
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -265,8 +268,19 @@ def test_random_sessions_reach_their_quota_or_were_ended_by_a_person():
     assert min(kinds[kind] for kind in ("undo", "void", "restore", "repeat", "pause", "skip", "more", "device")) > 0
 
 
+MANY = """
+import sys
+sys.path[:0] = {paths}
+import test_random_sessions
+for seed in range(1000, 21000):
+    test_random_sessions.held(seed)
+"""
+
+
 @pytest.mark.deep
-@pytest.mark.parametrize("part", range(20))
-def test_many_random_sessions(part):
-    for seed in range(1000 + 1000 * part, 2000 + 1000 * part):
-        held(seed)
+def test_twenty_thousand_random_sessions():
+    """In a process that checks no shapes, which take most of the time here: a minute or two."""
+    here = Path(__file__).parent
+    code = MANY.format(paths=[str(here), str(here.parent / "support")])
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=here.parents[1])
+    assert run.returncode == 0, run.stderr[-2000:]
