@@ -216,7 +216,7 @@ float hb_render(struct hb_device *device, float x_mm, float *old_N)
 {
     struct hb_renderer *idle = idle_bank(device);
     *old_N = 0.0F;
-    if (device->follows && (device->flipped || device->offset_N != 0.0F)) {
+    if ((device->flipped || device->offset_N != 0.0F) && device->follows) {
         *old_N = hb_renderer_step(idle, x_mm);
     } else if (device->staging == (uint8_t)HB_WARMING) {
         (void)hb_renderer_step(idle, x_mm);
