@@ -202,7 +202,7 @@ def test_a_report_of_two_materials(capsys, monkeypatch, tmp_path):
         ):
             assert (out / name / file).stat().st_size
         assert all((out / name / f"classes.{kind}").stat().st_size for kind in ("png", "svg"))
-    page = (out / "report.html").read_text()
+    page = " ".join((out / "report.html").read_text().split())
     assert page.count("data:image/png;base64,") == 2 * 9 + 1 and "http://" not in page
     assert "Hypothesis 4" in page and "fair, good, excellent" in page
     assert run(capsys, monkeypatch, "report", folder, "--out", out, "--force", "--exclude", "mood > 1")[0] == 2
