@@ -60,7 +60,7 @@ FAULTS = [
           "contact"),
     Fault("a model is felt out of contact", "hb_device.c",
           "if (hb_in_contact(&device->safety)) {\n        force_N = run",
-          "if (hb_in_contact(&device->safety) || device->safety.force_N > 0.0F) {\n        force_N = run", "contact"),
+          "if (device->tick > 0U) {\n        force_N = run", "contact"),
     Fault("switch from the unsaturated force", "hb_device.c",
           "felt(device, (uint8_t)(1U - device->active), old_N) - felt_N", "old_N - felt_N", "contact"),
     Fault("the other set's limit", "hb_device.c", "felt(device, (uint8_t)(1U - device->active), old_N)",
