@@ -155,8 +155,8 @@ def planned_header(plan: Mapping[str, Any], study: Study, participant: str, **ot
     rows = {row["participant"]: row for row in plan["participants"]}
     if participant not in rows:
         raise InputError(
-            f'participant "{participant}" is not in the plan, which has {len(rows)}; add them by a new plan, or reissue'
-            " the row of somebody who dropped out."
+            f'participant "{participant}" is not in the plan, which has {len(rows)}, {min(rows)} to {max(rows)}; add'
+            " them by a new plan, or reissue the row of somebody who dropped out."
         )
     return msgspec.convert(rows[participant]["header"] | {"plan": plan["hash"]} | others, Header)
 
