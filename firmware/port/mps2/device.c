@@ -5,15 +5,9 @@
  * on where it was, so that the longest wait of a tick is one call of hb_receive. */
 #include "board.h"
 #include "rig.h"
+#include "ring.h"
 
-enum { RING_SIZE = 256 };
-
-static struct {
-    volatile uint8_t bytes[RING_SIZE];
-    volatile uint32_t put; /* written by the interrupt alone */
-    volatile uint32_t got; /* and this by the loop */
-} received;
-
+static struct ring received;
 static volatile uint32_t ticks_due;
 static struct sim_rig rig;
 static struct {
@@ -31,24 +25,18 @@ void uart_received_interrupt(void)
 {
     uint8_t byte = 0;
     while (board_uart_receive(&byte)) {
-        const uint32_t put = received.put;
-        if (put - received.got < RING_SIZE) { /* a byte without room is lost: its frame's CRC will tell */
-            received.bytes[put % RING_SIZE] = byte;
-            received.put = put + 1U;
-        }
+        ring_put(&received, byte);
     }
 }
 
 static bool receive(void)
 {
-    if (received.got == received.put) {
-        return false;
+    uint8_t byte = 0;
+    const bool any = ring_take(&received, &byte);
+    if (any) {
+        (void)hb_receive(&rig.device, &byte, 1);
     }
-    const uint32_t got = received.got;
-    const uint8_t byte = received.bytes[got % RING_SIZE];
-    received.got = got + 1U;
-    (void)hb_receive(&rig.device, &byte, 1);
-    return true;
+    return any;
 }
 
 static bool transmit(void)
@@ -66,7 +54,7 @@ static bool transmit(void)
 static void rest(void)
 {
     board_interrupts_off();
-    if (ticks_due == 0 && received.got == received.put) {
+    if (ticks_due == 0 && ring_is_empty(&received)) {
         board_wait();
     }
     board_interrupts_on();
@@ -76,7 +64,7 @@ static void rest(void)
 static uint32_t first_boot_id(void)
 {
     uint32_t ticks_before = 0;
-    while (received.got == received.put) {
+    while (ring_is_empty(&received)) {
         rest();
         ticks_before += ticks_due;
         ticks_due = 0;
