@@ -56,8 +56,9 @@ def test_a_wait_that_ends_between_one_and_two_periods_late_is_counted(tmp_path):
     command = [sys.executable, "-c", WAIT, str(library), str(int(period * 1e9))]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None and process.stdout.readline() == "waits\n"
+        time.sleep(period / 4)  # now it sleeps
         process.send_signal(signal.SIGSTOP)
-        time.sleep(2.5 * period)
+        time.sleep(2.25 * period)
         process.send_signal(signal.SIGCONT)
         missed = [int(word) for word in process.stdout.readline().split()]
     assert missed[0] >= 1
