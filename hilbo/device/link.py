@@ -250,7 +250,7 @@ class Link:
             except Exception as error:  # of whoever takes what arrives: without a reader nobody may go on beating
                 self._end(
                     f"{self.name}: what the device says cannot be taken ({error}); heartbeats have ended and the device"
-                    " stops by itself, mend that and connect again."
+                    " stops by itself; remove the cause, then connect again."
                 )
                 return
 
