@@ -1,11 +1,13 @@
 """What every test runs under: float64, strict promotion, shapes and types checked at every call of hilbo."""
 
+import datetime
 import gc
 import itertools
 import os
 from pathlib import Path
 
 import jax
+import platformdirs
 import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
@@ -46,6 +48,15 @@ def pytest_configure(config):
     quick = config.getoption("markexpr") == "not deep" and "xla_backend_optimization_level" not in flags
     if quick and compiler_options():
         os.environ["XLA_FLAGS"] = f"{flags} {QUICKLY}".strip()
+    if not hasattr(config, "workerinput"):
+        _date_arviz()
+
+
+def _date_arviz():
+    """Writes the file that ArviZ writes at its first import of a day: two workers that import it at once fail."""
+    folder = Path(platformdirs.user_cache_dir("arviz", "arviz"))
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "daily_warning").write_text(datetime.date.today().isoformat())
 
 
 @pytest.fixture(scope="module", autouse=True)
