@@ -143,9 +143,10 @@ def test_a_port_that_cannot_be_shared_beats_from_a_thread(monkeypatch):
     monkeypatch.delattr(SocketPort, "fileno")
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        assert isinstance(device.link._heart, ThreadHeart)
+        heart = device.link._heart
+        assert isinstance(heart, ThreadHeart)
         before = peer.heartbeats
         until(lambda: peer.heartbeats > before + 3)
         peer.hang_up()
-        device.link._heart._thread.join()
+        heart._thread.join()
         device.reconnect()
