@@ -113,7 +113,7 @@ def answer(
     browser: Any = None,
     felt: bool = True,
 ) -> Event | None:
-    """A participant's answer; None if this very answer (trial and client id) has been accepted already.
+    """A participant's answer; None if this very answer (trial, client id and values) has been accepted already.
 
     `values`: class_a, class_b (responses of the study), preferred ("a" or "b"), as the phase asks. `browser`: its time
     and the response time, s; numbers by name. `felt`: refuse an answer to what was not felt. Raises RefusedError.
@@ -122,8 +122,10 @@ def answer(
         raise RefusedError("bad-answer", "an answer needs the number of its trial and the id of its client.")
     found = state.trial(trial)
     if found.values is not None:
-        if found.client == client:
+        if found.client == client and found.values == values:
             return None
+        if found.client == client:
+            raise RefusedError("answered", f"trial {trial} is answered otherwise already; the first answer counts.")
         raise RefusedError("answered", f"trial {trial} is answered already, from another page.")
     if found.status != "pending":
         code = "voided" if found.status == "void" else "old-trial"

@@ -95,6 +95,10 @@ def test_an_answer_is_accepted_once():
     driver.feel(trial)
     driver.log(live.answer(driver.state, trial.id, "x", {"class_a": "close"}, 1.0, browser={"time": 3.5}))
     assert live.answer(driver.state, trial.id, "x", {"class_a": "close"}, 2.0) is None
+    for other in ({"class_a": "similar"}, {"class_a": "close", "preferred": "a"}, {}, None):
+        with pytest.raises(RefusedError, match="answered otherwise already") as told:
+            live.answer(driver.state, trial.id, "x", other, 2.0)
+        assert told.value.code == "answered"
     with pytest.raises(RefusedError, match="from another page") as told:
         live.answer(driver.state, trial.id, "y", {"class_a": "similar"}, 2.0)
     assert told.value.code == "answered"
