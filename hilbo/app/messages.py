@@ -9,7 +9,7 @@ import msgspec
 
 from hilbo.errors import InputError
 
-__all__ = ["LARGEST", "Answer", "Command", "Join", "Press", "read"]
+__all__ = ["LARGEST", "Answer", "Command", "Join", "Press", "TooLargeError", "read"]
 
 LARGEST = 16_384  # bytes of a message
 
@@ -17,6 +17,10 @@ _Id = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
 _Text = Annotated[str, msgspec.Meta(max_length=2000)]
 _Number = Annotated[int, msgspec.Meta(ge=1, le=2**31)]
 _Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
+
+
+class TooLargeError(InputError):
+    """A message that is longer than any that is understood."""
 
 
 class _Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -59,7 +63,7 @@ class Command(_Message, frozen=True):
 def read(kind: type, body: bytes) -> Any:
     """The message in a request's body. Raises `InputError` with what is wrong with it."""
     if len(body) > LARGEST:
-        raise InputError(f"The message has {len(body)} bytes; {LARGEST} are the most.")
+        raise TooLargeError(f"The message has more than {LARGEST} bytes, which are the most.")
     try:
         return msgspec.json.decode(body or b"{}", type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:

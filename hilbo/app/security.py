@@ -11,8 +11,10 @@ else's that reaches this computer by a name of its own (DNS rebinding) or by a f
 import contextlib
 import hashlib
 import hmac
+import itertools
 import json
 import os
+import re
 import secrets
 import socket
 from collections.abc import Iterable, Mapping
@@ -21,18 +23,27 @@ from typing import Literal, get_args
 
 from hilbo.errors import InputError
 
-__all__ = ["COOKIES", "Gate", "Role", "lan_addresses"]
+__all__ = ["Gate", "Role", "lan_addresses"]
 
 Role = Literal["participant", "experimenter"]
-COOKIES: dict[Role, str] = {"participant": "hilbo_participant", "experimenter": "hilbo_experimenter"}
 _BYTES = 24
+_LENGTH = 32  # characters of a key: base64 of _BYTES
+_KEYS = 4  # that a request may show, so that nobody has the server try thousands
 
 
 class Gate:
-    """Tokens, keys and addresses of one server. `keys` is the file that keeps the keys from one start to the next."""
+    """Tokens, keys and addresses of one server. `keys` is the file that keeps the keys from one start to the next.
+
+    `cookies` has a name for each role with the port in it: browsers send a host's cookies to all of its ports, so that
+    two sessions on one computer would overwrite each other's.
+    """
 
     def __init__(self, hosts: Iterable[str], keys: Path | None = None):
         self.hosts = frozenset(host.lower() for host in hosts)
+        port = min(host.rpartition(":")[2] for host in self.hosts)  # all of them have the same
+        self.cookies: dict[Role, str] = {role: f"hilbo_{role}_{port}" for role in get_args(Role)}
+        names = "|".join(self.cookies.values())
+        self._shown = re.compile(rf"(?:(?:{names})=|bearer +)([\w-]{{{_LENGTH}}})(?![\w-])".encode(), re.IGNORECASE)
         self.origins = frozenset(f"http://{host}" for host in self.hosts)
         self._file = keys
         self._keys: dict[Role, str] = _kept(keys)
@@ -65,6 +76,12 @@ class Gate:
         """Whether this is the role's key."""
         known = self._keys.get(role)
         return known is not None and key is not None and hmac.compare_digest(known, _digest(key))
+
+    def role_in(self, data: bytes) -> Role | None:
+        """The role whose key is in some bytes of a connection, before anything has read them as HTTP; of two the
+        experimenter's."""
+        keys = [found[1].decode() for found in itertools.islice(self._shown.finditer(data), _KEYS)]
+        return next((role for role in reversed(get_args(Role)) for key in keys if self.admits(role, key)), None)
 
     def refuses(self, headers: Mapping[str, str], *, changes: bool, cookie: bool) -> str | None:
         """Why a request of these headers is refused, or None. `changes`: it is no mere look; `cookie`: its key was."""

@@ -5,6 +5,7 @@ hub is open.
 """
 
 import base64
+import functools
 import io
 import socket
 from collections.abc import Callable
@@ -17,7 +18,10 @@ from hilbo.errors import InputError
 __all__ = ["PORT", "Place", "bound", "qr_image", "qr_text", "serve"]
 
 PORT = 8642
-_LINGER = 3  # s for open streams when the server ends
+_LINGER = 3  # s for what is still being answered when the server ends
+_FILES = 1024  # open files that are asked for: select() knows no more
+_AT_ONCE = 16  # connections taken in at one turn of the event loop
+_BACKLOG = 1024  # those that wait for it in the kernel
 
 
 class Place:
@@ -49,7 +53,8 @@ def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> P
     addresses = lan_addresses() if lan else []
     if lan and not addresses:
         raise InputError("--lan: this computer is in no network; connect it to one, or leave --lan out.")
-    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    # With the protocol named, asyncio sets TCP_NODELAY on every connection; an answer's body waited 40 ms otherwise.
+    listening = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind(("0.0.0.0" if lan else "127.0.0.1", port))
@@ -69,11 +74,14 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
     """
     import uvicorn
 
+    from hilbo.app.connections import Connection, Connections, strangers_among
     from hilbo.app.server import application
 
+    connections = Connections(place.gate, strangers_among(_files()))
     config = uvicorn.Config(
-        application(hub, place.gate), log_level="warning", access_log=False, lifespan="off", server_header=False,
-        timeout_graceful_shutdown=_LINGER, ws="none",
+        application(hub, place.gate), log_level="error", access_log=False, lifespan="off", server_header=False,
+        timeout_graceful_shutdown=_LINGER, ws="none", backlog=_AT_ONCE,
+        http=functools.partial(Connection, connections),  # type: ignore[arg-type]
     )  # fmt: skip
     server = uvicorn.Server(config)
     listen, hang_up = server.startup, server.shutdown
@@ -83,6 +91,7 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
         try:
             await hub.open()
             await listen(sockets=sockets)
+            place.socket.listen(_BACKLOG)
         except BaseException:
             await hub.close()
             raise
@@ -90,6 +99,7 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
             started(stop)
 
     async def shutdown(sockets=None):
+        hub.watchers.end_all()
         try:
             await hang_up(sockets=sockets)
         finally:
@@ -103,6 +113,20 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
         server.run(sockets=[place.socket])
     finally:
         place.socket.close()
+
+
+def _files() -> int:
+    """How many files this process may have open, once it has asked for enough."""
+    try:
+        import resource
+    except ImportError:  # Windows has no such limit
+        return _FILES
+    now, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if now == resource.RLIM_INFINITY or now >= _FILES:
+        return _FILES
+    wanted = _FILES if most == resource.RLIM_INFINITY else min(_FILES, most)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, most))
+    return wanted
 
 
 def qr_image(link: str) -> str:

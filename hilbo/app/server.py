@@ -13,6 +13,8 @@ event loop only waits here: files, device and arithmetic have threads of their o
 """
 
 import asyncio
+import contextlib
+import mimetypes
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any, get_args
@@ -20,20 +22,20 @@ from typing import Any, get_args
 import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
-from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
-from starlette.routing import Mount, Route
-from starlette.staticfiles import StaticFiles
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import Route
 
 from hilbo.app import messages
 from hilbo.app.hub import COMMANDS, PRESSES, Hub, NotNowError
-from hilbo.app.security import COOKIES, Gate, Role
+from hilbo.app.security import Gate, Role
 from hilbo.errors import InputError
 from hilbo.session.event_log import LogError
 
 __all__ = ["application"]
 
-_STATIC = Path(__file__).parent / "static"
+# In memory: a visitor then takes neither a file of this process nor a thread of it.
+_FILES = {path.name: path.read_bytes() for path in (Path(__file__).parent / "static").iterdir()}
 _ALIVE = 5.0  # s between signs of life in a silent stream
 _DAY = 86_400
 _HEADERS = {
@@ -58,7 +60,7 @@ class _Guard:
             await self.app(scope, receive, send)
             return
         request = Request(scope)
-        cookie = any(name in request.cookies for name in COOKIES.values()) and not _bearer(request)
+        cookie = any(name in request.cookies for name in self.gate.cookies.values()) and not _bearer(request)
         why = self.gate.refuses(request.headers, changes=request.method not in ("GET", "HEAD"), cookie=cookie)
 
         async def sending(message):
@@ -66,7 +68,8 @@ class _Guard:
                 message["headers"] = [*message["headers"], *_HEADERS.items()]
             await send(message)
 
-        await (_error(403, why) if why else self.app)(scope, receive, sending)
+        with contextlib.suppress(ClientDisconnect):  # in mid-body: there is nobody to answer
+            await (_error(403, why) if why else self.app)(scope, receive, sending)
 
 
 def application(hub: Hub, gate: Gate) -> Starlette:
@@ -86,22 +89,26 @@ def application(hub: Hub, gate: Gate) -> Starlette:
     routes += [Route("/api/participant/answer", guarded("participant", _answer), methods=["POST"])]
     routes += [Route(f"/api/participant/{n}", guarded("participant", _press), methods=["POST"]) for n in PRESSES]
     routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
-    routes += [Mount("/static", StaticFiles(directory=_STATIC))]
+    routes += [Route(f"/static/{name}", _page(name)) for name in _FILES]
     return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)])
+
+
+def _file(name, status=200) -> Response:
+    return Response(_FILES[name], status, media_type=mimetypes.guess_type(name)[0])
 
 
 def _page(name):
     async def page(_request: Request) -> Response:
-        return FileResponse(_STATIC / name)
+        return _file(name)
 
     return page
 
 
 def _role_page(gate, role):
     async def page(request: Request) -> Response:
-        if not gate.admits(role, request.cookies.get(COOKIES[role])):
-            return FileResponse(_STATIC / "join.html", status_code=401)
-        return FileResponse(_STATIC / f"{role}.html")
+        if not gate.admits(role, request.cookies.get(gate.cookies[role])):
+            return _file("join.html", 401)
+        return _file(f"{role}.html")
 
     return page
 
@@ -111,7 +118,7 @@ def _join(hub, gate):
         try:
             message = messages.read(messages.Join, await _body(request))
         except InputError as error:
-            return _error(400, str(error))
+            return _not_understood(error)
         try:
             found = gate.redeem(message.token)
         except InputError as error:
@@ -123,7 +130,7 @@ def _join(hub, gate):
         if message.bearer:
             return JSONResponse({"role": role, "key": key})
         reply = JSONResponse({"role": role})
-        reply.set_cookie(COOKIES[role], key, max_age=_DAY, httponly=True, samesite="strict", path="/")
+        reply.set_cookie(gate.cookies[role], key, max_age=_DAY, httponly=True, samesite="strict", path="/")
         return reply
 
     return join
@@ -135,7 +142,7 @@ def _for(hub, gate):
     def guarded(role: Role, handler: Callable):
         async def handle(request: Request) -> Response:
             program = _bearer(request)
-            if not gate.admits(role, program or request.cookies.get(COOKIES[role])):
+            if not gate.admits(role, program or request.cookies.get(gate.cookies[role])):
                 return _error(401, "Open the link of this session first; this page is no longer part of it.")
             if program and role == "participant":
                 hub.watchers.heard()
@@ -146,7 +153,7 @@ def _for(hub, gate):
             except NotNowError as error:
                 return _json({"error": str(error), "view": hub.view(role)}, 409)
             except InputError as error:
-                return _error(400, str(error))
+                return _not_understood(error)
 
         return handle
 
@@ -227,6 +234,10 @@ def _page_of(request) -> str | None:
 
 def _json(content, status=200) -> Response:
     return Response(msgspec.json.encode(content), status, media_type="application/json")
+
+
+def _not_understood(error) -> Response:
+    return _error(413 if isinstance(error, messages.TooLargeError) else 400, str(error))
 
 
 def _error(status, sentence) -> Response:

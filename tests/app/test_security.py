@@ -33,6 +33,25 @@ def test_a_new_link_voids_the_one_that_nobody_has_used(gate):
     assert gate.redeem(other)[0] == "experimenter"
 
 
+def test_cookies_of_two_ports_have_two_names(gate):
+    other = Gate(["127.0.0.1:8643"])
+    assert set(gate.cookies.values()) == {"hilbo_participant_8642", "hilbo_experimenter_8642"}
+    assert not set(gate.cookies.values()) & set(other.cookies.values())
+
+
+def test_a_key_is_known_in_the_bytes_of_a_request(gate):
+    keys = {role: gate.redeem(gate.invite(role))[1] for role in ("participant", "experimenter")}
+    cookie = b"Cookie: hilbo_%s_8642=%s\r\n"
+    mine = {role: cookie % (role.encode(), key.encode()) for role, key in keys.items()}
+    assert gate.role_in(b"authorization: bearer " + keys["experimenter"].encode()) == "experimenter"
+    assert gate.role_in(mine["participant"]) == "participant"
+    assert gate.role_in(mine["participant"] + mine["experimenter"]) == "experimenter"
+    assert gate.role_in(mine["participant"].replace(b"8642", b"8643")) is None
+    assert gate.role_in(mine["participant"].replace(b"\r", b"x")) is None
+    assert gate.role_in(keys["participant"].encode()) is None
+    assert gate.role_in(b"Bearer " + b"a" * 32) is None
+
+
 def test_a_second_browser_ends_the_first(gate):
     _, first = gate.redeem(gate.invite("participant"))
     _, second = gate.redeem(gate.invite("participant"))

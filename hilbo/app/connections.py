@@ -1,0 +1,171 @@
+"""Connections to the server, and how much of it each may take, so that whoever holds a key is always heard.
+
+A connection is a stranger's until a key of a role has come in on it; then it is the role's. Strangers, participants and
+experimenters have numbers of connections of their own, and of too many the oldest is given up. At every turn of the
+event loop one connection of each is heard, so that a thousand strangers delay an experimenter by one of them. A
+request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's connection.
+
+uvicorn and h11 do the rest; without this, they would wait for a header for ever, and read a body of any size.
+"""
+
+import asyncio
+from typing import Any
+
+import h11
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from hilbo.app.security import Gate, Role
+
+__all__ = ["LARGEST", "PATIENCE", "ROLES", "Connection", "Connections", "strangers_among"]
+
+PATIENCE = 10.0  # s
+LARGEST = 65_536  # bytes of a request
+ROLES = 32  # connections of each role: a browser opens six at most, a program one
+_STRANGERS = 256
+_KEPT = 120  # s that a role's idle connection stays open, so that the next press of a button needs no new one
+_SEEN = 256  # bytes of the past in which the beginning of a key may be
+
+
+def strangers_among(files: int) -> int:
+    """How many strangers' connections a process takes that may have so many files open."""
+    return max(1, min(_STRANGERS, files // 4))
+
+
+class Connections:
+    """All open connections by role, None for strangers: the oldest first, those that wait to be heard too."""
+
+    def __init__(self, gate: Gate, strangers: int = _STRANGERS):
+        self.gate = gate
+        self._most: dict[Role | None, int] = {"experimenter": ROLES, "participant": ROLES, None: strangers}
+        self._open: dict[Role | None, dict[Connection, None]] = {role: {} for role in self._most}
+        self._waiting: dict[Role | None, dict[Connection, None]] = {role: {} for role in self._most}
+        self._turning = False
+
+    def count(self, role: Role | None) -> int:
+        """How many are open."""
+        return len(self._open[role])
+
+    def add(self, connection: "Connection") -> None:
+        """A new one, or one whose role has become another; the oldest of too many is given up."""
+        mine = self._open[connection.role]
+        mine[connection] = None
+        if len(mine) > self._most[connection.role]:
+            oldest = next(iter(mine))
+            self.remove(oldest)
+            oldest.give_up()
+
+    def remove(self, connection: "Connection") -> None:
+        """It is open no more, or another's."""
+        self._open[connection.role].pop(connection, None)
+        self._waiting[connection.role].pop(connection, None)
+
+    def wait(self, connection: "Connection") -> None:
+        """Have it heard when its turn comes."""
+        self._waiting[connection.role][connection] = None
+        if not self._turning:
+            self._turning = True
+            asyncio.get_running_loop().call_soon(self._turn)
+
+    def _turn(self) -> None:
+        for waiting in self._waiting.values():
+            if waiting:
+                connection = next(iter(waiting))
+                del waiting[connection]
+                connection.hear()
+        self._turning = any(self._waiting.values())
+        if self._turning:
+            asyncio.get_running_loop().call_soon(self._turn)
+
+
+class Connection(H11Protocol):
+    """One connection, which reads nothing new before what it has read was heard."""
+
+    def __init__(self, others: Connections, **uvicorns: Any):
+        super().__init__(**uvicorns)
+        self.role: Role | None = None
+        self._others = others
+        self._unheard = self._seen = b""
+        self._size = 0
+        self._limit: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        """A stranger comes."""
+        super().connection_made(transport)
+        self._others.add(self)
+        self._limit_time()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """It has ended, whoever ended it."""
+        self._others.remove(self)
+        self._unlimit_time()
+        self._unset_keepalive_if_required()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """Keep it for this connection's turn, and look whose it is."""
+        self._size += len(data)
+        if self._size > LARGEST:
+            self.give_up()
+            return
+        self._unheard += data
+        seen = self._seen + data
+        self._seen = seen[-_SEEN:]
+        role = self._others.gate.role_in(seen)
+        if role not in (None, self.role):
+            self._others.remove(self)
+            self.role, self.timeout_keep_alive = role, _KEPT
+            self._others.add(self)
+        self.transport.pause_reading()
+        self._others.wait(self)
+
+    def hear(self) -> None:
+        """What has come, as HTTP."""
+        if self.transport.is_closing():
+            return
+        data, self._unheard = self._unheard, b""
+        super().data_received(data)
+        if not self.flow.read_paused:
+            self.transport.resume_reading()
+        if self._begun():
+            self._limit_time()
+        elif self.role is not None:
+            self._unlimit_time()
+
+    def on_response_complete(self) -> None:
+        """The next request is counted from here."""
+        self._size = 0
+        super().on_response_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """Say that this is no HTTP, if there is a way to say it; an answer that had begun is not gone on with."""
+        if self.cycle is not None:
+            self.cycle.disconnected = True
+            self.cycle.message_event.set()
+        try:
+            super().send_400_response(msg)
+        except h11.LocalProtocolError:
+            self.give_up()
+
+    def shutdown(self) -> None:
+        """The server ends: nobody waits for the rest of a request."""
+        if self._begun():
+            self.give_up()
+        else:
+            super().shutdown()
+
+    def give_up(self) -> None:
+        """End it, whatever it is at."""
+        self.transport.abort()
+
+    def _begun(self) -> bool:
+        """Whether a request has not come to its end, or not begun."""
+        return self.conn.their_state in (h11.IDLE, h11.SEND_BODY)
+
+    def _limit_time(self) -> None:
+        if self._limit is None:
+            self._limit = self.loop.call_later(PATIENCE, self.give_up)
+
+    def _unlimit_time(self) -> None:
+        if self._limit is not None:
+            self._limit.cancel()
+            self._limit = None

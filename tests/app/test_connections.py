@@ -1,0 +1,235 @@
+"""Connections without a key take nothing from those who hold one: numbers, times, sizes, and a quiet stderr."""
+
+import asyncio
+import os
+import socket
+import struct
+import subprocess
+import sys
+import time
+from typing import Any, cast
+
+import pytest
+from bare_server import Bare, connected, request, status, until_closed, until_words
+
+from hilbo.app.connections import Connections
+
+HALF = b"GET / HTTP/1.1\r\nHost: "
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    with Bare(tmp_path_factory.mktemp("bare")) as found:
+        yield found
+
+
+@pytest.fixture
+def brief(monkeypatch):
+    """Patience of a tenth of a second."""
+    monkeypatch.setattr("hilbo.app.connections.PATIENCE", 0.1)
+
+
+def patient(line, seconds=2.0):
+    line.settimeout(seconds)
+    return line
+
+
+def test_half_a_header_is_not_waited_for(server, brief):
+    with patient(connected(server.port)) as silent, patient(connected(server.port)) as half:
+        half.sendall(HALF)
+        assert until_closed(silent) == until_closed(half) == b""
+
+
+def test_half_a_body_is_not_waited_for_though_it_comes_with_a_key(server, brief):
+    with patient(connected(server.port)) as line:
+        line.sendall(request(server, "/api/experimenter/note", server.experimenter._key, b"{", length=100))
+        assert until_closed(line) == b""
+
+
+def test_a_key_holder_s_open_stream_and_idle_connection_stay(server, brief):
+    with connected(server.port) as stream, connected(server.port) as idle:
+        stream.sendall(request(server, "/api/experimenter/events", server.experimenter._key))
+        assert status(server.stops(idle)) == 200
+        until_words(stream, b"event: view")
+        with pytest.raises(TimeoutError):
+            patient(stream, 0.3).recv(1)
+        assert status(server.stops(idle)) == 200
+
+
+def test_a_false_length_is_not_drained(server):
+    with patient(connected(server.port), 5.0) as line:
+        line.sendall(request(server, "/api/join", body=b"", length=200_000_000))
+        with pytest.raises(ConnectionError):
+            line.sendall(bytes(50_000_000))  # more than the kernel's buffers hold
+
+
+def test_a_message_that_is_too_large_is_told_so(server):
+    with connected(server.port) as line:
+        line.sendall(request(server, "/api/experimenter/note", server.experimenter._key, bytes(20_000)))
+        assert status(until_words(line, b"16384 bytes").decode()) == 413
+
+
+def test_the_oldest_stranger_is_given_up_and_nobody_with_a_key(server):
+    with connected(server.port) as mine:
+        assert status(server.stops(mine)) == 200
+        strangers = [connected(server.port) for _ in range(600)]
+        try:
+            for line in strangers:
+                line.sendall(HALF)
+            assert status(server.stops(mine)) == 200
+            assert status(server.stops()) == 200
+            assert until_closed(patient(strangers[0])) == b""
+            strangers[-1].sendall(f"127.0.0.1:{server.port}\r\n\r\n".encode())
+            assert status(strangers[-1].recv(65536).decode()) == 200
+        finally:
+            for line in strangers:
+                line.close()
+
+
+def test_a_participant_s_connections_take_none_of_the_experimenter_s(server):
+    with connected(server.port) as mine:
+        assert status(server.stops(mine)) == 200
+        theirs = [connected(server.port) for _ in range(100)]
+        try:
+            for line in theirs:
+                line.sendall(request(server, "/api/participant/events", server.participant._key))
+            assert status(server.stops(mine)) == 200
+            until_words(theirs[-1], b"event: view")
+            until_closed(patient(theirs[0]))
+        finally:
+            for line in theirs:
+                line.close()
+
+
+def test_a_key_in_two_pieces_is_one(server):
+    whole = request(server, "/api/experimenter/estop", server.experimenter._key, b"{}")
+    middle = whole.index(server.experimenter._key.encode()) + 10
+    with connected(server.port) as line:
+        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        line.sendall(whole[:middle])
+        time.sleep(0.05)
+        line.sendall(whole[middle:])
+        assert status(line.recv(65536).decode()) == 200
+
+
+def test_many_requests_in_one_piece_are_all_answered(server):
+    with connected(server.port) as line:
+        line.sendall(request(server, "/api/experimenter", server.experimenter._key) * 50)
+        came = b""
+        while came.count(b'{"role":"experimenter"}') < 50:
+            came += line.recv(65536)
+
+
+def test_every_connection_has_no_delay(server, monkeypatch):
+    """Without it the body of an answer waits for the acknowledgement of its header, 40 ms."""
+    seen, accept = [], socket.socket.accept
+
+    def accepted(listening):
+        line, address = accept(listening)
+        seen.append(line)
+        return line, address
+
+    monkeypatch.setattr(socket.socket, "accept", accepted)
+    with connected(server.port) as line:
+        assert status(server.stops(line)) == 200
+        assert seen[-1].getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+
+
+NOISE = [
+    b"\x16\x03\x01\x02\x00" + bytes(range(256)),
+    b"GET / HTTP/9.9\r\n\r\n",
+    b"POST /api/join HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nabc",
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nConnection: upgrade\r\nUpgrade: websocket\r\n\r\n",
+    b"POST /api/join HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nContent-Length: 100\r\n\r\n{",
+    b"POST /api/join HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nContent-Length: 2\r\nContent-Length: 3\r\n\r\n{}",
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\n" + b"X: " + b"y" * 70_000,
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nTransfer-Encoding: chunked\r\n\r\n",
+    b"GET /api/experimenter/events HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nAuthorization: Bearer KEY\r\n\r\n",
+    b"POST /api/experimenter/note HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nAuthorization: Bearer KEY\r\n"
+    b"Content-Length: 9\r\n\r\n{",
+]
+
+
+def noise(port, key):
+    """Hostile bytes, hung up after in three ways."""
+    for number, words in enumerate(NOISE * 3):
+        line = connected(port)
+        line.sendall(words.replace(b"%d", b"%d" % port).replace(b"KEY", key.encode()))
+        if number % 3:
+            time.sleep(0.02)
+        if words.endswith(b"chunked\r\n\r\n"):
+            time.sleep(0.05)  # it has been answered
+            line.sendall(b"zz\r\n")
+            time.sleep(0.02)
+        if number % 3 == 2:
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        line.close()
+
+
+def test_nothing_that_strangers_do_is_printed(tmp_path, capfd, caplog):
+    with Bare(tmp_path) as own:
+        noise(own.port, own.experimenter._key)
+        stream, half = connected(own.port), connected(own.port)
+        stream.sendall(request(own, "/api/experimenter/events", own.experimenter._key))
+        half.sendall(request(own, "/api/experimenter/note", own.experimenter._key, b"{", length=9))
+        assert status(own.stops()) == 200
+    stream.close()
+    half.close()
+    assert capfd.readouterr().err == "" and caplog.text == ""
+
+
+FEW = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_NOFILE, (64, int(sys.argv[2])))
+from pathlib import Path
+from bare_server import Bare, connected, status
+own = Bare(Path(sys.argv[1]))
+with own:
+    print(own.port, flush=True)
+    sys.stdin.readline()
+    print(resource.getrlimit(resource.RLIMIT_NOFILE)[0], status(own.stops()))
+"""
+
+
+@pytest.mark.deep
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no limit of files")
+@pytest.mark.parametrize("files", [256, 4096])
+def test_the_process_asks_for_files_and_lives_with_what_it_gets(tmp_path, files):
+    pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    command = [sys.executable, "-c", FEW, str(tmp_path), str(files)]
+    path = os.pathsep.join(sys.path)
+    with subprocess.Popen(command, text=True, env=os.environ | {"PYTHONPATH": path}, **pipes) as process:
+        port = int(process.stdout.readline())
+        strangers = [connected(port) for _ in range(400)]
+        for line in strangers:
+            line.send(HALF)
+        said, errors = process.communicate("\n", timeout=30)
+        for line in strangers:
+            line.close()
+    assert errors == ""
+    assert said.split() == [str(min(files, 1024)), "200"]
+
+
+class Waiting:
+    """A connection that only waits to be heard."""
+
+    def __init__(self, role, heard):
+        self.role, self._heard = role, heard
+
+    def hear(self):
+        self._heard.append(self.role)
+
+
+def test_one_of_each_is_heard_at_every_turn(server):
+    heard, roles = [], [None] * 50 + ["participant"] * 5 + ["experimenter"]
+
+    async def turns():
+        waiting = Connections(server.place.gate)
+        for role in roles:
+            waiting.wait(cast(Any, Waiting(role, heard)))
+        while len(heard) < len(roles):
+            await asyncio.sleep(0)
+
+    asyncio.run(turns())
+    assert heard == ["experimenter", "participant", None, *["participant", None] * 4, *[None] * 45]
