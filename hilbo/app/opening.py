@@ -1,7 +1,6 @@
 """From what was asked for on the command line to a hub: study, plan, log, choosing; compiled before the device runs."""
 
 import hashlib
-import json
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -16,7 +15,7 @@ from hilbo.session.actions import Header, LiveSession
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.participants import check_consent, read_people
-from hilbo.session.plan import header_for, planned_header
+from hilbo.session.plan import header_for, planned_header, read_plan
 from hilbo.session.warm_start import read_warm_start
 from hilbo.study.config import Study
 
@@ -105,12 +104,7 @@ def _header(wanted, study) -> Header:
     if wanted.plan is None:
         place = (wanted.participant, wanted.session, wanted.seed)
         return header_for(study, *place, materials=(wanted.material,), **facts)
-    try:
-        plan = json.loads(wanted.plan.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{wanted.plan}: cannot be read ({error.strerror}); check the path.") from error
-    except ValueError as error:
-        raise InputError(f"{wanted.plan}: is no plan ({error}); make one with `hilbo plan`.") from error
+    plan = read_plan(wanted.plan)
     try:
         return planned_header(plan, study, wanted.participant, **facts)
     except InputError as error:

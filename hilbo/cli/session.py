@@ -140,12 +140,13 @@ def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:
     from hilbo.session import plan_sets
     from hilbo.session.export import read_log_trials
     from hilbo.study.cohort import cohort_of
+    from hilbo.study.result_file import read_result
     from hilbo.study.trial_table import read_trials
 
     sets = {}
     for material, path in paths.items():
         here = study.material(material) if material else study
-        result = plan_sets.read_result(path, here)
+        result = read_result(path, here)
         if kind == "aggregate-best":
             sets[material] = plan_sets.aggregate_best_sets(here, result)
             continue
@@ -174,14 +175,14 @@ def _by_material(materials, given) -> dict[str, Path]:
 
 
 def _reissued(path, study, text):
-    from hilbo.session.plan import check_plan, reissue
+    from hilbo.session.plan import check_plan, read_plan, reissue
 
     old, equals, new = text.partition("=")
     if not equals:
         raise InputError(f'--reissue is "{text}"; write OLD=NEW.')
     try:
-        plan = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        plan = read_plan(path)
+    except InputError as error:
         raise InputError(f"{path}: is no plan that can be read; give the one to change with --out.") from error
     check_plan(plan, study)
     return reissue(plan, old.strip(), new.strip())

@@ -17,6 +17,8 @@ from hilbo.report.results import map_dataset, optima_table, result, save_figures
 from hilbo.study.batch_optimum import Merged
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.map_file import write_map
+from hilbo.study.typed_files import sealed
 
 __all__ = ["population_map", "write_population"]
 
@@ -41,10 +43,10 @@ def write_population(
     content = result(study, merged, seed, None, people)
     say("writing results")
     with (folder / "result.json").open("w", encoding="utf-8") as file:
-        file.writelines(json_lines(content))
+        file.writelines(sealed(json_lines(content)))
     optima_table(content, people).to_csv(folder / "optima.csv", index=False)
     grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
-    grid.to_netcdf(folder / "map.nc", engine="h5netcdf")
+    write_map(grid, folder / "map.nc")
     say("figures and report")
     figures, drawn = _figures(study, merged, grid)
     page = results_page(study, content, save_figures(figures, folder), people, drawn=drawn)

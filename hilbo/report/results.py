@@ -21,13 +21,15 @@ import xarray as xr
 from jaxtyping import Array, Float
 
 from hilbo.report.page import Pictures, results_page
-from hilbo.report.participants import People, as_json, people_of
+from hilbo.report.participants import People, as_json, json_lines, people_of
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import Aggregate, Optimum, nrmse, other_inference
 from hilbo.study.analysis import Population
 from hilbo.study.batch_optimum import Merged
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
+from hilbo.study.map_file import write_map
+from hilbo.study.typed_files import sealed
 
 __all__ = [
     "MAP_CELLS",
@@ -176,12 +178,12 @@ def write_results(
     study, aggregate = population.study, population.aggregate
     people = people_of(study, aggregate)
     content = result(study, aggregate, population.seed, truth, people)
-    (folder / "result.json").write_text(as_json(content))
+    (folder / "result.json").write_text("".join(sealed(json_lines(content))), encoding="utf-8")
     optima_table(content, people).to_csv(folder / "optima.csv", index=False)
     say("the population map on a grid")
     data = map_dataset(study, aggregate.surface, aggregate.optimum.x)
     data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
-    data.to_netcdf(folder / "map.nc", engine="h5netcdf")
+    write_map(data, folder / "map.nc")
     say("figures and report")
     page = results_page(
         study, content, save_figures(_figures(population, truth), folder), people, in_place(aggregate.map)

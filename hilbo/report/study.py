@@ -28,6 +28,7 @@ from hilbo.study.analysis import Analysis, analyse, moved_by_evidence
 from hilbo.study.folder import Material, StudyFolder
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
+from hilbo.study.map_file import write_map
 from hilbo.study.rule_comparison import compare
 
 __all__ = ["convergence_table", "table_1", "tolerance_table", "write_study"]
@@ -123,7 +124,7 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
     write_groups(data, folder / "inference.nc")
     grid = map_dataset(study, analysis.aggregate.surface, analysis.aggregate.optimum.x)
     grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
-    grid.to_netcdf(folder / "map.nc", engine="h5netcdf")
+    write_map(grid, folder / "map.nc")
     tables = {
         "optima": optima_table(content, people),
         "table_I": table_1(analysis, material.reference),

@@ -5,8 +5,9 @@ The first line is the header, every other an event:
     {"seq":1,"kind":"propose","time":…,"data":{…},"previous":"…","crc":"…"}
 
 `previous` is the start of the SHA-256 of the line before, `crc` the CRC-32 of this line up to it. A last line without
-its end was never acknowledged: it is dropped, and said so. Any other damage is refused with its line. One writer at a
-time, by a lock of the operating system on the file, which goes with the process that holds it.
+its end was never acknowledged: it is dropped, and said so. Any other damage is refused with its line. Neither digest
+has a secret, so that events are checked for what they say too (`hilbo.session.replay`). One writer at a time, by a lock
+of the operating system on the file, which goes with the process that holds it. A log is its owner's alone to read.
 """
 
 import hashlib
@@ -15,17 +16,34 @@ import re
 import time
 import zlib
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
 from hilbo.errors import InputError
+from hilbo.session.header_check import check_header
 from hilbo.session.records import Event, Header
+from hilbo.session.replay import replayed
 from hilbo.session.state import LiveSession
 from hilbo.study.config import Study
+from hilbo.study.typed_files import converted, decoded, read_bytes
 
-__all__ = ["EventLog", "LogError", "in_use", "log_name", "log_paths", "read_log"]
+__all__ = ["EventLog", "LogError", "in_use", "log_name", "log_paths", "read_log", "read_session"]
 
 _SUFFIX = ".session.jsonl"
+_MODE = 0o600
+_WHAT = "is not what this hilbo writes"
+
+
+class _Line(msgspec.Struct, forbid_unknown_fields=True):
+    """A line of a log."""
+
+    seq: int
+    kind: str
+    time: float
+    data: dict[str, Any]
+    previous: str
+    crc: str
 
 
 class LogError(RuntimeError):
@@ -48,9 +66,10 @@ class EventLog:
         """Begin a log. Raises InputError if there is one already, or it cannot be written."""
         path = Path(path)
         state = LiveSession.start(study, header)
+        check_header(study, header)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o644)
+            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), _MODE)
         except FileExistsError:
             raise InputError(f"{path}: exists already; resume it, or choose another session.") from None
         except OSError as error:
@@ -127,15 +146,16 @@ class EventLog:
 
 def read_log(path: str | os.PathLike, study: Study | None = None) -> tuple[Header, list[Event], str]:
     """Header, events, and what was dropped at the end; for readers, without a lock. Raises InputError."""
-    path = Path(path)
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
-    header, events, _, dropped = _parsed(content, path)
+    header, events, _, dropped = _parsed(read_bytes(path), path)
     if study is not None:
         _check_study(path, study, header)
     return header, events, dropped
+
+
+def read_session(path: str | os.PathLike, study: Study) -> LiveSession:
+    """The session of a log, every event checked; for readers, without a lock. Raises InputError."""
+    header, events, _ = read_log(path, study)
+    return _folded(path, study, header, events)
 
 
 def in_use(path: str | os.PathLike) -> bool:
@@ -184,9 +204,9 @@ def _parsed(content, path):
             break
         raw = _checked(line, number, previous, path)
         if number == 1:
-            header = _convert(raw["data"], Header, path, number)
+            header = converted(raw.data, Header, f"{path}:{number}", _WHAT)
         else:
-            events.append(_convert({k: raw[k] for k in ("seq", "kind", "time", "data")}, Event, path, number))
+            events.append(Event(seq=raw.seq, kind=raw.kind, time=raw.time, data=raw.data))
         previous, whole = line, whole + len(line)
     if header is None:
         raise InputError(f"{path}: holds no session; it has no whole first line.")
@@ -197,19 +217,12 @@ def _checked(line, number, previous, path):
     found = _CRC.search(line)
     if found is None or int(found[1], 16) != zlib.crc32(line[: found.start()]):
         raise InputError(f"{path}:{number}: is damaged; restore the file from a copy, nothing after it can be trusted.")
-    raw = msgspec.json.decode(line)
-    if raw.get("seq") != number - 1 or raw.get("previous") != _hash(previous):
+    raw = decoded(line, _Line, f"{path}:{number}", _WHAT)
+    if raw.seq != number - 1 or raw.previous != _hash(previous):
         raise InputError(f"{path}:{number}: does not follow the line before it; lines are missing or were changed.")
-    if (number == 1) != (raw["kind"] == "header"):
+    if (number == 1) != (raw.kind == "header"):
         raise InputError(f"{path}:{number}: is no {'header' if number == 1 else 'event'}; this is no session's log.")
     return raw
-
-
-def _convert(raw, kind, path, number):
-    try:
-        return msgspec.convert(raw, kind)
-    except msgspec.ValidationError as error:
-        raise InputError(f"{path}:{number}: is not what this hilbo writes ({error}).") from error
 
 
 def _check_study(path, study, header):
@@ -223,7 +236,7 @@ def _check_study(path, study, header):
 def _folded(path, study, header, events) -> LiveSession:
     _check_study(path, study, header)
     try:
-        return LiveSession.fold(study, header, events)
+        return replayed(study, header, events)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 

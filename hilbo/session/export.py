@@ -18,7 +18,7 @@ from typing import Any
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.session.event_log import log_paths, read_log
+from hilbo.session.event_log import log_paths, read_session
 from hilbo.session.explanation import described
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
@@ -75,10 +75,10 @@ def read_sessions(
         raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
     found, dry = [], 0
     for path in paths:
-        header, events, _ = read_log(path, study)
-        dry += header.dry_run
-        if not header.dry_run:
-            found.append(LiveSession.fold(study, header, events))
+        state = read_session(path, study)
+        dry += state.header.dry_run
+        if not state.header.dry_run:
+            found.append(state)
     if not found:
         raise InputError(f"{folder}: holds nothing but dry runs, in which nobody took part.")
     if dry:

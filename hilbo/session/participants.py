@@ -7,19 +7,18 @@ and the protocol's number must stand there before the first trial.
 import csv
 import datetime
 import os
-import re
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import in_use, log_paths, read_log
+from hilbo.study.text_cells import check_id
 
-__all__ = ["COLUMNS", "add_person", "check_consent", "check_id", "delete_participant", "read_people"]
+__all__ = ["COLUMNS", "add_person", "check_consent", "delete_participant", "read_people"]
 
 COLUMNS = ("participant", "consent_time", "protocol_number", "age", "handedness")
 _NEEDED = ("participant", "consent_time", "protocol_number")
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 _HANDS = ("", "right", "left", "both")
 People = dict[str, dict[str, str]]
 
@@ -63,15 +62,6 @@ def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place.") from error
     return people
-
-
-def check_id(participant: str, place: str) -> None:
-    """Refuse what is no pseudonymous id; `place` says where it stands."""
-    if not _ID.fullmatch(participant):
-        raise InputError(
-            f'{place}: participant is "{participant}"; an id has up to 32 letters, digits, "_", "-", "." and is'
-            " nobody's name."
-        )
 
 
 def check_consent(people: People, participant: str, protocol_number: str = "") -> dict[str, str]:

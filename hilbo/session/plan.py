@@ -5,23 +5,28 @@ it. Materials come in the orders of a Williams design, pairs balanced as `hilbo.
 
 A validation compares best, mid and worst: of the population's map (`source` aggregate; for people who were not in it),
 or of each participant's own (individual; for these very people). An aggregate-best validation compares the population's
-optimum with every individual's own.
+optimum with every individual's own. Sets of individuals are called by a code that is made from their values alone, in
+plans, logs and tables: whoever withdraws leaves no id in the answers of others.
 """
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
 
 from hilbo.errors import InputError
 from hilbo.session.counterbalance import block_size, comparisons, orders
-from hilbo.session.participants import check_id
+from hilbo.session.header_check import check_header
 from hilbo.session.records import Block, Header, Planned
+from hilbo.session.set_codes import OWN, Sets, coded, set_codes
 from hilbo.study.config import Study
 from hilbo.study.protocols import Phase, protocol
+from hilbo.study.text_cells import check_id, check_text
+from hilbo.study.typed_files import converted, decoded, read_bytes
 
 __all__ = [
     "Source",
@@ -31,15 +36,34 @@ __all__ = [
     "material_seed",
     "plan_hash",
     "planned_header",
+    "read_plan",
     "reissue",
     "seed_of",
     "warm_up",
 ]
 
 Source = Literal["aggregate", "individual"]
-Sets = Mapping[str, Mapping[str, float]]
 _SPARE = 2  # warm-up renderings in store: so many times the least number
+_WHAT = "is no plan; make one with hilbo plan"
 _PAIRS = (("best", "mid"), ("best", "worst"), ("mid", "worst"))
+
+
+class _Row(msgspec.Struct):
+    """Who has which session."""
+
+    participant: str
+    header: Header
+    order: Annotated[int, msgspec.Meta(ge=0)] = 0
+    reissued_from: str | None = None
+
+
+class _Plan(msgspec.Struct):
+    """What is read of a plan."""
+
+    hash: str
+    study: str
+    participants: Annotated[tuple[_Row, ...], msgspec.Meta(min_length=1)]
+    source: Source | None = None
 
 
 def seed_of(seed: int, *place: int) -> int:
@@ -112,19 +136,21 @@ def make_plan(
 
     **Arguments:** `materials`: all that each participant has, by default those of the study. `sets`: for validations
     material ("" for a study without) -> name of a set -> parameters; names are `best`, `mid` and `worst`, or with an
-    individual source `PARTICIPANT best` and so on; for aggregate-best `aggregate` and `individual:PARTICIPANT`. Raises
-    InputError.
+    individual source `PARTICIPANT best` and so on; for aggregate-best `aggregate` and `individual:PARTICIPANT`. The
+    plan has a code in the place of each PARTICIPANT in these names. Raises InputError.
     """
     if len(set(participants)) < len(participants) or not participants:
         raise InputError("plan: participants must be named, each once.")
     for person in participants:
         check_id(person, "plan")
+    check_text(session, "--session")
     names: list[str | None] = list(materials or study.materials) or [None]
+    codes = set_codes(sets or {})
     sequence = orders(len(names), len(participants), seed)
     people = []
     for i, person in enumerate(participants):
         own = [names[k] for k in sequence[i]]
-        header = _header(study, person, session, seed_of(seed, i), phase, own, sets, source)
+        header = _header(study, person, session, seed_of(seed, i), phase, own, sets, source, codes)
         people.append({"participant": person, "order": i, "header": _for_plan(header)})
     size = block_size(len(names))
     plan = {
@@ -151,30 +177,38 @@ def plan_hash(plan: Mapping[str, Any]) -> str:
 
 def planned_header(plan: Mapping[str, Any], study: Study, participant: str, **others: Any) -> Header:
     """The header of a planned session. Raises InputError if plan, study and participant do not belong together."""
-    check_plan(plan, study)
-    rows = {row["participant"]: row for row in plan["participants"]}
+    found = check_plan(plan, study)
+    rows = {row.participant: row.header for row in found.participants}
     if participant not in rows:
         raise InputError(
             f'participant "{participant}" is not in the plan, which has {len(rows)}, {min(rows)} to {max(rows)}; add'
             " them by a new plan, or reissue the row of somebody who dropped out."
         )
-    return msgspec.convert(rows[participant]["header"] | {"plan": plan["hash"]} | others, Header)
+    return msgspec.structs.replace(rows[participant], plan=found.hash, **others)
 
 
-def check_plan(plan: Mapping[str, Any], study: Study) -> None:
-    """Refuse a plan that was changed after it was made, or belongs to another study."""
-    try:
-        same = plan["hash"] == plan_hash(plan)
-        other = plan["study"] != study.hash
-    except (KeyError, TypeError) as error:
-        raise InputError(f"the plan is no plan ({error} is missing); make one with hilbo plan.") from error
-    if not same:
+def read_plan(path: str | os.PathLike) -> dict[str, Any]:
+    """A plan's content as plain data, which `check_plan` checks. Raises InputError."""
+    return decoded(read_bytes(path), dict[str, Any], str(path), _WHAT)
+
+
+def check_plan(plan: Mapping[str, Any], study: Study) -> _Plan:
+    """Refuse a plan that was changed after it was made, belongs to another study, or has sessions that cannot be."""
+    found = converted(plan, _Plan, "the plan", _WHAT)
+    if found.hash != plan_hash(plan):
         raise InputError("the plan was changed after it was made (its hash does not fit); make a new one.")
-    if other:
+    if found.study != study.hash:
         raise InputError(
-            f"the plan belongs to another study ({plan['study']}, not {study.hash}); use the study file it was made"
-            " from."
+            f"the plan belongs to another study ({found.study}, not {study.hash}); use the study file it was made from."
         )
+    names = [row.participant for row in found.participants]
+    if len(set(names)) < len(names):
+        raise InputError("the plan names a participant twice; make a new one.")
+    for row in found.participants:
+        check_header(study, row.header)
+        if row.header.participant != row.participant or row.header.study != found.study:
+            raise InputError(f"the plan's row of {row.participant} has somebody else's session; make a new one.")
+    return found
 
 
 def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
@@ -209,7 +243,7 @@ def _of(study, material):
     return study if material is None else study.material(material)
 
 
-def _header(study, person, session, seed, phase, materials, sets, source) -> Header:
+def _header(study, person, session, seed, phase, materials, sets, source, codes) -> Header:
     if phase == "optimisation":
         return header_for(study, person, session, seed, materials=materials)
     if phase == "warm-up" or sets is None:
@@ -218,21 +252,22 @@ def _header(study, person, session, seed, phase, materials, sets, source) -> Hea
     blocks = [begin]
     for i, material in enumerate(materials):
         here = sets.get(material or "", {})
-        trials, used = _compared(study, person, phase, here, source, seed_of(seed, i, 7))
+        trials, used = _compared(study, person, phase, here, source, codes, seed_of(seed, i, 7))
         prefix = f"{material} " if material else ""
-        renamed = {f"{prefix}{name}": {k: float(v) for k, v in here[name].items()} for name in used}
-        planned = tuple(Planned(prefix + a, prefix + b, first) for a, b, first in trials)
+        named = {name: prefix + coded(name, codes) for name in used}
+        renamed = {named[name]: {k: float(v) for k, v in here[name].items()} for name in used}
+        planned = tuple(Planned(named[a], named[b], first) for a, b, first in trials)
         rest = protocol(study.session, phase).rest if i else 0.0
         blocks.append(Block(phase, len(planned), planned, material, rest))
         found |= renamed
     return Header(study=study.hash, participant=person, session=session, seed=seed, blocks=tuple(blocks), sets=found)
 
 
-def _compared(study, person, phase, sets, source, seed):
+def _compared(study, person, phase, sets, source, codes, seed):
     """A block's comparisons, and the names of the sets in it."""
     repeats = protocol(study.session, phase).count
     if phase == "aggregate-best":
-        others = [name for name in sets if name.startswith("individual:")]
+        others = sorted((name for name in sets if name.startswith(OWN)), key=lambda name: coded(name, codes))
         if "aggregate" not in sets or not others:
             raise InputError("plan: aggregate-best needs the population's optimum and individuals' own.")
         pairs = [("aggregate", name) for name in others]

@@ -4,10 +4,7 @@ The map is fitted again from the answers, so that best, mid and worst are read f
 optimum where result.json has it: results of other answers, or of another study, are refused.
 """
 
-import json
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -22,37 +19,19 @@ from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.map_summary import best_mid_worst
+from hilbo.study.result_file import FoundOptimum, Result
+from hilbo.study.typed_files import check_values
 
-__all__ = ["aggregate_best_sets", "check_participants", "read_result", "validation_sets"]
+__all__ = ["aggregate_best_sets", "check_participants", "validation_sets"]
 
 _SAME = 1e-6  # of the search ranges
 _NAMES = ("best", "mid", "worst")
 NamedSets = dict[str, dict[str, float]]
 
 
-def read_result(path: str | os.PathLike, study: Study) -> dict[str, Any]:
-    """A result.json of this study. Raises InputError."""
-    try:
-        found = json.loads(Path(path).read_text(encoding="utf-8"))
-        whole = "parameters" in found["optimum"] and all("participant" in row for row in found["participants"])
-        same = found["study"] == study.hash
-        if not whole:
-            raise KeyError("parameters")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise InputError(f"{path}: is no result.json of hilbo; give the one that hilbo aggregate wrote.") from error
-    if not same:
-        raise InputError(
-            f"{path}: is the result of another study ({found['study']}, not {study.hash}); aggregate the answers again"
-            " with this study file."
-        )
-    return found
-
-
-def check_participants(result: dict[str, Any], participants: Sequence[str], source: Source) -> None:
+def check_participants(result: Result, participants: Sequence[str], source: Source) -> None:
     """Validation of the aggregate needs people who are not in it, of individuals' own maps these very people."""
-    known = {row["participant"] for row in result["participants"]}
+    known = {person.participant for person in result.participants}
     for person in participants:
         if source == "aggregate" and person in known:
             raise InputError(
@@ -65,13 +44,12 @@ def check_participants(result: dict[str, Any], participants: Sequence[str], sour
 
 
 def validation_sets(
-    study: Study, result: dict[str, Any], cohort: Cohort, source: Source, participants: Sequence[str]
+    study: Study, result: Result, cohort: Cohort, source: Source, participants: Sequence[str]
 ) -> NamedSets:
     """Best, mid and worst of the map, or of each participant's own (`PARTICIPANT best`): name -> parameters."""
-    seed = int(result.get("seed", 0))
-    found = aggregate_cohort(study, cohort, seed, alternatives=False)
+    found = aggregate_cohort(study, cohort, result.seed, alternatives=False)
     _check_same(study, result, np.asarray(found.optimum.x))
-    points = search_points(study.space, seed)
+    points = search_points(study.space, result.seed)
     if source == "aggregate":
         return _named(study, best_mid_worst(study, found.surface, points, prior=found.map.map_prior).x, "")
     sets: NamedSets = {}
@@ -89,17 +67,17 @@ class _Predict(eqx.Module):
         return self.posterior.predict(x)
 
 
-def aggregate_best_sets(study: Study, result: dict[str, Any]) -> NamedSets:
+def aggregate_best_sets(study: Study, result: Result) -> NamedSets:
     """The population's optimum and every individual's own."""
 
-    def of(optimum):
-        return {name: float(optimum["parameters"][name]) for name in study.space.names}
+    def of(optimum: FoundOptimum, what: str) -> dict[str, float]:
+        return check_values(optimum.parameters, study.space.parameters, "plan", what)
 
-    sets = {"aggregate": of(result["optimum"])}
-    for row in result["participants"]:
-        if "optimum" not in row:
+    sets = {"aggregate": of(result.optimum, "the optimum")}
+    for person in result.participants:
+        if person.optimum is None:
             raise InputError("plan: the results hold no individuals' optima; aggregate again without --no-individuals.")
-        sets[f"individual:{row['participant']}"] = of(row["optimum"])
+        sets[f"individual:{person.participant}"] = of(person.optimum, f"the optimum of {person.participant}")
     return sets
 
 
@@ -112,8 +90,8 @@ def _named(study, unit, prefix) -> NamedSets:
 
 
 def _check_same(study, result, x):
-    values = [result["optimum"]["parameters"][name] for name in study.space.names]
-    apart = np.max(np.abs(np.asarray(study.space.to_unit(np.array(values))) - x))
+    values = [result.optimum.parameters[name] for name in study.space.names]
+    apart = np.max(np.abs(np.asarray(study.space.to_unit(np.array(values, float))) - x))
     if apart > _SAME:
         raise InputError(
             f"plan: the optimum of these answers is {apart:.2g} of the ranges away from that of result.json; give the"

@@ -17,19 +17,17 @@ Aggregation, reports and the participant's own optimum are made from their answe
 docs/sessions.md has how many trials this saves (benchmarks/warm_start.py).
 """
 
-import hashlib
 import os
-from pathlib import Path
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
+from hilbo.study.typed_files import digest_of, read_bytes
 
 __all__ = ["SHARE", "WarmStart", "informed", "read_warm_start", "warm_point", "warm_start"]
 
@@ -86,25 +84,17 @@ def warm_point(
 
 
 def read_warm_start(path: str | os.PathLike, study: Study, seed: int = 0, share: float = SHARE) -> WarmStart:
-    """From the map.nc of a results folder, interpolated linearly. Raises InputError if it is of other parameters."""
-    import xarray as xr
+    """From the map.nc of a results folder, interpolated linearly. Raises InputError if it is of other parameters, or
+    damaged."""
     from scipy.interpolate import RegularGridInterpolator
 
-    try:
-        content = Path(path).read_bytes()
-        with xr.open_dataset(path, engine="h5netcdf") as opened:
-            grid = opened.load()
-        mean, variance = np.asarray(grid["mean"]), np.asarray(grid["variance"])
-    except (OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: is no map that can be read ({error}); give a results folder's map.nc.") from error
+    from hilbo.study.map_file import read_map
+
+    grid = read_map(path, study)
+    source = digest_of(read_bytes(path))
+    mean, variance = np.asarray(grid["mean"]), np.asarray(grid["variance"])
     sides = [np.linspace(0.0, 1.0, size) for size in mean.shape]
-    for parameter, side in zip(study.space.parameters, sides, strict=False):
-        here = np.asarray(parameter.to_physical(jnp.asarray(side)))
-        if parameter.name not in grid.coords or not np.allclose(grid[parameter.name], here, rtol=1e-6):
-            raise InputError(f"{path}: is a map of other parameters or ranges; give one of this study.")
-    if mean.ndim != study.space.dim:
-        raise InputError(f"{path}: is a slice of a map of more dimensions; a warm start needs all of them.")
     points = search_points(study.space, seed)
     at = np.asarray(points)
     values = [jnp.asarray(RegularGridInterpolator(sides, v)(at), points.dtype) for v in (mean, variance)]
-    return warm_start(study, points, *values, source=hashlib.sha256(content).hexdigest()[:16], share=share)
+    return warm_start(study, points, *values, source=source, share=share)

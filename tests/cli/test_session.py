@@ -114,6 +114,62 @@ def test_participants_are_listed_and_deleted(hilbo, tmp_path):
     assert "P01" not in (tmp_path / "participants.csv").read_text()
 
 
+def a_result(study, **changes):
+    """result.json as `hilbo aggregate` has it, as far as a plan needs it."""
+    people = [
+        {"participant": f"P0{i}", "trials": 6, "optimum": {"parameters": {"u": 0.2, "v": 0.1 * i}}} for i in (1, 2)
+    ]
+    optimum = {"parameters": {"u": 0.3, "v": 0.6}, "mean": 1.0}
+    return {"optimum": optimum, "participants": people, "study": study.hash, "seed": 0} | changes
+
+
+def no_number(value):
+    return {"optimum": {"parameters": {"u": value, "v": 0.6}}}
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        (no_number(float("nan")), "is no result.json"),
+        (no_number(None), "has no number for u"),
+        (no_number(1e308), "u of the optimum is 1e+308, it must be from 0 to 1"),
+        (no_number(-3), "u of the optimum is -3, it must be from 0 to 1"),
+        (no_number("x"), "is no result.json"),
+        ({"participants": [{"participant": "P01", "optimum": None}]}, "hold no individuals' optima"),
+        ({"participants": [{"participant": "P01", "optimum": {"parameters": {"u": 9, "v": 0}}}]}, "optimum of P01"),
+        ({"participants": [{"participant": "P01", "optimum": 7}]}, "is no result.json"),
+        ({"participants": []}, "holds no participants"),
+        ({"participants": [{"participant": "../P01"}]}, 'participant is "../P01"'),
+        ({"seed": "x"}, "is no result.json"),
+    ],
+)
+def test_a_plan_takes_no_result_that_is_none(hilbo, tmp_path, changes, sentence):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6))
+    study = Study.load("study.toml")
+    given = ("--participants", 2, "--kind", "aggregate-best", "--from", "result.json")
+    (tmp_path / "result.json").write_text(json.dumps(a_result(study)))
+    assert hilbo("plan", "study.toml", *given, "--out", "good.json")[0] == 0
+    (tmp_path / "result.json").write_text(json.dumps(a_result(study, **changes)))
+    code, _, err = hilbo("plan", "study.toml", *given)
+    assert code == 2 and err.startswith("hilbo: ") and err.count("\n") <= 2
+    assert sentence in err and "Traceback" not in err and not (tmp_path / "plan.json").exists()
+
+
+def test_a_result_that_was_changed_is_refused(hilbo, tmp_path):
+    from hilbo.report.participants import json_lines
+    from hilbo.study.typed_files import sealed
+
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6))
+    text = "".join(sealed(json_lines(a_result(Study.load("study.toml")))))
+    given = ("--participants", 2, "--kind", "aggregate-best", "--from", "result.json")
+    (tmp_path / "result.json").write_text(text)
+    assert hilbo("plan", "study.toml", *given, "--out", "good.json")[0] == 0
+    for changed in (text.replace("0.3", "0.4"), text.replace("P01", "P09"), text.replace("\n", "\r\n")):
+        (tmp_path / "result.json").write_bytes(changed.encode())
+        code, _, err = hilbo("plan", "study.toml", *given)
+        assert code == 2 and "has been changed since hilbo wrote it" in err
+
+
 def felt(point):
     apart = ((point["u"] - 0.3) ** 2 + (point["v"] - 0.6) ** 2) ** 0.5
     return "close" if apart < 0.2 else "similar" if apart < 0.4 else "different"

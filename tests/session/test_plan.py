@@ -14,9 +14,10 @@ from hilbo.session import actions as live
 from hilbo.session.actions import LiveSession
 from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue, warm_up
-from hilbo.session.plan_sets import aggregate_best_sets, check_participants, read_result
+from hilbo.session.plan_sets import aggregate_best_sets, check_participants
 from hilbo.session.views import participant_view
 from hilbo.study.protocols import protocol
+from hilbo.study.result_file import Result, read_result
 
 PEOPLE = [f"P{i:02d}" for i in range(1, 9)]
 SETS = {name: {"u": 0.1 + 0.3 * i, "v": 0.9 - 0.2 * i} for i, name in enumerate(("best", "mid", "worst"))}
@@ -83,7 +84,9 @@ def test_individual_sets_are_shown_to_their_owner_only():
     sets = {f"{person} {name}": values for person in PEOPLE for name, values in SETS.items()}
     plan = make_plan(STUDY, PEOPLE, 0, "validation", sets={"": sets}, source="individual")
     header = planned_header(plan, STUDY, "P02")
-    assert {n for n in header.sets if not n.startswith("warm-up")} == {f"P02 {name}" for name in SETS}
+    own = [name.split(" ") for name in header.sets if not name.startswith("warm-up")]
+    assert sorted(role for _, role in own) == sorted(SETS) and len({code for code, _ in own}) == 1
+    assert not any("P02" in name for name in header.sets)
     with pytest.raises(InputError, match="nobody else can be validated"):
         reissue(plan, "P02", "P30")
 
@@ -97,6 +100,49 @@ def test_aggregate_best_of_three_materials_rests_between_them():
     assert {block.count for block in header.blocks[1:]} == {48}
     names = {name for trial in header.blocks[2].trials for name in (trial.a, trial.b)}
     assert names <= set(header.sets) and len(names) == 25
+
+
+def test_a_plan_calls_nobodys_sets_by_their_id():
+    own = {f"individual:P{i:02d}": {"u": 0.04 * i, "v": 0.5} for i in range(1, 25)}
+    sets = {"": {"aggregate": SETS["best"]} | own}
+    plan = make_plan(STUDY, ["J01", "J02"], 0, "aggregate-best", sets=sets)
+    assert plan == make_plan(STUDY, ["J01", "J02"], 0, "aggregate-best", sets=sets)
+    header = planned_header(plan, STUDY, "J01")
+    named = [name for name in header.sets if name.startswith("individual:")]
+    assert len(named) == 24 and not any(person in json.dumps(plan) for person in own)
+    order = [header.sets[name]["u"] for name in named]
+    assert order != sorted(order)  # nor does their order say whose they are
+    assert {tuple(header.sets[name].items()) for name in named} == {tuple(values.items()) for values in own.values()}
+
+
+ROW = ("participants", 0, "header")
+FORGED_PLANS = {
+    "somebody else's session": ((*ROW, "participant"), "P02"),
+    "a participant who is a path": (("participants", 0, "participant"), "../P01"),
+    "no blocks": ((*ROW, "blocks"), []),
+    "a block that is none": ((*ROW, "blocks", 0), 7),
+    "a set out of range": ((*ROW, "sets", "best", "u"), 1e308),
+    "a set below its range": ((*ROW, "sets", "best", "u"), -3.0),
+    "a set that is no number": ((*ROW, "sets", "best", "u"), None),
+    "no sets": ((*ROW, "sets"), {}),
+    "a seed that is none": ((*ROW, "seed"), -1),
+    "nobody": (("participants",), []),
+    "participants that are none": (("participants",), 7),
+    "a source that is none": (("source",), "hearsay"),
+}
+
+
+@pytest.mark.parametrize("words", FORGED_PLANS)
+def test_a_plan_whose_hash_fits_and_says_what_cannot_be_is_refused(words):
+    plan = json.loads(json.dumps(make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate")))
+    (*way, last), value = FORGED_PLANS[words]
+    place = plan
+    for key in way:
+        place = place[key]
+    place[last] = value
+    plan["hash"] = plan_hash(plan)
+    with pytest.raises(InputError):
+        planned_header(plan, STUDY, "P01")
 
 
 def test_a_row_is_reissued_with_its_order_and_seed():
@@ -145,19 +191,20 @@ def result():
 def test_results_are_checked(tmp_path):
     path = tmp_path / "result.json"
     path.write_text(json.dumps(result()))
-    assert read_result(path, STUDY) == result()
-    assert set(aggregate_best_sets(STUDY, result())) == {"aggregate", "individual:P01", "individual:P02"}
+    found = read_result(path, STUDY)
+    assert found == msgspec.convert(result(), Result)
+    assert set(aggregate_best_sets(STUDY, found)) == {"aggregate", "individual:P01", "individual:P02"}
     with pytest.raises(InputError, match="result of another study"):
         read_result(path, MATERIALS)
     path.write_text("{}")
     with pytest.raises(InputError, match=r"is no result\.json"):
         read_result(path, STUDY)
-    check_participants(result(), ["V01"], "aggregate")
-    check_participants(result(), ["P01"], "individual")
+    check_participants(found, ["V01"], "aggregate")
+    check_participants(found, ["P01"], "individual")
     with pytest.raises(InputError, match="invite people who are not"):
-        check_participants(result(), ["V01", "P02"], "aggregate")
+        check_participants(found, ["V01", "P02"], "aggregate")
     with pytest.raises(InputError, match="no map of their own"):
-        check_participants(result(), ["V01"], "individual")
+        check_participants(found, ["V01"], "individual")
 
 
 def test_a_study_changes_protocols_and_texts():

@@ -1,0 +1,63 @@
+"""What a session's header has to be, wherever it comes from: a plan, a log, or the command line."""
+
+import math
+
+from hilbo.errors import InputError
+from hilbo.session.records import Block, Header
+from hilbo.study.config import Study
+from hilbo.study.protocols import protocol
+from hilbo.study.text_cells import check_id, check_text
+from hilbo.study.typed_files import check_values
+
+__all__ = ["check_header", "study_of"]
+
+_SCHEMA = 1
+_MOST = 100_000  # trials of a block
+_LABEL = 64  # characters of a session's label
+_DAY = 86_400.0  # s
+
+
+def study_of(study: Study, material: str | None) -> Study:
+    """The study of one material; None for a study, or a session, without."""
+    return study if material is None else study.material(material)
+
+
+def check_header(study: Study, header: Header) -> None:
+    """Refuse a header that no session of this study can have. Raises InputError."""
+    if header.schema != _SCHEMA:
+        raise InputError(f"the session's header is of schema {header.schema}; this hilbo knows {_SCHEMA}.")
+    check_id(header.participant, "the session's header")
+    check_text(header.session, "the session's label")
+    if not 0 < len(header.session) <= _LABEL or not header.session.isprintable():
+        raise InputError(f'the session\'s label is "{header.session[:_LABEL]}"; it has 1 to {_LABEL} characters.')
+    if not 0 <= header.seed < 2**63:
+        raise InputError(f"the session's seed is {header.seed}; it must be a whole number from 0.")
+    if not header.blocks:
+        raise InputError("the session's header has no blocks; there is nothing to ask.")
+    for number, block in enumerate(header.blocks, 1):
+        _check_block(study, header, block, f"block {number}")
+    for name, values in header.sets.items():
+        if not all(math.isfinite(value) for value in values.values()):
+            raise InputError(f'the set "{name}" of the session holds what is no finite number.')
+
+
+def _check_block(study: Study, header: Header, block: Block, place: str) -> None:
+    if not 0 <= block.count <= _MOST or not 0 <= block.rest <= _DAY:
+        raise InputError(f"{place} has {block.count} trials after {block.rest:g} s of rest, which is no session's.")
+    here = study_of(study, block.material)
+    if not block.trials:
+        if block.phase != "optimisation":
+            raise InputError(f"{place} is of the phase {block.phase} and has no planned trials.")
+        return
+    if block.count > len(block.trials):
+        raise InputError(f"{place} needs {block.count} trials and plans {len(block.trials)}.")
+    two = "b" in protocol(here.session, block.phase).sides
+    for planned in block.trials:
+        if (planned.b is not None) != two:
+            raise InputError(f"{place} has a trial of {1 + (not two)} renderings, its phase shows {1 + two}.")
+        for name in (planned.a, planned.b):
+            if name is not None and name not in header.sets:
+                raise InputError(f'{place} shows the set "{name}", which the session does not have.')
+            if name is not None:
+                check_text(name, "the name of a set", place)
+                check_values(header.sets[name], here.space.parameters, place, f'the set "{name}"')

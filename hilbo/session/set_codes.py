@@ -1,0 +1,55 @@
+"""Names of people's own sets: a code in the place of the participant's id.
+
+Others compare these sets, and their answers name them. A code is made from the sets' values alone, so that it leads to
+nobody once the results are gone in which the values stand beside the id.
+"""
+
+import json
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from hilbo.study.set_table import ROLES
+from hilbo.study.typed_files import digest_of
+
+__all__ = ["OWN", "Sets", "code_of", "coded", "set_codes"]
+
+OWN = "individual:"
+Sets = Mapping[str, Mapping[str, float]]
+"""Name of a set -> parameters in physical units."""
+
+
+def code_of(values: Any, taken: Iterable[str] = ()) -> str:
+    """The code of some values; with a number behind it where another person has the same ones."""
+    code = "s" + digest_of(json.dumps(values, sort_keys=True).encode())[:8]
+    again = sum(other.partition("-")[0] == code for other in taken)
+    return f"{code}-{again + 1}" if again else code
+
+
+def set_codes(sets: Mapping[str, Sets]) -> dict[str, str]:
+    """Participant -> the code that stands for them in names of sets. `sets`: material -> name -> parameters."""
+    values: dict[str, list[Any]] = {}
+    for material, here in sets.items():
+        for name, parameters in here.items():
+            if person := _person(name):
+                what = name.removesuffix(person).removeprefix(person)
+                values.setdefault(person, []).append([material, what, sorted(parameters.items())])
+    codes: dict[str, str] = {}
+    for person, found in values.items():
+        codes[person] = code_of(sorted(found), codes.values())
+    return codes
+
+
+def coded(name: str, codes: Mapping[str, str]) -> str:
+    """The name of a set with the code in the place of the participant."""
+    person = _person(name)
+    if not person:
+        return name
+    return OWN + codes[person] if name.startswith(OWN) else codes[person] + name.removeprefix(person)
+
+
+def _person(name: str) -> str:
+    """Who a set is named after; nobody for sets of the population."""
+    if name.startswith(OWN):
+        return name.removeprefix(OWN)
+    before, _, role = name.rpartition(" ")
+    return before if role in ROLES else ""

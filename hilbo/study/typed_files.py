@@ -1,0 +1,100 @@
+"""Reading what hilbo itself has written: typed JSON, and the digest by which an accidental change is seen.
+
+A digest is the SHA-256 of what stands before it. It shows damage, and an edit by somebody who did not know of it; it
+has no secret, so that it proves nothing against somebody who means to forge.
+"""
+
+import hashlib
+import math
+import os
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.search.space import Parameter
+
+__all__ = ["check_values", "converted", "decoded", "digest_of", "read_bytes", "sealed", "unsealed"]
+
+_SEAL = re.compile(rb',\n  "digest": "([0-9a-f]{16})"\n\}\n\Z')
+_END = "\n}\n"
+_SLACK = 1e-9  # of a parameter's range: what rounding may do
+
+
+def read_bytes(path: str | os.PathLike) -> bytes:
+    """The content of a file. Raises InputError."""
+    try:
+        return Path(path).read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
+
+
+def decoded(content: bytes, kind: Any, source: str, what: str) -> Any:
+    """JSON as a record of this type. `what`: what the file should be and where it comes from, ends the sentence.
+
+    Raises InputError.
+    """
+    try:
+        return msgspec.json.decode(content, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise InputError(f"{source}: {what} ({error}).") from error
+
+
+def converted(raw: Any, kind: Any, source: str, what: str) -> Any:
+    """As `decoded`, from plain Python data."""
+    try:
+        return msgspec.convert(raw, kind)
+    except (msgspec.ValidationError, RecursionError) as error:
+        raise InputError(f"{source}: {what} ({error}).") from error
+
+
+def digest_of(content: bytes) -> str:
+    """First 16 hex digits of the SHA-256."""
+    return hashlib.sha256(content).hexdigest()[:16]
+
+
+def sealed(pieces: Iterable[str]) -> Iterator[str]:
+    """The text of a JSON object in pieces, the last of which closes it, with the digest of the text as its last key."""
+    hashed, held = hashlib.sha256(), ""
+    for piece in pieces:
+        hashed.update(held.encode())
+        yield held
+        held = piece
+    before = held.removesuffix(_END)
+    hashed.update(before.encode())
+    yield f'{before},\n  "digest": "{hashed.hexdigest()[:16]}"{_END}'
+
+
+def unsealed(content: bytes, digest: str | None, source: str) -> None:
+    """Refuse a file whose `digest` is not that of its text. Files without one are as they are."""
+    if digest is None:
+        return
+    match = _SEAL.search(content)
+    if match is None or match[1].decode() != digest or digest_of(content[: match.start()]) != digest:
+        raise InputError(
+            f"{source}: has been changed since hilbo wrote it (its digest does not fit); restore it from a copy, or"
+            " make it again."
+        )
+
+
+def check_values(
+    values: Mapping[str, float | None], parameters: Iterable[Parameter], source: str, what: str
+) -> dict[str, float]:
+    """A rendering's parameters in physical units, each a finite number in the study's range. Raises InputError."""
+    found = {}
+    for parameter in parameters:
+        value = values.get(parameter.name)
+        slack = _SLACK * (parameter.high - parameter.low)
+        if value is None or not math.isfinite(value):
+            raise InputError(f"{source}: {what} has no number for {parameter.name}; make the file again.")
+        if not parameter.low - slack <= value <= parameter.high + slack:
+            raise InputError(
+                f"{source}: {parameter.name} of {what} is {value:g}, it must be from {parameter.low:g} to"
+                f" {parameter.high:g} {parameter.unit}".rstrip()
+                + ", the study's range; make the file again."
+            )
+        found[parameter.name] = float(value)
+    return found
