@@ -1,0 +1,379 @@
+"""The hierarchical model with a smooth shared function, at a cost that is linear in people.
+
+    f_j = g + h_j,   cov(g) = shared k,   cov(h_j) = own k,   an answer of person j by edges of their own
+
+A smooth g is known from few points: with Z the pivots of an incomplete Cholesky factorisation of k at all answered
+points, L L' = k(Z, Z) and the features phi(x) = L^-1 k(Z, x), k(x, y) = phi(x)'phi(y) to an error that the
+factorisation states. What is left between two answers of one person is kept, so that only covariances between people
+are approximate. All answers then have the covariance
+
+    K = F F' + blockdiag(K_j),   F_j = shared^(1/2) phi(x_j)',   K_j = own k(x_j, x_j) + what F_j F_j' lacks,
+
+and with W the curvatures, L_j L_j' = I + W_j^(1/2) K_j W_j^(1/2), A_j = L_j^-1 W_j^(1/2) F_j and S = I + sum_j A_j'A_j
+every system is solved by blocks of one person's answers and one of r x r: M n^3 + M n^2 r + M n r^2 + r^3 in place of
+(M n)^3. S is the posterior precision of the weights of g, g(x) = shared^(1/2) phi(x)'w.
+
+Laplace's method by Newton's steps, halved where the log posterior would fall. The evidence has exact first derivatives:
+a last step from the mode, whose derivative in its start is 0 there. References: Rasmussen & Williams (2006), sections
+3.4 and 5.5.1; Snelson & Ghahramani (2007), AISTATS, for what is kept within a block; Harbrecht, Peters & Schneider
+(2012), Applied Numerical Mathematics 62:428, for the factorisation.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
+from hilbo.kernels import RBF, gram
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.linalg import eigh
+from hilbo.ordinal_gp import OrdinalGP, OrdinalTerms, Posterior, Trials
+
+__all__ = [
+    "TOLERANCE",
+    "PeopleModel",
+    "SharedEvidence",
+    "rank_for",
+    "shared_evidence",
+    "shared_function",
+]
+
+TOLERANCE = 1e-6
+"""Largest part of the prior variance of g that the features may leave at an answered point."""
+_RANKS = (32, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
+_STEPS, _HALVINGS = 60, 40
+
+
+class PeopleModel(eqx.Module):
+    """The hyperparameters of the hierarchical model of M people."""
+
+    theta: Float[Array, " d"]
+    """Inverse squared lengths, per squared unit of x."""
+    shared: Float[Array, ""]
+    """Prior variance of g."""
+    own: Float[Array, ""]
+    """Prior variance of each h_j."""
+    thresholds: Float[Array, " edges"]
+    noise: Float[Array, ""]
+    log_widths: Float[Array, " M"]
+    """Logarithm of each person's distances between thresholds, about their middle, in units of those above."""
+
+    @property
+    def share(self) -> Float[Array, ""]:
+        """The part of a person's prior variance that all people have in common."""
+        return self.shared / (self.shared + self.own)
+
+    @property
+    def gp(self) -> OrdinalGP:
+        """One person's model, with the median widths."""
+        return OrdinalGP(RBF(self.theta, self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
+
+    @property
+    def person_thresholds(self) -> Float[Array, "M edges"]:
+        """Everybody's thresholds (M, C - 1)."""
+        middle = jnp.mean(self.thresholds)
+        return middle + jnp.exp(self.log_widths)[:, None] * (self.thresholds - middle)[None, :]
+
+
+# --- features of the shared function
+
+
+class Pivots(NamedTuple):
+    """Answered points from which the shared function is known."""
+
+    points: Float[Array, "r d"]
+    used: Bool[Array, " r"]
+    left: Float[Array, ""]
+    """Largest part of the prior variance of g, at an answered point, that they do not explain."""
+
+
+def _pivots(theta: Float[Array, " d"], trials: Trials, rank: int, tolerance: ArrayLike) -> Pivots:
+    """At most `rank` of the points of stacked trials (M, n), each where the ones before explain least."""
+    x = trials.x.reshape(-1, trials.x.shape[-1])
+    kernel = RBF(theta, jnp.ones_like(theta[0]))
+    start = trials.mask.reshape(-1).astype(x.dtype)
+
+    def going(state):
+        count, _, left, _ = state
+        return (count < rank) & (jnp.max(left) > tolerance)
+
+    def choose(state):
+        count, rows, left, chosen = state
+        place = jnp.argmax(left)
+        column = jax.vmap(lambda y: kernel(x[place], y))(x)
+        row = (column - rows[:, place] @ rows) / jnp.sqrt(left[place])
+        return count + 1, rows.at[count].set(row), (left - row**2).at[place].set(0.0), chosen.at[count].set(place)
+
+    begin = (jnp.asarray(0), jnp.zeros((rank, x.shape[0]), x.dtype), start, jnp.zeros(rank, int))
+    count, _, left, chosen = jax.lax.while_loop(going, choose, begin)
+    return Pivots(x[chosen], jnp.arange(rank) < count, jnp.max(left))
+
+
+@eqx.filter_jit
+def _unexplained(theta: Float[Array, " d"], trials: Trials, rank: int, tolerance: ArrayLike) -> Float[Array, ""]:
+    return _pivots(theta, trials, rank, tolerance).left
+
+
+def rank_for(theta: Float[Array, " d"], trials: Trials, tolerance: float = TOLERANCE) -> int:
+    """The number of features, from a short list, that g takes at these lengths; all points, or the largest, at most."""
+    answers = int(np.asarray(trials.mask).sum())
+    for rank in _RANKS:
+        if rank >= answers or float(_unexplained(theta, trials, rank, tolerance)) <= tolerance:
+            return rank
+    return _RANKS[-1]
+
+
+def _root_of_pivots(theta: Float[Array, " d"], pivots: Pivots) -> Float[Array, "r r"]:
+    """L, with ones on the diagonal in place of pivots that are not used."""
+    both = pivots.used[:, None] & pivots.used[None, :]
+    covariance = gram(RBF(theta, jnp.ones_like(theta[0])), pivots.points, pivots.points)
+    return jnp.linalg.cholesky(jnp.where(both, covariance, jnp.eye(len(pivots.used), dtype=covariance.dtype)))
+
+
+def _features(theta: Float[Array, " d"], pivots: Pivots, x: Float[Array, "M n d"]) -> Float[Array, "M n r"]:
+    """phi(x)' of everybody's points."""
+    cross = gram(RBF(theta, jnp.ones_like(theta[0])), pivots.points, x.reshape(-1, x.shape[-1]))
+    cross = jnp.where(pivots.used[:, None], cross, 0.0)
+    solved = solve_triangular(_root_of_pivots(theta, pivots), cross, lower=True)
+    return solved.T.reshape(*x.shape[:2], -1)
+
+
+# --- the prior, and what answers make of it
+
+
+class _Prior(NamedTuple):
+    """K = F F' + blockdiag(K_j)."""
+
+    features: Float[Array, "M n r"]
+    blocks: Float[Array, "M n n"]
+
+    def times(self, weights: Float[Array, "M n"]) -> Float[Array, "M n"]:
+        """K a."""
+        together = jnp.einsum("jnr,jn->r", self.features, weights)
+        return self.features @ together + jnp.einsum("jnm,jm->jn", self.blocks, weights)
+
+
+class _System(NamedTuple):
+    root: Float[Array, "M n"]  # W^(1/2)
+    lower: Float[Array, "M n n"]  # L_j
+    half: Float[Array, "M n r"]  # A_j
+    precision: Float[Array, "r r"]  # S
+    factor: Float[Array, "r r"]  # its triangular factor
+    log_determinant: Float[Array, ""]  # log |I + K W|
+
+    def solve(self, right: Float[Array, "M n"]) -> Float[Array, "M n"]:
+        """(K + W^-1)^-1 y, which needs no W^-1."""
+        first = jax.lax.map(lambda p: solve_triangular(p[0], p[1], lower=True), (self.lower, self.root * right))
+        together = jax.scipy.linalg.cho_solve((self.factor, True), jnp.einsum("jnr,jn->r", self.half, first))
+        rest = first - self.half @ together
+        return self.root * jax.lax.map(lambda p: solve_triangular(p[0], p[1], lower=True, trans=1), (self.lower, rest))
+
+
+def _prior(model: PeopleModel, trials: Trials, pivots: Pivots) -> _Prior:
+    unit = _features(model.theta, pivots, trials.x)
+    kernel = RBF(model.theta, jnp.ones_like(model.shared))
+
+    def block(person):
+        x, own_features = person
+        covariance = gram(kernel, x, x)
+        return model.own * covariance + model.shared * (covariance - own_features @ own_features.T)
+
+    return _Prior(jnp.sqrt(model.shared) * unit, jax.lax.map(block, (trials.x, unit)))
+
+
+def _system(prior: _Prior, curvature: Float[Array, "M n"]) -> _System:
+    answered = curvature > 0
+    root = jnp.where(answered, jnp.sqrt(jnp.where(answered, curvature, 1.0)), 0.0)
+    unit = jnp.eye(root.shape[1], dtype=root.dtype)
+
+    def person(block, features, root):
+        lower = jnp.linalg.cholesky(unit + root[:, None] * block * root[None, :])
+        return lower, solve_triangular(lower, root[:, None] * features, lower=True)
+
+    lower, half = jax.lax.map(lambda p: person(*p), (prior.blocks, prior.features, root))
+    flat = half.reshape(-1, half.shape[2])
+    precision = jnp.eye(half.shape[2], dtype=root.dtype) + flat.T @ flat
+    factor = jnp.linalg.cholesky(precision)
+    logs = jnp.sum(jnp.log(jnp.diagonal(lower, axis1=1, axis2=2))) + jnp.sum(jnp.log(jnp.diagonal(factor)))
+    return _System(root, lower, half, precision, factor, 2.0 * logs)
+
+
+def _expand(
+    model: PeopleModel, trials: Trials, eta: Float[Array, "M n"]
+) -> tuple[Float[Array, "M n"], Float[Array, "M n"], Float[Array, "M n"]]:
+    """Log-likelihood terms, slopes and curvatures of everybody's answers."""
+
+    def person(thresholds, q, mask, eta):
+        return OrdinalTerms(OrdinalProbit(thresholds, model.noise), q, mask)(eta)
+
+    return jax.vmap(person)(model.person_thresholds, trials.q, trials.mask, eta)
+
+
+# --- the mode
+
+
+class _Mode(NamedTuple):
+    weights: Float[Array, "M n"]
+    residual: Float[Array, ""]
+    tolerance: Float[Array, ""]
+    steps: Int[Array, ""]
+
+
+def _newton_step(
+    model: PeopleModel, trials: Trials, prior: _Prior, weights: Float[Array, "M n"]
+) -> tuple[Float[Array, "M n"], _System]:
+    """a + r - (K + W^-1)^-1 K r, r = slope - a: an error of the step is one of r's size."""
+    _, slope, curvature = _expand(model, trials, prior.times(weights))
+    system = _system(prior, curvature)
+    off = slope - weights
+    return weights + off - system.solve(prior.times(off)), system
+
+
+def _mode(model: PeopleModel, trials: Trials, prior: _Prior, start: Float[Array, "M n"]) -> _Mode:
+    """Newton's steps on the weights, from `start`; the residual is that of `laplace`."""
+    epsilon = jnp.finfo(start.dtype).eps
+
+    def height(weights):
+        eta = prior.times(weights)
+        values, slope, curvature = _expand(model, trials, eta)
+        value, size = jnp.sum(values) - 0.5 * jnp.sum(weights * eta), jnp.sum(jnp.abs(values))
+        off = slope - weights
+        summed = jnp.abs(slope) + curvature * jnp.abs(eta) + jnp.abs(weights)
+        residual, rounding = (
+            jnp.sqrt(jnp.linalg.norm(vector) * jnp.linalg.norm(prior.times(vector))) for vector in (off, summed)
+        )
+        tolerance = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
+        return value, size + 0.5 * jnp.abs(jnp.sum(weights * eta)), residual, tolerance
+
+    def going(state):
+        _, (_, _, residual, tolerance), steps, risen = state
+        return risen & (residual > tolerance) & (steps < _STEPS)
+
+    def forward(state):
+        weights, (value, size, _, _), steps, _ = state
+        full, _ = _newton_step(model, trials, prior, weights)
+
+        def lower(trial):
+            scale, (reached, _, _, _) = trial
+            fell = ~(reached >= value - 8.0 * epsilon * size)
+            return fell & (scale > 0.5**_HALVINGS)
+
+        def shorter(trial):
+            scale = 0.5 * trial[0]
+            return scale, height(weights + scale * (full - weights))
+
+        scale, reached = jax.lax.while_loop(lower, shorter, (jnp.ones_like(value), height(full)))
+        risen = reached[0] >= value - 8.0 * epsilon * size
+        moved = jnp.where(scale == 1.0, full, weights + scale * (full - weights))
+        kept = jax.tree.map(lambda new, old: jnp.where(risen, new, old), (moved, reached), (weights, state[1]))
+        return *kept, steps + 1, risen
+
+    first = start, height(start), jnp.asarray(0), jnp.asarray(True)
+    weights, (_, _, residual, tolerance), steps, _ = jax.lax.while_loop(going, forward, first)
+    return _Mode(weights, residual, tolerance, steps)
+
+
+class SharedEvidence(NamedTuple):
+    """Laplace's log evidence of all answers, and how it was found."""
+
+    value: Float[Array, ""]
+    weights: Float[Array, "M n"]
+    """Near which the mode of similar hyperparameters is."""
+    arrived: Bool[Array, ""]
+    left: Float[Array, ""]
+    """Largest part of the prior variance of g, at an answered point, without a feature."""
+
+
+def shared_evidence(
+    model: PeopleModel, trials: Trials, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
+) -> SharedEvidence:
+    """Log evidence of stacked trials (M, n), differentiable once in `model`.
+
+    **Arguments:** `start`: weights near which the mode is sought; `rank`: features of g, at most; `tolerance`: of g's
+    prior variance, the part that they may leave.
+    """
+    still = jax.lax.stop_gradient
+    pivots = _pivots(still(model.theta), trials, rank, tolerance)
+    prior = _prior(model, trials, pivots)
+    mode = still(_mode(still(model), trials, still(prior), start))
+    weights, _ = _newton_step(model, trials, prior, mode.weights)
+    value, _ = _value(model, trials, prior, weights)
+    arrived = (mode.residual <= mode.tolerance) & jnp.isfinite(value)
+    return SharedEvidence(value, mode.weights, arrived, pivots.left)
+
+
+@eqx.filter_jit
+def shared_function(
+    model: PeopleModel, trials: Trials, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
+) -> Posterior:
+    """Posterior of the shared function g, as a GP of its prior that was asked at the pivots; arguments as above.
+
+    What all answers say of g goes through its weights w, of precision S and mean F'a: with L L' = k(Z, Z) the mean is
+    k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Never raises: read
+    `certificate.converged`.
+    """
+    pivots = _pivots(model.theta, trials, rank, tolerance)
+    prior = _prior(model, trials, pivots)
+    mode = _mode(model, trials, prior, start)
+    value, system = _value(model, trials, prior, mode.weights)
+    # One step more changes the evidence by what is left of the way, or more.
+    further, _ = _newton_step(model, trials, prior, mode.weights)
+    error = jnp.abs(_value(model, trials, prior, further)[0] - value)
+
+    root = jnp.sqrt(model.shared) * _root_of_pivots(model.theta, pivots)
+    together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
+    weights = jnp.where(pivots.used, solve_triangular(root, together, lower=True, trans=1), 0.0)
+    excess, vectors = eigh(system.precision - jnp.eye(root.shape[0], dtype=root.dtype))
+    known = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
+    factor = known[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
+    factor = jnp.where(pivots.used[None, :], factor, 0.0)
+
+    kernel = RBF(model.theta, model.shared)
+    covariance = gram(kernel, pivots.points, pivots.points)
+    smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
+    rounding = _rounding(model, trials, mode.weights, covariance, weights)
+    certificate = Certificate(
+        residual=mode.residual,
+        tolerance=mode.tolerance,
+        iterations=mode.steps,
+        jitter=pivots.left,
+        condition=jnp.linalg.norm(system.precision),
+        smallest_variance=smallest,
+        variance_resolution=jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5,
+        evidence_error=error,
+        evidence_tolerance=evidence_tolerance(value),
+        evidence_rounding=rounding,
+        converged=(mode.residual <= mode.tolerance) & evidence_known(value, error, rounding),
+    )
+    latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, value, certificate)
+    asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.used)
+    return Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
+
+
+def _value(
+    model: PeopleModel, trials: Trials, prior: _Prior, weights: Float[Array, "M n"]
+) -> tuple[Float[Array, ""], _System]:
+    """The log evidence at some weights, and the system there."""
+    eta = prior.times(weights)
+    values, _, curvature = _expand(model, trials, eta)
+    system = _system(prior, curvature)
+    return jnp.sum(values) - 0.5 * jnp.sum(weights * eta) - 0.5 * system.log_determinant, system
+
+
+def _rounding(
+    model: PeopleModel,
+    trials: Trials,
+    weights: Float[Array, "M n"],
+    covariance: Float[Array, "r r"],
+    of_pivots: Float[Array, " r"],
+) -> Float[Array, ""]:
+    """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
+    kernel = RBF(model.theta, model.own)
+    each = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (trials.x, weights))
+    return jnp.linalg.norm(each) + evidence_rounding(covariance, of_pivots[None, :])
