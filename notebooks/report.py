@@ -61,7 +61,7 @@ for number, (name, truth) in enumerate(MATERIALS.items()):
     cohort = cohort_of(read_trials(folder / "one.csv", study), study)
     aggregate = aggregate_cohort(study, cohort, alternatives=False)
     three = best_mid_worst(study, aggregate.surface, search_points(study.space, 0), known=0.95)
-    renderings = sets_table(study, three, np.asarray(aggregate.individuals.x), cohort.names)
+    renderings = sets_table(study, three, np.asarray(aggregate.individuals.x))
     judged = validation_table(study, population, renderings, participants=8, judges=4, seed=number)
     prefix = f"{name}: "
     sets.append(renderings.assign(set_id=prefix + renderings["set_id"], material=name))

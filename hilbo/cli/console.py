@@ -5,10 +5,10 @@ and nothing is overwritten without `--force`. Progress goes to stderr, results w
 """
 
 import contextlib
-import hashlib
 import json
 import math
 import os
+import shlex
 import shutil
 import sys
 import tempfile
@@ -21,6 +21,7 @@ import typer
 
 from hilbo.errors import InputError
 from hilbo.numerics.compiling import set_flags
+from hilbo.study.results_list import LIST, digest, list_files, listed
 
 __all__ = [
     "PARTS",
@@ -47,7 +48,6 @@ Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.
 
 PARTS = ("video-quality", "simulated-memory-foam")
 _EVERY = 10.0  # s
-_MANIFEST = ".hilbo.json"
 
 
 def start(devices: int | None = None) -> None:
@@ -82,7 +82,7 @@ def results(out: Path, force: bool) -> Iterator[Path]:
     try:
         yield made
         made.chmod(0o755)
-        _list_files(made)
+        list_files(made, shlex.join(["hilbo", *sys.argv[1:]]), os.getcwd())
         if out.exists():
             shutil.rmtree(out)
         made.rename(out)
@@ -98,35 +98,13 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{out}: is a file; choose a folder for --out.")
     if any(out.iterdir()) and not force:
         raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
-    ours = _listed(out)
+    ours = listed(out).files
     for path in sorted(path for path in out.rglob("*") if not path.is_dir()):
         name = path.relative_to(out).as_posix()
-        if name not in ours and name != _MANIFEST:
+        if name not in ours and name != LIST:
             raise InputError(f"{path}: is not a result of hilbo's; choose another --out, so that it is not lost.")
-        if name in ours and _digest(path) != ours[name]:
+        if name in ours and digest(path) != ours[name]:
             raise InputError(f"{path}: has been changed since hilbo wrote it; choose another --out, or delete it.")
-
-
-def _listed(folder: Path) -> dict[str, str]:
-    """The files that hilbo wrote into a folder, and what they held; none if it did not write that folder."""
-    try:
-        listed = json.loads((folder / _MANIFEST).read_bytes())
-    except (OSError, ValueError):
-        return {}
-    return listed if isinstance(listed, dict) else {}
-
-
-def _list_files(folder: Path) -> None:
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    listed = {path.relative_to(folder).as_posix(): _digest(path) for path in files}
-    (folder / _MANIFEST).write_text(json.dumps(listed, indent=0), encoding="utf-8")
-
-
-def _digest(path: Path) -> str:
-    if not path.is_file():
-        return ""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 class Say(Protocol):

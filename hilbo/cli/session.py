@@ -117,13 +117,22 @@ def delete(
     participant: Annotated[str, typer.Argument(help="Pseudonymous id.")],
     yes: Annotated[bool, typer.Option("--yes", help="Do it; without, nothing is touched.")] = False,
 ) -> None:
-    """Remove one participant from the list, the logs and every exported table below a folder."""
-    from hilbo.session.participants import delete_participant
+    """Remove one participant who withdraws from everything below a folder, and say all that was done and left."""
+    from hilbo.session.withdrawal import delete_participant
 
     if not yes:
         raise InputError(f"this removes everything of participant {participant} below {folder}; add --yes to do it.")
-    for path, count in delete_participant(folder, participant).items():
+    done = delete_participant(folder, participant)
+    for path, count in done.removed.items():
         typer.echo(f"{path}: {count} removed", err=True)
+    for path, count in done.renamed.items():
+        typer.echo(f"{path}: {count} of what others have stays, under the name {done.label}", err=True)
+    for path in done.marked:
+        typer.echo(f"{path}: says that the results beside it were made before", err=True)
+    for path, why in done.left.items():
+        typer.echo(f"{path}: LEFT; {why}", err=True)
+    for command in done.commands:
+        typer.echo(f"make again: {command}", err=True)
 
 
 def _people(count, names, letter) -> list[str]:

@@ -124,7 +124,7 @@ def simulated_report(folder: Path, seed: int, say: Callable[..., None], count: i
     if analysis.sets is not None:
         say("simulated validation sessions")
         individual_optima = np.asarray(analysis.aggregate.individuals.x)
-        sets = sets_table(study, analysis.sets, individual_optima, analysis.cohort.names)
+        sets = sets_table(study, analysis.sets, individual_optima)
         sets.to_csv(folder / "sets.csv", index=False)
         validation_table(study, population, sets, seed=seed).to_csv(folder / "validation.csv", index=False)
     return write_study(read_folder(folder), folder, seed, say, {material.name: analysis}, comparison=False)

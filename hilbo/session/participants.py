@@ -1,4 +1,4 @@
-"""participants.csv: who takes part, by pseudonymous id, apart from all answers; and how somebody is deleted.
+"""participants.csv: who takes part, by pseudonymous id, apart from all answers.
 
 Columns: participant, consent_time (ISO 8601), protocol_number, optional age and handedness; others are kept. Consent
 and the protocol's number must stand there before the first trial.
@@ -12,10 +12,9 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from hilbo.errors import InputError
-from hilbo.session.event_log import in_use, log_paths, read_log
 from hilbo.study.text_cells import check_id
 
-__all__ = ["COLUMNS", "add_person", "check_consent", "delete_participant", "read_people"]
+__all__ = ["COLUMNS", "add_person", "check_consent", "read_people"]
 
 COLUMNS = ("participant", "consent_time", "protocol_number", "age", "handedness")
 _NEEDED = ("participant", "consent_time", "protocol_number")
@@ -82,47 +81,6 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
     return row
 
 
-def delete_participant(folder: str | os.PathLike, participant: str) -> dict[str, int]:
-    """Remove one participant from everything below a folder: their logs, their keys, and their rows of every CSV and
-    netCDF table (and in sets tables their own sets). File -> rows or files removed. Raises InputError if nothing is
-    there, or one of their sessions is running.
-
-    A plan made in advance keeps the id, and logs of others keep sets that were read from this person's map.
-    """
-    root = Path(folder)
-    whose = {path: read_log(path)[0].participant for sub in _folders(root) for path in log_paths(sub)}
-    logs = [path for path, person in whose.items() if person == participant]
-    for path in logs:
-        if in_use(path):
-            raise InputError(f"{path}: is being written; end the session first.")
-    changed: dict[str, int] = {}
-    for path in [*logs, *_keys(root, participant, set(whose.values()))]:
-        path.unlink()
-        changed[str(path)] = 1
-    for path in sorted(root.rglob("*.csv")):
-        if count := _without(path, participant):
-            changed[str(path)] = count
-    for path in sorted(root.rglob("*.nc")):
-        if count := _netcdf_without(path, participant):
-            changed[str(path)] = count
-    if not changed:
-        raise InputError(f'{folder}: holds nothing of participant "{participant}"; check id and folder.')
-    return changed
-
-
-def _folders(root):
-    return sorted({root, *(path.parent for path in root.rglob("*.session.jsonl"))})
-
-
-def _keys(root, participant, people):
-    """The files of keys of one participant's sessions, .ID-SESSION.keys; not those of somebody whose id begins so."""
-    longer = tuple(f".{person}-" for person in people if person.startswith(f"{participant}-"))
-    found = (path for end in ("*.keys", "*.keys.part") for path in root.rglob(end))
-    return sorted(
-        path for path in found if path.name.startswith(f".{participant}-") and not path.name.startswith(longer)
-    )
-
-
 def _check(row, place):
     check_id(row.get("participant", ""), place)
     if row.get("consent_time"):
@@ -157,47 +115,3 @@ def _replace(path, rows):
     except BaseException:
         Path(made).unlink(missing_ok=True)
         raise
-
-
-def _without(path, participant):
-    """Rewrite a CSV table without one participant; how many rows went."""
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error):
-        return 0
-    head = rows[0] if rows else []
-    theirs = {"participant": participant, "source": f"individual:{participant}"}
-    wanted = [(head.index(column), value) for column, value in theirs.items() if column in head]
-    kept = [row for row in rows[1:] if not any(len(row) > i and row[i] == value for i, value in wanted)]
-    removed = len(rows) - 1 - len(kept)
-    if wanted and removed:
-        _replace(path, [head, *kept])
-        return removed
-    return 0
-
-
-def _netcdf_without(path, participant):
-    """As `_without`, for a netCDF file with a dimension `participant`, or with a `participant` of every `obs_id`."""
-    import xarray as xr
-
-    try:
-        with xr.open_datatree(path, engine="h5netcdf") as opened:
-            groups = {node.path: node.to_dataset(inherit=False).load() for node in opened.subtree}
-    except (OSError, ValueError):
-        return 0
-    keep = {}
-    for group in groups.values():
-        if "participant" in group and group["participant"].dims in (("participant",), ("obs_id",)):
-            keep[group["participant"].dims[0]] = group["participant"].values != participant
-    removed = max((int((~kept).sum()) for kept in keep.values()), default=0)
-    if removed:
-        here = {name: {dim: kept for dim, kept in keep.items() if dim in g.dims} for name, g in groups.items()}
-        tree = xr.DataTree.from_dict({name: group.isel(here[name]).drop_encoding() for name, group in groups.items()})
-        made = path.with_name(f".{path.name}-new")
-        try:
-            tree.to_netcdf(made, engine="h5netcdf")
-            os.replace(made, path)
-        finally:
-            made.unlink(missing_ok=True)
-    return removed

@@ -13,6 +13,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from hilbo.search.rendering import set_of
+from hilbo.session.set_codes import OWN, code_of
 from hilbo.simulation.simulate import Person, Population, people
 from hilbo.study.config import Study
 from hilbo.study.map_summary import Sets
@@ -23,17 +24,18 @@ _TIMES = 4  # that a participant compares a pair of best, mid and worst
 _TWICE = 2  # that a judge compares an individual's set with the aggregate's
 
 
-def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"], names: tuple[str, ...]) -> pd.DataFrame:
-    """Best, mid and worst of the aggregate map (the aggregate's set is best), and everybody's own: a sets table with
-    a column `role`."""
+def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"]) -> pd.DataFrame:
+    """Best, mid and worst of the aggregate map (the aggregate's set is best), and everybody's own under a code, as in a
+    plan: a sets table with a column `role`."""
     rows = [
         {"set_id": role, "source": "aggregate", "role": role} | set_of(study.space, x)
         for role, x in zip(("best", "mid", "worst"), np.asarray(sets.x), strict=True)
     ]
-    rows += [
-        {"set_id": f"own-{name}", "source": f"individual:{name}", "role": ""} | set_of(study.space, x)
-        for name, x in zip(names, individuals, strict=True)
-    ]
+    own: dict[str, dict[str, float]] = {}
+    for x in individuals:
+        values = set_of(study.space, x)
+        own[code_of(sorted(values.items()), own)] = values
+    rows += [{"set_id": f"own-{code}", "source": OWN + code, "role": ""} | own[code] for code in sorted(own)]
     table = pd.DataFrame(rows)
     mechanics = study.space.mechanics
     return table if mechanics is None else table.assign(N=mechanics.N, T=mechanics.T)

@@ -92,8 +92,13 @@ def test_simulated_judges_prefer_what_is_nearer():
     truth = np.array([5.70, 5.89, 0.203])
     near = study.space.to_unit(truth)
     x = jnp.stack([jnp.asarray(near), jnp.asarray(near) + 0.1, jnp.array([0.05, 0.95, 0.9])])
-    sets = sets_table(study, Sets(x, jnp.zeros(3), jnp.ones(3)), np.asarray(x)[2:], ("P01",))
-    assert sets["set_id"].tolist() == ["best", "mid", "worst", "own-P01"] and sets["N"].eq(101).all()
+    sets = sets_table(study, Sets(x, jnp.zeros(3), jnp.ones(3)), np.asarray(x)[2:])
+    code = sets["source"].iloc[3].removeprefix("individual:")
+    assert (
+        sets["set_id"].tolist() == ["best", "mid", "worst", f"own-{code}"]
+        and code.startswith("s")
+        and sets["N"].eq(101).all()
+    )
     found = validate(validation_table(study, PRESETS["paper"], sets, seed=3), sets.set_index("set_id"))
     rates = found.tables.preferences.drop_duplicates(["set", "over"]).set_index(["set", "over"])["rate"]
     assert rates["best", "worst"] > 0.8 and rates["mid", "worst"] > 0.8 and found.comparisons == 20 * 12 + 8 * 2

@@ -14,7 +14,8 @@ from live import STUDY, Driver
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.export import netcdf, psych_ds, read_log_trials, read_sessions, sets_table, trials_table
-from hilbo.session.participants import add_person, check_consent, delete_participant, read_people
+from hilbo.session.participants import add_person, check_consent, read_people
+from hilbo.session.withdrawal import delete_participant
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import cohort_of
 from hilbo.study.inference_data import groups, write_groups
@@ -111,7 +112,7 @@ def test_one_participant_is_deleted_from_everything(folder, tmp_path):
     for person in ("P01", "P02", "P03"):
         add_person(people, {"participant": person, "consent_time": "2026-05-04T10:00", "protocol_number": "7"})
     gone = delete_participant(tmp_path, "P02")
-    assert len(gone) == 5  # list, trials, presentations, netCDF, log
+    assert len(gone.removed) == 5 and not (gone.renamed or gone.left)  # list, trials, presentations, netCDF, log
     assert set(read_people(people)) == {"P01", "P03"}
     for path in tmp_path.rglob("*"):
         if path.suffix in (".csv", ".jsonl"):
@@ -177,7 +178,7 @@ def test_a_deletion_that_cannot_be_ended_begins_with_the_logs(folder, monkeypatc
         delete_participant(tmp_path, "P02")
     assert not list(folder.glob("P02*"))
     monkeypatch.setattr(os, "replace", real)
-    assert delete_participant(tmp_path, "P02") == {str(people): 1}
+    assert delete_participant(tmp_path, "P02").removed == {str(people): 1}
 
 
 def test_dry_runs_are_nobodys_answers(folder, tmp_path):

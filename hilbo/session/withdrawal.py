@@ -1,0 +1,156 @@
+"""Somebody withdraws from a study: what of theirs goes, what becomes nobody's, what must be made again, what stays.
+
+`delete_participant` does it to everything below a folder and says all of it. What it does not touch: a log of somebody
+else, which is chained and theirs, even where it names a set of the one who withdraws; files that are not hilbo's. Both
+are listed. The study goes on: every command still runs on what is left.
+"""
+
+import os
+import secrets
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hilbo.errors import InputError
+from hilbo.session.event_log import in_use, log_paths, read_log
+from hilbo.session.withdrawn_results import LIST, clear_results, plan_without, results_folders
+from hilbo.session.withdrawn_tables import (
+    names_person,
+    netcdf_without,
+    read_table,
+    sets_compared,
+    without_person,
+    write_table,
+)
+from hilbo.study.results_list import relist
+
+__all__ = ["Withdrawal", "delete_participant"]
+
+_OPTIONAL = ("trials", "validation", "sets", "truth")  # a report takes none of these rather than one without rows
+_PICTURES = (".png", ".jpg", ".jpeg", ".gif", ".pdf")
+
+
+@dataclass
+class Withdrawal:
+    """What a withdrawal did, and what it left."""
+
+    participant: str
+    label: str
+    """What stands in the place of the id where something of theirs stays as nobody's."""
+    removed: dict[str, int] = field(default_factory=dict)
+    """File -> rows that went, or 1 for the whole file."""
+    renamed: dict[str, int] = field(default_factory=dict)
+    """File -> rows, or 1 for a plan, in which the label stands now."""
+    marked: list[str] = field(default_factory=list)
+    """Files that say of the results beside them that they were made before."""
+    commands: list[str] = field(default_factory=list)
+    """What makes again the results that went or are marked."""
+    left: dict[str, str] = field(default_factory=dict)
+    """File that still names them, or may -> why it stays."""
+
+
+def delete_participant(folder: str | os.PathLike, participant: str) -> Withdrawal:
+    """Remove one participant from everything below a folder. Raises InputError if nothing of theirs is there, or one of
+    their sessions is running."""
+    if not participant.strip():
+        raise InputError("participants delete: give the id of the participant.")
+    root = Path(folder)
+    done = Withdrawal(participant, f"withdrawn-{secrets.token_hex(3)}")
+    whose, damaged = _logs(root)
+    theirs = [path for path, person in whose.items() if person == participant]
+    for path in theirs:
+        if in_use(path):
+            raise InputError(f"{path}: is being written; end the session first.")
+    for path in [*theirs, *_keys(root, participant, set(whose.values()))]:
+        path.unlink()
+        done.removed[str(path)] = 1
+    folders = results_folders(root)
+    for results in folders:
+        cleared = clear_results(results, participant)
+        done.removed |= dict.fromkeys(map(str, cleared.removed), 1)
+        done.marked += map(str, cleared.marked)
+        done.commands += cleared.commands
+    _tables(root, done)
+    _plans(root, done)
+    changed = {Path(name) for name in (*done.removed, *done.renamed)}
+    for results in folders:
+        if (results / LIST).exists():
+            relist(results, changed)
+    done.left |= _left(root, participant, whose, damaged)
+    if not (done.removed or done.renamed):
+        also = f"; {len(done.left)} files name them that are not touched, {next(iter(done.left))}" if done.left else ""
+        raise InputError(f'{folder}: holds nothing of participant "{participant}"{also}; check id and folder.')
+    return done
+
+
+def _logs(root: Path) -> tuple[dict[Path, str], list[Path]]:
+    """Whose each log is, and the logs that cannot be read."""
+    whose, damaged = {}, []
+    for sub in sorted({root, *(path.parent for path in root.rglob("*.session.jsonl"))}):
+        for path in log_paths(sub):
+            try:
+                whose[path] = read_log(path)[0].participant
+            except InputError:
+                damaged.append(path)
+    return whose, damaged
+
+
+def _keys(root: Path, participant: str, people: set[str]) -> list[Path]:
+    """The files of keys of one participant's sessions, .ID-SESSION.keys; not those of somebody whose id begins so."""
+    longer = tuple(f".{person}-" for person in people if person.startswith(f"{participant}-"))
+    found = (path for end in ("*.keys", "*.keys.part") for path in root.rglob(end))
+    return sorted(
+        path for path in found if path.name.startswith(f".{participant}-") and not path.name.startswith(longer)
+    )
+
+
+def _tables(root: Path, done: Withdrawal) -> None:
+    """Their rows of every table; names of their sets that others have compared become nobody's."""
+    paths = sorted(path for end in ("*.csv", "*.parquet") for path in root.rglob(end))
+    tables = {path: table for path in paths if (table := read_table(path)) is not None}
+    compared = {name for table in tables.values() for name in sets_compared(table, done.participant)}
+    for path, table in tables.items():
+        edited = without_person(table, done.participant, done.label, compared)
+        gone = len(table.rows) - len(edited.kept)
+        if not (gone or edited.renamed):
+            continue
+        if edited.table.rows or path.stem.partition("-")[0] not in _OPTIONAL:
+            write_table(path, edited)
+        else:
+            path.unlink()
+        done.removed |= {str(path): gone} if gone else {}
+        done.renamed |= {str(path): edited.renamed} if edited.renamed else {}
+    for path in sorted(root.rglob("*.nc")):
+        if gone := netcdf_without(path, done.participant):
+            done.removed[str(path)] = gone
+
+
+def _plans(root: Path, done: Withdrawal) -> None:
+    for path in sorted(root.rglob("*.json")):
+        if path.name != LIST and plan_without(path, done.participant, done.label):
+            done.renamed[str(path)] = 1
+
+
+def _left(root: Path, participant: str, whose: dict[Path, str], damaged: Iterable[Path]) -> dict[str, str]:
+    """The files that still name somebody, and why they stay."""
+    left = {str(path): "is a log that cannot be read; if it is theirs, delete it" for path in damaged if path.exists()}
+    for path in sorted(path for path in root.rglob("*") if path.is_file() and str(path) not in left):
+        if path.suffix.lower() in _PICTURES or not _holds(path, participant):
+            continue
+        if path in whose:
+            left[str(path)] = (
+                f"is the log of {whose[path]} and names a set of theirs; it is chained, and stays as it is"
+            )
+        else:
+            left[str(path)] = "names them and is no file that hilbo changes; look at it yourself"
+    return left
+
+
+def _holds(path: Path, participant: str) -> bool:
+    """Whether a file names somebody: in its name, its text, or, of what is no text, its bytes."""
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return True
+    name = path.name.replace("_", " ")
+    return names_person(name, participant) or names_person(content.decode("utf-8", "replace"), participant)

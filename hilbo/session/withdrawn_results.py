@@ -1,0 +1,145 @@
+"""Results of a study from which somebody withdraws: what was made of their answers goes, or is marked, or is listed.
+
+A results folder is known by its list (`hilbo.study.results_list`). Where its files name the participant, everything in
+it that was computed goes; tables that were put or exported there stay, without the participant. Results that name
+nobody and may hold their answers (of `hilbo validate`) are marked by a file beside them.
+"""
+
+import json
+import re
+import shlex
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from hilbo.session.plan import plan_hash
+from hilbo.session.withdrawn_tables import names_person, replace_file, replaced
+from hilbo.study.results_list import LIST, Listed, listed, relist
+
+__all__ = ["MARK", "Cleared", "clear_results", "plan_without", "results_folders"]
+
+MARK = "MADE-BEFORE-A-WITHDRAWAL.txt"
+_KEPT = re.compile(
+    r"(study\.toml|(trials|validation)(-[^/]*)?\.(csv|parquet)|(sets|truth|participants)\.csv|[^/]*\.session\.jsonl)"
+)
+_NAMED = ("result.json", "report.html")  # where a result names its participants
+_NOBODYS = ("validate",)  # commands whose results may hold answers of people whom they do not name
+
+
+class Cleared(NamedTuple):
+    """What became of results: files that went, files that were made, commands that make results again."""
+
+    removed: list[Path]
+    marked: list[Path]
+    commands: list[str]
+
+
+def results_folders(root: Path) -> list[Path]:
+    """The results folders below a folder, the folder itself among them."""
+    return sorted(path.parent for path in root.rglob(LIST))
+
+
+def clear_results(folder: Path, participant: str) -> Cleared:
+    """Take away, or mark, what was computed from somebody's answers."""
+    found = listed(folder)
+    computed = [folder / name for name in found.files if not _is_kept(found, name)]
+    computed = [path for path in computed if path.is_file()]
+    if any(_text_names(path, participant) for path in computed if path.name in _NAMED or path.suffix == ".csv"):
+        for path in computed:
+            path.unlink()
+        relist(folder, set(computed))
+        _remove_empty(folder)
+        return Cleared(computed, [], [_command(folder, found, participant)])
+    words = shlex.split(found.command) if found.command else []
+    if computed and words[1:2] and words[1] in _NOBODYS:
+        mark, command = folder / MARK, _command(folder, found, participant)
+        mark.write_text(
+            f"These results were made before a participant withdrew, and may hold their answers. Make them again:\n"
+            f"{command}\n",
+            encoding="utf-8",
+        )
+        return Cleared([], [mark], [command])
+    return Cleared([], [], [])
+
+
+def _is_kept(found: Listed, name: str) -> bool:
+    """Whether a listed file is a table, log or study file, and no result: an export holds nothing else."""
+    return "dataset_description.json" in found.files or _KEPT.fullmatch(name) is not None
+
+
+def _text_names(path: Path, participant: str) -> bool:
+    try:
+        return names_person(path.read_text(encoding="utf-8"), participant)
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _remove_empty(folder: Path) -> None:
+    """Folders in which nothing but the list is left go too."""
+    for path in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):
+        if not any(path.iterdir()):
+            path.rmdir()
+    if [path.name for path in folder.iterdir()] == [LIST]:
+        (folder / LIST).unlink()
+        folder.rmdir()
+
+
+def _command(folder: Path, found: Listed, participant: str) -> str:
+    """What makes the results again: the report of a folder that holds its own tables, else the command that was given,
+    without the participant."""
+    if (folder / "trials.csv").exists() and (folder / "study.toml").exists():
+        return shlex.join(["hilbo", "report", str(folder), "--out", f"{folder}-report"])
+    if not found.command:
+        return f"{folder}: by the hilbo command that made it"
+    words = []
+    for word in shlex.split(found.command):
+        parts = word.split(",")
+        words.append(",".join(part for part in parts if part != participant) if len(parts) > 1 else word)
+    return f"cd {shlex.quote(found.where)} && {shlex.join(words)}"
+
+
+class _Named(msgspec.Struct):
+    participant: str
+    reissued_from: str | None = None
+
+
+class _PlanLike(msgspec.Struct):
+    hash: str
+    phase: str
+    participants: list[_Named]
+
+
+def plan_without(path: Path, participant: str, label: str) -> bool:
+    """Put a label in the place of a participant in a plan, whose hash changes; `replaces` keeps the one that logs
+    have. A session of their own sets goes. Whether there was anything to do."""
+    try:
+        content = path.read_bytes()
+        known = msgspec.json.decode(content, type=_PlanLike)
+        plan: dict[str, Any] = msgspec.json.decode(content)
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return False
+    people = {name for row in known.participants for name in (row.participant, row.reissued_from)}
+    if participant not in people:
+        return False
+    whole = plan["hash"] == plan_hash(plan)
+    plan["participants"] = [
+        _row_without(row, participant, label)
+        for row in plan["participants"]
+        if not (row["participant"] == participant and plan.get("source") == "individual")
+    ]
+    plan["replaces"] = [*plan.get("replaces", []), plan["hash"]]
+    plan["hash"] = plan_hash(plan) if whole else plan["hash"]
+    made = path.with_name(f".{path.name}-new")
+    made.write_text(json.dumps(plan, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    replace_file(path, made)
+    return True
+
+
+def _row_without(row: Any, participant: str, label: str) -> Any:
+    """A plan's row with the label wherever the id stands."""
+    if isinstance(row, dict):
+        return {key: _row_without(value, participant, label) for key, value in row.items()}
+    if isinstance(row, list):
+        return [_row_without(value, participant, label) for value in row]
+    return replaced(row, participant, label) if isinstance(row, str) else row

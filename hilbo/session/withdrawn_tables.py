@@ -1,0 +1,179 @@
+"""One participant's part of tables: rows taken out of CSV, Parquet and netCDF, and names of their sets made nobody's.
+
+A set that was read from somebody's own map may have been compared by others. Where their answers name it, it stays, and
+its name and source say `withdrawn-…` in the place of the id; where nobody does, it goes.
+"""
+
+import contextlib
+import csv
+import os
+import re
+import tempfile
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+__all__ = [
+    "Cells",
+    "Edited",
+    "names_person",
+    "netcdf_without",
+    "read_table",
+    "replace_file",
+    "replaced",
+    "sets_compared",
+    "without_person",
+    "write_table",
+]
+
+_SET_COLUMNS = ("set_a", "set_b", "first", "preferred", "set_id", "source")
+_INDIVIDUAL = "individual:"
+
+
+class Cells(NamedTuple):
+    """A table as text: the header, and the rows."""
+
+    head: list[str]
+    rows: list[list[str]]
+
+
+def names_person(text: str, participant: str) -> bool:
+    """Whether a text holds this id, not as a part of another one."""
+    return _pattern(participant).search(text) is not None
+
+
+def replaced(text: str, participant: str, label: str) -> str:
+    """A text with a label in the place of the id."""
+    return _pattern(participant).sub(label, text)
+
+
+def _pattern(participant: str) -> re.Pattern[str]:
+    before = r"(?:(?<![A-Za-z0-9_.-])|(?<=\bown-))"  # simulated studies of earlier versions have sets own-ID
+    return re.compile(rf"{before}{re.escape(participant)}(?![A-Za-z0-9_-]|\.[A-Za-z0-9])")
+
+
+def read_table(path: Path) -> Cells | None:
+    """A CSV or Parquet table; None for what is none that can be read."""
+    try:
+        if path.suffix == ".parquet":
+            from hilbo.errors import InputError
+            from hilbo.study.trial_table import read_cells
+
+            with contextlib.suppress(InputError):
+                frame = read_cells(path)
+                return Cells(list(map(str, frame.columns)), frame.to_numpy().tolist())
+            return None
+        with open(path, newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.reader(file))
+    except (OSError, UnicodeDecodeError, csv.Error):
+        return None
+    return Cells(rows[0], rows[1:]) if rows else None
+
+
+class Edited(NamedTuple):
+    """What is left of a table."""
+
+    kept: list[int]
+    """The rows that stay, by their number from 0."""
+    table: Cells
+    renamed: int
+    """Rows in which the name of a set has become nobody's."""
+
+
+def without_person(table: Cells, participant: str, label: str, compared: set[str]) -> Edited:
+    """A table without a participant. `compared`: names of sets that answers of others hold."""
+    head = [name.strip() for name in table.head]
+    kept, rows, renamed = [], [], 0
+    for number, row in enumerate(table.rows):
+        if _is_theirs(dict(zip(head, (cell.strip() for cell in row), strict=False)), participant, compared):
+            continue
+        made = [
+            replaced(cell, participant, label) if column in _SET_COLUMNS else cell
+            for column, cell in zip([*head, *[""] * (len(row) - len(head))], row, strict=False)
+        ]
+        renamed += made != row
+        kept.append(number)
+        rows.append(made)
+    return Edited(kept, Cells(table.head, rows), renamed)
+
+
+def sets_compared(table: Cells, participant: str) -> set[str]:
+    """The sets that answers of others name; empty for a table of something else."""
+    head = [name.strip() for name in table.head]
+    found = set()
+    for row in table.rows:
+        cells = dict(zip(head, (cell.strip() for cell in row), strict=False))
+        if cells.get("participant") != participant:
+            found |= {cells[column] for column in ("set_a", "set_b") if cells.get(column)}
+    return found
+
+
+def _is_theirs(cells: dict[str, str], participant: str, compared: set[str]) -> bool:
+    own = cells.get("source") == _INDIVIDUAL + participant
+    if cells.get("participant") == participant or (own and "set_id" not in cells):
+        return True
+    name = cells.get("set_id", "")
+    return name not in compared and (own or (bool(name) and names_person(name, participant)))
+
+
+def write_table(path: Path, edited: Edited) -> None:
+    """Write a table anew, whole or not at all."""
+    handle, made = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    with open(handle, "w", newline="", encoding="utf-8") as file:
+        if path.suffix != ".parquet":
+            csv.writer(file, lineterminator="\n").writerows([edited.table.head, *edited.table.rows])
+        file.flush()
+        os.fsync(file.fileno())
+    if path.suffix == ".parquet":
+        _parquet(path, edited).to_parquet(made, index=False)
+    replace_file(path, Path(made))
+
+
+def _parquet(path: Path, edited: Edited):
+    """The rows that are left as the file itself has them, so that numbers stay the same bits."""
+    import pandas as pd
+
+    frame = pd.read_parquet(path).iloc[edited.kept].copy()
+    for i, column in enumerate(edited.table.head):
+        if column in _SET_COLUMNS:
+            frame[column] = [row[i] for row in edited.table.rows]
+    return frame
+
+
+def netcdf_without(path: Path, participant: str) -> int | None:
+    """Take a participant out of a netCDF file with a dimension `participant`, or with a `participant` of every
+    `obs_id`; how many went, None for a file that cannot be read."""
+    import xarray as xr
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with xr.open_datatree(path, engine="h5netcdf") as opened:
+                groups = {node.path: node.to_dataset(inherit=False).load() for node in opened.subtree}
+    except Exception:  # a damaged file makes the HDF5 library raise nearly everything
+        return None
+    keep = {}
+    for group in groups.values():
+        if "participant" in group and group["participant"].dims in (("participant",), ("obs_id",)):
+            keep[group["participant"].dims[0]] = group["participant"].values != participant
+    removed = max((int((~kept).sum()) for kept in keep.values()), default=0)
+    if removed:
+        here = {name: {dim: kept for dim, kept in keep.items() if dim in g.dims} for name, g in groups.items()}
+        tree = xr.DataTree.from_dict({name: group.isel(here[name]).drop_encoding() for name, group in groups.items()})
+        made = path.with_name(f".{path.name}-new")
+        try:
+            tree.to_netcdf(made, engine="h5netcdf")
+            replace_file(path, made)
+        finally:
+            made.unlink(missing_ok=True)
+    return removed
+
+
+def replace_file(path: Path, made: Path) -> None:
+    """Put a file that is complete in the place of another, with that one's rights; or leave both as before."""
+    try:
+        os.chmod(made, path.stat().st_mode if path.exists() else 0o600)
+        os.replace(made, path)
+    except BaseException:
+        made.unlink(missing_ok=True)
+        raise

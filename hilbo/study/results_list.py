@@ -1,0 +1,68 @@
+"""The list that stands in every results folder, `.hilbo.json`: its files with their digests, and what made them.
+
+By it `--force` replaces what hilbo wrote and nothing else, and a withdrawal knows what is to be made again.
+"""
+
+import hashlib
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+__all__ = ["LIST", "Listed", "digest", "list_files", "listed", "relist"]
+
+LIST = ".hilbo.json"
+_COMMAND, _WHERE = "//command", "//folder"  # no file has such a name
+
+
+class Listed(NamedTuple):
+    """What a list says; empty for a folder that hilbo did not write."""
+
+    files: dict[str, str]
+    """Name within the folder -> SHA-256."""
+    command: str = ""
+    where: str = ""
+    """The folder in which the command was given."""
+
+
+def listed(folder: Path) -> Listed:
+    """The list of a folder; an empty one where there is none, or none that can be read."""
+    try:
+        found = msgspec.json.decode((folder / LIST).read_bytes(), type=dict[str, str])
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return Listed({})
+    command, where = found.pop(_COMMAND, ""), found.pop(_WHERE, "")
+    return Listed(found, command, where)
+
+
+def list_files(folder: Path, command: str = "", where: str = "") -> None:
+    """Write the list of all files that are in a folder now."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / LIST)
+    _write(folder, Listed({path.relative_to(folder).as_posix(): digest(path) for path in files}, command, where))
+
+
+def relist(folder: Path, changed: set[Path]) -> None:
+    """Bring a folder's list up to date about files that hilbo changed or took away; of others it says what it said."""
+    found = listed(folder)
+    files = {}
+    for name, was in found.files.items():
+        path = folder / name
+        if path not in changed:
+            files[name] = was
+        elif path.is_file():
+            files[name] = digest(path)
+    _write(folder, found._replace(files=files))
+
+
+def _write(folder: Path, content: Listed) -> None:
+    made = content.files | ({_COMMAND: content.command, _WHERE: content.where} if content.command else {})
+    (folder / LIST).write_text(json.dumps(made, indent=0, ensure_ascii=False), encoding="utf-8")
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file; empty for what is none."""
+    if not path.is_file():
+        return ""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

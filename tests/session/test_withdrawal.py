@@ -1,0 +1,144 @@
+"""Somebody withdraws: their part goes, what others said stays, what is left can be read, and all of it is said."""
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from commands import run
+from live import STUDY, Driver
+
+from hilbo.cli.console import results
+from hilbo.errors import InputError
+from hilbo.session.event_log import EventLog, log_name
+from hilbo.session.plan import make_plan, planned_header, reissue
+from hilbo.session.records import Block, Header, Planned
+from hilbo.study.trial_table import read_trials
+from hilbo.study.validation_table import read_validation, sets_frame
+
+SETS = {"best": {"u": 0.5, "v": 0.5}, "own-P02": {"u": 0.1, "v": 0.5}, "own-P01": {"u": 0.2, "v": 0.5}}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A study whose sets are called after people, as those of earlier versions were."""
+    rows = [(p, t, "close", 0.1 * t, 0.5) for p in ("P01", "P02", "P03") for t in (1, 2)]
+    trials = pd.DataFrame(rows, columns=["participant", "trial", "response", "u", "v"])
+    trials.to_csv(tmp_path / "trials.csv", index=False)
+    trials.to_parquet(tmp_path / "trials-copy.parquet", index=False)
+    sets = [
+        {"set_id": name, "source": name.replace("own-", "individual:").replace("best", "aggregate"), **values}
+        for name, values in SETS.items()
+    ]
+    pd.DataFrame(sets).to_csv(tmp_path / "sets.csv", index=False)
+    compared = [(p, 1, "best", "own-P02", "", "", "own-P02") for p in ("P02", "P03")]
+    columns = ["participant", "trial", "set_a", "set_b", "class_a", "class_b", "preferred"]
+    pd.DataFrame(compared, columns=columns).to_csv(tmp_path / "validation.csv", index=False)
+    (tmp_path / "plan.json").write_text(json.dumps(make_plan(STUDY, ["P01", "P02", "P03"], 0)))
+    return tmp_path
+
+
+def delete(capsys, monkeypatch, folder, person):
+    code, _, err = run(capsys, monkeypatch, "participants", "delete", folder, person, "--yes")
+    assert code == 0, err
+    return err
+
+
+def test_answers_of_others_about_their_set_stay_and_can_be_read(folder, capsys, monkeypatch):
+    err = delete(capsys, monkeypatch, folder, "P02")
+    left = read_validation(folder / "validation.csv", STUDY.responses)
+    sets = sets_frame(folder / "sets.csv", ("u", "v"))
+    assert left["participant"].tolist() == ["P03"] and set(left["set_b"]) <= set(sets.index)
+    (kept,) = set(left["set_b"])
+    assert left["preferred"].tolist() == [kept] and sets.at[kept, "u"] == 0.1
+    assert kept.startswith("own-withdrawn-") and sets.at[kept, "source"] == kept.replace("own-", "individual:")
+    for path in (folder / "trials.csv", folder / "trials-copy.parquet"):
+        assert set(read_trials(path, STUDY)["participant"]) == {"P01", "P03"}
+    for path in folder.rglob("*"):
+        assert path.suffix == ".parquet" or "P02" not in path.read_text(), path
+    for name in ("trials.csv", "trials-copy.parquet", "validation.csv", "sets.csv", "plan.json"):
+        assert f"{name}: " in err
+
+
+def test_a_set_that_nobody_else_compared_goes(folder, capsys, monkeypatch):
+    delete(capsys, monkeypatch, folder, "P01")
+    assert set(sets_frame(folder / "sets.csv", ("u", "v")).index) == {"best", "own-P02"}
+
+
+def test_a_plan_keeps_its_order_and_says_which_it_replaces(folder, capsys, monkeypatch):
+    before = json.loads((folder / "plan.json").read_text())
+    delete(capsys, monkeypatch, folder, "P02")
+    after = json.loads((folder / "plan.json").read_text())
+    assert after["replaces"] == [before["hash"]] != [after["hash"]]
+    assert planned_header(after, STUDY, "P03").seed == planned_header(before, STUDY, "P03").seed
+    label = after["participants"][1]["participant"]
+    fresh = reissue(after, label, "P30")
+    assert planned_header(fresh, STUDY, "P30").seed == planned_header(before, STUDY, "P02").seed
+    with pytest.raises(InputError, match="not in the plan"):
+        planned_header(after, STUDY, "P02")
+
+
+def results_of(monkeypatch, folder, people, *command):
+    monkeypatch.setattr("sys.argv", ["hilbo", *command])
+    with results(folder, force=False) as made:
+        (made / "result.json").write_text(json.dumps({"participants": [{"participant": name} for name in people]}))
+        (made / "map.png").write_bytes(b"\x89PNG")
+
+
+def test_results_with_them_go_and_those_that_may_hold_them_are_marked(folder, capsys, monkeypatch):
+    results_of(monkeypatch, folder / "map", ["P01", "P02"], "aggregate", "trials.csv", "--participants", "P01,P02")
+    results_of(monkeypatch, folder / "others", ["P01", "P03"], "aggregate", "trials.csv")
+    results_of(monkeypatch, folder / "compared", [], "validate", "validation.csv", "--study", "study.toml")
+    err = delete(capsys, monkeypatch, folder, "P02")
+    assert not (folder / "map").exists() and (folder / "others" / "map.png").exists()
+    assert "make again: " in err and "hilbo aggregate trials.csv --participants P01\n" in err
+    mark = folder / "compared" / "MADE-BEFORE-A-WITHDRAWAL.txt"
+    assert "hilbo validate validation.csv" in mark.read_text() and f"{mark}: " in err
+
+
+def test_an_exported_folder_can_be_replaced_afterwards(folder, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["hilbo", "export"])
+    with results(folder / "tables", force=False) as made:
+        (made / "dataset_description.json").write_text("{}")
+        (made / "t_data.csv").write_text("participant,trial\nP01,1\nP02,1\n")
+    delete(capsys, monkeypatch, folder, "P02")
+    assert (folder / "tables" / "t_data.csv").read_text() == "participant,trial\nP01,1\n"
+    with results(folder / "tables", force=True) as made:
+        (made / "new.csv").write_text("")
+
+
+def older_log(folder, person):
+    """The log of somebody who compared a set that is called after P02."""
+    block = Block("aggregate-best", 1, (Planned("aggregate", "individual:P02"),))
+    sets = {"aggregate": SETS["best"], "individual:P02": SETS["own-P02"]}
+    header = Header(study=STUDY.hash, participant=person, session="3", seed=0, blocks=(block,), sets=sets)
+    driver = Driver()
+    driver.header, driver.state = header, type(driver.state).start(STUDY, header)
+    driver.values = lambda trial, number: {"preferred": "a"}
+    driver.step()
+    driver.finish()
+    with EventLog.create(folder / log_name(header), STUDY, header) as log:
+        for event in driver.events:
+            log.append(event)
+    return folder / log_name(header)
+
+
+def test_logs_of_others_are_listed_and_stay_as_they_are(folder, capsys, monkeypatch):
+    theirs, others = older_log(folder, "P02"), older_log(folder, "P03")
+    content = others.read_bytes()
+    (folder / "P09_1.session.jsonl").write_bytes(b"damaged\n")
+    (folder / "letter.txt").write_text("P02 would like to know.")
+    (folder / "other.txt").write_text("P020 and xP02 and P02-b are other people.")
+    err = delete(capsys, monkeypatch, folder, "P02")
+    assert not theirs.exists() and others.read_bytes() == content
+    listed = {line.split(": ")[0] for line in err.splitlines() if ": LEFT; " in line}
+    assert listed == {str(folder / name) for name in ("P03_3.session.jsonl", "P09_1.session.jsonl", "letter.txt")}
+
+
+def test_a_plan_of_today_leaves_no_id_with_others():
+    own = {f"individual:P0{i}": {"u": 0.1 * i, "v": 0.5} for i in (1, 2, 3)}
+    plan = make_plan(STUDY, ["J01"], 0, "aggregate-best", sets={"": {"aggregate": SETS["best"]} | own})
+    header = planned_header(plan, STUDY, "J01")
+    assert "P02" not in json.dumps([header.sets, [[t.a, t.b] for b in header.blocks for t in b.trials]])
+    found = sorted(values["u"] for name, values in header.sets.items() if name.startswith("individual:"))
+    np.testing.assert_allclose(found, [0.1, 0.2, 0.3])
