@@ -16,40 +16,30 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from hilbo.app.security import Gate, Role
 
-__all__ = ["LARGEST", "PATIENCE", "ROLES", "Connection", "Connections", "strangers_among"]
+__all__ = ["LARGEST", "LOOKED", "PATIENCE", "Connection", "Connections"]
 
 PATIENCE = 10.0  # s
 LARGEST = 65_536  # bytes of a request
-ROLES = 32  # connections of each role: a browser opens six at most, a program one
-_STRANGERS = 256
+_MOST: dict[Role | None, int] = {"experimenter": 32, "participant": 32, None: 32}  # a browser opens six at most
 _KEPT = 120  # s that a role's idle connection stays open, so that the next press of a button needs no new one
 _SEEN = 256  # bytes of the past in which the beginning of a key may be
-
-
-def strangers_among(files: int) -> int:
-    """How many strangers' connections a process takes that may have so many files open."""
-    return max(1, min(_STRANGERS, files // 4))
+LOOKED = 4096  # bytes of what comes at once that are looked through for a key
 
 
 class Connections:
     """All open connections by role, None for strangers: the oldest first, those that wait to be heard too."""
 
-    def __init__(self, gate: Gate, strangers: int = _STRANGERS):
+    def __init__(self, gate: Gate):
         self.gate = gate
-        self._most: dict[Role | None, int] = {"experimenter": ROLES, "participant": ROLES, None: strangers}
-        self._open: dict[Role | None, dict[Connection, None]] = {role: {} for role in self._most}
-        self._waiting: dict[Role | None, dict[Connection, None]] = {role: {} for role in self._most}
+        self._open: dict[Role | None, dict[Connection, None]] = {role: {} for role in _MOST}
+        self._waiting: dict[Role | None, dict[Connection, None]] = {role: {} for role in _MOST}
         self._turning = False
-
-    def count(self, role: Role | None) -> int:
-        """How many are open."""
-        return len(self._open[role])
 
     def add(self, connection: "Connection") -> None:
         """A new one, or one whose role has become another; the oldest of too many is given up."""
         mine = self._open[connection.role]
         mine[connection] = None
-        if len(mine) > self._most[connection.role]:
+        if len(mine) > _MOST[connection.role]:
             oldest = next(iter(mine))
             self.remove(oldest)
             oldest.give_up()
@@ -78,18 +68,18 @@ class Connections:
 
 
 class Connection(H11Protocol):
-    """One connection, which reads nothing new before what it has read was heard."""
+    """One connection, which reads nothing new before what it has read was heard. `role` is that of the first key."""
 
-    def __init__(self, others: Connections, **uvicorns: Any):
+    def __init__(self, others: Connections, role: Role | None = None, **uvicorns: Any):
         super().__init__(**uvicorns)
-        self.role: Role | None = None
+        self.role: Role | None = role
         self._others = others
         self._unheard = self._seen = b""
         self._size = 0
         self._limit: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:
-        """A stranger comes."""
+        """Somebody comes."""
         super().connection_made(transport)
         self._others.add(self)
         self._limit_time()
@@ -108,12 +98,12 @@ class Connection(H11Protocol):
             self.give_up()
             return
         self._unheard += data
-        seen = self._seen + data
+        seen = self._seen + data[:LOOKED]
         self._seen = seen[-_SEEN:]
         role = self._others.gate.role_in(seen)
         if role not in (None, self.role):
             self._others.remove(self)
-            self.role, self.timeout_keep_alive = role, _KEPT
+            self.role = role
             self._others.add(self)
         self.transport.pause_reading()
         self._others.wait(self)
@@ -134,6 +124,8 @@ class Connection(H11Protocol):
     def on_response_complete(self) -> None:
         """The next request is counted from here."""
         self._size = 0
+        if self.role is not None:
+            self.timeout_keep_alive = _KEPT
         super().on_response_complete()
 
     def send_400_response(self, msg: str) -> None:

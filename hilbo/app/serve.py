@@ -4,10 +4,13 @@ The socket is bound before anything slow happens, so that a port in use is said 
 hub is open.
 """
 
+import asyncio
 import base64
+import contextlib
 import functools
 import io
 import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, get_args
@@ -20,8 +23,8 @@ __all__ = ["PORT", "Place", "bound", "qr_image", "qr_text", "serve"]
 PORT = 8642
 _LINGER = 3  # s for what is still being answered when the server ends
 _FILES = 1024  # open files that are asked for: select() knows no more
-_AT_ONCE = 16  # connections taken in at one turn of the event loop
-_BACKLOG = 1024  # those that wait for it in the kernel
+_SWITCH = 0.0005  # s until the busy event loop lets another thread go on: a stop passes through three of them
+_RESERVED = 160  # of them for connections that are served, the device, the log
 
 
 class Place:
@@ -74,24 +77,26 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
     """
     import uvicorn
 
-    from hilbo.app.connections import Connection, Connections, strangers_among
+    from hilbo.app.connections import Connection, Connections
+    from hilbo.app.porter import Porter
     from hilbo.app.server import application
 
-    connections = Connections(place.gate, strangers_among(_files()))
+    sys.setswitchinterval(_SWITCH)
     config = uvicorn.Config(
         application(hub, place.gate), log_level="error", access_log=False, lifespan="off", server_header=False,
-        timeout_graceful_shutdown=_LINGER, ws="none", backlog=_AT_ONCE,
-        http=functools.partial(Connection, connections),  # type: ignore[arg-type]
+        timeout_graceful_shutdown=_LINGER, ws="none",
+        http=functools.partial(Connection, Connections(place.gate)),  # type: ignore[arg-type]
     )  # fmt: skip
     server = uvicorn.Server(config)
     listen, hang_up = server.startup, server.shutdown
+    porter = Porter(place.socket, place.gate, max(1, _files() - _RESERVED), _admitting(config, server))
 
     # Not as ASGI's lifespan, which swallows what the hub raises.
     async def startup(sockets=None):
         try:
             await hub.open()
             await listen(sockets=sockets)
-            place.socket.listen(_BACKLOG)
+            porter.open()
         except BaseException:
             await hub.close()
             raise
@@ -99,6 +104,7 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
             started(stop)
 
     async def shutdown(sockets=None):
+        porter.close()
         hub.watchers.end_all()
         try:
             await hang_up(sockets=sockets)
@@ -110,9 +116,30 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
 
     server.startup, server.shutdown = startup, shutdown  # type: ignore[method-assign]
     try:
-        server.run(sockets=[place.socket])
+        server.run(sockets=[])  # the porter has it
     finally:
         place.socket.close()
+
+
+def _admitting(config, server) -> Callable[[socket.socket, Role | None], Any]:
+    """What serves a connection that was accepted."""
+
+    protocol = functools.partial(
+        config.http, config=config, server_state=server.server_state, app_state=dict[str, Any]()
+    )
+
+    async def serve_it(line, role):
+        with contextlib.suppress(OSError):  # it has ended meanwhile
+            await asyncio.get_running_loop().connect_accepted_socket(functools.partial(protocol, role=role), line)
+
+    tasks = set()
+
+    def admit(line, role):
+        task = asyncio.get_running_loop().create_task(serve_it(line, role))
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
+    return admit
 
 
 def _files() -> int:

@@ -26,10 +26,11 @@ def server(tmp_path_factory):
 @pytest.fixture
 def brief(monkeypatch):
     """Patience of a tenth of a second."""
-    monkeypatch.setattr("hilbo.app.connections.PATIENCE", 0.1)
+    for module in ("connections", "porter"):
+        monkeypatch.setattr(f"hilbo.app.{module}.PATIENCE", 0.1)
 
 
-def patient(line, seconds=2.0):
+def patient(line, seconds=4.0):
     line.settimeout(seconds)
     return line
 
@@ -72,7 +73,7 @@ def test_a_message_that_is_too_large_is_told_so(server):
 def test_the_oldest_stranger_is_given_up_and_nobody_with_a_key(server):
     with connected(server.port) as mine:
         assert status(server.stops(mine)) == 200
-        strangers = [connected(server.port) for _ in range(600)]
+        strangers = [connected(server.port) for _ in range(900)]
         try:
             for line in strangers:
                 line.sendall(HALF)

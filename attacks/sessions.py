@@ -1,0 +1,49 @@
+"""A real session for attacks: `hilbo session` as a process on a simulated device, with its own files and words."""
+
+import contextlib
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from hilbo.app.rehearsal import HILBO, fast_study
+from hilbo.app.robot import Client
+
+__all__ = ["Session", "session"]
+
+DATA = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
+
+
+class Session(NamedTuple):
+    """A running one. `words` is the file of what its process prints on stderr."""
+
+    process: subprocess.Popen
+    participant: Client
+    experimenter: Client
+    port: int
+    words: Path
+
+
+@contextlib.contextmanager
+def session(folder: Path, *more: str, seconds: float = 0.05) -> Iterator[Session]:
+    """A session of short steps without consent, ended at the end."""
+    study = fast_study(DATA, folder / "study.toml", seconds, 2)
+    given = ("--participant", "P01", "--logs", str(folder / "logs"), "--port", "0", "--gap", "0", "--dry-run", "--json")
+    with open(folder / "words", "w", encoding="utf-8") as words:
+        process = subprocess.Popen(
+            [*HILBO, "session", str(study), *given, *more], stdout=subprocess.PIPE, stderr=words, text=True
+        )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        if not line:
+            raise RuntimeError((folder / "words").read_text(encoding="utf-8"))
+        links = json.loads(line)
+        participant, experimenter = Client(links["participant"]), Client(links["experimenter"])
+        yield Session(
+            process, participant, experimenter, int(experimenter.address.rpartition(":")[2]), folder / "words"
+        )
+    finally:
+        process.terminate()
+        process.wait(60)
