@@ -5,167 +5,21 @@
 
 import contextlib
 import json
-import multiprocessing
 import os
-import random
-import signal
-import socket
 import sys
 import time
-import urllib.error
-from pathlib import Path
 
 import pytest
-from live_server import DATA, PATIENCE, until_held
+from killed_session import PATIENCE, Session
+from live_server import DATA, until_held
 
 from hilbo.app.rehearsal import example_sets, fast_study
-from hilbo.app.robot import Client
 from hilbo.device.simulator import Simulator
-from hilbo.session.event_log import read_log
 from hilbo.session.plan import make_plan
 from hilbo.study.config import Study
 
 KILLS = int(os.environ.get("HILBO_KILLS", "8"))
-LABELS = ("different", "similar", "close")
 pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals and SIGKILL")]
-
-# Forked from a process that has imported everything and computed nothing: a start costs a second instead of several.
-SERVERS = multiprocessing.get_context("forkserver")
-SERVERS.set_forkserver_preload(["hilbo.app.opening", "hilbo.app.server", "hilbo.app.serve", "uvicorn", "pandas"])
-
-
-def run_server(arguments, out):
-    """`hilbo session`, its links in the file `out`."""
-    from hilbo.cli.main import main
-
-    with open(out, "w", buffering=1) as file, open(f"{out}.err", "w") as words:
-        os.dup2(file.fileno(), 1)
-        os.dup2(words.fileno(), 2)
-        sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
-        sys.argv = ["hilbo", "session", *arguments]
-        main()
-
-
-def free_port():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-class Session:
-    """A session that is killed and resumed, and the program that is its participant."""
-
-    def __init__(self, folder, arguments, seed=0):
-        folder.mkdir()
-        self.folder, self.out = folder, folder / "links"
-        self.arguments = [
-            *arguments,
-            "--logs",
-            str(folder / "logs"),
-            "--port",
-            str(free_port()),
-            "--gap",
-            "0",
-            "--dry-run",
-            "--json",
-        ]
-        self.rng, self.process, self.client = random.Random(seed), None, None
-        self.acknowledged: dict[str, dict] = {}
-        self.waiting: dict | None = None
-        self.proposed: dict[int, dict] = {}
-        self.dropped, self.phase = 0, ""
-
-    def start(self):
-        """A new server; it resumes where there is a log."""
-        self.out.unlink(missing_ok=True)
-        resume = ["--resume"] if list((self.folder / "logs").glob("*.jsonl")) else []
-        self.process = SERVERS.Process(target=run_server, args=([*self.arguments, *resume], str(self.out)))
-        self.process.start()
-
-    def ready(self):
-        """Whether the server has given its links; a participant keeps the first one's key."""
-        assert self.process.is_alive(), Path(f"{self.out}.err").read_text()
-        if not self.out.exists() or "\n" not in self.out.read_text():
-            return False
-        if self.client is None:
-            self.client = Client(json.loads(self.out.read_text())["participant"])
-        return True
-
-    def kill(self):
-        os.kill(self.process.pid, signal.SIGKILL)
-        self.process.join()
-
-    def act(self):
-        """One look at the view, and what a participant would do; the phase. An answer is kept until acknowledged."""
-        try:
-            if self.waiting is not None:
-                self.send()
-            view = self.client.get("/api/participant")
-            self.phase = view["phase"]
-            if view["may"]["begin"]:
-                self.client.post("/api/participant/begin", {})
-            elif view["questions"]:
-                self.waiting = self.answer_to(view)
-                self.send()
-            return view["phase"]
-        except urllib.error.HTTPError as error:
-            error.close()
-            if error.code not in (409, 503):
-                raise
-            return "again"
-        except (OSError, ValueError):  # no server, or one that died while it spoke
-            return "nobody"
-
-    def answer_to(self, view):
-        number = int(view["trial"]["id"].split(":")[1].split(".")[0])
-        options = {"preferred": ("a", "b")}
-        answers = {
-            q["name"]: options.get(q["name"], LABELS)[number % len(options.get(q["name"], LABELS))]
-            for q in view["questions"]
-        }
-        return {"trial": view["trial"]["id"], "client": "program", "answers": answers}
-
-    def send(self):
-        if self.rng.random() < 0.2:  # the network goes away between click and acknowledgement
-            self.dropped += 1
-            self.send_and_hang_up()
-            return
-        self.client.post("/api/participant/answer", self.waiting)
-        self.acknowledged[self.waiting["trial"]] = self.waiting["answers"]
-        self.waiting = None
-
-    def send_and_hang_up(self):
-        body = json.dumps(self.waiting).encode()
-        host, port = self.client.address.removeprefix("http://").split(":")
-        head = f"POST /api/participant/answer HTTP/1.1\r\nHost: {host}:{port}\r\nContent-Length: {len(body)}\r\n"
-        head += f"Authorization: Bearer {self.client._key}\r\nContent-Type: application/json\r\n\r\n"
-        with socket.create_connection((host, int(port)), timeout=5) as line:
-            line.sendall(head.encode() + body)
-
-    def log(self, study):
-        (path,) = (self.folder / "logs").glob("*.jsonl")
-        return read_log(path, study)[1]
-
-    def check(self, study):
-        """What was acknowledged is in the log, once; and no proposal was ever made twice, or differently."""
-        if not list((self.folder / "logs").glob("*.jsonl")):
-            return
-        given = {}
-        for event in self.log(study):
-            if event.kind == "answer":
-                assert event.data["id"] not in given
-                given[event.data["id"]] = event.data["values"]
-            elif event.kind == "propose":
-                known = self.proposed.setdefault(event.data["id"], event.data)
-                assert known == event.data
-        for name, answers in self.acknowledged.items():
-            assert given[int(name.split(":")[1].split(".")[0])] == answers
-
-    def until(self, done, seconds=PATIENCE):
-        end = time.monotonic() + seconds
-        while not done():
-            assert time.monotonic() < end, Path(f"{self.out}.err").read_text()
-            time.sleep(0.005)
 
 
 def finished(study, folder, arguments, kills, most):
@@ -235,7 +89,6 @@ def test_a_kill_while_a_device_of_its_own_renders_loses_not_even_the_click(tmp_p
         session = Session(tmp_path / "killed", arguments)
         session.start()
         session.until(session.ready)
-        experimenter = Client(json.loads(session.out.read_text())["experimenter"])
 
         def asked():
             view = session.client.get("/api/participant")
@@ -253,7 +106,7 @@ def test_a_kill_while_a_device_of_its_own_renders_loses_not_even_the_click(tmp_p
         clicked = session.waiting
         assert not session.client.post("/api/participant/answer", clicked)["again"]
         session.waiting = None
-        experimenter.post("/api/experimenter/clear", {})
+        session.experimenter.post("/api/experimenter/clear", {})
         session.until(asked)
         assert session.waiting["trial"] != clicked["trial"]
         session.kill()
