@@ -41,7 +41,11 @@ def main() -> None:
         app()
     except InputError as error:
         fail(str(error), 2)
-    except (OSError, RuntimeError) as error:
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        reason = error.strerror or " ".join(str(error).split()) or type(error).__name__
+        fail(f"{place}could not be read or written ({reason}); check path, rights and the space on the disk.", 1)
+    except RuntimeError as error:
         fail(f"{type(error).__name__}: {error}", 1)
 
 
