@@ -131,10 +131,10 @@ def _claimed(logs: Path, participant: str, name: str):
     """The file of this session's keys; made with its folder."""
     import re
 
-    if not re.fullmatch(r"[\w.-]{1,64}", participant):
-        raise InputError(
-            f'--participant is "{participant}"; a pseudonym is letters, digits, dot, dash and underscore, such as P07.'
-        )
+    from hilbo.study.text_cells import check_id, check_text
+
+    check_id(participant, "--participant")
+    check_text(name, "--session")
     try:
         logs.mkdir(parents=True, exist_ok=True)
     except OSError as error:

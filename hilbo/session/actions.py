@@ -15,6 +15,7 @@ from hilbo.errors import InputError
 from hilbo.session.records import Block, Event, Header, Need, Planned, RefusedError, Trial
 from hilbo.session.state import LiveSession, Screen
 from hilbo.study.protocols import protocol
+from hilbo.study.text_cells import runs_in_a_spreadsheet
 
 __all__ = [
     "Block",
@@ -144,7 +145,7 @@ def undo(state: LiveSession, at: float, reason: str = "") -> Event:
     last = last_answered(state)
     if last is None:
         raise RefusedError("nothing", "there is no answer to undo.")
-    return _event(state, "undo", at, id=last.id, reason=reason)
+    return _event(state, "undo", at, id=last.id, reason=_text(reason))
 
 
 def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
@@ -167,7 +168,7 @@ def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
     found = state.trial(trial)
     if found.status not in ("pending", "answered"):
         raise RefusedError("nothing", f"trial {trial} is {found.status} already.")
-    return _event(state, "void", at, id=trial, reason=reason)
+    return _event(state, "void", at, id=trial, reason=_text(reason))
 
 
 def restore(state: LiveSession, trial: int, at: float) -> Event:
@@ -187,7 +188,7 @@ def skip(state: LiveSession, reason: str, at: float, trial: int | None = None) -
     found = skippable(state)
     if found is None or trial not in (None, found.id):
         raise RefusedError("nothing", "only a planned trial that the device has stopped twice can be left out.")
-    return _event(state, "skip", at, id=found.id, reason=reason)
+    return _event(state, "skip", at, id=found.id, reason=_text(reason))
 
 
 def skippable(state: LiveSession) -> Trial | None:
@@ -237,12 +238,12 @@ def resume(state: LiveSession, at: float) -> Event:
 def abort(state: LiveSession, reason: str, at: float) -> Event:
     """The end of the session before its time."""
     _running(state)
-    return _event(state, "abort", at, reason=reason)
+    return _event(state, "abort", at, reason=_text(reason))
 
 
 def note(state: LiveSession, text: str, at: float) -> Event:
     """The experimenter's words."""
-    return _event(state, "note", at, text=text)
+    return _event(state, "note", at, text=_text(text))
 
 
 def more(state: LiveSession, at: float) -> Event:
@@ -301,6 +302,13 @@ def _event(state, kind, at, **data):
     if not math.isfinite(at):
         raise RefusedError("bad-answer", f"the time {at} is no time.")
     return Event(seq=state.seq + 1, kind=kind, time=float(at), data=data)
+
+
+def _text(text: str) -> str:
+    """Words that will stand in a table as they are. Raises RefusedError for what a spreadsheet would run."""
+    if runs_in_a_spreadsheet(text):
+        raise RefusedError("bad-answer", f'the text "{text[:40]}" begins as a formula does; begin it with a letter.')
+    return text
 
 
 def _running(state):

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from hilbo.errors import InputError
-from hilbo.study.text_cells import check_id
+from hilbo.study.text_cells import check_id, check_text
 
 __all__ = ["COLUMNS", "add_person", "check_consent", "read_people"]
 
@@ -83,6 +83,9 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
 
 def _check(row, place):
     check_id(row.get("participant", ""), place)
+    for name, text in row.items():
+        check_text(name, "the name of a column", place)
+        check_text(text, name, place)
     if row.get("consent_time"):
         try:
             datetime.datetime.fromisoformat(row["consent_time"])

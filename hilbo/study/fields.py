@@ -13,6 +13,7 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 
 from hilbo.errors import InputError
+from hilbo.study.text_cells import FORMULA_WORDS, runs_in_a_spreadsheet
 
 __all__ = [
     "Name",
@@ -67,7 +68,10 @@ def _read_value(kind: Any, raw: Any, path: str) -> Any:
     """A checked value; the sentence where it is none is made of the words of its annotation."""
     try:
         value = msgspec.convert(raw, kind)
-        if all(math.isfinite(v) for v in (value if isinstance(value, tuple) else (value,)) if isinstance(v, float)):
+        parts = value if isinstance(value, tuple) else (value,)
+        if any(isinstance(v, str) and runs_in_a_spreadsheet(v) for v in parts):
+            raise InputError(f"{path} is {shown(value)}, {FORMULA_WORDS}.")
+        if all(math.isfinite(v) for v in parts if isinstance(v, float)):
             return value
     except msgspec.ValidationError:
         pass  # its text speaks of types and of `$`; the schema has the words
@@ -90,7 +94,9 @@ def check_keys(raw: Any, path: str, known: Iterable[str], required: Iterable[str
 
 
 def check_table(raw: Any, path: str) -> None:
-    """Refuse what is no table."""
+    """Refuse what is no table, and a table whose name would be run as a formula at the head of a column."""
+    if runs_in_a_spreadsheet(path.partition(".")[2]):
+        raise InputError(f"{path} has a name {FORMULA_WORDS}.")
     if not isinstance(raw, Mapping):
         raise InputError(f"{path} is {shown(raw)}, it must be a table; write it as [{path}].")
 

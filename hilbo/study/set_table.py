@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hilbo.errors import InputError
+from hilbo.study.text_cells import check_id, check_text
 
 __all__ = ["ROLES", "read_sets", "role_of", "source_kind", "source_of"]
 
@@ -37,6 +38,8 @@ def read_sets(path: str | os.PathLike, needs: Sequence[str] = ("K1", "B1", "alph
     again = [name for name in columns if columns.count(name) > 1]
     if again:
         raise InputError(f'{source}:1: column "{again[0]}" stands there twice; keep one of them.')
+    for name in columns:
+        check_text(name, "the name of a column", f"{source}:1")
     missing = [name for name in ("set_id", *needs) if name not in columns]
     if missing:
         raise InputError(
@@ -51,6 +54,7 @@ def read_sets(path: str | os.PathLike, needs: Sequence[str] = ("K1", "B1", "alph
         name = given.pop("set_id")
         if not name:
             raise InputError(f"{place}: set_id is empty; name every set.")
+        check_text(name, "set_id", place)
         if name in sets:
             raise InputError(f'{place}: set_id "{name}" stands there already; name every set once.')
         sets[name] = {column: _value(column, text, needs, place) for column, text in given.items() if text}
@@ -108,12 +112,16 @@ def _value(column: str, text: str, needs: Sequence[str], place: str) -> Any:
     if column == "source":
         if "source" in needs and source_kind(text) is None:
             raise InputError(f'{place}: source is "{text}"; it must be aggregate, sysid or individual:PARTICIPANT.')
+        if text.startswith(_INDIVIDUAL):
+            check_id(text.removeprefix(_INDIVIDUAL), place)
+        check_text(text, "source", place)
         return text
     if column in _WHOLE:
         if not re.fullmatch(r"\d+(\.0*)?", text) or int(float(text)) < 1:
             raise InputError(f'{place}: {column} is "{text}"; it must be a whole number from 1.')
         return int(float(text))
     if column not in (*_NUMBERS, "T", *needs):
+        check_text(text, column, place)
         return text
     if not _NUMERAL.fullmatch(text) or not math.isfinite(float(text)):
         raise InputError(f'{place}: {column} is "{text}"; it must be a finite number.')

@@ -8,7 +8,7 @@ A table is read piece by piece, and a piece's text is gone when its numbers are 
 
 import csv
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,20 @@ import pandas as pd
 from hilbo.errors import InputError
 from hilbo.search.space import Parameter
 from hilbo.study.config import Study
+from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, check_text, formulas, no_ids
 
-__all__ = ["NOT_FITTED", "numbers", "of_material", "place", "read_cells", "read_trials", "refuse", "write_trials"]
+__all__ = [
+    "NOT_FITTED",
+    "check_people",
+    "check_texts",
+    "numbers",
+    "of_material",
+    "place",
+    "read_cells",
+    "read_trials",
+    "refuse",
+    "write_trials",
+]
 
 NOT_FITTED = ("warm-up", "repeat")
 """Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
@@ -73,7 +85,8 @@ def _checked(text: pd.DataFrame, study: Study, source: str, others: bool, texts:
             table[column] = [texts.setdefault(cell, cell) for cell in text[column]]
     whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
     table["trial"] = whole.astype(int)
-    refuse(text["participant"] == "", source, lambda row: "participant is empty; give each row a participant.")
+    check_people(text, source)
+    check_texts(text, source, numeric | {"response"})
     for parameter in study.space.parameters:
         table[parameter.name] = _parameter_values(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
@@ -271,6 +284,23 @@ def of_material(table: pd.DataFrame, material: str | None, source: str) -> pd.Da
     if material is not None and material not in materials:
         raise InputError(f'{source}: holds no material "{material}"; it has {", ".join(materials)}.')
     return table if material is None else table[table["material"] == material]
+
+
+def check_people(text: pd.DataFrame, source: str) -> None:
+    """Refuse rows without a participant, and ids against the rule for them."""
+    cells = text["participant"]
+    refuse(cells == "", source, lambda row: "participant is empty; give each row a participant.")
+    refuse(cells.isin(no_ids(cells)), source, lambda row: f'participant is "{cells.at[row]}"; {ID_WORDS}.')
+
+
+def check_texts(text: pd.DataFrame, source: str, numeric: Collection[str] = ()) -> None:
+    """Refuse cells, and heads of columns, that a spreadsheet would run; `numeric`: columns that hold no text."""
+    for column in map(str, text.columns):
+        check_text(column, "the name of a column", place(source).rstrip(": "))
+        if column not in numeric:
+            cells = text[column]
+            wrong = cells.isin(formulas(cells))
+            refuse(wrong, source, lambda row, c=column: f'{c} is "{text.at[row, c]}", {FORMULA_WORDS}.')
 
 
 def refuse(wrong: pd.Series, source: str, sentence: Callable[[object], str]) -> None:

@@ -14,7 +14,7 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.study.set_table import read_sets
-from hilbo.study.trial_table import numbers, read_cells, refuse
+from hilbo.study.trial_table import check_people, check_texts, numbers, read_cells, refuse
 
 __all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_validation", "sets_frame"]
 
@@ -59,7 +59,9 @@ def check_validation(
     out = text.copy()
     whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
     out["trial"] = whole.astype(int)
-    for column in ("participant", "set_a", "set_b"):
+    check_people(text, source)
+    check_texts(text, source, ("trial",))
+    for column in ("set_a", "set_b"):
         refuse(text[column] == "", source, lambda row, c=column: f"{c} is empty; every comparison has one.")
     for column in ("set_a", "set_b"):
         refuse(
