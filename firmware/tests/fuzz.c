@@ -151,12 +151,15 @@ static void check_frame(struct rig *rig, const struct hb_frame *frame, const str
     }
 }
 
+static uint64_t frames_ended; /* good ones and bad ones: 0x00 bytes */
+
 static void feed(struct rig *rig, const uint8_t *bytes, size_t size)
 {
     static struct hb_device before;
     struct hb_frame frame;
     for (size_t i = 0U; i < size; i += 1U) {
         bool whole = hb_receiver_push(&rig->shadow, bytes[i], &frame);
+        frames_ended += bytes[i] == 0U ? 1U : 0U;
         if (whole) {
             before = rig->device;
         }
@@ -222,7 +225,8 @@ static uint64_t ticks_checked;
 
 static void say_ticks(void)
 {
-    (void)fprintf(stderr, "%llu ticks checked\n", (unsigned long long)ticks_checked);
+    (void)fprintf(stderr, "%llu frames, %llu ticks checked\n", (unsigned long long)frames_ended,
+                  (unsigned long long)ticks_checked);
 }
 
 static void check_input(struct rig *rig)
