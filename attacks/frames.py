@@ -37,10 +37,13 @@ class Port:
     name = "attack"
 
     def __init__(self, data: bytes):
-        self._parts, self.over = [data[at : at + 4096] for at in range(0, len(data), 4096)][::-1], threading.Event()
+        self._parts = [data[at : at + 4096] for at in range(0, len(data), 4096)][::-1]
+        self.begun, self.over = threading.Event(), threading.Event()
 
     def read(self) -> bytes:
-        """What comes next; nothing in the end."""
+        """What comes next, once it may; nothing in the end."""
+        if not self.begun.wait(0.01):
+            return b""
         if self._parts:
             return self._parts.pop()
         self.over.set()
@@ -110,9 +113,12 @@ def host_takes(rng: random.Random, count: int) -> str:
     try:
         taken = held._take
         held._take = lambda frame: (seen.append(frame), taken(frame))  # type: ignore[method-assign]
+        port.begun.set()
         port.over.wait(60)
         if held.lost or not port.over.is_set():
             return f"its reading ended: {held.lost}"
+        if not good <= set(seen):
+            return "frames that were whole are lost"
         strangers = set(seen) - good
         return f"{len(strangers)} frames that nobody sent, such as {strangers.pop()}" if strangers else ""
     finally:
