@@ -49,7 +49,7 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
     assert "has no [renderer]" in refused(DATA.parent / "video_quality.toml", *place, "--dry-run")
     assert "cannot be read" in refused(tmp_path / "none.toml", *place)
     assert "participants.csv: cannot be read" in refused(DATA, *place)
-    assert "pseudonym" in refused(DATA, "--logs", logs, "--port", 0, "--participant", "Jane Doe")
+    assert "an id has" in refused(DATA, "--logs", logs, "--port", 0, "--participant", "Jane Doe")
     assert "cannot be opened" in refused(DATA, *place, "--resume")
     (tmp_path / "plan.json").write_text("{}")
     assert "is no plan" in refused(DATA, *place, "--plan", tmp_path / "plan.json", "--dry-run")
