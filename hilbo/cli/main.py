@@ -59,7 +59,9 @@ def aggregate(
     participants: Annotated[str | None, typer.Option(help="Only these, separated by commas.")] = None,
     first: Annotated[int | None, typer.Option(min=1, help="Only everybody's first so many trials.")] = None,
     individuals: Annotated[bool, typer.Option(help="Seek everybody's own optimum: most of the work.")] = True,
-    rule: Annotated[str | None, typer.Option(help="How people are merged, in place of the study file's rule.")] = None,
+    rule: Annotated[
+        str | None, typer.Option(help="How people are merged, in place of the study file's; learnt-1 learns [gp] too.")
+    ] = None,
     compare: Annotated[
         bool, typer.Option("--compare", help="Besides, compare all rules: comparison.json, comparison.csv, figures.")
     ] = False,
@@ -206,8 +208,14 @@ def _read(trials, study, material, say):
 def _by_rule(study, rule):
     import dataclasses
 
+    from hilbo.population.learnt import RECIPE
     from hilbo.population.maps import ALL_RULES
+    from hilbo.study.learnt_study import that_learns
 
+    if rule == RECIPE:
+        return study if study.rule == RECIPE else that_learns(study)
+    if study.rule == RECIPE:
+        raise InputError(f'--rule is "{rule}", and the study, whose rule is "{RECIPE}", has no [gp] for it.')
     if rule not in ALL_RULES:
         raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
     return dataclasses.replace(study, rule=rule)

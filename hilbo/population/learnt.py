@@ -6,33 +6,50 @@ In units of the classification noise, with d parameters and C categories, people
     log theta_i ~ N(log(24 / d), 1.2^2)       log shared ~ N(log 3, 1)       log own ~ N(0, 1)
     middle of the thresholds ~ N(0, 1.5^2)    log gap ~ N(log 0.8, 0.7^2)    log width_j ~ N(0, 0.4^2), if C > 2.
 
-What maximises the Laplace evidence of all answers times these priors is taken, by L-BFGS from the priors' medians. A
+What maximises the Laplace evidence of all answers times these priors is taken, by L-BFGS from the priors' medians, at
+first with the same widths for all; then with people's own, which are kept if they add 3 or more to the log evidence. A
 hyperparameter that the study states is kept, and with a stated noise, or variance, everything is in its unit. The
 normal approximation of their posterior says how well each is known; one that is known hardly better than before the
 answers is not identified.
 """
 
-from collections.abc import Mapping
-from typing import NamedTuple
+import dataclasses
+from collections.abc import Mapping, Set
+from typing import Final, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
-from scipy.optimize import minimize
 
 from hilbo.errors import InputError
-from hilbo.ordinal_gp import Trials
-from hilbo.population.low_rank import PeopleModel, rank_for, shared_evidence
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
+from hilbo.population.low_rank import PeopleModel, rank_for, shared_evidence, shared_function
 
-__all__ = ["PRIORS", "Learnt", "Prior", "Stated", "learn"]
+__all__ = [
+    "NOTHING",
+    "PRIORS",
+    "RECIPE",
+    "Learnt",
+    "Prior",
+    "Stated",
+    "learn",
+    "learnt_function",
+    "newcomer_probabilities",
+    "prior_model",
+]
 
+RECIPE: Final = "learnt-1"
 Coordinates = dict[str, Float[Array, "..."]]
 
+_NODES = np.polynomial.hermite_e.hermegauss(7)
+_NODES = _NODES[0], _NODES[1] / _NODES[1].sum()
 _STEPS, _FINE = 100, 1e-3  # of the search; of the finite differences for the curvature
-_UNKNOWN = 0.9  # of the prior's standard deviation
+_WORTH = 3.0  # log Bayes factor from which people have widths of their own, about 20 to 1
 _LEFT = 1e-4
 """Of the shared function's prior variance, what the search may leave: 1e-5 of the log evidence of 600 answers."""
 
@@ -77,6 +94,8 @@ class Learnt(eqx.Module):
     """Logarithms in units of the noise, and the middle of the thresholds, as in the priors."""
     sd: Coordinates
     """Standard deviations of their posterior."""
+    gain_of_widths: float = eqx.field(static=True)
+    """What widths of people's own add to the log evidence; they are in the model if it is above 3."""
     steps: int = eqx.field(static=True)
     rank: int = eqx.field(static=True)
     left: Float[Array, ""]
@@ -84,41 +103,68 @@ class Learnt(eqx.Module):
     converged: Bool[Array, ""]
 
 
-def learn(
-    trials: Trials,
-    categories: int,
-    stated: Stated = NOTHING,
-    priors: Mapping[str, Prior] = PRIORS,
-    widths: bool = True,
-) -> Learnt:
+def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
+    """One person's model before any answer: what is stated, and the medians of the priors."""
+    nobody = Trials.empty(1, dim)
+    stacked = jax.tree.map(lambda leaf: leaf[None], nobody)
+    return _model(_medians(stacked, categories, stated, PRIORS), stacked, stated).gp
+
+
+def learnt_function(learnt: Learnt, trials: Trials) -> Posterior:
+    """The posterior of the shared function by learnt hyperparameters, from stacked trials (M, n)."""
+    rank = rank_for(learnt.model.theta, trials)
+    return shared_function(learnt.model, trials, learnt.weights, rank)
+
+
+def newcomer_probabilities(
+    learnt: Learnt, mean: Float[Array, " m"], variance: Float[Array, " m"]
+) -> Float[Array, "m C"]:
+    """Class probabilities (m, C) of a person who gave no answers, from the mean and variance of the shared function:
+    that person's own function is integrated out, and so are the widths, by Gauss and Hermite."""
+    model = learnt.model
+    nodes, weights = _NODES if "widths" in learnt.coordinates else (np.zeros(1), np.ones(1))
+    middle = jnp.mean(model.thresholds)
+    spread = jnp.sqrt(model.noise**2 + variance + model.own)
+
+    def at(log_width: Array) -> Float[Array, "m C"]:
+        thresholds = middle + jnp.exp(log_width) * (model.thresholds - middle)
+        return jax.vmap(lambda f, s: OrdinalProbit(thresholds, s).class_probabilities(f))(mean, spread)
+
+    widths = PRIORS["widths"].mean + PRIORS["widths"].sd * jnp.asarray(nodes, mean.dtype)
+    return jnp.tensordot(jnp.asarray(weights, mean.dtype), jax.vmap(at)(widths), 1)
+
+
+def learn(trials: Trials, categories: int, stated: Stated = NOTHING, priors: Mapping[str, Prior] = PRIORS) -> Learnt:
     """The hyperparameters of stacked trials (M, n) of answers in `categories`.
 
-    **Arguments:** `stated`: what is kept; `priors`: for studies of their influence; `widths`: whether people may differ
-    in their widths. Raises InputError where nobody answered.
+    **Arguments:** `stated`: what is kept; `priors`: for studies of their influence. Raises InputError where nobody
+    answered.
     """
     if not np.asarray(trials.mask).any():
         raise InputError("learnt-1: nobody gave an answer; at least one person's answers are needed.")
-    start = _medians(trials, categories, stated, priors, widths)
-    search = _Search(start, jnp.zeros(trials.q.shape, trials.x.dtype), 0, True)
-    rank = rank_for(_model(start, trials, stated).theta, trials, _LEFT)
-    while True:  # lengths that became shorter take more features
-        search = _searched(search, _Problem(trials, stated, priors, rank))
-        needed = rank_for(_model(search.coordinates, trials, stated).theta, trials, _LEFT)
-        if needed <= rank:
-            break
-        rank = needed
-    problem = _Problem(trials, stated, priors, rank)
-    end = _cost(search.coordinates, search.weights, problem)
+    start = _medians(trials, categories, stated, priors)
+    common = frozenset(start) - {"widths"}
+    problem = _Problem(trials, stated, priors, 0)
+    alike = _Search(start, jnp.zeros(trials.q.shape, trials.x.dtype), 0, True)
+    alike, problem = _searched(alike, problem, common)
+    chosen, free, gain = alike, common, 0.0
+    if "widths" in start:
+        different, wider = _searched(alike, problem, frozenset(start))
+        gain = _gain_of_widths(alike, different, wider)
+        if gain > _WORTH:
+            chosen, free, problem = different, frozenset(start), wider
+    end = _cost(chosen.coordinates, chosen.weights, problem)
     return Learnt(
-        model=_model(search.coordinates, trials, stated),
+        model=_model(chosen.coordinates, trials, stated),
         weights=end.weights,
         log_evidence=end.log_evidence,
-        coordinates=search.coordinates,
-        sd=_standard_deviations(search.coordinates, end.weights, problem),
-        steps=search.steps,
-        rank=rank,
+        coordinates={name: value for name, value in chosen.coordinates.items() if name in free},
+        sd=_standard_deviations(chosen.coordinates, end.weights, problem, free),
+        gain_of_widths=gain,
+        steps=chosen.steps,
+        rank=problem.rank,
         left=end.left,
-        converged=end.usable & jnp.asarray(search.ended) & (end.left <= _LEFT),
+        converged=end.usable & jnp.asarray(chosen.ended) & (end.left <= _LEFT),
     )
 
 
@@ -151,23 +197,59 @@ class _Cost(NamedTuple):
     left: Float[Array, ""]
 
 
-def _searched(search: _Search, problem: _Problem) -> _Search:
+def _searched(search: _Search, problem: _Problem, free: Set[str]) -> tuple[_Search, _Problem]:
+    """The maximum over the coordinates that are `free`, from where a search is; and the problem with the features that
+    it takes: lengths that became shorter need more of them."""
+    problem = _with_features(search, problem)
+    while True:
+        search = _descended(search, problem, free)
+        larger = _with_features(search, problem)
+        if larger.rank == problem.rank:
+            return search, problem
+        problem = larger
+
+
+def _with_features(search: _Search, problem: _Problem) -> _Problem:
+    theta = _model(search.coordinates, problem.trials, problem.stated).theta
+    return dataclasses.replace(problem, rank=max(problem.rank, rank_for(theta, problem.trials, _LEFT)))
+
+
+def _descended(search: _Search, problem: _Problem, free: Set[str]) -> _Search:
     """L-BFGS from where a search is; each mode is sought from the one before's."""
-    flat, restore = ravel_pytree(search.coordinates)
+    from scipy.optimize import minimize  # a fifth of a second, which commands that learn nothing need not wait
+
+    held = {name: value for name, value in search.coordinates.items() if name not in free}
+    flat, restore = ravel_pytree({name: value for name, value in search.coordinates.items() if name in free})
     latest = search.weights
 
-    def cost(z):
+    def cost(z: ArrayLike) -> tuple[float, np.ndarray]:
         nonlocal latest
-        here = _cost(restore(jnp.asarray(z, flat.dtype)), latest, problem)
+        here = _cost(held | restore(jnp.asarray(z, flat.dtype)), latest, problem)
         if not bool(here.usable):  # the line search is to turn back
-            return np.inf, np.zeros_like(z)
+            return np.inf, np.zeros(flat.size)
         latest = here.weights
-        return float(here.value), np.asarray(ravel_pytree(here.gradient)[0], float)
+        slope = ravel_pytree({name: here.gradient[name] for name in free})[0]
+        return float(here.value), np.asarray(slope, float)
 
-    options = {"maxiter": _STEPS, "ftol": 1e-9, "gtol": 1e-3}
+    # Nearer than that, another choice of features moves the evidence as much as a step does.
+    near = (1e-5 + 1e-6 * int(np.asarray(problem.trials.mask).sum())) / max(abs(cost(flat)[0]), 1.0)
+    options = {"maxiter": _STEPS, "ftol": near, "gtol": 1e-3}
     result = minimize(cost, np.asarray(flat, float), jac=True, method="L-BFGS-B", options=options)
-    end = restore(jnp.asarray(result.x, flat.dtype))
+    end = held | restore(jnp.asarray(result.x, flat.dtype))
     return _Search(end, latest, search.steps + int(result.nit), bool(result.success))
+
+
+def _gain_of_widths(alike: _Search, different: _Search, problem: _Problem) -> float:
+    """What widths of people's own add to the log evidence, by Laplace's method in each width alone."""
+    costs = [float(_cost(s.coordinates, s.weights, problem).value) for s in (alike, different)]
+    widths = different.coordinates["widths"]
+
+    def slope(step):
+        moved = different.coordinates | {"widths": widths + step}
+        return np.asarray(_cost(moved, different.weights, problem).gradient["widths"])
+
+    curvature = (slope(_FINE) - slope(-_FINE)) / (2 * _FINE)
+    return costs[0] - costs[1] - float(np.sum(np.log(problem.priors["widths"].sd * np.sqrt(curvature))))
 
 
 @eqx.filter_jit
@@ -182,7 +264,7 @@ def _cost(coordinates: Coordinates, start: Float[Array, "M n"], problem: _Proble
     return _Cost(cost, gradient, evidence.value, evidence.weights, evidence.arrived & finite, evidence.left)
 
 
-def _medians(trials: Trials, categories: int, stated: Stated, priors: Mapping[str, Prior], widths: bool) -> Coordinates:
+def _medians(trials: Trials, categories: int, stated: Stated, priors: Mapping[str, Prior]) -> Coordinates:
     """Where the search begins: the medians of what is learnt."""
     dtype, d = trials.x.dtype, trials.x.shape[-1]
     every = {
@@ -195,7 +277,7 @@ def _medians(trials: Trials, categories: int, stated: Stated, priors: Mapping[st
     }
     kept = {"theta"} if stated.theta is not None else set()
     kept |= {"middle", "gaps"} if stated.thresholds is not None else set()
-    kept |= {"widths"} if not widths or categories < 3 else set()
+    kept |= {"widths"} if categories < 3 else set()
     return {name: value for name, value in every.items() if name not in kept and value.size}
 
 
@@ -233,30 +315,33 @@ def _log_prior(coordinates: Coordinates, problem: _Problem) -> Float[Array, ""]:
     return total
 
 
-def _standard_deviations(coordinates: Coordinates, start: Float[Array, "M n"], problem: _Problem) -> Coordinates:
-    """Of the posterior, taken for normal: its curvature from differences of gradients.
+def _standard_deviations(
+    coordinates: Coordinates, start: Float[Array, "M n"], problem: _Problem, free: Set[str]
+) -> Coordinates:
+    """Of the posterior of what is `free`, taken for normal: its curvature from differences of gradients.
 
     People's widths are independent given the rest, up to what their answers share: their part of the curvature is
     taken for diagonal, and costs one difference for all.
     """
-    common = {name: value for name, value in coordinates.items() if name != "widths"}
+    common = {name: value for name, value in coordinates.items() if name in free - {"widths"}}
     flat, restore = ravel_pytree(common)
-    widths = coordinates.get("widths", jnp.zeros(0, flat.dtype))
 
-    def gradient(common: Array, widths: Array) -> tuple[Array, Array]:
-        moved = restore(common)
-        slope = _cost(moved | ({"widths": widths} if widths.size else {}), start, problem).gradient
-        return ravel_pytree({name: slope[name] for name in moved})[0], slope["widths"] if widths.size else widths
+    def difference(way: Coordinates) -> Coordinates:
+        ahead, behind = (
+            _cost({n: v + s * way[n] if n in way else v for n, v in coordinates.items()}, start, problem).gradient
+            for s in (_FINE, -_FINE)
+        )
+        return jax.tree.map(lambda a, b: (a - b) / (2 * _FINE), ahead, behind)
 
-    def difference(common_step, width_step):
-        ahead, behind = (gradient(flat + s * common_step, widths + s * width_step) for s in (_FINE, -_FINE))
-        return [np.asarray((a - b) / (2 * _FINE)) for a, b in zip(ahead, behind, strict=True)]
+    def of_common(moved: Coordinates) -> np.ndarray:
+        return np.asarray(ravel_pytree({name: moved[name] for name in common})[0])
 
-    units = jnp.eye(flat.size, dtype=flat.dtype)
-    columns = [difference(unit, 0.0 * widths) for unit in units]
-    hessian, mixed = (np.stack([column[i] for column in columns]) for i in (0, 1))
-    own = difference(0.0 * flat, jnp.ones_like(widths))[1] if widths.size else np.zeros(0)
+    columns = [difference(restore(unit)) for unit in jnp.eye(flat.size, dtype=flat.dtype)]
+    hessian = np.stack([of_common(column) for column in columns])
+    if "widths" not in free:
+        return restore(jnp.asarray(np.sqrt(np.diagonal(np.linalg.inv(hessian)))))
+    mixed = np.stack([np.asarray(column["widths"]) for column in columns])
+    own = np.asarray(difference({"widths": jnp.ones_like(coordinates["widths"])})["widths"])
     covariance = np.linalg.inv(hessian - (mixed / own) @ mixed.T)
     of_widths = 1.0 / own + np.einsum("iw,ij,jw->w", mixed / own, covariance, mixed / own)
-    sd = restore(jnp.asarray(np.sqrt(np.diagonal(covariance))))
-    return sd | ({"widths": jnp.asarray(np.sqrt(of_widths))} if widths.size else {})
+    return restore(jnp.asarray(np.sqrt(np.diagonal(covariance)))) | {"widths": jnp.asarray(np.sqrt(of_widths))}

@@ -5,6 +5,7 @@ Rules of `pointwise` merge everybody's own posterior point by point. Two rules l
 * `hierarchical`, where the answers are few enough: the posterior of the shared function g, exact (`hierarchical`, or
   `counts` where people answered the same stimuli); point by point otherwise, at the committee's cost.
 * `pooled`: the same with a share of 1, one function for all.
+* `learnt-1`: hierarchical, with hyperparameters that are learnt from the answers as well (`learnt`).
 
 The share that people have in common is learnt by evidence, from an even choice of people if there are many, and its
 posterior mean is used: the most probable share may be 0 or 1, where nothing, or everything, would be common.
@@ -23,11 +24,25 @@ from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.counts import Counts, counts_of, evidence, fit_counts, one_person
 from hilbo.population.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
+from hilbo.population.learnt import RECIPE, Learnt, learnt_function
 
-__all__ = ["ALL_RULES", "LARGEST_EXACT", "AnyRule", "RuleMap", "even_choice", "point_rule", "rule_map", "share_of"]
+__all__ = [
+    "ALL_RULES",
+    "GIVEN_RULES",
+    "LARGEST_EXACT",
+    "AnyRule",
+    "RuleMap",
+    "even_choice",
+    "learnt_map",
+    "point_rule",
+    "rule_map",
+    "share_of",
+]
 
-AnyRule = Literal[pointwise.Rule, "pooled"]
-ALL_RULES: tuple[AnyRule, ...] = (*get_args(pointwise.Rule), "pooled")
+AnyRule = Literal[pointwise.Rule, "pooled", "learnt-1"]
+GIVEN_RULES: tuple[AnyRule, ...] = (*get_args(pointwise.Rule), "pooled")
+"""Rules that take the hyperparameters as they are."""
+ALL_RULES: tuple[AnyRule, ...] = (*GIVEN_RULES, RECIPE)
 
 LARGEST_EXACT = 1500
 """Answers, or latent values, up to which the exact models are used: they are cubic in their number."""
@@ -77,10 +92,18 @@ class RuleMap(eqx.Module):
 
 def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[pointwise.Rule, Float[Array, ""] | None]:
     """By which rule, and with which share, everybody's posteriors are merged point by point in place of a map: by the
-    same rule, or by bcm where the rule takes all answers at once."""
+    same rule, or by bcm where the rule takes all answers at once; learnt-1 is the hierarchical one."""
+    if rule == RECIPE:
+        return "hierarchical", share
     if rule not in pointwise.RULES:
         return "bcm", None
     return rule, share if rule == "hierarchical" else None  # type: ignore[return-value]
+
+
+def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
+    """The map by learnt hyperparameters, from stacked trials (M, n)."""
+    variance = learnt.model.shared + learnt.model.own
+    return RuleMap(RECIPE, "exact", None, learnt_function(learnt, trials), learnt.model.share, variance)
 
 
 def rule_map(
@@ -93,14 +116,14 @@ def rule_map(
     inference: str = "laplace",
     largest: int = LARGEST_EXACT,
 ) -> RuleMap:
-    """The map by a rule of `ALL_RULES` from stacked trials (M, n).
+    """The map by a rule of `GIVEN_RULES` from stacked trials (M, n).
 
     **Arguments:** `posteriors`: everybody's own, if they are there; `share`: of the hierarchical rule, else learnt by
     `share_of`; `largest`: exact models are used up to so many latent values. Raises InputError for what a rule cannot
     do with these answers.
     """
-    if rule not in ALL_RULES:
-        raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
+    if rule not in GIVEN_RULES:
+        raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(GIVEN_RULES)}.')
     prior = jnp.asarray(gp.kernel.variance)
     one = jnp.ones_like(prior)
     if rule == "hierarchical":

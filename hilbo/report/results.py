@@ -28,6 +28,7 @@ from hilbo.study.analysis import Population
 from hilbo.study.batch_optimum import Merged
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
+from hilbo.study.learnt_study import learnt_content, learnt_sentences
 from hilbo.study.map_file import write_map
 from hilbo.study.typed_files import sealed
 
@@ -94,6 +95,7 @@ def result(
         if mean is None
         else {"parameters": set_of(study.space, mean), "passivity_margin": margin_of(study.space, mean)},
         "rule": study.rule,
+        "learnt": learnt_content(study, people.names),
         "heterogeneity": heterogeneity(aggregate),
         "inference": study.inference,
         "study": study.hash,
@@ -105,6 +107,7 @@ def result(
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
     failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
     content["warnings"] = ([_not_converged(failed)] if failed else []) + rule_warnings(study, aggregate)
+    content["warnings"] += learnt_sentences(study)
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content

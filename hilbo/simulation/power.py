@@ -29,12 +29,13 @@ from scipy.special import ndtr
 from scipy.stats import binomtest
 
 from hilbo.errors import InputError
-from hilbo.population.maps import LARGEST_EXACT, RuleMap, rule_map
+from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import Person, Population, people, simulate_study
 from hilbo.study.aggregate import fit_cohort, map_optimum
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.learnt_study import resolved
 
 __all__ = ["Plan", "cores", "one_study", "power_table", "simulate_power", "summarise", "top_probability"]
 
@@ -150,9 +151,13 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
         posteriors = fit_cohort(staged, so_far)
         for m in plan.participants:
             some, given = jax.tree.map(lambda leaf, m=m: leaf[:m], (posteriors, so_far.trials))
-            map_ = rule_map(study.gp, given, study.rule, posteriors=some, inference=study.inference)
-            x = np.asarray(map_optimum(study, map_, candidates).x)
-            probabilities = np.asarray(_map_top_probability(study, map_, points))
+            judged = resolved(study, so_far.rows(np.arange(m)))
+            if judged.learnt is None:
+                map_ = rule_map(study.gp, given, study.rule, posteriors=some, inference=study.inference)
+            else:
+                map_ = learnt_map(judged.learnt, given)
+            x = np.asarray(map_optimum(judged, map_, candidates).x)
+            probabilities = np.asarray(_map_top_probability(judged, map_, points))
             rows.append((index, m, count, _rms(x - truth), _rms(probabilities - target)))
     return pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
 

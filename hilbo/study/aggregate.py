@@ -22,10 +22,12 @@ from hilbo import acquisition, bcm
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
-from hilbo.population.maps import LARGEST_EXACT, RuleMap, rule_map, share_of
+from hilbo.population.learnt import RECIPE
+from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map, share_of
 from hilbo.search.candidates import search_points
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Inference, Study
+from hilbo.study.learnt_study import resolved
 
 __all__ = [
     "Aggregate",
@@ -156,16 +158,32 @@ def population_optimum(
 
 @eqx.filter_jit
 def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
-    """Where a rule's map has its largest mean in the feasible set."""
-    return _optimum(study, lambda x: predict_map(found, x), candidates, found.apart)
+    """Where a rule's map has its largest mean in the feasible set; by learnt-1 where a new person answers with the
+    highest category most often."""
+
+    def chance(mean, variance):
+        """Rises with the probability of the highest category: its normal score."""
+        likelihood = study.gp.likelihood
+        return (mean - likelihood.thresholds[-1]) / jnp.sqrt(likelihood.noise**2 + variance + found.apart)
+
+    height = chance if found.rule == RECIPE else None
+    return _optimum(study, lambda x: predict_map(found, x), candidates, found.apart, height)
 
 
-def _optimum(study: Study, predict: Callable, candidates: Float[Array, "m d"], apart: ArrayLike) -> Optimum:
-    """`apart`: variance of one person's function about the map's."""
+def _optimum(
+    study: Study,
+    predict: Callable,
+    candidates: Float[Array, "m d"],
+    apart: ArrayLike,
+    height: Callable[[Array, Array], Array] | None = None,
+) -> Optimum:
+    """`apart`: variance of one person's function about the map's; `height`: what is largest at the optimum, of means
+    and variances; by default the mean."""
+    height = (lambda mean, _: mean) if height is None else height
     choice = acquisition.maximise(
-        predict(candidates)[0],
+        height(*predict(candidates)),
         candidates,
-        lambda x: predict(x[None, :])[0][0],
+        lambda x: height(*predict(x[None, :]))[0],
         from_box=study.space.from_box,
         to_box=study.space.to_box,
         feasible=study.space.feasible,
@@ -211,18 +229,20 @@ def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: 
     """Fit everybody, merge, and find the optima; the study's `rule` decides the population optimum.
 
     `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
-    finds them in `posteriors.certificate`.
+    finds them in `posteriors.certificate`. A rule that learns the hyperparameters does so first, if they are not
+    there.
     """
+    study = resolved(study, cohort)
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
     answered = int(np.sum(cohort.counts() > 0))
     share = None
-    if study.rule == "hierarchical" or (alternatives and answered > 1):
+    if study.rule != RECIPE and (study.rule == "hierarchical" or (alternatives and answered > 1)):
         share = share_of(study.gp, cohort.trials, study.inference)
     rules = _rules(study, cohort, share) if alternatives else [study.rule]
     maps = {rule: _rule_map(study, cohort, rule, posteriors, share) for rule in rules}
     others = {rule: map_optimum(study, maps[rule], candidates) for rule in rules if rule != study.rule}
-    if alternatives:
+    if alternatives and study.rule != RECIPE:
         other = other_inference(study)
         by_other = fit_cohort(study, cohort, inference=other)
         others[other] = map_optimum(study, _rule_map(study, cohort, study.rule, by_other, share, other), candidates)
@@ -249,6 +269,9 @@ def _rule_map(
     study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share | None, inference: str | None = None
 ) -> RuleMap:
     """The map by a rule from everybody's posteriors, or from all answers where the rule takes them at once."""
+    if rule == RECIPE:
+        assert study.learnt is not None
+        return learnt_map(study.learnt, cohort.trials)
     return rule_map(
         study.gp,
         cohort.trials,

@@ -6,6 +6,7 @@ tolerance intervals under the study's hyperparameters and under those of maximum
 people. What cannot be had from these answers is a sentence in `limits`, not an error.
 """
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ import pandas as pd
 from hilbo.errors import InputError
 from hilbo.hyperparameters.maximum_evidence import Learned, maximise_shared_evidence
 from hilbo.ordinal_gp import Trials
+from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.candidates import search_points
@@ -23,6 +25,7 @@ from hilbo.study.aggregate import Aggregate, aggregate_cohort, nrmse
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import in_place
+from hilbo.study.learnt_study import resolved
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
 from hilbo.study.progress import Progress, follow
 from hilbo.study.tolerance_intervals import Ends, tolerance_ends
@@ -92,6 +95,9 @@ class Analysis(NamedTuple):
 
 def analyse_population(study: Study, cohort: Cohort, seed: int = 0, say: Say = lambda text: None) -> Population:
     """The aggregate of a cohort, and its optima after fewer trials; everything is fitted once."""
+    if study.rule == RECIPE:
+        say("learning the hyperparameters from all answers")
+    study = resolved(study, cohort)
     say(f"fitting {len(cohort.names)} participants ({study.name})")
     aggregate = aggregate_cohort(study, cohort, seed)
     say("the optima after fewer trials")
@@ -109,7 +115,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
         )
     cohort = everybody.of([name for name in everybody.names if name not in left_out]) if left_out else everybody
     population = analyse_population(study, cohort, seed, say)
-    aggregate = population.aggregate
+    study, aggregate = population.study, population.aggregate
     say("hyperparameters by maximum evidence")
     learned, learned_study, optimised = _optimised(study, cohort, seed)
     say("reading the maps")
@@ -163,7 +169,8 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
 def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Learned, Study, Aggregate]:
     """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
     learned = _learn(study, cohort.trials)
-    learned_study = eqx.tree_at(lambda s: s.gp, study, learned.gp)
+    rule = "hierarchical" if study.rule == RECIPE else study.rule
+    learned_study = dataclasses.replace(study, gp=learned.gp, rule=rule, learnt=None)
     return learned, learned_study, aggregate_cohort(learned_study, cohort, seed, alternatives=False)
 
 

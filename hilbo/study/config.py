@@ -21,6 +21,7 @@ import msgspec
 from hilbo.errors import InputError
 from hilbo.mechanics.memory import Memory
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
+from hilbo.population.learnt import NOTHING, RECIPE, Learnt, Stated, prior_model
 from hilbo.population.maps import ALL_RULES, AnyRule
 from hilbo.search.feasibility import Mechanics
 from hilbo.search.space import Parameter, SearchSpace
@@ -68,13 +69,15 @@ Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
 
 
 class _GPTable(_Table, frozen=True):
+    """What is left out is learnt; every key but `inference` is required by rules that do not learn."""
+
     theta: Annotated[
-        _Positive | Annotated[tuple[_Positive, ...], msgspec.Meta(min_length=1)],
+        _Positive | Annotated[tuple[_Positive, ...], msgspec.Meta(min_length=1)] | None,
         _text("a number above 0, or a list of one for each parameter", "30.0"),
-    ]
-    variance: Annotated[_Positive, msgspec.Meta(examples=["1.0"])]
-    thresholds: Annotated[tuple[float, ...], _text("a list of rising numbers", "[-0.5, 0.5]")]
-    noise: Annotated[_Positive, msgspec.Meta(examples=["0.5"])]
+    ] = None
+    variance: Annotated[_Positive | None, _text("a number above 0", "1.0")] = None
+    thresholds: Annotated[tuple[float, ...] | None, _text("a list of rising numbers", "[-0.5, 0.5]")] = None
+    noise: Annotated[_Positive | None, _text("a number above 0", "0.5")] = None
     inference: Annotated[Inference, _text('"laplace", "ep", "ep_corrected" or "exact"', '"laplace"')] = "laplace"
 
 
@@ -105,7 +108,7 @@ class _Content(_Table, frozen=True):
 
     study: _StudyTable
     parameters: dict[str, _ParameterTable]
-    gp: _GPTable
+    gp: _GPTable = _GPTable()
     renderer: _RendererTable | None = None
     selection: Selection = Selection()
     aggregation: _AggregationTable = _AggregationTable()
@@ -120,7 +123,7 @@ _TABLES = {
     "aggregation": _AggregationTable,
     "session": SessionTable,
 }
-_REQUIRED = ("schema", "study", "parameters", "gp")
+_REQUIRED = ("schema", "study", "parameters")
 _KEYS = ("schema", "study", "parameters", "renderer", "gp", "selection", "aggregation", "session", "materials")
 _OVERRIDES = ("renderer", "parameters")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
@@ -147,6 +150,11 @@ class Study(eqx.Module):
     source: str = eqx.field(static=True)
     content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON
     session: SessionTable = eqx.field(static=True, repr=False, default=SessionTable())
+    stated: Stated = eqx.field(static=True, repr=False, default=NOTHING)
+    """What the file states of the model, where the rule learns the rest."""
+    learnt: Learnt | None = eqx.field(repr=False, default=None)
+    """What was learnt from the answers, by a rule that learns; `gp` is then the learnt model, and before that the
+    priors' medians."""
 
     @staticmethod
     def load(path: str | os.PathLike) -> "Study":
@@ -218,25 +226,18 @@ def _study(raw: Mapping[str, Any], source: str) -> Study:
     """The study itself, without its materials' overrides."""
     content = _read(raw)
     space = _space(content)
-    labels, thresholds, theta = content.study.responses, content.gp.thresholds, content.gp.theta
+    labels = content.study.responses
     if len(set(labels)) < len(labels):
         raise InputError(f"study.responses is {shown(labels)}, it must not have one label twice.")
-    if len(thresholds) != len(labels) - 1:
-        raise InputError(
-            f"gp.thresholds has {len(thresholds)} numbers, it must have one fewer than the {len(labels)} responses."
-        )
     if content.selection.space_filling > content.selection.trials:
         raise InputError(
             f"selection.space_filling is {content.selection.space_filling}, it must be at most"
             f" trials = {content.selection.trials}."
         )
-    if any(low >= high for low, high in itertools.pairwise(thresholds)):
-        raise InputError(f"gp.thresholds is {shown(thresholds)}, it must rise from each number to the next.")
     content.session.check(labels)
-    if isinstance(theta, tuple) and len(theta) != space.dim:
-        raise InputError(f"gp.theta has {len(theta)} numbers, it must be one number or {space.dim}, one per parameter.")
+    gp, stated = _gp(content, space.dim)
     return Study(
-        gp=OrdinalGP(RBF(theta, content.gp.variance), OrdinalProbit(thresholds, content.gp.noise)),
+        gp=gp,
         space=space,
         name=content.study.name,
         responses=labels,
@@ -248,7 +249,34 @@ def _study(raw: Mapping[str, Any], source: str) -> Study:
         source=source,
         content=json.dumps(msgspec.to_builtins(content), ensure_ascii=False, separators=(",", ":")),
         session=content.session,
+        stated=stated,
     )
+
+
+def _gp(content: _Content, dim: int) -> tuple[OrdinalGP, Stated]:
+    """The model of [gp], and what the file states of it; a rule that learns takes the priors' medians for the rest."""
+    table, rule, count = content.gp, content.aggregation.rule, len(content.study.responses)
+    theta, variance, thresholds, noise = table.theta, table.variance, table.thresholds, table.noise
+    if thresholds is not None:
+        if len(thresholds) != count - 1:
+            raise InputError(
+                f"gp.thresholds has {len(thresholds)} numbers, it must have one fewer than the {count} responses."
+            )
+        if any(low >= high for low, high in itertools.pairwise(thresholds)):
+            raise InputError(f"gp.thresholds is {shown(thresholds)}, it must rise from each number to the next.")
+    if isinstance(theta, tuple) and len(theta) != dim:
+        raise InputError(f"gp.theta has {len(theta)} numbers, it must be one number or {dim}, one per parameter.")
+    if rule == RECIPE:
+        if table.inference != "laplace":
+            raise InputError(f'gp.inference is {shown(table.inference)}, it must be "laplace" with rule = "{RECIPE}".')
+        lengths = theta if theta is None or isinstance(theta, tuple) else (theta,) * dim
+        stated = Stated(lengths, variance, thresholds, noise)
+        return prior_model(dim, count, stated), stated
+    missing = [name for name in Stated._fields if getattr(table, name) is None]
+    if missing:
+        raise InputError(f'gp.{missing[0]} is missing, add it; rule = "{RECIPE}" learns it from the answers.')
+    assert theta is not None and variance is not None and thresholds is not None and noise is not None
+    return OrdinalGP(RBF(theta, variance), OrdinalProbit(thresholds, noise)), NOTHING
 
 
 def _space(content: _Content) -> SearchSpace:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from hilbo.population.hierarchical import Share
+from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import RuleMap
 from hilbo.population.pointwise import RULES
 from hilbo.study.config import Study
@@ -36,6 +37,8 @@ def share_content(share: Share) -> dict[str, Any]:
 
 def in_place(found: RuleMap) -> str:
     """How maps of fewer trials, or of bootstrap resamples, are merged where that is not as the map is; else nothing."""
+    if found.rule == RECIPE:
+        return "by the rule hierarchical point by point, with the learnt hyperparameters"
     if found.rule not in RULES:
         return "by bcm"
     return "" if found.method == "by points" else f"by the rule {found.rule} point by point"

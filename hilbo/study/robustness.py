@@ -23,6 +23,7 @@ from hilbo.hyperparameters.maximum_evidence import (
     optimum_sensitivity,
 )
 from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import point_rule, share_of
 from hilbo.population.pointwise import Rule
 from hilbo.search.candidates import search_points
@@ -93,6 +94,11 @@ def robustness(
     """
     if "variance" in learn:
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
+    if study.rule == RECIPE:
+        raise InputError(
+            f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{RECIPE}" has no fixed ones;'
+            " its result.json has their intervals."
+        )
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
     learned = _learn(study, cohort.trials, tuple(learn), shared, weak_priors)

@@ -142,7 +142,7 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ("noise = 0.5", "nose = 0.5", "29: gp.nose is not a key of a study file, those known here are theta, "),
     ("[aggregation]", "[agregation]", "36: agregation is not a key of a study file, those known here are schema, "),
     ("low = 0.001", "lowest = 0.001", "11: parameters.B1.lowest is not a key of a study file, "),
-    ("noise = 0.5\n", "", "25: gp.noise is missing, add it."),
+    ("noise = 0.5\n", "", '25: gp.noise is missing, add it; rule = "learnt-1" learns it from the answers.'),
     ("low = 0.001\n", "", "10: parameters.B1.low is missing, add it."),
     ("schema = 1\n", "", " schema is missing, add it."),
     ("schema = 1", "schema = 2", "1: schema is 2, it must be 1: this hilbo reads no other."),

@@ -1,0 +1,161 @@
+"""learnt-1: a maximum by another way of computing it, what is stated stays, and what cannot be learnt is said."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
+from hilbo.errors import InputError
+from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
+from hilbo.population.learnt import PRIORS, Stated, learn, learnt_function, newcomer_probabilities, prior_model
+
+PEOPLE, ANSWERS = 4, 12
+
+
+def answers(seed=0, rule=None):
+    """Stacked trials of people who like one place, or answer by a rule of points."""
+    rng = np.random.default_rng(seed)
+    each = []
+    for j in range(PEOPLE):
+        x = rng.uniform(size=(ANSWERS, 2))
+        felt = np.hypot(*(x - 0.4 - 0.05 * j).T) + 0.1 * rng.normal(size=ANSWERS)
+        q = (felt < 0.5).astype(int) + (felt < 0.25) if rule is None else rule(x)
+        each.append(Trials.from_arrays(x, q, ANSWERS))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+
+
+@pytest.fixture(scope="module")
+def learnt():
+    return learn(answers(), 3)
+
+
+def dense_objective(z, trials):
+    """The log posterior of [log theta (2), log shared, log own, middle, log gap], by the model of all answers at once
+    and the priors as docs/aggregation.md states them."""
+    theta, shared, own = np.exp(z[:2]), np.exp(z[2]), np.exp(z[3])
+    half = 0.5 * np.exp(z[5])
+    gp = OrdinalGP(RBF(tuple(theta), shared + own), OrdinalProbit((z[4] - half, z[4] + half), 1.0))
+    evidence = fit_people(gp, of_people(trials), shared / (shared + own)).log_evidence
+    mean = np.array([np.log(12.0), np.log(12.0), np.log(3.0), 0.0, 0.0, np.log(0.8)])
+    sd = np.array([1.2, 1.2, 1.0, 1.0, 1.5, 0.7])
+    return float(evidence) - 0.5 * float(np.sum(((z - mean) / sd) ** 2))
+
+
+def at(learnt):
+    c = learnt.coordinates
+    return np.concatenate([np.atleast_1d(np.asarray(c[k])) for k in ("theta", "shared", "own", "middle", "gaps")])
+
+
+def test_the_end_is_a_maximum_of_the_dense_posterior(learnt):
+    trials, z = answers(), at(learnt)
+    best = dense_objective(z, trials)
+    assert bool(learnt.converged)
+    steps = np.concatenate([np.eye(6), -np.eye(6)]) * 0.1
+    assert all(dense_objective(z + step, trials) < best for step in steps)
+
+
+def test_curvature_gives_the_standard_deviations(learnt):
+    """Of the gap, against the dense posterior along the whole of its conditional curve."""
+    trials, z, h = answers(), at(learnt), 0.05
+    hessian = np.empty((6, 6))
+    unit = h * np.eye(6)
+    for i in range(6):
+        for j in range(i, 6):
+            corners = [dense_objective(z + a * unit[i] + b * unit[j], trials) for a in (1, -1) for b in (1, -1)]
+            hessian[i, j] = hessian[j, i] = (corners[0] - corners[1] - corners[2] + corners[3]) / (4 * h * h)
+    by_differences = np.sqrt(np.diagonal(np.linalg.inv(-hessian)))
+    names = ("theta", "shared", "own", "middle", "gaps")
+    said = np.concatenate([np.atleast_1d(np.asarray(learnt.sd[k])) for k in names])
+    np.testing.assert_allclose(said, by_differences, rtol=0.05)
+
+
+def test_the_map_is_that_of_the_dense_model(learnt):
+    trials, model = answers(), learnt.model
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
+    dense = shared_posterior(fit_people(model.gp, of_people(trials), model.share))
+    for by_features, by_all in zip(learnt_function(learnt, trials).predict(x), dense.predict(x), strict=True):
+        np.testing.assert_allclose(by_features, by_all, atol=2e-3)
+
+
+def test_a_newcomer_has_a_function_of_their_own(learnt):
+    """Without widths these are the class probabilities of one model."""
+    assert "widths" not in learnt.coordinates
+    mean, variance = jnp.array([0.3, -1.0]), jnp.array([0.2, 0.5])
+    chances = newcomer_probabilities(learnt, mean, variance)
+    expected = jax.vmap(learnt.model.gp.likelihood.class_probabilities)(mean, variance + learnt.model.own)
+    np.testing.assert_allclose(chances, expected, rtol=1e-12)
+
+
+def test_before_the_answers_stand_the_medians_and_what_is_stated():
+    gp = prior_model(3, 3)
+    np.testing.assert_allclose(gp.kernel.theta, 8.0)
+    np.testing.assert_allclose(gp.kernel.variance, 4.0)
+    np.testing.assert_allclose(gp.likelihood.thresholds, (-0.4, 0.4))
+    stated = prior_model(3, 3, Stated(theta=(1.0, 2.0, 3.0), noise=0.5))
+    np.testing.assert_allclose(stated.kernel.theta, (1.0, 2.0, 3.0))
+    np.testing.assert_allclose(stated.kernel.variance, 1.0)  # in the unit of the noise
+    np.testing.assert_allclose(stated.likelihood.thresholds, (-0.2, 0.2))
+    by_variance = prior_model(3, 3, Stated(variance=1.0))
+    np.testing.assert_allclose(by_variance.likelihood.noise, 0.5)
+    assert prior_model(2, 2).likelihood.thresholds.shape == (1,)
+
+
+def test_nobody_answered():
+    trials = answers()
+    with pytest.raises(InputError, match="learnt-1: nobody gave an answer"):
+        learn(jax.tree.map(lambda leaf: leaf, Trials(trials.x[0], trials.q[0], trials.mask[0] & False)), 3)
+
+
+@pytest.mark.deep  # a search each
+@pytest.mark.parametrize("stated", [Stated((3.0, 5.0), 2.0, (-0.3, 0.7), 0.5), Stated(noise=2.0), Stated(variance=9.0)])
+def test_what_is_stated_is_kept(stated):
+    model = learn(answers(), 3, stated).model
+    kept = {"theta": model.theta, "variance": model.shared + model.own, "thresholds": model.thresholds}
+    for name, value in (kept | {"noise": model.noise}).items():
+        if getattr(stated, name) is not None:
+            np.testing.assert_allclose(value, getattr(stated, name), rtol=1e-12)
+
+
+@pytest.mark.deep
+def test_another_unit_of_the_noise_is_the_same_model(learnt):
+    """Noise, and what scales with it; the maps agree in units of the noise."""
+    scaled = learn(answers(), 3, Stated(noise=3.0))
+    np.testing.assert_allclose(at(scaled), at(learnt), atol=1e-4)
+    np.testing.assert_allclose(scaled.model.thresholds, 3.0 * learnt.model.thresholds, atol=1e-3)
+    np.testing.assert_allclose(scaled.model.shared, 9.0 * learnt.model.shared, rtol=1e-3)
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize(
+    ("name", "rule", "categories"),
+    [
+        ("one category only", lambda x: np.zeros(len(x), int), 3),
+        ("two of three", lambda x: (x[:, 0] > 0.5).astype(int), 3),
+        ("contradictory repeats", lambda x: np.arange(len(x)) % 3, 3),
+        ("two categories", lambda x: (x[:, 1] > 0.3).astype(int), 2),
+    ],
+)
+def test_hostile_answers_are_learnt_or_said_not_to_be(name, rule, categories):
+    trials = answers(rule=rule)
+    end = learn(trials, categories)
+    assert bool(end.converged), name
+    assert all(np.isfinite(np.asarray(sd)).all() for sd in end.sd.values())
+    if name == "one category only":
+        assert np.all(np.asarray(end.sd["theta"]) > 0.9 * PRIORS["theta"].sd)
+
+
+@pytest.mark.deep
+def test_widths_are_found_where_people_have_them():
+    """Half of the people have a wide middle category, half a narrow one."""
+    rng = np.random.default_rng(0)
+    each = []
+    for j in range(8):
+        x = rng.uniform(size=(60, 2))
+        felt = 2.0 * np.sin(4.0 * x[:, 0]) + x[:, 1] + rng.normal(size=60)
+        half = 2.2 if j % 2 else 0.25
+        each.append(Trials.from_arrays(x, (felt > 0.5 - half).astype(int) + (felt > 0.5 + half), 60))
+    end = learn(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each), 3)
+    assert end.gain_of_widths > 3
+    widths = np.asarray(end.coordinates["widths"])
+    assert widths[1::2].min() > widths[::2].max() + 0.5

@@ -1,0 +1,147 @@
+"""A study file without [gp]: what is read, what a session starts from, and what its results say."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import run
+
+from hilbo import Session
+from hilbo.errors import InputError
+from hilbo.simulation.simulate import to_table
+from hilbo.study.aggregate import aggregate_cohort
+from hilbo.study.cohort import cohort_of
+from hilbo.study.config import Study
+from hilbo.study.learnt_study import learnt_content, learnt_sentences, resolved, that_learns
+from hilbo.study.robustness import robustness
+from hilbo.study.trial_table import read_trials
+
+FILE = """\
+schema = 1
+[study]
+name = "sound"
+responses = ["bad", "fair", "good"]
+[parameters.level]
+low = 0
+high = 10
+[parameters.tone]
+low = -1
+high = 1
+[aggregation]
+rule = "learnt-1"
+"""
+PEOPLE, ANSWERS = 4, 12
+
+
+def study_of(text=FILE) -> Study:
+    import tomllib
+
+    return Study.from_dict(tomllib.loads(text))
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """A trial table of people who like one place."""
+    import jax
+    import jax.numpy as jnp
+
+    from hilbo.ordinal_gp import Trials
+
+    rng = np.random.default_rng(0)
+    each = []
+    for j in range(PEOPLE):
+        x = rng.uniform(size=(ANSWERS, 2))
+        felt = np.hypot(*(x - 0.4 - 0.05 * j).T) + 0.1 * rng.normal(size=ANSWERS)
+        each.append(Trials.from_arrays(x, (felt < 0.5).astype(int) + (felt < 0.25), ANSWERS))
+    path = tmp_path_factory.mktemp("sound") / "trials.csv"
+    to_table(study_of(), jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)).to_csv(path, index=False)
+    return path
+
+
+def test_a_session_starts_from_the_medians():
+    study = study_of()
+    np.testing.assert_allclose(study.gp.kernel.theta, 12.0)
+    np.testing.assert_allclose(study.gp.likelihood.thresholds, (-0.4, 0.4))
+    session = Session.start(study, seed=0)
+    assert set(session.ask()) == {"level", "tone"}
+
+
+def test_what_the_file_states_is_kept():
+    study = study_of(FILE + "[gp]\nnoise = 0.5\ntheta = 3.0\n")
+    np.testing.assert_allclose(study.gp.kernel.theta, 3.0)
+    np.testing.assert_allclose(study.gp.likelihood.noise, 0.5)
+    assert study.stated.theta == (3.0, 3.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (FILE.replace("learnt-1", "bcm"), 'gp.theta is missing, add it; rule = "learnt-1" learns it'),
+        (FILE + '[gp]\ninference = "ep"\n', 'gp.inference is "ep", it must be "laplace" with rule = "learnt-1"'),
+        (FILE + "[gp]\nthresholds = [0.0]\n", "gp.thresholds has 1 numbers, it must have one fewer than the 3"),
+        (FILE.replace("learnt-1", "learnt-2"), 'aggregation.rule is "learnt-2", it must be one of'),
+    ],
+)
+def test_bad_files_get_one_sentence(text, sentence):
+    with pytest.raises(InputError) as caught:
+        study_of(text)
+    assert str(caught.value).startswith(sentence)
+
+
+def test_results_hold_the_resolved_recipe(table):
+    study = study_of()
+    cohort = cohort_of(read_trials(table, study), study)
+    learnt = resolved(study, cohort)
+    assert resolved(learnt, cohort) is learnt
+    content = learnt_content(learnt, cohort.names)
+    assert content is not None
+    json.dumps(content, allow_nan=False)
+    assert content["recipe"] == "learnt-1"
+    assert set(content["theta"]) == {"level", "tone"}
+    assert set(content["intervals"]) == {"theta.level", "theta.tone", "shared", "own", "middle", "gap 1"}
+    assert learnt_content(study, cohort.names) is None
+    assert learnt_sentences(study) == []
+
+
+@pytest.mark.deep  # the searches of all maps are compiled
+def test_the_optimum_is_where_a_newcomer_most_often_says_the_highest(table):
+    study = study_of()
+    cohort = cohort_of(read_trials(table, study), study)
+    learnt = resolved(study, cohort)
+    aggregate = aggregate_cohort(study, cohort)
+    assert aggregate.map.rule == "learnt-1"
+    np.testing.assert_allclose(aggregate.map.share, learnt.learnt.model.share)
+    assert np.hypot(*(np.asarray(aggregate.optimum.x) - 0.475)) < 0.2
+
+    def chance(x):
+        mean, variance = aggregate.newcomer(x)
+        return np.array(
+            [learnt.gp.likelihood.class_probabilities(m, v)[-1] for m, v in zip(mean, variance, strict=True)]
+        )
+
+    side = np.linspace(0, 1, 12)
+    everywhere = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    assert chance(aggregate.optimum.x[None, :])[0] >= chance(everywhere).max()
+    np.testing.assert_allclose(aggregate.optimum.class_probabilities[-1], chance(aggregate.optimum.x[None, :])[0])
+
+
+def test_there_is_nothing_fixed_to_compare_with(table):
+    study = study_of()
+    with pytest.raises(InputError, match='the rule "learnt-1" has no fixed ones'):
+        robustness(study, cohort_of(read_trials(table, study), study))
+
+
+def test_another_rule_has_no_model_to_go_by(tmp_path, table, capsys, monkeypatch):
+    (tmp_path / "study.toml").write_text(FILE)
+    command = ["aggregate", str(table), "--study", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out")]
+    code, _, said = run(capsys, monkeypatch, *command, "--rule", "bcm")
+    assert code == 2
+    assert "has no [gp] for it" in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_by_the_command_line_nothing_stated_is_kept():
+    study = that_learns(Study.load("hilbo/data/paper.toml"))
+    np.testing.assert_allclose(study.gp.kernel.theta, 8.0)
+    assert study.rule == "learnt-1"
+    assert not any(study.stated)
