@@ -113,7 +113,7 @@ def _replace(path, rows):
             csv.writer(file, lineterminator="\n").writerows(rows)
             file.flush()
             os.fsync(file.fileno())
-        os.chmod(made, path.stat().st_mode if path.exists() else 0o644)
+        os.chmod(made, path.stat().st_mode if path.exists() else 0o600)
         os.replace(made, path)
     except BaseException:
         Path(made).unlink(missing_ok=True)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import in_use, log_paths, read_log
-from hilbo.session.withdrawn_results import LIST, clear_results, plan_without, results_folders
+from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
     names_person,
     netcdf_without,
@@ -22,7 +22,7 @@ from hilbo.session.withdrawn_tables import (
     without_person,
     write_table,
 )
-from hilbo.study.results_list import relist
+from hilbo.study.results_list import LIST, relist
 
 __all__ = ["Withdrawal", "delete_participant"]
 

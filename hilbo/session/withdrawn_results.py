@@ -42,30 +42,48 @@ def results_folders(root: Path) -> list[Path]:
 
 def clear_results(folder: Path, participant: str) -> Cleared:
     """Take away, or mark, what was computed from somebody's answers."""
-    found = listed(folder)
-    computed = [folder / name for name in found.files if not _is_kept(found, name)]
-    computed = [path for path in computed if path.is_file()]
+    found, cleared = listed(folder), Cleared([], [], [])
+    for part, names in _parts(found).items():
+        computed = [folder / name for name in names if not _is_kept(found, name)]
+        _clear_part(folder / part, [path for path in computed if path.is_file()], found, participant, cleared)
+    if cleared.removed:
+        relist(folder, set(cleared.removed))
+        _remove_empty(folder)
+    return cleared
+
+
+def _parts(found: Listed) -> dict[str, list[str]]:
+    """The files of each result in a folder: of one, whose materials may have folders, or of several side by side."""
+    if "result.json" in found.files or not any(name.endswith("/result.json") for name in found.files):
+        return {"": list(found.files)}
+    parts: dict[str, list[str]] = {}
+    for name in found.files:
+        parts.setdefault(name.rpartition("/")[0], []).append(name)
+    return parts
+
+
+def _clear_part(part: Path, computed: list[Path], found: Listed, participant: str, cleared: Cleared) -> None:
     if any(_text_names(path, participant) for path in computed if path.name in _NAMED or path.suffix == ".csv"):
+        cleared.commands.append(_command(part, found, participant))
         for path in computed:
             path.unlink()
-        relist(folder, set(computed))
-        _remove_empty(folder)
-        return Cleared(computed, [], [_command(folder, found, participant)])
+        cleared.removed.extend(computed)
+        return
     words = shlex.split(found.command) if found.command else []
     if computed and words[1:2] and words[1] in _NOBODYS:
-        mark, command = folder / MARK, _command(folder, found, participant)
+        mark, command = part / MARK, _command(part, found, participant)
         mark.write_text(
-            f"These results were made before a participant withdrew, and may hold their answers. Make them again:\n"
+            "These results were made before a participant withdrew, and may hold their answers. Make them again:\n"
             f"{command}\n",
             encoding="utf-8",
         )
-        return Cleared([], [mark], [command])
-    return Cleared([], [], [])
+        cleared.marked.append(mark)
+        cleared.commands.append(command)
 
 
 def _is_kept(found: Listed, name: str) -> bool:
     """Whether a listed file is a table, log or study file, and no result: an export holds nothing else."""
-    return "dataset_description.json" in found.files or _KEPT.fullmatch(name) is not None
+    return "dataset_description.json" in found.files or _KEPT.fullmatch(name.rpartition("/")[2]) is not None
 
 
 def _text_names(path: Path, participant: str) -> bool:

@@ -1,7 +1,6 @@
 """result.json of `hilbo aggregate` as another command reads it: typed, within the study's ranges, unchanged."""
 
 import os
-from collections.abc import Mapping
 from typing import Annotated
 
 import msgspec
@@ -58,24 +57,21 @@ def read_result(path: str | os.PathLike, study: Study) -> Result:
         check_id(name, source)
     if len(set(names)) < len(names):
         raise InputError(f"{path}: a participant stands there twice; aggregate the answers again.")
-    _check_optimum(study, found.optimum, source, "the optimum")
-    for person in found.participants:
-        if person.optimum is not None:
-            _check_optimum(study, person.optimum, source, f"the optimum of {person.participant}")
+    _check_optima(study, found, source)
     return found
 
 
-def _check_optimum(study: Study, found: FoundOptimum, source: str, what: str) -> None:
-    """Refuse an optimum outside the study's ranges, or one that would not be passive."""
-    values = check_values(found.parameters, study.space.parameters, source, what)
-    margin = _margin(study, values)
-    if margin is not None and not margin >= 0:
+def _check_optima(study: Study, found: Result, source: str) -> None:
+    """Refuse optima outside the study's ranges, and such as would not be passive."""
+    named = {"the optimum": found.optimum} | {
+        f"the optimum of {person.participant}": person.optimum for person in found.participants if person.optimum
+    }
+    rows = [check_values(optimum.parameters, study.space.parameters, source, what) for what, optimum in named.items()]
+    columns = {name: np.array([row[name] for row in rows]) for name in study.space.names}
+    margins = study.space.passivity_margin(columns)
+    if margins is None or study.space.mechanics is None:
+        return
+    bad = ~(np.asarray(margins) >= -_MARGIN * float(study.space.mechanics.damping))
+    if bad.any():
+        what = list(named)[int(bad.argmax())]
         raise InputError(f"{source}: {what} is not passive on the study's device; aggregate the answers again.")
-
-
-def _margin(study: Study, values: Mapping[str, float]) -> float | None:
-    """The passivity margin in N.s/m with the slack that rounding may need; None without mechanics."""
-    margin = study.space.passivity_margin({name: np.asarray(value, float) for name, value in values.items()})
-    if margin is None or study.space.mechanics is None:
-        return None
-    return float(margin) + _MARGIN * float(study.space.mechanics.damping)

@@ -96,6 +96,20 @@ def test_results_with_them_go_and_those_that_may_hold_them_are_marked(folder, ca
     assert "hilbo validate validation.csv" in mark.read_text() and f"{mark}: " in err
 
 
+def test_of_two_results_side_by_side_one_goes(folder, capsys, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["hilbo", "demo"])
+    with results(folder / "demo", force=False) as made:
+        for name, person in (("videos", "V01"), ("foam", "P02")):
+            (made / name).mkdir()
+            (made / name / "result.json").write_text(json.dumps({"participants": [{"participant": person}]}))
+            (made / name / "trials.csv").write_text(f"participant,trial\n{person},1\nX1,1\n")
+            (made / name / "study.toml").write_text("")
+    err = delete(capsys, monkeypatch, folder, "P02")
+    assert (folder / "demo" / "videos" / "result.json").exists()
+    assert sorted(path.name for path in (folder / "demo" / "foam").iterdir()) == ["study.toml", "trials.csv"]
+    assert f"make again: hilbo report {folder / 'demo' / 'foam'} --out " in err
+
+
 def test_an_exported_folder_can_be_replaced_afterwards(folder, capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["hilbo", "export"])
     with results(folder / "tables", force=False) as made:
