@@ -80,15 +80,14 @@ def _digest(grid: xr.Dataset) -> str:
 
 
 def _check_grid(path, study, axes, shape, *dims) -> None:
-    names = study.space.names
-    for parameter in study.space.parameters[: len(shape)]:
-        here = axes.get(parameter.name)
-        wanted = None if here is None else np.asarray(parameter.to_physical(jnp.linspace(0.0, 1.0, len(here))))
-        if here is None or wanted is None or not np.allclose(here, wanted, rtol=1e-6):
-            raise InputError(f"{path}: is a map of other parameters or ranges; give one of this study.")
-    if len(shape) != len(names):
+    if len(shape) < study.space.dim:
         raise InputError(f"{path}: is a slice of a map of more dimensions; a warm start needs all of them.")
-    if any(d != names for d in dims) or any(size < 2 for size in shape):
+    whole = all(d == study.space.names for d in dims) and all(size > 1 for size in shape)
+    for parameter, size in zip(study.space.parameters, shape, strict=False):
+        wanted = np.asarray(parameter.to_physical(jnp.linspace(0.0, 1.0, size)))
+        here = axes.get(parameter.name)
+        whole = whole and here is not None and here.shape == wanted.shape and np.allclose(here, wanted, rtol=1e-6)
+    if not whole:
         raise InputError(f"{path}: is a map of other parameters or ranges; give one of this study.")
 
 

@@ -83,3 +83,9 @@ def test_a_map_says_what_it_said_before_it_was_written(tmp_path):
 
     write_map(grid(), tmp_path / "map.nc")
     xr.testing.assert_identical(read_map(tmp_path / "map.nc", STUDY).drop_attrs(), grid().drop_attrs())
+
+
+def test_a_map_that_lost_a_dimension_is_refused(tmp_path):
+    for made in (grid().isel(u=0), grid().mean("u"), grid().drop_vars("u"), grid().drop_vars("mean")):
+        with pytest.raises(InputError, match=r"map\.nc: "):
+            read_warm_start(write(tmp_path / "map.nc", made), STUDY)
