@@ -115,14 +115,15 @@ def run(case: Case, count: int, seed: int, state: Path | None = None, every: int
     return counts
 
 
-def main(make: Callable[[], Case], words: str, count: int) -> None:
-    """The command line of an attack; exit code 1 if something got through. `make` prepares it."""
+def main(make: Callable[[], Case], words: str, count: int, every: int = 50) -> None:
+    """The command line of an attack; exit code 1 if something got through. `make` prepares it; the state is kept after
+    `every` so many cases."""
     parser = argparse.ArgumentParser(description=words)
     parser.add_argument("--count", type=int, default=count)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--state", type=Path, default=None, help="File to go on from after a stop.")
     given, begun = parser.parse_args(), time.perf_counter()
-    counts = run(make(), given.count, given.seed, given.state)
+    counts = run(make(), given.count, given.seed, given.state, every)
     for outcome, number in sorted(counts.items()):
         print(f"{number:>10,}  {outcome}")
     print(f"{sum(counts.values()):>10,}  in all, {time.perf_counter() - begun:.0f} s in this run")

@@ -234,4 +234,4 @@ def _judged(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(withdrawal_case, __doc__ or "", PEOPLE)
+    main(withdrawal_case, __doc__ or "", PEOPLE, every=1)
