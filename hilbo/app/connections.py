@@ -1,8 +1,8 @@
 """Connections to the server, and how much of it each may take, so that whoever holds a key is always heard.
 
 A connection is a stranger's until a key of a role has come in on it; then it is the role's. Strangers, participants and
-experimenters have numbers of connections of their own, and of too many the oldest is given up. At every turn of the
-event loop one connection of each is heard, so that a thousand strangers delay an experimenter by one of them. A
+experimenters have numbers of connections of their own, and of too many the oldest is given up. An experimenter is
+heard at once, participants and strangers by turns. A
 request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's connection.
 
 uvicorn and h11 do the rest; without this, they would wait for a header for ever, and read a body of any size.
@@ -15,6 +15,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from hilbo.app.security import Gate, Role
+from hilbo.app.turns import Turns
 
 __all__ = ["LARGEST", "LOOKED", "PATIENCE", "Connection", "Connections"]
 
@@ -27,13 +28,12 @@ LOOKED = 4096  # bytes of what comes at once that are looked through for a key
 
 
 class Connections:
-    """All open connections by role, None for strangers: the oldest first, those that wait to be heard too."""
+    """All open connections by role, None for strangers, the oldest first."""
 
     def __init__(self, gate: Gate):
         self.gate = gate
         self._open: dict[Role | None, dict[Connection, None]] = {role: {} for role in _MOST}
-        self._waiting: dict[Role | None, dict[Connection, None]] = {role: {} for role in _MOST}
-        self._turning = False
+        self._turns = Turns(lambda connection, _: connection.hear())
 
     def add(self, connection: "Connection") -> None:
         """A new one, or one whose role has become another; the oldest of too many is given up."""
@@ -47,24 +47,14 @@ class Connections:
     def remove(self, connection: "Connection") -> None:
         """It is open no more, or another's."""
         self._open[connection.role].pop(connection, None)
-        self._waiting[connection.role].pop(connection, None)
+        self._turns.remove(connection)
 
     def wait(self, connection: "Connection") -> None:
         """Have it heard when its turn comes."""
-        self._waiting[connection.role][connection] = None
-        if not self._turning:
-            self._turning = True
-            asyncio.get_running_loop().call_soon(self._turn)
-
-    def _turn(self) -> None:
-        for waiting in self._waiting.values():
-            if waiting:
-                connection = next(iter(waiting))
-                del waiting[connection]
-                connection.hear()
-        self._turning = any(self._waiting.values())
-        if self._turning:
-            asyncio.get_running_loop().call_soon(self._turn)
+        if connection.role == "experimenter":
+            connection.hear()
+        else:
+            self._turns.add(connection, connection.role)
 
 
 class Connection(H11Protocol):

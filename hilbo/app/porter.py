@@ -1,4 +1,4 @@
-"""The door of a server: an experimenter is let in at once, one participant and one stranger at each turn of the loop.
+"""The door of a server: an experimenter is let in at once, participants and strangers when it is their turn.
 
 A connection that is accepted is first only looked at: what has come is read without taking it. That costs a tenth of
 what it costs to serve it, so that a thousand strangers who come again and again do not hold up who comes behind them.
@@ -13,6 +13,7 @@ from typing import Any
 
 from hilbo.app.connections import LOOKED, PATIENCE
 from hilbo.app.security import Gate, Role
+from hilbo.app.turns import Turns
 
 __all__ = ["Porter"]
 
@@ -29,11 +30,8 @@ class Porter:
     ):
         self._listening, self._gate, self._most, self._admit = listening, gate, most, admit
         self._outside: dict[socket.socket, float] = {}  # until when, oldest first
-        self._speaking: dict[Role | None, dict[socket.socket, None]] = {
-            "participant": {},
-            None: {},
-        }  # who have their turn
-        self._turning = False
+        self._silent: set[socket.socket] = set()
+        self._turns = Turns(self._let_in)  # of those of them who have said something
 
     def open(self) -> None:
         """From now on, in the event loop that runs."""
@@ -62,7 +60,8 @@ class Porter:
             line.setblocking(False)
             self._outside[line] = self._loop.time() + PATIENCE
             if not self._look(line):
-                self._loop.add_reader(line, self._speaks, line)
+                self._silent.add(line)
+                self._loop.add_reader(line.fileno(), self._speaks, line)
             self._make_room(self._most)
 
     def _make_room(self, most: int) -> None:
@@ -70,7 +69,7 @@ class Porter:
             self._send_away(next(iter(self._outside)))
 
     def _speaks(self, line: socket.socket) -> None:
-        self._loop.remove_reader(line)
+        self._unwatch(line)
         self._look(line)
 
     def _look(self, line: socket.socket) -> bool:
@@ -87,21 +86,8 @@ class Porter:
         elif role == "experimenter":
             self._let_in(line, role)
         else:
-            self._speaking[role][line] = None
-            self._go_on()
+            self._turns.add(line, role)
         return True
-
-    def _go_on(self) -> None:
-        if any(self._speaking.values()) and not self._turning:
-            self._turning = True
-            self._loop.call_soon(self._turn)
-
-    def _turn(self) -> None:
-        self._turning = False
-        for role, lines in self._speaking.items():
-            if lines:
-                self._let_in(next(iter(lines)), role)
-        self._go_on()
 
     def _let_in(self, line: socket.socket, role: Role | None) -> None:
         self._forget(line)
@@ -109,14 +95,18 @@ class Porter:
 
     def _send_away(self, line: socket.socket) -> None:
         self._forget(line)
-        self._loop.remove_reader(line)
+        self._unwatch(line)
         with contextlib.suppress(OSError):
             line.close()
 
+    def _unwatch(self, line: socket.socket) -> None:
+        if line in self._silent:
+            self._silent.remove(line)
+            self._loop.remove_reader(line.fileno())
+
     def _forget(self, line: socket.socket) -> None:
         self._outside.pop(line, None)
-        for lines in self._speaking.values():
-            lines.pop(line, None)
+        self._turns.remove(line)
 
     def _tick(self) -> None:
         now = self._loop.time()

@@ -7,12 +7,11 @@ import struct
 import subprocess
 import sys
 import time
-from typing import Any, cast
 
 import pytest
 from bare_server import Bare, connected, request, status, until_closed, until_words
 
-from hilbo.app.connections import Connections
+from hilbo.app.turns import Turns
 
 HALF = b"GET / HTTP/1.1\r\nHost: "
 
@@ -212,25 +211,19 @@ def test_the_process_asks_for_files_and_lives_with_what_it_gets(tmp_path, files)
     assert said.split() == [str(min(files, 1024)), "200"]
 
 
-class Waiting:
-    """A connection that only waits to be heard."""
-
-    def __init__(self, role, heard):
-        self.role, self._heard = role, heard
-
-    def hear(self):
-        self._heard.append(self.role)
-
-
-def test_one_of_each_is_heard_at_every_turn(server):
-    heard, roles = [], [None] * 50 + ["participant"] * 5 + ["experimenter"]
+def test_one_of_each_goes_on_at_every_turn():
+    gone, waiting = [], [*((number, None) for number in range(30)), *((number, "participant") for number in range(5))]
 
     async def turns():
-        waiting = Connections(server.place.gate)
-        for role in roles:
-            waiting.wait(cast(Any, Waiting(role, heard)))
-        while len(heard) < len(roles):
-            await asyncio.sleep(0)
+        rows = Turns(lambda who, role: gone.append((who, role)))
+        for who, role in waiting:
+            rows.add(who, role)
+        rows.remove(7)
+        rows.add(8, None)  # keeps its place
+        while len(gone) < len(waiting) - 1:
+            await asyncio.sleep(0.001)
 
     asyncio.run(turns())
-    assert heard == ["experimenter", "participant", None, *["participant", None] * 4, *[None] * 45]
+    assert gone[:4] == [(0, "participant"), (0, None), (1, "participant"), (1, None)]
+    assert [who for who, role in gone if role is None] == [*range(7), *range(8, 30)]
+    assert [who for who, role in gone if role] == [0, 1, 2, 3, 4]
