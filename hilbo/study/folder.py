@@ -21,7 +21,7 @@ from jaxtyping import Float
 from hilbo.errors import InputError
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
-from hilbo.study.trial_table import numbers, read_cells, read_trials
+from hilbo.study.trial_table import check_texts, numbers, read_cells, read_trials
 from hilbo.study.validation_table import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]
@@ -173,6 +173,7 @@ def _check_answers_once(table: pd.DataFrame, path: Path) -> None:
 def _read_truth(path: Path, study: Study) -> pd.DataFrame:
     """The table of truth of a simulated study, its parameters as numbers."""
     cells = read_cells(path, "a table of truth needs a header and a row")
+    check_texts(cells, str(path), study.space.names)
     missing = [name for name in ("source", *study.space.names) if name not in cells]
     if missing:
         raise InputError(f'{path}:1: column "{missing[0]}" is missing.')
