@@ -27,6 +27,7 @@ from hilbo.study.results_list import LIST, relist
 __all__ = ["Withdrawal", "delete_participant"]
 
 _OPTIONAL = ("trials", "validation", "sets", "truth")  # a report takes none of these rather than one without rows
+_UNREADABLE = "cannot be read; if it holds their answers, delete it"
 _PICTURES = (".png", ".jpg", ".jpeg", ".gif", ".pdf")
 
 
@@ -108,6 +109,7 @@ def _tables(root: Path, done: Withdrawal) -> None:
     """Their rows of every table; names of their sets that others have compared become nobody's."""
     paths = sorted(path for end in ("*.csv", "*.parquet") for path in root.rglob(end))
     tables = {path: table for path in paths if (table := read_table(path)) is not None}
+    done.left |= {str(path): _UNREADABLE for path in paths if path.suffix == ".parquet" and path not in tables}
     compared = {name for table in tables.values() for name in sets_compared(table, done.participant)}
     for path, table in tables.items():
         edited = without_person(table, done.participant, done.label, compared)
@@ -121,7 +123,10 @@ def _tables(root: Path, done: Withdrawal) -> None:
         done.removed |= {str(path): gone} if gone else {}
         done.renamed |= {str(path): edited.renamed} if edited.renamed else {}
     for path in sorted(root.rglob("*.nc")):
-        if gone := netcdf_without(path, done.participant):
+        gone = netcdf_without(path, done.participant)
+        if gone is None:
+            done.left[str(path)] = _UNREADABLE
+        elif gone:
             done.removed[str(path)] = gone
 
 

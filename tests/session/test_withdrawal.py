@@ -141,12 +141,15 @@ def test_logs_of_others_are_listed_and_stay_as_they_are(folder, capsys, monkeypa
     theirs, others = older_log(folder, "P02"), older_log(folder, "P03")
     content = others.read_bytes()
     (folder / "P09_1.session.jsonl").write_bytes(b"damaged\n")
+    (folder / "map.nc").write_bytes(b"damaged")
+    (folder / "trials-2.parquet").write_bytes(b"damaged")
     (folder / "letter.txt").write_text("P02 would like to know.")
     (folder / "other.txt").write_text("P020 and xP02 and P02-b are other people.")
     err = delete(capsys, monkeypatch, folder, "P02")
     assert not theirs.exists() and others.read_bytes() == content
     listed = {line.split(": ")[0] for line in err.splitlines() if ": LEFT; " in line}
-    assert listed == {str(folder / name) for name in ("P03_3.session.jsonl", "P09_1.session.jsonl", "letter.txt")}
+    damaged = {"P09_1.session.jsonl", "map.nc", "trials-2.parquet"}
+    assert listed == {str(folder / name) for name in damaged | {"P03_3.session.jsonl", "letter.txt"}}
 
 
 def test_a_plan_of_today_leaves_no_id_with_others():
