@@ -115,6 +115,8 @@ class Siege:
         said = self._command(line, "estop")
         took = time.perf_counter() - begun
         self.times[kind].append(took)
+        if kind == "new":
+            line.close()
         self._command(self.line, "clear")
         if said != 200:
             return f"THROUGH: not acknowledged ({said})"
@@ -135,12 +137,13 @@ def besieged(connections: int, seed: int = 0):
     with tempfile.TemporaryDirectory() as folder, session(Path(folder), "--device", "sim") as held:
         _warm(held)
         arguments = (held.port, connections, held.participant._key, seed, attempts)
+        said = held.words.read_text(encoding="utf-8")
         hostile = spawned.Process(target=_hostile, args=arguments, daemon=True)
         hostile.start()
+        siege = Siege(held)
         try:
             while sum(attempts) < connections:
                 time.sleep(0.05)
-            siege = Siege(held)
             siege._command(siege.line, "estop")
             siege._command(siege.line, "clear")
             yield siege
@@ -149,8 +152,9 @@ def besieged(connections: int, seed: int = 0):
             hostile.join()
             tried = Counter(dict(zip(_KINDS, attempts, strict=True)))
             print("connections tried:", ", ".join(f"{n:,} {kind}" for kind, n in tried.items()))
-            words = held.words.read_text(encoding="utf-8")
-        assert not words, words
+            siege.line.close()
+            words = held.words.read_text(encoding="utf-8").removeprefix(said)
+            assert not words, words
 
 
 def _warm(held: Session) -> None:

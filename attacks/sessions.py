@@ -47,3 +47,5 @@ def session(folder: Path, *more: str, seconds: float = 0.05) -> Iterator[Session
     finally:
         process.terminate()
         process.wait(60)
+        if process.stdout is not None:
+            process.stdout.close()
