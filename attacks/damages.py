@@ -29,7 +29,7 @@ import numpy as np
 import xarray as xr
 from live import RAW, Driver
 
-from attacks.support import HOSTILE, damaged, main, mutated
+from attacks.support import HOSTILE, damaged, main, mutated, scratch
 from hilbo import Study
 from hilbo.cli.console import results
 from hilbo.errors import InputError
@@ -67,11 +67,10 @@ class Kind(NamedTuple):
 
 def damage_case() -> Callable[[random.Random, int], str]:
     """The attack's case; the files are made anew for each process, in a folder that goes with it."""
-    folder = tempfile.TemporaryDirectory(prefix="hilbo-damages-")
-    kinds = _kinds(Path(folder.name))
+    kinds = _kinds(scratch("damages"))
     before = {name: (kind.path.read_bytes(), kind.read(kind.path)) for name, kind in kinds.items()}
 
-    def case(rng: random.Random, number: int, folder=folder) -> str:
+    def case(rng: random.Random, number: int) -> str:
         name = list(kinds)[number % len(kinds)]
         kind, (content, whole) = kinds[name], before[name]
         forged = kind.forge is not None and rng.random() < 0.6

@@ -28,7 +28,7 @@ jax.config.update("jax_enable_x64", True)
 
 import pandas as pd
 
-from attacks.support import HOSTILE, damaged, main, mutated
+from attacks.support import HOSTILE, damaged, main, mutated, scratch
 from hilbo.errors import InputError
 from hilbo.session.participants import read_people
 from hilbo.statistics.paper_tables import paper_tables
@@ -49,15 +49,14 @@ TABLES = ("trials.csv", "validation.csv", "sets.csv", "participants.csv")
 
 def input_case(real: bool = True) -> Callable[[random.Random, int], str]:
     """The attack's case. `real`: every 21st by a command of its own."""
-    folder = tempfile.TemporaryDirectory(prefix="hilbo-inputs-")
-    whole = Path(folder.name)
+    whole = scratch("inputs")
     _make(whole)
     contents = {name: (whole / name).read_bytes() for name in ("study.toml", *TABLES)}
 
-    def case(rng: random.Random, number: int, folder=folder) -> str:
+    def case(rng: random.Random, number: int) -> str:
         name = rng.choice(("study.toml", *TABLES))
         made, suffix = _mutated(rng, name, contents[name])
-        with tempfile.TemporaryDirectory(dir=folder.name) as here:
+        with tempfile.TemporaryDirectory(dir=whole) as here:
             place = Path(here)
             for other, content in contents.items():
                 (place / other).write_bytes(content)

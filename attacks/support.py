@@ -5,9 +5,12 @@ An attack is a function `case(rng, number) -> str`, the word under which its out
 """
 
 import argparse
+import atexit
 import json
 import random
+import shutil
 import sys
+import tempfile
 import time
 import traceback
 from collections import Counter
@@ -15,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-__all__ = ["HOSTILE", "begin_at", "damaged", "main", "mutated", "run"]
+__all__ = ["HOSTILE", "begin_at", "damaged", "main", "mutated", "run", "scratch"]
 
 Case = Callable[[random.Random, int], str]
 
@@ -84,6 +87,13 @@ def _places(tree: Any):
     for key, value in pairs:
         yield tree, key
         yield from _places(value)
+
+
+def scratch(name: str) -> Path:
+    """A folder for this process, which goes with it."""
+    folder = Path(tempfile.mkdtemp(prefix=f"hilbo-{name}-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def begin_at(state: Path | None, seed: int) -> tuple[int, Counter[str]]:

@@ -13,7 +13,6 @@ import random
 import re
 import shutil
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,7 +21,7 @@ sys.path[:0] = [str(Path(__file__).parents[1])]
 import pandas as pd
 import xarray as xr
 
-from attacks.support import main
+from attacks.support import main, scratch
 from hilbo.cli import main as hilbo_main
 from hilbo.cli.console import start
 
@@ -35,13 +34,13 @@ __all__ = ["withdrawal_case"]
 def withdrawal_case(people: int = PEOPLE, quick: bool = False) -> Callable[[random.Random, int], str]:
     """The attack's case. `quick`: without the report and the robustness check, which are most of the time."""
     start()
-    folder = tempfile.TemporaryDirectory(prefix="hilbo-withdrawals-")
-    whole = Path(folder.name) / "whole"
+    folder = scratch("withdrawals")
+    whole = folder / "whole"
     _make(whole, people, quick)
 
-    def case(rng: random.Random, number: int, folder=folder) -> str:
+    def case(rng: random.Random, number: int) -> str:
         person = f"P{number % people + 1:02d}"
-        copy = Path(folder.name) / "copy"
+        copy = folder / "copy"
         shutil.copytree(whole, copy)
         try:
             return _withdraw(copy, person, quick)
