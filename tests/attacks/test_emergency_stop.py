@@ -1,4 +1,4 @@
-"""A short version of the attack in attacks/emergency_stop.py. No test asserts a time, but that nobody waits for ever."""
+"""A short version of the attack in attacks/emergency_stop.py. No test asserts a time; but nobody waits for ever."""
 
 import pytest
 from simulated import needs_device, own_cache  # noqa: F401
