@@ -163,6 +163,7 @@ def _make(folder: Path, people: int, quick: bool) -> None:
 
 def _quick_validation(folder: Path) -> None:
     """Sets and comparisons of a study whose map was not made."""
+    import jax.numpy as jnp
     import numpy as np
 
     from hilbo.simulation.simulate import PRESETS
@@ -173,7 +174,7 @@ def _quick_validation(folder: Path) -> None:
     study = Study.load(folder / "study.toml")
     count = pd.read_csv(folder / "trials.csv")["participant"].nunique()
     x = np.asarray(study.space.latin_hypercube(3 + count, 1))
-    sets = sets_table(study, Sets(x[:3], np.zeros(3), np.ones(3)), x[3:])  # type: ignore[arg-type]
+    sets = sets_table(study, Sets(jnp.asarray(x[:3]), jnp.zeros(3), jnp.ones(3)), x[3:])
     sets.to_csv(folder / "sets.csv", index=False)
     validation_table(study, PRESETS["paper"], sets, participants=4, judges=2).to_csv(
         folder / "validation.csv", index=False
