@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ def resolved(study: Study, cohort: Cohort) -> Study:
     return dataclasses.replace(study, gp=learnt.model.gp, learnt=learnt)
 
 
-def learnt_content(study: Study, names: tuple[str, ...]) -> dict[str, Any] | None:
+def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
     """What was learnt, for result.json: the resolved recipe, medians with 95 % intervals, and what is not identified;
     `names` are the participants'."""
     learnt = study.learnt
