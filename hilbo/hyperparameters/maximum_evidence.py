@@ -163,8 +163,9 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> Learned:
     model_first = (jnp.arange(options.starts) + _row_of_model(options.starts)) % options.starts
     best = model_first[jnp.argmin(ends.value[model_first])]
     end = jax.tree.map(lambda leaf: leaf[best], ends)
-    moved = [jnp.max(jnp.abs(end.at[k] - initial[k])) for k in initial if k != "first" and initial[k].size]
-    runaway = (jnp.max(jnp.stack(moved)) > _RUNAWAY) | end.flat
+    runaway = end.flat
+    for name in initial.keys() - {"first"}:
+        runaway |= jnp.any(jnp.abs(end.at[name] - initial[name]) > _RUNAWAY)
     return Learned(model_at(end.at, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
 
 

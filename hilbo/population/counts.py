@@ -103,7 +103,7 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
         evidence_error=error,
         evidence_tolerance=evidence_tolerance(value),
         evidence_rounding=rounding,
-        converged=(residual <= tolerance) & evidence_known(value, error, rounding),
+        converged=(residual <= tolerance) & evidence_known(value, error, rounding) & (smallest >= resolution),
     )
     inverse = system.factor.T @ system.factor
     latent = GaussianPosterior(shared @ weights, weights, system.factor, inverse, value, certificate)

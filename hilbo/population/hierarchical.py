@@ -80,7 +80,7 @@ class Share(eqx.Module):
     interpolation_error: Float[Array, ""]
     """Estimate, of the log evidence between the nodes: its last Chebyshev coefficients."""
     converged: Array
-    """Every fit held its certificate."""
+    """Every fit held its certificate, and the interpolation its tolerance."""
 
     @property
     def against_one(self) -> Float[Array, ""]:
@@ -167,7 +167,7 @@ def share_from(
         mean=jnp.asarray(np.trapezoid(weight * grid) / np.trapezoid(weight)),
         interval=jnp.asarray(np.interp([0.025, 0.975], area / area[-1], grid)),
         interpolation_error=jnp.asarray(error),
-        converged=jnp.asarray(all(good for _, good in evaluated.values())),
+        converged=jnp.asarray(error < _ENOUGH and all(good for _, good in evaluated.values())),
     )
 
 

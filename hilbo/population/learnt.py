@@ -50,8 +50,10 @@ _NODES = np.polynomial.hermite_e.hermegauss(7)
 _NODES = _NODES[0], _NODES[1] / _NODES[1].sum()
 _STEPS, _FINE = 100, 1e-3  # of the search; of the finite differences for the curvature
 _WORTH = 3.0  # log Bayes factor from which people have widths of their own, about 20 to 1
-_LEFT = 1e-4
-"""Of the shared function's prior variance, what the search may leave: 1e-5 of the log evidence of 600 answers."""
+_LEFT, _LARGEST = 1e-4, 256
+"""Of the shared function's prior variance, what the search may leave: 1e-5 of the log evidence of 600 answers; but it
+takes no more features than this, since functions that need more are too rugged to be shared by few answers."""
+_ROUGH = 0.05
 
 
 class Prior(NamedTuple):
@@ -164,7 +166,7 @@ def learn(trials: Trials, categories: int, stated: Stated = NOTHING, priors: Map
         steps=chosen.steps,
         rank=problem.rank,
         left=end.left,
-        converged=end.usable & jnp.asarray(chosen.ended) & (end.left <= _LEFT),
+        converged=end.usable & jnp.asarray(chosen.ended) & (end.left <= _ROUGH),
     )
 
 
@@ -211,7 +213,8 @@ def _searched(search: _Search, problem: _Problem, free: Set[str]) -> tuple[_Sear
 
 def _with_features(search: _Search, problem: _Problem) -> _Problem:
     theta = _model(search.coordinates, problem.trials, problem.stated).theta
-    return dataclasses.replace(problem, rank=max(problem.rank, rank_for(theta, problem.trials, _LEFT)))
+    needed = min(rank_for(theta, problem.trials, _LEFT), _LARGEST)
+    return dataclasses.replace(problem, rank=max(problem.rank, needed))
 
 
 def _descended(search: _Search, problem: _Problem, free: Set[str]) -> _Search:

@@ -32,6 +32,7 @@ __all__ = [
     "influence",
     "integral_transform",
     "leave_one_out",
+    "normal_scores",
     "reliability",
     "without",
 ]
@@ -102,6 +103,19 @@ def integral_transform(
     return below + np.random.default_rng(seed).uniform(size=len(q)) * chance
 
 
+def normal_scores(
+    probabilities: Float[np.ndarray, "n C"], q: Int[np.ndarray, " n"], seed: int = 0
+) -> Float[np.ndarray, " n"]:
+    """Normal scores of the transform (n,), each from the smaller of its tails: finite in both."""
+    n, v = np.arange(len(q)), np.random.default_rng(seed).uniform(size=len(q))
+    chance = probabilities[n, q]
+    ranks = np.arange(probabilities.shape[1])[None, :]
+    below = np.sum(np.where(ranks < q[:, None], probabilities, 0.0), axis=1)
+    above = np.sum(np.where(ranks > q[:, None], probabilities, 0.0), axis=1)
+    lower, upper = below + v * chance, above + (1.0 - v) * chance
+    return np.where(lower < upper, 1.0, -1.0) * ndtri(np.minimum(lower, upper))
+
+
 def clustered(values: Float[np.ndarray, " n"], person: Int[np.ndarray, " n"]) -> tuple[float, float]:
     """Mean of values, and its standard error where values of one person go together."""
     mean, people = values.mean(), np.unique(person)
@@ -117,7 +131,7 @@ def calibration(found: LeftOut, seed: int = 0) -> dict[str, float]:
     parts = {
         "negative_log_density": found.cost,
         "central_95": ((u > 0.025) & (u < 0.975)).astype(float),
-        "z2": ndtri(u) ** 2,
+        "z2": normal_scores(found.probabilities, found.q, seed) ** 2,
     }
     content = {}
     for name, values in parts.items():

@@ -46,7 +46,7 @@ __all__ = [
 
 TOLERANCE = 1e-6
 """Largest part of the prior variance of g that the features may leave at an answered point."""
-_RANKS = (32, 64, 96, 128, 192, 256, 384, 512, 768, 1024)
+_RANKS = (32, 64, 128, 256, 512, 1024)
 _STEPS, _HALVINGS = 60, 40
 
 
@@ -337,7 +337,9 @@ def shared_function(
     kernel = RBF(model.theta, model.shared)
     covariance = gram(kernel, pivots.points, pivots.points)
     smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
+    resolution = jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5
     rounding = _rounding(model, trials, mode.weights, covariance, weights)
+    known_well = evidence_known(value, error, rounding) & (smallest >= resolution)
     certificate = Certificate(
         residual=mode.residual,
         tolerance=mode.tolerance,
@@ -345,11 +347,11 @@ def shared_function(
         jitter=pivots.left,
         condition=jnp.linalg.norm(system.precision),
         smallest_variance=smallest,
-        variance_resolution=jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5,
+        variance_resolution=resolution,
         evidence_error=error,
         evidence_tolerance=evidence_tolerance(value),
         evidence_rounding=rounding,
-        converged=(mode.residual <= mode.tolerance) & evidence_known(value, error, rounding),
+        converged=(mode.residual <= mode.tolerance) & known_well,
     )
     latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, value, certificate)
     asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.used)

@@ -174,3 +174,14 @@ def test_a_hyperparameter_without_influence_is_said_to_run_away():
     assert bool(learned.converged)
     assert bool(learned.runaway)
     assert 0.1 < float(learned.gp.likelihood.noise) < 10.0
+
+
+@pytest.mark.deep  # another model to compile the search for
+def test_one_threshold_alone_is_learnt():
+    """Two categories: there is no gap to learn."""
+    gp = OrdinalGP(RBF(4.0, 1.0), OrdinalProbit((0.0,), 0.5))
+    rng = np.random.default_rng(0)
+    trials = Trials.from_arrays(rng.uniform(size=(20, 2)), (rng.uniform(size=20) < 0.8).astype(int), 25)
+    learned = hyper.maximise_evidence(gp, trials, ("thresholds",), weak_priors=True, starts=1)
+    assert bool(learned.converged)
+    assert -2.0 < float(learned.gp.likelihood.thresholds[0]) < -0.1

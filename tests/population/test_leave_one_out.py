@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
@@ -14,6 +15,7 @@ from hilbo.population.leave_one_out import (
     influence,
     integral_transform,
     leave_one_out,
+    normal_scores,
     reliability,
 )
 from hilbo.population.maps import rule_map
@@ -74,3 +76,15 @@ def test_nobody_predicts_themselves():
 def test_two_people_are_too_few():
     with pytest.raises(InputError, match="at least three are needed"):
         leave_one_out(GP, cohort(2), "bcm")
+
+
+def test_an_answer_that_was_all_but_excluded_has_a_finite_score_in_both_tails():
+    """1e-20 below, or above: the transform rounds to 1 there, and its score is the other tail's with another sign."""
+    probabilities = np.array([[1e-20, 1.0 - 1e-20], [1.0 - 1e-20, 1e-20]])
+    low, high = normal_scores(probabilities, np.array([0, 1]))
+    assert -11 < low < -9 < 9 < high < 11
+    found = LeftOut(np.array([0, 1]), np.array([0, 1]), probabilities)
+    assert np.isfinite(calibration(found)["z2"])
+    usual = calibrated(2000)
+    u = integral_transform(usual.probabilities, usual.q, 1)
+    np.testing.assert_allclose(ndtr(normal_scores(usual.probabilities, usual.q, 1)), u, atol=1e-12)
