@@ -169,10 +169,16 @@ class _Program:
     def __init__(self, structure: Any, fixed: tuple[Any, ...]) -> None:
         self._structure, self._fixed = structure, fixed
         self.compiled = jax.jit(self._step, compiler_options=compiler_options())
+        self._layouts: dict[Any, _Layout] = {}
 
     def layout(self, arrays: tuple[Array, ...]) -> _Layout:
-        """Of its posteriors."""
+        """Of its posteriors; traced once for arrays of the same shapes, since every session asks for it."""
+        shapes = tuple((array.shape, array.dtype) for array in arrays)
+        if shapes not in self._layouts:
+            self._layouts[shapes] = self._traced_layout(arrays)
+        return self._layouts[shapes]
 
+    def _traced_layout(self, arrays: tuple[Array, ...]) -> _Layout:
         def fitted(arrays):
             study, _ = self._bound(arrays)
             capacity = study.selection.trials
