@@ -35,3 +35,11 @@ def test_the_largest_mean_of_a_known_posterior_is_found_without_answers():
     highest = float(posterior.mean(STUDY.space.to_unit(grid)).max())
     assert highest - 1e-9 <= float(posterior.mean(STUDY.space.to_unit(best[None]))[0]) <= highest + 1e-2
     assert step.compiled._cache_size() == 1  # by the very program that chooses
+
+
+def test_another_session_of_a_study_traces_nothing(monkeypatch):
+    Session.start(STUDY).step.fitted(POINTS, ANSWERS)
+    monkeypatch.setattr(jax, "eval_shape", None)  # a layout that is traced again would call it
+    step = Session.start(STUDY, seed=1).step
+    assert step.fitted(POINTS, ANSWERS).posterior.certificate.converged
+    assert step.compiled._cache_size() == 1
