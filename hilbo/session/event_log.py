@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 
 from hilbo.errors import InputError
-from hilbo.session.header_check import check_header
+from hilbo.session.header_check import check_new_header
 from hilbo.session.records import Event, Header
 from hilbo.session.replay import replayed
 from hilbo.session.state import LiveSession
@@ -66,7 +66,7 @@ class EventLog:
         """Begin a log. Raises InputError if there is one already, or it cannot be written."""
         path = Path(path)
         state = LiveSession.start(study, header)
-        check_header(study, header)
+        check_new_header(study, header)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), _MODE)

@@ -18,12 +18,13 @@ from typing import Any
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.session.event_log import log_paths, read_session
+from hilbo.session.event_log import log_name, log_paths, read_session
 from hilbo.session.explanation import described
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
 from hilbo.study.config import Study
 from hilbo.study.set_table import role_of, source_of
+from hilbo.study.text_cells import check_text, runs_in_a_spreadsheet
 from hilbo.study.trial_table import read_trials, write_trials
 
 __all__ = [
@@ -37,6 +38,8 @@ __all__ = [
     "validation_table",
 ]
 
+_UNWRITTEN = "see the log"
+"""What stands in the place of words that a spreadsheet would run; the log has them."""
 _SINGLE = ("warm-up", "optimisation", "repeat")
 _WORDS = {
     "participant": "Pseudonymous id",
@@ -60,6 +63,7 @@ _WORDS = {
     "role": "best, mid or worst of the map that the set was read from; empty for others",
     "memory": "short or full: how the past is rendered",
     "states": "Number of exponentials of full memory",
+    "voided_reason": f"Why the trial does not count; '{_UNWRITTEN}' where a spreadsheet would run the words as a formula",
     "N": "Number of past samples that are rendered",
     "T": "Time between two samples, s",
 }
@@ -157,7 +161,7 @@ def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
             rows.append(
                 _place(state, trial)
                 | {"status": trial.status, "presentations": trial.presentation, "proposed_at": trial.proposed}
-                | {f"voided_{key}": (trial.voided or {}).get(key, "") for key in ("by", "reason")}
+                | {f"voided_{key}": _written((trial.voided or {}).get(key, "")) for key in ("by", "reason")}
                 | _times(trial)
             )
     return _table(rows)
@@ -188,7 +192,10 @@ def read_log_trials(
 
 
 def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: Study) -> list[Path]:
-    """Tables with their sidecars and dataset_description.json, in the shape of a Psych-DS data set; the files."""
+    """Tables with their sidecars and dataset_description.json, in the shape of a Psych-DS data set; the files.
+    Raises InputError for an id, label or name of a set that a spreadsheet would run."""
+    for state in sessions:
+        _check_names(state)
     tables = {
         "trials": trials_table(sessions),
         "validation": validation_table(sessions),
@@ -253,6 +260,19 @@ def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> bool:
     tree = xr.DataTree.from_dict({name: group.assign_attrs(attributes) for name, group in groups.items()})
     tree.to_netcdf(path, engine="h5netcdf")
     return True
+
+
+def _written(text: Any) -> Any:
+    return _UNWRITTEN if isinstance(text, str) and runs_in_a_spreadsheet(text) else text
+
+
+def _check_names(state: LiveSession) -> None:
+    """Names cannot be left out as words can: without them a table does not say whose its rows are."""
+    header, place = state.header, log_name(state.header)
+    check_text(header.participant, "participant", place)
+    check_text(header.session, "the session's label", place)
+    for name in header.sets:
+        check_text(name, "the name of a set", place)
 
 
 def _place(state, trial: Trial):

@@ -9,11 +9,11 @@ from hilbo.study.protocols import protocol
 from hilbo.study.text_cells import check_id, check_text
 from hilbo.study.typed_files import check_values
 
-__all__ = ["check_header", "study_of"]
+__all__ = ["check_header", "check_new_header", "study_of"]
 
 _SCHEMA = 1
 _MOST = 100_000  # trials of a block
-_LABEL = 64  # characters of a session's label
+_LABEL = 64  # characters of a session's label, and of an id
 _DAY = 86_400.0  # s
 
 
@@ -23,11 +23,12 @@ def study_of(study: Study, material: str | None) -> Study:
 
 
 def check_header(study: Study, header: Header) -> None:
-    """Refuse a header that no session of this study can have. Raises InputError."""
+    """Refuse a header that no session of this study can have, of whatever version. Raises InputError."""
     if header.schema != _SCHEMA:
         raise InputError(f"the session's header is of schema {header.schema}; this hilbo knows {_SCHEMA}.")
-    check_id(header.participant, "the session's header")
-    check_text(header.session, "the session's label")
+    person = header.participant
+    if not 0 < len(person) <= _LABEL or not person.isprintable() or any(mark in person for mark in "/\\"):
+        raise InputError(f"the session's participant is \"{person[:_LABEL]}\", which is nobody's id.")
     if not 0 < len(header.session) <= _LABEL or not header.session.isprintable():
         raise InputError(f'the session\'s label is "{header.session[:_LABEL]}"; it has 1 to {_LABEL} characters.')
     if not 0 <= header.seed < 2**63:
@@ -39,6 +40,17 @@ def check_header(study: Study, header: Header) -> None:
     for name, values in header.sets.items():
         if not all(math.isfinite(value) for value in values.values()):
             raise InputError(f'the set "{name}" of the session holds what is no finite number.')
+
+
+def check_new_header(study: Study, header: Header) -> None:
+    """Refuse a header with which no session may begin: one that `check_header` refuses, or with an id or words against
+    the rules for them. Raises InputError."""
+    check_header(study, header)
+    check_id(header.participant, "the session's header")
+    check_text(header.session, "the session's label")
+    for number, block in enumerate(header.blocks, 1):
+        for name in (name for planned in block.trials for name in (planned.a, planned.b) if name is not None):
+            check_text(name, "the name of a set", f"block {number}")
 
 
 def _check_block(study: Study, header: Header, block: Block, place: str) -> None:
@@ -59,5 +71,4 @@ def _check_block(study: Study, header: Header, block: Block, place: str) -> None
             if name is not None and name not in header.sets:
                 raise InputError(f'{place} shows the set "{name}", which the session does not have.')
             if name is not None:
-                check_text(name, "the name of a set", place)
                 check_values(header.sets[name], here.space.parameters, place, f'the set "{name}"')

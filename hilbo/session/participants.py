@@ -42,6 +42,8 @@ def read_people(path: str | os.PathLike) -> People:
     for line, row in rows:
         found = {key: (value or "").strip() for key, value in row.items() if key is not None}
         _check(found, f"{path}:{line}")
+        if not found["participant"]:
+            raise InputError(f"{path}:{line}: participant is empty; give each row a participant.")
         if found["participant"] in people:
             raise InputError(f"{path}:{line}: participant {found['participant']} stands there twice; keep one row.")
         people[found["participant"]] = found
@@ -52,6 +54,7 @@ def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
     """Add a row, and write the table anew, whole or not at all; with its folder. Raises InputError."""
     people = read_people(path) if Path(path).exists() else {}
     found = {key: str(value).strip() for key, value in row.items()}
+    _check_words(found, str(path))
     _check(found, str(path))
     if found["participant"] in people:
         raise InputError(f"{path}: participant {found['participant']} stands there already; choose another id.")
@@ -81,11 +84,15 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
     return row
 
 
-def _check(row, place):
+def _check_words(row, place):
+    """The rules for ids and words, for what comes in; a list that stands may hold what earlier versions took."""
     check_id(row.get("participant", ""), place)
     for name, text in row.items():
         check_text(name, "the name of a column", place)
         check_text(text, name, place)
+
+
+def _check(row, place):
     if row.get("consent_time"):
         try:
             datetime.datetime.fromisoformat(row["consent_time"])

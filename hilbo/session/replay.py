@@ -3,7 +3,7 @@
 An event is made again by the action of its kind in the state before it, and has to come out the same. So a log is
 refused whose lines fit each other and whose content does not: an answer to a trial that was not asked, a rendering
 outside the study's ranges, a trial out of nowhere. What an answer says cannot be checked so: the digests of a log have
-no secret.
+no secret. Which words may be said is asked where they are said, and never here.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -89,6 +89,11 @@ class _Given:
         return dict(self.found)
 
 
+def _worded(event: Event, **words: str) -> Event:
+    """An event with the words that a log has: no rule for words makes a log unreadable."""
+    return msgspec.structs.replace(event, data=event.data | words)
+
+
 _FIXED = ("id", "block", "phase", "material", "trial", "planned", "repeats")
 _Again = Callable[[LiveSession, Any, dict[str, Any], float], Event | None]
 _KINDS: dict[str, tuple[type, _Again]] = {
@@ -99,15 +104,15 @@ _KINDS: dict[str, tuple[type, _Again]] = {
         _Answer,
         lambda s, d, raw, at: actions.answer(s, d.id, d.client, d.values, at, browser=d.browser, felt=False),
     ),
-    "undo": (_Trial, lambda s, d, raw, at: actions.undo(s, at, d.reason)),
+    "undo": (_Trial, lambda s, d, raw, at: _worded(actions.undo(s, at), reason=d.reason)),
     "repeat": (_Trial, lambda s, d, raw, at: actions.repeat(s, at, d.id)),
-    "void": (_Trial, lambda s, d, raw, at: actions.void(s, d.id, d.reason, at)),
-    "skip": (_Trial, lambda s, d, raw, at: actions.skip(s, d.reason, at, d.id)),
+    "void": (_Trial, lambda s, d, raw, at: _worded(actions.void(s, d.id, "", at), reason=d.reason)),
+    "skip": (_Trial, lambda s, d, raw, at: _worded(actions.skip(s, "", at, d.id), reason=d.reason)),
     "restore": (_Trial, lambda s, d, raw, at: actions.restore(s, d.id, at)),
     "pause": (_Words, lambda s, d, raw, at: actions.pause(s, d.by, at)),
     "resume": (_Words, lambda s, d, raw, at: actions.resume(s, at)),
-    "abort": (_Words, lambda s, d, raw, at: actions.abort(s, d.reason, at)),
-    "note": (_Words, lambda s, d, raw, at: actions.note(s, d.text, at)),
+    "abort": (_Words, lambda s, d, raw, at: _worded(actions.abort(s, "", at), reason=d.reason)),
+    "note": (_Words, lambda s, d, raw, at: _worded(actions.note(s, "", at), text=d.text)),
     "more": (_Words, lambda s, d, raw, at: actions.more(s, at)),
     "go_on": (_Words, lambda s, d, raw, at: actions.go_on(s, at)),
     "device": (

@@ -4,12 +4,13 @@ import hashlib
 import json
 import zlib
 
+import msgspec
 import pytest
 from live import STUDY, Driver
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog
-from hilbo.session.export import read_sessions
+from hilbo.session.export import psych_ds, read_sessions
 
 
 def write(path, kind):
@@ -127,3 +128,35 @@ def test_a_log_is_its_owners_alone(tmp_path):
     path = tmp_path / "P01_1.session.jsonl"
     write(path, "optimisation")
     assert path.stat().st_mode & 0o077 == 0
+
+
+def older_words(lines):
+    """What earlier versions took: words that begin as a formula does."""
+    for kind, key in (("note", "text"), ("undo", "reason"), ("void", "reason")):
+        first(lines, kind)["data"][key] = "- participant sneezed"
+
+
+@pytest.mark.parametrize("person", ["_test", "Probelauf-mit-einem-langen-Namen-1", "Ümit"])
+def test_words_and_ids_of_earlier_versions_make_no_log_unreadable(tmp_path, person):
+    path = tmp_path / "P01_1.session.jsonl"
+    lines = write(path, "optimisation")
+    older_words(lines)
+    lines[0]["data"]["participant"] = person
+    chained(path, lines)
+    EventLog.resume(path, STUDY).close()
+    sessions = read_sessions(tmp_path, STUDY)
+    exported = psych_ds(sessions, tmp_path / "tables", STUDY)
+    table = next(file for file in exported if file.name == "study-plain_table-presentations_data.csv").read_text()
+    assert "sneezed" not in table and table.count("see the log") == 1
+    header = msgspec.structs.replace(sessions[0].header, session="2")
+    with pytest.raises(InputError, match="participant is"):
+        EventLog.create(tmp_path / "new.session.jsonl", STUDY, header)
+
+
+def test_an_export_names_the_log_whose_label_a_spreadsheet_would_run(tmp_path):
+    path = tmp_path / "P01_1.session.jsonl"
+    lines = write(path, "optimisation")
+    lines[0]["data"]["session"] = "=1+1"
+    chained(path, lines)
+    with pytest.raises(InputError, match=r"P01_-1-1\.session\.jsonl: the session's label"):
+        psych_ds(read_sessions(tmp_path, STUDY), tmp_path / "tables", STUDY)

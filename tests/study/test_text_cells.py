@@ -47,11 +47,18 @@ def people(path, **changes):
     return path
 
 
+def added(path):
+    """A row comes in by add_person; a list that stands may hold what earlier versions took."""
+    (row,) = pd.read_csv(path, dtype=str, keep_default_na=False).to_dict("records")
+    read_people(path)
+    return add_person(path.with_name(f"new-{len(list(path.parent.iterdir()))}.csv"), row)
+
+
 READ = {
     "trials": (trials, lambda path: read_trials(path, STUDY)),
     "validation": (compared, lambda path: read_validation(path, STUDY.responses)),
     "sets": (sets, lambda path: read_sets(path, ("source", "u", "v"))),
-    "people": (people, read_people),
+    "people": (people, added),
 }
 TEXTS = [
     *(("trials", column) for column in ("session", "notes")),
@@ -134,3 +141,10 @@ def test_an_error_of_the_system_is_a_sentence(tmp_path, monkeypatch, capsys):
     err = capsys.readouterr().err
     assert stopped.value.code == 1 and err.startswith("hilbo: /tmp/here: could not be read or written (No space left")
     assert "OSError" not in err and json.dumps(err).count("\\n") == 1
+
+
+def test_a_list_of_earlier_versions_can_be_read(tmp_path):
+    path = people(tmp_path / "people.csv", participant="_test", protocol_number="+49 1", notes="- left early")
+    assert read_people(path)["_test"]["notes"] == "- left early"
+    add_person(path, {"participant": "P02", "consent_time": "2026-05-04T10:00", "protocol_number": "7"})
+    assert list(read_people(path)) == ["_test", "P02"] and "- left early" in path.read_text()
