@@ -62,6 +62,8 @@ class RuleMap(eqx.Module):
     share: Float[Array, ""]
     prior: Float[Array, ""]
     """Prior variance of one person's function."""
+    reach: Float[Array, ""] | None = None
+    """By learnt-1 the largest variance of the map where somebody answered: beyond it no optimum is sought."""
 
     def predict(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the map at points (m, d)."""
@@ -102,8 +104,10 @@ def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[pointw
 
 def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
     """The map by learnt hyperparameters, from stacked trials (M, n)."""
-    variance = learnt.model.shared + learnt.model.own
-    return RuleMap(RECIPE, "exact", None, learnt_function(learnt, trials), learnt.model.share, variance)
+    shared = learnt_function(learnt, trials)
+    _, variances = shared.predict(trials.x.reshape(-1, trials.x.shape[-1]))
+    reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
+    return RuleMap(RECIPE, "exact", None, shared, learnt.model.share, learnt.model.shared + learnt.model.own, reach)
 
 
 def rule_map(

@@ -30,6 +30,7 @@ from hilbo.study.config import Study
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
 from hilbo.study.learnt_study import learnt_content, learnt_sentences
 from hilbo.study.map_file import write_map
+from hilbo.study.optimum_location import location_sentences
 from hilbo.study.typed_files import sealed
 
 __all__ = [
@@ -107,7 +108,8 @@ def result(
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
     failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
     content["warnings"] = ([_not_converged(failed)] if failed else []) + rule_warnings(study, aggregate)
-    content["warnings"] += learnt_sentences(study)
+    asked = None if isinstance(aggregate, Merged) else aggregate.asked_variance
+    content["warnings"] += learnt_sentences(study) + location_sentences(study, best.x, best.sd, asked)
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content

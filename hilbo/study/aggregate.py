@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition, bcm
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
@@ -89,6 +89,14 @@ class Aggregate(eqx.Module):
         certificate = self.posteriors.certificate
         return {name: np.asarray(getattr(certificate, name)) for name in certificate.__dataclass_fields__}
 
+    @property
+    def asked_variance(self) -> Float[Array, ""]:
+        """Largest variance of the map at a point that somebody answered."""
+        if self.map.reach is not None:
+            return self.map.reach
+        points = np.unique(np.asarray(self.cohort.trials.x)[np.asarray(self.cohort.trials.mask)], axis=0)
+        return jnp.max(self.surface(points)[1])
+
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube."""
         return predict_map(self.map, jnp.asarray(x))
@@ -159,15 +167,22 @@ def population_optimum(
 @eqx.filter_jit
 def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
     """Where a rule's map has its largest mean in the feasible set; by learnt-1 where a new person answers with the
-    highest category most often."""
+    highest category most often, among points of which the answers tell as much as of some that were asked."""
+    if found.rule != RECIPE:
+        return _optimum(study, lambda x: predict_map(found, x), candidates, found.apart)
+    likelihood = study.gp.likelihood
 
     def chance(mean, variance):
         """Rises with the probability of the highest category: its normal score."""
-        likelihood = study.gp.likelihood
         return (mean - likelihood.thresholds[-1]) / jnp.sqrt(likelihood.noise**2 + variance + found.apart)
 
-    height = chance if found.rule == RECIPE else None
-    return _optimum(study, lambda x: predict_map(found, x), candidates, found.apart, height)
+    assert found.reach is not None
+    known = jnp.maximum(found.reach, jnp.min(found.predict(candidates)[1]))  # of which there is one at least
+
+    def told(x):
+        return found.predict(x[None, :])[1][0] <= known
+
+    return _optimum(study, found.predict, candidates, found.apart, chance, told)
 
 
 def _optimum(
@@ -176,9 +191,10 @@ def _optimum(
     candidates: Float[Array, "m d"],
     apart: ArrayLike,
     height: Callable[[Array, Array], Array] | None = None,
+    allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
 ) -> Optimum:
     """`apart`: variance of one person's function about the map's; `height`: what is largest at the optimum, of means
-    and variances; by default the mean."""
+    and variances, by default the mean; `allowed`: where it may be."""
     height = (lambda mean, _: mean) if height is None else height
     choice = acquisition.maximise(
         height(*predict(candidates)),
@@ -187,6 +203,7 @@ def _optimum(
         from_box=study.space.from_box,
         to_box=study.space.to_box,
         feasible=study.space.feasible,
+        allowed=allowed,
         steps=300,
     )
     mean, variance = predict(choice.x[None, :])

@@ -25,8 +25,9 @@ from hilbo.study.aggregate import Aggregate, aggregate_cohort, nrmse
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import in_place
-from hilbo.study.learnt_study import resolved
+from hilbo.study.learnt_study import learnt_sentences, resolved
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
+from hilbo.study.optimum_location import location_sentences
 from hilbo.study.progress import Progress, follow
 from hilbo.study.tolerance_intervals import Ends, tolerance_ends
 
@@ -120,7 +121,10 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     learned, learned_study, optimised = _optimised(study, cohort, seed)
     say("reading the maps")
     sets, sentences = _best_mid_worst(study, aggregate, seed)
-    limits = (*limits_of(study, cohort), *sentences, *_merged_otherwise(aggregate.map))
+    best = aggregate.optimum
+    location = location_sentences(study, best.x, best.sd, aggregate.asked_variance)
+    limits = (*location, *learnt_sentences(study), *limits_of(study, cohort), *sentences)
+    limits += tuple(_merged_otherwise(aggregate.map))
     if bool(learned.runaway) or not bool(learned.converged):
         limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
     return Analysis(

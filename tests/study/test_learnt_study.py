@@ -1,16 +1,20 @@
 """A study file without [gp]: what is read, what a session starts from, and what its results say."""
 
 import json
+import tomllib
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import run
 
 from hilbo import Session
 from hilbo.errors import InputError
+from hilbo.ordinal_gp import Trials
 from hilbo.simulation.simulate import to_table
 from hilbo.study.aggregate import aggregate_cohort
-from hilbo.study.cohort import cohort_of
+from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.learnt_study import learnt_content, learnt_sentences, resolved, that_learns
 from hilbo.study.robustness import robustness
@@ -34,19 +38,12 @@ PEOPLE, ANSWERS = 4, 12
 
 
 def study_of(text=FILE) -> Study:
-    import tomllib
-
     return Study.from_dict(tomllib.loads(text))
 
 
 @pytest.fixture(scope="module")
 def table(tmp_path_factory):
     """A trial table of people who like one place."""
-    import jax
-    import jax.numpy as jnp
-
-    from hilbo.ordinal_gp import Trials
-
     rng = np.random.default_rng(0)
     each = []
     for j in range(PEOPLE):
@@ -145,3 +142,20 @@ def test_by_the_command_line_nothing_stated_is_kept():
     np.testing.assert_allclose(study.gp.kernel.theta, 8.0)
     assert study.rule == "learnt-1"
     assert not any(study.stated)
+
+
+@pytest.mark.deep  # the searches of all maps are compiled
+def test_no_optimum_where_the_answers_tell_less_than_wherever_somebody_was_asked():
+    """People who like more of everything, asked in one corner only: the best would be far outside."""
+    rng = np.random.default_rng(1)
+    each = []
+    for _ in range(PEOPLE):
+        x = 0.4 * rng.uniform(size=(ANSWERS, 2))
+        felt = 4.0 * (x.sum(axis=1) - 0.4) + 0.3 * rng.normal(size=ANSWERS)
+        each.append(Trials.from_arrays(x, (felt > -0.5).astype(int) + (felt > 0.5), ANSWERS))
+    trials = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    study = study_of()
+    cohort = Cohort(trials, np.asarray(trials.x), tuple(f"P{j}" for j in range(PEOPLE)))
+    aggregate = aggregate_cohort(study, cohort, alternatives=False)
+    assert float(aggregate.optimum.sd) ** 2 <= float(aggregate.asked_variance) * (1 + 1e-9)
+    assert float(jnp.max(aggregate.optimum.x)) < 0.6

@@ -1,0 +1,33 @@
+"""An optimum at an edge, at the border of what may be rendered, or where nobody was asked says so."""
+
+import jax.numpy as jnp
+
+from hilbo.study.config import Study
+from hilbo.study.optimum_location import location_sentences
+
+STUDY = Study.load("hilbo/data/paper.toml")
+SD, ASKED = jnp.asarray(0.3), jnp.asarray(0.25)
+
+
+def test_inside_and_known_there_is_nothing_to_say():
+    assert location_sentences(STUDY, jnp.array([0.1, 0.2, 0.2]), SD, ASKED) == []
+
+
+def test_the_edge_of_a_range_is_named():
+    (sentence,) = location_sentences(STUDY, jnp.array([0.1, 0.2, 0.0]), SD, ASKED)
+    assert sentence.startswith("The optimum lies at the lowest alpha that was searched (0.01):")
+
+
+def test_the_border_of_the_passive_set_is_named():
+    x = STUDY.space.from_box(jnp.array([1.0, 0.5, 0.5]))
+    assert 0 < float(x[0]) < 1
+    (sentence,) = location_sentences(STUDY, x, SD, ASKED)
+    assert "border of what the device may render: K1 could not be higher" in sentence
+
+
+def test_an_extrapolation_is_called_one():
+    x = jnp.array([0.1, 0.2, 0.2])
+    (sentence,) = location_sentences(STUDY, x, jnp.asarray(0.9), ASKED)
+    assert "there, 0.9, is larger than wherever somebody answered (0.5 at most)" in sentence
+    assert location_sentences(STUDY, x, jnp.asarray(0.9), None) == []
+    assert location_sentences(STUDY, x, jnp.asarray(0.5), ASKED) == []
