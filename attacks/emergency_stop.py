@@ -4,8 +4,9 @@
 
 The connections are of one other process, from this computer, and come again as soon as they are given up: silent ones,
 half headers a byte at a time, endless bodies, noise, clients that leave in mid-body, wrong keys, pages asked for as
-fast as they are given, and the same with the participant's key, as a stolen tablet would. Presses go by turns over a
-connection that is open already and over a new one. 99 % have to be acknowledged within 100 ms.
+fast as they are given, one by one and 200 at once, and the same with the participant's key, as a stolen tablet would.
+Presses go by turns over a connection that is open already and over a new one. 99 % have to be acknowledged within
+100 ms.
 """
 
 import asyncio
@@ -31,7 +32,9 @@ from attacks.support import main
 __all__ = ["WITHIN", "Siege", "besieged"]
 
 WITHIN = 0.1  # s
-_KINDS = ("silent", "drip", "endless", "noise", "leaves", "wrong key", "asks", "asks with the participant's key")
+_KINDS = ("silent", "drip", "endless", "noise", "leaves", "wrong key", "asks", "asks with the participant's key",
+          "many at once", "many at once with the participant's key")  # fmt: skip
+_AT_ONCE = 200  # requests in one piece
 
 
 def head(port: int, what: str, key: str = "", length: int | None = None) -> bytes:
@@ -71,9 +74,10 @@ async def attack(port: int, kind: str, key: str, rng: random.Random) -> None:
             writer.write(head(port, "POST /api/experimenter/estop", "a" * 32, length=2) + b"{}")
             await reader.read()
         else:
-            what = "GET /static/experimenter.js" if kind == "asks" else "GET /api/participant"
+            theirs = kind.endswith("key")
+            what = head(port, "GET /api/participant", key) if theirs else head(port, "GET /static/experimenter.js")
             while True:
-                writer.write(head(port, what, key if kind != "asks" else ""))
+                writer.write(what * (_AT_ONCE if kind.startswith("many") else 1))
                 if not await reader.read(65536):
                     return
     finally:

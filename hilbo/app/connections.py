@@ -1,9 +1,10 @@
 """Connections to the server, and how much of it each may take, so that whoever holds a key is always heard.
 
-A connection is a stranger's until a key of a role has come in on it; then it is the role's. Strangers, participants and
-experimenters have numbers of connections of their own, and of too many the oldest is given up. An experimenter is
-heard at once, participants and strangers by turns. A
-request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's connection.
+A connection is a stranger's until a key of a role has come in on it; then it is the role's. Strangers, participants
+and experimenters have numbers of connections of their own, and of too many the oldest is given up. An experimenter is
+heard at once, participants and strangers by turns, each request of theirs anew. A stranger's connection ends with its
+first answer. A request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's
+connection.
 
 uvicorn and h11 do the rest; without this, they would wait for a header for ever, and read a body of any size.
 """
@@ -12,6 +13,7 @@ import asyncio
 from typing import Any
 
 import h11
+from uvicorn.protocols.http.flow_control import CLOSE_HEADER
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from hilbo.app.security import Gate, Role
@@ -24,7 +26,7 @@ LARGEST = 65_536  # bytes of a request
 _MOST: dict[Role | None, int] = {"experimenter": 32, "participant": 32, None: 32}  # a browser opens six at most
 _KEPT = 120  # s that a role's idle connection stays open, so that the next press of a button needs no new one
 _SEEN = 256  # bytes of the past in which the beginning of a key may be
-LOOKED = 4096  # bytes of what comes at once that are looked through for a key
+LOOKED = 16_384  # bytes of what comes at once that are looked through for a key: all of the longest header
 
 
 class Connections:
@@ -103,18 +105,30 @@ class Connection(H11Protocol):
         if self.transport.is_closing():
             return
         data, self._unheard = self._unheard, b""
-        super().data_received(data)
-        if not self.flow.read_paused:
+        if data:
+            self._unset_keepalive_if_required()
+            self.conn.receive_data(data)
+        super().handle_events()
+        if self.cycle is not None:
+            usual = self.server_state.default_headers
+            self.cycle.default_headers = usual if self.role else [*usual, CLOSE_HEADER]
+        if not self.flow.read_paused and (self.role is not None or self._begun()):
             self.transport.resume_reading()
         if self._begun():
             self._limit_time()
         elif self.role is not None:
             self._unlimit_time()
 
+    def handle_events(self) -> None:
+        """Another request may have come with the one that was answered; it waits for its turn as that one did."""
+        if self._unheard or self.conn.trailing_data[0]:
+            self.transport.pause_reading()
+            self._others.wait(self)
+
     def on_response_complete(self) -> None:
-        """The next request is counted from here."""
-        self._size = 0
+        """A role's next request is counted from here."""
         if self.role is not None:
+            self._size = 0
             self.timeout_keep_alive = _KEPT
         super().on_response_complete()
 

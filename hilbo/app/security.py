@@ -28,7 +28,7 @@ __all__ = ["Gate", "Role", "lan_addresses"]
 Role = Literal["participant", "experimenter"]
 _BYTES = 24
 _LENGTH = 32  # characters of a key: base64 of _BYTES
-_KEYS = 4  # that a request may show, so that nobody has the server try thousands
+_KEYS = 4  # of each kind that a request may show, so that nobody has the server try thousands
 
 
 class Gate:
@@ -42,8 +42,11 @@ class Gate:
         self.hosts = frozenset(host.lower() for host in hosts)
         port = min(host.rpartition(":")[2] for host in self.hosts)  # all of them have the same
         self.cookies: dict[Role, str] = {role: f"hilbo_{role}_{port}" for role in get_args(Role)}
-        names = "|".join(self.cookies.values())
-        self._shown = re.compile(rf"(?:(?:{names})=|bearer +)([\w-]{{{_LENGTH}}})(?![\w-])".encode(), re.IGNORECASE)
+        roles = "|".join(get_args(Role))
+        key = rf"([\w-]{{{_LENGTH}}})(?![\w-])"
+        self._shown = [
+            re.compile(f"{before}{key}".encode()) for before in ("earer {1,8}", f"hilbo_(?:{roles})_{port}=")
+        ]
         self.origins = frozenset(f"http://{host}" for host in self.hosts)
         self._file = keys
         self._keys: dict[Role, str] = _kept(keys)
@@ -80,9 +83,8 @@ class Gate:
     def role_in(self, data: bytes) -> Role | None:
         """The role whose key is in some bytes of a connection, before anything has read them as HTTP; of two the
         experimenter's."""
-        if b"earer " not in data and b"hilbo_" not in data:  # most strangers', and quicker
-            return None
-        keys = [found[1].decode() for found in itertools.islice(self._shown.finditer(data), _KEYS)]
+        shown = (itertools.islice(pattern.finditer(data), _KEYS) for pattern in self._shown)
+        keys = [found[1].decode() for found in itertools.chain.from_iterable(shown)]
         return next((role for role in reversed(get_args(Role)) for key in keys if self.admits(role, key)), None)
 
     def refuses(self, headers: Mapping[str, str], *, changes: bool, cookie: bool) -> str | None:

@@ -22,7 +22,7 @@ __all__ = ["PORT", "Place", "bound", "qr_image", "qr_text", "serve"]
 
 PORT = 8642
 _LINGER = 3  # s for what is still being answered when the server ends
-_FILES = 1024  # open files that are asked for: select() knows no more
+_FILES = 512 if sys.platform == "win32" else 1024  # open files that are asked for: select() knows no more
 _SWITCH = 0.0005  # s until the busy event loop lets another thread go on: a stop passes through three of them
 _RESERVED = 160  # of them for connections that are served, the device, the log
 
@@ -116,7 +116,9 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
 
     server.startup, server.shutdown = startup, shutdown  # type: ignore[method-assign]
     try:
-        server.run(sockets=[])  # the porter has it
+        # The default of Windows has no add_reader, which the porter needs.
+        with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
+            runner.run(server.serve(sockets=[]))  # the porter has it
     finally:
         place.socket.close()
 

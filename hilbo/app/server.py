@@ -143,6 +143,7 @@ def _for(hub, gate):
         async def handle(request: Request) -> Response:
             program = _bearer(request)
             if not gate.admits(role, program or request.cookies.get(gate.cookies[role])):
+                await _body(request)  # the connection ends with the answer, and with it what is still on its way
                 return _error(401, "Open the link of this session first; this page is no longer part of it.")
             if program and role == "participant":
                 hub.watchers.heard()

@@ -7,6 +7,7 @@ import struct
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 from bare_server import Bare, connected, request, status, until_closed, until_words
@@ -118,6 +119,59 @@ def test_many_requests_in_one_piece_are_all_answered(server):
         came = b""
         while came.count(b'{"role":"experimenter"}') < 50:
             came += line.recv(65536)
+
+
+def test_a_stranger_is_answered_once(server):
+    with patient(connected(server.port)) as line:
+        line.sendall(request(server, "/static/participant.js") * 30)
+        came = until_closed(line)
+    assert came.count(b"HTTP/1.1 200") == 1
+    assert b"connection: close" in came
+
+
+def test_a_key_that_has_ended_is_told_so_when_all_of_the_message_has_come(server):
+    """What comes after the end of a connection can take the answer with it."""
+    whole = request(server, "/api/participant/here", "a" * 32, b"{}")
+    with connected(server.port) as line:
+        line.sendall(whole[:-1])
+        with pytest.raises(TimeoutError):
+            patient(line, 0.1).recv(1)
+        line.sendall(whole[-1:])
+        assert status(until_closed(patient(line)).decode()) == 401
+
+
+def test_what_a_participant_asks_for_in_one_piece_is_answered_turn_by_turn(server):
+    begun = time.monotonic()
+    with connected(server.port) as line:
+        line.sendall(request(server, "/api/participant", server.participant._key) * 30)
+        came = b""
+        while came.count(b'{"role":"participant"}') < 30:
+            came += line.recv(65536)
+    assert time.monotonic() - begun > 29 * 0.005
+
+
+@pytest.mark.parametrize("length", [5_000, 15_000])
+def test_a_key_behind_cookies_of_other_programs_is_seen(server, brief, length):
+    cookie = f"Cookie: other={'x' * length}; hilbo_experimenter_{server.port}={server.experimenter._key}\r\n\r\n"
+    with connected(server.port) as stream:
+        stream.sendall(request(server, "/api/experimenter/events")[:-2] + cookie.encode())
+        until_words(stream, b"event: view")
+        with pytest.raises(TimeoutError):
+            patient(stream, 0.3).recv(1)
+
+
+def test_the_event_loop_watches_sockets_on_windows_too(tmp_path, monkeypatch):
+    """What is the default there cannot."""
+
+    class Proactor(asyncio.SelectorEventLoop):
+        def add_reader(self, *_):
+            raise NotImplementedError
+
+    monkeypatch.setattr(asyncio, "ProactorEventLoop", Proactor, raising=False)
+    monkeypatch.setattr("uvicorn.loops.asyncio.sys", SimpleNamespace(platform="win32"))
+    monkeypatch.setattr("bare_server.PATIENCE", 0.5)
+    with Bare(tmp_path) as own:
+        assert status(own.stops()) == 200
 
 
 def test_every_connection_has_no_delay(server, monkeypatch):
