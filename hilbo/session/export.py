@@ -63,7 +63,7 @@ _WORDS = {
     "role": "best, mid or worst of the map that the set was read from; empty for others",
     "memory": "short or full: how the past is rendered",
     "states": "Number of exponentials of full memory",
-    "voided_reason": f"Why the trial does not count; '{_UNWRITTEN}' where a spreadsheet would run the words as a formula",
+    "voided_reason": f"Why the trial does not count; '{_UNWRITTEN}' for words that a spreadsheet would run",
     "N": "Number of past samples that are rendered",
     "T": "Time between two samples, s",
 }

@@ -13,12 +13,17 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import in_use, log_paths, read_log
+from hilbo.session.withdrawn_names import CODED_JUDGED, names_person
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
-    names_person,
+    Cells,
+    coded_own,
+    named_sets,
     netcdf_without,
     read_table,
+    set_names,
     sets_compared,
+    sets_from,
     without_person,
     write_table,
 )
@@ -81,6 +86,11 @@ def delete_participant(folder: str | os.PathLike, participant: str) -> Withdrawa
     if not (done.removed or done.renamed):
         also = f"; {len(done.left)} files name them that are not touched, {next(iter(done.left))}" if done.left else ""
         raise InputError(f'{folder}: holds nothing of participant "{participant}"{also}; check id and folder.')
+    if coded := _coded(root):
+        done.left[str(root)] = (
+            f"{len(coded)} files below hold renderings from individuals' maps under codes, theirs perhaps among them;"
+            f" the values stay with those who compared them: {', '.join(map(str, coded))}"
+        )
     return done
 
 
@@ -110,9 +120,9 @@ def _tables(root: Path, done: Withdrawal) -> None:
     paths = sorted(path for end in ("*.csv", "*.parquet") for path in root.rglob(end))
     tables = {path: table for path in paths if (table := read_table(path)) is not None}
     done.left |= {str(path): _UNREADABLE for path in paths if path.suffix == ".parquet" and path not in tables}
-    compared = {name for table in tables.values() for name in sets_compared(table, done.participant)}
+    names, gone_sets = _sets(tables.values(), done.participant, done.label)
     for path, table in tables.items():
-        edited = without_person(table, done.participant, done.label, compared)
+        edited = without_person(table, done.participant, done.label, names, gone_sets)
         gone = len(table.rows) - len(edited.kept)
         if not (gone or edited.renamed):
             continue
@@ -130,10 +140,32 @@ def _tables(root: Path, done: Withdrawal) -> None:
             done.removed[str(path)] = gone
 
 
+def _sets(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[str, str], set[str]]:
+    """Names of their sets, and what they are called afterwards; and the sets that nobody else has compared."""
+    tables = list(tables)
+    compared = {name for table in tables for name in sets_compared(table, participant)}
+    names = {old: new for table in tables for old, new in set_names(table, participant, label).items()}
+    own = {name for table in tables for name in coded_own(table, participant) | sets_from(table, participant)}
+    return names, (own | set(names)) - compared
+
+
 def _plans(root: Path, done: Withdrawal) -> None:
     for path in sorted(root.rglob("*.json")):
         if path.name != LIST and plan_without(path, done.participant, done.label):
             done.renamed[str(path)] = 1
+
+
+def _coded(root: Path) -> list[Path]:
+    """The files with renderings of individuals' maps that others compare under codes."""
+    found = []
+    for path in sorted(path for end in ("*.csv", "*.parquet", "*.json", "*.jsonl") for path in root.rglob(end)):
+        if path.suffix in (".csv", ".parquet"):
+            table = read_table(path)
+            holds = table is not None and any(CODED_JUDGED.search(name) for name in named_sets(table))
+        else:
+            holds = CODED_JUDGED.search(path.read_text(encoding="utf-8", errors="replace")) is not None
+        found += [path] if holds else []
+    return found
 
 
 def _left(root: Path, participant: str, whose: dict[Path, str], damaged: Iterable[Path]) -> dict[str, str]:

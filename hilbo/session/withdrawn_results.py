@@ -8,13 +8,15 @@ nobody and may hold their answers (of `hilbo validate`) are marked by a file bes
 import json
 import re
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
 from hilbo.session.plan import plan_hash
-from hilbo.session.withdrawn_tables import names_person, replace_file, replaced
+from hilbo.session.withdrawn_names import names_person, renamed_set
+from hilbo.session.withdrawn_tables import replace_file
 from hilbo.study.results_list import LIST, Listed, listed, relist
 
 __all__ = ["MARK", "Cleared", "clear_results", "plan_without", "results_folders"]
@@ -142,7 +144,7 @@ def plan_without(path: Path, participant: str, label: str) -> bool:
         return False
     whole = plan["hash"] == plan_hash(plan)
     plan["participants"] = [
-        _row_without(row, participant, label)
+        _row_without(row, participant, label, plan.get("materials") or ())
         for row in plan["participants"]
         if not (row["participant"] == participant and plan.get("source") == "individual")
     ]
@@ -154,10 +156,27 @@ def plan_without(path: Path, participant: str, label: str) -> bool:
     return True
 
 
-def _row_without(row: Any, participant: str, label: str) -> Any:
-    """A plan's row with the label wherever the id stands."""
-    if isinstance(row, dict):
-        return {key: _row_without(value, participant, label) for key, value in row.items()}
-    if isinstance(row, list):
-        return [_row_without(value, participant, label) for value in row]
-    return replaced(row, participant, label) if isinstance(row, str) else row
+def _row_without(row: dict[str, Any], participant: str, label: str, materials: Iterable[str | None]) -> dict[str, Any]:
+    """A plan's row with the label where the participant is named, and in names of sets from their map."""
+
+    def person(values: dict[str, Any], *keys: str) -> dict[str, Any]:
+        return values | {key: label for key in keys if values.get(key) == participant}
+
+    def trial(planned: Any) -> Any:
+        sides = {side: planned[side] for side in ("a", "b") if isinstance(planned, dict) and side in planned}
+        made = {side: renamed_set(str(name), participant, label, materials) for side, name in sides.items() if name}
+        return planned | made if made else planned
+
+    def block(found: Any) -> Any:
+        known = isinstance(found, dict) and isinstance(found.get("trials"), list)
+        return found | {"trials": [trial(planned) for planned in found["trials"]]} if known else found
+
+    row, header = person(row, "participant", "reissued_from"), row.get("header")
+    if not isinstance(header, dict):
+        return row
+    header = person(header, "participant")
+    if isinstance(sets := header.get("sets"), dict):
+        header["sets"] = {renamed_set(name, participant, label, materials): values for name, values in sets.items()}
+    if isinstance(blocks := header.get("blocks"), list):
+        header["blocks"] = [block(found) for found in blocks]
+    return row | {"header": header}

@@ -1,33 +1,38 @@
 """One participant's part of tables: rows taken out of CSV, Parquet and netCDF, and names of their sets made nobody's.
 
 A set that was read from somebody's own map may have been compared by others. Where their answers name it, it stays, and
-its name and source say `withdrawn-…` in the place of the id; where nobody does, it goes.
+its name and source say `withdrawn-…` in the place of the id; where nobody does, it goes. So do sets of their own map
+under a code that their own answers alone name.
 """
 
 import contextlib
 import csv
 import os
-import re
 import tempfile
 import warnings
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
+
+from hilbo.session.set_codes import OWN
+from hilbo.session.withdrawn_names import CODED_OWN, renamed_set, replaced
 
 __all__ = [
     "Cells",
     "Edited",
-    "names_person",
+    "coded_own",
+    "named_sets",
     "netcdf_without",
     "read_table",
     "replace_file",
-    "replaced",
+    "set_names",
     "sets_compared",
+    "sets_from",
     "without_person",
     "write_table",
 ]
 
 _SET_COLUMNS = ("set_a", "set_b", "first", "preferred", "set_id", "source")
-_INDIVIDUAL = "individual:"
 
 
 class Cells(NamedTuple):
@@ -35,21 +40,6 @@ class Cells(NamedTuple):
 
     head: list[str]
     rows: list[list[str]]
-
-
-def names_person(text: str, participant: str) -> bool:
-    """Whether a text holds this id, not as a part of another one."""
-    return _pattern(participant).search(text) is not None
-
-
-def replaced(text: str, participant: str, label: str) -> str:
-    """A text with a label in the place of the id."""
-    return _pattern(participant).sub(label, text)
-
-
-def _pattern(participant: str) -> re.Pattern[str]:
-    before = r"(?:(?<![A-Za-z0-9_.-])|(?<=\bown-))"  # simulated studies of earlier versions have sets own-ID
-    return re.compile(rf"{before}{re.escape(participant)}(?![A-Za-z0-9_-]|\.[A-Za-z0-9])")
 
 
 def read_table(path: Path) -> Cells | None:
@@ -80,15 +70,58 @@ class Edited(NamedTuple):
     """Rows in which the name of a set has become nobody's."""
 
 
-def without_person(table: Cells, participant: str, label: str, compared: set[str]) -> Edited:
-    """A table without a participant. `compared`: names of sets that answers of others hold."""
+def set_names(table: Cells, participant: str, label: str) -> dict[str, str]:
+    """The sets in a table that are named after a participant, and what they are called afterwards."""
+    found = {}
+    for cells in _rows(table):
+        for name in filter(None, (cells.get(column) for column in ("set_a", "set_b", "set_id"))):
+            made = renamed_set(name, participant, label, (cells.get("material"),))
+            if made == name and name == cells.get("set_id") and cells.get("source") == OWN + participant:
+                made = replaced(name, participant, label)
+            found |= {name: made} if made != name else {}
+    return found
+
+
+def coded_own(table: Cells, participant: str) -> set[str]:
+    """The sets of their own map that a participant's answers name by a code."""
+    theirs = (cells for cells in _rows(table) if cells.get("participant") == participant)
+    names = {cells.get(column, "") for cells in theirs for column in ("set_a", "set_b")}
+    return {name for name in names if CODED_OWN.fullmatch(name)}
+
+
+def named_sets(table: Cells) -> set[str]:
+    """All sets that a table names."""
+    return {cells[column] for cells in _rows(table) for column in ("set_a", "set_b", "set_id") if cells.get(column)}
+
+
+def sets_from(table: Cells, participant: str) -> set[str]:
+    """The sets whose source says that they are from a participant's map."""
+    return {cells["set_id"] for cells in _rows(table) if cells.get("source") == OWN + participant and "set_id" in cells}
+
+
+def sets_compared(table: Cells, participant: str) -> set[str]:
+    """The sets that answers of others name; empty for a table of something else."""
+    others = (cells for cells in _rows(table) if cells.get("participant") != participant)
+    return {cells[column] for cells in others for column in ("set_a", "set_b") if cells.get(column)}
+
+
+def _rows(table: Cells) -> Iterator[dict[str, str]]:
+    head = [name.strip() for name in table.head]
+    return (dict(zip(head, (cell.strip() for cell in row), strict=False)) for row in table.rows)
+
+
+def without_person(
+    table: Cells, participant: str, label: str, names: Mapping[str, str], gone: Collection[str] = ()
+) -> Edited:
+    """A table without a participant. `names`: sets that are called otherwise now. `gone`: sets whose rows go too."""
     head = [name.strip() for name in table.head]
     kept, rows, renamed = [], [], 0
-    for number, row in enumerate(table.rows):
-        if _is_theirs(dict(zip(head, (cell.strip() for cell in row), strict=False)), participant, compared):
+    for number, (row, cells) in enumerate(zip(table.rows, _rows(table), strict=True)):
+        own = cells.get("source") == OWN + participant and "set_id" not in cells
+        if own or cells.get("participant") == participant or cells.get("set_id") in gone:
             continue
         made = [
-            replaced(cell, participant, label) if column in _SET_COLUMNS else cell
+            _renamed(cell, column, names | {OWN + participant: OWN + label})
             for column, cell in zip([*head, *[""] * (len(row) - len(head))], row, strict=False)
         ]
         renamed += made != row
@@ -97,23 +130,10 @@ def without_person(table: Cells, participant: str, label: str, compared: set[str
     return Edited(kept, Cells(table.head, rows), renamed)
 
 
-def sets_compared(table: Cells, participant: str) -> set[str]:
-    """The sets that answers of others name; empty for a table of something else."""
-    head = [name.strip() for name in table.head]
-    found = set()
-    for row in table.rows:
-        cells = dict(zip(head, (cell.strip() for cell in row), strict=False))
-        if cells.get("participant") != participant:
-            found |= {cells[column] for column in ("set_a", "set_b") if cells.get(column)}
-    return found
-
-
-def _is_theirs(cells: dict[str, str], participant: str, compared: set[str]) -> bool:
-    own = cells.get("source") == _INDIVIDUAL + participant
-    if cells.get("participant") == participant or (own and "set_id" not in cells):
-        return True
-    name = cells.get("set_id", "")
-    return name not in compared and (own or (bool(name) and names_person(name, participant)))
+def _renamed(cell: str, column: str, names: Mapping[str, str]) -> str:
+    """A whole cell that is the name of a set, called otherwise; a and b are sides where a side stands."""
+    side = column in ("first", "preferred") and cell.strip() in ("a", "b")
+    return cell if column not in _SET_COLUMNS or side else names.get(cell.strip(), cell)
 
 
 def write_table(path: Path, edited: Edited) -> None:

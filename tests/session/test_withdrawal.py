@@ -2,6 +2,7 @@
 
 import json
 
+import msgspec
 import numpy as np
 import pandas as pd
 import pytest
@@ -11,8 +12,9 @@ from live import STUDY, Driver
 from hilbo.cli.console import results
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.plan import make_plan, planned_header, reissue
+from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue
 from hilbo.session.records import Block, Header, Planned
+from hilbo.session.withdrawal import delete_participant
 from hilbo.study.trial_table import read_trials
 from hilbo.study.validation_table import read_validation, sets_frame
 
@@ -159,3 +161,54 @@ def test_a_plan_of_today_leaves_no_id_with_others():
     assert "P02" not in json.dumps([header.sets, [[t.a, t.b] for b in header.blocks for t in b.trials]])
     found = sorted(values["u"] for name, values in header.sets.items() if name.startswith("individual:"))
     np.testing.assert_allclose(found, [0.1, 0.2, 0.3])
+
+
+def test_an_id_that_is_a_number_changes_names_alone(tmp_path):
+    plan = json.loads(json.dumps(make_plan(STUDY, ["1", "2", "3"], 0)))
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    done = delete_participant(tmp_path, "1")
+    after = json.loads((tmp_path / "plan.json").read_text())
+    for row, was in zip(after["participants"][1:], plan["participants"][1:], strict=True):
+        assert row == was
+    first, was = after["participants"][0]["header"], plan["participants"][0]["header"]
+    assert first == was | {"participant": done.label}
+    assert planned_header(after, STUDY, "2").session == "1"
+
+
+def test_names_of_sets_in_a_plan_change_with_the_trials_that_show_them(tmp_path):
+    block = Block("aggregate-best", 1, (Planned("aggregate", "individual:P02"),))
+    sets = {"aggregate": SETS["best"], "individual:P02": SETS["own-P02"], "individual:P020": SETS["own-P01"]}
+    rows = []
+    for order, person in enumerate(["P01", "P02"]):
+        header = Header(study=STUDY.hash, participant=person, session="3", seed=order, blocks=(block,), sets=sets)
+        rows.append({"participant": person, "order": order, "header": msgspec.to_builtins(header)})
+    plan = {"schema": 1, "study": STUDY.hash, "phase": "aggregate-best", "source": None, "participants": rows}
+    (tmp_path / "plan.json").write_text(json.dumps(plan | {"hash": plan_hash(plan)}))
+    done = delete_participant(tmp_path, "P02")
+    header = planned_header(json.loads((tmp_path / "plan.json").read_text()), STUDY, "P01")
+    assert list(header.sets) == ["aggregate", f"individual:{done.label}", "individual:P020"]
+
+
+@pytest.mark.parametrize("person", ["a", "1"])
+def test_sides_and_parts_of_cells_stay(tmp_path, person):
+    head = "participant,trial,set_a,set_b,first,preferred\n"
+    kept = "b,1,best,set 1,a,b\nc,1,best,set 1,b,a\n"
+    sets = "set_id,source,u,v\nbest,aggregate,.5,.5\nset 1,aggregate,.1,.1\na,aggregate,.1,.1\n"
+    (tmp_path / "validation.csv").write_text(f"{head}{person},1,best,set 1,a,b\n{kept}")
+    (tmp_path / "sets.csv").write_text(sets)
+    done = delete_participant(tmp_path, person)
+    assert (tmp_path / "validation.csv").read_text() == head + kept and not done.renamed
+    assert (tmp_path / "sets.csv").read_text() == sets
+
+
+def test_coded_sets_that_their_rows_alone_name_go(tmp_path):
+    rows = ["P01,1,s00000001 best,s00000001 mid,,,s00000001 mid", "P02,1,s00000002 best,s00000002 mid,,,s00000002 best"]
+    (tmp_path / "validation.csv").write_text(
+        "\n".join(["participant,trial,set_a,set_b,class_a,class_b,preferred", *rows]) + "\n"
+    )
+    names = [f"s0000000{i} {role}" for i in (1, 2) for role in ("best", "mid")] + ["individual:s0000000a"]
+    lines = [f"{name},individual:{name.split()[0].removeprefix('individual:')},.1,.2" for name in names]
+    (tmp_path / "sets.csv").write_text("\n".join(["set_id,source,u,v", *lines]) + "\n")
+    done = delete_participant(tmp_path, "P02")
+    assert list(sets_frame(tmp_path / "sets.csv", ("u", "v")).index) == [*names[:2], names[-1]]
+    assert "under codes" in done.left[str(tmp_path)] and str(tmp_path / "sets.csv") in done.left[str(tmp_path)]
