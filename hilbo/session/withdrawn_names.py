@@ -5,13 +5,17 @@ simulated studies of earlier versions. Nothing else in a plan or a table is take
 also a session's label, a number, or a side.
 """
 
+import csv
+import json
 import re
 from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 from hilbo.session.set_codes import OWN
 from hilbo.study.set_table import ROLES
 
-__all__ = ["CODED_JUDGED", "CODED_OWN", "names_person", "renamed_set", "replaced"]
+__all__ = ["CODED_JUDGED", "CODED_OWN", "file_names", "names_person", "renamed_set", "replaced"]
 
 CODED_OWN = re.compile(rf"(?:.+ )?s[0-9a-f]{{8}}(?:-\d+)? (?:{'|'.join(ROLES)})")
 """A set of somebody's own map under a code, as nobody else compares it."""
@@ -44,3 +48,71 @@ def renamed_set(name: str, participant: str, label: str, materials: Iterable[str
         if participant not in known and own in [f"{participant} {role}" for role in ROLES]:
             return prefix + label + own.removeprefix(participant)
     return name
+
+
+_ID_COLUMNS = re.compile(
+    r"(participant|subject|person|proband|vp)s?(_?(id|nr|no|code))?|id|reissued_from", re.IGNORECASE
+)
+_BYTE_ORDER = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
+
+
+def read_text(path: Path) -> str:
+    """A file's text, whatever can be read of it. Raises OSError."""
+    content = path.read_bytes()
+    return content.decode(_BYTE_ORDER.get(content[:2], "utf-8"), "replace")
+
+
+def file_names(path: Path, participant: str) -> bool:
+    """Whether a file's content names somebody; also if it cannot be read. An id that is a number is one only where
+    ids stand: in columns and fields of that name, after such a word, and in names of sets."""
+    try:
+        text = read_text(path)
+    except OSError:
+        return True
+    if not names_person(text, participant):
+        return False
+    if not participant.replace(".", "").isdigit():
+        return True
+    if path.suffix in (".nc", ".parquet"):
+        return False
+    with_roles = rf"(individual:|\bown-){re.escape(participant)}(?![\w.-])|(?<![\w.-]){re.escape(participant)} ({'|'.join(ROLES)})\b"
+    if re.search(with_roles, text):
+        return True
+    if path.suffix in (".json", ".jsonl"):
+        lines = text.splitlines() if path.suffix == ".jsonl" else [text]
+        return any(_field_names(line, participant) for line in lines)
+    if path.suffix in (".csv", ".tsv"):
+        return any(_column_names(text, participant, mark) for mark in ",;\t")
+    return (
+        re.search(
+            rf"(participants?|subject|person|proband|vp|id)\W{{0,4}}{re.escape(participant)}(?![\w.-])", text, re.I
+        )
+        is not None
+    )
+
+
+def _column_names(text: str, participant: str, delimiter: str) -> bool:
+    """Whether a whole cell of a column of ids is this id."""
+    try:
+        head, *rows = csv.reader(text.lstrip("\ufeff").splitlines(), delimiter=delimiter)
+    except (ValueError, csv.Error):
+        return False
+    columns = [i for i, name in enumerate(head) if _ID_COLUMNS.fullmatch(name.strip())]
+    return any(row[i].strip() == participant for row in rows for i in columns if i < len(row))
+
+
+def _field_names(text: str, participant: str) -> bool:
+    """Whether a field of ids of a JSON text holds this id, or one of a list of ids does."""
+
+    def named(value: Any, ids: bool) -> bool:
+        if isinstance(value, dict):
+            here = ids and participant in value
+            return here or any(named(v, _ID_COLUMNS.fullmatch(k) is not None) for k, v in value.items())
+        if isinstance(value, list):
+            return any(named(v, ids) for v in value)
+        return ids and value == participant
+
+    try:
+        return named(json.loads(text), False)
+    except (ValueError, RecursionError):
+        return True

@@ -2,7 +2,8 @@
 
 A results folder is known by its list (`hilbo.study.results_list`). Where its files name the participant, everything in
 it that was computed goes; tables that were put or exported there stay, without the participant. Results that name
-nobody and may hold their answers (of `hilbo validate`) are marked by a file beside them.
+nobody and may hold their answers (of `hilbo validate`, or of earlier versions whose lists have no command) are marked
+by a file beside them.
 """
 
 import json
@@ -15,18 +16,18 @@ from typing import Any, NamedTuple
 import msgspec
 
 from hilbo.session.plan import plan_hash
-from hilbo.session.withdrawn_names import names_person, renamed_set
+from hilbo.session.withdrawn_names import file_names, renamed_set
 from hilbo.session.withdrawn_tables import replace_file
-from hilbo.study.results_list import LIST, Listed, listed, relist
+from hilbo.study.results_list import LIST, Listed, digest, listed, write_list
 
-__all__ = ["MARK", "Cleared", "clear_results", "plan_without", "results_folders"]
+__all__ = ["MARK", "Cleared", "clear_results", "command_without", "plan_without", "results_folders"]
 
 MARK = "MADE-BEFORE-A-WITHDRAWAL.txt"
 _KEPT = re.compile(
     r"(study\.toml|(trials|validation)(-[^/]*)?\.(csv|parquet)|(sets|truth|participants)\.csv|[^/]*\.session\.jsonl)"
 )
 _NAMED = ("result.json", "report.html")  # where a result names its participants
-_NOBODYS = ("validate",)  # commands whose results may hold answers of people whom they do not name
+_COUNT_PEOPLE = ("plan", "simulate", "power")  # commands whose --participants is a number
 
 
 class Cleared(NamedTuple):
@@ -43,44 +44,60 @@ def results_folders(root: Path) -> list[Path]:
 
 
 def clear_results(folder: Path, participant: str) -> Cleared:
-    """Take away, or mark, what was computed from somebody's answers."""
-    found, cleared = listed(folder), Cleared([], [], [])
-    for part, names in _parts(found).items():
-        computed = [folder / name for name in names if not _is_kept(found, name)]
-        _clear_part(folder / part, [path for path in computed if path.is_file()], found, participant, cleared)
-    if cleared.removed:
-        relist(folder, set(cleared.removed))
+    """Take away, or mark, what was computed from somebody's answers; the folder's list and command say so."""
+    found = listed(folder)
+    parts = {
+        part: [path for name in names if not _is_kept(found, name) and (path := folder / name).is_file()]
+        for part, names in _parts(found).items()
+    }
+    named = [part for part, paths in parts.items() if any(_names(path, participant) for path in paths)]
+    if named and "" in parts and "result.json" not in found.files:
+        named = list(dict.fromkeys([*named, ""]))  # what lies above several results was made of all of them
+    removed = [path for part in named for path in parts[part]]
+    marked = [part for part, paths in parts.items() if paths and part not in named and _may_hold(found)]
+    for path in removed:
+        path.unlink()
+    again = command_without(found.command, participant)
+    stays = any(path.name != LIST for path in folder.rglob("*") if path.is_file())
+    forced = f"{again} --force" if again and stays and "--force" not in again.split() else again
+    commands = {part: _command(folder / part, found, forced) for part in [*named, *marked] if parts[part]}
+    for part in marked:
+        (folder / part / MARK).write_text(_marked(commands[part]), encoding="utf-8")
+    if removed or marked or again != found.command:
+        _list_again(folder, found, {folder / part / MARK for part in marked}, again)
         _remove_empty(folder)
-    return cleared
+    made = [command for command in dict.fromkeys(commands.values()) if command]
+    return Cleared(removed, [folder / part / MARK for part in marked], made)
+
+
+def _list_again(folder: Path, found: Listed, marks: set[Path], command: str) -> None:
+    """The list without what went, with the marks, so that --force replaces them too, and with the command of today."""
+    files = {name: was for name, was in found.files.items() if (folder / name).is_file()}
+    files |= {path.relative_to(folder).as_posix(): digest(path) for path in marks}
+    write_list(folder, found._replace(files=files, command=command))
 
 
 def _parts(found: Listed) -> dict[str, list[str]]:
-    """The files of each result in a folder: of one, whose materials may have folders, or of several side by side."""
-    if "result.json" in found.files or not any(name.endswith("/result.json") for name in found.files):
-        return {"": list(found.files)}
+    """The files of each result in a folder, by the nearest folder above them that has a result.json."""
+    results = {name.rpartition("/")[0] for name in found.files if name.rpartition("/")[2] == "result.json"}
     parts: dict[str, list[str]] = {}
     for name in found.files:
-        parts.setdefault(name.rpartition("/")[0], []).append(name)
+        above = name.rpartition("/")[0]
+        while above and above not in results:
+            above = above.rpartition("/")[0]
+        parts.setdefault(above, []).append(name)
     return parts
 
 
-def _clear_part(part: Path, computed: list[Path], found: Listed, participant: str, cleared: Cleared) -> None:
-    if any(_text_names(path, participant) for path in computed if path.name in _NAMED or path.suffix == ".csv"):
-        cleared.commands.append(_command(part, found, participant))
-        for path in computed:
-            path.unlink()
-        cleared.removed.extend(computed)
-        return
-    words = shlex.split(found.command) if found.command else []
-    if computed and words[1:2] and words[1] in _NOBODYS:
-        mark, command = part / MARK, _command(part, found, participant)
-        mark.write_text(
-            "These results were made before a participant withdrew, and may hold their answers. Make them again:\n"
-            f"{command}\n",
-            encoding="utf-8",
-        )
-        cleared.marked.append(mark)
-        cleared.commands.append(command)
+def _may_hold(found: Listed) -> bool:
+    """Whether results that name nobody may hold anybody's answers: also where no list says what made them."""
+    words = _words(found.command)
+    return not words or words[1:2] == ["validate"]
+
+
+def _marked(command: str) -> str:
+    again = f"Make them again:\n{command}\n" if command else "Nobody else's answers are in them; delete them.\n"
+    return f"These results were made before a participant withdrew, and may hold their answers. {again}"
 
 
 def _is_kept(found: Listed, name: str) -> bool:
@@ -88,11 +105,9 @@ def _is_kept(found: Listed, name: str) -> bool:
     return "dataset_description.json" in found.files or _KEPT.fullmatch(name.rpartition("/")[2]) is not None
 
 
-def _text_names(path: Path, participant: str) -> bool:
-    try:
-        return names_person(path.read_text(encoding="utf-8"), participant)
-    except (OSError, UnicodeDecodeError):
-        return False
+def _names(path: Path, participant: str) -> bool:
+    """Whether a file is one in which a result names its participants, and names this one."""
+    return (path.name in _NAMED or path.suffix == ".csv") and file_names(path, participant)
 
 
 def _remove_empty(folder: Path) -> None:
@@ -105,18 +120,38 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _command(folder: Path, found: Listed, participant: str) -> str:
+def _command(folder: Path, found: Listed, again: str) -> str:
     """What makes the results again: the report of a folder that holds its own tables, else the command that was given,
-    without the participant."""
+    without the participant; empty where it was about nobody else."""
     if (folder / "trials.csv").exists() and (folder / "study.toml").exists():
-        return shlex.join(["hilbo", "report", str(folder), "--out", f"{folder}-report"])
+        out = Path(f"{folder}-report")
+        return shlex.join(["hilbo", "report", str(folder), "--out", str(out), *["--force"] * out.exists()])
     if not found.command:
         return f"{folder}: by the hilbo command that made it"
-    words = []
-    for word in shlex.split(found.command):
-        parts = word.split(",")
-        words.append(",".join(part for part in parts if part != participant) if len(parts) > 1 else word)
-    return f"cd {shlex.quote(found.where)} && {shlex.join(words)}"
+    return f"cd {shlex.quote(found.where)} && {again}" if again else ""
+
+
+def command_without(command: str, participant: str) -> str:
+    """A command without a participant among those whom it names; empty if it names nobody else."""
+    words, made = _words(command), []
+    names = {"--names"} if words[1:2] and words[1] in _COUNT_PEOPLE else {"--names", "--participants"}
+    for before, word in zip(["", *words], words, strict=False):
+        option, equals, value = word.partition("=") if word.startswith("--") else (before, "", word)
+        people = [name.strip() for name in value.split(",")]
+        if option in names and participant in people:
+            left = ",".join(name for name in people if name != participant)
+            if not left:
+                return ""
+            word = f"{option}={left}" if equals else left
+        made.append(word)
+    return shlex.join(made) if made != words else command
+
+
+def _words(command: str) -> list[str]:
+    try:
+        return shlex.split(command)
+    except ValueError:  # a list that somebody changed
+        return command.split()
 
 
 class _Named(msgspec.Struct):

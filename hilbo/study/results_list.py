@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import msgspec
 
-__all__ = ["LIST", "Listed", "digest", "list_files", "listed", "relist"]
+__all__ = ["LIST", "Listed", "digest", "list_files", "listed", "relist", "write_list"]
 
 LIST = ".hilbo.json"
 _COMMAND, _WHERE = "//command", "//folder"  # no file has such a name
@@ -39,7 +39,7 @@ def listed(folder: Path) -> Listed:
 def list_files(folder: Path, command: str = "", where: str = "") -> None:
     """Write the list of all files that are in a folder now."""
     files = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / LIST)
-    _write(folder, Listed({path.relative_to(folder).as_posix(): digest(path) for path in files}, command, where))
+    write_list(folder, Listed({path.relative_to(folder).as_posix(): digest(path) for path in files}, command, where))
 
 
 def relist(folder: Path, changed: set[Path]) -> None:
@@ -52,10 +52,11 @@ def relist(folder: Path, changed: set[Path]) -> None:
             files[name] = was
         elif path.is_file():
             files[name] = digest(path)
-    _write(folder, found._replace(files=files))
+    write_list(folder, found._replace(files=files))
 
 
-def _write(folder: Path, content: Listed) -> None:
+def write_list(folder: Path, content: Listed) -> None:
+    """Write a folder's list."""
     made = content.files | ({_COMMAND: content.command, _WHERE: content.where} if content.command else {})
     (folder / LIST).write_text(json.dumps(made, indent=0, ensure_ascii=False), encoding="utf-8")
 

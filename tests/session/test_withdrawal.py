@@ -1,6 +1,7 @@
 """Somebody withdraws: their part goes, what others said stays, what is left can be read, and all of it is said."""
 
 import json
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -15,6 +16,8 @@ from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue
 from hilbo.session.records import Block, Header, Planned
 from hilbo.session.withdrawal import delete_participant
+from hilbo.session.withdrawn_results import command_without
+from hilbo.study.results_list import list_files, listed
 from hilbo.study.trial_table import read_trials
 from hilbo.study.validation_table import read_validation, sets_frame
 
@@ -212,3 +215,60 @@ def test_coded_sets_that_their_rows_alone_name_go(tmp_path):
     done = delete_participant(tmp_path, "P02")
     assert list(sets_frame(tmp_path / "sets.csv", ("u", "v")).index) == [*names[:2], names[-1]]
     assert "under codes" in done.left[str(tmp_path)] and str(tmp_path / "sets.csv") in done.left[str(tmp_path)]
+
+
+def test_marked_results_can_be_made_again_by_the_command_that_is_printed(folder, monkeypatch):
+    compared = folder / "compared"
+    results_of(monkeypatch, compared, [], "validate", "validation.csv")
+    done = delete_participant(folder, "P02")
+    (command,) = done.commands
+    assert command.endswith("hilbo validate validation.csv --force") and command in Path(done.marked[0]).read_text()
+    with results(compared, force=True) as made:
+        (made / "result.json").write_text("{}")
+    assert not (compared / "MADE-BEFORE-A-WITHDRAWAL.txt").exists()
+
+
+def test_results_without_a_command_are_marked(folder, capsys, monkeypatch):
+    (folder / "older").mkdir()
+    (folder / "older" / "result.json").write_text("{}")
+    list_files(folder / "older")
+    assert delete_participant(folder, "P02").marked == [str(folder / "older" / "MADE-BEFORE-A-WITHDRAWAL.txt")]
+
+
+COMMANDS = {
+    "hilbo aggregate t.csv --participants=P02,P01": "hilbo aggregate t.csv --participants=P01",
+    "hilbo aggregate t.csv --participants P01,P02": "hilbo aggregate t.csv --participants P01",
+    "hilbo aggregate t.csv --participants P02": "",
+    "hilbo aggregate t.csv --participants=P02": "",
+    "hilbo aggregate t.csv --seed 1": "hilbo aggregate t.csv --seed 1",
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_is_written_back_without_them(folder, monkeypatch, command):
+    assert command_without(command, "P02") == COMMANDS[command]
+    assert command_without("hilbo power --participants 6,12 --trials 12", "12").count("12") == 2
+    results_of(monkeypatch, folder / "compared", [], *command.replace("aggregate", "validate").split()[1:])
+    delete_participant(folder, "P02")
+    assert listed(folder / "compared").command == COMMANDS[command].replace("aggregate", "validate")
+
+
+def test_figures_in_folders_below_a_result_go_with_it(folder, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["hilbo", "demo"])
+    with results(folder / "demo", force=False) as made:
+        for name, person in (("videos", "V01"), ("foam", "P02")):
+            (made / name / "figures").mkdir(parents=True)
+            (made / name / "result.json").write_text(json.dumps({"participants": [{"participant": person}]}))
+            (made / name / "figures" / "map.png").write_bytes(b"\x89PNG")
+        (made / "comparison.json").write_text("{}")
+    delete_participant(folder, "P02")
+    left = sorted(path.name for path in (folder / "demo").rglob("*") if path.is_file())
+    assert left == [".hilbo.json", "map.png", "result.json"]
+
+
+def test_results_that_hold_a_number_do_not_name_somebody(folder, monkeypatch):
+    results_of(monkeypatch, folder / "map", ["2"], "aggregate", "t.csv")
+    (folder / "map" / "result.json").write_text('{"participants": [{"participant": "2", "trials": 1}], "seed": 1}')
+    (folder / "t.csv").write_text("participant,trial\n1,1\n2,1\n")
+    delete_participant(folder, "1")
+    assert (folder / "map" / "map.png").exists()
