@@ -13,7 +13,7 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import in_use, log_paths, read_log
-from hilbo.session.withdrawn_names import CODED_JUDGED, names_person
+from hilbo.session.withdrawn_names import CODED_JUDGED, file_is_called_after, file_names
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
     Cells,
@@ -27,13 +27,14 @@ from hilbo.session.withdrawn_tables import (
     without_person,
     write_table,
 )
-from hilbo.study.results_list import LIST, relist
+from hilbo.study.results_list import LIST, listed, relist
 
 __all__ = ["Withdrawal", "delete_participant"]
 
 _OPTIONAL = ("trials", "validation", "sets", "truth")  # a report takes none of these rather than one without rows
 _UNREADABLE = "cannot be read; if it holds their answers, delete it"
-_PICTURES = (".png", ".jpg", ".jpeg", ".gif", ".pdf")
+_PICTURES = (".png", ".jpg", ".jpeg", ".gif")
+_CLOSED = (".zip", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".xlsx", ".xls", ".ods", ".docx", ".doc", ".odt", ".pdf")
 
 
 @dataclass
@@ -171,23 +172,18 @@ def _coded(root: Path) -> list[Path]:
 def _left(root: Path, participant: str, whose: dict[Path, str], damaged: Iterable[Path]) -> dict[str, str]:
     """The files that still name somebody, and why they stay."""
     left = {str(path): "is a log that cannot be read; if it is theirs, delete it" for path in damaged if path.exists()}
+    ours = {folder / name for folder in results_folders(root) for name in listed(folder).files}
     for path in sorted(path for path in root.rglob("*") if path.is_file() and str(path) not in left):
-        if path.suffix.lower() in _PICTURES or not _holds(path, participant):
-            continue
         if path in whose:
-            left[str(path)] = (
-                f"is the log of {whose[path]} and names a set of theirs; it is chained, and stays as it is"
-            )
-        else:
+            if file_names(path, participant):
+                left[str(path)] = (
+                    f"is the log of {whose[path]} and names a set of theirs; it is chained, and stays as it is"
+                )
+        elif path not in ours and file_is_called_after(path, participant):
+            left[str(path)] = "is called after them and is no file that hilbo changes; look at it yourself"
+        elif path.suffix.lower() in _CLOSED:
+            if path not in ours:
+                left[str(path)] = "cannot be searched; if it holds anything of theirs, delete it"
+        elif path.suffix.lower() not in _PICTURES and file_names(path, participant):
             left[str(path)] = "names them and is no file that hilbo changes; look at it yourself"
     return left
-
-
-def _holds(path: Path, participant: str) -> bool:
-    """Whether a file names somebody: in its name, its text, or, of what is no text, its bytes."""
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return True
-    name = path.name.replace("_", " ")
-    return names_person(name, participant) or names_person(content.decode("utf-8", "replace"), participant)

@@ -15,7 +15,7 @@ from typing import Any
 from hilbo.session.set_codes import OWN
 from hilbo.study.set_table import ROLES
 
-__all__ = ["CODED_JUDGED", "CODED_OWN", "file_names", "names_person", "renamed_set", "replaced"]
+__all__ = ["CODED_JUDGED", "CODED_OWN", "file_is_called_after", "file_names", "names_person", "renamed_set", "replaced"]
 
 CODED_OWN = re.compile(rf"(?:.+ )?s[0-9a-f]{{8}}(?:-\d+)? (?:{'|'.join(ROLES)})")
 """A set of somebody's own map under a code, as nobody else compares it."""
@@ -62,33 +62,34 @@ def read_text(path: Path) -> str:
     return content.decode(_BYTE_ORDER.get(content[:2], "utf-8"), "replace")
 
 
+def file_is_called_after(path: Path, participant: str) -> bool:
+    """Whether a file's name has this id as one of its parts."""
+    return re.search(rf"(?<![A-Za-z0-9]){re.escape(participant)}(?![A-Za-z0-9])", path.stem) is not None
+
+
 def file_names(path: Path, participant: str) -> bool:
-    """Whether a file's content names somebody; also if it cannot be read. An id that is a number is one only where
-    ids stand: in columns and fields of that name, after such a word, and in names of sets."""
+    """Whether a file's content names somebody; also if it cannot be read."""
     try:
         text = read_text(path)
     except OSError:
         return True
-    if not names_person(text, participant):
+    number = participant.replace(".", "").isdigit()
+    return names_person(text, participant) and (not number or _names_number(text, path.suffix, participant))
+
+
+def _names_number(text: str, suffix: str, participant: str) -> bool:
+    """Whether a number is an id in a text: in columns and fields of ids, after such a word, in names of sets."""
+    person = re.escape(participant)
+    if suffix in (".nc", ".parquet"):  # what can be read of these has been edited
         return False
-    if not participant.replace(".", "").isdigit():
+    if re.search(rf"(individual:|\bown-){person}(?![\w.-])|(?<![\w.-]){person} ({'|'.join(ROLES)})\b", text):
         return True
-    if path.suffix in (".nc", ".parquet"):
-        return False
-    with_roles = rf"(individual:|\bown-){re.escape(participant)}(?![\w.-])|(?<![\w.-]){re.escape(participant)} ({'|'.join(ROLES)})\b"
-    if re.search(with_roles, text):
-        return True
-    if path.suffix in (".json", ".jsonl"):
-        lines = text.splitlines() if path.suffix == ".jsonl" else [text]
-        return any(_field_names(line, participant) for line in lines)
-    if path.suffix in (".csv", ".tsv"):
+    if suffix in (".json", ".jsonl"):
+        return any(_field_names(part, participant) for part in (text.splitlines() if suffix == ".jsonl" else [text]))
+    if suffix in (".csv", ".tsv"):
         return any(_column_names(text, participant, mark) for mark in ",;\t")
-    return (
-        re.search(
-            rf"(participants?|subject|person|proband|vp|id)\W{{0,4}}{re.escape(participant)}(?![\w.-])", text, re.I
-        )
-        is not None
-    )
+    words = rf"\b(participants?|subject|person|proband|vp)\W{{0,4}}{person}(?![\w.-])"
+    return re.search(words, text, re.IGNORECASE) is not None
 
 
 def _column_names(text: str, participant: str, delimiter: str) -> bool:

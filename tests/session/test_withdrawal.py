@@ -272,3 +272,30 @@ def test_results_that_hold_a_number_do_not_name_somebody(folder, monkeypatch):
     (folder / "t.csv").write_text("participant,trial\n1,1\n2,1\n")
     delete_participant(folder, "1")
     assert (folder / "map" / "map.png").exists()
+
+
+def test_files_called_after_them_and_files_that_cannot_be_searched_are_listed(tmp_path):
+    wanted = ["P02.txt", "P02.png", "notes-P02.md", "interview_P02.docx", "backup.zip", "list.xlsx", "letter.pdf"]
+    for name in [*wanted, "P020.txt", "xP02.png", "picture.png", "notes.md"]:
+        (tmp_path / name).write_bytes(b"x")
+    (tmp_path / "utf16.csv").write_bytes("participant,trial\nP02,1\n".encode("utf-16"))
+    (tmp_path / "latin.csv").write_bytes("participant;é\nP02;é\n".encode("latin1"))
+    (tmp_path / "t.csv").write_text("participant\nP02\nP01\n")
+    left = delete_participant(tmp_path, "P02").left
+    assert {Path(name).name for name in left} == {*wanted, "utf16.csv", "latin.csv"}
+    assert "cannot be searched" in left[str(tmp_path / "backup.zip")]
+
+
+def test_a_number_is_an_id_where_ids_stand_alone(tmp_path):
+    (tmp_path / "t.csv").write_text("participant,trial,u\n1,1,1\n2,1,1\n")
+    (tmp_path / "device.csv").write_text("time,force\n1,1\n")
+    (tmp_path / "subjects.csv").write_text("subject;age\n1;30\n")
+    (tmp_path / "plan.json").write_text(json.dumps(make_plan(STUDY, ["2", "3"], 0)))
+    (tmp_path / "notes.md").write_text("1 of 2 motors was warm.")
+    (tmp_path / "diary.md").write_text("Participant 1 came late.")
+    driver = Driver()
+    driver.step()
+    with EventLog.create(tmp_path / "P01_1.session.jsonl", STUDY, driver.header) as log:
+        log.append(driver.events[0])
+    left = delete_participant(tmp_path, "1").left
+    assert {Path(name).name for name in left} == {"subjects.csv", "diary.md"}
