@@ -13,7 +13,7 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import in_use, log_paths, read_log
-from hilbo.session.withdrawn_names import CODED_JUDGED, file_is_called_after, file_names
+from hilbo.session.withdrawn_names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
     Cells,
@@ -146,7 +146,10 @@ def _sets(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[s
     tables = list(tables)
     compared = {name for table in tables for name in sets_compared(table, participant)}
     names = {old: new for table in tables for old, new in set_names(table, participant, label).items()}
-    own = {name for table in tables for name in coded_own(table, participant) | sets_from(table, participant)}
+    own = {name for table in tables for name in sets_from(table, participant)}
+    coded = {name for table in tables for name in coded_own(table, participant)} - compared
+    same = {name.rpartition(" ")[0] for name in coded}  # the roles of their map that they have not yet compared
+    own |= {n for table in tables for n in named_sets(table) if CODED_OWN.fullmatch(n) and n.rpartition(" ")[0] in same}
     return names, (own | set(names)) - compared
 
 

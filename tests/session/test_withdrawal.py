@@ -209,11 +209,11 @@ def test_coded_sets_that_their_rows_alone_name_go(tmp_path):
     (tmp_path / "validation.csv").write_text(
         "\n".join(["participant,trial,set_a,set_b,class_a,class_b,preferred", *rows]) + "\n"
     )
-    names = [f"s0000000{i} {role}" for i in (1, 2) for role in ("best", "mid")] + ["individual:s0000000a"]
+    names = [f"s0000000{i} {role}" for i in (1, 2) for role in ("best", "mid", "worst")] + ["individual:s0000000a"]
     lines = [f"{name},individual:{name.split()[0].removeprefix('individual:')},.1,.2" for name in names]
     (tmp_path / "sets.csv").write_text("\n".join(["set_id,source,u,v", *lines]) + "\n")
     done = delete_participant(tmp_path, "P02")
-    assert list(sets_frame(tmp_path / "sets.csv", ("u", "v")).index) == [*names[:2], names[-1]]
+    assert list(sets_frame(tmp_path / "sets.csv", ("u", "v")).index) == [*names[:3], names[-1]]
     assert "under codes" in done.left[str(tmp_path)] and str(tmp_path / "sets.csv") in done.left[str(tmp_path)]
 
 
