@@ -121,7 +121,7 @@ def without_person(
         if own or cells.get("participant") == participant or cells.get("set_id") in gone:
             continue
         made = [
-            _renamed(cell, column, names | {OWN + participant: OWN + label})
+            _renamed(cell, column, {**names, OWN + participant: OWN + label})
             for column, cell in zip([*head, *[""] * (len(row) - len(head))], row, strict=False)
         ]
         renamed += made != row
