@@ -31,6 +31,7 @@ from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
 from hilbo.study.learnt_study import learnt_content, learnt_sentences
 from hilbo.study.map_file import write_map
 from hilbo.study.optimum_location import location_sentences
+from hilbo.study.optimum_region import optimum_region, region_content, region_sentences
 from hilbo.study.typed_files import sealed
 
 __all__ = [
@@ -109,7 +110,10 @@ def result(
     failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
     content["warnings"] = ([_not_converged(failed)] if failed else []) + rule_warnings(study, aggregate)
     asked = None if isinstance(aggregate, Merged) else aggregate.asked_variance
+    region = None if isinstance(aggregate, Merged) else optimum_region(study, aggregate.map, seed)
+    content["optimum_region"] = region_content(study, region)
     content["warnings"] += learnt_sentences(study) + location_sentences(study, best.x, best.sd, asked)
+    content["warnings"] += region_sentences(region)
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content

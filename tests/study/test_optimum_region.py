@@ -1,0 +1,78 @@
+"""The region of the best rendering: which points it has, what it says, and how much it holds."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo.population.maps import RuleMap
+from hilbo.study.config import Study
+from hilbo.study.optimum_region import Region, optimum_region, region_content, region_sentences
+
+STUDY = Study.load("hilbo/data/video_quality.toml")
+THETA = np.array([6.0, 6.0])
+
+
+def region_of(count, seed=0):
+    """The region after `count` answers about a function that is known: its best place is (0.3, 0.6)."""
+    gp = OrdinalGP(RBF(6.0, 4.0), OrdinalProbit((-0.5, 0.5), 0.5))
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(size=(count, 2))
+    felt = 2.0 - 12.0 * ((x - [0.3, 0.6]) ** 2).sum(axis=1) + 0.5 * rng.normal(size=count)
+    posterior = fit(gp, Trials.from_arrays(x, (felt > -0.5).astype(int) + (felt > 0.5), 64))
+    one = jnp.ones(())
+    return optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), seed)
+
+
+def test_more_answers_leave_less_and_hold_the_best():
+    few, many = region_of(4), region_of(60)
+    assert few is not None and many is not None
+    assert 0 < many.volume < 0.5 * few.volume
+    assert len(many.points) + len(many.others) == 1000
+    assert many.holds(np.array([0.3, 0.6]), THETA)
+    assert not many.holds(np.array([0.95, 0.05]), THETA)
+
+
+def test_an_unlocated_optimum_says_so():
+    some = np.zeros((2, 2))
+    assert region_sentences(Region(some, some, 0.25)) == []
+    (sentence,) = region_sentences(Region(some, some, 0.31))
+    assert sentence.startswith("The best rendering is not located: with 95% it lies in a region that takes up 31%")
+    assert region_sentences(None) == []
+
+
+def test_maps_by_points_have_none():
+    one = jnp.ones(())
+    assert optimum_region(STUDY, RuleMap("bcm", "by points", None, None, one, one)) is None
+    assert region_content(STUDY, None) is None
+
+
+def test_what_results_say_is_in_physical_units():
+    region = Region(np.array([[0.0, 0.5], [1.0, 1.0]]), np.zeros((0, 2)), 1.0)
+    content = region_content(STUDY, region)
+    assert content is not None
+    parameters = STUDY.space.parameters
+    assert content["parameters"][parameters[0].name] == pytest.approx([parameters[0].low, parameters[0].high])
+    assert content["located"] is False
+
+
+@pytest.mark.deep  # 25 fits
+def test_the_best_is_in_it_as_often_as_it_says():
+    """Functions drawn from the model; 95 % of 25, less three standard errors."""
+    gp = OrdinalGP(RBF(6.0, 4.0), OrdinalProbit((-0.5, 0.5), 0.5))
+    side = np.linspace(0.0, 1.0, 25)
+    grid = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
+    held = 0
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        x = np.concatenate([rng.uniform(size=(40, 2)), grid])
+        prior = 4.0 * np.exp(-6.0 * ((x[:, None] - x[None]) ** 2).sum(-1))
+        eigenvalues, vectors = np.linalg.eigh(prior)
+        f = vectors @ (np.sqrt(np.clip(eigenvalues, 0, None)) * rng.normal(size=len(x)))
+        z = f[:40] + 0.5 * rng.normal(size=40)
+        posterior = fit(gp, Trials.from_arrays(x[:40], (z > -0.5).astype(int) + (z > 0.5), 64))
+        one = jnp.ones(())
+        region = optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), seed)
+        assert region is not None
+        held += region.holds(grid[np.argmax(f[40:])], THETA)
+    assert held >= 0.95 * 25 - 3 * np.sqrt(25 * 0.95 * 0.05)
