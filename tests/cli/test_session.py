@@ -259,7 +259,9 @@ def test_from_logs_to_a_validation_plan(hilbo, tmp_path):
     own = ("--names", "P01,P03", "--source", "individual", *given, table, "--out", "w.json")
     code, _, err = hilbo("plan", "study.toml", *own)
     assert code == 0, err
-    assert "P03 worst" in json.loads((tmp_path / "w.json").read_text())["participants"][1]["header"]["sets"]
+    sets = json.loads((tmp_path / "w.json").read_text())["participants"][1]["header"]["sets"]
+    assert [name.partition(" ")[2] for name in sets if not name.startswith("warm-up")] == ["best", "mid", "worst"]
+    assert not any("P0" in name for name in sets)  # a code is nobody's name
     code, _, err = hilbo("plan", "study.toml", "--names", "P01", *given, "logs", "--out", "x.json")
     assert code == 2 and "invite people who are not" in err
     code, _, err = hilbo("export", "logs", "--study", "study.toml", "--out", "tables", "--force")
