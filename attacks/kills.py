@@ -159,7 +159,7 @@ class Kills:
         lines = ("POST /api/participant/answer HTTP/1.1", f"Host: {host}:{port}", f"Content-Length: {len(body)}")
         lines += (f"Authorization: Bearer {session.client._key}", "", "")
         whole = "\r\n".join(lines).encode() + body
-        with socket.create_connection((host, int(port)), timeout=5) as line:
+        with contextlib.suppress(OSError), socket.create_connection((host, int(port)), timeout=5) as line:
             line.sendall(whole[: rng.randrange(len(whole) + 1)])
             if rng.random() < 0.5:  # reset instead of ended
                 line.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
