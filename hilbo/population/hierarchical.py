@@ -41,7 +41,7 @@ NEWCOMER = -1.0
 """The number of a person who has given no answers."""
 
 _NODES = 33  # of the log evidence's Chebyshev interpolation in p
-_ENOUGH = 1e-5  # error of the log evidence between them
+_ENOUGH, _USABLE = 1e-5, 0.02  # error of the log evidence between them: that ends the refinement, that is too large
 _FINE = 2001
 
 
@@ -167,7 +167,7 @@ def share_from(
         mean=jnp.asarray(np.trapezoid(weight * grid) / np.trapezoid(weight)),
         interval=jnp.asarray(np.interp([0.025, 0.975], area / area[-1], grid)),
         interpolation_error=jnp.asarray(error),
-        converged=jnp.asarray(error < _ENOUGH and all(good for _, good in evaluated.values())),
+        converged=jnp.asarray(error < _USABLE and all(good for _, good in evaluated.values())),
     )
 
 
