@@ -22,7 +22,7 @@ from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
 from hilbo.population.joint import joint_map, posterior_map
 from hilbo.population.leave_one_out import LeftOut, calibration, clustered, influence, leave_one_out, reliability
-from hilbo.population.maps import ALL_RULES, RuleMap, rule_map, share_of
+from hilbo.population.maps import GIVEN_RULES, RuleMap, rule_map, share_of
 from hilbo.population.pointwise import RULES
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, map_optimum, nrmse
@@ -56,7 +56,7 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0) -> dict[str, Any]
     posteriors = jax.tree.map(lambda leaf: leaf[answered], aggregate.posteriors)
     share = aggregate.share or share_of(study.gp, cohort.trials, study.inference)
     fitted = aggregate.maps if len(answered) == len(aggregate.cohort.names) else {}
-    maps = {rule: fitted.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in ALL_RULES}
+    maps = {rule: fitted.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in GIVEN_RULES}
     pooled = maps["pooled"]
     rules: dict[str, Any] = {}
     left: dict[str, LeftOut] = {}
