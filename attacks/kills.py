@@ -114,7 +114,7 @@ class Kills:
         answered = len(session.acknowledged)
         random_end = time.monotonic() + rng.uniform(0, 0.5)
         while session.phase not in ("done", "ended"):
-            assert time.monotonic() < end, f"nothing goes on: {session.phase}"
+            assert time.monotonic() < end, f"nothing goes on: {self._seen()}"
             if moment == "answer" and session.waiting is None:
                 with contextlib.suppress(OSError, ValueError):
                     view = session.client.get("/api/participant")
@@ -134,6 +134,18 @@ class Kills:
                 return "random" if moment == "begin" else moment
             time.sleep(0.005)
         return "end"
+
+    def _seen(self) -> str:
+        """What both roles are shown, and what the server has said: why nothing goes on."""
+        session = self.session
+        words = Path(f"{session.out}.err").read_text(encoding="utf-8")
+        with contextlib.suppress(OSError, ValueError):
+            view = session.experimenter.get("/api/experimenter")
+            may = session.client.get("/api/participant")["may"]
+            return (
+                f"{view['phase']}, {may}, {view['device']}, {view['alert']}, {view['may']}, {view['log'][:8]}\n{words}"
+            )
+        return f"{session.phase}, no server\n{words}"
 
     def _kill_server(self, moment: str, rng: random.Random) -> None:
         self.session.kill()

@@ -112,6 +112,11 @@ class Hub:
 
     # Events.
 
+    @property
+    def fault(self) -> str | None:
+        """What of the watch over the session does not work."""
+        return self._interruptions.fault
+
     async def commit(self, make: Callable[[LiveSession, float], Any], *, mine: bool = False) -> Any:
         """Have an event made from the newest state, on the disk, and counted; None if there is none to make.
 

@@ -37,6 +37,7 @@ class Interruptions:
         self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what it did, not yet on the disk
         self._saying = asyncio.Lock()
         self._tasks: list[asyncio.Task] = []
+        self._faults: dict[str, str] = {}  # by what of the watch does not work, until it does again
         self._wall, self._steady = time.time(), time.monotonic()  # at the last look
         self._here, self._absent = False, None  # whether the participant's page is, and since when it is not
 
@@ -51,6 +52,11 @@ class Interruptions:
         for task in self._tasks:
             task.cancel()
 
+    @property
+    def fault(self) -> str | None:
+        """What of the watch does not work, in a sentence; it stands until that works again."""
+        return next(iter(self._faults.values()), None)
+
     def device_changed(self, seen: Snapshot) -> None:
         """What the device did unasked is an event where it matters to a trial: the one that was pending then."""
         self._spawn(self._device_changed(seen))
@@ -63,13 +69,18 @@ class Interruptions:
     def _ended(self, task: asyncio.Task) -> None:
         """Nothing ends silently."""
         self._tasks.remove(task)
-        if not task.cancelled() and task.exception() is not None:
-            self._failed(task.exception())
+        if not task.cancelled():
+            self._went("device", task.exception())
 
-    def _failed(self, error: BaseException | None) -> None:
-        """The experimenter is told."""
-        self.hub.alert = f"A fault in watching what interrupts the session: {str(error) or type(error).__name__}."
-        self.hub.publish()
+    def _went(self, what: str, error: BaseException | None) -> None:
+        """The experimenter is told of a fault, and no more once the same works again."""
+        before = self.fault
+        self._faults.pop(what, None)
+        if error is not None:
+            words = str(error) or type(error).__name__
+            self._faults[what] = f"A fault in watching what interrupts the session: {words}."
+        if self.fault != before:
+            self.hub.publish()
 
     async def _device_changed(self, seen: Snapshot, *, opening: bool = False) -> None:
         hub, condition = self.hub, _condition_of(seen)
@@ -102,8 +113,9 @@ class Interruptions:
             await asyncio.sleep(_LATER)
             try:
                 await self._look()
+                self._went("time", None)
             except Exception as error:
-                self._failed(error)
+                self._went("time", error)
 
     async def _look(self) -> None:
         """At the clocks, at what is still to be said, and for the participant's page."""

@@ -124,7 +124,7 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "trust": hub.trust,
         "table": _table(state),
         "log": [_log_line(event) for event in list(hub.recent)[:60]],
-        "alert": hub.alert or (runner.trouble if runner.stage == "trouble" else None),
+        "alert": hub.alert or hub.fault or (runner.trouble if runner.stage == "trouble" else None),
         "may": _may(hub),
         "means": {
             "void": _meant(voidable(state)),

@@ -14,7 +14,7 @@ pytestmark = [pytest.mark.deep, needs_device, pytest.mark.skipif(sys.platform !=
 def test_kills_lose_double_and_change_nothing(tmp_path):
     kills = Kills(tmp_path, trials=15)
     try:
-        counts = run(kills, 8, 1)
+        counts = run(kills, 20, 1)
     finally:
         kills.close()
-    assert sum(counts.values()) == 8 and not [word for word in counts if word.startswith("THROUGH")], counts
+    assert sum(counts.values()) == 20 and not [word for word in counts if word.startswith("THROUGH")], counts
