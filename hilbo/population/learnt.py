@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
@@ -49,6 +48,7 @@ Coordinates = dict[str, Float[Array, "..."]]
 _NODES = np.polynomial.hermite_e.hermegauss(7)
 _NODES = _NODES[0], _NODES[1] / _NODES[1].sum()
 _STEPS, _FINE = 100, 1e-3  # of the search; of the finite differences for the curvature
+_NEAR = 2e-6  # of the evidence: another choice of features moves it as much as a nearer step would
 _WORTH = 3.0  # log Bayes factor from which people have widths of their own, about 20 to 1
 _LEFT, _LARGEST = 1e-4, 256
 """Of the shared function's prior variance, what the search may leave: 1e-5 of the log evidence of 600 answers; but it
@@ -225,7 +225,7 @@ def _descended(search: _Search, problem: _Problem, free: Set[str]) -> _Search:
     flat, restore = ravel_pytree({name: value for name, value in search.coordinates.items() if name in free})
     latest = search.weights
 
-    def cost(z: ArrayLike) -> tuple[float, np.ndarray]:
+    def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal latest
         here = _cost(held | restore(jnp.asarray(z, flat.dtype)), latest, problem)
         if not bool(here.usable):  # the line search is to turn back
@@ -234,9 +234,7 @@ def _descended(search: _Search, problem: _Problem, free: Set[str]) -> _Search:
         slope = ravel_pytree({name: here.gradient[name] for name in free})[0]
         return float(here.value), np.asarray(slope, float)
 
-    # Nearer than that, another choice of features moves the evidence as much as a step does.
-    near = (1e-5 + 1e-6 * int(np.asarray(problem.trials.mask).sum())) / max(abs(cost(flat)[0]), 1.0)
-    options = {"maxiter": _STEPS, "ftol": near, "gtol": 1e-3}
+    options = {"maxiter": _STEPS, "ftol": _NEAR, "gtol": 1e-3}
     result = minimize(cost, np.asarray(flat, float), jac=True, method="L-BFGS-B", options=options)
     end = held | restore(jnp.asarray(result.x, flat.dtype))
     return _Search(end, latest, search.steps + int(result.nit), bool(result.success))
