@@ -89,7 +89,8 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
     )  # fmt: skip
     server = uvicorn.Server(config)
     listen, hang_up = server.startup, server.shutdown
-    porter = Porter(place.socket, place.gate, max(1, _files() - _RESERVED), _admitting(config, server))
+    admission = _Admission(config, server)
+    porter = Porter(place.socket, place.gate, max(1, _files() - _RESERVED), admission.admit)
 
     # Not as ASGI's lifespan, which swallows what the hub raises.
     async def startup(sockets=None):
@@ -106,6 +107,7 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
     async def shutdown(sockets=None):
         porter.close()
         hub.watchers.end_all()
+        await admission.settled()  # uvicorn ends those that it knows, and waits for all
         try:
             await hang_up(sockets=sockets)
         finally:
@@ -123,25 +125,29 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
         place.socket.close()
 
 
-def _admitting(config, server) -> Callable[[socket.socket, Role | None], Any]:
-    """What serves a connection that was accepted."""
+class _Admission:
+    """Has uvicorn serve connections that were accepted elsewhere."""
 
-    protocol = functools.partial(
-        config.http, config=config, server_state=server.server_state, app_state=dict[str, Any]()
-    )
+    def __init__(self, config, server):
+        self._protocol = functools.partial(
+            config.http, config=config, server_state=server.server_state, app_state=dict[str, Any]()
+        )
+        self._tasks: set[asyncio.Task] = set()
 
-    async def serve_it(line, role):
+    def admit(self, line: socket.socket, role: Role | None) -> None:
+        """Serve a connection; the role is that of the key which came with it."""
+        task = asyncio.get_running_loop().create_task(self._serve(line, role))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def settled(self) -> None:
+        """Until each of them is known to uvicorn, or has ended."""
+        await asyncio.gather(*self._tasks)
+
+    async def _serve(self, line, role):
         with contextlib.suppress(OSError):  # it has ended meanwhile
-            await asyncio.get_running_loop().connect_accepted_socket(functools.partial(protocol, role=role), line)
-
-    tasks = set()
-
-    def admit(line, role):
-        task = asyncio.get_running_loop().create_task(serve_it(line, role))
-        tasks.add(task)
-        task.add_done_callback(tasks.discard)
-
-    return admit
+            loop = asyncio.get_running_loop()
+            await loop.connect_accepted_socket(functools.partial(self._protocol, role=role), line)
 
 
 def _files() -> int:

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 from bare_server import Bare, connected, request, status, until_closed, until_words
 
+from hilbo.app.serve import _Admission
 from hilbo.app.turns import Turns
 
 HALF = b"GET / HTTP/1.1\r\nHost: "
@@ -244,6 +245,30 @@ with own:
     sys.stdin.readline()
     print(resource.getrlimit(resource.RLIMIT_NOFILE)[0], status(own.stops()))
 """
+
+
+def test_who_is_just_let_in_when_the_server_ends_is_known_to_it():
+    """Else nobody ends that connection, and the server waits 3 s for it and complains."""
+    known = []
+
+    class Known(asyncio.Protocol):
+        def __init__(self, **_):
+            pass
+
+        def connection_made(self, transport):
+            known.append(transport)
+
+    async def admitted(line):
+        admission = _Admission(SimpleNamespace(http=Known), SimpleNamespace(server_state=None))
+        admission.admit(line, None)
+        await admission.settled()
+        known.pop().abort()
+        await asyncio.sleep(0)
+
+    here, there = socket.socketpair()
+    with here, there:
+        here.setblocking(False)
+        asyncio.run(admitted(here))
 
 
 @pytest.mark.deep
