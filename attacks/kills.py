@@ -102,7 +102,7 @@ class Kills:
     def _act(self) -> str:
         """What participant and experimenter would do now; the phase."""
         phase = self.session.act()
-        if phase in ("wait", "hello", "paused", "ready"):
+        if phase in ("wait", "hello", "paused", "ready", "trouble"):
             with contextlib.suppress(OSError, ValueError):
                 if "clear" in self.session.experimenter.get("/api/experimenter")["may"]:
                     self.session.experimenter.post("/api/experimenter/clear", {})

@@ -111,18 +111,21 @@ def _resume_all() -> None:
 
 
 def _naming(root: Path, person: str) -> list[Path]:
-    """The files that hold the id as a word: in their names, text, cells, or netCDF variables."""
+    """The files that hold the id as a word: in their names, text, cells, or netCDF names, attributes and variables. Of
+    binary files the bytes are not searched: in a megabyte of numbers any three letters come up by chance."""
     word = re.compile(rf"(?<![A-Za-z0-9]){person}(?![A-Za-z0-9])")
     found = []
     for path in sorted(path for path in root.rglob("*") if path.is_file() and path.suffix != ".png"):
-        texts = [path.name.replace("_", " "), path.read_bytes().decode("utf-8", "replace")]
+        texts = [path.name.replace("_", " ")]
         if path.suffix == ".nc":
             with xr.open_datatree(path, engine="h5netcdf") as tree:
-                texts += [
-                    str(v.values.tolist()) for node in tree.subtree for v in node.variables.values() if v.size < 1e4
-                ]
-        if path.suffix == ".parquet":
+                for node in tree.subtree:
+                    texts += [node.path, str(node.attrs), str(list(node.variables))]
+                    texts += [f"{v.attrs} {v.values.tolist()}" for v in node.variables.values() if v.size < 1e4]
+        elif path.suffix == ".parquet":
             texts.append(pd.read_parquet(path).to_csv())
+        else:
+            texts.append(path.read_bytes().decode("utf-8", "replace"))
         if any(word.search(text) for text in texts):
             found.append(path)
     return found

@@ -75,6 +75,13 @@ class Lattice(eqx.Module):
         coordinates.insert(self.along, height)
         return jnp.stack(coordinates, axis=-1)
 
+    def everywhere(self) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
+        """All points (m, d), and which of them are feasible."""
+        usable = jnp.concatenate([self.inside, self.present])
+        own = self.points(*jnp.indices(usable.shape)).reshape(-1, self.dim)
+        points = jnp.concatenate([own, self.extra.astype(own.dtype)])
+        return points, jnp.concatenate([usable.reshape(-1), jnp.ones(len(self.extra), bool)])
+
 
 def nodes_for(theta: float) -> int:
     """Nodes per coordinate for a kernel with this (largest) theta: about three per length scale, 12 to 32."""

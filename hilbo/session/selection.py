@@ -4,11 +4,13 @@ The first trials are a Latin hypercube inside the feasible set, the following ma
 low-discrepancy candidate set or a lattice and are polished (paper, algorithm 1).
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo import acquisition
 from hilbo.kernels import gram
@@ -65,10 +67,13 @@ def point_after(
     study: Study, plan: Design, posterior: Posterior, trial: Int[Array, ""] | int, weight: ArrayLike | None = None
 ) -> Float[Array, " d"]:
     """The same from the posterior of the answers."""
-    if study.selection.acquisition == "thompson":
-        return _thompson_point(posterior, plan, trial)
-    distance = study.selection.minimum_distance
-    allowed = (lambda x: _far_from(posterior.trials, x, distance)) if distance else None
+    thompson, distance = study.selection.acquisition == "thompson", study.selection.minimum_distance
+    allowed = None
+    if distance:
+        points, usable = _searched(plan, _JOINT_CANDIDATES if thompson else None)
+        allowed = _apart_from(posterior.trials, points, usable, distance)
+    if thompson:
+        return _thompson_point(posterior, plan, trial, allowed)
     return _highest(study, plan, posterior, _score(study, posterior, weight), allowed).x
 
 
@@ -120,16 +125,44 @@ def _score(study, posterior, weight):
     return acquisition.Mean()
 
 
-def _far_from(trials, x, distance):
-    """Whether x keeps the smallest distance to every earlier trial."""
-    apart = jnp.sum((trials.x - x[None, :]) ** 2, axis=1) >= distance**2
-    return jnp.all(apart | ~trials.mask)
+def _searched(plan: Design, count: int | None) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
+    """The points (m, d) that are searched, the first `count` of candidates; and which of them are feasible."""
+    if plan.lattice is not None:
+        return plan.lattice.everywhere()
+    assert plan.candidates is not None
+    points = plan.candidates[:count]
+    return points, jnp.ones(len(points), bool)
 
 
-def _thompson_point(posterior, plan, trial):
+def _apart_from(
+    trials: Trials, points: Float[Array, "m d"], usable: Bool[Array, " m"], distance: float
+) -> Callable[[Float[Array, " d"]], Bool[Array, ""]]:
+    """Whether a point keeps the distance to every earlier trial; where none of the usable points does, whether it is as
+    far from all trials as one of them can be."""
+
+    def gap(x: Float[Array, " d"]) -> Float[Array, ""]:
+        """Squared distance to the nearest trial."""
+        return jnp.min(jnp.where(trials.mask, jnp.sum((trials.x - x[None, :]) ** 2, axis=1), jnp.inf))
+
+    farthest = jnp.max(jnp.where(usable, jax.vmap(gap)(points), 0.0))
+    rounding = 1.0 - 8.0 * jnp.finfo(trials.x.dtype).eps
+    smallest = jnp.minimum(distance**2, rounding * farthest)
+    return lambda x: gap(x) >= smallest
+
+
+def _thompson_point(
+    posterior: Posterior,
+    plan: Design,
+    trial: Int[Array, ""] | int,
+    allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None,
+) -> Float[Array, " d"]:
+    """Where one joint draw of the function is largest among the candidates that are allowed."""
+    assert plan.candidates is not None
     points = plan.candidates[:_JOINT_CANDIDATES]
     cross = gram(posterior.gp.kernel, points, posterior.trials.x)
     covariance = gram(posterior.gp.kernel, points, points) - cross @ posterior.latent.inverse @ cross.T
     key = jax.random.fold_in(plan.key, trial)
-    row, _ = acquisition.thompson(key, cross @ posterior.latent.weights, covariance)
+    row, draw = acquisition.thompson(key, cross @ posterior.latent.weights, covariance)
+    if allowed is not None:
+        row = jnp.argmax(jnp.where(jax.vmap(allowed)(points), draw, -jnp.inf))
     return points[row]

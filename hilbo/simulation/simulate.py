@@ -115,15 +115,21 @@ def simulate_study(study: Study, persons: Person, seed: int) -> Trials:
     count = persons.noise.shape[0]
     plan = design(study, seed)
     hypercubes = [study.space.latin_hypercube(len(plan.initial), 1 + seed * count + i) for i in range(count)]
-    keys = jax.random.split(plan.key, count)
-    return _simulate(study, plan, jnp.asarray(np.stack(hypercubes)), persons, keys)
+    answering, drawing = (jax.random.split(key, count) for key in (plan.key, jax.random.fold_in(plan.key, 1)))
+    return _simulate(study, plan, jnp.asarray(np.stack(hypercubes)), persons, answering, drawing)
 
 
 @eqx.filter_jit
 def _simulate(
-    study: Study, plan: Design, initial: Float[Array, "M k d"], persons: Person, keys: Key[Array, " M"]
+    study: Study,
+    plan: Design,
+    initial: Float[Array, "M k d"],
+    persons: Person,
+    answering: Key[Array, " M"],
+    drawing: Key[Array, " M"],
 ) -> Trials:
-    """Everybody's session at once: the trials `initial` first, then those that the acquisition chooses."""
+    """Everybody's session at once: the trials `initial` first, then those that the acquisition chooses. `answering` are
+    the keys of people's answers, `drawing` those of the acquisition's draws, if it makes any."""
     trials = study.selection.trials
 
     def answered(state, point, trial):
@@ -131,13 +137,16 @@ def _simulate(
             progress = (trial / trials).astype(x.dtype)
             return data.append(x, person.answer(jax.random.fold_in(key, trial), x, progress))
 
-        return jax.vmap(one)(persons, keys, state, point)
+        return jax.vmap(one)(persons, answering, state, point)
 
     def filling(state, trial):
         return answered(state, initial[:, trial], trial), None
 
     def choosing(state, trial):
-        points = jax.vmap(lambda data: next_point(study, plan, data, trial))(state)
+        def point(key, data):
+            return next_point(study, eqx.tree_at(lambda p: p.key, plan, key), data, trial)
+
+        points = jax.vmap(point)(drawing, state)
         return answered(state, points, trial), None
 
     empty = jax.vmap(lambda _: Trials.empty(trials, study.space.dim))(jnp.arange(initial.shape[0]))

@@ -162,6 +162,31 @@ def test_a_smallest_distance_keeps_trials_apart(study):
         assert np.linalg.norm(x[:n] - x[n], axis=1).min() >= 0.2 - 1e-12
 
 
+def liked_everywhere(kind, distance, count):
+    """A study with a smallest distance, and the points of a session in which all are close."""
+    changed = RAW["selection"] | {"acquisition": kind, "minimum_distance": distance}
+    small = Study.from_dict(RAW | {"selection": changed})
+    return small, np.asarray(small.space.to_unit(Session.replay(small, ["close"] * count).points))
+
+
+@pytest.mark.parametrize("kind", ["ucb", "thompson"])
+def test_where_no_point_keeps_the_distance_the_farthest_is_asked(kind):
+    """After the first trial nothing is 0.9 away any more: each is as far from the others as a point can be."""
+    small, x = liked_everywhere(kind, 0.9, 5)
+    everywhere = np.asarray(small.space.candidates(2000, 1))
+    for n in range(small.selection.space_filling, 5):
+        gaps = np.linalg.norm(everywhere[:, None, :] - x[None, :n], axis=2).min(axis=1)
+        assert np.linalg.norm(x[:n] - x[n], axis=1).min() > min(0.9, gaps.max()) - 0.06
+
+
+@pytest.mark.parametrize("kind", ["ucb", "thompson"])
+def test_a_distance_is_kept(kind):
+    """Answers that pull to one place do not bring trials nearer to each other."""
+    small, x = liked_everywhere(kind, 0.15, 6)
+    for n in range(small.selection.space_filling, 6):
+        assert np.linalg.norm(x[:n] - x[n], axis=1).min() >= 0.15 - 1e-9
+
+
 def test_the_study_is_a_pytree_of_its_model_alone(study):
     assert len(eqx.filter(study, eqx.is_array).gp.likelihood.thresholds) == 2
 

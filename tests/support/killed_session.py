@@ -103,9 +103,19 @@ class Session:
             error.close()
             if error.code not in (409, 503):
                 raise
+            self._forget_what_is_asked_no_more()
             return "again"
         except (OSError, ValueError):  # no server, or one that died while it spoke
             return "nobody"
+
+    def _forget_what_is_asked_no_more(self):
+        """An answer that was not acknowledged, to a trial that has been begun anew, is refused, and rightly."""
+        try:
+            trial = self.client.get("/api/participant")["trial"]
+        except (OSError, ValueError):
+            return
+        if self.waiting is not None and trial is not None and trial["id"] != self.waiting["trial"]:
+            self.waiting = None
 
     def answer_to(self, view):
         number = int(view["trial"]["id"].split(":")[1].split(".")[0])
