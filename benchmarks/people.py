@@ -23,12 +23,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-from scipy.optimize import minimize
 from scipy.stats import norm
 
 jax.config.update("jax_enable_x64", True)
 
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit  # noqa: E402
+from hilbo.population.baselines import constant, quadratic  # noqa: E402
 from hilbo.population.counts import Counts, fit_counts  # noqa: E402
 from hilbo.population.hierarchical_evidence import learn_people  # noqa: E402
 from hilbo.population.leave_one_out import clustered, integral_transform  # noqa: E402
@@ -105,29 +105,6 @@ def predicted(gp, share, counts, common, mask, x):
     return {rule: jax.vmap(gp.likelihood.class_probabilities)(*found) for rule, found in maps.items()}
 
 
-def probit(data, train, test):
-    """An ordinal probit, quadratic in the standardised parameters, by maximum likelihood."""
-    z = (data.x - data.x[train].mean(axis=0)) / data.x[train].std(axis=0)
-    features = jnp.asarray(np.c_[z, z**2, z[:, :1] * z[:, 1:]])
-    known, q = features[train], jnp.asarray(data.q[train])
-    frequencies = np.cumsum(np.bincount(data.q[train], minlength=data.categories))[:-1] / train.sum()
-    edges = norm.ppf(frequencies)
-
-    def model(w):
-        return w[:5], OrdinalProbit(jnp.cumsum(jnp.concatenate([w[5:6], jnp.exp(w[6:])])), jnp.ones(()))
-
-    @jax.jit
-    @jax.value_and_grad
-    def cost(w):
-        slope, likelihood = model(w)
-        return -jnp.mean(jax.vmap(likelihood.log_prob)(known @ slope, q))
-
-    begin = np.r_[np.zeros(5), edges[0], np.log(np.diff(edges))]
-    found = minimize(lambda w: tuple(map(np.asarray, cost(jnp.asarray(w)))), begin, jac=True, method="BFGS")
-    slope, likelihood = model(jnp.asarray(found.x))
-    return jax.vmap(likelihood.class_probabilities)(features[test] @ slope)
-
-
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("data", choices=["video", "orientation"])
@@ -152,9 +129,8 @@ def main():
         x = jnp.asarray(data.x[rows])
         found = predicted(learnt.gp, learnt.share, counts, None, jnp.asarray(mask), x)
         found = {rule: np.asarray(p)[: test.sum()] for rule, p in found.items()}
-        found["probit"] = np.asarray(probit(data, ~test, test))
-        share = np.bincount(data.q[~test], minlength=data.categories) / (~test).sum()
-        found["marginal"] = np.broadcast_to(share, (test.sum(), data.categories))
+        found["probit"] = quadratic(data.x, data.q, data.categories, ~test)[test]
+        found["marginal"] = constant(data.q, data.categories, ~test)[test]
         for rule, p in found.items():
             chances.setdefault(rule, np.zeros((len(data.q), data.categories)))[test] = p
         print(data.names[left], f"{time.perf_counter() - begun:.0f} s, share {shares[-1]:.3f}", flush=True)

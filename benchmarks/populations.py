@@ -5,10 +5,11 @@ All rules have the same answers.
     python benchmarks/populations.py FILE [--studies 100] [--first 1000] [--only NAME] [--design 12x15] [--chance]
     python benchmarks/populations.py FILE --write
 
-FILE (JSON Lines) collects a row for each study and design; a run that was stopped goes on where it was. *Regret* is how
-much less often a new person of the population gives the highest answer at the optimum found than at the best feasible
-rendering. Choices of method were made on seeds 0 to 99; what is reported begins at 1000. --chance: points by chance in
-place of sessions. --write puts the tables into docs/which_method.md.
+FILE (JSON Lines) collects a row for each study and design; a run that was stopped goes on where it was. What has been
+run with this recipe is in benchmarks/populations.jsonl. *Regret* is how much less often a new person of the population
+gives the highest answer at the optimum found than at the best feasible rendering. Choices of method were made on seeds
+0 to 99; what is reported begins at 1000. --chance: points by chance in place of sessions. --write puts the tables into
+docs/which_method.md.
 """
 
 import argparse
@@ -33,9 +34,9 @@ from hilbo.study.aggregate import fit_cohort, individual_optima, map_optimum  # 
 from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
+from hilbo.study.optimum_region import optimum_region  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
-STUDY = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
 RULES = ("learnt-1", "bcm", "average", "mean of the individual optima")
 LARGE = 0.05  # a regret of the committee machine that is worth mending
 
@@ -61,8 +62,15 @@ def main():
                 continue
             row = {"population": name, "design": design, "seed": seed} | one_study(name, design, seed)
             with chosen.file.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+                file.write(json.dumps(rounded(row)) + "\n")
             print(name, seed, {rule: round(row["rules"][rule]["regret"], 3) for rule in RULES}, flush=True)
+
+
+def rounded(row):
+    """Numbers with six digits after the point: a hundredth of what anybody reads."""
+    if isinstance(row, dict):
+        return {name: rounded(value) for name, value in row.items()}
+    return round(row, 6) if isinstance(row, float) else row
 
 
 def rows_of(path):
@@ -72,7 +80,7 @@ def rows_of(path):
 def one_study(name, design, seed):
     """Regret and distances of every rule's optimum, and of learnt-1's own claims."""
     people, trials = map(int, design.split()[0].split("x"))
-    study = with_trials(STUDY, trials)
+    study = with_trials(POPULATIONS[name].study, trials)
     scene = POPULATIONS[name].scene(study, people, seed)
     if "chance" in design:
         answers = by_chance(study, scene.persons, people, trials, seed)
@@ -86,7 +94,10 @@ def one_study(name, design, seed):
     posteriors = fit_cohort(study, cohort)
     individual = jnp.mean(individual_optima(study, posteriors, candidates).x, axis=0)
     resolved_study = resolved(that_learns(study), cohort)
-    learnt = map_optimum(resolved_study, learnt_map(resolved_study.learnt, answers), candidates)
+    learnt_rule = learnt_map(resolved_study.learnt, answers)
+    learnt = map_optimum(resolved_study, learnt_rule, candidates)
+    region = optimum_region(resolved_study, learnt_rule, seed)
+    held = region.holds(np.asarray(best), np.asarray(resolved_study.gp.kernel.theta))
     places = {
         "learnt-1": learnt.x,
         "bcm": map_optimum(study, rule_map(study.gp, answers, "bcm", posteriors=posteriors), candidates).x,
@@ -101,12 +112,16 @@ def one_study(name, design, seed):
         for rule, x in places.items()
     }
     said = float(learnt.class_probabilities[-1])
-    return {"best": top, "median": median, "rules": rules, "said": said, "is": top - rules["learnt-1"]["regret"]}
+    content = {"best": top, "median": median, "rules": rules, "said": said, "is": top - rules["learnt-1"]["regret"]}
+    return content | {
+        "region": {"holds": held, "volume": region.volume},
+        "converged": bool(resolved_study.learnt.converged),
+    }
 
 
 def with_trials(study, trials):
     raw = {"schema": 1} | json.loads(study.content)
-    raw["selection"] = {"space_filling": min(5, trials), "trials": trials}
+    raw["selection"] |= {"space_filling": min(5, trials), "trials": trials}
     return Study.from_dict(raw)
 
 

@@ -10,7 +10,9 @@ A population makes, for one seed, people who take part and what a new person's h
 None of these is the model that is fitted, but *functions, RBF*.
 """
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,8 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from hilbo.simulation.simulate import PRESETS, people
+from hilbo.study.config import Study
 
 FEATURES, CROWD = 400, 2000
+PAPER = Study.load(Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml")
 
 
 class Scene(NamedTuple):
@@ -38,6 +42,10 @@ class Places(NamedTuple):
     groups: bool = False
     widths: float = 0.0
     anywhere: bool = False
+
+    @property
+    def study(self):
+        return PAPER
 
     def scene(self, study, count, seed):
         population = PRESETS["paper"]
@@ -102,12 +110,27 @@ def anywhere(study, rng, at_wall):
 
 
 class Functions(NamedTuple):
-    """People whose functions are drawn; thresholds where the classes have these shares on the whole."""
+    """People whose functions are drawn; thresholds where the classes have these shares on the whole. `dim`: parameters,
+    each of 0 to 1; None for the paper's space."""
 
     theta: float
     share: float = 0.6
     matern: bool = False
     shares: tuple[float, ...] = (0.55, 0.2, 0.25)
+    dim: int | None = None
+
+    @property
+    def study(self):
+        """With the paper's fixed hyperparameters for the rules that take them as they are."""
+        if self.dim is None and len(self.shares) == 3:
+            return PAPER
+        raw = {"schema": 1} | json.loads(PAPER.content)
+        raw["study"] = {"name": "functions", "responses": [f"c{c}" for c in range(len(self.shares))]}
+        raw["gp"] |= {"thresholds": np.linspace(-0.5, 0.5, len(self.shares) - 1).tolist()}
+        if self.dim is not None:
+            del raw["renderer"]
+            raw["parameters"] = {f"p{i}": {"low": 0.0, "high": 1.0, "unit": ""} for i in range(self.dim)}
+        return Study.from_dict(raw)
 
     def scene(self, study, count, seed):
         rng, d = np.random.default_rng([seed, 9]), study.space.dim
@@ -175,4 +198,7 @@ POPULATIONS = {
     "functions, RBF, theta 12": Functions(12.0),
     "functions, Matérn 5/2, theta 4": Functions(4.0, matern=True),
     "functions, Matérn 5/2, theta 12": Functions(12.0, matern=True),
+    "functions, RBF, two parameters": Functions(12.0, dim=2),
+    "functions, RBF, four parameters": Functions(4.0, dim=4),
+    "functions, RBF, five categories": Functions(4.0, shares=(0.3, 0.2, 0.2, 0.15, 0.15)),
 }

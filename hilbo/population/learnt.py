@@ -22,10 +22,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
-from hilbo.likelihoods import OrdinalProbit
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.low_rank import PeopleModel, rank_for, shared_evidence, shared_function
 
@@ -38,20 +37,17 @@ __all__ = [
     "Stated",
     "learn",
     "learnt_function",
-    "newcomer_probabilities",
     "prior_model",
 ]
 
 RECIPE: Final = "learnt-1"
 Coordinates = dict[str, Float[Array, "..."]]
 
-_NODES = np.polynomial.hermite_e.hermegauss(7)
-_NODES = _NODES[0], _NODES[1] / _NODES[1].sum()
 _STEPS, _FINE = 100, 1e-3  # of the search; of the finite differences for the curvature
 _NEAR = 2e-6  # of the evidence: another choice of features moves it as much as a nearer step would
 _WORTH = 3.0  # log Bayes factor from which people have widths of their own, about 20 to 1
 _LEFT, _LARGEST = 1e-4, 256
-"""Of the shared function's prior variance, what the search may leave: 1e-5 of the log evidence of 600 answers; but it
+"""Of the shared function's prior variance, what the search may leave: 2e-4 of the log evidence of 600 answers; but it
 takes no more features than this, since functions that need more are too rugged to be shared by few answers."""
 _ROUGH = 0.05
 
@@ -96,13 +92,18 @@ class Learnt(eqx.Module):
     """Logarithms in units of the noise, and the middle of the thresholds, as in the priors."""
     sd: Coordinates
     """Standard deviations of their posterior."""
-    gain_of_widths: float = eqx.field(static=True)
+    gain_of_widths: Float[Array, ""]
     """What widths of people's own add to the log evidence; they are in the model if it is above 3."""
-    steps: int = eqx.field(static=True)
-    rank: int = eqx.field(static=True)
+    steps: Int[Array, ""]
+    rank: Int[Array, ""]
     left: Float[Array, ""]
     """Largest part of the shared function's prior variance, at an answered point, that is not followed."""
     converged: Bool[Array, ""]
+
+    @property
+    def widths(self) -> bool:
+        """Whether people have widths of their own."""
+        return "widths" in self.coordinates
 
 
 def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
@@ -118,34 +119,24 @@ def learnt_function(learnt: Learnt, trials: Trials) -> Posterior:
     return shared_function(learnt.model, trials, learnt.weights, rank)
 
 
-def newcomer_probabilities(
-    learnt: Learnt, mean: Float[Array, " m"], variance: Float[Array, " m"]
-) -> Float[Array, "m C"]:
-    """Class probabilities (m, C) of a person who gave no answers, from the mean and variance of the shared function:
-    that person's own function is integrated out, and so are the widths, by Gauss and Hermite."""
-    model = learnt.model
-    nodes, weights = _NODES if "widths" in learnt.coordinates else (np.zeros(1), np.ones(1))
-    middle = jnp.mean(model.thresholds)
-    spread = jnp.sqrt(model.noise**2 + variance + model.own)
-
-    def at(log_width: Array) -> Float[Array, "m C"]:
-        thresholds = middle + jnp.exp(log_width) * (model.thresholds - middle)
-        return jax.vmap(lambda f, s: OrdinalProbit(thresholds, s).class_probabilities(f))(mean, spread)
-
-    widths = PRIORS["widths"].mean + PRIORS["widths"].sd * jnp.asarray(nodes, mean.dtype)
-    return jnp.tensordot(jnp.asarray(weights, mean.dtype), jax.vmap(at)(widths), 1)
-
-
-def learn(trials: Trials, categories: int, stated: Stated = NOTHING, priors: Mapping[str, Prior] = PRIORS) -> Learnt:
+def learn(
+    trials: Trials,
+    categories: int,
+    stated: Stated = NOTHING,
+    priors: Mapping[str, Prior] = PRIORS,
+    near: Learnt | None = None,
+) -> Learnt:
     """The hyperparameters of stacked trials (M, n) of answers in `categories`.
 
-    **Arguments:** `stated`: what is kept; `priors`: for studies of their influence. Raises InputError where nobody
-    answered.
+    **Arguments:** `stated`: what is kept; `priors`: for studies of their influence; `near`: what was learnt from nearly
+    the same answers of as many people, where the search may begin. Raises InputError where nobody answered.
     """
     if not np.asarray(trials.mask).any():
         raise InputError("learnt-1: nobody gave an answer; at least one person's answers are needed.")
     start = _medians(trials, categories, stated, priors)
     common = frozenset(start) - {"widths"}
+    if near is not None:
+        start |= {name: near.coordinates[name] for name in common}
     problem = _Problem(trials, stated, priors, 0)
     alike = _Search(start, jnp.zeros(trials.q.shape, trials.x.dtype), 0, True)
     alike, problem = _searched(alike, problem, common)
@@ -162,9 +153,9 @@ def learn(trials: Trials, categories: int, stated: Stated = NOTHING, priors: Map
         log_evidence=end.log_evidence,
         coordinates={name: value for name, value in chosen.coordinates.items() if name in free},
         sd=_standard_deviations(chosen.coordinates, end.weights, problem, free),
-        gain_of_widths=gain,
-        steps=chosen.steps,
-        rank=problem.rank,
+        gain_of_widths=jnp.asarray(gain),
+        steps=jnp.asarray(chosen.steps),
+        rank=jnp.asarray(problem.rank),
         left=end.left,
         converged=end.usable & jnp.asarray(chosen.ended) & (end.left <= _ROUGH),
     )

@@ -13,6 +13,7 @@ Reference: Czado, Gneiting & Held (2009), Biometrics 65:1254, for the transform 
 """
 
 import dataclasses
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -23,7 +24,9 @@ from scipy.special import ndtri
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
-from hilbo.population.maps import RuleMap, rule_map
+from hilbo.population.learnt import Learnt, Stated, learn
+from hilbo.population.maps import RuleMap, learnt_map, rule_map
+from hilbo.population.newcomer import class_probabilities
 
 __all__ = [
     "LeftOut",
@@ -32,10 +35,15 @@ __all__ = [
     "influence",
     "integral_transform",
     "leave_one_out",
+    "leave_one_out_learnt",
+    "left_out_by",
     "normal_scores",
     "reliability",
     "without",
 ]
+
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(15)
+_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +53,10 @@ class LeftOut:
     person: Int[np.ndarray, " n"]
     q: Int[np.ndarray, " n"]
     probabilities: Float[np.ndarray, "n C"]
+    agreement: Float[np.ndarray, " n"] | None = None
+    """Probability that a second answer of the same person, there, is the same."""
+    not_converged: int = 0
+    """Folds in which a fit did not hold its certificate."""
 
     @property
     def cost(self) -> Float[np.ndarray, " n"]:
@@ -52,9 +64,9 @@ class LeftOut:
         return -np.log(self.probabilities[np.arange(len(self.q)), self.q])
 
 
-def without(trials: Trials, person: int) -> Trials:
-    """Stacked trials without one person."""
-    rows = np.delete(np.arange(trials.mask.shape[0]), person)
+def without(trials: Trials, left: int | Int[np.ndarray, " k"]) -> Trials:
+    """Stacked trials without some people."""
+    rows = np.delete(np.arange(trials.mask.shape[0]), left)
     return jax.tree.map(lambda leaf: leaf[rows], trials)
 
 
@@ -66,24 +78,66 @@ def leave_one_out(
     share: Float[Array, ""] | None = None,
     posteriors: Posterior | None = None,
     inference: str = "laplace",
+    groups: Sequence[Int[np.ndarray, " k"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
     """What a rule predicts of each person's answers from all others' (hyperparameters and share as given); and the
-    maps without them. Raises InputError for fewer than three people: two must be left to differ."""
+    maps without them; errors as in [`left_out_by`][]."""
+
+    def fold(left: Int[np.ndarray, " k"]) -> tuple[OrdinalGP, RuleMap]:
+        rest = np.delete(np.arange(trials.mask.shape[0]), left)
+        others = None if posteriors is None else jax.tree.map(lambda leaf: leaf[rest], posteriors)
+        given = without(trials, left)
+        return gp, rule_map(gp, given, rule, posteriors=others, share=share, inference=inference)
+
+    return left_out_by(trials, fold, groups)
+
+
+def leave_one_out_learnt(
+    learnt: Learnt,
+    trials: Trials,
+    stated: Stated,
+    *,
+    again: bool = True,
+    groups: Sequence[Int[np.ndarray, " k"]] | None = None,
+) -> tuple[LeftOut, list[RuleMap]]:
+    """The same by learnt-1, from what was learnt of everybody's answers.
+
+    **Arguments:** `stated`: what the study states; `again`: whether the hyperparameters are learnt again in each fold;
+    else those of all answers are kept, those of the person left out among them.
+    """
+    categories = learnt.model.thresholds.shape[0] + 1
+
+    def fold(left: Int[np.ndarray, " k"]) -> tuple[OrdinalGP, RuleMap]:
+        rest = eqx.tree_at(lambda t: t.mask, trials, trials.mask.at[left].set(False))  # all shapes stay
+        of_rest = learn(rest, categories, stated, near=learnt) if again else learnt
+        return of_rest.model.gp, learnt_map(of_rest, rest)
+
+    return left_out_by(trials, fold, groups)
+
+
+def left_out_by(
+    trials: Trials,
+    fold: Callable[[Int[np.ndarray, " k"]], tuple[OrdinalGP, RuleMap]],
+    groups: Sequence[Int[np.ndarray, " k"]] | None = None,
+) -> tuple[LeftOut, list[RuleMap]]:
+    """What `fold` predicts of people: the model and the map without those in some rows of the trials; each alone, or in
+    `groups`. Raises InputError for fewer than three people: two must be left to differ."""
     people = trials.mask.shape[0]
     if people < 3:
         raise InputError(f"leave_one_out: {people} people; at least three are needed, of whom two are left each time.")
     mask, q = np.asarray(trials.mask), np.asarray(trials.q)
-    rows, maps = [], []
-    for person in range(people):
-        rest = np.delete(np.arange(people), person)
-        others_posteriors = None if posteriors is None else jax.tree.map(lambda leaf, rest=rest: leaf[rest], posteriors)
-        map_without = rule_map(
-            gp, without(trials, person), rule, posteriors=others_posteriors, share=share, inference=inference
-        )
-        rows.append(np.asarray(_newcomer_probabilities(gp, map_without, trials.x[person]))[mask[person]])
+    persons, categories, rows, again, maps = [], [], [], [], []
+    for group in np.arange(people)[:, None] if groups is None else groups:
+        gp, map_without = fold(group)
         maps.append(map_without)
-    person = np.nonzero(mask)[0]
-    return LeftOut(person, q[mask].astype(int), np.concatenate(rows)), maps
+        for person in group:
+            for part, values in zip((rows, again), _newcomer(gp, map_without, trials.x[person]), strict=True):
+                part.append(np.asarray(values)[mask[person]])
+            persons.append(np.full(mask[person].sum(), person))
+            categories.append(q[person][mask[person]])
+    person, category, chances, agreement = (np.concatenate(part) for part in (persons, categories, rows, again))
+    failed = sum(not _converged(map_) for map_ in maps)
+    return LeftOut(person, category.astype(int), chances, agreement, failed), maps
 
 
 def influence(whole: RuleMap, parts: list[RuleMap], x: Float[Array, "m d"]) -> Float[np.ndarray, " M"]:
@@ -161,5 +215,20 @@ def _predict(population_map: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Arr
 
 
 @eqx.filter_jit
-def _newcomer_probabilities(gp: OrdinalGP, population_map: RuleMap, x: Float[Array, "m d"]) -> Float[Array, "m C"]:
-    return jax.vmap(gp.likelihood.class_probabilities)(*population_map.newcomer(x))
+def _newcomer(
+    gp: OrdinalGP, population_map: RuleMap, x: Float[Array, "m d"]
+) -> tuple[Float[Array, "m C"], Float[Array, " m"]]:
+    """Class probabilities (m, C) of a new person's answers, and the probability (m,) that two of them there agree (with
+    the median widths)."""
+    mean, variance = population_map.newcomer(x)
+    levels = mean[:, None] + jnp.sqrt(variance)[:, None] * jnp.asarray(_NODES, mean.dtype)[None, :]
+    given = jax.vmap(jax.vmap(gp.likelihood.class_probabilities))(levels, jnp.zeros_like(levels))
+    agree = jnp.sum(given**2, axis=2) @ jnp.asarray(_WEIGHTS, mean.dtype)
+    return class_probabilities(gp.likelihood, mean, variance, population_map.widths), agree
+
+
+def _converged(map_: RuleMap) -> bool:
+    """Whether every fit behind a map held its certificate."""
+    fits = map_.experts if map_.shared is None else map_.shared
+    assert fits is not None
+    return bool(jnp.all(fits.certificate.converged))

@@ -20,11 +20,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
+from hilbo.likelihoods import OrdinalProbit
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.counts import Counts, counts_of, evidence, fit_counts, one_person
 from hilbo.population.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
 from hilbo.population.learnt import RECIPE, Learnt, learnt_function
+from hilbo.population.newcomer import class_probabilities
 
 __all__ = [
     "ALL_RULES",
@@ -64,6 +66,8 @@ class RuleMap(eqx.Module):
     """Prior variance of one person's function."""
     reach: Float[Array, ""] | None = None
     """By learnt-1 the largest variance of the map where somebody answered: beyond it no optimum is sought."""
+    widths: bool = eqx.field(static=True, default=False)
+    """Whether people differ in the widths of their middle categories."""
 
     def predict(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the map at points (m, d)."""
@@ -91,6 +95,10 @@ class RuleMap(eqx.Module):
         mean, variance = self.predict(x)
         return mean, variance + self.apart
 
+    def class_probabilities(self, likelihood: OrdinalProbit, x: Float[Array, "m d"]) -> Float[Array, "m C"]:
+        """Probabilities (m, C) of a new person's answers at points (m, d)."""
+        return class_probabilities(likelihood, *self.newcomer(x), self.widths)
+
 
 def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[pointwise.Rule, Float[Array, ""] | None]:
     """By which rule, and with which share, everybody's posteriors are merged point by point in place of a map: by the
@@ -107,7 +115,8 @@ def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
     shared = learnt_function(learnt, trials)
     _, variances = shared.predict(trials.x.reshape(-1, trials.x.shape[-1]))
     reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
-    return RuleMap(RECIPE, "exact", None, shared, learnt.model.share, learnt.model.shared + learnt.model.own, reach)
+    model = learnt.model
+    return RuleMap(RECIPE, "exact", None, shared, model.share, model.shared + model.own, reach, learnt.widths)
 
 
 def rule_map(

@@ -30,6 +30,7 @@ from hilbo.study.config import Study
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
 from hilbo.study.learnt_study import learnt_content, learnt_sentences
 from hilbo.study.map_file import write_map
+from hilbo.study.model_check import check_sentences, model_check
 from hilbo.study.optimum_location import location_sentences
 from hilbo.study.optimum_region import optimum_region, region_content, region_sentences
 from hilbo.study.typed_files import sealed
@@ -114,6 +115,8 @@ def result(
     content["optimum_region"] = region_content(study, region)
     content["warnings"] += learnt_sentences(study) + location_sentences(study, best.x, best.sd, asked)
     content["warnings"] += region_sentences(region)
+    content["model_check"] = None if isinstance(aggregate, Merged) else model_check(study, aggregate)
+    content["warnings"] += check_sentences(content["model_check"])
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
+from hilbo.population.learnt import RECIPE
 from hilbo.report import validation
 from hilbo.report.comparison import comparison_table
 from hilbo.report.hypotheses import Results, hypotheses
@@ -112,7 +113,7 @@ def _compared(analysis: Analysis, seed, say) -> dict[str, Any] | None:
     if np.sum(analysis.cohort.counts() > 0) < _FEWEST:
         return None
     say("comparing the rules of aggregation")
-    return compare(analysis.study, analysis.aggregate, seed)
+    return compare(analysis.study, analysis.aggregate, seed, learns=analysis.study.rule == RECIPE)
 
 
 def _write_material(material, analysis: Analysis, validated, compared, folder: Path, seed):
@@ -265,6 +266,7 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
         "moved": content["optimised"]["nrmse"],
+        "model_check": content["model_check"],
         "without": [
             name for name, reading in readings.items() if all(i is None for i, _ in reading.tolerances.values())
         ],

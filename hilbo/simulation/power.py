@@ -169,8 +169,7 @@ def _rms(difference: Float[np.ndarray, "..."]) -> float:
 @eqx.filter_jit
 def _map_top_probability(study: Study, map_: RuleMap, points: Float[Array, "m d"]) -> Float[Array, " m"]:
     """Probability of a new person's highest answer that the map predicts."""
-    mean, variance = map_.newcomer(points)
-    return jax.vmap(study.gp.likelihood.class_probabilities)(mean, variance)[:, -1]
+    return map_.class_probabilities(study.gp.likelihood, points)[:, -1]
 
 
 def _with_trials(study: Study, trials: int) -> Study:

@@ -19,11 +19,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition, bcm
+from hilbo.likelihoods import OrdinalProbit
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
 from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map, share_of
+from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.search.candidates import search_points
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Inference, Study
@@ -101,9 +103,13 @@ class Aggregate(eqx.Module):
         """Mean and variance (m,) of the population map at points of the unit cube."""
         return predict_map(self.map, jnp.asarray(x))
 
+    def class_probabilities(self, likelihood: OrdinalProbit, x: Float[ArrayLike, "m d"]) -> Float[Array, "m C"]:
+        """Probabilities (m, C) of a new person's answers at points of the unit cube."""
+        return class_probabilities(likelihood, *self.newcomer(x), self.map.widths)
+
     def newcomer(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new person's function at points of the unit cube: what answers are predicted
-        from. By the hierarchical rule it differs from the map, which is the function that people share."""
+        """Mean and variance (m,) of a new person's function at points of the unit cube. By the hierarchical rules it
+        differs from the map, which is the function that people share."""
         mean, variance = self.surface(x)
         return mean, variance + self.map.apart
 
@@ -173,8 +179,7 @@ def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -
     likelihood = study.gp.likelihood
 
     def chance(mean, variance):
-        """Rises with the probability of the highest category: its normal score."""
-        return (mean - likelihood.thresholds[-1]) / jnp.sqrt(likelihood.noise**2 + variance + found.apart)
+        return log_highest(likelihood, mean, variance + found.apart, found.widths)
 
     assert found.reach is not None
     known = jnp.maximum(found.reach, jnp.min(found.predict(candidates)[1]))  # of which there is one at least
@@ -182,7 +187,7 @@ def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -
     def told(x):
         return found.predict(x[None, :])[1][0] <= known
 
-    return _optimum(study, found.predict, candidates, found.apart, chance, told)
+    return _optimum(study, found.predict, candidates, found.apart, chance, told, found.widths)
 
 
 def _optimum(
@@ -192,9 +197,10 @@ def _optimum(
     apart: ArrayLike,
     height: Callable[[Array, Array], Array] | None = None,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
+    widths: bool = False,
 ) -> Optimum:
     """`apart`: variance of one person's function about the map's; `height`: what is largest at the optimum, of means
-    and variances, by default the mean; `allowed`: where it may be."""
+    and variances (m,), by default the mean; `allowed`: where it may be; `widths`: whether people differ in them."""
     height = (lambda mean, _: mean) if height is None else height
     choice = acquisition.maximise(
         height(*predict(candidates)),
@@ -207,7 +213,7 @@ def _optimum(
         steps=300,
     )
     mean, variance = predict(choice.x[None, :])
-    probabilities = study.gp.likelihood.class_probabilities(mean[0], variance[0] + apart)
+    probabilities = class_probabilities(study.gp.likelihood, mean, variance + apart, widths)[0]
     return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
 
 

@@ -48,12 +48,12 @@ def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
         "share": float(model.share),
         "thresholds": np.asarray(model.thresholds).tolist(),
         "log_evidence": float(learnt.log_evidence),
-        "steps": learnt.steps,
+        "steps": int(learnt.steps),
         "converged": bool(learnt.converged),
     }
     content["intervals"] = {name: list(ends) for name, ends, _ in _coordinates(study, learnt)}
     content["not_identified"] = [name for name, _, known in _coordinates(study, learnt) if not known]
-    if "widths" in learnt.coordinates:
+    if learnt.widths:
         widths, sd = (np.asarray(part["widths"]) for part in (learnt.coordinates, learnt.sd))
         ends = np.exp(np.stack([widths, widths - 1.96 * sd, widths + 1.96 * sd], axis=1)).tolist()
         content["widths"] = {

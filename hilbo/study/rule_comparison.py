@@ -7,6 +7,7 @@ agrees with one model of all answers; and how much of the space the answers cove
 what it is without answers. And, once, how people differ, with a recommendation in words.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -21,14 +22,24 @@ from hilbo.ordinal_gp import Posterior
 from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
 from hilbo.population.joint import joint_map, posterior_map
-from hilbo.population.leave_one_out import LeftOut, calibration, clustered, influence, leave_one_out, reliability
-from hilbo.population.maps import GIVEN_RULES, RuleMap, rule_map, share_of
+from hilbo.population.learnt import RECIPE
+from hilbo.population.leave_one_out import (
+    LeftOut,
+    calibration,
+    clustered,
+    influence,
+    leave_one_out,
+    leave_one_out_learnt,
+    reliability,
+)
+from hilbo.population.maps import GIVEN_RULES, RuleMap, learnt_map, rule_map, share_of
 from hilbo.population.pointwise import RULES
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, map_optimum, nrmse
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import share_content
+from hilbo.study.learnt_study import resolved, that_learns
 
 __all__ = ["KNOWN", "compare", "recommendation"]
 
@@ -39,9 +50,9 @@ _POINTS = 400  # at which joint draws and bootstrap seek the optimum
 _DRAWS = 2000
 
 
-def compare(study: Study, aggregate: Aggregate, seed: int = 0) -> dict[str, Any]:
-    """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say. What a rule
-    cannot do stands there as its reason.
+def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool = True) -> dict[str, Any]:
+    """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say, but learnt-1
+    by what it learns in each fold, if it `learns` (a search in each). What a rule cannot do stands there as its reason.
 
     Raises InputError for fewer than three people with answers: two must be left when one is left out.
     """
@@ -50,12 +61,13 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0) -> dict[str, Any]
         raise InputError(
             f"compare: {len(answered)} people gave answers; at least three are needed, since each is left out in turn."
         )
-    cohort = aggregate.cohort.rows(answered)
+    everybody = len(answered) == len(aggregate.cohort.names)
+    cohort = aggregate.cohort if everybody else aggregate.cohort.rows(answered)
     candidates = search_points(study.space, seed)
     x = candidates[: min(_POINTS, len(candidates))]
     posteriors = jax.tree.map(lambda leaf: leaf[answered], aggregate.posteriors)
     share = aggregate.share or share_of(study.gp, cohort.trials, study.inference)
-    fitted = aggregate.maps if len(answered) == len(aggregate.cohort.names) else {}
+    fitted = aggregate.maps if everybody else {}
     maps = {rule: fitted.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in GIVEN_RULES}
     pooled = maps["pooled"]
     rules: dict[str, Any] = {}
@@ -69,8 +81,35 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0) -> dict[str, Any]
         )
         rules[rule] = calibration(left[rule], seed) | {"reliability": reliability(left[rule])}
         rules[rule] |= _map_content(study, cohort, posteriors, map_, folds, pooled, candidates, x, seed)
+        rules[rule]["hyperparameters"] = "given" if study.learnt is None else "learnt from all answers"
+    if learns:
+        left[RECIPE], rules[RECIPE] = _learnt_entry(study, cohort, everybody, posteriors, pooled, candidates, x, seed)
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
     return content | {"rules": rules, "recommendation": recommendation(left, rules, share, len(answered))}
+
+
+def _learnt_entry(
+    study: Study,
+    cohort: Cohort,
+    everybody: bool,
+    posteriors: Posterior,
+    pooled: RuleMap | str,
+    candidates: Float[Array, "m d"],
+    x: Float[Array, "p d"],
+    seed: int,
+) -> tuple[LeftOut, dict[str, Any]]:
+    """learnt-1, whose hyperparameters are learnt again without each person; beside it, with those of all answers."""
+    learns = study if study.rule == RECIPE else that_learns(study)
+    learns = resolved(learns if everybody else dataclasses.replace(learns, learnt=None), cohort)
+    assert learns.learnt is not None
+    left, folds = leave_one_out_learnt(learns.learnt, cohort.trials, learns.stated)
+    kept, _ = leave_one_out_learnt(learns.learnt, cohort.trials, learns.stated, again=False)
+    map_ = learnt_map(learns.learnt, cohort.trials)
+    entry: dict[str, Any] = calibration(left, seed) | {"reliability": reliability(left)}
+    entry |= _map_content(learns, cohort, posteriors, map_, folds, pooled, candidates, x, seed)
+    entry["hyperparameters"] = "learnt in each fold"
+    entry["negative_log_density_kept"] = float(kept.cost.mean())
+    return left, entry
 
 
 def _map(study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share) -> RuleMap | str:
@@ -167,10 +206,11 @@ def _parameters(study: Study, x: Float[Array, " d"]) -> dict[str, float]:
 
 
 def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Share, people: int) -> str:
-    """Which rule to use, and why, in a few sentences; `left`: what each rule predicted of everybody's answers.
+    """How people differ and which rule predicts best, in a few sentences; `left`: what each rule predicted of
+    everybody's answers. A rule is recommended only if the others predict worse by more than two errors.
 
-    Two rules are near if the difference of their costs, answer by answer, is within two of its errors by person: people
-    are predicted well or badly by all rules alike, which the error of one rule's mean cost would take for doubt.
+    Costs are compared answer by answer, with errors by person: people are predicted well or badly by all rules alike,
+    which the error of one rule's mean cost would take for doubt.
     """
     scored = {rule: scores for rule, scores in rules.items() if "negative_log_density" in scores}
     best = min(scored, key=lambda rule: scored[rule]["negative_log_density"])
@@ -182,18 +222,21 @@ def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Sh
     words = (
         f"{evidence}: they share {float(share.mean):.2f} of the prior variance (95 % from {low:.2f} to {high:.2f}; log"
         f" Bayes factor against people who are alike {differ:+.1f}). Of people left out, {best} predicts best"
-        f" ({scored[best]['negative_log_density']:.3f} ± {scored[best]['negative_log_density_error']:.3f})"
+        f" ({scored[best]['negative_log_density']:.3f} ± {scored[best]['negative_log_density_error']:.3f} nats an"
+        f" answer; {100 * scored[best]['central_95']:.1f} % of the answers lie in its central 95 %)."
     )
-    hierarchical = scored.get("hierarchical")
-    chosen = best
-    if hierarchical is not None:
-        gap, error = clustered(left["hierarchical"].cost - left[best].cost, left[best].person)
-        near = not math.isfinite(error) or gap <= 2 * error
-        if near and (differ > 3 or best == "hierarchical"):
-            chosen = "hierarchical"
-        elif near and differ < 0 and "bcm" in scored:
-            chosen = "bcm"
-    inside = 100 * scored[chosen]["central_95"]
-    words += f". Recommended: {chosen}; of held-out answers {inside:.1f} % lie in its central 95 %"
-    words += "." if people >= 8 else f". With {people} people differences between rules are hardly told from chance."
+    tied = [rule for rule in scored if rule != best and _near(left[rule], left[best])]
+    if tied:
+        words += f" No rule is recommended: {', '.join(tied)} predict{'s' * (len(tied) == 1)} as well, within two"
+        words += " standard errors of the difference."
+    else:
+        words += f" Exploratory, since it is drawn from the answers themselves: use {best}."
+    if people < 8:
+        words += f" With {people} people differences between rules are hardly told from chance."
     return words
+
+
+def _near(other: LeftOut, best: LeftOut) -> bool:
+    """Whether the difference of two rules' costs is within two of its errors by person."""
+    gap, error = clustered(other.cost - best.cost, best.person)
+    return not math.isfinite(error) or gap <= 2 * error

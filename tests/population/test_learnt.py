@@ -8,7 +8,7 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
-from hilbo.population.learnt import PRIORS, Stated, learn, learnt_function, newcomer_probabilities, prior_model
+from hilbo.population.learnt import PRIORS, Stated, learn, learnt_function, prior_model
 
 PEOPLE, ANSWERS = 4, 12
 
@@ -76,15 +76,6 @@ def test_the_map_is_that_of_the_dense_model(learnt):
     dense = shared_posterior(fit_people(model.gp, of_people(trials), model.share))
     for by_features, by_all in zip(learnt_function(learnt, trials).predict(x), dense.predict(x), strict=True):
         np.testing.assert_allclose(by_features, by_all, atol=2e-3)
-
-
-def test_a_newcomer_has_a_function_of_their_own(learnt):
-    """Without widths these are the class probabilities of one model."""
-    assert "widths" not in learnt.coordinates
-    mean, variance = jnp.array([0.3, -1.0]), jnp.array([0.2, 0.5])
-    chances = newcomer_probabilities(learnt, mean, variance)
-    expected = jax.vmap(learnt.model.gp.likelihood.class_probabilities)(mean, variance + learnt.model.own)
-    np.testing.assert_allclose(chances, expected, rtol=1e-12)
 
 
 def test_before_the_answers_stand_the_medians_and_what_is_stated():

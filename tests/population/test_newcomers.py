@@ -2,21 +2,25 @@
 its own variance without answers."""
 
 import dataclasses
+from functools import partial
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.stats import norm
 from studies import plain
 
 from hilbo import Trials
+from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.maps import RuleMap, point_rule
+from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.population.pointwise import RULES
 from hilbo.report.figures import study as plotting_study
 from hilbo.study import analysis
-from hilbo.study.aggregate import fit_cohort, map_optimum, population
+from hilbo.study.aggregate import Aggregate, fit_cohort, map_optimum, population
 from hilbo.study.batch_optimum import _optimum_at, _variance_apart
 from hilbo.study.cohort import Cohort
 from hilbo.study.heterogeneity import in_place
@@ -123,6 +127,7 @@ def test_readings_are_of_new_people(monkeypatch):
         surface="the map",
         newcomer=lambda x: (jnp.zeros(len(x)), jnp.full(len(x), 3.0)),
     )
+    aggregate.class_probabilities = partial(Aggregate.class_probabilities, aggregate)
     monkeypatch.setattr(analysis, "tolerance", lambda study, predict, x, name: predict)
     monkeypatch.setattr(analysis, "tolerance_ends", lambda *args, **named: None)
     read = analysis._reading(STUDY, aggregate, 0)
@@ -145,3 +150,46 @@ def test_what_a_map_does_not_know_is_hatched(prior, hatched):
         prior,
     )
     assert bool(drawn) == hatched
+
+
+# Widths of people's middle categories are integrated out.
+
+LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.2, 1.3]), jnp.asarray(0.8))
+MEAN, VARIANCE = jnp.array([0.3, -1.0, 4.0]), jnp.array([0.2, 0.5, 2.0])
+
+
+def by_quadrature(mean, variance, category):
+    """Over the log width, N(0, 0.4^2)."""
+    edges = np.array([-np.inf, -0.5, 0.2, 1.3, np.inf])
+    middle = edges[1:4].mean()
+    spread = np.sqrt(0.8**2 + variance)
+
+    def given(w):
+        low, high = middle + np.exp(w) * (edges[category : category + 2] - middle)
+        return (norm.cdf((high - mean) / spread) - norm.cdf((low - mean) / spread)) * norm.pdf(w, 0.0, 0.4)
+
+    return quad(given, -4.0, 4.0, epsabs=1e-12)[0]
+
+
+def test_widths_are_integrated_out():
+    expected = [[by_quadrature(m, v, c) for c in range(4)] for m, v in zip(MEAN, VARIANCE, strict=True)]
+    np.testing.assert_allclose(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, True), expected, atol=2e-5)
+
+
+@pytest.mark.parametrize("widths", [False, True])
+def test_the_highest_category_is_the_last_one(widths):
+    chances = class_probabilities(LIKELIHOOD, MEAN, VARIANCE, widths)
+    np.testing.assert_allclose(jnp.exp(log_highest(LIKELIHOOD, MEAN, VARIANCE, widths)), chances[:, -1], rtol=1e-12)
+
+
+def test_the_highest_category_far_below():
+    """Its logarithm stays finite, and so does its slope, where the probability is 0 in double precision."""
+    far = jnp.array([-60.0])
+    value, slope = jax.value_and_grad(lambda m: log_highest(LIKELIHOOD, m, jnp.zeros(1))[0])(far)
+    np.testing.assert_allclose(value, norm.logcdf((-60.0 - 1.3) / 0.8), rtol=1e-12)
+    assert np.isfinite(slope).all() and slope[0] > 0
+
+
+def test_without_widths_it_is_one_model():
+    expected = jax.vmap(LIKELIHOOD.class_probabilities)(MEAN, VARIANCE)
+    np.testing.assert_array_equal(class_probabilities(LIKELIHOOD, MEAN, VARIANCE), expected)

@@ -7,7 +7,6 @@ or words too, never by colour alone: the pages are printed, and read by the colo
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
@@ -277,8 +276,7 @@ def _class_curves(axes, reading, shades):
 
 
 def _probabilities(reading, x):
-    mean, variance = reading.aggregate.newcomer(x)
-    return jax.vmap(reading.study.gp.likelihood.class_probabilities)(mean, variance)
+    return reading.aggregate.class_probabilities(reading.study.gp.likelihood, x)
 
 
 def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:

@@ -1,0 +1,133 @@
+"""What learnt-1 costs, and how much it depends on its priors.
+
+    python benchmarks/learning.py [--write]           times on one core, warm, and the error of the low rank
+    python benchmarks/learning.py --priors [--seeds 10] [--write]
+
+Studies of the population `paper-individuals` (benchmarks/populations_people.py), sessions of 25 trials. --priors: every
+prior's standard deviation halved and doubled, seeds from 0; how far the optimum moves (NRMSE), and what that does to
+how often new people give the highest answer there. --write puts the tables into docs/which_method.md.
+"""
+
+import argparse
+import dataclasses
+import os
+import resource
+import time
+from pathlib import Path
+
+for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+    os.environ[variable] = "1"
+os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false " + os.environ.get("XLA_FLAGS", "")
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:1])
+
+import jax  # noqa: E402
+
+jax.config.update("jax_enable_x64", True)
+
+import equinox as eqx  # noqa: E402
+import jax.numpy as jnp  # noqa: E402
+import numpy as np  # noqa: E402
+from populations import chance_at  # noqa: E402
+from populations_people import POPULATIONS  # noqa: E402
+
+from hilbo.population.learnt import PRIORS, learn  # noqa: E402
+from hilbo.population.low_rank import shared_evidence  # noqa: E402
+from hilbo.population.maps import learnt_map  # noqa: E402
+from hilbo.search.candidates import search_points  # noqa: E402
+from hilbo.simulation.simulate import simulate_study  # noqa: E402
+from hilbo.study.aggregate import map_optimum  # noqa: E402
+from hilbo.study.config import Study  # noqa: E402
+from hilbo.study.learnt_study import that_learns  # noqa: E402
+
+PAGE = Path(__file__).parents[1] / "docs" / "which_method.md"
+POPULATION = POPULATIONS["paper-individuals"]
+SIZES = ((24, 3), (100, 15), (1000, 180))  # people, and the seconds that are asked
+EXACT = 1000  # features, of which all but the rounding is left
+
+
+def main():
+    options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("--priors", action="store_true")
+    options.add_argument("--seeds", type=int, default=10)
+    options.add_argument("--write", action="store_true")
+    chosen = options.parse_args()
+    name, lines = ("priors", sensitivity(chosen.seeds)) if chosen.priors else ("times", times())
+    print("\n".join(lines))
+    if chosen.write:
+        before, _, rest = PAGE.read_text().partition(f"<!-- {name} -->")
+        _, _, after = rest.partition("<!-- end -->")
+        PAGE.write_text(f"{before}<!-- {name} -->\n" + "\n".join(lines) + f"\n<!-- end -->{after}")
+
+
+def answers(people, seed):
+    """A simulated study's answers, and what a new person thinks of renderings."""
+    study: Study = POPULATION.study
+    scene = POPULATION.scene(study, people, seed)
+    return simulate_study(study, scene.persons, seed), scene.chance
+
+
+def times():
+    lines = [
+        "| people × trials | seconds (asked) | L-BFGS steps | features | error of the log evidence by the low rank |",
+        "|---|---:|---:|---:|---:|",
+    ]
+    for people, asked in SIZES:
+        trials, _ = answers(people, 1)
+        learn(trials, 3)  # compiles what it needs
+        begun = time.perf_counter()
+        learnt = jax.block_until_ready(learn(trials, 3))
+        seconds = time.perf_counter() - begun
+        given = learnt.model, trials, learnt.weights
+        error = abs(evidence(*given, int(learnt.rank), 1e-4) - evidence(*given, min(EXACT, 25 * people), 1e-12))
+        lines.append(
+            f"| {people} × 25 | {seconds:.1f} ({asked}) | {int(learnt.steps)} | {int(learnt.rank)} | {error:.1e} |"
+        )
+        print(lines[-1], flush=True)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    return [*lines, "", f"One core, one BLAS thread, in 64 bits, second call; peak memory of all {peak:.1f} GB."]
+
+
+def evidence(model, trials, weights, rank, tolerance):
+    return float(eqx.filter_jit(shared_evidence)(model, trials, weights, rank, tolerance).value)
+
+
+def sensitivity(seeds):
+    study = that_learns(POPULATION.study)
+    moved = {(name, factor): [] for name in PRIORS for factor in (0.5, 2.0)}
+    for seed in range(seeds):
+        trials, chance = answers(24, seed)
+        candidates = search_points(study.space, seed)
+
+        def best(priors, near=None, trials=trials, candidates=candidates, chance=chance):
+            traced = jax.tree.map(jnp.asarray, priors)  # numbers, not constants: one compilation for all
+            learnt = learn(trials, 3, priors=traced, near=near)
+            x = _optimum(study, learnt, trials, candidates)
+            return learnt, np.asarray(x), float(chance_at(chance, x[None, :])[0])
+
+        learnt, x, value = best(PRIORS)
+        for name, factor in moved:
+            changed = PRIORS | {name: PRIORS[name]._replace(sd=factor * PRIORS[name].sd)}
+            _, other, its_value = best(changed, learnt)
+            moved[name, factor].append((100 * np.sqrt(np.mean((other - x) ** 2)), its_value - value))
+        print(seed, flush=True)
+    lines = [
+        "| prior | sd | optimum moves, median (largest), % of the ranges | change of P(highest) of a new person |",
+        "|---|---|---:|---:|",
+    ]
+    for (name, factor), rows in moved.items():
+        ways, gains = np.array(rows).T
+        error = gains.std(ddof=1) / np.sqrt(len(gains))
+        lines.append(
+            f"| {name} | × {factor:g} | {np.median(ways):.2f} ({ways.max():.2f}) | {gains.mean():+.4f} ± {error:.4f} |"
+        )
+    return [*lines, "", f"{seeds} studies, seeds from 0."]
+
+
+def _optimum(study, learnt, trials, candidates):
+    own = dataclasses.replace(study, gp=learnt.model.gp, learnt=learnt)
+    return map_optimum(own, learnt_map(learnt, trials), jnp.asarray(candidates)).x
+
+
+if __name__ == "__main__":
+    main()

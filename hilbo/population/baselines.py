@@ -1,0 +1,70 @@
+"""What a population map has to beat: predictions of people's answers that know nothing of how a function may look.
+
+* `constant`: the same class probabilities everywhere, (count + 1/2) / (n + C/2) of the others' answers;
+* `quadratic`: an ordinal probit, quadratic in the parameters, one for all people; its slopes have a prior N(0, 3^2) in
+  units of the noise and of the parameters' standard deviations, so that it exists where answers are separated.
+"""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.special import log_ndtr, ndtri
+
+__all__ = ["constant", "quadratic"]
+
+_SLOPE_SD, _GAP_SD = 3.0, 1.5
+
+
+def constant(q: Int[np.ndarray, " n"], categories: int, known: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n C"]:
+    """Class probabilities (n, C) from the answers q (n,) that are `known` (n,)."""
+    counts = np.bincount(q[known], minlength=categories) + 0.5
+    return np.tile(counts / counts.sum(), (len(q), 1))
+
+
+def quadratic(
+    x: Float[np.ndarray, "n d"], q: Int[np.ndarray, " n"], categories: int, known: Bool[np.ndarray, " n"]
+) -> Float[np.ndarray, "n C"]:
+    """Class probabilities (n, C) at points x (n, d), from the answers that are `known` (n,)."""
+    from scipy.optimize import minimize
+
+    spread = x[known].std(axis=0)
+    z = (x - x[known].mean(axis=0)) / np.where(spread > 0, spread, 1.0)  # a parameter that nobody varied is 0
+    first, second = np.triu_indices(x.shape[1])
+    features = np.concatenate([z, z[:, first] * z[:, second]], axis=1)
+    count = features.shape[1]
+    edges = ndtri(np.cumsum(constant(q, categories, known)[0])[:-1])
+    begin = np.concatenate([np.zeros(count), edges[:1], np.log(np.diff(edges))])
+    scale = np.concatenate([np.full(count, _SLOPE_SD), [np.inf], np.full(categories - 2, _GAP_SD)])
+
+    def cost(w: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
+        logs, by_low, by_high = _log_masses(features[known] @ w[:count], _edges(w[count:]), q[known])
+        by_edge = np.zeros(categories + 1)
+        np.add.at(by_edge, q[known], by_low)
+        np.add.at(by_edge, q[known] + 1, by_high)
+        by_edge = by_edge[1:-1]
+        later = np.cumsum(by_edge[::-1])[::-1]  # a gap moves all thresholds above it
+        of_edges = np.concatenate([later[:1], np.exp(w[count + 1 :]) * later[1:]])
+        slope = np.concatenate([-(by_low + by_high) @ features[known], of_edges])
+        away = (w - begin) / scale
+        return 0.5 * away @ away - logs.sum(), away / scale - slope
+
+    w = minimize(cost, begin, jac=True, method="L-BFGS-B").x
+    level, edges = features @ w[:count], _edges(w[count:])
+    masses = [_log_masses(level, edges, np.full(len(q), c))[0] for c in range(categories)]
+    return np.exp(np.stack(masses, axis=1))
+
+
+def _edges(w: Float[np.ndarray, " edges"]) -> Float[np.ndarray, " bounds"]:
+    """Thresholds from the first one and the logarithms of the gaps, between minus and plus infinity."""
+    return np.concatenate([[-np.inf], np.cumsum(np.concatenate([w[:1], np.exp(w[1:])])), [np.inf]])
+
+
+def _log_masses(
+    level: Float[np.ndarray, " n"], edges: Float[np.ndarray, " bounds"], q: Int[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """log P(q) of levels with noise 1, and its derivatives in the lower and the upper edge; from the smaller tails."""
+    low, high = edges[q] - level, edges[q + 1] - level
+    above = low > 0  # then the same mass mirrored lies in the lower tail
+    a, b = np.where(above, -high, low), np.where(above, -low, high)
+    logs = log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
+    half = 0.5 * np.log(2 * np.pi)
+    return logs, -np.exp(-0.5 * low**2 - half - logs), np.exp(-0.5 * high**2 - half - logs)

@@ -1,0 +1,149 @@
+"""Predictions of people left out, beside their answers: what fits is not spoken of, what does not is."""
+
+import dataclasses
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import norm
+from studies import answered, plain_study
+
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.population.baselines import constant, quadratic
+from hilbo.study.aggregate import aggregate_cohort
+from hilbo.study.cohort import Cohort
+from hilbo.study.model_check import check_sentences, model_check
+
+
+@pytest.fixture(scope="module")
+def checked():
+    """Everybody's first rendering comes twice."""
+    study = plain_study(2)
+    cohort = answered(study, people=5)
+    trials = eqx.tree_at(lambda t: t.x, cohort.trials, cohort.trials.x.at[:, 1].set(cohort.trials.x[:, 0]))
+    cohort = Cohort(trials, cohort.physical, cohort.names)
+    return study, cohort, model_check(study, aggregate_cohort(study, cohort, alternatives=False))
+
+
+def test_shares_are_those_of_the_answers(checked):
+    study, cohort, content = checked
+    q, mask = np.asarray(cohort.trials.q), np.asarray(cohort.trials.mask)
+    for c, label in enumerate(study.responses):
+        assert content["shares"][label]["given"] == pytest.approx(np.mean(q[mask] == c))
+        assert content["by_person"]["P2"]["given"][label] == pytest.approx(np.mean(q[2][mask[2]] == c))
+    thirds = [third[study.responses[0]]["given"] for third in content["by_third"]]
+    assert len(thirds) == 3
+    assert sum(row["predicted"] for row in content["shares"].values()) == pytest.approx(1.0)
+    assert content["hyperparameters"] == "as stated" and content["not_converged"] == 0
+
+
+def test_repeats_are_pairs_of_one_person(checked):
+    _, cohort, content = checked
+    x, q = np.asarray(cohort.trials.x), np.asarray(cohort.trials.q)
+    mask = np.asarray(cohort.trials.mask)
+    agree = [
+        q[p, i] == q[p, j]
+        for p in range(5)
+        for i in range(mask.shape[1])
+        for j in range(i)
+        if mask[p, i] and mask[p, j] and (x[p, i] == x[p, j]).all()
+    ]
+    assert content["repeats"]["pairs"] == len(agree) == 5
+    assert content["repeats"]["given"] == pytest.approx(np.mean(agree))
+    assert 0.5 < content["repeats"]["predicted"] < 1.0  # of two classes
+
+
+def test_repeats_that_agree_too_often_are_spoken_of(checked):
+    _, _, content = checked
+    told = content | {"repeats": {"pairs": 40, "given": 0.95, "predicted": 0.6, "error": 0.03}}
+    (said,) = check_sentences(told)
+    assert "the same answer in 95 % of 40 pairs, and 60 % were predicted" in said
+
+
+def test_what_fits_is_not_spoken_of(checked):
+    """Differences within two errors, or below 5 %."""
+    _, _, content = checked
+    near = {"given": 0.30, "predicted": 0.36, "error": 0.04}
+    small = {"given": 0.70, "predicted": 0.66, "error": 0.001}
+    density = {name: {"cost": 1.0, "difference": -0.01, "error": 0.006} for name in ("constant", "quadratic")}
+    fitting = {"shares": {"bad": near, "good": small}, "repeats": None, "negative_log_density": density}
+    assert check_sentences(content | fitting) == []
+
+
+def test_a_threshold_that_does_not_fit_is_spoken_of(checked):
+    """All say "bad", where the study's threshold lies in the middle."""
+    study, cohort, _ = checked
+    trials = eqx.tree_at(lambda t: t.q, cohort.trials, jnp.zeros_like(cohort.trials.q))
+    shifted = dataclasses.replace(
+        study, gp=eqx.tree_at(lambda gp: gp.likelihood.thresholds, study.gp, jnp.array([-2.0]))
+    )
+    aggregate = aggregate_cohort(shifted, Cohort(trials, cohort.physical, cohort.names), alternatives=False)
+    content = model_check(shifted, aggregate)
+    assert content["shares"]["good"]["given"] == 0.0
+    (said,) = check_sentences(content)
+    assert said.startswith("With the study's hyperparameters the model does not fit")
+    assert '0 % of their answers were "good", and' in said
+    assert "the same shares everywhere would predict better" in said
+
+
+def test_two_people_cannot_be_checked(checked):
+    """Of five, three said nothing."""
+    study, cohort, _ = checked
+    trials = eqx.tree_at(lambda t: t.mask, cohort.trials, cohort.trials.mask.at[2:].set(False))
+    aggregate = aggregate_cohort(study, Cohort(trials, cohort.physical, cohort.names), alternatives=False)
+    assert model_check(study, aggregate) is None
+    assert check_sentences(None) == []
+
+
+def test_the_constant_is_the_others_shares():
+    q, known = np.array([0, 0, 1, 2, 2]), np.array([True, True, True, False, False])
+    np.testing.assert_allclose(constant(q, 3, known)[3], np.array([2.5, 1.5, 0.5]) / 4.5)
+
+
+def test_the_quadratic_finds_a_hill():
+    """Of 3,000 answers with a known quadratic."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(size=(3000, 2))
+    eta = 1.5 - 8.0 * (x[:, 0] - 0.4) ** 2 - 4.0 * (x[:, 1] - 0.7) ** 2
+    q = (eta + rng.normal(size=3000) > 0.2).astype(int) + (eta + rng.normal(size=3000) > 9.0)
+    found = quadratic(x, q, 3, np.ones(3000, bool))
+    np.testing.assert_allclose(found[:, 0], norm.cdf(0.2 - eta), atol=0.05)
+
+
+def test_the_quadratic_of_separated_answers_and_of_a_parameter_that_nobody_varied():
+    x = np.stack([np.linspace(0, 1, 12), np.full(12, 0.5)], axis=1)
+    q = (x[:, 0] > 0.5).astype(int)
+    found = quadratic(x, q, 3, np.ones(12, bool))
+    assert np.isfinite(found).all() and (found > 0).all()
+    assert found[0, 0] > 0.9 and found[-1, 1] > 0.9
+
+
+def test_the_quadratics_masses_and_slopes():
+    """Against differences, and far out in both tails."""
+    from hilbo.population.baselines import _log_masses
+
+    edges = np.array([-np.inf, -0.5, 0.9, np.inf])
+    level, q = np.array([0.3, -2.0, 30.0, -30.0, 1.0]), np.array([1, 0, 1, 1, 2])
+    logs, by_low, by_high = _log_masses(level, edges, q)
+    likelihood = OrdinalProbit(jnp.array([-0.5, 0.9]), jnp.asarray(1.0))
+    np.testing.assert_allclose(
+        logs, [float(likelihood.log_prob(f, c)) for f, c in zip(level, q, strict=True)], rtol=1e-10
+    )
+    moved = [_log_masses(level, edges + np.array([0, s, s, 0]), q)[0] for s in (1e-5, -1e-5)]
+    np.testing.assert_allclose(by_low + by_high, (moved[0] - moved[1]) / 2e-5, rtol=1e-6)
+
+
+def test_agreement_is_the_square_of_the_classes():
+    """Where the function is known, two answers agree with the sum of squared probabilities."""
+    from hilbo.population.leave_one_out import _NODES, _WEIGHTS
+
+    likelihood = OrdinalProbit(jnp.array([-0.5, 0.5]), jnp.asarray(0.5))
+    levels = 0.3 + 0.8 * _NODES
+    by_nodes = sum(
+        w * float(jnp.sum(likelihood.class_probabilities(f) ** 2)) for f, w in zip(levels, _WEIGHTS, strict=True)
+    )
+    rng = np.random.default_rng(1)
+    f = 0.3 + 0.8 * rng.normal(size=200_000)
+    first, second = (np.searchsorted([-0.5, 0.5], f + 0.5 * rng.normal(size=f.size)) for _ in range(2))
+    assert by_nodes == pytest.approx(np.mean(first == second), abs=0.005)
