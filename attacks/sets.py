@@ -22,7 +22,8 @@ import numpy as np
 from helpers_firmware import CONFIG, Device, pack, parameters
 
 from attacks.support import main
-from hilbo.mechanics.exponentials import STATES, exponentials
+from hilbo.mechanics.exponentials import exponentials
+from hilbo.mechanics.span import STATES
 
 __all__ = ["Sets"]
 

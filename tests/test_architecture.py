@@ -18,6 +18,7 @@ PACKAGE = Path(__file__).parents[1] / "hilbo"
 MAY_IMPORT = {
     "errors": set(),
     "kernels": set(),
+    "programs": set(),
     "bcm": set(),
     "numerics": set(),
     "acquisition": {"numerics"},
@@ -41,7 +42,7 @@ MAY_IMPORT = {
     "identification": {"hardware_bridge", "study"},
     "report": {"identification", "statistics", "simulation"},
     "app": {"simulation", "hardware_bridge"},
-    "cli": {"app", "report"},
+    "cli": {"app", "report", "programs"},
 }
 # The mathematics: no files, clock, printing or environment.
 MATHS = {

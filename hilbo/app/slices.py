@@ -4,12 +4,12 @@ import itertools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.session import progress
 from hilbo.session.actions import LiveSession
@@ -113,7 +113,7 @@ def _slice(study, made: _Slices, k: int, pair: tuple[int, int], marks, levels, n
     }
 
 
-@eqx.filter_jit
+@program
 def _slices(study: Study, posterior: Posterior, physical: Float[Array | np.ndarray, " d"]) -> _Slices:
     best = study.space.to_unit(physical)
     axis = jnp.linspace(0.0, 1.0, _SIDE, dtype=best.dtype)

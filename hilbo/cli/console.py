@@ -13,9 +13,9 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, Protocol
+from typing import Annotated, Any, NoReturn
 
 import typer
 
@@ -30,6 +30,7 @@ __all__ = [
     "Out",
     "Say",
     "Seed",
+    "cache_folder",
     "fail",
     "finish",
     "print_result",
@@ -51,7 +52,8 @@ _EVERY = 10.0  # s
 
 
 def start(devices: int | None = None) -> None:
-    """Float64, and compiled functions kept in the user's cache folder from one command to the next.
+    """Float64, and programs kept in the user's cache folder from one command to the next, as they were traced and as
+    they were compiled. HILBO_KEEP_PROGRAMS=0 traces them anew.
 
     `devices`: as how many devices the CPU is to count.
     """
@@ -62,10 +64,24 @@ def start(devices: int | None = None) -> None:
     if devices is not None:
         jax.config.update("jax_num_cpu_devices", devices)
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        home = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-        jax.config.update("jax_compilation_cache_dir", str(Path(home) / "hilbo" / "jax"))
+        jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    if os.environ.get("HILBO_KEEP_PROGRAMS", "1") != "0":
+        _keep_programs()
+
+
+def cache_folder() -> Path:
+    """Where programs are kept: for this user, and for all studies."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")) / "hilbo"
+
+
+def _keep_programs() -> None:
+    from hilbo.numerics.tracing import keep_with
+    from hilbo.programs.entries import Entries
+    from hilbo.programs.keeping import Programs
+
+    keep_with(Programs(Entries(cache_folder() / "programs", remark), Path(__file__).parents[1]))
 
 
 @contextlib.contextmanager
@@ -107,10 +123,25 @@ def _check_free(out: Path, force: bool) -> None:
             raise InputError(f"{path}: has been changed since hilbo wrote it; choose another --out, or delete it.")
 
 
-class Say(Protocol):
+class Say:
     """Told what is being done and, where that is counted, how many are done already, and of how many."""
 
-    def __call__(self, text: str, done: int | None = None, people: int | None = None) -> None: ...
+    def __init__(self, console: Any, status: Any):
+        self._console, self._status, self._pace = console, status, _Pace()
+        self.told: list[str] = []
+
+    def __call__(self, text: str, done: int | None = None, people: int | None = None) -> None:
+        line, new = self._pace.line(text, done, people, time.perf_counter())
+        if self._console.is_terminal:
+            self._status.update(line)
+        elif new:
+            self._console.print(line)
+
+    def tell(self, sentences: list[str]) -> None:
+        """Results that are known before the others; they stay on a terminal too."""
+        self.told += sentences
+        for sentence in sentences:
+            self._console.print(sentence)
 
 
 @contextlib.contextmanager
@@ -122,16 +153,7 @@ def progress(quiet: bool = False) -> Iterator[Say]:
     console, begun = Console(stderr=True, highlight=False, markup=False, soft_wrap=True), time.perf_counter()
     console.quiet = quiet
     with console.status("starting") as status:
-        pace = _Pace()
-
-        def say(text: str, done: int | None = None, people: int | None = None) -> None:
-            line, new = pace.line(text, done, people, time.perf_counter())
-            if console.is_terminal:
-                status.update(line)
-            elif new:
-                console.print(line)
-
-        yield say
+        yield Say(console, status)
     console.print(f"done in {time.perf_counter() - begun:.1f} s")
 
 
@@ -161,10 +183,11 @@ class _Pace:
         return line, True
 
 
-def finish(content: dict[str, Any], out: Path, as_json: bool) -> None:
-    """The last words of a command: warnings, then result.json or the way to the report."""
+def finish(content: dict[str, Any], out: Path, as_json: bool, told: Collection[str] = ()) -> None:
+    """The last words of a command: warnings that were not told before, then result.json or the way to the report."""
     for warning in content.get("warnings", []):
-        remark(warning)
+        if warning not in told:
+            remark(warning)
     if as_json:
         with (out / "result.json").open(encoding="utf-8") as file:
             shutil.copyfileobj(file, sys.stdout)

@@ -15,6 +15,7 @@ from hilbo.cli import device, session
 from hilbo.cli import live as cli_live
 from hilbo.cli import material as cli_material
 from hilbo.cli import study as cli_study
+from hilbo.cli.cache import cache
 from hilbo.cli.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, remark, results, start
 from hilbo.errors import InputError
 
@@ -101,7 +102,7 @@ def aggregate(
         else:
             content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say)
     if team.writes:
-        finish(content, out, as_json)
+        finish(content, out, as_json, say.told)
 
 
 @app.command()
@@ -127,7 +128,7 @@ def simulate(
         return
     with results(out, force) as folder, progress() as say:
         content = _simulate(preset, study, participants, seed, folder, say)
-    finish(content, out, as_json)
+    finish(content, out, as_json, say.told)
 
 
 @app.command()
@@ -170,6 +171,7 @@ app.command()(cli_live.doctor)
 app.command()(session.plan)
 app.command()(session.export)
 app.add_typer(session.app_participants, name="participants")
+app.command()(cache)
 
 
 @app.command()
@@ -227,7 +229,7 @@ def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False) -> d
     from hilbo.report.results import write_results
     from hilbo.study.analysis import analyse_population
 
-    population = analyse_population(study, cohort, seed, say)
+    population = analyse_population(study, cohort, seed, say, say.tell)
     content = write_results(population, folder, truth, say)
     if compare:
         say("every rule, with each person left out")

@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.numerics.least_squares import Solution, least_squares
+from hilbo.numerics.tracing import program
 
 __all__ = [
     "Curve",
@@ -174,7 +175,7 @@ def polish(found: Fit, start: Float[Array, " p"]) -> Fit:
     return eqx.tree_at(lambda f: f.solution, found, again) if better else found
 
 
-@eqx.filter_jit
+@program
 def _polished(current: Fit, start: Float[Array, " p"]) -> Solution:
     """The minimum that the search comes to from another start."""
     return least_squares(
@@ -203,7 +204,7 @@ def nrmse(found: Fit) -> dict[str, float]:
     return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(found.curves, parts, strict=True)}
 
 
-@eqx.filter_jit
+@program
 def search(model, curves, weights, starts, lower, upper) -> tuple[Solution, Float[Array, " starts"]]:
     """All starts for a few steps, the best of them to the end; with the costs that the race ended in."""
 

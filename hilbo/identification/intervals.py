@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Fit, curve_residuals, residuals
 from hilbo.numerics.least_squares import Solution, least_squares, solve_symmetric
+from hilbo.numerics.tracing import program
 
 __all__ = ["Intervals", "Noise", "Spread", "block_bootstrap", "noise", "profile_intervals", "refits", "spread"]
 
@@ -80,7 +81,7 @@ class Intervals(eqx.Module):
     lowest_q: Float[Array, " p"]
 
 
-@eqx.filter_jit
+@program
 def noise(found: Fit) -> tuple[Noise, ...]:
     """The autoregressions of the residuals, curve by curve."""
     return tuple(_autoregression(r) for r in _residuals(found, found.q))
@@ -91,7 +92,7 @@ def spread(found: Fit, quantile: float = 1.959964) -> Spread:
     return _spread(found, quantile)
 
 
-@eqx.filter_jit
+@program
 def _spread(fit: Fit, quantile: float) -> Spread:
     q = fit.q
     slopes = jax.jacfwd(lambda x: _residuals(fit, x))(q)
@@ -145,7 +146,7 @@ class _Search(NamedTuple):
     open: Array
 
 
-@eqx.filter_jit
+@program
 def _profile(fit: Fit, sampling: Spread) -> Intervals:
     """Both ends of every coordinate's interval."""
     size = fit.q.size
@@ -223,7 +224,7 @@ def _pick(condition: Bool[Array, ""], yes: tuple[Array, ...], no: tuple[Array, .
     return (jnp.where(condition, a, b) for a, b in zip(yes, no, strict=True))
 
 
-@eqx.filter_jit
+@program
 def refits(found: Fit, weights: tuple[Float[Array, "B R"], ...]) -> Float[Array, "B p"]:
     """Coordinates fitted anew under other weights of the repeats, each from the fit."""
 
@@ -249,7 +250,7 @@ def block_bootstrap(
     return _bootstrap(found, key, resamples, quantile, exact)
 
 
-@eqx.filter_jit
+@program
 def _bootstrap(
     fit: Fit, key: PRNGKeyArray, resamples: int, quantile: float, exact: bool
 ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:

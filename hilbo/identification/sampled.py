@@ -24,6 +24,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import MEASURED, Curve, Test
+from hilbo.numerics.tracing import program
 
 __all__ = ["Sampled"]
 
@@ -185,7 +186,7 @@ def _unit_of_force(test: Test) -> float:
     return _mean_secant(test) if test.kind == "creep" else 1.0
 
 
-@eqx.filter_jit
+@program
 def _screen(
     model: Sampled, curves: tuple[Curve, ...], scales: list[Float[Array, ""]], grid: Float[Array, "K A 2"]
 ) -> tuple[Float[Array, "K A"], Float[Array, "K A 2"]]:

@@ -30,6 +30,7 @@ from hilbo.errors import InputError
 from hilbo.mechanics.memory import GLSums, Memory, Span, gl_coefficients, response, span, sums
 from hilbo.mechanics.recursion import BLOCK, past_of
 from hilbo.numerics.mittag_leffler import mittag_leffler
+from hilbo.numerics.tracing import program
 
 __all__ = ["FOSLS", "Start", "pot_stiffness", "series", "share", "slow_damping", "slow_stiffness"]
 
@@ -180,13 +181,13 @@ def slow_damping(
     return 1000 * T * beta * gl.moment * share(K1, beta * gl.at_dc) ** 2
 
 
-@eqx.filter_jit
+@program
 def _frequency_response(model: FOSLS, omega: Float[Array, "*w"]) -> Complex[Array, "*w"]:
     pot = response(model.alpha, omega * model.T, model.span)
     return model.K0.astype(pot.dtype) + series(model.K1, model.beta.astype(pot.dtype) * pot)
 
 
-@eqx.filter_jit
+@program
 def _force(model: FOSLS, x: Float[Array, " n"], start: Start, unilateral: bool, block: int) -> Float[Array, " n"]:
     beta = model.beta
     gain, stiffness = share(model.K1, beta), series(model.K1, beta)
@@ -199,7 +200,7 @@ def _force(model: FOSLS, x: Float[Array, " n"], start: Start, unilateral: bool, 
     return jnp.maximum(force, 0) if unilateral else force
 
 
-@eqx.filter_jit
+@program
 def _position(model: FOSLS, F: Float[Array, " n"], start: Start, block: int) -> Float[Array, " n"]:
     beta = model.beta
     gain, stiffness = share(model.K1, beta), series(model.K1, beta)
@@ -211,7 +212,7 @@ def _position(model: FOSLS, F: Float[Array, " n"], start: Start, block: int) -> 
     return (F + stiffness * past) / total
 
 
-@eqx.filter_jit
+@program
 def _short_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""]:
     """First sample n with s_n >= fraction·s_inf after a unit step: the force relaxes as s grows, and s only grows."""
     beta, gl = model.beta, sums(model.alpha, model.span)
@@ -232,7 +233,7 @@ def _short_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""
     return jnp.where(past < goal, jnp.inf, model.T * n)
 
 
-@eqx.filter_jit
+@program
 def _full_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""]:
     """z with E_α(-z) = 1 - fraction by bisection of log z, and the time it stands for."""
 

@@ -33,6 +33,7 @@ from jaxtyping import Array, Bool, Complex, Float, Real
 from hilbo.mechanics.exponentials import exponentials
 from hilbo.mechanics.fosls import FOSLS, series, share
 from hilbo.mechanics.memory import gl_coefficients
+from hilbo.numerics.tracing import program
 
 __all__ = ["Certificate", "Witness", "certify", "needed_damping", "witness"]
 
@@ -89,7 +90,7 @@ def needed_damping(model: FOSLS, omega: Real[ArrayLike, "*w"]) -> Float[Array, "
     return jnp.where(moving, 500 * model.T * stiffness, 500 * model.T * model.dc_gain() - model.effective_damping())
 
 
-@eqx.filter_jit
+@program
 def certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
     """Whether the rendering is passive on a device with physical damping `b` (N·s/m); `jax.vmap` for several.
 

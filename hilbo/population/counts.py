@@ -29,6 +29,7 @@ from hilbo.errors import InputError
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
 from hilbo.kernels import RBF, gram
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 
 __all__ = ["Counts", "counts_of", "evidence", "fit_counts", "one_person"]
@@ -71,7 +72,7 @@ def one_person(answers: Counts) -> Counts:
     return Counts(answers.x, jnp.sum(answers.counts, axis=0, keepdims=True))
 
 
-@eqx.filter_jit
+@program
 def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Posterior:
     """Posterior of the shared function g, whose prior variance is `share` in (0, 1] times that of `gp`.
 

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.kernels import RBF, Kernel
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 
 __all__ = [
@@ -175,7 +176,7 @@ def _nodes() -> np.ndarray:
     return -np.cos(np.pi * np.arange(_NODES) / (_NODES - 1))
 
 
-@eqx.filter_jit
+@program
 def _evidence(
     gp: OrdinalGP, trials: Trials, share: Float[Array, ""], inference: str
 ) -> tuple[Float[Array, ""], Bool[Array, ""]]:

@@ -19,6 +19,7 @@ from scipy.optimize import minimize
 
 from hilbo.kernels import RBF
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP
 from hilbo.population.counts import Counts, evidence
 
@@ -76,7 +77,7 @@ def learn_people(
     )
 
 
-@eqx.filter_jit
+@program
 def _cost(
     z: Float[Array, " z"],
     rebuild: Callable[[Array], dict[str, Array]],

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from hilbo.kernels import gram
 from hilbo.numerics.linalg import cholesky, eigh, solve_lower, solve_lower_transposed
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 
 __all__ = ["JointMap", "joint_map", "posterior_map"]
@@ -54,7 +55,7 @@ class JointMap(eqx.Module):
         return total / (blocks * block)
 
 
-@eqx.filter_jit
+@program
 def joint_map(posteriors: Posterior, x: Float[Array, "m d"]) -> JointMap:
     """Committee of stacked posteriors (of `fit` under `vmap`, one prior for all) at points (m, d) of the unit cube.
 
@@ -92,7 +93,7 @@ def _roots(covariance: Float[Array, "m m"]) -> tuple[Float[Array, "m m"], Float[
     return vectors * (kept * scale)[None, :], (vectors * (kept / scale)[None, :]).T
 
 
-@eqx.filter_jit
+@program
 def posterior_map(posterior: Posterior, x: Float[Array, "m d"]) -> JointMap:
     """One posterior at points (m, d) as a joint Gaussian: of the hierarchical model's shared function, say."""
     kernel = posterior.gp.kernel

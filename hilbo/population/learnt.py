@@ -25,6 +25,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.low_rank import PeopleModel, rank_for, shared_evidence, shared_function
 
@@ -244,7 +245,7 @@ def _gain_of_widths(alike: _Search, different: _Search, problem: _Problem) -> fl
     return costs[0] - costs[1] - float(np.sum(np.log(problem.priors["widths"].sd * np.sqrt(curvature))))
 
 
-@eqx.filter_jit
+@program
 def _cost(coordinates: Coordinates, start: Float[Array, "M n"], problem: _Problem) -> _Cost:
     def value(coordinates):
         model = _model(coordinates, problem.trials, problem.stated)

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import ndtri
 
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.learnt import Learnt, Stated, learn
 from hilbo.population.maps import RuleMap, learnt_map, rule_map
@@ -209,12 +210,12 @@ def reliability(found: LeftOut, bins: int = 10) -> list[dict[str, float]]:
     ]
 
 
-@eqx.filter_jit
+@program
 def _predict(population_map: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     return population_map.predict(x)
 
 
-@eqx.filter_jit
+@program
 def _newcomer(
     gp: OrdinalGP, population_map: RuleMap, x: Float[Array, "m d"]
 ) -> tuple[Float[Array, "m C"], Float[Array, " m"]]:

@@ -33,6 +33,7 @@ from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evide
 from hilbo.kernels import RBF, gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.linalg import eigh
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, OrdinalTerms, Posterior, Trials
 
 __all__ = [
@@ -115,7 +116,7 @@ def _pivots(theta: Float[Array, " d"], trials: Trials, rank: int, tolerance: Arr
     return Pivots(x[chosen], jnp.arange(rank) < count, jnp.max(left))
 
 
-@eqx.filter_jit
+@program
 def _unexplained(theta: Float[Array, " d"], trials: Trials, rank: int, tolerance: ArrayLike) -> Float[Array, ""]:
     return _pivots(theta, trials, rank, tolerance).left
 
@@ -308,7 +309,7 @@ def shared_evidence(
     return SharedEvidence(value, mode.weights, arrived, pivots.left)
 
 
-@eqx.filter_jit
+@program
 def shared_function(
     model: PeopleModel, trials: Trials, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
 ) -> Posterior:

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.counts import Counts, counts_of, evidence, fit_counts, one_person
@@ -185,7 +186,7 @@ def even_choice(trials: Trials, largest: int) -> Trials:
     return jax.tree.map(lambda leaf: leaf[rows], trials)
 
 
-@eqx.filter_jit
+@program
 def _evidence(gp: OrdinalGP, counts: Counts, share: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
     """Log evidence of a share from counts, and whether the fit held its certificate."""
     return evidence(gp, share, counts)
@@ -200,13 +201,13 @@ def _experts(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
     return _fit_people_from_trials(gp, trials, inference)
 
 
-@eqx.filter_jit
+@program
 def _fit_people_from_counts(gp: OrdinalGP, counts: Counts) -> Posterior:
     one = jnp.ones_like(gp.kernel.variance)
     return jax.lax.map(lambda person_counts: fit_counts(gp, one, Counts(counts.x, person_counts[None])), counts.counts)
 
 
-@eqx.filter_jit
+@program
 def _fit_people_from_trials(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
     return jax.vmap(lambda person: fit(gp, person, inference=inference, throw=False))(trials)
 

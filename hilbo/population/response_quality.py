@@ -38,6 +38,7 @@ from scipy.stats import binomtest, chi2
 from hilbo.errors import InputError
 from hilbo.kernels import Kernel, gram
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Trials, fit
 
 __all__ = ["MEASURES", "drift", "excluded", "lapse", "left_out", "measure_people", "repeats"]
@@ -119,7 +120,7 @@ def left_out(
     return mean, variance, jax.vmap(gp.likelihood.class_probabilities)(mean, variance)
 
 
-@eqx.filter_jit
+@program
 def _left_out(gp: OrdinalGP, trials: Trials) -> tuple[Float[Array, "M n"], Float[Array, "M n"], Float[Array, "M n C"]]:
     return jax.lax.map(lambda t: left_out(gp, t), trials)
 

@@ -9,11 +9,11 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from hilbo.numerics.tracing import program
 from hilbo.study.config import Study
 
 __all__ = ["People", "as_json", "json_lines", "parameter_sets", "people_of", "quoted"]
@@ -84,18 +84,18 @@ def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str,
         sets = {name: np.concatenate([block[0][name] for block in parts])[: len(x)] for name in parts[0][0]}
         block_margins = [margin for _, margin in parts if margin is not None]
         return sets, np.concatenate(block_margins)[: len(x)] if block_margins else None
-    physical, derived, margins = _mechanics(study, x)
+    physical, derived, margins = _mechanics(study.space, x)
     named = {name: np.asarray(physical)[:, i] for i, name in enumerate(study.space.names)}
     return {name: np.asarray(v) for name, v in derived.items()} | named, None if margins is None else np.asarray(
         margins
     )
 
 
-@eqx.filter_jit
-def _mechanics(study, x):
-    physical = study.space.to_physical(x)
-    values = {name: physical[:, i] for i, name in enumerate(study.space.names)}
-    return physical, study.space.derived(values), study.space.passivity_margin(values)
+@program
+def _mechanics(space, x):
+    physical = space.to_physical(x)
+    values = {name: physical[:, i] for i, name in enumerate(space.names)}
+    return physical, space.derived(values), space.passivity_margin(values)
 
 
 def as_json(content: dict[str, Any]) -> str:

@@ -27,6 +27,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
 from hilbo.search.feasibility import K0_of, K1_range, Mechanics, allowed, largest_K1, minimum_damping
 from hilbo.search.space_filling import Chunks, latin_chunks, sobol_chunks, take, wall_chunks
 
@@ -265,7 +266,7 @@ def _rosenblatt(space: SearchSpace, uniform: Float[np.ndarray, "n d"]) -> Float[
     return w
 
 
-@eqx.filter_jit
+@program
 def column_ends(space: SearchSpace, x: Float[ArrayLike, "*batch d"]) -> tuple[_Batch, _Batch]:
     """Both ends (...,) of the column of each point (..., d) of the unit cube, in x_K1; equal where none is feasible."""
     x, mechanics = _floating(x), space.mechanics
@@ -277,7 +278,7 @@ def column_ends(space: SearchSpace, x: Float[ArrayLike, "*batch d"]) -> tuple[_B
     return low, low + width
 
 
-@eqx.filter_jit
+@program
 def _from_box(space: SearchSpace, w: Float[ArrayLike, "n d"]) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
     x = space.from_box(w)
     return x, space.feasible(x)

@@ -14,11 +14,11 @@ import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.session.selection import Design, design
 from hilbo.session.step import Step, padding
@@ -37,7 +37,7 @@ def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capac
     return Trials(_to_unit(study.space, padded), jnp.asarray(categories), jnp.arange(capacity) < len(points))
 
 
-@eqx.filter_jit
+@program
 def _to_unit(space, physical):
     return space.to_unit(physical)
 

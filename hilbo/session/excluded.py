@@ -4,11 +4,11 @@ At the end of the space-filling trials the candidate farthest from all others ta
 afterwards the highest UCB that keeps a distance of `APART` from it in the unit cube; so do choices from a map.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.session.selection import Design, point_apart
 from hilbo.session.warm_start import WarmStart, warm_point
@@ -66,11 +66,11 @@ def _to_unit(study: Study, physical: Float[np.ndarray, "k d"]) -> Float[np.ndarr
     return np.asarray(study.space.to_unit(physical))
 
 
-@eqx.filter_jit
+@program
 def _kept_apart(study, plan, posterior, excluded):
     return study.space.to_physical(point_apart(study, plan, posterior, excluded, APART))
 
 
-@eqx.filter_jit
+@program
 def _from_map(study, warm, posterior, excluded):
     return study.space.to_physical(warm_point(study, warm, posterior, excluded, APART))

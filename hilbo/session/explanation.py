@@ -10,11 +10,11 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.study.config import Study
 
@@ -73,7 +73,7 @@ def _numbers(words: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in kept.items() if not isinstance(value, float) or math.isfinite(value)}
 
 
-@eqx.filter_jit
+@program
 def _explanation(study: Study, posterior: Posterior, point: Float[Array | np.ndarray, " d"]) -> _Explanation:
     unit = study.space.to_unit(point)
     mean, variance = (moment[0] for moment in posterior.predict(unit[None, :]))
@@ -90,7 +90,7 @@ def described(study: Study, values: Mapping[str, float]) -> Described:
     return Described(parameters, None if margin is None or not math.isfinite(margin) else float(margin))
 
 
-@eqx.filter_jit
+@program
 def _facts(study: Study, values: Mapping[str, Any]):
     """What follows from a rendering's values, by name, and its passivity margin; None without mechanics."""
     return study.space.derived(values), study.space.passivity_margin(values)

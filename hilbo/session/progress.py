@@ -13,10 +13,10 @@ default.
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from hilbo.numerics.tracing import program
 from hilbo.session.look_ahead import Answers, LiveChooser
 from hilbo.session.state import LiveSession
 from hilbo.session.step import Fitted
@@ -66,12 +66,12 @@ def trust(
     return Trust(named, float(top[-1]), float(chances @ moved))
 
 
-@eqx.filter_jit
+@program
 def _chances(study, posterior, physical):
     return posterior.class_probabilities(study.space.to_unit(physical))
 
 
-@eqx.filter_jit
+@program
 def _units(study, physical):
     return study.space.to_unit(physical)
 

@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.gaussian import GaussianPosterior, certify
 from hilbo.kernels import gram
 from hilbo.numerics.compiling import compiler_options
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalTerms, Posterior, Trials, fit
 from hilbo.session.selection import Design, point_after
 from hilbo.study.config import Study
@@ -245,6 +246,6 @@ def _program_of(study: Study, plan: Design) -> tuple[_Program, tuple[Array, ...]
 _program = functools.lru_cache(maxsize=32)(_Program)
 
 
-@eqx.filter_jit
+@program
 def _to_physical(space, unit):
     return space.to_physical(unit)

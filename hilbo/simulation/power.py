@@ -29,6 +29,7 @@ from scipy.special import ndtr
 from scipy.stats import binomtest
 
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import Person, Population, people, simulate_study
@@ -166,7 +167,7 @@ def _rms(difference: Float[np.ndarray, "..."]) -> float:
     return float(np.sqrt(np.mean(difference**2)))
 
 
-@eqx.filter_jit
+@program
 def _map_top_probability(study: Study, map_: RuleMap, points: Float[Array, "m d"]) -> Float[Array, " m"]:
     """Probability of a new person's highest answer that the map predicts."""
     return map_.class_probabilities(study.gp.likelihood, points)[:, -1]

@@ -19,6 +19,7 @@ import pandas as pd
 from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.session.selection import Design, design, next_point
 from hilbo.study.config import Study
@@ -119,7 +120,7 @@ def simulate_study(study: Study, persons: Person, seed: int) -> Trials:
     return _simulate(study, plan, jnp.asarray(np.stack(hypercubes)), persons, answering, drawing)
 
 
-@eqx.filter_jit
+@program
 def _simulate(
     study: Study,
     plan: Design,

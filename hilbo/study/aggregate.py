@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition, bcm
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
@@ -27,14 +28,17 @@ from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map, share_of
 from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.search.candidates import search_points
+from hilbo.search.space import SearchSpace
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Inference, Study
 from hilbo.study.learnt_study import resolved
 
 __all__ = [
     "Aggregate",
+    "First",
     "Optimum",
     "aggregate_cohort",
+    "asked_variance",
     "best_point",
     "fit_cohort",
     "individual_optima",
@@ -60,6 +64,9 @@ class Optimum(eqx.Module):
     mean: Float[Array, "*s"]
     sd: Float[Array, "*s"]
     class_probabilities: Float[Array, "*s C"]
+
+
+First = Callable[[Optimum, RuleMap], None]
 
 
 class Aggregate(eqx.Module):
@@ -94,10 +101,7 @@ class Aggregate(eqx.Module):
     @property
     def asked_variance(self) -> Float[Array, ""]:
         """Largest variance of the map at a point that somebody answered."""
-        if self.map.reach is not None:
-            return self.map.reach
-        points = np.unique(np.asarray(self.cohort.trials.x)[np.asarray(self.cohort.trials.mask)], axis=0)
-        return jnp.max(self.surface(points)[1])
+        return asked_variance(self.map, self.cohort)
 
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube."""
@@ -124,18 +128,22 @@ def fit_cohort(
 ) -> Posterior:
     """Everybody's posterior, stacked; with the study's model, or with `gps`, one stacked model each; by the study's
     inference, or by another."""
-    return _fit_cohort(study, cohort.trials, gps, inference)
-
-
-@eqx.filter_jit
-def _fit_cohort(study: Study, trials: Trials, gps: OrdinalGP | None, inference: Inference | None = None) -> Posterior:
     inference = study.inference if inference is None else inference
-    if gps is None:
-        return jax.vmap(lambda t: fit(study.gp, t, inference=inference, throw=False))(trials)
+    return _fit_cohort(study.gp, cohort.trials, inference) if gps is None else _fit_own(gps, cohort.trials, inference)
+
+
+# Programs take what they use: two studies that differ in their words share them.
+@program
+def _fit_cohort(gp: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
+    return jax.vmap(lambda t: fit(gp, t, inference=inference, throw=False))(trials)
+
+
+@program
+def _fit_own(gps: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
     return jax.vmap(lambda gp, t: fit(gp, t, inference=inference, throw=False))(gps, trials)
 
 
-@eqx.filter_jit
+@program
 def population(
     posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm", share: Float[Array, ""] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
@@ -151,13 +159,12 @@ def population(
     return evidence.merge(prior)
 
 
-@eqx.filter_jit
+@program
 def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Mean and variance (m,) of a population map at points of the unit cube; bcm's as a stream over people."""
     return population(map_.experts, x) if map_.rule == "bcm" and map_.experts is not None else map_.predict(x)
 
 
-@eqx.filter_jit
 def population_optimum(
     study: Study,
     posteriors: Posterior,
@@ -166,17 +173,27 @@ def population_optimum(
     share: Float[Array, ""] | None = None,
 ) -> Optimum:
     """Where the population map's mean is largest in the feasible set."""
-    apart = 0.0 if share is None else (1.0 - share) * study.gp.kernel.variance
-    return _optimum(study, lambda x: population(posteriors, x, rule, share), candidates, apart)
+    return _population_optimum(study.gp, study.space, posteriors, candidates, rule, share)
 
 
-@eqx.filter_jit
+@program
+def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidates, rule, share) -> Optimum:
+    apart = 0.0 if share is None else (1.0 - share) * gp.kernel.variance
+    return _optimum(gp.likelihood, space, lambda x: population(posteriors, x, rule, share), candidates, apart)
+
+
 def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
     """Where a rule's map has its largest mean in the feasible set; by learnt-1 where a new person answers with the
     highest category most often, among points of which the answers tell as much as of some that were asked."""
+    return _map_optimum(study.gp.likelihood, study.space, found, candidates)
+
+
+@program
+def _map_optimum(
+    likelihood: OrdinalProbit, space: SearchSpace, found: RuleMap, candidates: Float[Array, "m d"]
+) -> Optimum:
     if found.rule != RECIPE:
-        return _optimum(study, lambda x: predict_map(found, x), candidates, found.apart)
-    likelihood = study.gp.likelihood
+        return _optimum(likelihood, space, lambda x: predict_map(found, x), candidates, found.apart)
 
     def chance(mean, variance):
         return log_highest(likelihood, mean, variance + found.apart, found.widths)
@@ -187,11 +204,12 @@ def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -
     def told(x):
         return found.predict(x[None, :])[1][0] <= known
 
-    return _optimum(study, found.predict, candidates, found.apart, chance, told, found.widths)
+    return _optimum(likelihood, space, found.predict, candidates, found.apart, chance, told, found.widths)
 
 
 def _optimum(
-    study: Study,
+    likelihood: OrdinalProbit,
+    space: SearchSpace,
     predict: Callable,
     candidates: Float[Array, "m d"],
     apart: ArrayLike,
@@ -206,23 +224,26 @@ def _optimum(
         height(*predict(candidates)),
         candidates,
         lambda x: height(*predict(x[None, :]))[0],
-        from_box=study.space.from_box,
-        to_box=study.space.to_box,
-        feasible=study.space.feasible,
+        from_box=space.from_box,
+        to_box=space.to_box,
+        feasible=space.feasible,
         allowed=allowed,
         steps=300,
     )
     mean, variance = predict(choice.x[None, :])
-    probabilities = class_probabilities(study.gp.likelihood, mean, variance + apart, widths)[0]
+    probabilities = class_probabilities(likelihood, mean, variance + apart, widths)[0]
     return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
 
 
-@eqx.filter_jit
 def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
     """Where each participant's posterior mean is largest in the feasible set, stacked; one after the other."""
+    return _individual_optima(study.space, posteriors, candidates)
 
+
+@program
+def _individual_optima(space: SearchSpace, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
     def one(posterior):
-        x = best_point(study, posterior, candidates).x
+        x = best_point(space, posterior, candidates).x
         mean, variance = posterior.predict(x[None, :])
         probabilities = posterior.gp.likelihood.class_probabilities(mean[0], variance[0])
         return Optimum(x, mean[0], jnp.sqrt(variance[0]), probabilities)
@@ -231,15 +252,15 @@ def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Arr
     return jax.lax.map(one, posteriors, batch_size=None if jax.default_backend() == "cpu" else 256)
 
 
-def best_point(study: Study, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
+def best_point(space: SearchSpace, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
     """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
     return acquisition.maximise(
         posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
         candidates,
         lambda x: posterior.mean(x[None, :])[0],
-        from_box=study.space.from_box,
-        to_box=study.space.to_box,
-        feasible=study.space.feasible,
+        from_box=space.from_box,
+        to_box=space.to_box,
+        feasible=space.feasible,
     )
 
 
@@ -248,23 +269,27 @@ def other_inference(study: Study) -> Inference:
     return "laplace" if study.inference == "ep" else "ep"
 
 
-def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: bool = True) -> Aggregate:
+def aggregate_cohort(
+    study: Study, cohort: Cohort, seed: int = 0, alternatives: bool = True, first: First = lambda optimum, map_: None
+) -> Aggregate:
     """Fit everybody, merge, and find the optima; the study's `rule` decides the population optimum.
 
     `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
     finds them in `posteriors.certificate`. A rule that learns the hyperparameters does so first, if they are not
-    there.
+    there. `first` is told the optimum and its map as soon as they are known.
     """
     study = resolved(study, cohort)
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
-    answered = int(np.sum(cohort.counts() > 0))
-    share = None
-    if study.rule != RECIPE and (study.rule == "hierarchical" or (alternatives and answered > 1)):
+    share = share_of(study.gp, cohort.trials, study.inference) if study.rule == "hierarchical" else None
+    map_ = _rule_map(study, cohort, study.rule, posteriors, share)
+    optimum = map_optimum(study, map_, candidates)
+    first(optimum, map_)
+    if share is None and study.rule != RECIPE and alternatives and np.sum(cohort.counts() > 0) > 1:
         share = share_of(study.gp, cohort.trials, study.inference)
     rules = _rules(study, cohort, share) if alternatives else [study.rule]
-    maps = {rule: _rule_map(study, cohort, rule, posteriors, share) for rule in rules}
-    others = {rule: map_optimum(study, maps[rule], candidates) for rule in rules if rule != study.rule}
+    beside = {rule: _rule_map(study, cohort, rule, posteriors, share) for rule in rules if rule != study.rule}
+    others = {rule: map_optimum(study, other_map, candidates) for rule, other_map in beside.items()}
     if alternatives and study.rule != RECIPE:
         other = other_inference(study)
         by_other = fit_cohort(study, cohort, inference=other)
@@ -272,11 +297,11 @@ def aggregate_cohort(study: Study, cohort: Cohort, seed: int = 0, alternatives: 
     return Aggregate(
         cohort=cohort,
         posteriors=posteriors,
-        optimum=map_optimum(study, maps[study.rule], candidates),
+        optimum=optimum,
         individuals=individual_optima(study, posteriors, candidates),
         alternatives=others,
-        map=maps[study.rule],
-        maps=maps,
+        map=map_,
+        maps={study.rule: map_} | beside,
         share=share,
     )
 
@@ -304,6 +329,14 @@ def _rule_map(
         inference=study.inference if inference is None else inference,
         largest=_LARGEST_POOL if rule == "pooled" else LARGEST_EXACT,
     )
+
+
+def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""]:
+    """Largest variance of a map at a point that somebody answered."""
+    if map_.reach is not None:
+        return map_.reach
+    points = np.unique(np.asarray(cohort.trials.x)[np.asarray(cohort.trials.mask)], axis=0)
+    return jnp.max(predict_map(map_, jnp.asarray(points))[1])
 
 
 def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array, "*s"]:

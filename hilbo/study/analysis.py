@@ -10,24 +10,24 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.hyperparameters.maximum_evidence import Learned, maximise_shared_evidence
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, aggregate_cohort, nrmse
+from hilbo.study.aggregate import Aggregate, aggregate_cohort, asked_variance, nrmse
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.learnt_study import learnt_sentences, resolved
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
-from hilbo.study.optimum_location import location_sentences
+from hilbo.study.optimum_location import location_sentences, optimum_sentence
 from hilbo.study.progress import Progress, follow
 from hilbo.study.tolerance_intervals import Ends, tolerance_ends
 
@@ -94,13 +94,25 @@ class Analysis(NamedTuple):
         return self.population.progress
 
 
-def analyse_population(study: Study, cohort: Cohort, seed: int = 0, say: Say = lambda text: None) -> Population:
-    """The aggregate of a cohort, and its optima after fewer trials; everything is fitted once."""
+def analyse_population(
+    study: Study,
+    cohort: Cohort,
+    seed: int = 0,
+    say: Say = lambda text: None,
+    tell: Callable[[list[str]], None] = lambda sentences: None,
+) -> Population:
+    """The aggregate of a cohort, and its optima after fewer trials; everything is fitted once. `tell` is given the
+    optimum in sentences as soon as it is known."""
     if study.rule == RECIPE:
         say("learning the hyperparameters from all answers")
     study = resolved(study, cohort)
     say(f"fitting {len(cohort.names)} participants ({study.name})")
-    aggregate = aggregate_cohort(study, cohort, seed)
+
+    def first(optimum, map_):
+        asked = asked_variance(map_, cohort)
+        tell([optimum_sentence(study, optimum.x), *location_sentences(study, optimum.x, optimum.sd, asked)])
+
+    aggregate = aggregate_cohort(study, cohort, seed, first=first)
     say("the optima after fewer trials")
     return Population(study, aggregate, follow(study, aggregate, seed), seed)
 
@@ -178,7 +190,7 @@ def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Learned, Study,
     return learned, learned_study, aggregate_cohort(learned_study, cohort, seed, alternatives=False)
 
 
-@eqx.filter_jit
+@program
 def _learn(study: Study, trials: Trials) -> Learned:
     return maximise_shared_evidence(study.gp, trials, _LEARN, weak_priors=True, inference=study.inference)
 

@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, PyTree
 
 from hilbo.gaussian import factor, mean_and_explained
 from hilbo.kernels import RBF, gram
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.pointwise import Rule, Sums, terms
 from hilbo.study.aggregate import Optimum, individual_optima
@@ -172,7 +173,7 @@ def _padded_blocks(population: Population, rows: slice) -> tuple[Trials, np.ndar
     return jax.tree.map(block, (population.trials, population.modes))
 
 
-@eqx.filter_jit
+@program
 def _blocks_on_devices(
     study: Study,
     points: Float[ArrayLike, "m d"],

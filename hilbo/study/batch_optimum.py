@@ -20,6 +20,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.errors import InputError
 from hilbo.numerics.newton import TrustRegionNewton
+from hilbo.numerics.tracing import program
 from hilbo.population.hierarchical import Share
 from hilbo.population.maps import share_of
 from hilbo.population.pointwise import RULES, Rule, Sums
@@ -130,12 +131,12 @@ def optima_from(
     return best
 
 
-@eqx.filter_jit
+@program
 def _feasible(study: Study, x: Float[ArrayLike, "s d"]) -> Bool[Array, " s"]:
     return study.space.feasible(x)
 
 
-@eqx.filter_jit
+@program
 def _optimum_at(
     study: Study,
     x: Float[ArrayLike, " d"],
@@ -222,7 +223,7 @@ def _nowhere(w: Float[Array, " d"], _: None) -> NoReturn:
     raise NotImplementedError
 
 
-@eqx.filter_jit
+@program
 def _start_newton(study: Study, starts: Float[ArrayLike, "s d"]) -> tuple[Float[Array, "s d"], PyTree]:
     """Each start in the optimiser's coordinates, and the solver's state there."""
 
@@ -235,13 +236,13 @@ def _start_newton(study: Study, starts: Float[ArrayLike, "s d"]) -> tuple[Float[
     return jax.vmap(one)(jnp.asarray(starts))
 
 
-@eqx.filter_jit
+@program
 def _next_points(study: Study, w: Float[Array, "s d"], state: PyTree) -> Float[Array, "s d"]:
     """The points (s, d) of the unit cube at which the next step wants the map."""
     return jax.vmap(study.space.from_box)(w + state.move)
 
 
-@eqx.filter_jit
+@program
 def _newton_step(
     study: Study,
     w: Float[Array, "s d"],

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
@@ -77,7 +78,7 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     return Cohort(jax.vmap(Trials)(x, jnp.asarray(answers), jnp.asarray(held)), physical, tuple(names))
 
 
-@eqx.filter_jit
+@program
 def _to_unit(space: SearchSpace, physical: Float[ArrayLike, "M n d"]) -> Float[Array, "M n d"]:
     """Person by person, as `session.ask_tell.physical_trials` does for one: the same bits."""
     return jax.lax.map(space.to_unit, jnp.asarray(physical))

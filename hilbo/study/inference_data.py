@@ -12,7 +12,6 @@ Groups and variables (dimensions chain, draw, participant, trial):
 import os
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +20,7 @@ from jaxtyping import Array, Float, Int, Key
 
 from hilbo.kernels import gram
 from hilbo.numerics.linalg import eigh
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -74,7 +74,7 @@ def predictive_shares(found: dict[str, xr.Dataset], categories: int) -> tuple[np
     return np.bincount(observed[held], minlength=categories) / held.sum(), np.stack(count, axis=1)
 
 
-@eqx.filter_jit
+@program
 def _draw(
     posteriors: Posterior, keys: Key[Array, " M"], draws: int
 ) -> tuple[Float[Array, "M draws n"], Int[Array, "M draws n"], Float[Array, "M draws n"]]:

@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import program
 from hilbo.study.config import Study
 
 __all__ = ["End", "Predict", "Sets", "Tolerance", "best_mid_worst", "dominant", "slice_through", "tolerance"]
@@ -164,20 +165,20 @@ def _bisect(study: Study, predict: Predict, x: Float[Array, " d"], parameter: st
     return inner
 
 
-@eqx.filter_jit
+@program
 def _lead(study: Study, predict: Predict, x: Float[Array, "m d"]) -> Float[Array, " m"]:
     """Probability of the highest answer less that of the likeliest other one."""
     p = jax.vmap(study.gp.likelihood.class_probabilities)(*predict(x))
     return p[:, -1] - jnp.max(p[:, :-1], axis=1)
 
 
-@eqx.filter_jit
+@program
 def _mean_and_sd(predict: Predict, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     mean, variance = predict(x)
     return mean, jnp.sqrt(variance)
 
 
-@eqx.filter_jit
+@program
 def _highest(
     study: Study, predict: Predict, candidates: Float[Array, "m d"], mean: Float[Array, " m"]
 ) -> Float[Array, " d"]:
@@ -199,7 +200,7 @@ def _minima(
     return _downhill(study, predict, candidates[np.array(padded)])
 
 
-@eqx.filter_jit
+@program
 def _downhill(study: Study, predict: Predict, starts: Float[Array, "s d"]) -> Float[Array, "s d"]:
     """The local minimum of the mean below each start."""
 

@@ -7,9 +7,19 @@ from jaxtyping import Array, Float
 
 from hilbo.study.config import Study
 
-__all__ = ["location_sentences"]
+__all__ = ["location_sentences", "optimum_sentence"]
 
 _AT = 1e-6  # of a range
+
+
+def optimum_sentence(study: Study, x: Float[Array, " d"]) -> str:
+    """The optimum x (d,) of the unit cube in the study's units."""
+    values = np.asarray(study.space.to_physical(x))
+    sets = (
+        f"{parameter.name} = {value:.4g}{f' {parameter.unit}' if parameter.unit else ''}"
+        for parameter, value in zip(study.space.parameters, values, strict=True)
+    )
+    return f"The population optimum is {', '.join(sets)}."
 
 
 def location_sentences(

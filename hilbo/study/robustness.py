@@ -22,6 +22,7 @@ from hilbo.hyperparameters.maximum_evidence import (
     maximise_shared_evidence,
     optimum_sensitivity,
 )
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import point_rule, share_of
@@ -137,7 +138,7 @@ def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:
     return share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
 
 
-@eqx.filter_jit
+@program
 def _learn(study: Study, trials: Trials, learn: tuple[str, ...], shared: bool, weak_priors: bool) -> Learned:
     settings = {"weak_priors": weak_priors, "inference": study.inference}
     if shared:
@@ -145,7 +146,7 @@ def _learn(study: Study, trials: Trials, learn: tuple[str, ...], shared: bool, w
     return jax.lax.map(lambda t: maximise_evidence(study.gp, t, learn, **settings), trials)
 
 
-@eqx.filter_jit
+@program
 def _sensitivity(
     study: Study,
     trials: Trials,

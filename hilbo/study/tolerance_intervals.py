@@ -13,6 +13,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.pointwise import Rule, aggregate
 from hilbo.study.config import Study
@@ -66,7 +67,7 @@ def tolerance_ends(
     return Ends((float(low[0]), float(low[1])), (float(high[0]), float(high[1])), lost)
 
 
-@eqx.filter_jit
+@program
 def _predictions(
     posteriors: Posterior, x: Float[Array, "m d"]
 ) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
@@ -76,7 +77,7 @@ def _predictions(
     return means, explained, jax.vmap(kernel.diagonal)(x)
 
 
-@eqx.filter_jit
+@program
 def _dominant_in_draws(
     study: Study,
     means: Float[Array, "M m"],

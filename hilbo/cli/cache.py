@@ -1,0 +1,33 @@
+"""`hilbo cache`: what hilbo keeps from one command to the next, and how it is dropped."""
+
+import shutil
+from typing import Annotated
+
+import typer
+
+from hilbo.cli.console import Json, cache_folder, print_result, remark
+from hilbo.programs.entries import Entries
+
+__all__ = ["cache"]
+
+
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Drop everything; it is made again when needed.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Show the programs that are kept from one command to the next, or drop them."""
+    folder = cache_folder()
+    traced, compiled = Entries(folder / "programs", remark), folder / "jax"
+    if clear:
+        traced.clear()
+        shutil.rmtree(compiled, ignore_errors=True)
+    parts = {"traced": list(traced.sizes().values()), "compiled": [path.stat().st_size for path in _files(compiled)]}
+    content = {"folder": str(folder)} | {
+        name: {"programs": len(sizes), "bytes": sum(sizes)} for name, sizes in parts.items()
+    }
+    words = [f"{name}: {len(sizes)} programs, {sum(sizes) / 1e6:.1f} MB" for name, sizes in parts.items()]
+    print_result(content, "\n".join([str(folder), *words]), as_json)
+
+
+def _files(folder):
+    return [path for path in folder.glob("*-cache") if path.is_file()]

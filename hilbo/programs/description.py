@@ -1,0 +1,95 @@
+"""A call of a program in words that hold for every process: all that its trace may depend on, apart from the code.
+
+Two calls with the same words are the same program. What has no such words, a function made inside another, an object
+of a kind that is not known here, raises `NotKeptError`; such a call is traced by every process anew.
+"""
+
+import dataclasses
+import enum
+import functools
+import inspect
+import sys
+from collections.abc import Callable, Mapping
+from types import BuiltinFunctionType, FunctionType
+from typing import Any
+
+import equinox as eqx
+import jax
+import msgspec
+import numpy as np
+
+__all__ = ["NotKeptError", "describe", "name_of"]
+
+
+class NotKeptError(Exception):
+    """This call cannot be kept; the words say why."""
+
+
+def describe(function: Callable, args: tuple, kwargs: dict[str, Any]) -> str:
+    """The words of a call: arrays by shape, type and weakness of the type, all else by value."""
+    return f"{name_of(function)} {_words(args)} {_words(kwargs)}"
+
+
+def name_of(what: Any) -> str:
+    """Where a function or a class is found again. Raises `NotKeptError` where nothing, or another, is found there."""
+    module, path = getattr(what, "__module__", None), getattr(what, "__qualname__", "")
+    found: Any = sys.modules.get(str(module))
+    for part in path.split("."):
+        found = getattr(found, part, None)
+    if found is None or inspect.unwrap(found) is not inspect.unwrap(what):
+        raise NotKeptError(f"{module}.{path} is not found by its name")
+    return f"{module}.{path}"
+
+
+def _words(what: Any) -> str:
+    if isinstance(what, jax.Array):
+        return f"array:{what.dtype}{list(what.shape)}{'weak' * what.weak_type}"
+    if isinstance(what, np.ndarray | np.generic):
+        return f"numpy:{what.dtype.str}{list(what.shape)}"
+    if type(what) in (type(None), bool, int, str, bytes):
+        return f"{type(what).__name__}:{what!r}"
+    if type(what) is float:
+        return f"float:{what.hex()}"
+    if isinstance(what, np.dtype):
+        return f"dtype:{what.str}"
+    return _words_of_parts(what)
+
+
+def _words_of_parts(what: Any) -> str:
+    if isinstance(what, enum.Enum):
+        return f"{name_of(type(what))}.{what.name}"
+    if isinstance(what, type | FunctionType | BuiltinFunctionType):
+        return name_of(what)
+    if isinstance(what, functools.partial):
+        _refuse_arrays((what.args, what.keywords))
+        return f"partial({_words(what.func)} {_words(what.args)} {_words(what.keywords)})"
+    if isinstance(what, Mapping):
+        return "{" + " ".join(f"{_words(key)}={_words(value)}" for key, value in what.items()) + "}"
+    if isinstance(what, tuple | list):
+        kind = type(what).__name__ if type(what) in (tuple, list) else name_of(type(what))
+        return f"{kind}(" + " ".join(map(_words, what)) + ")"
+    if isinstance(what, msgspec.Struct):
+        _refuse_arrays([getattr(what, name) for name in what.__struct_fields__])
+        parts = (f"{name}={_words(getattr(what, name))}" for name in what.__struct_fields__)
+        return f"{name_of(type(what))}({' '.join(parts)})"
+    if dataclasses.is_dataclass(what):
+        return _words_of_fields(what)
+    raise NotKeptError(f"{type(what).__name__} has no words")
+
+
+def _words_of_fields(what: Any) -> str:
+    """A record. Of a module of Equinox the arrays in static fields are no arguments of the program, so they are refused
+    like those of every other record."""
+    dynamic = isinstance(what, eqx.Module)
+    parts = []
+    for field in dataclasses.fields(what):
+        value = getattr(what, field.name)
+        if not dynamic or field.metadata.get("static", False):
+            _refuse_arrays(value)
+        parts.append(f"{field.name}={_words(value)}")
+    return f"{name_of(type(what))}({' '.join(parts)})"
+
+
+def _refuse_arrays(static: Any) -> None:
+    if any(isinstance(leaf, jax.Array | np.ndarray) for leaf in jax.tree.leaves(static)):
+        raise NotKeptError("an array is part of the program")

@@ -1,0 +1,104 @@
+"""The folder in which programs are kept: whole entries of this user's, none that is damaged, none beyond a size."""
+
+import contextlib
+import hashlib
+import os
+import stat
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+__all__ = ["Entries", "Entry"]
+
+_SIZE = 64 * 2**20  # bytes in all; an entry has 40,000 to 200,000
+_SUFFIX = ".program"
+
+
+class Entry(msgspec.Struct, forbid_unknown_fields=True):
+    """A program: the words that it was asked by, its results' structure, and what JAX exported."""
+
+    words: str
+    structure: bytes
+    exported: bytes
+
+
+class Entries:
+    """The entries of a folder, which is made if need be, for nobody but this user. `remark` is told in a sentence of
+    what could not be used."""
+
+    def __init__(self, folder: Path, remark: Callable[[str], None], size: int = _SIZE):
+        self.folder, self._remark, self._size = folder, remark, size
+
+    def read(self, words: str) -> Entry | None:
+        """The entry of these words, if there is one that is whole and this user's."""
+        path = self._path(words)
+        try:
+            if not _private(self.folder) or not _private(path):
+                self._remark(f"{path}: belongs to, or may be changed by, another user; it is not used.")
+                return None
+            content = path.read_bytes()
+        except OSError:
+            return None
+        digest, body = content[:32], content[32:]
+        try:
+            entry = msgspec.msgpack.decode(body, type=Entry)
+        except (msgspec.MsgspecError, UnicodeDecodeError):
+            entry = None
+        if entry is None or hashlib.sha256(body).digest() != digest or entry.words != words:
+            self._remark(f"{path}: is damaged; the program is made again.")
+            return None
+        with contextlib.suppress(OSError):
+            os.utime(path)
+        return entry
+
+    def write(self, entry: Entry) -> None:
+        """Publish an entry whole, and drop those that were used longest ago where there are too many."""
+        body = msgspec.msgpack.encode(entry)
+        try:
+            self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if not _private(self.folder):
+                self._remark(f"{self.folder}: belongs to, or may be changed by, another user; nothing is kept there.")
+                return
+            handle, name = tempfile.mkstemp(dir=self.folder)
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(body).digest() + body)
+            os.replace(name, self._path(entry.words))
+            self._drop()
+        except OSError as error:
+            self._remark(f"{self.folder}: programs cannot be kept there ({error.strerror}).")
+
+    def sizes(self) -> dict[Path, int]:
+        """Bytes of each entry, that which was used longest ago first."""
+        found = []
+        for path in self.folder.glob(f"*{_SUFFIX}"):
+            with contextlib.suppress(FileNotFoundError):  # another process drops it
+                found.append((path.stat().st_mtime_ns, path, path.stat().st_size))
+        return {path: size for _, path, size in sorted(found)}
+
+    def clear(self) -> None:
+        """Drop every entry."""
+        for path in self.sizes():
+            path.unlink(missing_ok=True)
+
+    def _drop(self) -> None:
+        sizes = self.sizes()
+        total = sum(sizes.values())
+        for path, size in sizes.items():
+            if total <= self._size:
+                break
+            path.unlink(missing_ok=True)
+            total -= size
+
+    def _path(self, words: str) -> Path:
+        return self.folder / f"{hashlib.sha256(words.encode()).hexdigest()}{_SUFFIX}"
+
+
+def _private(path: Path) -> bool:
+    """Whether it is this user's and nobody else may write to it; on Windows, whose rights are others, it is taken to be
+    so in a user's own folder."""
+    found = path.lstat()
+    if os.name == "nt":
+        return not stat.S_ISLNK(found.st_mode)
+    return found.st_uid == os.geteuid() and not found.st_mode & 0o022 and not stat.S_ISLNK(found.st_mode)

@@ -1,0 +1,52 @@
+"""All that a program may depend on apart from its call: the code, what computes, the processor, flags and settings."""
+
+import functools
+import hashlib
+import os
+import platform
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+__all__ = ["code_digest", "surroundings"]
+
+_COMPUTE = ("jax", "jaxlib", "equinox", "lineax", "optimistix", "jaxtyping", "numpy", "scipy")
+_ELSEWHERE = ("cache", "log", "debug_info", "dump")  # settings that say where something is written, not what
+
+
+def surroundings() -> str:
+    """Words that differ wherever a program of the same code might."""
+    import jax
+
+    settings = {
+        name: value for name, value in jax.config.values.items() if not any(part in name for part in _ELSEWHERE)
+    }
+    flags = {name: value for name, value in os.environ.items() if name.startswith(("XLA_", "JAX_", "LIBTPU_"))}
+    flags = {name: value for name, value in flags.items() if not any(part in name.lower() for part in _ELSEWHERE)}
+    return "\n".join((
+        f"versions {platform.python_version()} {' '.join(f'{name} {version(name)}' for name in _COMPUTE)}",
+        f"processor {sys.platform} {platform.machine()} {_processor()}",
+        f"devices {jax.default_backend()} {[device.device_kind for device in jax.devices()]}",
+        f"flags {sorted(flags.items())}",
+        f"settings {sorted(settings.items(), key=str)}",
+    ))  # fmt: skip
+
+
+def code_digest(package: Path) -> str:
+    """Of every Python file of a package, by name and content."""
+    whole = hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        content = path.read_bytes()
+        whole.update(f"{path.relative_to(package).as_posix()} {len(content)}\n".encode() + content)
+    return whole.hexdigest()
+
+
+@functools.cache
+def _processor() -> str:
+    """What the processor can do, as far as the system says it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    said = {line.partition(":")[0].strip(): line.partition(":")[2].strip() for line in reversed(lines)}
+    return " ".join(said.get(name, "") for name in ("model name", "flags", "Features", "CPU part"))
