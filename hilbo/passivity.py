@@ -27,8 +27,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hilbo.mechanics.fosls import pot_stiffness, share
-from hilbo.mechanics.memory import Memory, Span, span, sums
+from hilbo.mechanics.memory import sums
 from hilbo.mechanics.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
+from hilbo.mechanics.span import Memory, Span, span
 from hilbo.viscoelastic import elementwise
 
 __all__ = [

@@ -35,7 +35,8 @@ from hilbo.mechanics.materials import (
     spring,
     springpot,
 )
-from hilbo.mechanics.memory import GLSums, Memory, Span, gl_coefficients, gl_sums, span, sums
+from hilbo.mechanics.memory import GLSums, gl_coefficients, gl_sums, sums
+from hilbo.mechanics.span import Memory, Span, span
 from hilbo.mechanics.switching import switched_force
 
 __all__ = [

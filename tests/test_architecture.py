@@ -57,9 +57,13 @@ ONLY_IN = {"matplotlib": {"report.figures"}, "serial": {"device.ports"}}
 WITHOUT_JAX = {
     *("errors", "device", "hardware_bridge", "identification.device_tests", "cli.measure", "cli.device"),
     "cli.device_screen",
-    "study.set_table",
+    *("mechanics.span", "search.box", "report.json_text"),
+    *(f"study.{name}" for name in ("fields", "protocols", "set_table", "study_file", "study_tables", "trial_table")),
+    *(f"session.{name}" for name in ("actions", "event_log", "export", "header_check", "netcdf", "participants")),
+    *(f"session.{name}" for name in ("plan", "records", "replay", "state", "views", "withdrawal", "withdrawn_results")),
 }
-LATER = {"device.parameter_sets"}  # imports JAX when a set with full memory has to be sent, and not before
+# These import JAX for a set with full memory, and to convert a value, and not before.
+LATER = {"device.parameter_sets", "search.box"}
 OUTSIDE_WORLD = {"os", "io", "sys", "time", "datetime", "pathlib", "logging", "random", "socket", "subprocess"}
 MAY_ENABLE_X64 = {"cli.console", "app"}
 LONGEST = 400  # lines

@@ -20,8 +20,6 @@ from typing import Annotated, Any, NoReturn
 import typer
 
 from hilbo.errors import InputError
-from hilbo.numerics.compiling import set_flags
-from hilbo.study.results_list import LIST, digest, list_files, listed
 
 __all__ = [
     "PARTS",
@@ -57,6 +55,8 @@ def start(devices: int | None = None) -> None:
 
     `devices`: as how many devices the CPU is to count.
     """
+    from hilbo.numerics.compiling import set_flags
+
     set_flags()
     import jax
 
@@ -88,6 +88,8 @@ def _keep_programs() -> None:
 def results(out: Path, force: bool) -> Iterator[Path]:
     """A new folder that becomes `out` when everything in it is complete; with a list of what it holds, so that
     `force` replaces nothing else later."""
+    from hilbo.study.results_list import list_files
+
     out = out.resolve()
     _check_free(out, force)
     try:
@@ -114,6 +116,8 @@ def _check_free(out: Path, force: bool) -> None:
         raise InputError(f"{out}: is a file; choose a folder for --out.")
     if any(out.iterdir()) and not force:
         raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
+    from hilbo.study.results_list import LIST, digest, listed
+
     ours = listed(out).files
     for path in sorted(path for path in out.rglob("*") if not path.is_dir()):
         name = path.relative_to(out).as_posix()

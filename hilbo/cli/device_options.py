@@ -189,9 +189,9 @@ def _whole(given, line, K_eff) -> dict[str, Any]:
 def _mechanics(line) -> Any:
     if line.study is None:
         return None
-    from hilbo.study.config import Study
+    from hilbo.study.study_file import StudyFile
 
-    mechanics = Study.load(line.study).space.mechanics
+    mechanics = StudyFile.load(line.study).space.mechanics
     if mechanics is None:
         raise InputError(f"{line.study}: has no [renderer], and a device nothing to render.")
     return mechanics

@@ -36,22 +36,31 @@ class Check(NamedTuple):
     mend: str = ""
 
 
-def checks(study: Path | None, connect: Callable[[float | None], Any], folder: Path, port: int) -> Iterator[Check]:
-    """One check after the other. `connect(damping)` opens the device, logs go to `folder`, `port` is the server's."""
+def checks(
+    study: Path | None,
+    connect: Callable[[float | None], Any],
+    folder: Path,
+    port: int,
+    begin: Callable[[], Any] = lambda: None,
+) -> Iterator[Check]:
+    """One check after the other. `connect(damping)` opens the device, logs go to `folder`, `port` is the server's.
+
+    What JAX is needed for comes last, after `begin`; the rest does not wait for it.
+    """
     yield _versions()
     yield _disk(folder)
     yield _port(port)
     yield _browser()
     yield _serial_ports()
-    chosen = None
+    file = None
     if study is not None:
-        check, chosen = _study(study)
+        check, file = _study_file(study)
         yield check
+    yield from _device(connect, file)
+    begin()
     yield _precision()
-    if chosen is not None:
-        yield _feasible(chosen)
-        yield _step(chosen)
-    yield from _device(connect, chosen)
+    if study is not None and file is not None:
+        yield from _study(study)
 
 
 def _versions() -> Check:
@@ -118,15 +127,15 @@ def _serial_ports() -> Check:
     )
 
 
-def _study(path: Path) -> tuple[Check, Any]:
-    from hilbo.study.config import Study
+def _study_file(path: Path) -> tuple[Check, Any]:
+    from hilbo.study.study_file import StudyFile
 
     try:
-        study = Study.load(path)
+        file = StudyFile.load(path)
     except InputError as error:
         return Check("study", "bad", str(error), "mend the study file"), None
-    words = f"{study.name}, {study.selection.trials} trials, hash {study.hash}"
-    return Check("study", "good", words), study
+    words = f"{file.name}, {file.selection.trials} trials, hash {file.hash}"
+    return Check("study", "good", words), file
 
 
 def _precision() -> Check:
@@ -147,6 +156,19 @@ def _precision() -> Check:
         words,
         "the first session compiles for a minute; run `hilbo simulate --live` once before" if empty else "",
     )
+
+
+def _study(path: Path) -> Iterator[Check]:
+    """What is computed of a study whose file is in order."""
+    from hilbo.study.config import Study
+
+    try:
+        study = Study.load(path)
+    except InputError as error:
+        yield Check("feasible set", "bad", str(error), "mend the study file")
+        return
+    yield _feasible(study)
+    yield _step(study)
 
 
 def _feasible(study: Any) -> Check:
@@ -173,10 +195,10 @@ def _step(study: Any) -> Check:
     )
 
 
-def _device(connect: Callable[[float | None], Any], study: Any) -> Iterator[Check]:
+def _device(connect: Callable[[float | None], Any], file: Any) -> Iterator[Check]:
     from hilbo.device.link import DeviceError
 
-    mechanics = study.space.mechanics if study is not None else None
+    mechanics = file.space.mechanics if file is not None else None
     needs = None if mechanics is None else float(mechanics.damping)
     try:
         device = connect(None)

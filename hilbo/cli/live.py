@@ -158,12 +158,11 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Is everything ready for a session? What is not, and how to mend it."""
-    start()
     from hilbo.cli.doctor import checks
 
     results = []
     marks = {"good": "ok  ", "note": "note", "bad": "BAD "}
-    for check in checks(study, line.open, logs, port):
+    for check in checks(study, line.open, logs, port, start):
         results.append(check)
         mend = f"\n       -> {check.mend}" if check.mend else ""
         print(f"{marks[check.level]}  {check.name}: {check.words}{mend}", file=sys.stderr, flush=True)

@@ -25,7 +25,6 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    help="From people's ordinal answers to a population optimum, for haptic rendering of viscoelastic material.",
 )
 
 _LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
@@ -34,6 +33,24 @@ StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")
 Table = Annotated[
     Path, typer.Argument(help="Trial table (CSV or Parquet), or a folder of session logs.", show_default=False)
 ]
+
+
+def _say_version(wanted: bool) -> bool:
+    if wanted:
+        import hilbo
+
+        print(f"hilbo {hilbo.__version__}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _all(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_say_version, is_eager=True, help="Print hilbo's version.")
+    ] = False,
+) -> None:
+    """From people's ordinal answers to a population optimum, for haptic rendering of viscoelastic material."""
 
 
 def main() -> None:

@@ -98,8 +98,8 @@ def passivity(
     _positive("T", period)
     _positive("damping", damping)
     start()
-    from hilbo.report import material as report_material
-    from hilbo.report.results import as_json as text
+    from hilbo.report.json_text import quoted
+    from hilbo.report.passivity import passivity_result, passivity_words
     from hilbo.viscoelastic import FOSLS, K0_from_effective_stiffness
 
     given = {"N": taps, "T": period, "memory": memory, "K_eff": K_eff, "damping": damping}
@@ -111,14 +111,16 @@ def passivity(
     elif K_eff is not None:
         raise InputError("--K0 and --K-eff are both given; one follows from the other, leave one out.")
     model = FOSLS(K0, K1, B1, alpha, *sampling, memory=renderer["memory"])
-    content = report_material.passivity_result(model, renderer["damping"])
+    content = passivity_result(model, renderer["damping"])
     if out is not None:
+        from hilbo.report.material import write_passivity
+
         with results(out, force) as folder:
-            report_material.write_passivity(model, content, folder)
+            write_passivity(model, content, folder)
     if as_json:
-        print(text(content), end="")
+        print(quoted(content, indent=2))
     else:
-        print(report_material.passivity_words(content))
+        print(passivity_words(content))
         if out is not None:
             print(f"{out / 'report.html'}", file=sys.stderr)
 
@@ -127,9 +129,9 @@ def _renderer(study):
     """[renderer] of a study, or the paper's."""
     if study is None:
         return {"N": 101, "T": 1e-3, "memory": "short", "K_eff": 0.44, "damping": 0.95}
-    from hilbo.study.config import Study
+    from hilbo.study.study_file import StudyFile
 
-    mechanics = Study.load(study).space.mechanics
+    mechanics = StudyFile.load(study).space.mechanics
     if mechanics is None:
         raise InputError(f"{study}: has no [renderer], so that there is nothing to be passive.")
     return {name: getattr(mechanics, name) for name in ("N", "T", "memory", "K_eff", "damping")}

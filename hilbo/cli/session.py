@@ -14,12 +14,12 @@ from hilbo.errors import InputError
 
 __all__ = ["app_participants", "export", "plan"]
 
-StudyFile = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
+StudyPath = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
 app_participants = typer.Typer(no_args_is_help=True, help="The list of participants, by pseudonymous id.")
 
 
 def plan(
-    study: StudyFile,
+    study: StudyPath,
     out: Annotated[Path, typer.Option("--out", help="File for the plan.")] = Path("plan.json"),
     participants: Annotated[int | None, typer.Option(min=1, help="How many people: P01, P02, ...")] = None,
     names: Annotated[str | None, typer.Option(help="Their ids instead, separated by commas.")] = None,
@@ -37,28 +37,32 @@ def plan(
     as_json: Json = False,
 ) -> None:
     """Plan a whole study in advance: orders, seeds and validation sets, with a hash that every log will hold."""
-    start()
-    from hilbo.session.plan import make_plan
-    from hilbo.study.config import Study
     from hilbo.study.protocols import PHASES
+    from hilbo.study.study_file import StudyFile
 
-    chosen = Study.load(study)
+    file = StudyFile.load(study)
     if reissue is not None:
-        _write_plan(_reissued(out, chosen, reissue), out, True, as_json)
+        _write_plan(_reissued(out, file, reissue), out, True, as_json)
         return
     if kind not in PHASES[1:]:
         raise InputError(f'--kind is "{kind}"; it must be one of {", ".join(PHASES[1:])}.')
     if source not in ("aggregate", "individual"):
         raise InputError(f'--source is "{source}"; it must be aggregate or individual.')
-    materials = tuple(material or chosen.materials)
-    for name in materials:
-        chosen.material(name)  # refuses what is none
     people = _people(participants, names, "P" if kind == "optimisation" or source == "individual" else "V")
+    materials = tuple(material or file.materials)
+    for name in materials:
+        file.material(name)  # refuses what is none
+    paths = {} if kind == "optimisation" else _by_material(materials, results_ or [])
     _check_free(out, force)
+    start()
+    from hilbo.session.plan import make_plan
+
     with progress() as say:
-        sets = None
-        if kind != "optimisation":
-            sets = _sets(chosen, kind, _by_material(materials, results_ or []), trials, source, people, say)
+        if kind == "optimisation":
+            chosen, sets = _searchable(study), None
+        else:
+            chosen = _whole(study)
+            sets = _sets(chosen, kind, paths, trials, source, people, say)
         label = session or {"optimisation": "1", "validation": "2", "aggregate-best": "3"}[kind]
         made = make_plan(
             chosen,
@@ -80,17 +84,19 @@ def export(
     force: Force = False,
 ) -> None:
     """Tables of a folder of session logs: trials, validation and sets (Psych-DS), and netCDF for xarray and ArviZ."""
-    start()
     from hilbo.session import export as log_tables
-    from hilbo.study.config import Study
+    from hilbo.session.netcdf import netcdf
+    from hilbo.study.study_file import StudyFile
 
-    chosen = Study.load(study)
+    chosen = StudyFile.load(study)
     with results(out, force) as folder, progress() as say:
         say("reading logs")
         sessions = log_tables.read_sessions(logs, chosen, remark)
         say("writing tables")
+        if log_tables.computes_sets(sessions):
+            start()
         log_tables.psych_ds(sessions, folder, chosen)
-        singles = log_tables.netcdf(sessions, folder / "trials.nc", chosen)
+        singles = netcdf(sessions, folder / "trials.nc", chosen)
         if not singles and log_tables.validation_table(sessions).empty:
             raise InputError(f"{logs}: its sessions hold no answers that count yet; there is nothing to export.")
 
@@ -142,6 +148,24 @@ def _people(count, names, letter) -> list[str]:
         return [name.strip() for name in names.split(",")]
     width = max(2, len(str(count)))
     return [f"{letter}{i + 1:0{width}d}" for i in range(count)]
+
+
+def _searchable(path) -> Any:
+    """The study's file, of whose parameters something can be rendered. Whoever plans an optimisation needs no model."""
+    from hilbo.search.space import SearchSpace
+    from hilbo.study.study_file import StudyFile, read_study
+
+    def made(file: StudyFile) -> StudyFile:
+        SearchSpace(file.space.parameters, file.space.mechanics)  # refuses a space without a passive set
+        return file
+
+    return read_study(path, made)
+
+
+def _whole(path) -> Any:
+    from hilbo.study.config import Study
+
+    return Study.load(path)
 
 
 def _sets(study, kind, paths, trials, source, people, say) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from typing import Any, SupportsFloat
 from hilbo.device.messages import Exponential, HelloReply, Set, SetParams, SetStates
 from hilbo.device.protocol import payload_of
 from hilbo.errors import InputError
+from hilbo.mechanics.span import STATES
 
 __all__ = ["InForce", "ParameterSet", "crc_of", "differences", "in_force", "wanted_for"]
 
@@ -129,15 +130,15 @@ def _bits(value: float | int) -> bytes | int:
 
 def _states(set_id: int, alpha: float, count: int) -> list[SetStates]:
     """The exponentials of full memory, as many to a message as fit."""
-    import jax.numpy as jnp
-    import numpy as np
-
-    from hilbo.mechanics.exponentials import STATES, exponentials
-
     if count not in STATES:
         raise InputError(f"states is {count}, it must be one of {', '.join(map(str, STATES))}.")
     if not 0 < alpha < 1:
         raise InputError(f"alpha is {alpha}, it must be above 0 and below 1.")
+    import jax.numpy as jnp
+    import numpy as np
+
+    from hilbo.mechanics.exponentials import exponentials
+
     weight, loss = (np.asarray(values, float) for values in exponentials(jnp.asarray(alpha, float), count))
     pairs = tuple(Exponential(*map(float, pair)) for pair in zip(weight, loss, strict=True))
     chunks = [(first, pairs[first : first + _PER_MESSAGE]) for first in range(0, count, _PER_MESSAGE)]

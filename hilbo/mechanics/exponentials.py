@@ -20,17 +20,13 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["STATES", "decode", "exponentials"]
-
-
-STATES = (8, 10, 12)
-"""Numbers of exponentials to choose from."""
+__all__ = ["decode", "exponentials"]
 
 
 def exponentials(
     alpha: Float[Array, ""], states: int = 10
 ) -> tuple[Float[Array, " {states}"], Float[Array, " {states}"]]:
-    """p_k and 1 - λ_k of order α in [0, 1], fastest first, for one of the numbers of `STATES`; differentiable."""
+    """p_k and 1 - λ_k of order α in [0, 1], fastest first, for one of the numbers of `span.STATES`; differentiable."""
     table = jnp.asarray(_TABLE[states], alpha.dtype)
     x = 2 * alpha - 1
     basis = [jnp.ones_like(x), x]

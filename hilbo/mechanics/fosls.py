@@ -27,8 +27,9 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Inexact, Real
 
 from hilbo.errors import InputError
-from hilbo.mechanics.memory import GLSums, Memory, Span, gl_coefficients, response, span, sums
+from hilbo.mechanics.memory import GLSums, gl_coefficients, response, sums
 from hilbo.mechanics.recursion import BLOCK, past_of
+from hilbo.mechanics.span import Memory, Span, span
 from hilbo.numerics.mittag_leffler import mittag_leffler
 from hilbo.numerics.tracing import program
 

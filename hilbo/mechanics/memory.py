@@ -16,7 +16,6 @@ Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (shor
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,19 +23,10 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Real
 
-from hilbo.mechanics.exponentials import STATES, exponentials
+from hilbo.mechanics.exponentials import exponentials
+from hilbo.mechanics.span import Span
 
-__all__ = ["GLSums", "Memory", "Span", "gl_coefficients", "gl_sums", "response", "span", "sums"]
-
-Memory = Literal["short", "full"]
-
-
-class Span(NamedTuple):
-    """How far a model looks back: `N` taps (short memory), or `states` exponentials (full memory)."""
-
-    memory: Memory
-    N: int
-    states: int
+__all__ = ["GLSums", "gl_coefficients", "gl_sums", "response", "sums"]
 
 
 class GLSums(eqx.Module):
@@ -46,17 +36,6 @@ class GLSums(eqx.Module):
     at_nyquist: Float[Array, ""]  # C(-1), close to 2^α
     spread: Float[Array, ""]  # C(-1) - C(1) = 2·Σ_{odd i} |c_i|
     moment: Float[Array, ""]  # M1 = -Σ i·c_i
-
-
-def span(memory: Memory, N: int, states: int = 10) -> Span:
-    """The memory of a model, checked. The number that does not apply is 0, so that it compiles nothing anew."""
-    if memory not in ("short", "full"):
-        raise ValueError(f'memory is {memory!r}, it must be "short" (N taps) or "full" (exponentials).')
-    if memory == "short" and N < 1:
-        raise ValueError(f"N is {N}, it must be at least 1: the number of past samples in the sum.")
-    if memory == "full" and states not in STATES:
-        raise ValueError(f"states is {states}, it must be one of {', '.join(map(str, STATES))}.")
-    return Span("short", N, 0) if memory == "short" else Span("full", 0, states)
 
 
 def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:

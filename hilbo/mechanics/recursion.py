@@ -22,7 +22,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hilbo.mechanics.exponentials import exponentials
-from hilbo.mechanics.memory import Span, gl_coefficients
+from hilbo.mechanics.memory import gl_coefficients
+from hilbo.mechanics.span import Span
 
 __all__ = ["BLOCK", "past_of"]
 

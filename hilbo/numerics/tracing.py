@@ -52,4 +52,4 @@ def program(function: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _typed(leaf: Any) -> Any:
-    return jnp.asarray(leaf, leaf.dtype) if isinstance(leaf, jax.Array) and leaf.weak_type else leaf
+    return jnp.asarray(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf

@@ -43,7 +43,7 @@ def name_of(what: Any) -> str:
 
 def _words(what: Any) -> str:
     if isinstance(what, jax.Array):
-        return f"array:{what.dtype}{list(what.shape)}{'weak' * what.weak_type}"
+        return f"array:{what.dtype}{list(what.shape)}{'weak' * _weak(what)}"
     if isinstance(what, np.ndarray | np.generic):
         return f"numpy:{what.dtype.str}{list(what.shape)}"
     if type(what) in (type(None), bool, int, str, bytes):
@@ -53,6 +53,11 @@ def _words(what: Any) -> str:
     if isinstance(what, np.dtype):
         return f"dtype:{what.str}"
     return _words_of_parts(what)
+
+
+def _weak(array: jax.Array) -> bool:
+    """Whether its type gives way to others; random keys do not say."""
+    return getattr(array, "weak_type", False)
 
 
 def _words_of_parts(what: Any) -> str:

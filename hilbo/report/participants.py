@@ -4,8 +4,6 @@ Parameter sets and passivity margins of all participants are computed together; 
 while the file is written, since a hundred thousand of them as Python objects would take more memory than the fits.
 """
 
-import json
-import math
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -14,9 +12,10 @@ import pandas as pd
 from jaxtyping import Float
 
 from hilbo.numerics.tracing import program
+from hilbo.report.json_text import quoted
 from hilbo.study.config import Study
 
-__all__ = ["People", "as_json", "json_lines", "parameter_sets", "people_of", "quoted"]
+__all__ = ["People", "as_json", "json_lines", "parameter_sets", "people_of"]
 
 _TOGETHER = 4096  # sets whose mechanics are computed at once
 
@@ -115,16 +114,3 @@ def json_lines(content: dict[str, Any]) -> Iterator[str]:
         else:
             yield quoted(value, indent=2).replace("\n", "\n  ")
     yield "\n}\n"
-
-
-def quoted(value: Any, indent: int | None = None) -> str:
-    """JSON, with null for what is not finite."""
-    return json.dumps(_clean(value), indent=indent, allow_nan=False)
-
-
-def _clean(value):
-    if isinstance(value, dict):
-        return {key: _clean(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return [_clean(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

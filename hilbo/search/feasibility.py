@@ -8,22 +8,20 @@ The search keeps `SEARCH_MARGIN` away from the device's damping, so that a devic
 float32 never refuses a proposal.
 """
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
-import equinox as eqx
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
 from hilbo import passivity, viscoelastic
-from hilbo.errors import InputError
-from hilbo.mechanics.exponentials import STATES
 from hilbo.mechanics.fosls import pot_stiffness
-from hilbo.mechanics.memory import Memory, Span, span, sums
+from hilbo.mechanics.memory import sums
+from hilbo.mechanics.span import Span, span
+from hilbo.search.box import Mechanics
 
-__all__ = ["SEARCH_MARGIN", "K0_of", "K1_range", "Mechanics", "allowed", "largest_K1", "minimum_damping"]
+__all__ = ["SEARCH_MARGIN", "K0_of", "K1_range", "allowed", "largest_K1", "minimum_damping"]
 
 SEARCH_MARGIN = 1e-3
 """The search uses the damping b·(1 - SEARCH_MARGIN)."""
@@ -32,38 +30,6 @@ SEARCH_MARGIN = 1e-3
 _ROUNDING = 64
 _Batch = Float[Array, "*batch"]
 _Physical = Mapping[str, Real[ArrayLike, "..."]]
-
-
-class Mechanics(eqx.Module):
-    """What the renderer adds to the box: the FO-SLS, its memory and rate, and the device's damping.
-
-    `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
-    optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd) of short memory; `states`: exponentials of full memory,
-    for which alone the effective damping depends on them, and not on K1; `T`: s.
-    """
-
-    K_eff: float = eqx.field(static=True, converter=float)
-    damping: float = eqx.field(static=True, converter=float)
-    N: int = eqx.field(static=True, default=101)
-    T: float = eqx.field(static=True, converter=float, default=1e-3)
-    memory: Memory = eqx.field(static=True, default="short")
-    states: int = eqx.field(static=True, default=10)
-    effective_damping: tuple[float, float] | None = eqx.field(static=True, default=None)
-
-    def __check_init__(self):
-        for key, least in (("damping", 0.0), ("T", 0.0), ("K_eff", -math.ulp(0.0))):
-            value = getattr(self, key)
-            if not least < value < math.inf:
-                raise InputError(f"renderer.{key} is {value}, it must be {'0 or' if least else 'a number'} above 0.")
-        if self.memory == "full" and self.states not in STATES:
-            raise InputError(f"renderer.states is {self.states}, it must be one of {', '.join(map(str, STATES))}.")
-        if self.memory == "short" and (self.N < 1 or self.N % 2 == 0):
-            raise InputError(f"renderer.N is {self.N}, it must be odd and at least 1; write for example N = 101.")
-        if self.effective_damping is not None and not 0 <= self.effective_damping[0] < self.effective_damping[1]:
-            raise InputError(
-                f"renderer.effective_damping is {list(self.effective_damping)}, it must be a lower end, 0 or above, "
-                "and a higher one; write for example effective_damping = [10, 80]."
-            )
 
 
 def allowed(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:

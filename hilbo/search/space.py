@@ -16,9 +16,7 @@ Rosenblatt (1952), Ann. Math. Stat. 23:470.
 """
 
 import functools
-import math
 from collections.abc import Mapping
-from typing import Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,10 +26,11 @@ from jaxtyping import Array, Bool, Float, Real
 
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
-from hilbo.search.feasibility import K0_of, K1_range, Mechanics, allowed, largest_K1, minimum_damping
+from hilbo.search.box import Box, Mechanics, Parameter
+from hilbo.search.feasibility import K0_of, K1_range, allowed, largest_K1, minimum_damping
 from hilbo.search.space_filling import Chunks, latin_chunks, sobol_chunks, take, wall_chunks
 
-__all__ = ["COLUMNS", "ROWS", "Parameter", "SearchSpace", "column_ends", "column_table"]
+__all__ = ["COLUMNS", "ROWS", "SearchSpace", "column_ends", "column_table"]
 
 # Cells of the table of column widths. At small B1 the width falls from all to little within 1/1000 of the range, so
 # the rows crowd there: with even rows the share of the first one alone would be off by a sixth.
@@ -39,44 +38,6 @@ _CELLS = 256
 ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
 COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
 _Batch = Float[Array, "*batch"]
-
-
-class Parameter(eqx.Module):
-    """One named parameter, `low` to `high` in `unit`; `scale` says how it lies on [0, 1]."""
-
-    name: str = eqx.field(static=True)
-    low: float = eqx.field(static=True, converter=float)
-    high: float = eqx.field(static=True, converter=float)
-    unit: str = eqx.field(static=True, default="")
-    scale: Literal["linear", "log"] = eqx.field(static=True, default="linear")
-
-    def __check_init__(self):
-        path = f"parameters.{self.name}"
-        if not (math.isfinite(self.low) and math.isfinite(self.high)):
-            raise InputError(f"{path} runs from {self.low} to {self.high}, both ends must be finite numbers.")
-        if not self.low < self.high:
-            raise InputError(f"{path}.low is {self.low}, it must be below high = {self.high}.")
-        if self.scale == "log" and self.low <= 0:
-            raise InputError(f'{path}.low is {self.low}, it must be above 0 on a scale = "log".')
-
-    def to_unit(self, value: Real[Array, "..."]) -> Float[Array, "..."]:
-        """Physical value to [0, 1]; measured from the nearer end, so that both ends are met exactly."""
-        if self.scale == "log":
-            above, below = jnp.log1p((value - self.low) / self.low), jnp.log1p((self.high - value) / value)
-            width = math.log(self.high / self.low)
-        else:
-            above, below, width = value - self.low, self.high - value, self.high - self.low
-        return jnp.where(above < below, above / width, 1 - below / width)
-
-    def to_physical(self, unit: Real[Array, "..."]) -> Float[Array, "..."]:
-        """Inverse of `to_unit`; never leaves [low, high] for a `unit` in [0, 1]."""
-        if self.scale == "log":
-            ratio = self.high / self.low
-            upwards, downwards = self.low * ratio**unit, self.high * ratio ** (unit - 1)
-        else:
-            width = self.high - self.low
-            upwards, downwards = self.low + width * unit, self.high - width * (1 - unit)
-        return jnp.where(unit < 0.5, upwards, downwards)
 
 
 class SearchSpace(eqx.Module):
@@ -90,24 +51,11 @@ class SearchSpace(eqx.Module):
     mechanics: Mechanics | None = eqx.field(static=True, default=None)
 
     def __check_init__(self):
-        if not self.parameters:
-            raise InputError("parameters is empty, a search space needs at least one.")
-        if len(set(self.names)) < self.dim:
-            raise InputError(f"parameters has one name twice: {', '.join(self.names)}.")
+        Box(self.parameters, self.mechanics)  # refuses what is no box
         if self.mechanics is not None:
-            self._check_mechanics(self.mechanics)
+            self._check_volume(self.mechanics)
 
-    def _check_mechanics(self, mechanics: Mechanics) -> None:
-        missing = [name for name in ("K1", "B1", "alpha") if name not in self.names]
-        if missing:
-            raise InputError(f"parameters.{missing[0]} is missing, the renderer's model needs K1, B1 and alpha.")
-        for name in ("K1", "B1", "alpha"):
-            parameter = self.parameters[self._index(name)]
-            if parameter.low <= 0:
-                raise InputError(f"parameters.{name}.low is {parameter.low}, it must be above 0 for the FO-SLS.")
-        alpha = self.parameters[self._index("alpha")]
-        if alpha.high >= 1:
-            raise InputError(f"parameters.alpha.high is {alpha.high}, it must be below 1 for the FO-SLS.")
+    def _check_volume(self, mechanics: Mechanics) -> None:
         if not _cumulative_volume(self)[0][-1] > 0:
             if mechanics.effective_damping is not None:
                 raise InputError(

@@ -25,7 +25,7 @@ from hilbo.session.header_check import check_new_header
 from hilbo.session.records import Event, Header
 from hilbo.session.replay import replayed
 from hilbo.session.state import LiveSession
-from hilbo.study.config import Study
+from hilbo.study.study_file import AnyStudy
 from hilbo.study.typed_files import converted, decoded, read_bytes
 
 __all__ = ["EventLog", "LogError", "in_use", "log_name", "log_paths", "read_log", "read_session"]
@@ -62,7 +62,7 @@ class EventLog:
         self._file, self._previous, self._size = file, previous, size
 
     @classmethod
-    def create(cls, path: str | os.PathLike, study: Study, header: Header) -> "EventLog":
+    def create(cls, path: str | os.PathLike, study: AnyStudy, header: Header) -> "EventLog":
         """Begin a log. Raises InputError if there is one already, or it cannot be written."""
         path = Path(path)
         state = LiveSession.start(study, header)
@@ -86,7 +86,7 @@ class EventLog:
         return log
 
     @classmethod
-    def resume(cls, path: str | os.PathLike, study: Study) -> "EventLog":
+    def resume(cls, path: str | os.PathLike, study: AnyStudy) -> "EventLog":
         """Open a log to go on with it; a torn last line is cut off. Raises InputError."""
         path = Path(path)
         try:
@@ -144,7 +144,7 @@ class EventLog:
         self.close()
 
 
-def read_log(path: str | os.PathLike, study: Study | None = None) -> tuple[Header, list[Event], str]:
+def read_log(path: str | os.PathLike, study: AnyStudy | None = None) -> tuple[Header, list[Event], str]:
     """Header, events, and what was dropped at the end; for readers, without a lock. Raises InputError."""
     header, events, _, dropped = _parsed(read_bytes(path), path)
     if study is not None:
@@ -152,7 +152,7 @@ def read_log(path: str | os.PathLike, study: Study | None = None) -> tuple[Heade
     return header, events, dropped
 
 
-def read_session(path: str | os.PathLike, study: Study) -> LiveSession:
+def read_session(path: str | os.PathLike, study: AnyStudy) -> LiveSession:
     """The session of a log, every event checked; for readers, without a lock. Raises InputError."""
     header, events, _ = read_log(path, study)
     return _folded(path, study, header, events)

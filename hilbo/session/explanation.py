@@ -7,7 +7,6 @@ number (of a fit that failed, say) is left out: JSON has no word for it.
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -16,9 +15,10 @@ from jaxtyping import Array, Float
 
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
+from hilbo.session.set_facts import facts
 from hilbo.study.config import Study
 
-__all__ = ["Choice", "Described", "described", "explained"]
+__all__ = ["Choice", "explained"]
 
 
 class Choice(NamedTuple):
@@ -26,13 +26,6 @@ class Choice(NamedTuple):
 
     point: Float[np.ndarray, " d"]
     by: str
-
-
-class Described(NamedTuple):
-    """A rendering's values by name in physical units, with what follows from them, and its passivity margin."""
-
-    parameters: dict[str, float]
-    margin: float | None
 
 
 class _Explanation(NamedTuple):
@@ -77,20 +70,6 @@ def _numbers(words: dict[str, Any]) -> dict[str, Any]:
 def _explanation(study: Study, posterior: Posterior, point: Float[Array | np.ndarray, " d"]) -> _Explanation:
     unit = study.space.to_unit(point)
     mean, variance = (moment[0] for moment in posterior.predict(unit[None, :]))
-    derived, margin = _facts(study, dict(zip(study.space.names, point, strict=True)))
+    derived, margin = facts(study.space, dict(zip(study.space.names, point, strict=True)))
     probabilities = study.gp.likelihood.class_probabilities(mean, variance)
     return _Explanation(unit, mean, variance, probabilities, posterior.certificate, derived, margin)
-
-
-def described(study: Study, values: Mapping[str, float]) -> Described:
-    """A planned set, by name in physical units."""
-    derived, margin = _facts(study, {name: np.asarray(values[name], float) for name in study.space.names})
-    parameters = {name: float(values[name]) for name in study.space.names}
-    parameters |= {name: float(value) for name, value in derived.items()}
-    return Described(parameters, None if margin is None or not math.isfinite(margin) else float(margin))
-
-
-@program
-def _facts(study: Study, values: Mapping[str, Any]):
-    """What follows from a rendering's values, by name, and its passivity margin; None without mechanics."""
-    return study.space.derived(values), study.space.passivity_margin(values)

@@ -1,4 +1,4 @@
-"""Session logs as tables, as a Psych-DS folder, and as a netCDF file of groups; all made from the logs alone.
+"""Session logs as tables and as a Psych-DS folder, made from the logs alone.
 
 `trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
 and `sets_table` are those of `hilbo.study.validation_table` (voided comparisons left out), `presentations_table` has
@@ -11,7 +11,7 @@ import json
 import os
 import re
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,15 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import log_name, log_paths, read_session
-from hilbo.session.explanation import described
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
-from hilbo.study.config import Study
 from hilbo.study.set_table import role_of, source_of
+from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import check_text, runs_in_a_spreadsheet
 from hilbo.study.trial_table import read_trials, write_trials
 
 __all__ = [
-    "netcdf",
+    "computes_sets",
     "presentations_table",
     "psych_ds",
     "read_log_trials",
@@ -70,7 +69,7 @@ _WORDS = {
 
 
 def read_sessions(
-    folder: str | os.PathLike, study: Study, note: Callable[[str], Any] = lambda sentence: None
+    folder: str | os.PathLike, study: AnyStudy, note: Callable[[str], Any] = lambda sentence: None
 ) -> list[LiveSession]:
     """Every session in a folder but dry runs; `note` is told of those. Raises InputError if there is none, or a log is
     damaged or of another study."""
@@ -135,7 +134,7 @@ def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
             rendered = _rendered(study.space.mechanics)
             for name in dict.fromkeys(n for p in block.trials if p.b is not None for n in (p.a, p.b)):
                 is_what = {"source": source_of(name, block.material), "role": role_of(name), "material": block.material}
-                values = described(study, state.header.sets[name]).parameters
+                values = _parameters(study.space, state.header.sets[name])
                 row = {"set_id": name, **is_what, **values, **rendered}
                 if rows.setdefault(name, row) != row:
                     raise InputError(
@@ -143,6 +142,22 @@ def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
                         " under this name; export the logs of one plan at a time."
                     )
     return _table(list(rows.values()))
+
+
+def computes_sets(sessions: Sequence[LiveSession]) -> bool:
+    """Whether `sets_table` has to compute, with JAX: the K0 of sets that were compared."""
+    compared = any(p.b is not None for state in sessions for block in state.header.blocks for p in block.trials)
+    return compared and any(state.study.space.mechanics is not None for state in sessions)
+
+
+def _parameters(box, values: Mapping[str, float]) -> dict[str, float]:
+    """A set's parameters, with the K0 of one that is rendered."""
+    if box.mechanics is None:
+        return {name: float(values[name]) for name in box.names}
+    from hilbo.search.space import SearchSpace
+    from hilbo.session.set_facts import described
+
+    return described(SearchSpace(box.parameters, box.mechanics), values).parameters
 
 
 def _rendered(mechanics) -> dict[str, Any]:
@@ -169,7 +184,7 @@ def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 def read_log_trials(
     folder: str | os.PathLike,
-    study: Study,
+    study: AnyStudy,
     material: str | None = None,
     *,
     others: bool = True,
@@ -191,7 +206,7 @@ def read_log_trials(
             raise InputError(str(error).replace(str(path), str(folder))) from None
 
 
-def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: Study) -> list[Path]:
+def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> list[Path]:
     """Tables with their sidecars and dataset_description.json, in the shape of a Psych-DS data set; the files.
     Raises InputError for an id, label or name of a set that a spreadsheet would run."""
     for state in sessions:
@@ -230,36 +245,6 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: Study) -> lis
     path = folder / "dataset_description.json"
     path.write_text(_json(description), encoding="utf-8")
     return [*written, path]
-
-
-def netcdf(sessions: Sequence[LiveSession], path: Path, study: Study) -> bool:
-    """The answers to single renderings that count as groups of a netCDF file: observed_data has the categories and
-    constant_data what they are about, along `obs_id`; attributes name the study. xarray reads it as a DataTree, ArviZ
-    as InferenceData. False, and no file, where there are none."""
-    import numpy as np
-    import xarray as xr
-
-    table = trials_table(sessions)
-    table = table[(table["voided"] == 0) & (table["phase"] != "warm-up")] if len(table) else table
-    if table.empty:
-        return False
-    rows = {"obs_id": np.arange(len(table))}
-    ranks = {label: i for i, label in enumerate(study.responses)}
-    observed = xr.Dataset({"category": ("obs_id", table["response"].map(ranks).to_numpy(int))}, rows)
-    observed["category"].attrs["labels"] = list(study.responses)
-    constant = xr.Dataset(coords=rows)
-    for column in ("participant", "session", "phase", "material"):
-        if column in table:
-            constant[column] = ("obs_id", table[column].to_numpy(str).astype(object))
-    constant["trial"] = ("obs_id", table["trial"].to_numpy(int))
-    for parameter in study.space.parameters:
-        constant[parameter.name] = ("obs_id", table[parameter.name].to_numpy(float))
-        constant[parameter.name].attrs["units"] = parameter.unit
-    attributes = {"study": study.hash, "study_name": study.name, "made_by": "hilbo"}
-    groups = {"observed_data": observed, "constant_data": constant}
-    tree = xr.DataTree.from_dict({name: group.assign_attrs(attributes) for name, group in groups.items()})
-    tree.to_netcdf(path, engine="h5netcdf")
-    return True
 
 
 def _written(text: Any) -> Any:

@@ -4,8 +4,8 @@ import math
 
 from hilbo.errors import InputError
 from hilbo.session.records import Block, Header
-from hilbo.study.config import Study
 from hilbo.study.protocols import protocol
+from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import check_id, check_text
 from hilbo.study.typed_files import check_values
 
@@ -17,12 +17,12 @@ _LABEL = 64  # characters of a session's label, and of an id
 _DAY = 86_400.0  # s
 
 
-def study_of(study: Study, material: str | None) -> Study:
+def study_of(study: AnyStudy, material: str | None) -> AnyStudy:
     """The study of one material; None for a study, or a session, without."""
     return study if material is None else study.material(material)
 
 
-def check_header(study: Study, header: Header) -> None:
+def check_header(study: AnyStudy, header: Header) -> None:
     """Refuse a header that no session of this study can have, of whatever version. Raises InputError."""
     if header.schema != _SCHEMA:
         raise InputError(f"the session's header is of schema {header.schema}; this hilbo knows {_SCHEMA}.")
@@ -42,7 +42,7 @@ def check_header(study: Study, header: Header) -> None:
             raise InputError(f'the set "{name}" of the session holds what is no finite number.')
 
 
-def check_new_header(study: Study, header: Header) -> None:
+def check_new_header(study: AnyStudy, header: Header) -> None:
     """Refuse a header with which no session may begin: one that `check_header` refuses, or with an id or words against
     the rules for them. Raises InputError."""
     check_header(study, header)
@@ -53,7 +53,7 @@ def check_new_header(study: Study, header: Header) -> None:
             check_text(name, "the name of a set", f"block {number}")
 
 
-def _check_block(study: Study, header: Header, block: Block, place: str) -> None:
+def _check_block(study: AnyStudy, header: Header, block: Block, place: str) -> None:
     if not 0 <= block.count <= _MOST or not 0 <= block.rest <= _DAY:
         raise InputError(f"{place} has {block.count} trials after {block.rest:g} s of rest, which is no session's.")
     here = study_of(study, block.material)

@@ -18,9 +18,10 @@ from jaxtyping import Float
 from hilbo.errors import InputError
 from hilbo.session import excluded as apart
 from hilbo.session.ask_tell import Session
-from hilbo.session.explanation import Choice, described, explained
+from hilbo.session.explanation import Choice, explained
 from hilbo.session.plan import material_seed
 from hilbo.session.records import Need, Planned
+from hilbo.session.set_facts import described
 from hilbo.session.state import LiveSession
 from hilbo.session.step import Fitted
 from hilbo.session.warm_start import WarmStart
@@ -77,6 +78,7 @@ class LiveChooser:
         self._choices: dict[_Situation, dict[str, Any]] = {}
         self._fitted: dict[Answers, Fitted] = {}
         header, study = state.header, state.study
+        assert isinstance(study, Study)  # whoever chooses needs the model too
         self._blocks = header.blocks
         materials = {block.material for block in header.blocks}
         self._studies = {name: study if name is None else study.material(name) for name in materials}
@@ -86,7 +88,7 @@ class LiveChooser:
             if not block.trials
         }
         self._sets = {
-            (name, id): described(self._studies[name], values)
+            (name, id): described(self._studies[name].space, values)
             for name in materials
             for id, values in header.sets.items()
             if any(id in (p.a, p.b) for b in header.blocks if b.material == name for p in b.trials)

@@ -23,8 +23,8 @@ from hilbo.session.counterbalance import block_size, comparisons, orders
 from hilbo.session.header_check import check_header
 from hilbo.session.records import Block, Header, Planned
 from hilbo.session.set_codes import OWN, Sets, coded, set_codes
-from hilbo.study.config import Study
 from hilbo.study.protocols import Phase, protocol
+from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import check_id, check_text
 from hilbo.study.typed_files import converted, decoded, read_bytes
 
@@ -81,10 +81,13 @@ def material_seed(header: Header, material: str | None) -> int:
     return seed_of(header.seed, int.from_bytes(digest[:4]))
 
 
-def warm_up(study: Study, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
+def warm_up(study: AnyStudy, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
     """The warm-up: spread, feasible renderings from the seed, as many again for "another one"; and their sets."""
+    from hilbo.search.space import SearchSpace  # with JAX, which nothing else here needs
+
     count = protocol(study.session, "warm-up").count
-    space = _of(study, material).space
+    box = _of(study, material).space
+    space = SearchSpace(box.parameters, box.mechanics)
     unit = np.concatenate([space.latin_hypercube(count, seed_of(seed, k)) for k in range(_SPARE)])
     physical = np.asarray(space.to_physical(unit))
     names = [f"warm-up {i + 1}" for i in range(len(physical))]
@@ -93,7 +96,7 @@ def warm_up(study: Study, seed: int, material: str | None = None) -> tuple[Block
 
 
 def header_for(
-    study: Study,
+    study: AnyStudy,
     participant: str,
     session: str = "1",
     seed: int = 0,
@@ -122,7 +125,7 @@ def header_for(
 
 
 def make_plan(
-    study: Study,
+    study: AnyStudy,
     participants: Sequence[str],
     seed: int = 0,
     phase: Phase = "optimisation",
@@ -175,7 +178,7 @@ def plan_hash(plan: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def planned_header(plan: Mapping[str, Any], study: Study, participant: str, **others: Any) -> Header:
+def planned_header(plan: Mapping[str, Any], study: AnyStudy, participant: str, **others: Any) -> Header:
     """The header of a planned session. Raises InputError if plan, study and participant do not belong together."""
     found = check_plan(plan, study)
     rows = {row.participant: row.header for row in found.participants}
@@ -192,7 +195,7 @@ def read_plan(path: str | os.PathLike) -> dict[str, Any]:
     return decoded(read_bytes(path), dict[str, Any], str(path), _WHAT)
 
 
-def check_plan(plan: Mapping[str, Any], study: Study) -> _Plan:
+def check_plan(plan: Mapping[str, Any], study: AnyStudy) -> _Plan:
     """Refuse a plan that was changed after it was made, belongs to another study, or has sessions that cannot be."""
     found = converted(plan, _Plan, "the plan", _WHAT)
     if found.hash != plan_hash(plan):

@@ -16,8 +16,8 @@ from hilbo.session import actions
 from hilbo.session.header_check import check_header, study_of
 from hilbo.session.records import Event, Header, Need
 from hilbo.session.state import LiveSession
-from hilbo.study.config import Study
 from hilbo.study.protocols import Ask, Show
+from hilbo.study.study_file import AnyStudy
 from hilbo.study.typed_files import check_values, converted
 
 __all__ = ["check_event", "replayed"]
@@ -122,7 +122,7 @@ _KINDS: dict[str, tuple[type, _Again]] = {
 }
 
 
-def replayed(study: Study, header: Header, events: Iterable[Event]) -> LiveSession:
+def replayed(study: AnyStudy, header: Header, events: Iterable[Event]) -> LiveSession:
     """The state after a log's events, each of them checked. Raises InputError with the number of the event."""
     check_header(study, header)
     state = LiveSession.start(study, header)

@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 from hilbo.errors import InputError
 from hilbo.session.records import Event, Header, Need, RefusedError, Trial
-from hilbo.study.config import Study
+from hilbo.study.study_file import AnyStudy
 
 __all__ = ["STOPS", "LiveSession", "Screen"]
 
@@ -37,7 +37,7 @@ STOPS = 2
 class LiveSession:
     """The state of a session; made by `start`, `after` and `fold`."""
 
-    study: Study = field(repr=False)
+    study: AnyStudy = field(repr=False)
     header: Header
     seq: int = 0
     trials: tuple[Trial, ...] = ()
@@ -52,7 +52,7 @@ class LiveSession:
     last: float | None = None
 
     @classmethod
-    def start(cls, study: Study, header: Header) -> "LiveSession":
+    def start(cls, study: AnyStudy, header: Header) -> "LiveSession":
         """A session before its first event. Raises InputError if the header belongs to another study."""
         if header.study != study.hash:
             raise InputError(
@@ -62,7 +62,7 @@ class LiveSession:
         return cls(study, header)
 
     @classmethod
-    def fold(cls, study: Study, header: Header, events: Iterable[Event]) -> "LiveSession":
+    def fold(cls, study: AnyStudy, header: Header, events: Iterable[Event]) -> "LiveSession":
         """The state after these events."""
         state = cls.start(study, header)
         for event in events:

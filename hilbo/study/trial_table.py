@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.search.space import Parameter
-from hilbo.study.config import Study
+from hilbo.search.box import Parameter
+from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, check_text, formulas, no_ids
 
 __all__ = [
@@ -42,7 +42,7 @@ _PIECE = 50_000  # rows
 
 def read_trials(
     path: str | os.PathLike,
-    study: Study,
+    study: AnyStudy,
     material: str | None = None,
     *,
     others: bool = True,
@@ -74,7 +74,7 @@ def read_trials(
     return order.drop(columns=["_person", "_session"])
 
 
-def _checked(text: pd.DataFrame, study: Study, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
+def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
     """A piece with its numbers as numbers and its texts as one object each, and `_fitted`: which rows count."""
     numeric = {"trial", *study.space.names}
     table = pd.DataFrame(index=text.index)
@@ -196,7 +196,7 @@ def place(source: str, row: object = None) -> str:
     return f"{source}:{1 if row is None else row}: "
 
 
-def _check_columns(text: pd.DataFrame, study: Study, source: str) -> None:
+def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
     needed = ("participant", "trial", "response", *study.space.names)
     missing = [name for name in needed if name not in text.columns]
     if missing:

@@ -15,7 +15,7 @@ from typing import Any
 import msgspec
 
 from hilbo.errors import InputError
-from hilbo.search.space import Parameter
+from hilbo.search.box import Parameter
 
 __all__ = ["check_values", "converted", "decoded", "digest_of", "read_bytes", "sealed", "unsealed"]
 

@@ -10,8 +10,8 @@ import pytest
 from commands import run
 from material import FOAM, foam_tests
 
-from hilbo.report import material
 from hilbo.report.figures.mechanics import passivity_figure
+from hilbo.report.passivity import passivity_result
 from hilbo.study.config import Study
 from hilbo.viscoelastic import FOSLS
 
@@ -37,7 +37,7 @@ def test_a_set_far_from_passive_has_its_figure_too():
 
 
 def test_an_even_number_of_taps_has_no_closed_form():
-    content = material.passivity_result(FOSLS(-3.0, 5.58, 7.88, 0.176, N=100), 0.95)
+    content = passivity_result(FOSLS(-3.0, 5.58, 7.88, 0.176, N=100), 0.95)
     assert content["status"] in ("passive", "violated")
     assert content["largest_K1"] is None and not content["every_K1"]
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from helpers import check_grad
 
-from hilbo.mechanics.exponentials import STATES, exponentials
-from hilbo.mechanics.memory import gl_coefficients, gl_sums, response, span, sums
+from hilbo.mechanics.exponentials import exponentials
+from hilbo.mechanics.memory import gl_coefficients, gl_sums, response, sums
+from hilbo.mechanics.span import STATES, span
 from hilbo.viscoelastic import FOSLS, creep_load, relaxation_load
 
 ORDERS = np.concatenate([[1e-6, 1e-3], np.linspace(0.01, 0.99, 50), [0.999, 1 - 1e-6, 1.0]])

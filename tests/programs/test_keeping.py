@@ -32,6 +32,12 @@ def doubled(x, power=1, names=("a",)):
 
 
 @program
+def drawn(key, count=3):
+    TRACES.append(key)
+    return jax.random.split(key, count)
+
+
+@program
 def shown(x):
     jax.debug.print("{}", x)
     return x
@@ -90,6 +96,14 @@ def test_the_second_process_traces_nothing_and_gives_the_same(kept):
             np.testing.assert_array_equal(a, b)
             assert getattr(a, "dtype", None) == getattr(b, "dtype", None)
             assert getattr(a, "weak_type", False) == getattr(b, "weak_type", False)
+
+
+def test_random_keys_go_in_and_out(kept):
+    expected = jax.random.key_data(drawn(jax.random.key(1)))
+    for again in (False, True):
+        kept()
+        np.testing.assert_array_equal(jax.random.key_data(drawn(jax.random.key(1))), expected)
+        assert bool(TRACES) != again
 
 
 def test_another_call_is_another_program(kept):

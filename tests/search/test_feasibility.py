@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 import numpy as np
 
-from hilbo.search.feasibility import SEARCH_MARGIN, K0_of, K1_range, Mechanics, allowed, largest_K1, minimum_damping
+from hilbo.search.box import Mechanics
+from hilbo.search.feasibility import SEARCH_MARGIN, K0_of, K1_range, allowed, largest_K1, minimum_damping
 from hilbo.viscoelastic import FOSLS
 
 DAMPED = Mechanics(K_eff=0.44, damping=0.95, effective_damping=(10.0, 80.0))

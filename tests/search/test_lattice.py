@@ -11,17 +11,17 @@ import pytest
 from hilbo import acquisition
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.search import lattice
-from hilbo.search.feasibility import Mechanics
-from hilbo.search.space import Parameter, SearchSpace
+from hilbo.search.box import Mechanics, Parameter
+from hilbo.search.space import SearchSpace
 from hilbo.search.space_lattice import lattice_of
 
-K1, B1, ALPHA = Parameter("K1", 1, 32), Parameter("B1", 0.001, 32), Parameter("alpha", 0.01, 0.99)
+K1, B1, ALPHA = Parameter("K1", 1.0, 32.0), Parameter("B1", 0.001, 32.0), Parameter("alpha", 0.01, 0.99)
 SPACES = {
     "mechanics": SearchSpace((K1, B1, ALPHA), Mechanics(K_eff=0.44, damping=0.95)),
     "other order, damped": SearchSpace(
         (ALPHA, K1, B1), Mechanics(K_eff=0.44, damping=0.95, effective_damping=(10.0, 80.0))
     ),
-    "plane": SearchSpace((Parameter("a", 0, 1), Parameter("b", 0, 1))),
+    "plane": SearchSpace((Parameter("a", 0.0, 1.0), Parameter("b", 0.0, 1.0))),
 }
 SCORES = [acquisition.UCB(0.7), acquisition.LogEI(0.3), acquisition.TopCategory(0.5, 0.5), acquisition.Mean()]
 each_space = pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)

@@ -12,15 +12,18 @@ from scipy.stats import qmc
 
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
-from hilbo.search.feasibility import SEARCH_MARGIN, Mechanics
-from hilbo.search.space import Parameter, SearchSpace
+from hilbo.search.box import Mechanics, Parameter
+from hilbo.search.feasibility import SEARCH_MARGIN
+from hilbo.search.space import SearchSpace
 
-K1 = Parameter("K1", 1, 32, "N/mm")
-B1 = Parameter("B1", 0.001, 32, "N.s^alpha/mm")
+K1 = Parameter("K1", 1.0, 32.0, "N/mm")
+B1 = Parameter("B1", 0.001, 32.0, "N.s^alpha/mm")
 ALPHA = Parameter("alpha", 0.01, 0.99)
 PAPER = Mechanics(K_eff=0.44, damping=0.95)
-PLAIN = SearchSpace((Parameter("bitrate", 100, 20000, "kbit/s", "log"), Parameter("height", 144, 2160, "px", "log")))
-ORDERS = {"usual": (K1, B1, ALPHA), "other": (ALPHA, Parameter("friction", 0, 1), K1, B1)}
+PLAIN = SearchSpace(
+    (Parameter("bitrate", 100.0, 20000.0, "kbit/s", "log"), Parameter("height", 144.0, 2160.0, "px", "log"))
+)
+ORDERS = {"usual": (K1, B1, ALPHA), "other": (ALPHA, Parameter("friction", 0.0, 1.0), K1, B1)}
 units = st.floats(0, 1, allow_subnormal=False)  # XLA flushes these to 0
 
 
@@ -193,7 +196,7 @@ def test_wall_points_lie_on_every_wall_of_the_feasible_set(space):
 
 
 def test_walls_of_one_parameter_are_its_ends():
-    assert set(SearchSpace((Parameter("p", 0, 1),)).walls(8, seed=0).ravel()) == {0.0, 1.0}
+    assert set(SearchSpace((Parameter("p", 0.0, 1.0),)).walls(8, seed=0).ravel()) == {0.0, 1.0}
 
 
 @pytest.mark.parametrize("draw", ["candidates", "latin_hypercube"])
@@ -272,20 +275,20 @@ def test_a_damping_range_fills_evenly():
 @pytest.mark.parametrize(
     ("build", "sentence"),
     [
-        (lambda: Parameter("p", 2, 1), "parameters.p.low is 2.0, it must be below high = 1.0"),
-        (lambda: Parameter("p", 1, 1), "it must be below"),
-        (lambda: Parameter("p", 0, np.inf), "must be finite"),
-        (lambda: Parameter("p", 0, 1, scale="log"), "must be above 0"),
-        (lambda: Mechanics(K_eff=0.44, damping=0), "renderer.damping is 0.0"),
-        (lambda: Mechanics(K_eff=-0.1, damping=1), "renderer.K_eff is -0.1, it must be 0 or above"),
-        (lambda: Mechanics(K_eff=0.44, damping=1, N=100), "renderer.N is 100, it must be odd"),
-        (lambda: Mechanics(K_eff=0.44, damping=1, T=np.nan), "renderer.T is nan"),
-        (lambda: Mechanics(K_eff=0.44, damping=1, effective_damping=(80.0, 10.0)), "effective_damping is"),
+        (lambda: Parameter("p", 2.0, 1.0), "parameters.p.low is 2.0, it must be below high = 1.0"),
+        (lambda: Parameter("p", 1.0, 1.0), "it must be below"),
+        (lambda: Parameter("p", 0.0, np.inf), "must be finite"),
+        (lambda: Parameter("p", 0.0, 1.0, scale="log"), "must be above 0"),
+        (lambda: Mechanics(K_eff=0.44, damping=0.0), "renderer.damping is 0.0"),
+        (lambda: Mechanics(K_eff=-0.1, damping=1.0), "renderer.K_eff is -0.1, it must be 0 or above"),
+        (lambda: Mechanics(K_eff=0.44, damping=1.0, N=100), "renderer.N is 100, it must be odd"),
+        (lambda: Mechanics(K_eff=0.44, damping=1.0, T=np.nan), "renderer.T is nan"),
+        (lambda: Mechanics(K_eff=0.44, damping=1.0, effective_damping=(80.0, 10.0)), "effective_damping is"),
         (lambda: SearchSpace(()), "at least one"),
         (lambda: SearchSpace((K1, K1)), "twice"),
         (lambda: SearchSpace((K1, B1), PAPER), "parameters.alpha is missing"),
-        (lambda: SearchSpace((K1, Parameter("B1", 0, 32), ALPHA), PAPER), "parameters.B1.low is 0.0"),
-        (lambda: SearchSpace((K1, B1, Parameter("alpha", 0.01, 1)), PAPER), "parameters.alpha.high is 1.0"),
+        (lambda: SearchSpace((K1, Parameter("B1", 0.0, 32.0), ALPHA), PAPER), "parameters.B1.low is 0.0"),
+        (lambda: SearchSpace((K1, B1, Parameter("alpha", 0.01, 1.0)), PAPER), "parameters.alpha.high is 1.0"),
         (lambda: fosls(0.2), "renderer.damping is 0.2 N.s/m, with which no K1 from 1.0 N/mm up is passive"),
     ],
 )

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hilbo.errors import InputError
-from hilbo.study.config import Selection, Study
+from hilbo.study.config import Study
+from hilbo.study.study_tables import Selection
 
 GOOD = """\
 schema = 1

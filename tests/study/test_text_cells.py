@@ -135,7 +135,7 @@ def test_an_error_of_the_system_is_a_sentence(tmp_path, monkeypatch, capsys):
         raise OSError(28, "No space left on device", "/tmp/here")
 
     monkeypatch.setattr("pathlib.Path.read_bytes", full)
-    monkeypatch.setattr("hilbo.study.config.Study.load", staticmethod(full))
+    monkeypatch.setattr("hilbo.study.study_file.StudyFile.load", staticmethod(full))
     with pytest.raises(SystemExit) as stopped:
         main.main()
     err = capsys.readouterr().err

@@ -1,0 +1,55 @@
+"""What `hilbo passivity` says of one parameter set on a device: numbers, and a verdict in words."""
+
+import math
+from typing import Any
+
+from hilbo import passivity
+from hilbo.viscoelastic import FOSLS
+
+__all__ = ["passivity_result", "passivity_words"]
+
+
+def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
+    """Status and margin by certificate, binding frequency, largest K1, a witness."""
+    certificate = passivity.certify(model, b)
+    status, K_eff, largest = certificate.status, float(certificate.static_stiffness), None
+    if model.memory == "full" or model.N % 2 == 1:
+        place = (model.B1, model.alpha, b, K_eff, model.N, model.T)
+        largest = float(passivity.largest_K1(*place, memory=model.memory))
+    content: dict[str, Any] = {
+        "status": status,
+        "margin": [float(certificate.lower), float(certificate.upper)],
+        "minimum_damping": b - 0.5 * (float(certificate.lower) + float(certificate.upper)),
+        "damping": b,
+        "binding_frequency": float(certificate.frequency) / (2 * math.pi),
+        "largest_K1": None if largest is None or math.isinf(largest) else largest,
+        "every_K1": largest is not None and math.isinf(largest),
+        "set": {name: float(getattr(model, name)) for name in ("K0", "K1", "B1", "alpha")},
+        "K_eff": K_eff,
+        "memory": model.memory,
+        "N": model.N if model.memory == "short" else None,
+        "T": model.T,
+    }
+    if status == "violated" and (cycle := passivity.witness(model, b)) is not None:
+        content["witness"] = {"frequency": cycle.frequency / (2 * math.pi), "energy_per_cycle": cycle.energy}
+    return content
+
+
+def passivity_words(content: dict[str, Any]) -> str:
+    """The verdict in one or two sentences."""
+    K_eff, b = content["K_eff"], content["damping"]
+    if K_eff < 0:
+        return f"violated: the static stiffness H(1) = {K_eff:.4g} N/mm is negative, which no damping makes good."
+    margin = content["margin"][0] if content["margin"][0] > 0 else content["margin"][1]
+    words = (
+        f"{content['status']}: the device has {b:g} N·s/m, {abs(margin):.4g} {'more' if margin > 0 else 'less'} than"
+        f" the {content['minimum_damping']:.5g} N·s/m that the set needs; {content['binding_frequency']:.4g} Hz binds."
+    )
+    largest, cycle = content["largest_K1"], content.get("witness")
+    if largest is not None:
+        words += f" The largest passive K1 with this B1, α and K_eff = {K_eff:.4g} N/mm is {largest:.4g} N/mm."
+    elif content["every_K1"]:
+        words += " Every K1 is passive with this B1 and α."
+    if cycle is not None:
+        words += f" A cycle at {cycle['frequency']:.4g} Hz creates {-cycle['energy_per_cycle']:.3g} mJ."
+    return words

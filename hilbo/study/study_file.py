@@ -1,0 +1,193 @@
+"""A study file, read and checked: all that plans, logs, tables and devices need to know of a study. Loads no JAX.
+
+A study file is TOML (docs, "Study file"). Whatever is wrong becomes one `InputError`: `file:line: key.path is …, it
+must be …`. The hash is the first 16 hex digits of the SHA-256 of the parsed content as JSON, in the order of the
+schemas, with defaults left out: spelling a default out changes nothing, the order of the parameters does.
+"""
+
+import hashlib
+import json
+import os
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol, TypeVar, runtime_checkable
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.search.box import Box, Mechanics, Parameter
+from hilbo.study.fields import enclosing, lines_of, prefix
+from hilbo.study.protocols import SessionTable
+from hilbo.study.study_tables import Selection, Tables, box_of, check_together, of_material, read
+
+__all__ = ["AnyStudy", "StudyFile", "checked", "hash_of", "made_of_material", "materials_in", "read_study"]
+
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class StudyFile:
+    """What stands in a study file. `space` is the box of its parameters, of which a part may be passive."""
+
+    tables: Tables
+    space: Box
+    source: str
+    """The file that it came from."""
+
+    @staticmethod
+    def load(path: str | os.PathLike) -> "StudyFile":
+        """Read and check a study file; InputError says in one sentence what is wrong with it, and where."""
+        return read_study(path, _itself)
+
+    @property
+    def name(self) -> str:
+        """The study's name."""
+        return self.tables.study.name
+
+    @property
+    def responses(self) -> tuple[str, ...]:
+        """The answers, lowest first."""
+        return self.tables.study.responses
+
+    @property
+    def selection(self) -> Selection:
+        """How trials are chosen."""
+        return self.tables.selection
+
+    @property
+    def session(self) -> SessionTable:
+        """What is said of live sessions."""
+        return self.tables.session
+
+    @cached_property
+    def content(self) -> str:
+        """The parsed file as JSON."""
+        return json.dumps(msgspec.to_builtins(self.tables), ensure_ascii=False, separators=(",", ":"))
+
+    @property
+    def hash(self) -> str:
+        """Identifies the content."""
+        return hash_of(self.content)
+
+    @property
+    def materials(self) -> tuple[str, ...]:
+        """Names of the materials that override the renderer or the parameters."""
+        return materials_in(self.content)
+
+    def material(self, name: str) -> "StudyFile":
+        """The file as it is for one material: its overrides of [renderer] and [parameters] applied."""
+        return made_of_material(self.content, self.source, name, _itself)
+
+
+@runtime_checkable
+class _AnySpace(Protocol):
+    """The names and ranges of a space: of a `Box`, or of the `SearchSpace` that is in it."""
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]: ...
+
+    @property
+    def mechanics(self) -> Mechanics | None: ...
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+
+    @property
+    def dim(self) -> int: ...
+
+
+@runtime_checkable
+class AnyStudy(Protocol):
+    """What plans, logs and tables need of a study: a `StudyFile`, or the `Study` that was made of it."""
+
+    @property
+    def name(self) -> str: ...
+
+    @property
+    def responses(self) -> tuple[str, ...]: ...
+
+    @property
+    def space(self) -> _AnySpace: ...
+
+    @property
+    def selection(self) -> Selection: ...
+
+    @property
+    def session(self) -> SessionTable: ...
+
+    @property
+    def hash(self) -> str: ...
+
+    @property
+    def materials(self) -> tuple[str, ...]: ...
+
+    def material(self, name: str) -> "AnyStudy": ...
+
+
+def read_study(path: str | os.PathLike, made: Callable[[StudyFile], _T]) -> _T:
+    """What `made` makes of a study file, of that of each material too, to find mistakes now. InputError says in one
+    sentence what is wrong, with the file or for `made`, and where."""
+    source = str(path)
+    try:
+        text = Path(path).read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read ({error.strerror}), check the path.") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{source}: is not UTF-8 text, save it as UTF-8.") from error
+    try:
+        raw = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        reason, _, rest = str(error).partition(" (at line ")
+        line = rest.partition(",")[0]
+        place = f"{source}:{line or len(text.splitlines())}"
+        raise InputError(f"{place}: is not valid TOML ({reason}), mend that line.") from error
+    return checked(raw, source, made, text)
+
+
+def checked(raw: Mapping[str, Any], source: str, made: Callable[[StudyFile], _T], text: str = "") -> _T:
+    """As `read_study`, from the parsed tables; `text`: the file's, in which the line of a mistake is looked for."""
+    place = ""
+    try:
+        file = _file(raw, source)
+        whole = made(file)
+        for name in file.materials:
+            place = f"materials.{name}."
+            made(_file(of_material(raw, name), source))
+    except InputError as error:
+        lines = lines_of(text)
+        where = next((lines[key] for key in enclosing(place + str(error).split()[0], place) if key in lines), None)
+        raise InputError(f"{prefix(source, where)}{place}{error}") from None
+    return whole
+
+
+def hash_of(content: str) -> str:
+    """First 16 hex digits of the SHA-256 of a study's content."""
+    return hashlib.sha256(content.encode()).hexdigest()[:16]
+
+
+def materials_in(content: str) -> tuple[str, ...]:
+    """Names of the materials in a study's content."""
+    return tuple(json.loads(content).get("materials", {}))
+
+
+def made_of_material(content: str, source: str, name: str, made: Callable[[StudyFile], _T]) -> _T:
+    """What `made` makes of the study of one material, from the content of the whole one. Raises InputError."""
+    if name not in materials_in(content):
+        listed = ", ".join(materials_in(content)) or "there are none"
+        raise InputError(f"{prefix(source)}materials.{name} is not in the study, its materials: {listed}.")
+    return checked(of_material({"schema": 1} | json.loads(content), name), source, made)
+
+
+def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
+    """The file itself, without its materials' overrides."""
+    tables = read(raw)
+    file = StudyFile(tables, box_of(tables), source)
+    check_together(tables)
+    return file
+
+
+def _itself(file: StudyFile) -> StudyFile:
+    return file

@@ -1,0 +1,75 @@
+"""The file alone says of a study what the study itself says, and refuses the same mistakes in the same words."""
+
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+from hilbo.errors import InputError
+from hilbo.population.learnt import RECIPE
+from hilbo.population.maps import ALL_RULES
+from hilbo.study.config import Study
+from hilbo.study.study_file import AnyStudy, StudyFile
+from hilbo.study.study_tables import Rule
+
+DATA = Path("hilbo/data")
+GEL = "[materials.gel.renderer]\nK_eff = 0.2\n[materials.gel.parameters.K1]\nhigh = 16.0\n"
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text((DATA / "paper.toml").read_text() + GEL)
+    return path
+
+
+def said(study):
+    """All that plans, logs and tables ask of it."""
+    box = study.space.parameters, study.space.mechanics, study.space.names, study.space.dim
+    return study.name, study.responses, study.selection, study.session, study.hash, study.content, study.materials, box
+
+
+def test_a_file_says_what_the_study_says(path):
+    file, study = StudyFile.load(path), Study.load(path)
+    assert isinstance(file, AnyStudy) and isinstance(study, AnyStudy)
+    assert said(file) == said(study) and file.materials == ("gel",)
+    assert said(file.material("gel")) == said(study.material("gel"))
+    assert file.material("gel").space.mechanics.K_eff == 0.2 and file.material("gel").space.parameters[0].high == 16.0
+    assert said(Study.of(file)) == said(study)
+
+
+@pytest.mark.parametrize(
+    ("was", "wrong"),
+    [
+        ("theta = 30.0", 'theta = "long"'),
+        ("theta = 30.0", "theta = [1.0, 2.0]"),
+        ("[-0.5, 0.5]", "[0.5, -0.5]"),
+        ("noise = 0.5\n", ""),
+        ("trials = 25", "trials = 2"),
+        ("N = 101", "N = 100"),
+        ("K_eff = 0.2", "K_eff = -0.2"),
+        ("high = 16.0", "high = 0.5"),
+        ('rule = "bcm"', 'rule = "median"'),
+    ],
+)
+def test_both_refuse_the_same_in_the_same_words(path, was, wrong):
+    text = path.read_text()
+    assert was in text
+    path.write_text(text.replace(was, wrong))
+    sentences = []
+    for kind in (StudyFile, Study):
+        with pytest.raises(InputError) as error:
+            kind.load(path)
+        sentences.append(str(error.value))
+    assert sentences[0] == sentences[1] and sentences[0].startswith(f"{path}:")
+
+
+def test_what_has_to_be_computed_is_the_studys_to_refuse(path):
+    path.write_text(path.read_text().replace("damping = 0.95", "damping = 0.001"))
+    assert StudyFile.load(path).space.mechanics.damping == 0.001
+    with pytest.raises(InputError, match=r"study.toml:\d+: renderer.damping is 0.001 N.s/m, with which no K1"):
+        Study.load(path)
+
+
+def test_the_rules_are_those_of_the_population():
+    assert get_args(Rule) == ALL_RULES and RECIPE in get_args(Rule)
