@@ -34,13 +34,11 @@ def test_it_shows_and_drops_what_is_kept(tmp_path, capsys, monkeypatch):
     "command",
     [
         "aggregate hilbo/data/video_quality.csv --study hilbo/data/video_quality.toml --first 10",
-        "aggregate hilbo/data/video_quality.csv --study hilbo/data/video_quality.toml --first 10 --rule learnt-1",
-        "robustness hilbo/data/video_quality.csv --study hilbo/data/video_quality.toml",
-        "simulate --participants 3 --seed 4",
         "identify hilbo/data/memory_foam_simulated.csv --damping 0.95",
     ],
 )
 def test_results_are_the_same_bits_traced_made_and_kept(command, tmp_path):
+    """Compiles everything twice, so of the commands only these two."""
     contents = []
     for keep in (0, 1, 1):
         out = tmp_path / str(len(contents))
