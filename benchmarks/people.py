@@ -10,9 +10,9 @@ middle; the held-out answers are predicted where they were given. No answer is l
 but the randomised probability integral transform (seed 0).
 
 Hyperparameters maximise the evidence of the hierarchical model on the training people of each fold, noise 1 (the scale
-of f is free), and serve every rule. Beside the rules stand the training people's frequencies of the categories, and an
-ordinal probit that is quadratic in the two standardised parameters. Errors are clustered by person. --write puts the
-table into docs/people.md.
+of f is free), and serve every rule but learnt-1, which learns its own there. Beside the rules stand the training
+people's frequencies of the categories, and an ordinal probit that is quadratic in the two standardised parameters.
+Errors are clustered by person. --write puts the table into docs/people.md.
 """
 
 import argparse
@@ -27,11 +27,13 @@ from scipy.stats import norm
 
 jax.config.update("jax_enable_x64", True)
 
-from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit  # noqa: E402
+from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials  # noqa: E402
 from hilbo.population.baselines import constant, quadratic  # noqa: E402
 from hilbo.population.counts import Counts, fit_counts  # noqa: E402
 from hilbo.population.hierarchical_evidence import learn_people  # noqa: E402
+from hilbo.population.learnt import RECIPE, learn  # noqa: E402
 from hilbo.population.leave_one_out import clustered, integral_transform  # noqa: E402
+from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.population.pointwise import RULES, aggregate  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
@@ -56,6 +58,13 @@ class Data:
         counts = np.zeros((len(self.names), len(self.points), categories))
         np.add.at(counts, (self.who, self.place, q), 1.0)
         self.counts = Counts(jnp.asarray(self.points), jnp.asarray(counts))
+
+    def trials(self, people):
+        """Stacked answers of some people, at the points at which they count."""
+        each = [np.flatnonzero(self.who == person) for person in people]
+        longest = max(map(len, each))
+        stacked = [Trials.from_arrays(self.points[self.place[rows]], self.q[rows], longest) for rows in each]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
 
 
 def video(path, _):
@@ -116,7 +125,7 @@ def main():
     begun = time.perf_counter()
     everybody = learn_people(start(data), data.counts, max_steps=60)
     print(describe(everybody), flush=True)
-    chances, shares = {}, []
+    chances, shares, wide = {}, [], []
     for left in range(len(data.names)):
         mask = np.arange(len(data.names)) != left
         kept = jnp.asarray(mask[:, None, None] * 1.0)
@@ -129,18 +138,29 @@ def main():
         x = jnp.asarray(data.x[rows])
         found = predicted(learnt.gp, learnt.share, counts, None, jnp.asarray(mask), x)
         found = {rule: np.asarray(p)[: test.sum()] for rule, p in found.items()}
+        found[RECIPE], widths = by_learnt_1(data, np.flatnonzero(mask), data.x[test])
+        wide.append(widths)
         found["probit"] = quadratic(data.x, data.q, data.categories, ~test)[test]
         found["marginal"] = constant(data.q, data.categories, ~test)[test]
         for rule, p in found.items():
             chances.setdefault(rule, np.zeros((len(data.q), data.categories)))[test] = p
         print(data.names[left], f"{time.perf_counter() - begun:.0f} s, share {shares[-1]:.3f}", flush=True)
-    text = table(chosen, data, chances, everybody, shares)
+    text = table(chosen, data, chances, everybody, shares, wide)
     print(text)
     if chosen.write:
         path = ROOT / "docs" / "people.md"
         before, mark, rest = path.read_text(encoding="utf-8").partition(f"<!-- {chosen.data} -->\n")
         after = rest.partition("<!-- end -->")[2]
         path.write_text(f"{before}{mark}{text}<!-- end -->{after}", encoding="utf-8")
+
+
+def by_learnt_1(data, people, x):
+    """Class probabilities (n, C) of a new person at x, and whether people have widths of their own."""
+    trials = data.trials(people)
+    learnt = learn(trials, data.categories)
+    if not bool(learnt.converged):
+        print("learnt-1: the search did not end well", flush=True)
+    return np.asarray(learnt_map(learnt, trials).class_probabilities(learnt.model.gp.likelihood, x)), learnt.widths
 
 
 def describe(learnt):
@@ -152,7 +172,7 @@ def describe(learnt):
     )
 
 
-def table(chosen, data, chances, everybody, shares):
+def table(chosen, data, chances, everybody, shares, wide):
     n = np.arange(len(data.q))
     cost = {rule: -np.log(p[n, data.q]) for rule, p in chances.items()}
     order = sorted(cost, key=lambda rule: cost[rule].mean())
@@ -160,7 +180,8 @@ def table(chosen, data, chances, everybody, shares):
         f"Made by `python benchmarks/people.py {chosen.data} FILE --write`: {len(data.names)} people,"
         f" {len(data.q):,} answers, {len(data.points)} points.",
         describe(everybody),
-        f"Over the folds the share was between {min(shares):.3f} and {max(shares):.3f}.",
+        f"Over the folds the share was between {min(shares):.3f} and {max(shares):.3f}; learnt-1 took widths of"
+        f" people's own in {sum(wide)} of {len(wide)}.",
         "",
         "| rule | mean negative log density | less than the probit's by | within the central 95 % |",
         "|---|---:|---:|---:|",

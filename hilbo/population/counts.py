@@ -17,6 +17,7 @@ arrived. The evidence has exact first derivatives: a last step from the mode, wh
 is 0 there. Reference: Rasmussen & Williams (2006), sections 3.4 and 5.5.1.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -31,6 +32,7 @@ from hilbo.kernels import RBF, gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
+from hilbo.population.tallies import Expansion, expand_counts
 
 __all__ = ["Counts", "counts_of", "evidence", "fit_counts", "one_person"]
 
@@ -80,7 +82,7 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
     """
     covariance = gram(gp.kernel, answers.x, answers.x)
     mode, residual, steps = _mode(gp.likelihood, share, covariance, answers.counts)
-    system = _system(share, covariance, _expand(gp.likelihood, answers.counts, mode.eta)[2])
+    system = _system(share, covariance, _expand(gp.likelihood, answers.counts, mode.eta).curvature)
     weights, shared = jnp.sum(mode.weights, axis=0), share * covariance
     prior, explained = jnp.diagonal(shared), jnp.sum((system.factor @ shared) ** 2, axis=0)
     smallest, largest = jnp.min(prior - explained), jnp.max(jnp.diagonal(covariance))
@@ -89,7 +91,7 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
     tolerance = _tolerance(gp.likelihood, share, covariance, answers.counts, mode)
     # One step more would change the evidence by so much; what is left is of the size of that change or smaller.
     last = _newton_step(gp.likelihood, share, covariance, answers.counts, mode)
-    beyond = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta)[2])
+    beyond = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta).curvature)
     error = jnp.abs(_log_evidence(gp.likelihood, answers.counts, last, beyond) - value)
     every = jnp.concatenate([share**0.5 * weights[None, :], (1.0 - share) ** 0.5 * mode.weights])
     rounding = evidence_rounding(covariance, every)
@@ -122,7 +124,7 @@ def evidence(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> tuple[F
     mode, residual, _ = _mode(*fixed, answers.counts)
     mode = jax.lax.stop_gradient(mode)
     last = _newton_step(gp.likelihood, share, covariance, answers.counts, mode)
-    system = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta)[2])
+    system = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta).curvature)
     arrived = residual <= _tolerance(*fixed, answers.counts, mode)
     return _log_evidence(gp.likelihood, answers.counts, last, system), arrived
 
@@ -157,9 +159,8 @@ def _tolerance(
 ) -> Float[Array, ""]:
     """eps^(2/3), or the rounding error of the residual where that is larger, as in `laplace`."""
     epsilon = jnp.finfo(covariance.dtype).eps
-    _, slope, curvature = _expand(likelihood, counts, state.eta)
-    size = jnp.abs(state.weights)
-    summed = jnp.abs(slope) + curvature * _latent(share, jnp.abs(covariance), size) + size
+    terms, size = _expand(likelihood, counts, state.eta), jnp.abs(state.weights)
+    summed = terms.slopes + terms.curvature * _latent(share, jnp.abs(covariance), size) + size
     rounding = jnp.linalg.norm(summed) * jnp.linalg.norm(_latent(share, covariance, summed))
     return jnp.clip(4.0 * epsilon * jnp.sqrt(rounding), epsilon ** (2 / 3), epsilon**0.25)
 
@@ -179,7 +180,7 @@ def _mode(
     start = jnp.zeros(counts.shape[:2], covariance.dtype)
 
     def residual_of(state):
-        off = _expand(likelihood, counts, state.eta)[1] - state.weights
+        off = _expand(likelihood, counts, state.eta).slope - state.weights
         return jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(_latent(share, covariance, off)))
 
     def forward(carry):
@@ -205,9 +206,9 @@ def _newton_step(
 ) -> _State:
     """a <- a + (I + W K)^-1 r, r = slope - a, of all people by way of g: an error of the step is one of r's size."""
     eta = _latent(share, covariance, state.weights)  # not state.eta: derivatives come through here
-    _, slope, curvature = _expand(likelihood, counts, eta)
-    system = _system(share, covariance, curvature)
-    off = slope - state.weights
+    terms = _expand(likelihood, counts, eta)
+    system = _system(share, covariance, terms.curvature)
+    off = terms.slope - state.weights
     person_terms = _solve_people(system, _latent(share, covariance, off))
     # (S + (p K)^-1)^-1 s = p K L (I + p L'K L)^-1 L^-1 s: nothing is subtracted
     solve = jax.scipy.linalg.solve_triangular
@@ -227,7 +228,7 @@ def _damped(likelihood: OrdinalProbit, counts: Float[Array, "M m C"], state: _St
 
     def height_at(scale):
         between = jax.tree.map(lambda a, b: a + scale * (b - a), state, full)
-        value = jnp.sum(_expand(likelihood, counts, between.eta)[0])
+        value = jnp.sum(_expand(likelihood, counts, between.eta).value)
         return value - 0.5 * jnp.sum(between.weights * between.eta), jnp.abs(value)
 
     heights, sizes = jax.vmap(height_at)(scales)
@@ -272,22 +273,16 @@ def _system(share: Float[Array, ""], covariance: Float[Array, "m m"], curvature:
     return _System(person_factors, root, sum_root, asked, lower, factor, log_determinant, jnp.linalg.norm(matrix))
 
 
-def _expand(
-    likelihood: OrdinalProbit, counts: Float[Array, "M m C"], eta: Float[Array, "M m"]
-) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, "M m"]]:
+def _expand(likelihood: OrdinalProbit, counts: Float[Array, "M m C"], eta: Float[Array, "M m"]) -> Expansion:
     """Sums of log-likelihood terms, slopes and curvatures at everybody's latent values (M, m)."""
 
-    def expand_point(f, count):
-        parts = jax.vmap(lambda q: jnp.stack(likelihood.expand(f, q)))(jnp.arange(count.shape[0]))
-        return jnp.sum(jnp.where(count[:, None] > 0, count[:, None] * parts, 0.0), axis=0)
-
-    parts = jax.vmap(jax.vmap(expand_point))(eta, counts)
-    return parts[..., 0], parts[..., 1], parts[..., 2]
+    one = partial(expand_counts, likelihood)
+    return jax.vmap(jax.vmap(one))(eta, counts)
 
 
 def _log_evidence(
     likelihood: OrdinalProbit, counts: Float[Array, "M m C"], state: _State, system: _System
 ) -> Float[Array, ""]:
     """Laplace's approximation: log likelihood and log prior at the mode, less half of log|I + K_all W|."""
-    values = _expand(likelihood, counts, state.eta)[0]
+    values = _expand(likelihood, counts, state.eta).value
     return jnp.sum(values) - 0.5 * jnp.sum(state.weights * state.eta) - 0.5 * system.log_determinant

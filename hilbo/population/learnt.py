@@ -27,7 +27,9 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
-from hilbo.population.low_rank import PeopleModel, rank_for, shared_evidence, shared_function
+from hilbo.population.low_rank import PeopleModel, shared_evidence, shared_function
+from hilbo.population.shared_features import rank_for
+from hilbo.population.tallies import Tallies, tallied
 
 __all__ = [
     "NOTHING",
@@ -87,7 +89,7 @@ class Learnt(eqx.Module):
 
     model: PeopleModel
     weights: Float[Array, "M n"]
-    """Near which the posterior's mode is."""
+    """Near which the posterior's mode is; one for each point that a person was asked at (`tallied`)."""
     log_evidence: Float[Array, ""]
     coordinates: Coordinates
     """Logarithms in units of the noise, and the middle of the thresholds, as in the priors."""
@@ -109,15 +111,14 @@ class Learnt(eqx.Module):
 
 def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
     """One person's model before any answer: what is stated, and the medians of the priors."""
-    nobody = Trials.empty(1, dim)
-    stacked = jax.tree.map(lambda leaf: leaf[None], nobody)
-    return _model(_medians(stacked, categories, stated, PRIORS), stacked, stated).gp
+    nobody = Tallies(jnp.zeros((1, 1, dim)), jnp.zeros((1, 1, categories)))
+    return _model(_medians(nobody, stated, PRIORS), nobody, stated).gp
 
 
 def learnt_function(learnt: Learnt, trials: Trials) -> Posterior:
     """The posterior of the shared function by learnt hyperparameters, from stacked trials (M, n)."""
-    rank = rank_for(learnt.model.theta, trials)
-    return shared_function(learnt.model, trials, learnt.weights, rank)
+    answers = tallied(trials, learnt.model.thresholds.size + 1)
+    return shared_function(learnt.model, answers, learnt.weights, rank_for(learnt.model.theta, answers))
 
 
 def learn(
@@ -134,12 +135,13 @@ def learn(
     """
     if not np.asarray(trials.mask).any():
         raise InputError("learnt-1: nobody gave an answer; at least one person's answers are needed.")
-    start = _medians(trials, categories, stated, priors)
+    answers = tallied(trials, categories)
+    start = _medians(answers, stated, priors)
     common = frozenset(start) - {"widths"}
     if near is not None:
         start |= {name: near.coordinates[name] for name in common}
-    problem = _Problem(trials, stated, priors, 0)
-    alike = _Search(start, jnp.zeros(trials.q.shape, trials.x.dtype), 0, True)
+    problem = _Problem(answers, stated, priors, 0)
+    alike = _Search(start, answers.blank, 0, True)
     alike, problem = _searched(alike, problem, common)
     chosen, free, gain = alike, common, 0.0
     if "widths" in start:
@@ -149,7 +151,7 @@ def learn(
             chosen, free, problem = different, frozenset(start), wider
     end = _cost(chosen.coordinates, chosen.weights, problem)
     return Learnt(
-        model=_model(chosen.coordinates, trials, stated),
+        model=_model(chosen.coordinates, answers, stated),
         weights=end.weights,
         log_evidence=end.log_evidence,
         coordinates={name: value for name, value in chosen.coordinates.items() if name in free},
@@ -165,7 +167,7 @@ def learn(
 class _Problem(eqx.Module):
     """What is given of a search."""
 
-    trials: Trials
+    answers: Tallies
     stated: Stated = eqx.field(static=True)
     priors: Mapping[str, Prior]
     rank: int = eqx.field(static=True)
@@ -204,8 +206,8 @@ def _searched(search: _Search, problem: _Problem, free: Set[str]) -> tuple[_Sear
 
 
 def _with_features(search: _Search, problem: _Problem) -> _Problem:
-    theta = _model(search.coordinates, problem.trials, problem.stated).theta
-    needed = min(rank_for(theta, problem.trials, _LEFT), _LARGEST)
+    theta = _model(search.coordinates, problem.answers, problem.stated).theta
+    needed = min(rank_for(theta, problem.answers, _LEFT), _LARGEST)
     return dataclasses.replace(problem, rank=max(problem.rank, needed))
 
 
@@ -248,8 +250,8 @@ def _gain_of_widths(alike: _Search, different: _Search, problem: _Problem) -> fl
 @program
 def _cost(coordinates: Coordinates, start: Float[Array, "M n"], problem: _Problem) -> _Cost:
     def value(coordinates):
-        model = _model(coordinates, problem.trials, problem.stated)
-        evidence = shared_evidence(model, problem.trials, start, problem.rank, _LEFT)
+        model = _model(coordinates, problem.answers, problem.stated)
+        evidence = shared_evidence(model, problem.answers, start, problem.rank, _LEFT)
         return -evidence.value - _log_prior(coordinates, problem), evidence
 
     (cost, evidence), gradient = jax.value_and_grad(value, has_aux=True)(coordinates)
@@ -257,16 +259,16 @@ def _cost(coordinates: Coordinates, start: Float[Array, "M n"], problem: _Proble
     return _Cost(cost, gradient, evidence.value, evidence.weights, evidence.arrived & finite, evidence.left)
 
 
-def _medians(trials: Trials, categories: int, stated: Stated, priors: Mapping[str, Prior]) -> Coordinates:
+def _medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior]) -> Coordinates:
     """Where the search begins: the medians of what is learnt."""
-    dtype, d = trials.x.dtype, trials.x.shape[-1]
+    (people, _, d), categories, dtype = answers.x.shape, answers.counts.shape[-1], answers.x.dtype
     every = {
         "theta": jnp.full(d, priors["theta"].mean - np.log(d), dtype),
         "shared": jnp.asarray(priors["shared"].mean, dtype),
         "own": jnp.asarray(priors["own"].mean, dtype),
         "middle": jnp.asarray(priors["middle"].mean, dtype),
         "gaps": jnp.full(categories - 2, priors["gaps"].mean, dtype),
-        "widths": jnp.full(trials.mask.shape[0], priors["widths"].mean, dtype),
+        "widths": jnp.full(people, priors["widths"].mean, dtype),
     }
     kept = {"theta"} if stated.theta is not None else set()
     kept |= {"middle", "gaps"} if stated.thresholds is not None else set()
@@ -274,9 +276,9 @@ def _medians(trials: Trials, categories: int, stated: Stated, priors: Mapping[st
     return {name: value for name, value in every.items() if name not in kept and value.size}
 
 
-def _model(coordinates: Coordinates, trials: Trials, stated: Stated) -> PeopleModel:
+def _model(coordinates: Coordinates, answers: Tallies, stated: Stated) -> PeopleModel:
     """The hyperparameters at some coordinates, in units of the stated noise, or variance, or else of a noise of 1."""
-    dtype, people = trials.x.dtype, trials.mask.shape[0]
+    (people, _, d), dtype = answers.x.shape, answers.x.dtype
     shared, own = jnp.exp(coordinates["shared"]), jnp.exp(coordinates["own"])
     noise = jnp.asarray(1.0 if stated.noise is None else stated.noise, dtype)
     if stated.variance is not None:
@@ -288,7 +290,7 @@ def _model(coordinates: Coordinates, trials: Trials, stated: Stated) -> PeopleMo
     if stated.theta is None:
         theta = jnp.exp(coordinates["theta"])
     else:
-        theta = jnp.broadcast_to(jnp.asarray(stated.theta, dtype), trials.x.shape[-1:])
+        theta = jnp.broadcast_to(jnp.asarray(stated.theta, dtype), (d,))
     if stated.thresholds is None:
         gaps = jnp.exp(coordinates["gaps"]) if "gaps" in coordinates else jnp.zeros(0, dtype)
         edges = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(gaps)])
@@ -300,8 +302,8 @@ def _model(coordinates: Coordinates, trials: Trials, stated: Stated) -> PeopleMo
 
 def _log_prior(coordinates: Coordinates, problem: _Problem) -> Float[Array, ""]:
     """Up to a constant."""
-    d = problem.trials.x.shape[-1]
-    total = jnp.zeros((), problem.trials.x.dtype)
+    d = problem.answers.x.shape[-1]
+    total = jnp.zeros((), problem.answers.x.dtype)
     for name, value in coordinates.items():
         mean, sd = problem.priors[name]
         total -= 0.5 * jnp.sum(((value - mean + (jnp.log(d) if name == "theta" else 0.0)) / sd) ** 2)

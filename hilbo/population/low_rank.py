@@ -19,12 +19,12 @@ a last step from the mode, whose derivative in its start is 0 there. References:
 (2012), Applied Numerical Mathematics 62:428, for the factorisation.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
@@ -34,20 +34,17 @@ from hilbo.kernels import RBF, gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.tracing import program
-from hilbo.ordinal_gp import OrdinalGP, OrdinalTerms, Posterior, Trials
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
+from hilbo.population.shared_features import TOLERANCE, Pivots, features_of, pivots_of, root_of_pivots
+from hilbo.population.tallies import Expansion, Tallies, expand_counts
 
 __all__ = [
-    "TOLERANCE",
     "PeopleModel",
     "SharedEvidence",
-    "rank_for",
     "shared_evidence",
     "shared_function",
 ]
 
-TOLERANCE = 1e-6
-"""Largest part of the prior variance of g that the features may leave at an answered point."""
-_RANKS = (32, 64, 128, 256, 512, 1024)
 _STEPS, _HALVINGS = 60, 40
 
 
@@ -82,69 +79,6 @@ class PeopleModel(eqx.Module):
         return middle + jnp.exp(self.log_widths)[:, None] * (self.thresholds - middle)[None, :]
 
 
-# --- features of the shared function
-
-
-class Pivots(NamedTuple):
-    """Answered points from which the shared function is known."""
-
-    points: Float[Array, "r d"]
-    used: Bool[Array, " r"]
-    left: Float[Array, ""]
-    """Largest part of the prior variance of g, at an answered point, that they do not explain."""
-
-
-def _pivots(theta: Float[Array, " d"], trials: Trials, rank: int, tolerance: ArrayLike) -> Pivots:
-    """At most `rank` of the points of stacked trials (M, n), each where the ones before explain least."""
-    x = trials.x.reshape(-1, trials.x.shape[-1])
-    kernel = RBF(theta, jnp.ones_like(theta[0]))
-    start = trials.mask.reshape(-1).astype(x.dtype)
-
-    def going(state):
-        count, _, left, _ = state
-        return (count < rank) & (jnp.max(left) > tolerance)
-
-    def choose(state):
-        count, rows, left, chosen = state
-        place = jnp.argmax(left)
-        column = jax.vmap(lambda y: kernel(x[place], y))(x)
-        row = (column - rows[:, place] @ rows) / jnp.sqrt(left[place])
-        return count + 1, rows.at[count].set(row), (left - row**2).at[place].set(0.0), chosen.at[count].set(place)
-
-    begin = (jnp.asarray(0), jnp.zeros((rank, x.shape[0]), x.dtype), start, jnp.zeros(rank, int))
-    count, _, left, chosen = jax.lax.while_loop(going, choose, begin)
-    return Pivots(x[chosen], jnp.arange(rank) < count, jnp.max(left))
-
-
-@program
-def _unexplained(theta: Float[Array, " d"], trials: Trials, rank: int, tolerance: ArrayLike) -> Float[Array, ""]:
-    return _pivots(theta, trials, rank, tolerance).left
-
-
-def rank_for(theta: Float[Array, " d"], trials: Trials, tolerance: float = TOLERANCE) -> int:
-    """The number of features, from a short list, that g takes at these lengths; all points, or the largest, at most."""
-    answers = int(np.asarray(trials.mask).sum())
-    for rank in _RANKS:
-        if rank >= answers or float(_unexplained(theta, trials, rank, tolerance)) <= tolerance:
-            return rank
-    return _RANKS[-1]
-
-
-def _root_of_pivots(theta: Float[Array, " d"], pivots: Pivots) -> Float[Array, "r r"]:
-    """L, with ones on the diagonal in place of pivots that are not used."""
-    both = pivots.used[:, None] & pivots.used[None, :]
-    covariance = gram(RBF(theta, jnp.ones_like(theta[0])), pivots.points, pivots.points)
-    return jnp.linalg.cholesky(jnp.where(both, covariance, jnp.eye(len(pivots.used), dtype=covariance.dtype)))
-
-
-def _features(theta: Float[Array, " d"], pivots: Pivots, x: Float[Array, "M n d"]) -> Float[Array, "M n r"]:
-    """phi(x)' of everybody's points."""
-    cross = gram(RBF(theta, jnp.ones_like(theta[0])), pivots.points, x.reshape(-1, x.shape[-1]))
-    cross = jnp.where(pivots.used[:, None], cross, 0.0)
-    solved = solve_triangular(_root_of_pivots(theta, pivots), cross, lower=True)
-    return solved.T.reshape(*x.shape[:2], -1)
-
-
 # --- the prior, and what answers make of it
 
 
@@ -176,8 +110,8 @@ class _System(NamedTuple):
         return self.root * jax.lax.map(lambda p: solve_triangular(p[0], p[1], lower=True, trans=1), (self.lower, rest))
 
 
-def _prior(model: PeopleModel, trials: Trials, pivots: Pivots) -> _Prior:
-    unit = _features(model.theta, pivots, trials.x)
+def _prior(model: PeopleModel, answers: Tallies, pivots: Pivots) -> _Prior:
+    unit = features_of(model.theta, pivots, answers.x)
     kernel = RBF(model.theta, jnp.ones_like(model.shared))
 
     def block(person):
@@ -185,7 +119,7 @@ def _prior(model: PeopleModel, trials: Trials, pivots: Pivots) -> _Prior:
         covariance = gram(kernel, x, x)
         return model.own * covariance + model.shared * (covariance - own_features @ own_features.T)
 
-    return _Prior(jnp.sqrt(model.shared) * unit, jax.lax.map(block, (trials.x, unit)))
+    return _Prior(jnp.sqrt(model.shared) * unit, jax.lax.map(block, (answers.x, unit)))
 
 
 def _system(prior: _Prior, curvature: Float[Array, "M n"]) -> _System:
@@ -205,15 +139,13 @@ def _system(prior: _Prior, curvature: Float[Array, "M n"]) -> _System:
     return _System(root, lower, half, precision, factor, 2.0 * logs)
 
 
-def _expand(
-    model: PeopleModel, trials: Trials, eta: Float[Array, "M n"]
-) -> tuple[Float[Array, "M n"], Float[Array, "M n"], Float[Array, "M n"]]:
+def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> Expansion:
     """Log-likelihood terms, slopes and curvatures of everybody's answers."""
 
-    def person(thresholds, q, mask, eta):
-        return OrdinalTerms(OrdinalProbit(thresholds, model.noise), q, mask)(eta)
+    def person(thresholds, counts, eta):
+        return jax.vmap(partial(expand_counts, OrdinalProbit(thresholds, model.noise)))(eta, counts)
 
-    return jax.vmap(person)(model.person_thresholds, trials.q, trials.mask, eta)
+    return jax.vmap(person)(model.person_thresholds, answers.counts, eta)
 
 
 # --- the mode
@@ -227,25 +159,26 @@ class _Mode(NamedTuple):
 
 
 def _newton_step(
-    model: PeopleModel, trials: Trials, prior: _Prior, weights: Float[Array, "M n"]
+    model: PeopleModel, answers: Tallies, prior: _Prior, weights: Float[Array, "M n"]
 ) -> tuple[Float[Array, "M n"], _System]:
     """a + r - (K + W^-1)^-1 K r, r = slope - a: an error of the step is one of r's size."""
-    _, slope, curvature = _expand(model, trials, prior.times(weights))
-    system = _system(prior, curvature)
-    off = slope - weights
+    terms = _expand(model, answers, prior.times(weights))
+    system = _system(prior, terms.curvature)
+    off = terms.slope - weights
     return weights + off - system.solve(prior.times(off)), system
 
 
-def _mode(model: PeopleModel, trials: Trials, prior: _Prior, start: Float[Array, "M n"]) -> _Mode:
+def _mode(model: PeopleModel, answers: Tallies, prior: _Prior, start: Float[Array, "M n"]) -> _Mode:
     """Newton's steps on the weights, from `start`; the residual is that of `laplace`."""
     epsilon = jnp.finfo(start.dtype).eps
+    sizes = jax.tree.map(jnp.abs, prior)  # the latent values are sums whose terms may cancel
 
     def height(weights):
         eta = prior.times(weights)
-        values, slope, curvature = _expand(model, trials, eta)
-        value, size = jnp.sum(values) - 0.5 * jnp.sum(weights * eta), jnp.sum(jnp.abs(values))
-        off = slope - weights
-        summed = jnp.abs(slope) + curvature * jnp.abs(eta) + jnp.abs(weights)
+        terms = _expand(model, answers, eta)
+        value, size = jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta), jnp.sum(jnp.abs(terms.value))
+        off = terms.slope - weights
+        summed = terms.slopes + terms.curvature * sizes.times(jnp.abs(weights)) + jnp.abs(weights)
         residual, rounding = (
             jnp.sqrt(jnp.linalg.norm(vector) * jnp.linalg.norm(prior.times(vector))) for vector in (off, summed)
         )
@@ -258,7 +191,7 @@ def _mode(model: PeopleModel, trials: Trials, prior: _Prior, start: Float[Array,
 
     def forward(state):
         weights, (value, size, _, _), steps, _ = state
-        full, _ = _newton_step(model, trials, prior, weights)
+        full, _ = _newton_step(model, answers, prior, weights)
 
         def lower(trial):
             scale, (reached, _, _, _) = trial
@@ -292,26 +225,26 @@ class SharedEvidence(NamedTuple):
 
 
 def shared_evidence(
-    model: PeopleModel, trials: Trials, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
+    model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
 ) -> SharedEvidence:
-    """Log evidence of stacked trials (M, n), differentiable once in `model`.
+    """Log evidence of all answers, differentiable once in `model`.
 
     **Arguments:** `start`: weights near which the mode is sought; `rank`: features of g, at most; `tolerance`: of g's
     prior variance, the part that they may leave.
     """
     still = jax.lax.stop_gradient
-    pivots = _pivots(still(model.theta), trials, rank, tolerance)
-    prior = _prior(model, trials, pivots)
-    mode = still(_mode(still(model), trials, still(prior), start))
-    weights, _ = _newton_step(model, trials, prior, mode.weights)
-    value, _ = _value(model, trials, prior, weights)
+    pivots = pivots_of(still(model.theta), answers, rank, tolerance)
+    prior = _prior(model, answers, pivots)
+    mode = still(_mode(still(model), answers, still(prior), start))
+    weights, _ = _newton_step(model, answers, prior, mode.weights)
+    value, _ = _value(model, answers, prior, weights)
     arrived = (mode.residual <= mode.tolerance) & jnp.isfinite(value)
     return SharedEvidence(value, mode.weights, arrived, pivots.left)
 
 
 @program
 def shared_function(
-    model: PeopleModel, trials: Trials, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
+    model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
 ) -> Posterior:
     """Posterior of the shared function g, as a GP of its prior that was asked at the pivots; arguments as above.
 
@@ -319,15 +252,15 @@ def shared_function(
     k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Never raises: read
     `certificate.converged`.
     """
-    pivots = _pivots(model.theta, trials, rank, tolerance)
-    prior = _prior(model, trials, pivots)
-    mode = _mode(model, trials, prior, start)
-    value, system = _value(model, trials, prior, mode.weights)
+    pivots = pivots_of(model.theta, answers, rank, tolerance)
+    prior = _prior(model, answers, pivots)
+    mode = _mode(model, answers, prior, start)
+    value, system = _value(model, answers, prior, mode.weights)
     # One step more changes the evidence by what is left of the way, or more.
-    further, _ = _newton_step(model, trials, prior, mode.weights)
-    error = jnp.abs(_value(model, trials, prior, further)[0] - value)
+    further, _ = _newton_step(model, answers, prior, mode.weights)
+    error = jnp.abs(_value(model, answers, prior, further)[0] - value)
 
-    root = jnp.sqrt(model.shared) * _root_of_pivots(model.theta, pivots)
+    root = jnp.sqrt(model.shared) * root_of_pivots(model.theta, pivots)
     together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
     weights = jnp.where(pivots.used, solve_triangular(root, together, lower=True, trans=1), 0.0)
     excess, vectors = eigh(system.precision - jnp.eye(root.shape[0], dtype=root.dtype))
@@ -339,7 +272,7 @@ def shared_function(
     covariance = gram(kernel, pivots.points, pivots.points)
     smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
     resolution = jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5
-    rounding = _rounding(model, trials, mode.weights, covariance, weights)
+    rounding = _rounding(model, answers, mode.weights, covariance, weights)
     known_well = evidence_known(value, error, rounding) & (smallest >= resolution)
     certificate = Certificate(
         residual=mode.residual,
@@ -360,23 +293,23 @@ def shared_function(
 
 
 def _value(
-    model: PeopleModel, trials: Trials, prior: _Prior, weights: Float[Array, "M n"]
+    model: PeopleModel, answers: Tallies, prior: _Prior, weights: Float[Array, "M n"]
 ) -> tuple[Float[Array, ""], _System]:
     """The log evidence at some weights, and the system there."""
     eta = prior.times(weights)
-    values, _, curvature = _expand(model, trials, eta)
-    system = _system(prior, curvature)
-    return jnp.sum(values) - 0.5 * jnp.sum(weights * eta) - 0.5 * system.log_determinant, system
+    terms = _expand(model, answers, eta)
+    system = _system(prior, terms.curvature)
+    return jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta) - 0.5 * system.log_determinant, system
 
 
 def _rounding(
     model: PeopleModel,
-    trials: Trials,
+    answers: Tallies,
     weights: Float[Array, "M n"],
     covariance: Float[Array, "r r"],
     of_pivots: Float[Array, " r"],
 ) -> Float[Array, ""]:
     """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
     kernel = RBF(model.theta, model.own)
-    each = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (trials.x, weights))
+    each = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (answers.x, weights))
     return jnp.linalg.norm(each) + evidence_rounding(covariance, of_pivots[None, :])

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, as_json, json_lines, people_of
 from hilbo.search.rendering import K0_range, margin_of, set_of
-from hilbo.study.aggregate import Aggregate, Optimum, nrmse, other_inference
+from hilbo.study.aggregate import Aggregate, Optimum, asked_variance, nrmse, other_inference
 from hilbo.study.analysis import Population
 from hilbo.study.batch_optimum import Merged
 from hilbo.study.config import Study
@@ -31,7 +31,7 @@ from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
 from hilbo.study.learnt_study import learnt_content, learnt_sentences
 from hilbo.study.map_file import write_map
 from hilbo.study.model_check import check_sentences, model_check
-from hilbo.study.optimum_location import location_sentences
+from hilbo.study.optimum_location import location_notes, location_sentences
 from hilbo.study.optimum_region import optimum_region, region_content, region_sentences
 from hilbo.study.typed_files import sealed
 
@@ -91,9 +91,12 @@ def result(
     people = people_of(study, aggregate) if people is None else people
     best, mean = aggregate.optimum, aggregate.mean_of_optima
     content = {
-        "optimum": optimum_content(study, best),
+        "optimum": optimum_content(study, best) | {"location": _location(study, aggregate, study.rule, best)},
         "participants": people if isinstance(aggregate, Merged) else list(people.entries()),
-        "alternatives": {name: optimum_content(study, optimum) for name, optimum in aggregate.alternatives.items()},
+        "alternatives": {
+            name: optimum_content(study, optimum) | {"location": _location(study, aggregate, name, optimum)}
+            for name, optimum in aggregate.alternatives.items()
+        },
         "mean_of_optima": None
         if mean is None
         else {"parameters": set_of(study.space, mean), "passivity_margin": margin_of(study.space, mean)},
@@ -120,6 +123,13 @@ def result(
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content
+
+
+def _location(study: Study, aggregate: Aggregate | Merged, name: str, optimum: Optimum) -> list[str]:
+    """What is to be known of where an optimum lies, by the map of its own that `name` says."""
+    map_ = None if isinstance(aggregate, Merged) else aggregate.maps.get(name)
+    asked = None if isinstance(aggregate, Merged) or map_ is None else asked_variance(map_, aggregate.cohort)
+    return location_notes(study, optimum.x, optimum.sd, asked)
 
 
 def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> dict[str, Any]:
@@ -219,8 +229,11 @@ def save_figures(figures: Mapping[str, Any], folder: Path) -> Pictures:
 
 def optima_table(content: dict[str, Any], people: People) -> pd.DataFrame:
     """What optima.csv holds: the population's, the alternatives' and everybody's own."""
-    rows = [{"source": "aggregate"} | content["optimum"]["parameters"]]
-    rows += [{"source": name} | optimum["parameters"] for name, optimum in content["alternatives"].items()]
+    claims = {"aggregate": content["optimum"]} | content["alternatives"]
+    rows = [
+        {"source": name} | claim["parameters"] | {"location": "; ".join(claim["location"])}
+        for name, claim in claims.items()
+    ]
     return pd.concat([pd.DataFrame(rows), people.table()])
 
 

@@ -65,6 +65,8 @@ class Population(eqx.Module):
     noise: float = eqx.field(static=True)
     lapse: float = eqx.field(static=True)
     drift_sd: float = eqx.field(static=True)
+    contrast: float = eqx.field(static=True, default=0.0)
+    """In a validation: how much of the difference of two renderings, as they are felt side by side, is added to it."""
 
 
 _PAPER = Population(

@@ -1,9 +1,10 @@
 """Simulated validation sessions: people who compare renderings of which they perceive the dissimilarity.
 
 New people are drawn from the population of a simulated study. Shown two renderings, a person perceives how unlike each
-is (`simulate.Person`), puts each in the class whose criterion it stays below, and prefers the smaller; with
-probability `lapse` each of the three answers is a guess. As in the paper, every pair of best, mid and worst is compared
-four times by everybody, and every individual's set twice with the aggregate's by each of a few judges.
+is (`simulate.Person`) and prefers the smaller. Side by side the two seem to differ more than they do: the population's
+`contrast` times the difference is added. Each is then put in the class whose criterion it stays below. With probability
+`lapse` each of the three answers is a guess. As in the paper, every pair of best, mid and worst is compared four times
+by everybody, and every individual's set twice with the aggregate's by each of a few judges.
 """
 
 from itertools import combinations
@@ -59,7 +60,7 @@ def validation_table(
         name = f"{'N' if model else 'J'}{person + 1 if model else person + 1 - participants:02d}"
         for trial, i in enumerate(rng.permutation(len(asked))):
             a, b = asked[i] if rng.random() < 0.5 else asked[i][::-1]
-            classes, preferred = _answer(study, crowd, person, x[a], x[b], rng)
+            classes, preferred = _answer(study, crowd, person, x[a], x[b], population.contrast, rng)
             first = {"participant": name, "session": "model" if model else "aggregate-best", "trial": trial + 1}
             shown = {"class_a": classes[0], "class_b": classes[1]} if model else {"class_a": "", "class_b": ""}
             rows.append(first | {"set_a": a, "set_b": b, "first": "a"} | shown | {"preferred": (a, b)[preferred]})
@@ -77,13 +78,15 @@ def _answer(
     person: int,
     x: Float[np.ndarray, " d"],
     y: Float[np.ndarray, " d"],
+    contrast: float,
     rng: np.random.Generator,
 ) -> tuple[list[str], int]:
     """Classes of two renderings, and which of them is preferred."""
     optimum, tolerance = np.asarray(crowd.optimum[person]), np.asarray(crowd.tolerance[person])
     felt = np.array([np.sqrt(np.sum(((point - optimum) / tolerance) ** 2)) for point in (x, y)])
     felt = felt + float(crowd.noise[person]) * rng.standard_normal(2)
-    judged = [int((value < np.asarray(crowd.criteria[person])).sum()) for value in felt]
+    shown = felt + contrast * (felt - felt[::-1])
+    judged = [int((value < np.asarray(crowd.criteria[person])).sum()) for value in shown]
     lapses = rng.random(3) < float(crowd.lapse[person])
     judged = [rng.integers(len(study.responses)) if lapse else c for c, lapse in zip(judged, lapses, strict=False)]
     preferred = int(rng.integers(2)) if lapses[2] else int(np.argmin(felt))

@@ -83,7 +83,7 @@ class Aggregate(eqx.Module):
     map: RuleMap
     """The population map by the study's rule."""
     maps: dict[str, RuleMap]
-    """The maps by all rules that were asked for, the study's among them."""
+    """The maps by all rules that were asked for, the study's among them, and that by the other inference."""
     share: Share | None
     """What the answers say of how people differ; None if it was not asked, or fewer than two people answered."""
 
@@ -293,7 +293,8 @@ def aggregate_cohort(
     if alternatives and study.rule != RECIPE:
         other = other_inference(study)
         by_other = fit_cohort(study, cohort, inference=other)
-        others[other] = map_optimum(study, _rule_map(study, cohort, study.rule, by_other, share, other), candidates)
+        beside[other] = _rule_map(study, cohort, study.rule, by_other, share, other)
+        others[other] = map_optimum(study, beside[other], candidates)
     return Aggregate(
         cohort=cohort,
         posteriors=posteriors,

@@ -14,7 +14,6 @@ from hilbo.study.config import Study
 __all__ = ["learnt_content", "learnt_sentences", "resolved", "that_learns"]
 
 _UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
-_SMOOTH = 1e-6  # of the shared function's variance, which features may leave
 
 
 def that_learns(study: Study) -> Study:

@@ -1,15 +1,23 @@
 """Where an optimum lies, in sentences: at an edge of what was searched, or where nobody was asked."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
 
 from hilbo.study.config import Study
 
-__all__ = ["location_sentences", "optimum_sentence"]
+__all__ = ["location_notes", "location_sentences", "optimum_sentence"]
 
 _AT = 1e-6  # of a range
+
+
+class _Edges(NamedTuple):
+    """Ends of the search ranges that hold a point, and parameters that could not be higher there on the device."""
+
+    ends: list[str]
+    border: list[str]
 
 
 def optimum_sentence(study: Study, x: Float[Array, " d"]) -> str:
@@ -27,8 +35,18 @@ def location_sentences(
 ) -> list[str]:
     """What must be said of an optimum x (d,) of the unit cube, where the map has the standard deviation `sd`; `asked`:
     its largest variance where somebody answered (None: not known)."""
-    sentences = [*_edges(study, np.asarray(x))]
-    if asked is not None and float(sd) > (1.0 + _AT) * math.sqrt(float(asked)):
+    edges, sentences = _edges(study, np.asarray(x)), []
+    if edges.ends:
+        sentences.append(
+            f"The optimum lies at {' and '.join(edges.ends)}: whether people would like what is beyond is not known"
+            " from this study."
+        )
+    if edges.border:
+        sentences.append(
+            f"The optimum lies at the border of what the device may render: {' and '.join(edges.border)} could not be"
+            " higher there."
+        )
+    if asked is not None and _extrapolates(sd, asked):
         sentences.append(
             f"The optimum is an extrapolation: the map's standard deviation there, {float(sd):.2g}, is larger than"
             f" wherever somebody answered ({math.sqrt(float(asked)):.2g} at most). Have people judge it before it is"
@@ -37,26 +55,29 @@ def location_sentences(
     return sentences
 
 
-def _edges(study: Study, x: Float[np.ndarray, " d"]) -> list[str]:
-    """The edges of the search ranges, and the border of what may be rendered, that hold the optimum."""
-    inner = np.asarray(study.space.to_box(x))
-    ends, border = [], []
+def location_notes(
+    study: Study, x: Float[Array, " d"], sd: Float[Array, ""], asked: Float[Array, ""] | None
+) -> list[str]:
+    """The same in a few words each, for a row of a table; arguments as above."""
+    edges = _edges(study, np.asarray(x))
+    notes = [f"at {end}" for end in edges.ends]
+    notes += [f"{name} could not be higher on the device" for name in edges.border]
+    if asked is not None and _extrapolates(sd, asked):
+        notes.append("an extrapolation: less is known there than wherever somebody answered")
+    return notes
+
+
+def _extrapolates(sd: Float[Array, ""], asked: Float[Array, ""]) -> bool:
+    return float(sd) > (1.0 + _AT) * math.sqrt(float(asked))
+
+
+def _edges(study: Study, x: Float[np.ndarray, " d"]) -> _Edges:
+    inner, edges = np.asarray(study.space.to_box(x)), _Edges([], [])
     for i, parameter in enumerate(study.space.parameters):
         unit = f" {parameter.unit}" if parameter.unit else ""
         for place, end, word in ((0.0, parameter.low, "lowest"), (1.0, parameter.high, "highest")):
             if abs(x[i] - place) < _AT:
-                ends.append(f"the {word} {parameter.name} that was searched ({end:g}{unit})")
+                edges.ends.append(f"the {word} {parameter.name} that was searched ({end:g}{unit})")
             elif abs(inner[i] - place) < _AT:
-                border.append(parameter.name)
-    sentences = []
-    if ends:
-        sentences.append(
-            f"The optimum lies at {' and '.join(ends)}: whether people would like what is beyond is not known from"
-            " this study."
-        )
-    if border:
-        sentences.append(
-            f"The optimum lies at the border of what the device may render: {' and '.join(border)} could not be higher"
-            " there."
-        )
-    return sentences
+                edges.border.append(parameter.name)
+    return edges

@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo.population.counts import counts_of, fit_counts
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
-from hilbo.population.low_rank import PeopleModel, rank_for, shared_evidence, shared_function
+from hilbo.population.low_rank import PeopleModel, shared_evidence, shared_function
+from hilbo.population.shared_features import rank_for
+from hilbo.population.tallies import Tallies, tallied
 
 EXACT = 1e-15  # what features may leave where nothing is to be left
 PEOPLE, ANSWERS = 3, 8
@@ -30,9 +33,16 @@ def model(shared=0.6, own=0.4, log_widths=(0.0,) * PEOPLE):
     )
 
 
+def apart(trials):
+    """Every answer as a point of its own, so that all tests have the same shapes."""
+    counts = jax.nn.one_hot(trials.q, 3, dtype=trials.x.dtype)
+    return Tallies(trials.x, jnp.where(trials.mask[..., None], counts, 0.0))
+
+
 @eqx.filter_jit
 def _evidence(people, trials, tolerance):
-    return shared_evidence(people, trials, jnp.zeros(trials.q.shape), 24, tolerance)
+    answers = apart(trials)
+    return shared_evidence(people, answers, answers.blank, 24, tolerance)
 
 
 def evidence(people, trials, tolerance=EXACT):
@@ -43,7 +53,8 @@ def evidence(people, trials, tolerance=EXACT):
 def test_is_the_dense_model():
     trials, people = stacked(), model()
     dense = fit_people(people.gp, of_people(trials), people.share)
-    posterior = shared_function(people, trials, jnp.zeros(trials.q.shape), 24, EXACT)
+    answers = apart(trials)
+    posterior = shared_function(people, answers, answers.blank, 24, EXACT)
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
     np.testing.assert_allclose(evidence(people, trials).value, dense.log_evidence, rtol=1e-10)
     np.testing.assert_allclose(posterior.log_evidence, dense.log_evidence, rtol=1e-10)
@@ -94,10 +105,10 @@ def test_gradients_are_differences_of_the_dense_evidence():
 @pytest.mark.deep  # shapes of its own, and the dense model of 114 answers
 def test_what_features_leave_is_said_and_bounds_the_covariances():
     trials = stacked(people=4, answers=30)
-    theta = jnp.array([3.0, 5.0])
-    rank = rank_for(theta, trials)
+    theta, answers = jnp.array([3.0, 5.0]), apart(trials)
+    rank = rank_for(theta, answers)
     held = eqx.tree_at(lambda m: m.log_widths, model(), jnp.zeros(4))
-    end = shared_evidence(held, trials, jnp.zeros(trials.q.shape), rank)
+    end = shared_evidence(held, answers, answers.blank, rank)
     dense = fit_people(held.gp, of_people(trials), held.share)
     assert float(end.left) <= 1e-6
     assert rank < int(trials.mask.sum())
@@ -115,3 +126,38 @@ def test_the_mode_is_found_or_said_not_to_be(noise):
     if bool(end.arrived):
         dense = fit_people(people.gp, of_people(conflicting), people.share)
         np.testing.assert_allclose(end.value, dense.log_evidence, rtol=1e-8)
+
+
+def test_repeated_answers_add_up_to_the_same_evidence():
+    """Trials at five points, each asked in some order by everybody, against every answer as a point of its own."""
+    rng = np.random.default_rng(3)
+    places = rng.uniform(size=(5, 2))
+    trials = stacked()
+    repeated = eqx.tree_at(lambda t: t.x, trials, jnp.asarray(places[rng.integers(0, 5, (PEOPLE, ANSWERS))]))
+    people = model(log_widths=(0.2, -0.1, 0.3))
+    answers = tallied(repeated, 3)
+    assert answers.x.shape[1] <= 5
+    assert float(answers.counts.sum()) == float(repeated.mask.sum())
+    together = shared_evidence(people, answers, answers.blank, 24, EXACT)
+    np.testing.assert_allclose(together.value, evidence(people, repeated).value, rtol=1e-12)
+
+
+def test_points_of_a_tally_stand_in_the_order_in_which_they_were_asked():
+    x = np.array([[0.9, 0.1], [0.2, 0.3], [0.9, 0.1], [0.5, 0.5]])
+    one = Trials.from_arrays(x, np.array([2, 0, 1, 1]), 6)
+    answers = tallied(jax.tree.map(lambda leaf: leaf[None], one), 3)
+    np.testing.assert_array_equal(answers.x[0], x[[0, 1, 3]])
+    np.testing.assert_array_equal(answers.counts[0], [[0, 1, 1], [1, 0, 0], [0, 1, 0]])
+
+
+def test_hundreds_of_contradictory_answers_are_no_obstacle():
+    """Slopes of answers that contradict each other cancel, their rounding errors do not; against the exact counts."""
+    rng = np.random.default_rng(4)
+    x = np.repeat(rng.uniform(size=(5, 2)), 300, axis=0)
+    each = [Trials.from_arrays(x, rng.integers(0, 3, len(x))) for _ in range(PEOPLE)]
+    trials, people = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each), model()
+    answers = tallied(trials, 3)
+    end = shared_evidence(people, answers, answers.blank, 24, EXACT)
+    exact = fit_counts(people.gp, people.share, counts_of(trials, 3))
+    assert bool(end.arrived)
+    np.testing.assert_allclose(end.value, exact.log_evidence, rtol=1e-10)

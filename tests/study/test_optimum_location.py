@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 
 from hilbo.study.config import Study
-from hilbo.study.optimum_location import location_sentences
+from hilbo.study.optimum_location import location_notes, location_sentences
 
 STUDY = Study.load("hilbo/data/paper.toml")
 SD, ASKED = jnp.asarray(0.3), jnp.asarray(0.25)
@@ -31,3 +31,10 @@ def test_an_extrapolation_is_called_one():
     assert "there, 0.9, is larger than wherever somebody answered (0.5 at most)" in sentence
     assert location_sentences(STUDY, x, jnp.asarray(0.9), None) == []
     assert location_sentences(STUDY, x, jnp.asarray(0.5), ASKED) == []
+
+
+def test_a_row_of_a_table_has_the_same_in_a_few_words():
+    assert location_notes(STUDY, jnp.array([0.1, 0.2, 0.2]), SD, ASKED) == []
+    edge, beyond = location_notes(STUDY, jnp.array([0.1, 0.2, 0.0]), jnp.asarray(0.9), ASKED)
+    assert edge == "at the lowest alpha that was searched (0.01)"
+    assert "less is known there than wherever somebody answered" in beyond

@@ -1,0 +1,68 @@
+"""Everybody's answers, the repeated ones added up: at one point only how often each category was chosen counts."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.ordinal_gp import Trials
+
+__all__ = ["Expansion", "Tallies", "expand_counts", "tallied"]
+
+
+class Tallies(eqx.Module):
+    """How often each of M people chose each of C categories, at points of their own."""
+
+    x: Float[Array, "M n d"]
+    counts: Float[Array, "M n C"]
+    """All 0 in rows beyond a person's points."""
+
+    @property
+    def asked(self) -> Bool[Array, "M n"]:
+        """Where a person gave an answer."""
+        return jnp.sum(self.counts, axis=-1) > 0
+
+    @property
+    def blank(self) -> Float[Array, "M n"]:
+        """A zero for each point."""
+        return jnp.zeros(self.x.shape[:2], self.x.dtype)
+
+
+def tallied(trials: Trials, categories: int) -> Tallies:
+    """Stacked trials (M, n), each person's points once, in the order in which they were first asked."""
+    x, q, mask = (np.asarray(leaf) for leaf in (trials.x, trials.q, trials.mask))
+    people, capacity, _ = x.shape
+    points, counts = np.zeros_like(x), np.zeros((people, capacity, categories), x.dtype)
+    longest = 1
+    for person in range(people):
+        asked, answers = x[person][mask[person]], q[person][mask[person]]
+        _, first, place = np.unique(asked, axis=0, return_index=True, return_inverse=True)
+        order = np.argsort(first)  # of the sorted points, by their first trial
+        rank = np.empty_like(order)
+        rank[order] = np.arange(len(order))
+        points[person, : len(order)] = asked[first[order]]
+        np.add.at(counts[person], (rank[place.reshape(-1)], answers), 1.0)
+        longest = max(longest, len(order))
+    return Tallies(jnp.asarray(points[:, :longest]), jnp.asarray(counts[:, :longest]))
+
+
+class Expansion(NamedTuple):
+    """Log-likelihoods of answers, and their derivatives, at latent values."""
+
+    value: Float[Array, "..."]
+    slope: Float[Array, "..."]
+    curvature: Float[Array, "..."]
+    """Minus the second derivative."""
+    slopes: Float[Array, "..."]
+    """The sum of the answers' absolute slopes, by which the slope's rounding error is judged."""
+
+
+def expand_counts(likelihood: OrdinalProbit, f: Float[Array, ""], counts: Float[Array, " C"]) -> Expansion:
+    """At one latent value, of so many answers in each category; 0 of none."""
+    parts = jax.vmap(lambda q: jnp.stack(likelihood.expand(f, q)))(jnp.arange(counts.shape[0]))
+    parts = jnp.where(counts[:, None] > 0, counts[:, None] * parts, 0.0)
+    return Expansion(*jnp.sum(parts, axis=0), jnp.sum(jnp.abs(parts[:, 1])))
