@@ -31,7 +31,8 @@ import numpy as np  # noqa: E402
 from populations import chance_at  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
 
-from hilbo.population.learnt import PRIORS, learn  # noqa: E402
+from hilbo.population.learnt import learn  # noqa: E402
+from hilbo.population.learnt_posterior import PRIORS  # noqa: E402
 from hilbo.population.low_rank import shared_evidence  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402

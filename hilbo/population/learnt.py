@@ -25,63 +25,38 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
-from hilbo.numerics.tracing import program
-from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
-from hilbo.population.low_rank import PeopleModel, shared_evidence, shared_function
+from hilbo.ordinal_gp import Posterior, Trials
+from hilbo.population.learnt_posterior import (
+    LEFT,
+    NOTHING,
+    PRIORS,
+    Coordinates,
+    Prior,
+    Problem,
+    Stated,
+    cost_at,
+    medians,
+    model_at,
+)
+from hilbo.population.low_rank import PeopleModel, shared_function
 from hilbo.population.shared_features import rank_for
-from hilbo.population.tallies import Tallies, tallied
+from hilbo.population.tallies import tallied
 
 __all__ = [
-    "NOTHING",
-    "PRIORS",
     "RECIPE",
     "Learnt",
-    "Prior",
-    "Stated",
     "learn",
     "learnt_function",
-    "prior_model",
 ]
 
 RECIPE: Final = "learnt-1"
-Coordinates = dict[str, Float[Array, "..."]]
 
 _STEPS, _FINE = 100, 1e-3  # of the search; of the finite differences for the curvature
 _NEAR = 2e-6  # of the evidence: another choice of features moves it as much as a nearer step would
 _WORTH = 3.0  # log Bayes factor from which people have widths of their own, about 20 to 1
-_LEFT, _LARGEST = 1e-4, 256
-"""Of the shared function's prior variance, what the search may leave: 2e-4 of the log evidence of 600 answers; but it
-takes no more features than this, since functions that need more are too rugged to be shared by few answers."""
+_LARGEST = 256  # features: functions that need more are too rugged to be shared by few answers
 _ROUGH = 0.05
-
-
-class Prior(NamedTuple):
-    """Normal, of one coordinate."""
-
-    mean: float
-    sd: float
-
-
-PRIORS = {
-    "theta": Prior(float(np.log(24.0)), 1.2),  # less log d
-    "shared": Prior(float(np.log(3.0)), 1.0),
-    "own": Prior(0.0, 1.0),
-    "middle": Prior(0.0, 1.5),
-    "gaps": Prior(float(np.log(0.8)), 0.7),
-    "widths": Prior(0.0, 0.4),
-}
-
-
-class Stated(NamedTuple):
-    """What a study file states of the model; None is learnt."""
-
-    theta: tuple[float, ...] | None = None
-    variance: float | None = None
-    thresholds: tuple[float, ...] | None = None
-    noise: float | None = None
-
-
-NOTHING = Stated()
+_WHOLE = 32  # people, up to whom the curvature in all widths is made: a gradient or two each
 
 
 class Learnt(eqx.Module):
@@ -109,12 +84,6 @@ class Learnt(eqx.Module):
         return "widths" in self.coordinates
 
 
-def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
-    """One person's model before any answer: what is stated, and the medians of the priors."""
-    nobody = Tallies(jnp.zeros((1, 1, dim)), jnp.zeros((1, 1, categories)))
-    return _model(_medians(nobody, stated, PRIORS), nobody, stated).gp
-
-
 def learnt_function(learnt: Learnt, trials: Trials) -> Posterior:
     """The posterior of the shared function by learnt hyperparameters, from stacked trials (M, n)."""
     answers = tallied(trials, learnt.model.thresholds.size + 1)
@@ -136,11 +105,11 @@ def learn(
     if not np.asarray(trials.mask).any():
         raise InputError("learnt-1: nobody gave an answer; at least one person's answers are needed.")
     answers = tallied(trials, categories)
-    start = _medians(answers, stated, priors)
+    start = medians(answers, stated, priors)
     common = frozenset(start) - {"widths"}
     if near is not None:
         start |= {name: near.coordinates[name] for name in common}
-    problem = _Problem(answers, stated, priors, 0)
+    problem = Problem(answers, stated, priors, 0)
     alike = _Search(start, answers.blank, 0, True)
     alike, problem = _searched(alike, problem, common)
     chosen, free, gain = alike, common, 0.0
@@ -149,9 +118,9 @@ def learn(
         gain = _gain_of_widths(alike, different, wider)
         if gain > _WORTH:
             chosen, free, problem = different, frozenset(start), wider
-    end = _cost(chosen.coordinates, chosen.weights, problem)
+    end = cost_at(chosen.coordinates, chosen.weights, problem, chosen.coordinates)
     return Learnt(
-        model=_model(chosen.coordinates, answers, stated),
+        model=model_at(chosen.coordinates, answers, stated),
         weights=end.weights,
         log_evidence=end.log_evidence,
         coordinates={name: value for name, value in chosen.coordinates.items() if name in free},
@@ -164,15 +133,6 @@ def learn(
     )
 
 
-class _Problem(eqx.Module):
-    """What is given of a search."""
-
-    answers: Tallies
-    stated: Stated = eqx.field(static=True)
-    priors: Mapping[str, Prior]
-    rank: int = eqx.field(static=True)
-
-
 class _Search(NamedTuple):
     """Where a search is."""
 
@@ -182,18 +142,7 @@ class _Search(NamedTuple):
     ended: bool
 
 
-class _Cost(NamedTuple):
-    """Minus the log posterior of the hyperparameters and its gradient; and what was seen on the way."""
-
-    value: Float[Array, ""]
-    gradient: Coordinates
-    log_evidence: Float[Array, ""]
-    weights: Float[Array, "M n"]
-    usable: Bool[Array, ""]
-    left: Float[Array, ""]
-
-
-def _searched(search: _Search, problem: _Problem, free: Set[str]) -> tuple[_Search, _Problem]:
+def _searched(search: _Search, problem: Problem, free: Set[str]) -> tuple[_Search, Problem]:
     """The maximum over the coordinates that are `free`, from where a search is; and the problem with the features that
     it takes: lengths that became shorter need more of them."""
     problem = _with_features(search, problem)
@@ -205,13 +154,13 @@ def _searched(search: _Search, problem: _Problem, free: Set[str]) -> tuple[_Sear
         problem = larger
 
 
-def _with_features(search: _Search, problem: _Problem) -> _Problem:
-    theta = _model(search.coordinates, problem.answers, problem.stated).theta
-    needed = min(rank_for(theta, problem.answers, _LEFT), _LARGEST)
+def _with_features(search: _Search, problem: Problem) -> Problem:
+    theta = model_at(search.coordinates, problem.answers, problem.stated).theta
+    needed = min(rank_for(theta, problem.answers, LEFT), _LARGEST)
     return dataclasses.replace(problem, rank=max(problem.rank, needed))
 
 
-def _descended(search: _Search, problem: _Problem, free: Set[str]) -> _Search:
+def _descended(search: _Search, problem: Problem, free: Set[str]) -> _Search:
     """L-BFGS from where a search is; each mode is sought from the one before's."""
     from scipy.optimize import minimize  # a fifth of a second, which commands that learn nothing need not wait
 
@@ -221,7 +170,8 @@ def _descended(search: _Search, problem: _Problem, free: Set[str]) -> _Search:
 
     def cost(z: np.ndarray) -> tuple[float, np.ndarray]:
         nonlocal latest
-        here = _cost(held | restore(jnp.asarray(z, flat.dtype)), latest, problem)
+        coordinates = held | restore(jnp.asarray(z, flat.dtype))
+        here = cost_at(coordinates, latest, problem, coordinates)
         if not bool(here.usable):  # the line search is to turn back
             return np.inf, np.zeros(flat.size)
         latest = here.weights
@@ -234,96 +184,36 @@ def _descended(search: _Search, problem: _Problem, free: Set[str]) -> _Search:
     return _Search(end, latest, search.steps + int(result.nit), bool(result.success))
 
 
-def _gain_of_widths(alike: _Search, different: _Search, problem: _Problem) -> float:
+def _gain_of_widths(alike: _Search, different: _Search, problem: Problem) -> float:
     """What widths of people's own add to the log evidence, by Laplace's method in each width alone."""
-    costs = [float(_cost(s.coordinates, s.weights, problem).value) for s in (alike, different)]
+    costs = [float(cost_at(s.coordinates, s.weights, problem, s.coordinates).value) for s in (alike, different)]
     widths = different.coordinates["widths"]
 
     def slope(step):
         moved = different.coordinates | {"widths": widths + step}
-        return np.asarray(_cost(moved, different.weights, problem).gradient["widths"])
+        return np.asarray(cost_at(moved, different.weights, problem, moved).gradient["widths"])
 
     curvature = (slope(_FINE) - slope(-_FINE)) / (2 * _FINE)
     return costs[0] - costs[1] - float(np.sum(np.log(problem.priors["widths"].sd * np.sqrt(curvature))))
 
 
-@program
-def _cost(coordinates: Coordinates, start: Float[Array, "M n"], problem: _Problem) -> _Cost:
-    def value(coordinates):
-        model = _model(coordinates, problem.answers, problem.stated)
-        evidence = shared_evidence(model, problem.answers, start, problem.rank, _LEFT)
-        return -evidence.value - _log_prior(coordinates, problem), evidence
-
-    (cost, evidence), gradient = jax.value_and_grad(value, has_aux=True)(coordinates)
-    finite = jnp.all(jnp.isfinite(ravel_pytree(gradient)[0])) & jnp.isfinite(cost)
-    return _Cost(cost, gradient, evidence.value, evidence.weights, evidence.arrived & finite, evidence.left)
-
-
-def _medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior]) -> Coordinates:
-    """Where the search begins: the medians of what is learnt."""
-    (people, _, d), categories, dtype = answers.x.shape, answers.counts.shape[-1], answers.x.dtype
-    every = {
-        "theta": jnp.full(d, priors["theta"].mean - np.log(d), dtype),
-        "shared": jnp.asarray(priors["shared"].mean, dtype),
-        "own": jnp.asarray(priors["own"].mean, dtype),
-        "middle": jnp.asarray(priors["middle"].mean, dtype),
-        "gaps": jnp.full(categories - 2, priors["gaps"].mean, dtype),
-        "widths": jnp.full(people, priors["widths"].mean, dtype),
-    }
-    kept = {"theta"} if stated.theta is not None else set()
-    kept |= {"middle", "gaps"} if stated.thresholds is not None else set()
-    kept |= {"widths"} if categories < 3 else set()
-    return {name: value for name, value in every.items() if name not in kept and value.size}
-
-
-def _model(coordinates: Coordinates, answers: Tallies, stated: Stated) -> PeopleModel:
-    """The hyperparameters at some coordinates, in units of the stated noise, or variance, or else of a noise of 1."""
-    (people, _, d), dtype = answers.x.shape, answers.x.dtype
-    shared, own = jnp.exp(coordinates["shared"]), jnp.exp(coordinates["own"])
-    noise = jnp.asarray(1.0 if stated.noise is None else stated.noise, dtype)
-    if stated.variance is not None:
-        scale = stated.variance / (shared + own)
-        noise = jnp.sqrt(scale) if stated.noise is None else noise
-        shared, own = scale * shared, scale * own
-    else:
-        shared, own = noise**2 * shared, noise**2 * own
-    if stated.theta is None:
-        theta = jnp.exp(coordinates["theta"])
-    else:
-        theta = jnp.broadcast_to(jnp.asarray(stated.theta, dtype), (d,))
-    if stated.thresholds is None:
-        gaps = jnp.exp(coordinates["gaps"]) if "gaps" in coordinates else jnp.zeros(0, dtype)
-        edges = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(gaps)])
-        thresholds = noise * (coordinates["middle"] + edges - jnp.mean(edges))
-    else:
-        thresholds = jnp.asarray(stated.thresholds, dtype)
-    return PeopleModel(theta, shared, own, thresholds, noise, coordinates.get("widths", jnp.zeros(people, dtype)))
-
-
-def _log_prior(coordinates: Coordinates, problem: _Problem) -> Float[Array, ""]:
-    """Up to a constant."""
-    d = problem.answers.x.shape[-1]
-    total = jnp.zeros((), problem.answers.x.dtype)
-    for name, value in coordinates.items():
-        mean, sd = problem.priors[name]
-        total -= 0.5 * jnp.sum(((value - mean + (jnp.log(d) if name == "theta" else 0.0)) / sd) ** 2)
-    return total
-
-
 def _standard_deviations(
-    coordinates: Coordinates, start: Float[Array, "M n"], problem: _Problem, free: Set[str]
+    coordinates: Coordinates, start: Float[Array, "M n"], problem: Problem, free: Set[str]
 ) -> Coordinates:
-    """Of the posterior of what is `free`, taken for normal: its curvature from differences of gradients.
+    """Of the posterior of what is `free`, taken for normal: its curvature from differences of gradients. Infinite where
+    the curvature says that there is no maximum.
 
-    People's widths are independent given the rest, up to what their answers share: their part of the curvature is
-    taken for diagonal, and costs one difference for all.
+    Widths of many people are taken for independent given the rest. What stands for each one's curvature is then its row
+    of the Hessian added up, which keeps that of all widths together: they may rise where the gaps fall.
     """
     common = {name: value for name, value in coordinates.items() if name in free - {"widths"}}
     flat, restore = ravel_pytree(common)
 
     def difference(way: Coordinates) -> Coordinates:
         ahead, behind = (
-            _cost({n: v + s * way[n] if n in way else v for n, v in coordinates.items()}, start, problem).gradient
+            cost_at(
+                {n: v + s * way[n] if n in way else v for n, v in coordinates.items()}, start, problem, coordinates
+            ).gradient
             for s in (_FINE, -_FINE)
         )
         return jax.tree.map(lambda a, b: (a - b) / (2 * _FINE), ahead, behind)
@@ -334,9 +224,19 @@ def _standard_deviations(
     columns = [difference(restore(unit)) for unit in jnp.eye(flat.size, dtype=flat.dtype)]
     hessian = np.stack([of_common(column) for column in columns])
     if "widths" not in free:
-        return restore(jnp.asarray(np.sqrt(np.diagonal(np.linalg.inv(hessian)))))
+        return restore(jnp.asarray(_root_of_diagonal(np.linalg.inv(hessian))))
     mixed = np.stack([np.asarray(column["widths"]) for column in columns])
-    own = np.asarray(difference({"widths": jnp.ones_like(coordinates["widths"])})["widths"])
-    covariance = np.linalg.inv(hessian - (mixed / own) @ mixed.T)
-    of_widths = 1.0 / own + np.einsum("iw,ij,jw->w", mixed / own, covariance, mixed / own)
-    return restore(jnp.asarray(np.sqrt(np.diagonal(covariance)))) | {"widths": jnp.asarray(np.sqrt(of_widths))}
+    widths = coordinates["widths"]
+    if widths.size <= _WHOLE:
+        each = [difference({"widths": unit})["widths"] for unit in jnp.eye(widths.size, dtype=widths.dtype)]
+        own = np.stack([np.asarray(row) for row in each])
+    else:
+        own = np.diag(np.asarray(difference({"widths": jnp.ones_like(widths)})["widths"]))
+    sd = _root_of_diagonal(np.linalg.inv(np.block([[hessian, mixed], [mixed.T, own]])))
+    return restore(jnp.asarray(sd[: flat.size])) | {"widths": jnp.asarray(sd[flat.size :])}
+
+
+def _root_of_diagonal(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:
+    """Square roots of the variances, where they are some."""
+    variances = np.diagonal(covariance)
+    return np.sqrt(np.where(variances > 0, variances, np.inf))

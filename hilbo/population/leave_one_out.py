@@ -25,7 +25,8 @@ from scipy.special import ndtri
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
-from hilbo.population.learnt import Learnt, Stated, learn
+from hilbo.population.learnt import Learnt, learn
+from hilbo.population.learnt_posterior import Stated
 from hilbo.population.maps import RuleMap, learnt_map, rule_map
 from hilbo.population.newcomer import class_probabilities
 

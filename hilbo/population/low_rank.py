@@ -225,15 +225,21 @@ class SharedEvidence(NamedTuple):
 
 
 def shared_evidence(
-    model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
+    model: PeopleModel,
+    answers: Tallies,
+    start: Float[Array, "M n"],
+    rank: int,
+    tolerance: ArrayLike = TOLERANCE,
+    lengths: Float[Array, " d"] | None = None,
 ) -> SharedEvidence:
     """Log evidence of all answers, differentiable once in `model`.
 
     **Arguments:** `start`: weights near which the mode is sought; `rank`: features of g, at most; `tolerance`: of g's
-    prior variance, the part that they may leave.
+    prior variance, the part that they may leave; `lengths`: the theta by which their points are chosen, the model's own
+    if it is not given. With other points the value changes in a small step, so that differences of it want the same.
     """
     still = jax.lax.stop_gradient
-    pivots = pivots_of(still(model.theta), answers, rank, tolerance)
+    pivots = pivots_of(still(model.theta if lengths is None else lengths), answers, rank, tolerance)
     prior = _prior(model, answers, pivots)
     mode = still(_mode(still(model), answers, still(prior), start))
     weights, _ = _newton_step(model, answers, prior, mode.weights)

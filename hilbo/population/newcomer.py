@@ -8,7 +8,7 @@ from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Float
 
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.population.learnt import PRIORS
+from hilbo.population.learnt_posterior import PRIORS
 
 __all__ = ["class_probabilities", "log_highest"]
 

@@ -65,4 +65,5 @@ def expand_counts(likelihood: OrdinalProbit, f: Float[Array, ""], counts: Float[
     """At one latent value, of so many answers in each category; 0 of none."""
     parts = jax.vmap(lambda q: jnp.stack(likelihood.expand(f, q)))(jnp.arange(counts.shape[0]))
     parts = jnp.where(counts[:, None] > 0, counts[:, None] * parts, 0.0)
-    return Expansion(*jnp.sum(parts, axis=0), jnp.sum(jnp.abs(parts[:, 1])))
+    value, slope, curvature = jnp.sum(parts, axis=0)
+    return Expansion(value, slope, curvature, jnp.sum(jnp.abs(parts[:, 1])))

@@ -7,7 +7,8 @@ from typing import Any
 import equinox as eqx
 
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
-from hilbo.population.learnt import NOTHING, RECIPE, Learnt, Stated, prior_model
+from hilbo.population.learnt import RECIPE, Learnt
+from hilbo.population.learnt_posterior import NOTHING, Stated, prior_model
 from hilbo.population.maps import AnyRule
 from hilbo.search.space import SearchSpace
 from hilbo.study.protocols import SessionTable

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hilbo.population.learnt import NOTHING, PRIORS, RECIPE, Learnt, learn, prior_model
+from hilbo.population.learnt import RECIPE, Learnt, learn
+from hilbo.population.learnt_posterior import NOTHING, PRIORS, prior_model
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 

@@ -8,7 +8,8 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
-from hilbo.population.learnt import PRIORS, Stated, learn, learnt_function, prior_model
+from hilbo.population.learnt import learn, learnt_function
+from hilbo.population.learnt_posterior import PRIORS, Stated, prior_model
 
 PEOPLE, ANSWERS = 4, 12
 

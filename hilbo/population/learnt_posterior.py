@@ -1,0 +1,157 @@
+"""What learnt-1 maximises: the hyperparameters' coordinates, their priors, and the log posterior with its gradient."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Bool, Float
+
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import OrdinalGP
+from hilbo.population.low_rank import PeopleModel, shared_evidence
+from hilbo.population.tallies import Tallies
+
+__all__ = [
+    "LEFT",
+    "NOTHING",
+    "PRIORS",
+    "Coordinates",
+    "Cost",
+    "Prior",
+    "Problem",
+    "Stated",
+    "cost_at",
+    "medians",
+    "model_at",
+    "prior_model",
+]
+
+Coordinates = dict[str, Float[Array, "..."]]
+LEFT = 1e-4
+"""Of the shared function's prior variance, what the search may leave: 2e-4 of the log evidence of 600 answers."""
+
+
+class Prior(NamedTuple):
+    """Normal, of one coordinate."""
+
+    mean: float
+    sd: float
+
+
+PRIORS = {
+    "theta": Prior(float(np.log(24.0)), 1.2),  # less log d
+    "shared": Prior(float(np.log(3.0)), 1.0),
+    "own": Prior(0.0, 1.0),
+    "middle": Prior(0.0, 1.5),
+    "gaps": Prior(float(np.log(0.8)), 0.7),
+    "widths": Prior(0.0, 0.4),
+}
+
+
+class Stated(NamedTuple):
+    """What a study file states of the model; None is learnt."""
+
+    theta: tuple[float, ...] | None = None
+    variance: float | None = None
+    thresholds: tuple[float, ...] | None = None
+    noise: float | None = None
+
+
+NOTHING = Stated()
+
+
+class Problem(eqx.Module):
+    """What is given of a search."""
+
+    answers: Tallies
+    stated: Stated = eqx.field(static=True)
+    priors: Mapping[str, Prior]
+    rank: int = eqx.field(static=True)
+
+
+class Cost(NamedTuple):
+    """Minus the log posterior of the hyperparameters and its gradient; and what was seen on the way."""
+
+    value: Float[Array, ""]
+    gradient: Coordinates
+    log_evidence: Float[Array, ""]
+    weights: Float[Array, "M n"]
+    usable: Bool[Array, ""]
+    left: Float[Array, ""]
+
+
+def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
+    """One person's model before any answer: what is stated, and the medians of the priors."""
+    nobody = Tallies(jnp.zeros((1, 1, dim)), jnp.zeros((1, 1, categories)))
+    return model_at(medians(nobody, stated, PRIORS), nobody, stated).gp
+
+
+@program
+def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Problem, features: Coordinates) -> Cost:
+    """At some coordinates, by the points of the features that the coordinates `features` have: with other points the
+    value changes in a small step, which differences must not be taken across."""
+    lengths = model_at(features, problem.answers, problem.stated).theta
+
+    def value(coordinates):
+        model = model_at(coordinates, problem.answers, problem.stated)
+        evidence = shared_evidence(model, problem.answers, start, problem.rank, LEFT, lengths)
+        return -evidence.value - _log_prior(coordinates, problem), evidence
+
+    (cost, evidence), gradient = jax.value_and_grad(value, has_aux=True)(coordinates)
+    finite = jnp.all(jnp.isfinite(ravel_pytree(gradient)[0])) & jnp.isfinite(cost)
+    return Cost(cost, gradient, evidence.value, evidence.weights, evidence.arrived & finite, evidence.left)
+
+
+def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior]) -> Coordinates:
+    """Where the search begins: the medians of what is learnt."""
+    (people, _, d), categories, dtype = answers.x.shape, answers.counts.shape[-1], answers.x.dtype
+    every = {
+        "theta": jnp.full(d, priors["theta"].mean - np.log(d), dtype),
+        "shared": jnp.asarray(priors["shared"].mean, dtype),
+        "own": jnp.asarray(priors["own"].mean, dtype),
+        "middle": jnp.asarray(priors["middle"].mean, dtype),
+        "gaps": jnp.full(categories - 2, priors["gaps"].mean, dtype),
+        "widths": jnp.full(people, priors["widths"].mean, dtype),
+    }
+    kept = {"theta"} if stated.theta is not None else set()
+    kept |= {"middle", "gaps"} if stated.thresholds is not None else set()
+    kept |= {"widths"} if categories < 3 else set()
+    return {name: value for name, value in every.items() if name not in kept and value.size}
+
+
+def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated) -> PeopleModel:
+    """The hyperparameters at some coordinates, in units of the stated noise, or variance, or else of a noise of 1."""
+    (people, _, d), dtype = answers.x.shape, answers.x.dtype
+    shared, own = jnp.exp(coordinates["shared"]), jnp.exp(coordinates["own"])
+    noise = jnp.asarray(1.0 if stated.noise is None else stated.noise, dtype)
+    if stated.variance is not None:
+        scale = stated.variance / (shared + own)
+        noise = jnp.sqrt(scale) if stated.noise is None else noise
+        shared, own = scale * shared, scale * own
+    else:
+        shared, own = noise**2 * shared, noise**2 * own
+    if stated.theta is None:
+        theta = jnp.exp(coordinates["theta"])
+    else:
+        theta = jnp.broadcast_to(jnp.asarray(stated.theta, dtype), (d,))
+    if stated.thresholds is None:
+        gaps = jnp.exp(coordinates["gaps"]) if "gaps" in coordinates else jnp.zeros(0, dtype)
+        edges = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(gaps)])
+        thresholds = noise * (coordinates["middle"] + edges - jnp.mean(edges))
+    else:
+        thresholds = jnp.asarray(stated.thresholds, dtype)
+    return PeopleModel(theta, shared, own, thresholds, noise, coordinates.get("widths", jnp.zeros(people, dtype)))
+
+
+def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:
+    """Up to a constant."""
+    d = problem.answers.x.shape[-1]
+    total = jnp.zeros((), problem.answers.x.dtype)
+    for name, value in coordinates.items():
+        mean, sd = problem.priors[name]
+        total -= 0.5 * jnp.sum(((value - mean + (jnp.log(d) if name == "theta" else 0.0)) / sd) ** 2)
+    return total
