@@ -169,7 +169,7 @@ def _quick_validation(folder: Path) -> None:
     import jax.numpy as jnp
     import numpy as np
 
-    from hilbo.simulation.simulate import PRESETS
+    from hilbo.simulation.presets import PRESETS
     from hilbo.simulation.validation_sessions import sets_table, validation_table
     from hilbo.study.config import Study
     from hilbo.study.map_summary import Sets

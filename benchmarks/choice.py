@@ -23,11 +23,12 @@ def states(study, count, seed=0):
     import jax
 
     from hilbo.simulation import simulate
+    from hilbo.simulation.presets import PRESETS
 
     studies = -(-count // 400)
     found = []
     for k in range(studies):
-        persons = simulate.people(study, simulate.PRESETS["paper"], 24, seed + k)
+        persons = simulate.people(study, PRESETS["paper-individuals"], 24, seed + k)
         found.append(simulate.simulate_study(study, persons, seed + k))
     everybody = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
     rng = np.random.default_rng(seed)

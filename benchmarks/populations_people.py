@@ -20,7 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hilbo.simulation.simulate import PRESETS, people
+from hilbo.simulation.presets import PRESETS
+from hilbo.simulation.simulate import people
 from hilbo.study.config import Study
 
 FEATURES, CROWD = 400, 2000
@@ -48,7 +49,7 @@ class Places(NamedTuple):
         return PAPER
 
     def scene(self, study, count, seed):
-        population = PRESETS["paper"]
+        population = PRESETS["paper-individuals"]
         rng = np.random.default_rng([seed, 7])
         shift = np.zeros(study.space.dim)
         if self.anywhere:
@@ -61,7 +62,7 @@ class Places(NamedTuple):
         return Scene(persons, ChanceOfPlaces(crowd))
 
     def _changed(self, study, persons, shift, rng):
-        truth = unit_truth(study, PRESETS["paper"])
+        truth = unit_truth(study, PRESETS["paper-individuals"])
         optimum = truth + self.differences * (np.asarray(persons.optimum) - truth)
         if self.groups:
             other = rng.uniform(size=len(optimum)) < 0.5

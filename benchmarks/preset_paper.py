@@ -17,11 +17,12 @@ ROOT = Path(__file__).parents[1]
 def one_study(study, seed, candidates):
     """Answers and errors of one simulated study (NRMSE over K1, B1, alpha by search range)."""
     from hilbo.simulation import simulate
+    from hilbo.simulation.presets import PRESETS
     from hilbo.study.aggregate import aggregate_cohort, nrmse, population_optimum
     from hilbo.study.cohort import Cohort
     from hilbo.study.progress import follow
 
-    population = simulate.PRESETS["paper"]
+    population = PRESETS["paper-individuals"]
     truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
     trials = simulate.simulate_study(study, simulate.people(study, population, 24, seed), seed)
     cohort = Cohort(trials, np.zeros((24, 25, 3)), tuple(f"P{j:02d}" for j in range(24)))

@@ -153,29 +153,37 @@ def population_at(place):
 
 
 def one_study(population, seed, number):
-    """What came of one study of 24 x 25 trials and its validation; None if its map has no three sets."""
+    """What came of one study of 24 x 25 trials and its validation; no classes if its map has no three sets."""
     start = 10_000 * seed + number
-    persons = people(STUDY, population, 24, start)
-    trials = simulate_study(STUDY, persons, start)
+    trials = simulate_study(STUDY, people(STUDY, population, 24, start), start)
     cohort = Cohort(trials, np.zeros((24, 25, 3)), tuple(f"P{j:02d}" for j in range(24)))
     candidates = jnp.asarray(search_points(STUDY.space, 0))
     posteriors = fit_cohort(STUDY, cohort)
-    own = np.asarray(individual_optima(STUDY, posteriors, candidates).x)
-    physical = np.asarray(STUDY.space.to_physical(own))
-    truth = np.asarray(STUDY.space.to_unit(np.array([TRUTH[name] for name in STUDY.space.names])))
-    close = np.asarray((trials.q == 2).sum(axis=1))
-    came = {"close": float(close.mean()), "close sd": float(close.std(ddof=1))}
-    nrmse = 100 * np.sqrt(np.mean((own - truth) ** 2, axis=1))
-    came |= {f"nrmse {q}": float(np.percentile(nrmse, q)) for q in (25, 50, 75)}
-    for name, values in zip(STUDY.space.names, physical.T, strict=True):
-        came |= {name: float(values.mean()), f"{name} sd": float(values.std(ddof=1))}
+    came = individuals(STUDY, trials, np.asarray(individual_optima(STUDY, posteriors, candidates).x))
     try:
         rule = rule_map(STUDY.gp, trials, "bcm", posteriors=posteriors)
         sets = np.asarray(best_mid_worst(STUDY, rule.predict, candidates).x)
     except InputError:
         return came | {"classes": None}
-    came["error"] = float(100 * np.sqrt(np.mean((sets[0] - truth) ** 2)))
+    came["error"] = float(100 * np.sqrt(np.mean((sets[0] - truth_of(STUDY)) ** 2)))
     return came | validation(population, sets, start)
+
+
+def truth_of(study):
+    """The truth of all populations, in the unit cube."""
+    return np.asarray(study.space.to_unit(np.array([TRUTH[name] for name in study.space.names])))
+
+
+def individuals(study, trials, own):
+    """What the paper says of its individuals: answers "close", and their optima (M, d), in physical units and to the
+    truth."""
+    close = np.asarray((trials.q == 2).sum(axis=1))
+    came = {"close": float(close.mean()), "close sd": float(close.std(ddof=1))}
+    nrmse = 100 * np.sqrt(np.mean((own - truth_of(study)) ** 2, axis=1))
+    came |= {f"nrmse {q}": float(np.percentile(nrmse, q)) for q in (25, 50, 75)}
+    for name, values in zip(study.space.names, np.asarray(study.space.to_physical(own)).T, strict=True):
+        came |= {name: float(values.mean()), f"{name} sd": float(values.std(ddof=1))}
+    return came
 
 
 def validation(population, sets, seed):

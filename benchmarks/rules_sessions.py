@@ -19,9 +19,9 @@ PEOPLE = 24
 
 def population(level):
     """The preset with `level` times the differences between people."""
-    from hilbo.simulation.simulate import PRESETS
+    from hilbo.simulation.presets import PRESETS
 
-    preset = PRESETS["paper"]
+    preset = PRESETS["paper-individuals"]
     return dataclasses.replace(
         preset,
         spread=tuple(level * s for s in preset.spread),

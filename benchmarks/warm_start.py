@@ -24,7 +24,8 @@ from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.candidates import search_points
 from hilbo.session.selection import design, point_after
 from hilbo.session.warm_start import warm_point, warm_start
-from hilbo.simulation.simulate import PRESETS, Person, people, simulate_study
+from hilbo.simulation.presets import PRESETS
+from hilbo.simulation.simulate import Person, people, simulate_study
 from hilbo.study.aggregate import population
 
 TRIALS = 25
@@ -72,7 +73,7 @@ def reached(curve, target):
 
 def studied(study, seed, count, fillings, share):
     """One earlier study and the new people after it: start -> what `judged` says of them."""
-    preset, points = PRESETS["paper"], search_points(study.space, seed)
+    preset, points = PRESETS["paper-individuals"], search_points(study.space, seed)
     earlier = simulate_study(study, people(study, preset, 24, seed), seed)
     posteriors = jax.vmap(lambda t: fit(study.gp, t, inference=study.inference, throw=False))(earlier)
     mean, variance = population(posteriors, points)

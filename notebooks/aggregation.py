@@ -17,7 +17,8 @@ import numpy as np
 
 from hilbo import Study
 from hilbo.report.comparison import comparison_table
-from hilbo.simulation.simulate import PRESETS, people, simulate_study, to_table
+from hilbo.simulation.presets import PRESETS
+from hilbo.simulation.simulate import people, simulate_study, to_table
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.rule_comparison import compare

@@ -19,7 +19,8 @@ import pandas as pd
 from hilbo import Study
 from hilbo.report.study import write_study
 from hilbo.search.candidates import search_points
-from hilbo.simulation.simulate import PRESETS, people, simulate_study, to_table, truth_table
+from hilbo.simulation.presets import PRESETS
+from hilbo.simulation.simulate import people, simulate_study, to_table, truth_table
 from hilbo.simulation.validation_sessions import sets_table, validation_table
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import cohort_of

@@ -2,7 +2,7 @@
 
 The server is a process of its own, as `hilbo session` starts it; the device is the firmware's core on a
 pseudo-terminal, whose finger presses while a rendering is shown; the participant's page is in Chromium. The participant
-is one of `simulate.PRESETS` and answers from what was really on the device.
+is one of `simulation.presets` and answers from what was really on the device.
 """
 
 import contextlib
@@ -24,6 +24,7 @@ from hilbo.errors import InputError
 from hilbo.session.event_log import read_log
 from hilbo.session.plan import make_plan
 from hilbo.simulation import simulate
+from hilbo.simulation.presets import PRESETS
 from hilbo.study.config import Study
 
 __all__ = ["HILBO", "Decider", "example_sets", "fast_study", "rehearse", "server"]
@@ -42,7 +43,7 @@ class Decider:
 
     def __init__(self, study: Study, preset: str = "paper", seed: int = 0):
         self._study, self._key, self._count = study, jax.random.key(seed), 0
-        people = simulate.people(study, simulate.PRESETS[preset], 1, seed)
+        people = simulate.people(study, PRESETS[preset], 1, seed)
         self._person = jax.tree.map(lambda leaf: leaf[0], people)
         self._answer = jax.jit(lambda key, x: self._person.answer(key, x, jnp.asarray(0.5, x.dtype)))
 
@@ -79,7 +80,7 @@ def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int |
 
 def example_sets(study: Study, preset: str = "paper") -> dict[str, dict[str, float]]:
     """Best, mid and worst renderings of a simulated population, by their distance from its truth."""
-    space, truth = study.space, simulate.PRESETS[preset].truth
+    space, truth = study.space, PRESETS[preset].truth
     points = space.candidates(256, 0)
     centre = np.asarray(space.to_unit(np.array([truth[name] for name in space.names])))
     order = np.argsort(np.linalg.norm(points - centre, axis=1))

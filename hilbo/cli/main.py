@@ -126,7 +126,7 @@ def aggregate(
 def simulate(
     out: Out,
     preset: Annotated[str, typer.Option(help="Population that the people are drawn from.")] = "paper",
-    study: Annotated[Path | None, typer.Option("--study", help="Study file; by default the preset's own.")] = None,
+    study: Annotated[Path | None, typer.Option("--study", help="Study file; by default the paper's.")] = None,
     participants: Annotated[int, typer.Option(min=1, help="How many people.")] = 24,
     seed: Seed = 0,
     force: Force = False,
@@ -277,7 +277,7 @@ def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
     import json
     from importlib.resources import files
 
-    source = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if study is None else study
+    source = Path(str(files("hilbo") / "data" / "paper.toml")) if study is None else study
     with progress() as say:
         summary = cli_live.live(source, out, phase, seconds, seed, say)
     print(

@@ -56,17 +56,15 @@ def power(
         start()
         from hilbo.report.power import write_power
         from hilbo.simulation.power import Plan, cores, simulate_power
-        from hilbo.simulation.simulate import PRESETS
+        from hilbo.simulation.presets import preset_of
         from hilbo.study.config import Study
 
-        chosen = Study.load(study)
-        if preset not in PRESETS:
-            raise InputError(f'--preset is "{preset}"; there are {", ".join(PRESETS)}.')
+        chosen, population = Study.load(study), preset_of(preset)
         plan = Plan(_numbers(participants, "--participants"), _numbers(trials, "--trials"), studies, seed)
         jobs = min(jobs or cores(), studies)
         say(f"simulating {studies} studies in {jobs} processes")
         errors = simulate_power(
-            chosen, PRESETS[preset], plan, jobs=jobs, begin=start, say=lambda done: say("studies", done, studies)
+            chosen, population, plan, jobs=jobs, begin=start, say=lambda done: say("studies", done, studies)
         )
         cost = {"seconds": time.perf_counter() - begun, "jobs": jobs, "cores": cores(), "preset": preset}
         content = write_power(chosen, errors, plan, error, cost, folder)

@@ -80,7 +80,7 @@ def leave_one_out(
     share: Float[Array, ""] | None = None,
     posteriors: Posterior | None = None,
     inference: str = "laplace",
-    groups: Sequence[Int[np.ndarray, " k"]] | None = None,
+    groups: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
     """What a rule predicts of each person's answers from all others' (hyperparameters and share as given); and the
     maps without them; errors as in [`left_out_by`][]."""
@@ -100,7 +100,7 @@ def leave_one_out_learnt(
     stated: Stated,
     *,
     again: bool = True,
-    groups: Sequence[Int[np.ndarray, " k"]] | None = None,
+    groups: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
     """The same by learnt-1, from what was learnt of everybody's answers.
 
@@ -120,7 +120,7 @@ def leave_one_out_learnt(
 def left_out_by(
     trials: Trials,
     fold: Callable[[Int[np.ndarray, " k"]], tuple[OrdinalGP, RuleMap]],
-    groups: Sequence[Int[np.ndarray, " k"]] | None = None,
+    groups: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
     """What `fold` predicts of people: the model and the map without those in some rows of the trials; each alone, or in
     `groups`. Raises InputError for fewer than three people: two must be left to differ."""

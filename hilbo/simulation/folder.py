@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from hilbo.errors import InputError
 from hilbo.simulation import simulate
+from hilbo.simulation.presets import preset_of
 from hilbo.simulation.simulate import Population
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
@@ -30,12 +30,10 @@ class Simulated(NamedTuple):
 def simulate_folder(folder: Path, preset: str, count: int, seed: int, source: Path | None = None) -> Simulated:
     """Simulate `count` people of a preset and write trials.csv, truth.csv and study.toml.
 
-    `source`: a study file in place of the preset's own. Raises InputError for a preset that there is not.
+    `source`: a study file in place of the paper's. Raises InputError for a preset that there is not.
     """
-    if preset not in simulate.PRESETS:
-        raise InputError(f'--preset is "{preset}"; there are {", ".join(simulate.PRESETS)}.')
-    population = simulate.PRESETS[preset]
-    path = Path(str(files("hilbo") / "data" / f"{preset}.toml")) if source is None else source
+    population = preset_of(preset)
+    path = Path(str(files("hilbo") / "data" / "paper.toml")) if source is None else source
     study = Study.load(path)
     people = simulate.people(study, population, count, seed)
     table = simulate.to_table(study, simulate.simulate_study(study, people, seed))

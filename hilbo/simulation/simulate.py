@@ -24,7 +24,7 @@ from hilbo.ordinal_gp import Trials
 from hilbo.session.selection import Design, design, next_point
 from hilbo.study.config import Study
 
-__all__ = ["PRESETS", "Person", "Population", "people", "simulate_study", "to_table", "truth_table"]
+__all__ = ["Person", "Population", "people", "simulate_study", "to_table", "truth_table"]
 
 
 class Person(eqx.Module):
@@ -67,21 +67,6 @@ class Population(eqx.Module):
     drift_sd: float = eqx.field(static=True)
     contrast: float = eqx.field(static=True, default=0.0)
     """In a validation: how much of the difference of two renderings, as they are felt side by side, is added to it."""
-
-
-_PAPER = Population(
-    truth={"K1": 5.70, "B1": 5.89, "alpha": 0.203},
-    spread=(0.36, 0.135, 0.133),
-    tolerance=(0.238, 0.362, 0.087),
-    tolerance_sd=0.41,
-    criteria=(1.36, 1.0),
-    noise=0.98,
-    lapse=0.1,
-    drift_sd=0.38,
-)
-
-PRESETS: dict[str, Population] = {"paper": _PAPER}
-"""Populations by name; docs/simulation.md says how `paper` was made and what it is like."""
 
 
 def people(study: Study, population: Population, count: int, seed: int) -> Person:

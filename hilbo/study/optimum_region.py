@@ -14,13 +14,16 @@ from jaxtyping import Float
 from hilbo.population.joint import posterior_map
 from hilbo.population.maps import RuleMap
 from hilbo.search.candidates import search_points
+from hilbo.search.rendering import set_of
 from hilbo.study.config import Study
+from hilbo.study.hills import Hill, hills_of
 
 __all__ = ["Region", "optimum_region", "region_content", "region_sentences"]
 
 PROBABILITY = 0.95
 _POINTS, _DRAWS = 800, 4000
 _LOCATED = 0.25  # of the feasible set: a larger region locates nothing
+_RIVAL = 0.2  # of the draws on another hill
 
 
 class Region(NamedTuple):
@@ -31,6 +34,8 @@ class Region(NamedTuple):
     """The points that are not in it."""
     volume: float
     """Its share of the feasible set."""
+    hills: tuple[Hill, ...] = ()
+    """By falling probability."""
 
     @property
     def located(self) -> bool:
@@ -54,8 +59,10 @@ def optimum_region(study: Study, map_: RuleMap, seed: int = 0) -> Region | None:
     count = int(np.searchsorted(np.cumsum(weight[order]), PROBABILITY)) + 1
     inside = np.zeros(len(weight), bool)
     inside[order[:count]] = True
-    points = np.asarray(x)
-    return Region(points[inside], points[~inside], float(inside[:_POINTS].mean()))
+    points, box = np.asarray(x), np.asarray(study.space.to_box(x))
+    mean, sd = np.asarray(joint.mean), np.sqrt(np.asarray(joint.variance))
+    hills = hills_of(box, mean, sd, weight, np.broadcast_to(np.asarray(study.gp.kernel.theta), box.shape[1]))
+    return Region(points[inside], points[~inside], float(inside[:_POINTS].mean()), hills)
 
 
 def region_content(study: Study, region: Region | None) -> dict[str, Any] | None:
@@ -63,20 +70,37 @@ def region_content(study: Study, region: Region | None) -> dict[str, Any] | None
     if region is None:
         return None
     physical = np.asarray(study.space.to_physical(jnp.asarray(region.points)))
+
+    def of_box(x: Float[np.ndarray, " d"]) -> dict[str, float]:
+        return set_of(study.space, study.space.from_box(jnp.asarray(x)))
+
     ends = zip(study.space.names, physical.min(axis=0).tolist(), physical.max(axis=0).tolist(), strict=True)
     return {
         "probability": PROBABILITY,
         "volume": region.volume,
         "located": region.located,
         "parameters": {name: [low, high] for name, low, high in ends},
+        "hills": [
+            {"probability": hill.probability, "top": of_box(hill.top), "centre": of_box(hill.centre)}
+            for hill in region.hills
+        ],
     }
 
 
 def region_sentences(region: Region | None) -> list[str]:
-    """A warning where these answers do not locate the optimum."""
-    if region is None or region.located:
+    """A warning where these answers do not locate the optimum, and one where it may be on another hill."""
+    if region is None:
         return []
-    return [
-        f"The best rendering is not located: with {PROBABILITY:.0%} it lies in a region that takes up"
-        f" {region.volume:.0%} of what may be rendered. More people or trials would narrow it."
-    ]
+    sentences = []
+    if not region.located:
+        sentences.append(
+            f"The best rendering is not located: with {PROBABILITY:.0%} it lies in a region that takes up"
+            f" {region.volume:.0%} of what may be rendered. More people or trials would narrow it."
+        )
+    if len(region.hills) > 1 and region.hills[1].probability > _RIVAL:
+        first, second = (f"{hill.probability:.0%}" for hill in region.hills[:2])
+        sentences.append(
+            f"The map has more than one hill: the best rendering is on the likeliest with {first}, on the next with"
+            f" {second}. Have people compare their tops before one is used."
+        )
+    return sentences

@@ -11,7 +11,7 @@ from studies import paper_counts
 
 from hilbo import Study
 from hilbo.report.validation import p_words, safest, slug, validate, validation_figures
-from hilbo.simulation.simulate import PRESETS
+from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.validation_sessions import sets_table, validation_table
 from hilbo.study.map_summary import Sets
 

@@ -17,7 +17,8 @@ from hilbo.errors import InputError
 from hilbo.report.figures.power import power_figure
 from hilbo.report.power import enough, write_power
 from hilbo.simulation.power import Plan, one_study, power_table, simulate_power, summarise, top_probability
-from hilbo.simulation.simulate import PRESETS, people
+from hilbo.simulation.presets import PRESETS
+from hilbo.simulation.simulate import people
 
 
 def study():

@@ -7,6 +7,7 @@ import pytest
 
 from hilbo.errors import InputError
 from hilbo.simulation import simulate
+from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import Person
 from hilbo.study.config import Study
 
@@ -43,7 +44,7 @@ def test_drift_makes_people_stricter_in_time():
 
 @pytest.mark.deep  # as `make demo` does
 def test_the_preset_makes_a_study():
-    population = simulate.PRESETS["paper"]
+    population = PRESETS["paper"]
     people = simulate.people(STUDY, population, 3, seed=1)
     trials = simulate.simulate_study(STUDY, people, seed=1)
     assert trials.mask.shape == (3, 25)
@@ -59,4 +60,4 @@ def test_the_preset_makes_a_study():
 def test_a_population_of_another_study_is_refused():
     five = Study.load("hilbo/data/video_quality.toml")
     with pytest.raises(InputError, match="2 criteria"):
-        simulate.people(five, simulate.PRESETS["paper"], 2, 0)
+        simulate.people(five, PRESETS["paper"], 2, 0)

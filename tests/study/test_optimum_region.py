@@ -7,6 +7,7 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.population.maps import RuleMap
 from hilbo.study.config import Study
+from hilbo.study.hills import Hill
 from hilbo.study.optimum_region import Region, optimum_region, region_content, region_sentences
 
 STUDY = Study.load("hilbo/data/video_quality.toml")
@@ -39,6 +40,10 @@ def test_an_unlocated_optimum_says_so():
     (sentence,) = region_sentences(Region(some, some, 0.31))
     assert sentence.startswith("The best rendering is not located: with 95% it lies in a region that takes up 31%")
     assert region_sentences(None) == []
+    place = np.zeros(2)
+    twins = Region(some, some, 0.1, (Hill(place, place, 0.6), Hill(place, place, 0.3)))
+    (sentence,) = region_sentences(twins)
+    assert "on the likeliest with 60%, on the next with 30%" in sentence
 
 
 def test_maps_by_points_have_none():
@@ -48,9 +53,15 @@ def test_maps_by_points_have_none():
 
 
 def test_what_results_say_is_in_physical_units():
-    region = Region(np.array([[0.0, 0.5], [1.0, 1.0]]), np.zeros((0, 2)), 1.0)
+    hill = Hill(np.array([0.0, 1.0]), np.array([1.0, 0.0]), 1.0)
+    region = Region(np.array([[0.0, 0.5], [1.0, 1.0]]), np.zeros((0, 2)), 1.0, (hill,))
     content = region_content(STUDY, region)
     assert content is not None
+    (said,) = content["hills"]
+    assert list(said["top"].values()) == pytest.approx([STUDY.space.parameters[0].low, STUDY.space.parameters[1].high])
+    assert list(said["centre"].values()) == pytest.approx(
+        [STUDY.space.parameters[0].high, STUDY.space.parameters[1].low]
+    )
     parameters = STUDY.space.parameters
     assert content["parameters"][parameters[0].name] == pytest.approx([parameters[0].low, parameters[0].high])
     assert content["located"] is False

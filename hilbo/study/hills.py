@@ -1,0 +1,74 @@
+"""Hills of a population map, and with what probability the best rendering is on each.
+
+Even points of the map are added from the highest down. A point joins the hill of its higher neighbours; one that has
+none begins a hill; where two hills meet, the lower one is part of the other if its top is above the meeting place by
+less than the map's standard deviation at that top: a dip that the answers do not show. Joint draws of the map then say
+how often the largest value of all is on each hill. Its *centre* is the mean of the places where it was.
+
+Reference: Edelsbrunner & Harer (2010), Computational Topology, chapter VII, for tops and the places where they merge.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
+
+__all__ = ["Hill", "hills_of"]
+
+_AROUND, _MOST = 2, 64  # neighbours of a point: so many times 3^d, which stand all around it, up to a number
+_LEAST = 0.01  # of the draws: what is rarer is no hill to speak of
+
+
+class Hill(NamedTuple):
+    """Points of the box coordinates in which the feasible set is a cube."""
+
+    top: Float[np.ndarray, " d"]
+    centre: Float[np.ndarray, " d"]
+    probability: float
+    """That the best rendering is on it."""
+
+
+def hills_of(
+    points: Float[np.ndarray, "m d"],
+    height: Float[np.ndarray, " m"],
+    sd: Float[np.ndarray, " m"],
+    weight: Float[np.ndarray, " m"],
+    theta: Float[np.ndarray, " d"],
+) -> tuple[Hill, ...]:
+    """Hills by falling probability, from even points of the box, the map's mean and standard deviation, and the share
+    of draws that are largest there; `theta`: inverse squared lengths, by which points are near."""
+    tops = _tops(points * np.sqrt(theta), height, sd)
+    hills = []
+    for top in np.unique(tops):
+        on = tops == top
+        probability = float(weight[on].sum())
+        if probability >= _LEAST:
+            hills.append(Hill(points[top], weight[on] @ points[on] / probability, probability))
+    return tuple(sorted(hills, key=lambda hill: -hill.probability))
+
+
+def _tops(
+    scaled: Float[np.ndarray, "m d"], height: Float[np.ndarray, " m"], sd: Float[np.ndarray, " m"]
+) -> Int[np.ndarray, " m"]:
+    """For each point the top of its hill."""
+    count, d = scaled.shape
+    _, near = KDTree(scaled).query(scaled, min(3**d * _AROUND, _MOST, count))
+    joined = list(range(count))  # to the top of a hill, or of one that this hill became part of
+
+    def top_of(point: int) -> int:
+        while joined[point] != point:
+            point = joined[point]
+        return point
+
+    for point in np.argsort(-height, kind="stable").tolist():
+        higher = [other for other in near[point].tolist() if height[other] > height[point]]
+        if not higher:
+            continue
+        joined[point] = top_of(max(higher, key=lambda other: height[other]))
+        tops = {top_of(other) for other in higher}
+        best = max(tops, key=lambda top: height[top])
+        for top in tops - {best}:
+            if height[top] - height[point] < sd[top]:
+                joined[top] = best
+    return np.array([top_of(point) for point in range(count)])
