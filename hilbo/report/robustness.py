@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
+from hilbo.hyperparameters.judged_evidence import judged_sentences
 from hilbo.report.page import Pictures, rendered
 from hilbo.report.results import as_json, map_dataset, optimum_content, save_figures, versions
 from hilbo.study.cohort import Cohort
@@ -83,6 +84,8 @@ def robustness_result(study: Study, cohort: Cohort, found: Robustness, seed: int
         "participants": rows,
         "learned": {
             "parameters": list(learned.learn),
+            "laplace_error": np.asarray(found.judged.error).tolist(),
+            "learnt_again": np.asarray(found.judged.again).tolist(),
             "shared": found.shared,
             "theta": np.asarray(model.kernel.theta).tolist(),
             "noise": np.asarray(model.likelihood.noise).tolist(),
@@ -110,4 +113,4 @@ def _warnings(check, stacked):
         if state.any():
             whose = "The search" if check.shared else f"{state.sum()} of {len(state)} searches"
             sentences.append(f"{whose} for hyperparameters {words}.")
-    return sentences
+    return sentences + judged_sentences(check.judged)

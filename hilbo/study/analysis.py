@@ -14,9 +14,8 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.hyperparameters.maximum_evidence import Learned, maximise_shared_evidence
-from hilbo.numerics.tracing import program
-from hilbo.ordinal_gp import Trials
+from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maximise_judged
+from hilbo.hyperparameters.maximum_evidence import Learned
 from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.response_quality import excluded, measure_people
@@ -130,13 +129,14 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     population = analyse_population(study, cohort, seed, say)
     study, aggregate = population.study, population.aggregate
     say("hyperparameters by maximum evidence")
-    learned, learned_study, optimised = _optimised(study, cohort, seed)
+    judged, learned_study, optimised = _optimised(study, cohort, seed)
+    learned = judged.learned
     say("reading the maps")
     sets, sentences = _best_mid_worst(study, aggregate, seed)
     best = aggregate.optimum
     location = location_sentences(study, best.x, best.sd, aggregate.asked_variance)
     limits = (*location, *learnt_sentences(study), *limits_of(study, cohort), *sentences)
-    limits += tuple(_merged_otherwise(aggregate.map))
+    limits += (*_merged_otherwise(aggregate.map), *judged_sentences(judged))
     if bool(learned.runaway) or not bool(learned.converged):
         limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
     return Analysis(
@@ -182,17 +182,13 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Learned, Study, Aggregate]:
+def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, Aggregate]:
     """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
-    learned = _learn(study, cohort.trials)
+    judged = maximise_judged(study.gp, cohort.trials, _LEARN, inference=study.inference)
+    learned = judged.learned
     rule = "hierarchical" if study.rule == RECIPE else study.rule
     learned_study = dataclasses.replace(study, gp=learned.gp, rule=rule, learnt=None)
-    return learned, learned_study, aggregate_cohort(learned_study, cohort, seed, alternatives=False)
-
-
-@program
-def _learn(study: Study, trials: Trials) -> Learned:
-    return maximise_shared_evidence(study.gp, trials, _LEARN, weak_priors=True, inference=study.inference)
+    return judged, learned_study, aggregate_cohort(learned_study, cohort, seed, alternatives=False)
 
 
 def _reading(study: Study, aggregate: Any, seed: int) -> Reading:

@@ -16,12 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
-from hilbo.hyperparameters.maximum_evidence import (
-    Learned,
-    maximise_evidence,
-    maximise_shared_evidence,
-    optimum_sensitivity,
-)
+from hilbo.hyperparameters.judged_evidence import Judged, maximise_judged
+from hilbo.hyperparameters.maximum_evidence import Learned, optimum_sensitivity
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.learnt import RECIPE
@@ -41,8 +37,8 @@ LIMIT = 0.03
 class Robustness(eqx.Module):
     """Optima under fixed and under learnt hyperparameters, and how far apart they are."""
 
-    learned: Learned
-    """One model if `shared`, else stacked, one for each participant."""
+    judged: Judged
+    """What was learnt, one model if `shared`, else stacked, one for each participant; and Laplace's error there."""
     fixed: Optimum
     optimised: Optimum
     fixed_individuals: Optimum
@@ -61,6 +57,11 @@ class Robustness(eqx.Module):
     """By which people were merged, point by point: the study's, or bcm where that takes all answers at once."""
     shares: tuple[Float[Array, ""] | None, Float[Array, ""] | None]
     """Of the hierarchical rule, under the fixed and under the learnt hyperparameters."""
+
+    @property
+    def learned(self) -> Learned:
+        """The hyperparameters."""
+        return self.judged.learned
 
     def maps(self) -> tuple[partial, partial]:
         """The population maps under the fixed and under the learnt hyperparameters: functions of points (m, d)."""
@@ -102,7 +103,10 @@ def robustness(
         )
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
-    learned = _learn(study, cohort.trials, tuple(learn), shared, weak_priors)
+    judged = maximise_judged(
+        study.gp, cohort.trials, learn, shared=shared, weak_priors=weak_priors, inference=study.inference
+    )
+    learned = judged.learned
     if shared:
         study_learnt = eqx.tree_at(lambda s: s.gp, study, learned.gp)
         again = fit_cohort(study_learnt, cohort)
@@ -117,7 +121,7 @@ def robustness(
     )
     before, after = (individual_optima(s, p, candidates) for s, p in ((study, posteriors), (study_learnt, again)))
     return Robustness(
-        learned=learned,
+        judged=judged,
         fixed=fixed,
         optimised=optimised,
         fixed_individuals=before,
@@ -136,14 +140,6 @@ def robustness(
 def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:
     """What people have in common, where the study's rule asks for it."""
     return share_of(study.gp, cohort.trials, study.inference).mean if study.rule == "hierarchical" else None
-
-
-@program
-def _learn(study: Study, trials: Trials, learn: tuple[str, ...], shared: bool, weak_priors: bool) -> Learned:
-    settings = {"weak_priors": weak_priors, "inference": study.inference}
-    if shared:
-        return maximise_shared_evidence(study.gp, trials, learn, **settings)
-    return jax.lax.map(lambda t: maximise_evidence(study.gp, t, learn, **settings), trials)
 
 
 @program
