@@ -36,8 +36,9 @@ class Scene(NamedTuple):
 
 
 class Places(NamedTuple):
-    """People of the preset, changed."""
+    """People of a preset, changed."""
 
+    preset: str = "paper-individuals"
     differences: float = 1.0
     lapse: float | None = None
     groups: bool = False
@@ -49,7 +50,7 @@ class Places(NamedTuple):
         return PAPER
 
     def scene(self, study, count, seed):
-        population = PRESETS["paper-individuals"]
+        population = PRESETS[self.preset]
         rng = np.random.default_rng([seed, 7])
         shift = np.zeros(study.space.dim)
         if self.anywhere:
@@ -62,7 +63,7 @@ class Places(NamedTuple):
         return Scene(persons, ChanceOfPlaces(crowd))
 
     def _changed(self, study, persons, shift, rng):
-        truth = unit_truth(study, PRESETS["paper-individuals"])
+        truth = unit_truth(study, PRESETS[self.preset])
         optimum = truth + self.differences * (np.asarray(persons.optimum) - truth)
         if self.groups:
             other = rng.uniform(size=len(optimum)) < 0.5
@@ -188,9 +189,9 @@ class Drawn(eqx.Module):
 
 POPULATIONS = {
     "paper-individuals": Places(),
-    "paper-individuals, differences × 0": Places(0.0),
-    "paper-individuals, differences × 1/2": Places(0.5),
-    "paper-individuals, differences × 2": Places(2.0),
+    "paper-individuals, differences × 0": Places(differences=0.0),
+    "paper-individuals, differences × 1/2": Places(differences=0.5),
+    "paper-individuals, differences × 2": Places(differences=2.0),
     "paper-individuals, no lapses": Places(lapse=0.0),
     "two groups": Places(groups=True),
     "widths of their own": Places(widths=0.5),
@@ -202,4 +203,4 @@ POPULATIONS = {
     "functions, RBF, two parameters": Functions(12.0, dim=2),
     "functions, RBF, four parameters": Functions(4.0, dim=4),
     "functions, RBF, five categories": Functions(4.0, shares=(0.3, 0.2, 0.2, 0.15, 0.15)),
-}
+} | {name: Places(name) for name in PRESETS if name not in ("paper", "paper-individuals")}

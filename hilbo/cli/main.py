@@ -17,6 +17,7 @@ from hilbo.cli import material as cli_material
 from hilbo.cli import study as cli_study
 from hilbo.cli.cache import cache
 from hilbo.cli.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, remark, results, start
+from hilbo.cli.demo import print_demo
 from hilbo.errors import InputError
 
 __all__ = ["app", "main"]
@@ -203,7 +204,7 @@ def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) 
         chosen, cohort = _read(Path(str(data / "video_quality.csv")), Path(str(data / "video_quality.toml")), None, say)
         real = _aggregate(chosen, cohort, folder / PARTS[0], seed, say)
         simulated = cli_study.simulated_report(folder / PARTS[1], seed, say)["materials"][""]
-    _print_demo(real, simulated, out)
+    print_demo(real, simulated, out)
 
 
 def _read(trials, study, material, say):
@@ -283,44 +284,3 @@ def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
     print(
         json.dumps(summary, indent=2) if as_json else f"{summary['answers']} answers in {summary['seconds']} s: {out}"
     )
-
-
-def _print_demo(real, simulated, out) -> None:
-    """The demo's last words: the real optimum in a line, the simulated misses beside the paper's."""
-    from rich import box
-    from rich.console import Console
-    from rich.table import Table as RichTable
-
-    console = Console(highlight=False, soft_wrap=True)
-    best = real["optimum"]["parameters"]
-    console.print(f"\nVideo quality, {len(real['participants'])} people: the map is highest at", end=" ")
-    console.print(", ".join(f"{name} = {value:.0f}" for name, value in best.items()) + ".\n")
-    truth = simulated["truth"]
-    table = RichTable(
-        title="Simulated memory foam, 24 people x 25 trials: NRMSE to the truth, of the search ranges",
-        box=box.SIMPLE_HEAD,
-        title_justify="left",
-        pad_edge=False,
-    )
-    for head in ("", "K1, B1, alpha", "with K0", "passive by", "the paper"):
-        table.add_column(head, justify="right" if head else "left", no_wrap=True)
-
-    def row(name, key, optimum, paper):
-        miss, margin = truth["nrmse"][key], optimum["passivity_margin"]
-        passive = f"{'yes' if margin >= 0 else 'no'}, {margin:+.3f}"
-        table.add_row(name, f"{100 * miss['nrmse']:.1f} %", f"{100 * miss['nrmse_with_K0']:.1f} %", passive, paper)
-
-    row("population (BCM)", "aggregate", simulated["optimum"], "4 %, yes")
-    q, qk = truth["individuals"]["quartiles"], truth["individuals"]["with_K0"]
-    spread = [f"{100 * v[1]:.0f} % ({100 * v[0]:.0f}–{100 * v[2]:.0f})" for v in (q, qk)]
-    margins = [person["optimum"]["passivity_margin"] for person in simulated["participants"]]
-    passive = f"{sum(margin >= 0 for margin in margins)} of {len(margins)}"
-    table.add_row("individuals", *spread, passive, "24 % (13–41)")
-    row("mean of optima", "mean_of_optima", simulated["mean_of_optima"], "10.5 %, no")
-    row("mean of maps", "average", simulated["alternatives"]["average"], "")
-    console.print(table)
-    console.print("Individuals: median and quartiles. Passive by so many N.s/m of damping more than the least.")
-    top = truth["top_answers"]
-    console.print(f'"close" answers of 25: {top["mean"]:.2f} ± {top["sd"]:.2f} (paper: 5.96 ± 4.47)\n')
-    for name in PARTS:
-        console.print(str(out / name / "report.html"))

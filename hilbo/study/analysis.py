@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 import pandas as pd
 
@@ -17,14 +18,14 @@ from hilbo.errors import InputError
 from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maximise_judged
 from hilbo.hyperparameters.maximum_evidence import Learned
 from hilbo.population.learnt import RECIPE
-from hilbo.population.maps import RuleMap, point_rule
+from hilbo.population.maps import RuleMap, learnt_map, point_rule
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, aggregate_cohort, asked_variance, nrmse
+from hilbo.study.aggregate import Aggregate, aggregate_cohort, asked_variance, map_optimum, nrmse
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import in_place
-from hilbo.study.learnt_study import learnt_sentences, resolved
+from hilbo.study.learnt_study import learnt_sentences, resolved, that_learns
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
 from hilbo.study.optimum_location import location_sentences, optimum_sentence
 from hilbo.study.progress import Progress, follow
@@ -126,7 +127,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
             f'the rule "{study.exclude}" leaves out all {len(left_out)} participants; there is nothing to merge.'
         )
     cohort = everybody.of([name for name in everybody.names if name not in left_out]) if left_out else everybody
-    population = analyse_population(study, cohort, seed, say)
+    population = _with_learnt(analyse_population(study, cohort, seed, say), seed, say)
     study, aggregate = population.study, population.aggregate
     say("hyperparameters by maximum evidence")
     judged, learned_study, optimised = _optimised(study, cohort, seed)
@@ -180,6 +181,24 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     if counts.max() < planned:
         sentences.append(f"The study plans {planned} trials; nobody has given more than {counts.max()}.")
     return tuple(sentences)
+
+
+def _with_learnt(population: Population, seed: int, say: Say) -> Population:
+    """With the optimum by learnt-1 among the alternatives, where the study's rule is another."""
+    study, aggregate = population.study, population.aggregate
+    if study.rule == RECIPE:
+        return population
+    say(f"the same by {RECIPE}")
+    learns = resolved(that_learns(study), aggregate.cohort)
+    assert learns.learnt is not None
+    map_ = learnt_map(learns.learnt, aggregate.cohort.trials)
+    optimum = map_optimum(learns, map_, search_points(study.space, seed))
+    beside = eqx.tree_at(
+        lambda a: (a.alternatives, a.maps),
+        aggregate,
+        (aggregate.alternatives | {RECIPE: optimum}, aggregate.maps | {RECIPE: map_}),
+    )
+    return population._replace(aggregate=beside)
 
 
 def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, Aggregate]:
