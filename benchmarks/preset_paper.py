@@ -1,4 +1,4 @@
-"""The simulated preset `paper-individuals` over many seeds, beside the paper's figures; writes docs/simulation.md with --write.
+"""The simulated preset `paper-individuals` over many seeds, beside the paper's figures, for docs/simulation.md.
 
     python benchmarks/preset_paper.py --seeds 20 --write
 

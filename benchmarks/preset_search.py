@@ -1,17 +1,20 @@
 """Populations that agree with the paper's individuals and with its validation: a search, by simulated studies.
 
-    python benchmarks/preset_search.py FILE [--first 1000] [--rounds 6] [--per-round 200] [--again 4]
+    python benchmarks/preset_search.py FILE [--first 500] [--rounds 3] [--per-round 150] [--again 3]
+    python benchmarks/preset_search.py FILE --write
 
 FILE (JSON Lines) collects a row for each simulated study; a run that was stopped goes on where it was. The first round
 draws populations from wide ranges; each later one draws near the best so far (population Monte Carlo); then the best 60
-are simulated again, on other seeds. Compared are what individuals of 24 x 25 trials by the paper's method did (answers
-"close", their optima, how far these are from the truth) and the classes of best, mid and worst in the validation. The
-preferences of the validation, the comparison of the aggregate with individuals' sets and the close-dominant intervals
-are held out; benchmarks/preset_paper.py reports them on fresh seeds.
+are simulated again, on other seeds. --write puts the best 30 into hilbo/data/populations.toml. Compared are what
+individuals of 24 x 25 trials by the paper's method did (answers "close", their optima, how far these are from the
+truth) and the classes of best, mid and worst in the validation. The preferences of the validation, the comparison of
+the aggregate with individuals' sets and the close-dominant intervals are held out; benchmarks/presets.py reports them
+on fresh seeds.
 """
 
 import argparse
 import json
+import re
 from itertools import combinations
 from pathlib import Path
 
@@ -31,10 +34,11 @@ from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 from hilbo.study.map_summary import best_mid_worst  # noqa: E402
 
-STUDY = Study.load(Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml")
+DATA = Path(__file__).parents[1] / "hilbo" / "data"
+FILE, STUDY = DATA / "populations.toml", Study.load(DATA / "paper.toml")
 TRUTH = {"K1": 5.70, "B1": 5.89, "alpha": 0.203}
 CROWD = 1000  # new people who validate
-BEST = 60  # populations that a round is drawn near
+BEST, KEPT = 60, 30  # populations that a round is drawn near, and that become presets
 
 RANGES = {  # from, to; all but `contrast` and `lapse` on a logarithmic scale
     "spread K1": (0.08, 0.5),
@@ -74,12 +78,16 @@ CLUSTERED = 3.0  # 8 answers of one person are worth fewer: their variance is ab
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("file", type=Path)
-    options.add_argument("--first", type=int, default=800)
-    options.add_argument("--rounds", type=int, default=6)
-    options.add_argument("--per-round", type=int, default=200)
-    options.add_argument("--again", type=int, default=4)
+    options.add_argument("--first", type=int, default=500)
+    options.add_argument("--rounds", type=int, default=3)
+    options.add_argument("--per-round", type=int, default=150)
+    options.add_argument("--again", type=int, default=3)
+    options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
     search = Search(chosen.file)
+    if chosen.write:
+        write([place for number, place in search.ranked() if search.studies(number) > 1][:KEPT])
+        return
     rng = np.random.default_rng(18)
     for number in range(chosen.first):
         search.study(number, rng.uniform(size=len(NAMES)), seed=0)
@@ -115,6 +123,9 @@ class Search:
             file.write(json.dumps(row) + "\n")
         print(number, seed, round(row["distance"], 1), flush=True)
 
+    def studies(self, number):
+        return sum(row["number"] == number for row in self.rows)
+
     def ranked(self):
         """Numbers and places of all populations, by the distance of what their studies had in the mean."""
         by_number = {}
@@ -125,6 +136,27 @@ class Search:
             for number, rows in by_number.items()
         ]
         return [(number, place) for _, number, place in sorted(each, key=lambda row: row[:2])]
+
+
+def write(places):
+    """The presets in the order of their distance from the paper; `paper` is nearest to their middle."""
+    middle = np.mean(places, axis=0)
+    nearest = int(np.argmin([np.sum((place - middle) ** 2) for place in places]))
+    text = FILE.read_text()
+    lines = [
+        re.sub(
+            r'(?m)^paper = "[^"]*"', f'paper = "paper-{nearest + 1:02d}"', text.partition("\n[populations.paper-0")[0]
+        )
+    ]
+    for k, place in enumerate(places):
+        p = population_at(place)
+        truth = ", ".join(f"{name} = {value}" for name, value in p.truth.items())
+        lines += ["", f"[populations.paper-{k + 1:02d}]", f"truth = {{{truth}}}"]
+        for name in ("spread", "tolerance", "tolerance_sd", "criteria", "noise", "lapse", "drift_sd", "contrast"):
+            value = getattr(p, name)
+            shown = f"[{', '.join(f'{v:.3g}' for v in value)}]" if isinstance(value, tuple) else f"{value:.3g}"
+            lines.append(f"{name} = {shown}")
+    FILE.write_text("\n".join(lines) + "\n")
 
 
 def reflected(place):
