@@ -154,9 +154,13 @@ def write(places):
         lines += ["", f"[populations.paper-{k + 1:02d}]", f"truth = {{{truth}}}"]
         for name in ("spread", "tolerance", "tolerance_sd", "criteria", "noise", "lapse", "drift_sd", "contrast"):
             value = getattr(p, name)
-            shown = f"[{', '.join(f'{v:.3g}' for v in value)}]" if isinstance(value, tuple) else f"{value:.3g}"
+            shown = f"[{', '.join(map(three_digits, value))}]" if isinstance(value, tuple) else three_digits(value)
             lines.append(f"{name} = {shown}")
     FILE.write_text("\n".join(lines) + "\n")
+
+
+def three_digits(value):
+    return repr(float(f"{value:.3g}"))
 
 
 def reflected(place):
