@@ -1,7 +1,8 @@
 """What a study's results say of the paper's hypotheses H1 to H4, item by item.
 
-Every item is a sentence with its figures, and whether it speaks for the hypothesis, against it, or leaves it open. The
-thresholds are stated in the sentence; the verdict counts the items and is no test of its own.
+Every item is a sentence with its figures, and whether it supports the hypothesis, contradicts it, or is inconclusive.
+The bounds are stated in the sentence. Items are not counted, and none is a test of its own. Only a study that asks for
+it has this section (`[report] hypotheses = true`): the hypotheses are the paper's, not everybody's.
 
     H1  individuals' parameters can be found by asking      H3  individuals need not have converged for that
     H2  a population's map has an optimum that people share  H4  it holds for other materials
@@ -22,7 +23,7 @@ from hilbo.study.progress import settled
 
 __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
-Side = Literal["for", "against", "open"]
+Side = Literal["supports", "contradicts", "inconclusive"]
 _NEAR = 0.05
 
 
@@ -44,21 +45,10 @@ class Evidence(NamedTuple):
 
 
 class Hypothesis(NamedTuple):
-    """A hypothesis, its evidence and what that comes to."""
+    """A hypothesis and its evidence."""
 
     number: str
     evidence: tuple[Evidence, ...]
-
-    @property
-    def verdict(self) -> str:
-        """In words."""
-        sides = [item.side for item in self.evidence]
-        pro, con = sides.count("for"), sides.count("against")
-        if not pro + con:
-            return "These data cannot say."
-        if not con:
-            return f"All that can be said ({pro} of {pro}) speaks for it."
-        return f"{pro} of {pro + con} items speak for it, {con} against."
 
 
 def hypotheses(results: Sequence[Results]) -> list[Hypothesis]:
@@ -73,7 +63,7 @@ def hypotheses(results: Sequence[Results]) -> list[Hypothesis]:
 
 
 def _side(good: bool) -> Side:
-    return "for" if good else "against"
+    return "supports" if good else "contradicts"
 
 
 def _individuals(results):
@@ -86,7 +76,7 @@ def _individuals(results):
         yield Evidence(
             _side(len(settled_from) > people / 2),
             f"{len(settled_from)} of {people} individual optima stayed within {100 * _NEAR:.0f} % (NRMSE) of their"
-            f" final place before their last trial{median} (for: more than half).",
+            f" final place before their last trial{median} (supports: more than half).",
         )
     answers = np.asarray(analysis.cohort.trials.q) == len(study.responses) - 1
     mask = np.asarray(analysis.cohort.trials.mask)
@@ -99,16 +89,17 @@ def _individuals(results):
         for columns in (slice(0, third), slice(longest - third, longest))
     )
     yield Evidence(
-        _side(late > early) if longest >= 6 else "open",
+        _side(late > early) if longest >= 6 else "inconclusive",
         f'Of {longest} trials, {totals.mean():.2f}{spread} were answered "{top}"; in the first third of the session'
-        f" {100 * early:.0f} % of the answers, in the last third {100 * late:.0f} % (for: more than in the first).",
+        f" {100 * early:.0f} % of the answers, in the last third {100 * late:.0f} % (supports: more than in the"
+        " first).",
     )
     chances = np.asarray(analysis.aggregate.individuals.class_probabilities)
     likeliest = int((chances.argmax(axis=1) == chances.shape[1] - 1).sum())
     yield Evidence(
         _side(likeliest > people / 2),
         f'At their own optimum "{top}" is the likeliest answer for {likeliest} of {people} participants (median'
-        f" probability {100 * np.median(chances[:, -1]):.0f} %; for: more than half of them).",
+        f" probability {100 * np.median(chances[:, -1]):.0f} %; supports: more than half of them).",
     )
 
 
@@ -124,16 +115,16 @@ def _population(results):
             _side(bool(ours < middle and ours < mean)),
             f"From {results.reference_name} the population optimum is {100 * ours:.1f} % away (NRMSE), the individual"
             f" optima {100 * middle:.0f} % (median; quartiles {100 * low:.0f} and {100 * high:.0f} %), their mean"
-            f" {100 * mean:.1f} % (for: nearer than both the median and the mean).",
+            f" {100 * mean:.1f} % (supports: nearer than both the median and the mean).",
         )
     p = float(best.class_probabilities[-1])
     yield Evidence(
         _side(int(np.argmax(np.asarray(best.class_probabilities))) == len(study.responses) - 1),
-        f'At the population optimum the map gives "{study.responses[-1]}" a probability of {100 * p:.0f} % (for: the'
-        " likeliest answer).",
+        f'At the population optimum the map gives "{study.responses[-1]}" a probability of {100 * p:.0f} %'
+        " (supports: the likeliest answer).",
     )
     if results.validated is None:
-        yield Evidence("open", "No validation session asked people again.")
+        yield Evidence("inconclusive", "No validation session asked people again.")
         return
     yield from _validation(results.validated, study.responses)
 
@@ -161,7 +152,7 @@ def _validation(validated, responses):
         if term not in rows.index:
             continue
         low, high = sorted((sign * rows.at[term, "low"], sign * rows.at[term, "high"]))
-        side: Side = "for" if low > 0 else "against" if high < 0 else "open"
+        side: Side = "supports" if low > 0 else "contradicts" if high < 0 else "inconclusive"
         yield Evidence(
             side,
             f"Table {number}, {term}: {rows.at[term, 'estimate']:.2f}, 95 % interval {rows.at[term, 'low']:.2f} to"
@@ -174,14 +165,14 @@ def _convergence(results):
     counts, (population_errors, individual_errors) = analysis.progress.counts, analysis.progress.to_end()
     people = len(analysis.cohort.names)
     if len(counts) <= 2 or people < 2:
-        yield Evidence("open", "It takes several participants and trials to say.")
+        yield Evidence("inconclusive", "It takes several participants and trials to say.")
         return
     first = settled(counts, population_errors, _NEAR)
     how = in_place(analysis.aggregate.map)
     how = f" (merged {how})" if how else ""
     if first is None:
         yield Evidence(
-            "against",
+            "contradicts",
             f"The population optimum{how} still moved by more than {100 * _NEAR:.0f} % before the last trial.",
         )
         return
@@ -191,7 +182,7 @@ def _convergence(results):
         _side(open_ > 0),
         f"From trial {first} on the population optimum{how} stayed within {100 * _NEAR:.0f} % (NRMSE) of its final"
         f" place; {open_} of {answering} individual optima that could still move were further from theirs then"
-        " (for: one at least).",
+        " (supports: one at least).",
     )
     if results.reference is not None:
         miss = [
@@ -201,17 +192,17 @@ def _convergence(results):
         yield Evidence(
             _side(miss[0] <= miss[1] + _NEAR),
             f"It was then {100 * miss[0]:.1f} % from {results.reference_name}, and {100 * miss[1]:.1f} % in the"
-            f" end{how} (for: at most {100 * _NEAR:.0f} % more).",
+            f" end{how} (supports: at most {100 * _NEAR:.0f} % more).",
         )
 
 
 def _materials(results):
     if len(results) < 2:
-        yield Evidence("open", "One material was studied.")
+        yield Evidence("inconclusive", "One material was studied.")
     for one in results[1:]:
         items = [*_near(one), *([] if one.validated is None else _preferred(one.name, one.validated))]
         words = f"{one.name}: there is no reference, and no decided comparison of the map's set with individuals'."
-        yield from items or [Evidence("open", words)]
+        yield from items or [Evidence("inconclusive", words)]
 
 
 def _near(one):
@@ -223,7 +214,7 @@ def _near(one):
     yield Evidence(
         _side(ours < individual_miss),
         f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference_name}, the median individual one"
-        f" {100 * individual_miss:.0f} % (for: nearer than that).",
+        f" {100 * individual_miss:.0f} % (supports: nearer than that).",
     )
 
 
@@ -232,7 +223,7 @@ def _preferred(name, validated):
     if table is None or validated.overall is None:
         return
     row = safest(table).set_index("term").loc["Aggregate-Best"]
-    side: Side = "for" if row["low"] > 0 else "against" if row["high"] < 0 else "open"
+    side: Side = "supports" if row["low"] > 0 else "contradicts" if row["high"] < 0 else "inconclusive"
     yield Evidence(
         side,
         f"{name}: the aggregate's set was preferred in {100 * validated.overall['rate'].iloc[0]:.1f} % of the decided"

@@ -69,7 +69,7 @@ def write_study(
         content, section = _write_material(material, analysis, validated, comparison_content, material_folder, seed)
         contents[material.name] = content
         sections.append(section)
-    claims = hypotheses(results)
+    claims = hypotheses(results) if folder.study.report.hypotheses else []
     content = _content(folder, contents, claims, seed)
     (out / "result.json").write_text(as_json(content), encoding="utf-8")
     say("the page")
@@ -89,9 +89,7 @@ def write_study(
 def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
     return {
         "materials": contents,
-        "hypotheses": [
-            {"number": h.number, "verdict": h.verdict, "evidence": [e._asdict() for e in h.evidence]} for h in claims
-        ],
+        "hypotheses": [{"number": h.number, "evidence": [e._asdict() for e in h.evidence]} for h in claims],
         "study": folder.study.hash,
         "seed": seed,
         "versions": versions(),

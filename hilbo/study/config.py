@@ -13,7 +13,7 @@ from hilbo.population.maps import AnyRule
 from hilbo.search.space import SearchSpace
 from hilbo.study.protocols import SessionTable
 from hilbo.study.study_file import StudyFile, checked, hash_of, made_of_material, materials_in, read_study
-from hilbo.study.study_tables import Inference, Selection
+from hilbo.study.study_tables import Inference, ReportTable, Selection
 
 __all__ = ["RBF", "OrdinalGP", "OrdinalProbit", "Study"]
 
@@ -39,6 +39,7 @@ class Study(eqx.Module):
     source: str = eqx.field(static=True)
     content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON
     session: SessionTable = eqx.field(static=True, repr=False, default=SessionTable())
+    report: ReportTable = eqx.field(static=True, repr=False, default=ReportTable())
     stated: Stated = eqx.field(static=True, repr=False, default=NOTHING)
     """What the file states of the model, where the rule learns the rest."""
     learnt: Learnt | None = eqx.field(repr=False, default=None)
@@ -72,6 +73,7 @@ class Study(eqx.Module):
             source=file.source,
             content=file.content,
             session=file.session,
+            report=file.tables.report,
             stated=stated,
         )
 

@@ -20,7 +20,18 @@ from hilbo.study.fields import check_keys, check_table, read_table, shown
 from hilbo.study.fields import words as _text
 from hilbo.study.protocols import SessionTable
 
-__all__ = ["GPTable", "Inference", "Rule", "Selection", "Tables", "box_of", "check_together", "of_material", "read"]
+__all__ = [
+    "GPTable",
+    "Inference",
+    "ReportTable",
+    "Rule",
+    "Selection",
+    "Tables",
+    "box_of",
+    "check_together",
+    "of_material",
+    "read",
+]
 
 Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
 Rule = Literal["bcm", "hierarchical", "rbcm", "average", "pooled", "learnt-1"]
@@ -90,6 +101,13 @@ class _AggregationTable(_Table, frozen=True):
     rule: Annotated[Rule, _text("one of " + ", ".join(f'"{name}"' for name in get_args(Rule)), '"bcm"')] = "bcm"
 
 
+class ReportTable(_Table, frozen=True):
+    """What `hilbo report` says besides. `hypotheses`: what the results say of the paper's hypotheses H1 to H4, and
+    which figure is which of the paper's."""
+
+    hypotheses: Annotated[bool, _text("true or false", "true")] = False
+
+
 class Tables(_Table, frozen=True):
     """The whole file: what the hash is taken of."""
 
@@ -101,6 +119,7 @@ class Tables(_Table, frozen=True):
     aggregation: _AggregationTable = _AggregationTable()
     materials: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
     session: SessionTable = SessionTable()
+    report: ReportTable = ReportTable()
 
 
 _TABLES = {
@@ -109,9 +128,21 @@ _TABLES = {
     "selection": Selection,
     "aggregation": _AggregationTable,
     "session": SessionTable,
+    "report": ReportTable,
 }
 _REQUIRED = ("schema", "study", "parameters")
-_KEYS = ("schema", "study", "parameters", "renderer", "gp", "selection", "aggregation", "session", "materials")
+_KEYS = (
+    "schema",
+    "study",
+    "parameters",
+    "renderer",
+    "gp",
+    "selection",
+    "aggregation",
+    "session",
+    "report",
+    "materials",
+)
 _OVERRIDES = ("renderer", "parameters")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
 

@@ -19,7 +19,7 @@ from studies import paper_counts, plain
 from hilbo import Trials
 from hilbo.population.maps import RuleMap
 from hilbo.report.figures.study import individual_convergence
-from hilbo.report.hypotheses import Evidence, Hypothesis, _convergence, _materials
+from hilbo.report.hypotheses import _convergence, _materials
 from hilbo.report.study import _comparison, _shown, _tolerances
 from hilbo.report.study_figures import comparison_figures
 from hilbo.report.validation import validate
@@ -85,7 +85,7 @@ def test_who_stopped_early_has_not_converged_for_that():
             aggregate=aggregate,
         )
         (item,) = _convergence(SimpleNamespace(found=found, reference=None))
-        assert item.side == "for" and words in item.text and "(for: one at least)" in item.text
+        assert item.side == "supports" and words in item.text and "(supports: one at least)" in item.text
 
 
 def test_other_materials_are_the_others():
@@ -99,10 +99,14 @@ def test_other_materials_are_the_others():
         for name, asked, reference in (("A", None, np.zeros(2)), ("B", validated, np.full(2, 0.5)), ("C", None, None))
     )
     items = list(_materials([first, second, third]))
-    assert [item.text[0] for item in items] == ["B", "B", "C"] and [i.side for i in items] == ["for", "for", "open"]
-    assert items[0].text.endswith("(for: nearer than that).")
+    assert [item.text[0] for item in items] == ["B", "B", "C"] and [i.side for i in items] == [
+        "supports",
+        "supports",
+        "inconclusive",
+    ]
+    assert items[0].text.endswith("(supports: nearer than that).")
     assert "76.6 % of the decided comparisons (20 ties;" in items[1].text
-    assert [item.side for item in _materials([first])] == ["open"]
+    assert [item.side for item in _materials([first])] == ["inconclusive"]
 
 
 def test_measures_have_the_digits_that_answers_give():
@@ -112,15 +116,6 @@ def test_measures_have_the_digits_that_answers_give():
     row |= dict(low=1.0, high=12.346, low_from=1.0, low_to=1.2346, high_from=1.1, high_to=12.346)
     ((*_, low, ends, _),) = _tolerances(pd.DataFrame([row]))
     assert (low, ends) == ("12.35 (range)", "1.1 to 12")
-
-
-def test_verdicts_count_what_can_be_said():
-    def verdict(*sides):
-        return Hypothesis("H1", tuple(Evidence(side, "") for side in sides)).verdict
-
-    assert verdict("open") == "These data cannot say."
-    assert verdict("for", "open", "for") == "All that can be said (2 of 2) speaks for it."
-    assert verdict("for", "against", "open") == "1 of 2 items speak for it, 1 against."
 
 
 class Population(eqx.Module):
@@ -180,7 +175,8 @@ def test_a_report_of_two_materials(capsys, monkeypatch, tmp_path):
     table["material"] = np.where(table["participant"].isin(["V01", "V02"]), "one", "two")
     folder, out = tmp_path / "folder", tmp_path / "out"
     folder.mkdir()
-    (folder / "study.toml").write_text(Path("hilbo/data/video_quality.toml").read_text())
+    text = Path("hilbo/data/video_quality.toml").read_text()
+    (folder / "study.toml").write_text(f"{text}\n[report]\nhypotheses = true\n")
     table.to_csv(folder / "trials.csv", index=False)
     pair = "participant,material,trial,set_a,set_b,class_a,class_b,preferred\n"
     (folder / "validation.csv").write_text(pair + "".join(f"N{i},one,1,best,worst,good,bad,a\n" for i in range(4)))
