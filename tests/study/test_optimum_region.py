@@ -7,6 +7,7 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.population.maps import RuleMap
 from hilbo.study.config import Study
+from hilbo.study import optimum_region as module
 from hilbo.study.hills import Hill
 from hilbo.study.optimum_region import Region, optimum_region, region_content, region_sentences
 
@@ -25,11 +26,13 @@ def region_of(count, seed=0):
     return optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), seed)
 
 
-def test_more_answers_leave_less_and_hold_the_best():
+def test_more_answers_leave_less_and_hold_the_best(monkeypatch):
+    monkeypatch.setattr(module, "_POINTS", 200)  # 800 take a quarter of a minute
+    monkeypatch.setattr(module, "_DRAWS", 1000)
     few, many = region_of(4), region_of(60)
     assert few is not None and many is not None
     assert 0 < many.volume < 0.5 * few.volume
-    assert len(many.points) + len(many.others) == 1000
+    assert len(many.points) + len(many.others) == 250
     assert many.holds(np.array([0.3, 0.6]), THETA)
     assert not many.holds(np.array([0.95, 0.05]), THETA)
 
