@@ -6,8 +6,8 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.population.maps import RuleMap
-from hilbo.study.config import Study
 from hilbo.study import optimum_region as module
+from hilbo.study.config import Study
 from hilbo.study.hills import Hill
 from hilbo.study.optimum_region import Region, optimum_region, region_content, region_sentences
 
