@@ -1,15 +1,18 @@
 """What is traced once: functions whose trace is kept, and programs that a command calls from outside of any trace."""
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ParamSpec, TypeVar, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 
-__all__ = ["Keeper", "keep_with", "program", "traced_once"]
+from hilbo.numerics.compiling import compiler_options
+
+__all__ = ["Keeper", "OfArrays", "arrays_in", "keep_with", "prepared", "program", "traced_once"]
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -21,8 +24,11 @@ For functions of arrays that programs use many times: tracing the likelihood is 
 """
 
 
-Keeper = Callable[[Callable, Callable, tuple, dict[str, Any]], Any]
-"""Answers a call of a program: what was traced, the same compiled, and the call's arguments."""
+OfArrays = Callable[[Sequence[Any]], Any]
+"""A program as a function of a call's arrays, in the order of `jax.tree.leaves`."""
+
+Keeper = Callable[[Callable, tuple, dict[str, Any]], OfArrays | None]
+"""Finds the program of a call, or makes it: of what was traced, and the call's arguments. None: it cannot be kept."""
 
 _keepers: list[Keeper] = []
 
@@ -35,21 +41,64 @@ def keep_with(keeper: Keeper | None) -> None:
 def program(function: Callable[_P, _R]) -> Callable[_P, _R]:
     """Decorator: compiled as by `eqx.filter_jit`, and kept from one process to the next where a command has set a
     keeper. Within another trace it is a part of that program. Its results have types of their own, no weak ones."""
-
-    @functools.wraps(function)
-    def typed(*args, **kwargs):
-        return jax.tree.map(_typed, function(*args, **kwargs))
-
+    typed = _typed(function)
     compiled = eqx.filter_jit(typed)
 
     @functools.wraps(function)
     def call(*args, **kwargs):
-        if not _keepers or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((args, kwargs))):
+        arrays = arrays_in((args, kwargs)) if _keepers else ()
+        if not _keepers or any(isinstance(array, Tracer) for array in arrays):
             return compiled(*args, **kwargs)
-        return _keepers[0](typed, compiled, args, kwargs)
+        kept = _keepers[0](typed, args, kwargs)
+        return compiled(*args, **kwargs) if kept is None else kept(arrays)
 
     return cast(Callable[_P, _R], call)
 
 
-def _typed(leaf: Any) -> Any:
+def prepared(function: Callable, *args: Any) -> OfArrays:
+    """The program of a call, to be given its arrays again and again: walking through records costs more than a short
+    program. Kept like other programs; without a keeper compiled once for all calls that differ in arrays only.
+
+    The function is one of a module, by name; calls are not part of another trace.
+    """
+    typed = _typed(function)
+    kept = _keepers[0](typed, args, {}) if _keepers else None
+    if kept is not None:
+        return kept
+    leaves, structure = jax.tree.flatten(args)
+    return _compiled(typed, structure, tuple(None if _is_array(leaf) else (type(leaf), leaf) for leaf in leaves))
+
+
+def arrays_in(what: Any) -> tuple[Any, ...]:
+    """The arrays among its leaves, NumPy's too: what a program is given of its arguments."""
+    return tuple(leaf for leaf in jax.tree.leaves(what) if _is_array(leaf))
+
+
+@functools.lru_cache(maxsize=32)
+def _compiled(function: Callable, structure: Any, fixed: tuple[tuple[type, Any] | None, ...]) -> OfArrays:
+    """A function of the arrays among the leaves of its arguments; the other leaves are `fixed`."""
+
+    def of_arrays(arrays):
+        given = iter(arrays)
+        return function(*jax.tree.unflatten(structure, [next(given) if leaf is None else leaf[1] for leaf in fixed]))
+
+    return jax.jit(of_arrays, compiler_options=compiler_options())
+
+
+@functools.cache
+def _typed(function: Callable) -> Callable:
+    """The function, whose results have types of their own."""
+
+    @functools.wraps(function)
+    def typed(*args, **kwargs):
+        return jax.tree.map(_strong, function(*args, **kwargs))
+
+    return typed
+
+
+def _strong(leaf: Any) -> Any:
     return jnp.asarray(leaf, leaf.dtype) if getattr(leaf, "weak_type", False) else leaf
+
+
+def _is_array(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array | np.ndarray | np.generic)

@@ -55,18 +55,16 @@ class Programs:
         """Asked for when a program is: until then nobody may have to know of JAX's devices."""
         return f"code {self._code}\n{surroundings()}"
 
-    def __call__(self, function: Callable, compiled: Callable, args: tuple, kwargs: dict[str, Any]) -> Any:
-        """The result of a call."""
+    def __call__(self, function: Callable, args: tuple, kwargs: dict[str, Any]) -> Callable[[Sequence[Any]], Any] | None:
+        """The program of a call as a function of the call's arrays; None if it cannot be kept."""
         leaves, tree = jax.tree.flatten((args, kwargs))
-        arrays = [leaf for leaf in leaves if _is_array(leaf)]
         try:
             key = (function, tree, tuple(_kind(leaf) for leaf in leaves))
             if key not in self._known:
                 self._known[key] = self._find(function, args, kwargs)
-        except TypeError:  # something that cannot be hashed; what is wrong with the call itself is met again here
-            return compiled(*args, **kwargs)
-        ready = self._known[key]
-        return compiled(*args, **kwargs) if ready is None else ready(arrays)
+        except TypeError:  # something that cannot be hashed; what is wrong with the call itself is met again there
+            return None
+        return self._known[key]
 
     def _find(self, function, args, kwargs) -> _Ready | None:
         """From its entry, or made; None if there is no way to keep it."""

@@ -9,22 +9,41 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import msgspec
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo import acquisition
 from hilbo.kernels import gram
-from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.search.candidates import CANDIDATES, search_points
 from hilbo.search.lattice import Lattice, nodes_for, screen, screen_points
+from hilbo.search.space import SearchSpace
 from hilbo.search.space_lattice import lattice_of
-from hilbo.study.config import Study
+from hilbo.study.config import Inference, Study
+from hilbo.study.study_tables import Selection
 
-__all__ = ["Design", "design", "next_point", "point_after", "point_apart"]
+__all__ = ["Choosing", "Design", "design", "next_point", "point_after", "point_apart"]
 
 _STARTS = 4  # of the polishing, on the lattice
 _GAIN, _IN_UNITS_OF_F = 1e-7, ("ucb", "mean")  # of the prior's sd: less is no reason to polish on
 _JOINT_CANDIDATES = 512  # of which a Thompson draw is a joint one, cubic in their number
+
+
+class Choosing(eqx.Module):
+    """Of a study, what its choices depend on: studies that differ in anything else are asked the same points, and share
+    their programs. Whoever chooses by it gives the weight of the standard deviation each time."""
+
+    gp: OrdinalGP
+    space: SearchSpace
+    inference: Inference = eqx.field(static=True)
+    selection: Selection = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, study: Study) -> "Choosing":
+        """Without the numbers of the selection that are no part of a program."""
+        selection = msgspec.structs.replace(study.selection, space_filling=0, weight=0.0)
+        return cls(study.gp, study.space, study.inference, selection)
 
 
 class Design(eqx.Module):
@@ -64,7 +83,11 @@ def next_point(
 
 
 def point_after(
-    study: Study, plan: Design, posterior: Posterior, trial: Int[Array, ""] | int, weight: ArrayLike | None = None
+    study: Study | Choosing,
+    plan: Design,
+    posterior: Posterior,
+    trial: Int[Array, ""] | int,
+    weight: ArrayLike | None = None,
 ) -> Float[Array, " d"]:
     """The same from the posterior of the answers."""
     thompson, distance = study.selection.acquisition == "thompson", study.selection.minimum_distance

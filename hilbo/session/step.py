@@ -13,7 +13,6 @@ import functools
 import math
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import msgspec
@@ -22,10 +21,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.gaussian import GaussianPosterior, certify
 from hilbo.kernels import gram
-from hilbo.numerics.compiling import compiler_options
-from hilbo.numerics.tracing import program
+from hilbo.numerics.tracing import OfArrays, arrays_in, prepared, program, traced_once
 from hilbo.ordinal_gp import OrdinalTerms, Posterior, Trials, fit
-from hilbo.session.selection import Design, point_after
+from hilbo.session.selection import Choosing, Design, point_after
 from hilbo.study.config import Study
 
 __all__ = ["Fitted", "Step", "padding"]
@@ -55,8 +53,7 @@ class Step:
     """
 
     def __init__(self, study: Study, plan: Design) -> None:
-        self._study, self._plan = study, plan
-        self._program, self._arrays = _program_of(study, plan)
+        self._study, self._plan, self._choosing = study, plan, Choosing.of(study)
         self.weight, self.capacity = float(study.selection.weight), study.selection.trials
         self.initial: Float[np.ndarray, "s d"] = np.asarray(_to_physical(study.space, plan.initial))
         self.responses, self.names = study.responses, study.space.names
@@ -65,8 +62,8 @@ class Step:
 
     @property
     def compiled(self) -> Any:
-        """The jitted function behind it, shared by all studies that differ in numbers only."""
-        return self._program.compiled
+        """The program behind it; where none are kept, shared by all studies that differ in numbers only."""
+        return self._bound.program
 
     def __call__(self, points: Float[np.ndarray, "n d"], answers: Any) -> Float[np.ndarray, " d"] | None:
         """The next point, as numbers that survive a round trip through text; None when all trials are answered."""
@@ -86,11 +83,10 @@ class Step:
 
     def best(self, posterior: Posterior) -> Float[np.ndarray, " d"]:
         """Where the mean of a posterior of this study is largest, in physical units; nothing is fitted."""
-        program, arrays = self._of_the_mean
         query = self._blank.copy()
         query[_KNOWN] = 1.0
         known = jnp.asarray(self._layout.vector(posterior))
-        return np.asarray(program.compiled(arrays, query, known))[: len(self.names)]
+        return np.asarray(self._bound_to_the_mean(query, known))[: len(self.names)]
 
     def warm(self) -> None:
         """Compile what chooses."""
@@ -102,21 +98,40 @@ class Step:
         query[_FACTS : _FACTS + count] = answers
         begin = _FACTS + self.capacity
         query[begin : begin + count * len(self.names)] = np.ravel(points)
-        return np.asarray(self._program.compiled(self._arrays, query, self._unknown))
+        return np.asarray(self._bound(query, self._unknown))
 
     @functools.cached_property
     def _layout(self) -> "_Layout":
-        return self._program.layout(self._arrays)
+        leaves, structure = jax.tree.flatten(_posterior_shapes(self._choosing))
+        return _Layout(structure, tuple(leaves))
 
     @functools.cached_property
     def _unknown(self) -> Float[Array, " p"]:
         return jnp.zeros(self._layout.size)
 
     @functools.cached_property
-    def _of_the_mean(self):
+    def _bound(self) -> "_Bound":
+        return self._bound_by(self._choosing)
+
+    @functools.cached_property
+    def _bound_to_the_mean(self) -> "_Bound":
         """The UCB of weight 0 is largest where the mean is: in most studies this is the program that chooses."""
-        plain = msgspec.structs.replace(self._study.selection, acquisition="ucb", minimum_distance=None)
-        return _program_of(dataclasses.replace(self._study, selection=plain), self._plan)
+        plain = msgspec.structs.replace(self._choosing.selection, acquisition="ucb", minimum_distance=None)
+        return self._bound_by(dataclasses.replace(self._choosing, selection=plain))
+
+    def _bound_by(self, choosing: Choosing) -> "_Bound":
+        arrays = arrays_in((choosing, self._plan))
+        return _Bound(prepared(_step, choosing, self._plan, self._blank, self._unknown), arrays)
+
+
+class _Bound(NamedTuple):
+    """The program of a step, and its arrays but for what is asked."""
+
+    program: OfArrays
+    arrays: tuple[Array, ...]
+
+    def __call__(self, query: Float[np.ndarray, " k"], known: Float[Array, " p"]) -> Float[Array, " r"]:
+        return self.program((*self.arrays, query, known))
 
 
 class _Query(NamedTuple):
@@ -164,51 +179,40 @@ class _Layout(NamedTuple):
         return jax.tree.unflatten(self.structure, parts)
 
 
-class _Program:
-    """What is compiled for all studies and designs of one `structure`, whose leaves are arrays or `fixed`."""
-
-    def __init__(self, structure: Any, fixed: tuple[Any, ...]) -> None:
-        self._structure, self._fixed = structure, fixed
-        self.compiled = jax.jit(self._step, compiler_options=compiler_options())
-        self._layouts: dict[Any, _Layout] = {}
-
-    def layout(self, arrays: tuple[Array, ...]) -> _Layout:
-        """Of its posteriors; traced once for arrays of the same shapes, since every session asks for it."""
-        shapes = tuple((array.shape, array.dtype) for array in arrays)
-        if shapes not in self._layouts:
-            self._layouts[shapes] = self._traced_layout(arrays)
-        return self._layouts[shapes]
-
-    def _traced_layout(self, arrays: tuple[Array, ...]) -> _Layout:
-        def fitted(arrays):
-            study, _ = self._bound(arrays)
-            capacity = study.selection.trials
-            numbers = jnp.zeros(_FACTS + capacity * (1 + study.space.dim))
-            return _fitted(study, _Query.of(numbers, capacity))
-
-        leaves, structure = jax.tree.flatten(jax.eval_shape(fitted, arrays))
-        return _Layout(structure, tuple(leaves))
-
-    def _bound(self, arrays) -> tuple[Study, Design]:
-        given = iter(arrays)
-        return jax.tree.unflatten(self._structure, [next(given) if leaf is None else leaf for leaf in self._fixed])
-
-    def _step(self, arrays: tuple[Array, ...], numbers: Float[Array, " k"], known: Float[Array, " p"]):
-        """The next point in physical units and, behind it, the posterior's numbers."""
-        study, plan = self._bound(arrays)
-        query, layout = _Query.of(numbers, study.selection.trials), self.layout(arrays)
-        trials, latent = jax.lax.cond(query.known, lambda: layout.tree(known), lambda: _fitted(study, query))
-        point = point_after(study, plan, Posterior(study.gp, trials, latent), query.count, query.weight)
-        parts = [study.space.to_physical(point), *jax.tree.leaves((trials, latent))]
-        return jnp.concatenate([part.astype(numbers.dtype).ravel() for part in parts])
+def _step(
+    choosing: Choosing, plan: Design, numbers: Float[Array, " k"], known: Float[Array, " p"]
+) -> Float[Array, " r"]:
+    """The next point in physical units and, behind it, the posterior's numbers."""
+    query = _Query.of(numbers, choosing.selection.trials)
+    leaves, structure = jax.tree.flatten(_shapes(choosing))
+    layout = _Layout(structure, tuple(leaves))
+    trials, latent = jax.lax.cond(query.known, lambda: layout.tree(known), lambda: _fitted(choosing, query))
+    point = point_after(choosing, plan, Posterior(choosing.gp, trials, latent), query.count, query.weight)
+    parts = [choosing.space.to_physical(point), *jax.tree.leaves((trials, latent))]
+    return jnp.concatenate([part.astype(numbers.dtype).ravel() for part in parts])
 
 
-def _fitted(study: Study, query: _Query):
+@program
+def _posterior_shapes(choosing: Choosing) -> Any:
+    """Of trials and latent values, as a step finds them. A program, though it computes nothing: whoever keeps programs
+    traces no fit to know it."""
+    return _shapes(choosing)
+
+
+def _shapes(choosing: Choosing) -> Any:
+    capacity = choosing.selection.trials
+    numbers = jax.ShapeDtypeStruct((_FACTS + capacity * (1 + choosing.space.dim),), jnp.result_type(float))
+    shapes = jax.eval_shape(lambda given: _fitted(choosing, _Query.of(given, capacity)), numbers)
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), shapes)
+
+
+@traced_once
+def _fitted(choosing: Choosing, query: _Query):
     """Trials and latent values."""
     mask = jnp.arange(len(query.categories), dtype=query.count.dtype) < query.count
-    trials = Trials(study.space.to_unit(query.points), query.categories, mask)
-    latent = fit(study.gp, trials, inference=study.inference, throw=False).latent
-    return trials, _uncertified(latent) if study.inference == "laplace" else latent
+    trials = Trials(choosing.space.to_unit(query.points), query.categories, mask)
+    latent = fit(choosing.gp, trials, inference=choosing.inference, throw=False).latent
+    return trials, _uncertified(latent) if choosing.inference == "laplace" else latent
 
 
 def _uncertified(latent: Any) -> GaussianPosterior:
@@ -218,7 +222,7 @@ def _uncertified(latent: Any) -> GaussianPosterior:
     return dataclasses.replace(latent, certificate=dataclasses.replace(certificate, **nothing))
 
 
-@jax.jit
+@program
 def _certified(posterior: Posterior) -> Posterior:
     """With the certificate that the fit would have given it."""
     trials, latent, likelihood = posterior.trials, posterior.latent, posterior.gp.likelihood
@@ -234,16 +238,6 @@ def _certified(posterior: Posterior) -> Posterior:
         **{name: getattr(latent.certificate, name) for name in _FROM_THE_SEARCH},
     )
     return dataclasses.replace(posterior, latent=dataclasses.replace(latent, certificate=certificate))
-
-
-def _program_of(study: Study, plan: Design) -> tuple[_Program, tuple[Array, ...]]:
-    """The program of a study and a design, and their arrays."""
-    leaves, structure = jax.tree.flatten((study, plan))
-    fixed = tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves)
-    return _program(structure, fixed), tuple(leaf for leaf in leaves if eqx.is_array(leaf))
-
-
-_program = functools.lru_cache(maxsize=32)(_Program)
 
 
 @program
