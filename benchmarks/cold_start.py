@@ -20,6 +20,7 @@ STUDY = f"from hilbo import Session, Study\nstudy = Study.load({str(ROOT / 'hilb
 START = "session = Session.start(study)\n"
 ANSWERS = "for _ in range(5): session = session.tell('different')\nsession.ask()\n"
 WHOLE = X64 + STUDY + START + ANSWERS
+KEPT = WHOLE.replace(X64, "from hilbo.cli.console import start; start()\n")
 PROCESSES = {
     "bare `python`": "",
     "`import jax`": "import jax",
@@ -29,6 +30,7 @@ PROCESSES = {
     "study loaded": X64 + STUDY,
     "session started: the first point to show": X64 + STUDY + START,
     "first chosen point, after 5 answers": WHOLE,
+    "the same with programs kept, as commands keep them (docs/programs.md)": KEPT,
     "the same by XLA's newer code generator (`hilbo/numerics/compiling.py`)": "import hilbo.numerics.compiling\n"
     "hilbo.numerics.compiling._TRIED = (0, 0)\n" + WHOLE,
 }
@@ -64,6 +66,8 @@ def seconds(code, cache):
 def run(code, cache):
     env = os.environ | {
         "JAX_COMPILATION_CACHE_DIR": cache,
+        "XDG_CACHE_HOME": cache,
+        "PYTHONDONTWRITEBYTECODE": "",  # as a person's Python, which does not parse sources twice
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
         "PYTHONPATH": str(ROOT),

@@ -19,12 +19,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.numerics.linalg import eigh
-from hilbo.numerics.newton import TrustRegionNewton
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
 
 __all__ = ["UCB", "Choice", "LogEI", "Mean", "Score", "TopCategory", "climb", "maximise", "spread", "thompson"]
@@ -231,6 +229,10 @@ def _polish(
     options: dict[str, Float[Array, "s d"]],
 ) -> tuple[Float[Array, " d"], Float[Array, ""]]:
     """Newton's method within the unit cube from `start`: where it ends, and the score there."""
+    import optimistix as optx  # slow to import, and needed only where a search is traced
+
+    from hilbo.numerics.newton import TrustRegionNewton
+
     solution = optx.minimise(
         lambda w, _: -score(w),
         TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION, gain=gain),

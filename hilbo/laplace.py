@@ -10,7 +10,7 @@ K is the prior covariance of the eta's, of whatever rank (the same stimulus aske
 * The search begins with full Newton steps on the weights a, eta = K a (R & W, algorithm 3.1), which need no R: there
   v = R'a and the same residual is sqrt(r'Kr), r = grad l - a. Where they do not end below the tolerance, because the
   answers conflict at little noise, say, the search begins anew in v, where every start converges: the steps are damped
-  by Armijo's rule (`_DampedNewton`, an optimistix root finder).
+  by Armijo's rule (`hilbo.numerics.damped_newton`).
 * Derivatives of any order come from the stationarity eta = K grad l(eta) by the implicit function theorem, and from
   C = (K + 1/W)^-1 written so that W = 0 is no special case. R, whose derivative may not exist, has no part in them.
 
@@ -24,7 +24,6 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hilbo.gaussian import (
@@ -36,7 +35,7 @@ from hilbo.gaussian import (
     square_root,
     still,
 )
-from hilbo.numerics.linalg import cholesky, one_at_a_time, solve_lower, solve_lower_transposed
+from hilbo.numerics.linalg import one_at_a_time, solve_lower, solve_lower_transposed
 
 __all__ = ["Mode", "Pointwise", "Terms", "find_mode", "laplace", "plain_mode"]
 
@@ -177,10 +176,14 @@ def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array
 
 def _whitened_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
     """Damped Newton steps in v, from the weights `start`."""
+    import optimistix as optx  # slow to import, and needed only where a fit is traced
+
+    from hilbo.numerics.damped_newton import DampedNewton
+
     root, changed = square_root(covariance)
     solution = optx.root_find(
         _stationarity,
-        _DampedNewton(),
+        DampedNewton(),
         jnp.zeros_like(start),
         (terms, covariance),
         options={"root": root, "start": root.T @ start},
@@ -212,78 +215,3 @@ def _stationarity(eta: Float[Array, " n"], args: tuple[Terms, Float[Array, "n n"
     """eta - K grad l(eta), zero at the mode: what the solver is asked for."""
     terms, covariance = args
     return eta - covariance @ terms(eta)[1]
-
-
-class _NewtonState(eqx.Module):
-    """The best point so far, and the step from it that is evaluated next."""
-
-    v: Float[Array, " n"]  # the mode in whitened coordinates, eta = R v
-    direction: Float[Array, " n"]
-    scale: Float[Array, ""]  # of the next step along `direction`
-    gain: Float[Array, ""]  # rate of ascent along `direction`
-    objective: Float[Array, ""]
-    residual: Float[Array, ""]
-    tolerance: Float[Array, ""]
-
-
-class _DampedNewton(optx.AbstractRootFinder):
-    """Newton's method in whitened coordinates for the mode of a log-concave posterior, with Armijo's step rule.
-
-    One evaluation an iteration, at `v + scale * direction`: taken if the log posterior rose by a share of what the
-    slope promised (beyond its own rounding), else the scale is halved. `options` hold the root R and the start v.
-    """
-
-    rtol: float = 0.0
-    atol: float = 0.0
-    norm: Callable = optx.two_norm
-
-    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
-        del fn, args, f_struct, aux_struct, tags
-        infinite = jnp.asarray(jnp.inf, y.dtype)
-        zero, one = jnp.zeros_like(infinite), jnp.ones_like(infinite)
-        return _NewtonState(options["start"], jnp.zeros_like(y), one, zero, -infinite, infinite, zero)
-
-    def step(self, fn, y, args, options, state, tags):
-        del fn, tags
-        root = options["root"]
-        trial = state.v + state.scale * state.direction
-        taken, slack = _newton_state(args[0], root, trial)
-        risen = taken.objective >= state.objective + 1e-4 * state.scale * state.gain - slack
-        # A start without a finite objective has no direction in which to look for one: that ends the search.
-        halved = jnp.where(jnp.isfinite(state.objective), 0.5 * state.scale, 0.0)
-        refused = eqx.tree_at(lambda s: s.scale, state, halved)
-        state = jax.tree.map(lambda new, old: jnp.where(risen, new, old), taken, refused)
-        return jnp.where(risen, root @ trial, y), state, None
-
-    def terminate(self, fn, y, args, options, state, tags):
-        del fn, y, args, options, tags
-        return (state.residual <= state.tolerance) | (state.scale < 1e-12), optx.RESULTS.successful
-
-    def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        del fn, args, options, state, tags, result
-        return y, aux, {}
-
-
-def _newton_state(
-    terms: Terms, root: Float[Array, "n n"], v: Float[Array, " n"]
-) -> tuple[_NewtonState, Float[Array, ""]]:
-    """Everything at `v`: objective, residual and what it can resolve, next direction; and the objective's rounding."""
-    values, slope, curvature = terms(root @ v)
-    uphill = root.T @ slope - v
-    newton_matrix = jnp.eye(v.shape[0], dtype=v.dtype) + (root.T * curvature[None, :]) @ root
-    lower = cholesky(newton_matrix)
-    half = solve_lower(lower, uphill[:, None])
-    direction = solve_lower_transposed(lower, half)[:, 0]
-    epsilon, magnitude = jnp.finfo(v.dtype).eps, jnp.abs(root)
-    summed = magnitude.T @ (jnp.abs(slope) + curvature * (magnitude @ jnp.abs(v))) + jnp.abs(v)
-    state = _NewtonState(
-        v=v,
-        direction=direction,
-        scale=jnp.ones_like(v[0]),
-        gain=uphill @ direction,
-        objective=jnp.sum(values) - 0.5 * v @ v,
-        residual=jnp.linalg.norm(uphill),
-        tolerance=jnp.clip(4.0 * epsilon * jnp.linalg.norm(summed), epsilon ** (2 / 3), epsilon**0.25),
-    )
-    # The values are rounded, and so is R v, to which they answer by their slopes: at little noise that is far more.
-    return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v + jnp.abs(slope) @ (magnitude @ jnp.abs(v)))

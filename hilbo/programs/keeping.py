@@ -55,7 +55,9 @@ class Programs:
         """Asked for when a program is: until then nobody may have to know of JAX's devices."""
         return f"code {self._code}\n{surroundings()}"
 
-    def __call__(self, function: Callable, args: tuple, kwargs: dict[str, Any]) -> Callable[[Sequence[Any]], Any] | None:
+    def __call__(
+        self, function: Callable, args: tuple, kwargs: dict[str, Any]
+    ) -> Callable[[Sequence[Any]], Any] | None:
         """The program of a call as a function of the call's arrays; None if it cannot be kept."""
         leaves, tree = jax.tree.flatten((args, kwargs))
         try:
@@ -108,7 +110,13 @@ class Programs:
 
 def _ready(entry: Entry) -> _Ready:
     exported = export.deserialize(bytearray(entry.exported))
-    return _Ready(jax.jit(exported.call), pickle.loads(entry.structure))
+    run = jax.jit(exported.call) if exported.out_avals else _nothing
+    return _Ready(run, pickle.loads(entry.structure))
+
+
+def _nothing(*arrays: Any) -> tuple[()]:
+    """What a program computes whose result has no arrays: it is known when it is traced."""
+    return ()
 
 
 def _is_array(leaf: Any) -> bool:

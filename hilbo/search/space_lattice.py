@@ -7,7 +7,7 @@ and along alpha: found in a table of the wall by interpolation, then put exactly
 
 import functools
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from hilbo.search.lattice import Lattice
@@ -22,23 +22,17 @@ def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
     """The lattice of a space, `nodes` per coordinate; without mechanics its columns run along the first parameter."""
     even, dim = np.linspace(0.0, 1.0, nodes), space.dim
     if space.mechanics is None:
-        none = jnp.zeros((0, nodes ** (dim - 1)))
-        inside, extra = jnp.ones((nodes, none.shape[1]), bool), jnp.zeros((0, dim))
-        return Lattice(jnp.asarray(even), inside, none, none > 0, extra, 0, dim)
+        none = np.zeros((0, nodes ** (dim - 1)))
+        inside, extra = np.ones((nodes, none.shape[1]), bool), np.zeros((0, dim))
+        return Lattice(*jax.device_put((even, inside, none, none > 0, extra)), 0, dim)
     along = space.names.index("K1")
     others = np.stack(np.meshgrid(*[even] * (dim - 1), indexing="ij"), axis=-1).reshape(-1, dim - 1)
     low, high = _ends_of(space, np.insert(others, along, 0.0, axis=1))
     inside = (low <= even[:, None]) & (even[:, None] <= high) & (high > low)
     ends = np.stack([low, high] if space.mechanics.effective_damping else [high])
-    return Lattice(
-        nodes=jnp.asarray(even),
-        inside=jnp.asarray(inside),
-        ends=jnp.asarray(ends),
-        present=jnp.asarray(np.broadcast_to(high > low, ends.shape)),
-        extra=jnp.asarray(_steep_wall(space, even)),
-        along=along,
-        dim=dim,
-    )
+    present = np.broadcast_to(high > low, ends.shape)
+    # Put on the device as they are: jnp.asarray would be a program for each shape.
+    return Lattice(*jax.device_put((even, inside, ends, present, _steep_wall(space, even))), along, dim)
 
 
 def _steep_wall(space, levels):

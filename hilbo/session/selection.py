@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import msgspec
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
@@ -61,10 +62,10 @@ class Design(eqx.Module):
 
 def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
     """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
-    space, nodes = study.space, nodes_for(float(jnp.max(study.gp.kernel.theta)))
+    space, nodes = study.space, nodes_for(float(np.asarray(study.gp.kernel.theta).max()))
     on_lattice = space.dim in (2, 3) and study.selection.acquisition != "thompson"
     return Design(
-        jnp.asarray(space.latin_hypercube(study.selection.space_filling, seed)),
+        jax.device_put(space.latin_hypercube(study.selection.space_filling, seed)),
         None if on_lattice else search_points(space, seed, count),
         lattice_of(space, nodes) if on_lattice else None,
         jax.random.key(seed),

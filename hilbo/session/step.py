@@ -85,7 +85,7 @@ class Step:
         """Where the mean of a posterior of this study is largest, in physical units; nothing is fitted."""
         query = self._blank.copy()
         query[_KNOWN] = 1.0
-        known = jnp.asarray(self._layout.vector(posterior))
+        known = jax.device_put(self._layout.vector(posterior))
         return np.asarray(self._bound_to_the_mean(query, known))[: len(self.names)]
 
     def warm(self) -> None:
@@ -107,7 +107,7 @@ class Step:
 
     @functools.cached_property
     def _unknown(self) -> Float[Array, " p"]:
-        return jnp.zeros(self._layout.size)
+        return jax.device_put(np.zeros(self._layout.size))
 
     @functools.cached_property
     def _bound(self) -> "_Bound":

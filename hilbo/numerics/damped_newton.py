@@ -1,0 +1,91 @@
+"""Newton's method for the mode of a log-concave posterior in whitened coordinates, by Armijo's rule; an optimistix root
+finder. Apart from `hilbo.laplace`, which imports it where a fit is traced: optimistix is slow to import.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from hilbo.numerics.linalg import cholesky, solve_lower, solve_lower_transposed
+
+__all__ = ["DampedNewton"]
+
+Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
+"""Log-likelihood terms, their slopes and curvatures, as `hilbo.laplace` has them."""
+
+
+class _NewtonState(eqx.Module):
+    """The best point so far, and the step from it that is evaluated next."""
+
+    v: Float[Array, " n"]  # the mode in whitened coordinates, eta = R v
+    direction: Float[Array, " n"]
+    scale: Float[Array, ""]  # of the next step along `direction`
+    gain: Float[Array, ""]  # rate of ascent along `direction`
+    objective: Float[Array, ""]
+    residual: Float[Array, ""]
+    tolerance: Float[Array, ""]
+
+
+class DampedNewton(optx.AbstractRootFinder):
+    """One evaluation an iteration, at `v + scale * direction`: taken if the log posterior rose by a share of what the
+    slope promised (beyond its own rounding), else the scale is halved. `options` hold the root R and the start v.
+    """
+
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable = optx.two_norm
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        del fn, args, f_struct, aux_struct, tags
+        infinite = jnp.asarray(jnp.inf, y.dtype)
+        zero, one = jnp.zeros_like(infinite), jnp.ones_like(infinite)
+        return _NewtonState(options["start"], jnp.zeros_like(y), one, zero, -infinite, infinite, zero)
+
+    def step(self, fn, y, args, options, state, tags):
+        del fn, tags
+        root = options["root"]
+        trial = state.v + state.scale * state.direction
+        taken, slack = _newton_state(args[0], root, trial)
+        risen = taken.objective >= state.objective + 1e-4 * state.scale * state.gain - slack
+        # A start without a finite objective has no direction in which to look for one: that ends the search.
+        halved = jnp.where(jnp.isfinite(state.objective), 0.5 * state.scale, 0.0)
+        refused = eqx.tree_at(lambda s: s.scale, state, halved)
+        state = jax.tree.map(lambda new, old: jnp.where(risen, new, old), taken, refused)
+        return jnp.where(risen, root @ trial, y), state, None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        del fn, y, args, options, tags
+        return (state.residual <= state.tolerance) | (state.scale < 1e-12), optx.RESULTS.successful
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        del fn, args, options, state, tags, result
+        return y, aux, {}
+
+
+def _newton_state(
+    terms: Terms, root: Float[Array, "n n"], v: Float[Array, " n"]
+) -> tuple[_NewtonState, Float[Array, ""]]:
+    """Everything at `v`: objective, residual and what it can resolve, next direction; and the objective's rounding."""
+    values, slope, curvature = terms(root @ v)
+    uphill = root.T @ slope - v
+    newton_matrix = jnp.eye(v.shape[0], dtype=v.dtype) + (root.T * curvature[None, :]) @ root
+    lower = cholesky(newton_matrix)
+    half = solve_lower(lower, uphill[:, None])
+    direction = solve_lower_transposed(lower, half)[:, 0]
+    epsilon, magnitude = jnp.finfo(v.dtype).eps, jnp.abs(root)
+    summed = magnitude.T @ (jnp.abs(slope) + curvature * (magnitude @ jnp.abs(v))) + jnp.abs(v)
+    state = _NewtonState(
+        v=v,
+        direction=direction,
+        scale=jnp.ones_like(v[0]),
+        gain=uphill @ direction,
+        objective=jnp.sum(values) - 0.5 * v @ v,
+        residual=jnp.linalg.norm(uphill),
+        tolerance=jnp.clip(4.0 * epsilon * jnp.linalg.norm(summed), epsilon ** (2 / 3), epsilon**0.25),
+    )
+    # The values are rounded, and so is R v, to which they answer by their slopes: at little noise that is far more.
+    return state, 4.0 * epsilon * (jnp.sum(jnp.abs(values)) + 0.5 * v @ v + jnp.abs(slope) @ (magnitude @ jnp.abs(v)))
