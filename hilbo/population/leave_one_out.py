@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import ndtri
 
 from hilbo.errors import InputError
+from hilbo.numerics.rows import rows_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.learnt import Learnt, learn
@@ -69,7 +70,7 @@ class LeftOut:
 def without(trials: Trials, left: int | Int[np.ndarray, " k"]) -> Trials:
     """Stacked trials without some people."""
     rows = np.delete(np.arange(trials.mask.shape[0]), left)
-    return jax.tree.map(lambda leaf: leaf[rows], trials)
+    return rows_of(trials, rows)
 
 
 def leave_one_out(
@@ -87,7 +88,7 @@ def leave_one_out(
 
     def fold(left: Int[np.ndarray, " k"]) -> tuple[OrdinalGP, RuleMap]:
         rest = np.delete(np.arange(trials.mask.shape[0]), left)
-        others = None if posteriors is None else jax.tree.map(lambda leaf: leaf[rest], posteriors)
+        others = None if posteriors is None else rows_of(posteriors, rest)
         given = without(trials, left)
         return gp, rule_map(gp, given, rule, posteriors=others, share=share, inference=inference)
 

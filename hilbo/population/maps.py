@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.rows import rows_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
@@ -170,7 +171,7 @@ def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest:
             f' {len(answered)} of them gave an answer; use "bcm", whose map is then that person\'s.'
         )
     inference = "ep" if inference == "exact" else inference
-    trials = even_choice(jax.tree.map(lambda leaf: leaf[answered], trials), largest)
+    trials = even_choice(rows_of(trials, answered), largest)
     counts = _counts_if_cheaper(gp, trials, inference)
     if counts is None:
         return learn_share(gp, of_people(trials), inference=inference)
@@ -183,7 +184,7 @@ def even_choice(trials: Trials, largest: int) -> Trials:
     people = trials.mask.shape[0]
     count = people if answers <= largest else max(2, int(people * largest / answers))
     rows = np.unique(np.linspace(0, people - 1, count).round().astype(int))
-    return jax.tree.map(lambda leaf: leaf[rows], trials)
+    return rows_of(trials, rows)
 
 
 @program

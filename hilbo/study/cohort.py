@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from hilbo.errors import InputError
+from hilbo.numerics.rows import rows_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.search.space import SearchSpace
@@ -47,7 +48,7 @@ class Cohort(eqx.Module):
     def rows(self, rows: Int[np.ndarray, " k"]) -> "Cohort":
         """Only the participants in these places."""
         names = tuple(self.names[row] for row in rows)
-        return Cohort(jax.tree.map(lambda leaf: leaf[rows], self.trials), self.physical[rows], names)
+        return Cohort(rows_of(self.trials, rows), self.physical[rows], names)
 
     def counts(self) -> Int[np.ndarray, " M"]:
         """Answers of each participant."""

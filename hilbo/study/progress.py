@@ -6,6 +6,7 @@ rule takes all answers at once.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
@@ -23,6 +24,7 @@ __all__ = ["Progress", "follow", "settled"]
 
 _SETTLED = 0.05  # NRMSE: an optimum that stays this near to its last place has settled
 _LONGEST = 25  # points of a progress curve
+_AT_A_TIME = 2  # of which so many are computed: each search keeps a core busy, and no more
 _MOMENTS = (5, 15, 25)  # numbers of trials whose maps are drawn, as in the paper, and all trials
 
 
@@ -76,17 +78,21 @@ def follow(study: Study, aggregate: Aggregate, seed: int = 0, counts: Sequence[i
     longest = int(ends.max())
     asked = _counts(ends) if counts is None else np.unique([*counts, longest])
     candidates = search_points(study.space, seed)
-    population, individual, maps = [], [], {}
-    for count in asked.tolist():
+
+    def after(count: int) -> tuple[np.ndarray, np.ndarray, RuleMap | None]:
         last = count == longest
         posteriors = aggregate.posteriors if last else fit_cohort(study, cohort.first(count))
         map_ = _map_by_points(study, aggregate.map.share, posteriors)
-        population.append(np.asarray(map_optimum(study, map_, candidates).x))
+        population = np.asarray(map_optimum(study, map_, candidates).x)
         optima = aggregate.individuals if last else individual_optima(study, posteriors, candidates)
-        individual.append(np.asarray(optima.x))
-        if last or count in _MOMENTS:
-            maps[count] = map_
-    return Progress(asked, np.stack(population), np.stack(individual), ends, maps)
+        return population, np.asarray(optima.x), map_ if last or count in _MOMENTS else None
+
+    found = [after(count) for count in asked[:1].tolist()]  # whose programs serve the others
+    with ThreadPoolExecutor(_AT_A_TIME) as pool:
+        found += pool.map(after, asked[1:].tolist())
+    population, individual, maps = zip(*found, strict=True)
+    kept = {count: map_ for count, map_ in zip(asked.tolist(), maps, strict=True) if map_ is not None}
+    return Progress(asked, np.stack(population), np.stack(individual), ends, kept)
 
 
 def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], within: float = _SETTLED) -> int | None:
