@@ -2,6 +2,7 @@
 
 import functools
 import pickle
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,6 +50,7 @@ class Programs:
         self._entries, self._package = entries, package
         self._code = code_digest(package)
         self._known: dict[Any, _Ready | None] = {}
+        self._finding = threading.RLock()  # calls may come from several threads
 
     @functools.cached_property
     def _around(self) -> str:
@@ -63,7 +65,9 @@ class Programs:
         try:
             key = (function, tree, tuple(_kind(leaf) for leaf in leaves))
             if key not in self._known:
-                self._known[key] = self._find(function, args, kwargs)
+                with self._finding:
+                    if key not in self._known:
+                        self._known[key] = self._find(function, args, kwargs)
         except TypeError:  # something that cannot be hashed; what is wrong with the call itself is met again there
             return None
         return self._known[key]

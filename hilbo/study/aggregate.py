@@ -10,6 +10,7 @@ optimum is searched like a session's.
 """
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
@@ -285,26 +286,35 @@ def aggregate_cohort(
     map_ = _rule_map(study, cohort, study.rule, posteriors, share)
     optimum = map_optimum(study, map_, candidates)
     first(optimum, map_)
-    if share is None and study.rule != RECIPE and alternatives and np.sum(cohort.counts() > 0) > 1:
-        share = share_of(study.gp, cohort.trials, study.inference)
-    rules = _rules(study, cohort, share) if alternatives else [study.rule]
-    beside = {rule: _rule_map(study, cohort, rule, posteriors, share) for rule in rules if rule != study.rule}
-    others = {rule: map_optimum(study, other_map, candidates) for rule, other_map in beside.items()}
-    if alternatives and study.rule != RECIPE:
+    beside = alternatives and study.rule != RECIPE
+    with ThreadPoolExecutor(1) as other_core:  # for what does not wait for the share
+        individuals = other_core.submit(individual_optima, study, posteriors, candidates)
+        by_other = other_core.submit(_by_other_inference, study, cohort, candidates, share) if beside else None
+        if share is None and beside and np.sum(cohort.counts() > 0) > 1:
+            share = share_of(study.gp, cohort.trials, study.inference)
+        rules = _rules(study, cohort, share) if alternatives else [study.rule]
+        maps = {rule: _rule_map(study, cohort, rule, posteriors, share) for rule in rules if rule != study.rule}
+        others = {rule: map_optimum(study, other_map, candidates) for rule, other_map in maps.items()}
+    if by_other is not None:
         other = other_inference(study)
-        by_other = fit_cohort(study, cohort, inference=other)
-        beside[other] = _rule_map(study, cohort, study.rule, by_other, share, other)
-        others[other] = map_optimum(study, beside[other], candidates)
+        maps[other], others[other] = by_other.result()
     return Aggregate(
         cohort=cohort,
         posteriors=posteriors,
         optimum=optimum,
-        individuals=individual_optima(study, posteriors, candidates),
+        individuals=individuals.result(),
         alternatives=others,
         map=map_,
-        maps={study.rule: map_} | beside,
+        maps={study.rule: map_} | maps,
         share=share,
     )
+
+
+def _by_other_inference(study: Study, cohort: Cohort, candidates: Float[Array, "m d"], share: Share | None) -> tuple[RuleMap, Optimum]:
+    """The map by the study's rule and its optimum, where everybody is fitted by the other inference."""
+    other = other_inference(study)
+    map_ = _rule_map(study, cohort, study.rule, fit_cohort(study, cohort, inference=other), share, other)
+    return map_, map_optimum(study, map_, candidates)
 
 
 def _rules(study: Study, cohort: Cohort, share: Share | None) -> list[str]:
