@@ -55,6 +55,8 @@ def start(devices: int | None = None) -> None:
 
     `devices`: as how many devices the CPU is to count.
     """
+    # Matrices are small here: a second thread of OpenBLAS, which reads this once, keeps a core busy by waiting.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from hilbo.numerics.compiling import set_flags
 
     set_flags()

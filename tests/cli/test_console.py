@@ -1,5 +1,9 @@
 """What the commands say while they work, and the folder that is whole or absent."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from hilbo.cli.console import _Pace, progress, results
@@ -38,3 +42,16 @@ def test_a_folder_is_whole_or_absent(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"), results(tmp_path / "file" / "out", False):
         pass
+
+
+@pytest.mark.parametrize(("given", "holds"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_openblas_has_one_thread_unless_it_was_told_otherwise(given, holds):
+    """In a process of its own, since it is told before NumPy is loaded: `import jax` takes the test's time."""
+    code = (
+        "import sys; from hilbo.cli.console import start\n"
+        "assert 'numpy' not in sys.modules; start()\n"
+        "import os; print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    plain = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    done = subprocess.run([sys.executable, "-c", code], env=plain | given, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == holds
