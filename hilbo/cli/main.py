@@ -6,6 +6,8 @@ one sentence.
 """
 
 import contextlib
+import importlib
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -243,13 +245,21 @@ def _by_rule(study, rule):
 
 def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False) -> dict[str, Any]:
     """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
-    from hilbo.report.comparison import write_comparison
-    from hilbo.report.results import write_results
     from hilbo.study.analysis import analyse_population
 
-    population = analyse_population(study, cohort, seed, say, say.tell)
+    with ThreadPoolExecutor(1) as other_core:
+
+        def told(sentences):
+            say.tell(sentences)
+            other_core.submit(importlib.import_module, "hilbo.report.results")  # matplotlib too, meanwhile
+
+        population = analyse_population(study, cohort, seed, say, told)
+    from hilbo.report.results import write_results
+
     content = write_results(population, folder, truth, say)
     if compare:
+        from hilbo.report.comparison import write_comparison
+
         say("every rule, with each person left out")
         write_comparison(study, population.aggregate, folder, seed)
     return content
