@@ -24,15 +24,20 @@ def lattice_of(space: SearchSpace, nodes: int) -> Lattice:
     if space.mechanics is None:
         none = np.zeros((0, nodes ** (dim - 1)))
         inside, extra = np.ones((nodes, none.shape[1]), bool), np.zeros((0, dim))
-        return Lattice(*jax.device_put((even, inside, none, none > 0, extra)), 0, dim)
+        return _on_device(even, inside, none, none > 0, extra, 0, dim)
     along = space.names.index("K1")
     others = np.stack(np.meshgrid(*[even] * (dim - 1), indexing="ij"), axis=-1).reshape(-1, dim - 1)
     low, high = _ends_of(space, np.insert(others, along, 0.0, axis=1))
     inside = (low <= even[:, None]) & (even[:, None] <= high) & (high > low)
     ends = np.stack([low, high] if space.mechanics.effective_damping else [high])
     present = np.broadcast_to(high > low, ends.shape)
-    # Put on the device as they are: jnp.asarray would be a program for each shape.
-    return Lattice(*jax.device_put((even, inside, ends, present, _steep_wall(space, even))), along, dim)
+    return _on_device(even, inside, ends, present, _steep_wall(space, even), along, dim)
+
+
+def _on_device(nodes, inside, ends, present, extra, along, dim) -> Lattice:
+    """The lattice of these arrays, put on the device as they are: `jnp.asarray` would be a program for each shape."""
+    nodes, inside, ends, present, extra = jax.device_put((nodes, inside, ends, present, extra))
+    return Lattice(nodes, inside, ends, present, extra, along, dim)
 
 
 def _steep_wall(space, levels):
