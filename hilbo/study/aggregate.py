@@ -310,7 +310,9 @@ def aggregate_cohort(
     )
 
 
-def _by_other_inference(study: Study, cohort: Cohort, candidates: Float[Array, "m d"], share: Share | None) -> tuple[RuleMap, Optimum]:
+def _by_other_inference(
+    study: Study, cohort: Cohort, candidates: Float[Array, "m d"], share: Share | None
+) -> tuple[RuleMap, Optimum]:
     """The map by the study's rule and its optimum, where everybody is fitted by the other inference."""
     other = other_inference(study)
     map_ = _rule_map(study, cohort, study.rule, fit_cohort(study, cohort, inference=other), share, other)
