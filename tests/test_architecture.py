@@ -58,8 +58,12 @@ WITHOUT_JAX = {
     *("errors", "device", "hardware_bridge", "identification.device_tests", "cli.measure", "cli.device"),
     "cli.device_screen",
     *("mechanics.span", "search.box", "report.json_text"),
-    *(f"study.{name}" for name in ("fields", "protocols", "set_table", "study_file", "study_tables", "trial_table")),
-    *(f"session.{name}" for name in ("actions", "event_log", "export", "header_check", "netcdf", "participants")),
+    *(f"study.{name}" for name in ("fields", "protocols", "set_table", "stimulus_table", "study_file", "study_tables")),
+    "study.trial_table",
+    *(
+        f"session.{name}"
+        for name in ("actions", "confirmed", "event_log", "export", "header_check", "netcdf", "participants")
+    ),
     *(f"session.{name}" for name in ("plan", "records", "replay", "state", "views", "withdrawal", "withdrawn_results")),
 }
 # These import JAX for a set with full memory, and to convert a value, and not before.

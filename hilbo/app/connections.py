@@ -1,16 +1,16 @@
 """Connections to the server, and how much of it each may take, so that whoever holds a key is always heard.
 
-A connection is a stranger's until a key of a role has come in on it; then it is the role's. Strangers, participants
-and experimenters have numbers of connections of their own, and of too many the oldest is given up. An experimenter is
-heard at once, participants and strangers by turns, each request of theirs anew. A stranger's connection ends with its
-first answer. A request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's
+A connection is a stranger's until a key of a role has come in on it; then it is the role's. Strangers and each role
+have numbers of connections of their own, and of too many the oldest is given up. An experimenter is heard at once,
+programs that present, participants and strangers by turns, each request of theirs anew. A stranger's connection ends
+with its first answer. A request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's
 connection.
 
 uvicorn and h11 do the rest; without this, they would wait for a header for ever, and read a body of any size.
 """
 
 import asyncio
-from typing import Any
+from typing import Any, get_args
 
 import h11
 from uvicorn.protocols.http.flow_control import CLOSE_HEADER
@@ -23,7 +23,7 @@ __all__ = ["LARGEST", "LOOKED", "PATIENCE", "Connection", "Connections"]
 
 PATIENCE = 10.0  # s
 LARGEST = 65_536  # bytes of a request
-_MOST: dict[Role | None, int] = {"experimenter": 32, "participant": 32, None: 32}  # a browser opens six at most
+_MOST: dict[Role | None, int] = {role: 32 for role in (*get_args(Role), None)}  # a browser opens six at most
 _KEPT = 120  # s that a role's idle connection stays open, so that the next press of a button needs no new one
 _SEEN = 256  # bytes of the past in which the beginning of a key may be
 LOOKED = 16_384  # bytes of what comes at once that are looked through for a key: all of the longest header

@@ -3,7 +3,7 @@
     page or program --> answer / press / command --> event --> log (fsync) --> state --> views to everybody
 
 Events are made one after the other, and one counts only when it is on the disk: then the state moves on, the sender is
-told, and the next proposal is made. Four threads work beside the event loop: the disk's, the device's (`rig`), the
+told, and the next proposal is made. Threads work beside the event loop: the disk's, a device's (`device_rig`), the
 choosing's, and the server's own. What a participant does next is in `runner`, what comes between in `interruptions`.
 """
 
@@ -40,10 +40,11 @@ class NotNowError(InputError):
 
 
 class Hub:
-    """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` opens the device, `maps` makes
-    what draws the slices of the chooser's posterior.
+    """A session being held. `log` is its `EventLog`, `chooser` proposes, `connect` makes the rig that shows renderings
+    (given what is to be told of each new snapshot, and of what it says unasked), `maps` makes what draws the slices of
+    the chooser's posterior.
 
-    `invite`, once set, makes a new link for the participant; `gap` (s) is the pause between two trials, `tag` is what
+    `invite`, once set, makes a new link for a role; `gap` (s) is the pause between two trials, `tag` is what
     trials of this session are known by in browsers.
     """
 
@@ -51,7 +52,7 @@ class Hub:
         self,
         log: Any,
         chooser: Any,
-        connect: Callable[[], Any],
+        connect: Callable[[Callable[[Snapshot], Any], Callable[[str], Any]], Rig],
         *,
         tag: str,
         maps: Callable[[Any], Any] | None = None,
@@ -65,7 +66,7 @@ class Hub:
         self.trust: list[list[str]] = []
         self.recent: deque = deque(maxlen=200)
         self.delays: list[dict[str, float]] = []  # s, from each answer on
-        self.invite: Callable[[], dict[str, str]] | None = None
+        self.invite: Callable[[Role], dict[str, str]] | None = None
         self._connect, self._make_maps, self._maps = connect, maps, None
         self.warm: asyncio.Future | None = None
         self.watchers = Watchers(lambda: self.state.study.session.text("moved"))
@@ -80,9 +81,9 @@ class Hub:
     # Life.
 
     async def open(self) -> None:
-        """Connect to the device, and begin. Raises `InputError` or `DeviceError`."""
+        """Connect to the rig, and begin. Raises `InputError` or `DeviceError`."""
         self._lock, self._loop = asyncio.Lock(), asyncio.get_running_loop()
-        rig = await self._loop.run_in_executor(self._disk, lambda: Rig(self._connect, self._from_rig, self._noticed))
+        rig = await self._loop.run_in_executor(self._disk, lambda: self._connect(self._from_rig, self._noticed))
         self.rig = rig
         self.warm = self._loop.run_in_executor(self.compute, self._warm)
         await self._interruptions.begin(rig.snapshot)
@@ -100,7 +101,7 @@ class Hub:
         self._loop.call_soon_threadsafe(self.publish)
 
     async def close(self) -> None:
-        """Stop the device, let go of everything."""
+        """Stop the rig, let go of everything."""
         self._interruptions.end()
         self.runner.cancel()
         self.watchers.end_all()
@@ -146,6 +147,12 @@ class Hub:
             self.runner.restart()
         self.publish()
         return event
+
+    def hang_up(self) -> None:
+        """The server ends: nobody waits for news."""
+        self.watchers.end_all()
+        if self.rig is not None:
+            self.rig.hang_up()
 
     def publish(self) -> None:
         """Tell everybody who looks that there is news."""
@@ -206,7 +213,9 @@ class Hub:
         if what == "invite":
             if self.invite is None:
                 raise NotNowError("This session gives no links.")
-            return self.invite()
+            if message.role == "stimulus" and self.state.study.stimulus is None:
+                raise NotNowError("In this session a device renders, and no program presents.")
+            return self.invite(message.role)
         try:
             await self.commit(self._event_of(what, message))
         except RefusedError as error:
@@ -240,15 +249,15 @@ class Hub:
     async def _estop(self):
         assert self.rig is not None
         try:
-            await self._loop.run_in_executor(None, self.rig.estop)
+            await self.rig.estop()
         except (RuntimeError, ValueError) as error:
-            raise NotNowError(f"The device could not be told: {error}") from None
+            raise NotNowError(f"The {self.rig.title.lower()} could not be told: {error}") from None
         return {"done": "estop"}
 
     async def _clear(self):
         assert self.rig is not None
         try:
-            await asyncio.wrap_future(self.rig.do(lambda device: device.clear()))
+            await self.rig.clear()
         except (RuntimeError, ValueError) as error:
             raise NotNowError(str(error)) from None
         return {"done": "clear"}

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from typing import Any
 
 from hilbo.app.rig import Snapshot
-from hilbo.device.reasons import HoldReason, held_because
 from hilbo.errors import InputError
 from hilbo.session import actions
 from hilbo.session.actions import LiveSession
@@ -156,8 +155,6 @@ def _told(seen: Snapshot, condition: str, pending: Any, opening: bool) -> Callab
 
     A device that held because the server before this one was killed has done what it should, and voids nothing.
     """
-    reason = seen.lost or (held_because(seen.hold_reason) if condition != "ready" else "")
-    facts = {"trial": None if pending is None else pending.id, "reason": reason, "counters": seen.counters}
-    killed = opening and condition == "hold" and seen.hold_reason == HoldReason.WATCHDOG
-    says = "stopped" if killed else condition
+    facts = {"trial": None if pending is None else pending.id, "reason": seen.lost or seen.reason, **seen.facts}
+    says = "stopped" if opening and seen.excused else condition
     return lambda state, at: actions.device(state, says, at, **facts)

@@ -3,13 +3,13 @@
 docs/live.md is the same for a reader. Whatever does not fit is refused with one sentence, and changes nothing.
 """
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 
 from hilbo.errors import InputError
 
-__all__ = ["LARGEST", "Answer", "Command", "Join", "Press", "TooLargeError", "read"]
+__all__ = ["LARGEST", "Answer", "Command", "Hello", "Join", "Press", "Report", "TooLargeError", "read"]
 
 LARGEST = 16_384  # bytes of a message
 
@@ -53,11 +53,39 @@ class Press(_Message, frozen=True):
 
 class Command(_Message, frozen=True):
     """An experimenter's command. `trial`: the one that it is about, so that it never hits another (void, undo, restore,
-    skip)."""
+    skip). `role`: whose link is wanted (invite)."""
 
     reason: _Text = ""
     text: _Text = ""
     trial: _Number | None = None
+    role: Literal["participant", "stimulus"] = "participant"
+
+
+class Hello(_Message, frozen=True):
+    """What a program that presents says of itself. `force`: it moves something that people touch. `neutral_within_s`:
+    so soon does it show nothing and push nothing when it is told, and when nobody tells it anything any more."""
+
+    name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
+    version: Annotated[str, msgspec.Meta(max_length=100)]
+    force: bool
+    neutral_within_s: Annotated[float, msgspec.Meta(gt=0, le=10)]
+
+
+class Report(_Message, frozen=True):
+    """How a program that presents is: which order it knows, what it has done about it.
+
+    `values`: what is really in force, where the order's state is "presented" and the order had any. `wait_s`: how long
+    it would wait for another order.
+    """
+
+    run: _Id
+    order: Annotated[int, msgspec.Meta(ge=0, le=2**53)]
+    state: Literal["busy", "presented", "neutral", "failed"]
+    trial: _Id | None = None
+    values: Annotated[dict[_Id, float], msgspec.Meta(max_length=32)] | None = None
+    contact: bool = False
+    why: Annotated[str, msgspec.Meta(max_length=500)] = ""
+    wait_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 0.0
 
 
 def read(kind: type, body: bytes) -> Any:

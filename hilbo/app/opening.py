@@ -1,5 +1,6 @@
 """From what was asked for on the command line to a hub: study, plan, log, choosing; compiled before the device runs."""
 
+import functools
 import hashlib
 from collections.abc import Callable
 from importlib import metadata
@@ -8,8 +9,10 @@ from typing import Any, NamedTuple
 
 import msgspec
 
+from hilbo.app.device_rig import DeviceRig
 from hilbo.app.hub import Hub
 from hilbo.app.slices import Maps
+from hilbo.app.stimulus_rig import StimulusRig
 from hilbo.errors import InputError
 from hilbo.session.actions import Header, LiveSession
 from hilbo.session.event_log import EventLog, log_name
@@ -41,15 +44,17 @@ class Wanted(NamedTuple):
 def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable[[str], Any]) -> tuple[Hub, EventLog]:
     """The hub of a session, new or resumed, and its open log. Raises `InputError`."""
     study = Study.load(wanted.study)
-    mechanics = study.space.mechanics
-    if mechanics is None:
-        raise InputError(f"{wanted.study}: has no [renderer], and a device nothing to render.")
     say("preparing what chooses")
     import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
 
     log, chooser = (_resumed if wanted.resume else _begun)(wanted, study)
-    damping = max(_damping(study, block.material) for block in log.state.header.blocks)
-    return Hub(log, chooser, lambda: connect(damping), tag=_tag(log.state.header), maps=Maps), log
+    tag = _tag(log.state.header)
+    if study.stimulus is not None:
+        rig = functools.partial(StimulusRig, study, tag)
+    else:
+        damping = max(_damping(study, block.material) for block in log.state.header.blocks)
+        rig = functools.partial(DeviceRig, study, lambda: connect(damping))
+    return Hub(log, chooser, rig, tag=tag, maps=Maps), log
 
 
 def let_go(log: EventLog, resumed: bool = False) -> None:

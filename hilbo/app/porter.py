@@ -1,4 +1,4 @@
-"""The door of a server: an experimenter is let in at once, participants and strangers when it is their turn.
+"""The door of a server: an experimenter is let in at once, all others when it is their turn.
 
 A connection that is accepted is first only looked at: what has come is read without taking it. That costs a tenth of
 what it costs to serve it, so that a thousand strangers who come again and again do not hold up who comes behind them.

@@ -1,11 +1,10 @@
-"""What happens next in a session: propose, put on the device, lead through the steps, wait for the answer.
+"""What happens next in a session: propose, make ready, lead through the steps, wait for the answer.
 
 One task at a time, begun anew whenever an event changes what is to be felt (an answer, a break, an undo, a HOLD …).
-Sets go over to the device out of contact only, while the participant feels the reference or nothing. The renderer runs
-from the first rendering to the next break or end: what is in force pushes the handle back when the hand leaves it, and
-is then changed. It never starts before Begin, nor while something is compiled; whenever nobody is to feel anything it
-is told to stop, whatever it was doing. While the participant feels, the next proposal is made ready for every possible
-answer, so that after the answer it is only looked up.
+A rendering is made ready by the rig (`rig`) while the participant feels the reference or nothing, and a step begins
+when the rig says that it shows it. Nothing is shown before Begin, nor while something is compiled; whenever nobody is
+to feel anything the rig is told to rest, whatever it was doing. While the participant feels, the next proposal is made
+ready for every possible answer, so that after the answer it is only looked up.
 """
 
 import asyncio
@@ -15,6 +14,7 @@ import time
 from concurrent.futures import Future
 from typing import Any
 
+from hilbo.app.rig import Loaded, MissedError, Showing
 from hilbo.session import actions
 from hilbo.session.actions import RefusedError, Trial
 
@@ -22,6 +22,7 @@ __all__ = ["Runner"]
 
 _LATER = 1.0  # s until what the device refused is tried again
 _SOON = 0.05  # s
+_HAND = 0.15  # s that a hand may keep a rendering from being shown before it is asked to leave
 
 
 class Runner:
@@ -36,10 +37,10 @@ class Runner:
         self._task: asyncio.Task | None = None
         self._stop = threading.Event()
         self._in_force: tuple[int, int, str] | None = None
+        self._showing: Showing | None = None  # what was asked for last
         self._wake = asyncio.Event()
         self._ahead: Future | None = None
         self.fits_after = 0  # fits that a participant had to wait for
-        self._mechanics: dict[str | None, Any] = {}
 
     def key(self) -> tuple:
         """What is to be felt now: a change begins everything anew."""
@@ -65,24 +66,17 @@ class Runner:
         self._wake.set()
 
     def forget(self) -> None:
-        """The device has no set any more."""
+        """The rig has no rendering any more."""
         self._in_force = None
 
     async def _run(self, stop: threading.Event) -> None:
         """Until there is nothing to do before somebody does something."""
-        hub = self.hub
         try:
-            if hub.state.screen not in ("wait", "trial") or not hub.begun:
-                self.clock = {}  # what follows a rest does not follow an answer
-                await self._halt()
-            while hub.state.screen in ("wait", "trial"):
-                if hub.state.screen == "wait":
-                    self._at("choosing")
-                    await self._propose()
-                else:
-                    await self._present(hub.state.pending, stop)
-                    return
-            self._at("idle")
+            try:
+                await self._lead(stop)
+            except MissedError as error:
+                await self._missed(str(error))
+                self._again(stop)
         except RefusedError:  # the state has changed meanwhile, and with it what is to be done
             await asyncio.sleep(_SOON)
             self._again(stop)
@@ -91,6 +85,20 @@ class Runner:
             self._at("trouble")
             await asyncio.sleep(_LATER)
             self._again(stop)
+
+    async def _lead(self, stop: threading.Event) -> None:
+        hub = self.hub
+        if hub.state.screen not in ("wait", "trial") or not hub.begun:
+            self.clock = {}  # what follows a rest does not follow an answer
+            await hub.rig.rest()
+        while hub.state.screen in ("wait", "trial"):
+            if hub.state.screen == "wait":
+                self._at("choosing")
+                await self._propose()
+            else:
+                await self._present(hub.state.pending, stop)
+                return
+        self._at("idle")
 
     def _again(self, stop) -> None:
         if not stop.is_set():
@@ -132,7 +140,8 @@ class Runner:
             self._at("answer")
             return
         steps = actions.steps_of(hub.state, trial)
-        await self._device_ready()
+        await hub.rig.blank()
+        await self._rig_ready()
         loading = self._loading(trial, _next_side(steps, 0), stop)
         try:
             await asyncio.shield(hub.warm)  # a long arithmetic start, and a device that renders, do not go together
@@ -150,25 +159,38 @@ class Runner:
                 elif i and loading.done():
                     loading = self._loading(trial, _next_side(steps, i), stop)
                 await self._step(trial, i, show, seconds)
+            await hub.rig.blank()
         finally:
             loading.cancel()
         self._at("answer")
 
     async def _step(self, trial, i, show, seconds) -> None:
-        rig, commit = self.hub.rig, self.hub.commit
-        if show in trial.renderings:
-            await asyncio.wrap_future(rig.render())
+        commit = self.hub.commit
+        self._showing = self._showing_of(trial, i, show)
+        loaded = await self._untouched(asyncio.ensure_future(self.hub.rig.show(self._showing)))
+        if loaded is not None:
+            await self._in_log(trial, show, loaded)
         await commit(lambda state, at: actions.present(state, trial.id, i, True, at), mine=True)
         self._at("step", i, seconds)
         await asyncio.sleep(seconds)
         await commit(lambda state, at: actions.present(state, trial.id, i, False, at), mine=True)
 
     async def _arrived(self, loading) -> None:
-        """The set is in force; if a hand keeps it from that, it is asked to leave."""
-        done, _ = await asyncio.wait([loading], timeout=0.15)
+        """What was to be made ready is."""
+        done, _ = await asyncio.wait([loading], timeout=_HAND)
         if not done:
             self._at("let-go")
         await loading
+
+    async def _untouched(self, shown: asyncio.Task) -> Loaded | None:
+        """It is shown; if a hand keeps it from that, it is asked to leave."""
+        try:
+            done, _ = await asyncio.wait([shown], timeout=_HAND)
+            if not done:
+                self._at("let-go" if self.hub.rig.snapshot.contact else "showing")
+            return await shown
+        finally:
+            shown.cancel()
 
     def _loading(self, trial, side, stop) -> asyncio.Task:
         """`_load`, going on beside what the participant feels."""
@@ -177,60 +199,61 @@ class Runner:
         return task
 
     async def _load(self, trial: Trial, side: str | None, stop: threading.Event) -> None:
-        """A side's set in force, and in the log that it is."""
-        hub = self.hub
+        """A side made ready, and in the log if it is in force by that."""
         if side is None or self._in_force == (trial.id, trial.presentation, side):
             return
         self._in_force = None  # nobody knows which, until this one is known to be
-        loaded = await asyncio.wrap_future(hub.rig.load(self._wanted(trial, side), stop, self._may_push))
-        if loaded is None:
-            raise asyncio.CancelledError
-        facts = {"in_force": loaded.in_force._asdict(), "serial_s": loaded.serial_s}
-        self._note_times(loaded)
-        await hub.commit(lambda state, at: actions.sent(state, trial.id, side, at, **facts), mine=True)
-        self._in_force = (trial.id, trial.presentation, side)
+        showing = self._showing_of(trial, 0, side)
+        loaded = await self.hub.rig.prepare(showing, stop, self._may_push)
+        if loaded is not None:
+            await self._in_log(trial, side, loaded)
+            self._in_force = (trial.id, trial.presentation, side)
 
-    def _wanted(self, trial: Trial, side: str) -> dict[str, Any]:
-        """What `Renderer.send` takes."""
+    async def _in_log(self, trial: Trial, side: str, loaded: Loaded) -> None:
+        """In the log that a side is in force; what is presented may be another rendering than the one asked for."""
+        self._note_times(loaded)
+        await self.hub.commit(lambda state, at: actions.sent(state, trial.id, side, at, **loaded.facts), mine=True)
+        now = self.hub.state.trial(trial.id)
+        if now.presented != now.renderings:
+            self._look_ahead()
+
+    def _showing_of(self, trial: Trial, step: int, show: Any) -> Showing:
         material = self.hub.state.header.blocks[trial.block].material
-        if material not in self._mechanics:
-            study = self.hub.state.study
-            self._mechanics[material] = (study if material is None else study.material(material)).space.mechanics
-        m, values = self._mechanics[material], trial.renderings[side]
-        numbers = {name: values[name] for name in ("K0", "K1", "B1", "alpha")}
-        return numbers | {"N": m.N, "T": m.T, "memory": m.memory, "states": m.states}
+        return Showing(trial.id, trial.presentation, step, show, trial.renderings.get(show), material)
+
+    async def _missed(self, why: str) -> None:
+        """What was not presented voids its trial; nothing goes on by itself."""
+        hub, showing = self.hub, self._showing
+        assert showing is not None  # only a step can be missed
+        with contextlib.suppress(RefusedError):
+            await hub.commit(lambda state, at: actions.missed(state, showing.trial, showing.show, why, at), mine=True)
+        hub.begun = False
 
     def _note_times(self, loaded) -> None:
         """How long it took from an answer to parameters in force, in parts."""
         clock, now = self.clock, time.perf_counter()
         if {"came", "chosen", "proposed"} <= set(clock):
             parts = {"total": now - clock["came"], "fsync": clock["fsync"], "chosen": clock["chosen"]}
-            self.hub.delays.append(parts | {"serial": loaded.serial_s, "acknowledged": clock["logged"] - clock["came"]})
+            self.hub.delays.append(parts | {"serial": loaded.took_s, "acknowledged": clock["logged"] - clock["came"]})
         self.clock = {}
 
-    async def _device_ready(self) -> None:
-        """Wait while the device is lost, or holds."""
+    async def _rig_ready(self) -> None:
+        """Wait while the rig is lost, or holds."""
         while True:
             seen = self.hub.rig.snapshot
             if seen.lost is None and seen.state not in ("HOLD", "ESTOP"):
                 return
             self.clock = {}
-            self.trouble = seen.lost or f"The device is in {seen.state}."
+            self.trouble = seen.lost or f"The {self.hub.rig.title.lower()} is in {seen.state}."
             self._at("trouble")
             self._wake.clear()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), _LATER)
 
     def _may_push(self) -> bool:
-        """Whether the device may move by itself: somebody sits there who has pressed Begin, and everything is ready."""
+        """Whether the rig may move by itself: somebody sits there who has pressed Begin, and everything is ready."""
         hub = self.hub
         return hub.begun and hub.warm.done() and hub.watchers.participant_here
-
-    async def _halt(self) -> None:
-        """The renderer rests while nobody is to feel anything; where it cannot be told, it is tried again."""
-        told = asyncio.wrap_future(self.hub.rig.do(lambda device: device.stop()))
-        told.add_done_callback(_looked_at)
-        await asyncio.shield(told)  # told even if this is left
 
     def _look_ahead(self) -> None:
         """In the choosing's thread, while somebody feels: what comes next after each possible answer."""

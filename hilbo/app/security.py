@@ -1,4 +1,4 @@
-"""Who may ask the server for what: one-time links, keys for two roles, and where a request may come from.
+"""Who may ask the server for what: one-time links, keys for three roles, and where a request may come from.
 
 A link ends in `#token`, which browsers do not send: the page that it opens trades the token, once, for the role's key,
 in a cookie that scripts cannot read (or, for programs, in the answer). Keys outlive the server, in a file beside the
@@ -23,9 +23,12 @@ from typing import Literal, get_args
 
 from hilbo.errors import InputError
 
-__all__ = ["Gate", "Role", "lan_addresses"]
+__all__ = ["PAGES", "Gate", "Role", "lan_addresses"]
 
-Role = Literal["participant", "experimenter"]
+Role = Literal["stimulus", "participant", "experimenter"]
+"""Who is in a session, the one who is heard first last. The stimulus is a program that presents renderings."""
+PAGES: tuple[Role, ...] = ("participant", "experimenter")
+"""The roles that have a page in a browser; the other's key is told to a program."""
 _BYTES = 24
 _LENGTH = 32  # characters of a key: base64 of _BYTES
 _KEYS = 4  # of each kind that a request may show, so that nobody has the server try thousands
@@ -41,8 +44,8 @@ class Gate:
     def __init__(self, hosts: Iterable[str], keys: Path | None = None):
         self.hosts = frozenset(host.lower() for host in hosts)
         port = min(host.rpartition(":")[2] for host in self.hosts)  # all of them have the same
-        self.cookies: dict[Role, str] = {role: f"hilbo_{role}_{port}" for role in get_args(Role)}
-        roles = "|".join(get_args(Role))
+        self.cookies: dict[Role, str] = {role: f"hilbo_{role}_{port}" for role in PAGES}
+        roles = "|".join(PAGES)
         key = rf"([\w-]{{{_LENGTH}}})(?![\w-])"
         self._shown = [
             re.compile(f"{before}{key}".encode()) for before in ("earer {1,8}", f"hilbo_(?:{roles})_{port}=")
@@ -59,13 +62,17 @@ class Gate:
         self._tokens[_digest(token)] = role
         return token
 
+    def asked_for(self, token: str) -> Role | None:
+        """The role of a token that is still good."""
+        return self._tokens.get(_digest(token))
+
     def redeem(self, token: str) -> tuple[Role, str] | None:
         """The role of a token and a new key for it, None if it is unknown or used.
 
         The key replaces the one before: a participant's second browser ends the first. Raises `InputError` if it cannot
         be kept; the token is still good then, and the key before too.
         """
-        role = self._tokens.get(_digest(token))
+        role = self.asked_for(token)
         if role is None:
             return None
         key = secrets.token_urlsafe(_BYTES)

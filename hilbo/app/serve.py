@@ -11,9 +11,9 @@ import functools
 import io
 import socket
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 from hilbo.app.security import Gate, Role, lan_addresses
 from hilbo.errors import InputError
@@ -38,14 +38,14 @@ class Place:
         self.gate = Gate(self.hosts, keys)
 
     def link(self, role: Role) -> str:
-        """A one-time link for a role. The participant's is for the network where there is one, the experimenter's for
-        this computer."""
-        host = self._far if role == "participant" else self._near
+        """A one-time link for a role. The experimenter's is for this computer, the others' for the network where there
+        is one."""
+        host = self._near if role == "experimenter" else self._far
         return f"http://{host}/#{self.gate.invite(role)}"
 
-    def links(self) -> dict[str, str]:
-        """One link for each role."""
-        return {role: self.link(role) for role in get_args(Role)}
+    def links(self, roles: Iterable[Role] = ("participant", "experimenter")) -> dict[str, str]:
+        """One link for each of the roles."""
+        return {role: self.link(role) for role in roles}
 
 
 def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> Place:
@@ -106,7 +106,7 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
 
     async def shutdown(sockets=None):
         porter.close()
-        hub.watchers.end_all()
+        hub.hang_up()
         await admission.settled()  # uvicorn ends those that it knows, and waits for all
         try:
             await hang_up(sockets=sockets)

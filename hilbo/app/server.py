@@ -7,6 +7,8 @@
     GET  /api/participant/events the same as server-sent events, at every change
     POST /api/participant/…      answer, begin, break, more, here
     POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite
+    POST /api/stimulus/hello     a program that presents begins
+    POST /api/stimulus           how it is; the answer is the newest order
 
 Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 409 not now, 413 too large. The
 event loop only waits here: files, device and arithmetic have threads of their own.
@@ -17,7 +19,7 @@ import contextlib
 import mimetypes
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import msgspec
 from starlette.applications import Starlette
@@ -28,7 +30,8 @@ from starlette.routing import Route
 
 from hilbo.app import messages
 from hilbo.app.hub import COMMANDS, PRESSES, Hub, NotNowError
-from hilbo.app.security import Gate, Role
+from hilbo.app.security import PAGES, Gate, Role
+from hilbo.app.stimulus_rig import OverError, StimulusRig
 from hilbo.errors import InputError
 from hilbo.session.event_log import LogError
 
@@ -80,7 +83,7 @@ def application(hub: Hub, gate: Gate) -> Starlette:
         Route("/api/join", _join(hub, gate), methods=["POST"]),
         Route("/api/experimenter/map", guarded("experimenter", _map), methods=["GET"]),
     ]
-    for role in get_args(Role):
+    for role in PAGES:
         routes += [
             Route(f"/{role}", _role_page(gate, role)),
             Route(f"/api/{role}", guarded(role, _view), methods=["GET"]),
@@ -89,6 +92,8 @@ def application(hub: Hub, gate: Gate) -> Starlette:
     routes += [Route("/api/participant/answer", guarded("participant", _answer), methods=["POST"])]
     routes += [Route(f"/api/participant/{n}", guarded("participant", _press), methods=["POST"]) for n in PRESSES]
     routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
+    routes += [Route("/api/stimulus", guarded("stimulus", _report), methods=["POST"])]
+    routes += [Route("/api/stimulus/hello", guarded("stimulus", _hello), methods=["POST"])]
     routes += [Route(f"/static/{name}", _page(name)) for name in _FILES]
     return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)])
 
@@ -119,6 +124,8 @@ def _join(hub, gate):
             message = messages.read(messages.Join, await _body(request))
         except InputError as error:
             return _not_understood(error)
+        if gate.asked_for(message.token) == "stimulus" and not message.bearer:
+            return _error(400, "This link is for a program that presents, not for a browser; give it to the program.")
         try:
             found = gate.redeem(message.token)
         except InputError as error:
@@ -142,7 +149,7 @@ def _for(hub, gate):
     def guarded(role: Role, handler: Callable):
         async def handle(request: Request) -> Response:
             program = _bearer(request)
-            if not gate.admits(role, program or request.cookies.get(gate.cookies[role])):
+            if not gate.admits(role, program or request.cookies.get(gate.cookies.get(role, ""))):
                 await _body(request)  # the connection ends with the answer, and with it what is still on its way
                 return _error(401, "Open the link of this session first; this page is no longer part of it.")
             if program and role == "participant":
@@ -151,6 +158,8 @@ def _for(hub, gate):
                 return await handler(hub, role, request)
             except LogError as error:
                 return _json({"error": str(error)}, 503)
+            except OverError as error:
+                return _json({"error": str(error), **error.told}, 409)
             except NotNowError as error:
                 return _json({"error": str(error), "view": hub.view(role)}, 409)
             except InputError as error:
@@ -185,6 +194,21 @@ async def _press(hub, role, request) -> Response:
 async def _command(hub, _role, request) -> Response:
     message = messages.read(messages.Command, await _body(request))
     return _json(await hub.command(request.url.path.rpartition("/")[2], message))
+
+
+def _program(hub) -> StimulusRig:
+    """The rig that a program is. Raises `InputError` where a device renders."""
+    if not isinstance(hub.rig, StimulusRig):
+        raise InputError("In this session a device renders, and no program presents.")
+    return hub.rig
+
+
+async def _hello(hub, _role, request) -> Response:
+    return _json(await _program(hub).hello(messages.read(messages.Hello, await _body(request))))
+
+
+async def _report(hub, _role, request) -> Response:
+    return _json(await _program(hub).report(messages.read(messages.Report, await _body(request))))
 
 
 async def _events(hub, role, request) -> Response:

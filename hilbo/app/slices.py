@@ -62,7 +62,7 @@ class Maps:
             return None
         trial = state.pending
         block = trial.block if trial is not None and trial.block in blocks else blocks[0]
-        asked = None if trial is None or trial.sets else trial.renderings["a"]
+        asked = None if trial is None or trial.sets else trial.presented["a"]
         return self._sliced(Answers.of(state, block), asked)
 
     def _sliced(self, answers: Answers, asked: Mapping[str, float] | None) -> dict[str, Any]:

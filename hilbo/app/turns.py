@@ -1,6 +1,7 @@
-"""Whose turn it is: participants and strangers wait in two rows, and every few milliseconds the first of each goes on.
+"""Whose turn it is: programs that present, participants and strangers wait in rows, and every few milliseconds the
+first of each goes on.
 
-So neither can take more than a part of the one thread that serves everybody. Where nobody waits, nobody is kept.
+So none can take more than a part of the one thread that serves everybody. Where nobody waits, nobody is kept.
 """
 
 import asyncio
@@ -15,11 +16,11 @@ _APART = 0.005  # s from one turn to the next
 
 
 class Turns:
-    """The two rows. `go` is called with whoever goes on, and its role."""
+    """The rows. `go` is called with whoever goes on, and its role."""
 
     def __init__(self, go: Callable[[Any, Role | None], Any]):
         self._go, self._due, self._waiting = go, 0.0, False
-        self._rows: dict[Role | None, dict[Any, None]] = {"participant": {}, None: {}}
+        self._rows: dict[Role | None, dict[Any, None]] = {"stimulus": {}, "participant": {}, None: {}}
 
     def add(self, who: Any, role: Role | None) -> None:
         """At the end of its row, unless it is there."""

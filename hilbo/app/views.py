@@ -22,6 +22,7 @@ _PHASE_WORDS = {
     "hello": "Waiting for the participant to press Begin",
     "choosing": "Choosing the next rendering",
     "between": "Between two trials",
+    "showing": "Waiting until it is shown",
     "let-go": "Waiting for the hand to leave the device",
     "answer": "Waiting for the answer",
     "idle": "Nothing to do",
@@ -204,15 +205,9 @@ def _set_words(values):
 def _device(hub):
     seen = hub.rig.snapshot
     level = "bad" if seen.lost or seen.state in ("HOLD", "ESTOP") else "good" if seen.state == "RUNNING" else "rest"
-    rows = [
-        ["Contact", "yes" if seen.contact else "no"],
-        ["Position", f"{seen.position_mm:.2f} mm"],
-        ["Force", f"{seen.force_N:.2f} N"],
-    ]
-    rows += [[name.replace("_", " "), str(value)] for name, value in seen.counters.items() if value]
-    said = hub.rig.device.device
-    words = seen.lost or f"{hub.rig.device.link.name}, damping {said.damping_N_s_per_m:.3g} N·s/m"
-    return {"state": "lost" if seen.lost else seen.state.lower(), "level": level, "words": words, "rows": rows}
+    state, rows = "lost" if seen.lost else seen.state.lower(), [list(row) for row in seen.rows]
+    words = seen.lost or hub.rig.words
+    return {"title": hub.rig.title, "state": state, "level": level, "words": words, "rows": rows}
 
 
 def _may(hub):
@@ -253,7 +248,7 @@ def _table(state: LiveSession):
         if trial.sets:
             cells = [place, " / ".join(trial.sets.values()), *[""] * (width - 1), answer or trial.status]
         else:
-            cells = [place, *(trial.renderings["a"][name] for name in names), answer or trial.status]
+            cells = [place, *(trial.presented["a"][name] for name in names), answer or trial.status]
         row = {"kind": kind, "cells": cells}
         voided = trial.status == "void" and trial.values is not None
         rows.append(row | ({"restore": _meant(trial)} if voided and restorable(state, trial.id) else {}))

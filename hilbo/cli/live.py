@@ -72,7 +72,7 @@ def session(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """A live session: the participant's and the experimenter's page, the device, and the log."""
+    """A live session: the participant's and the experimenter's page, what shows renderings, and the log."""
     _need_extra()
     from hilbo.app import serve
 
@@ -90,6 +90,8 @@ def session(
             )
             hub, log = opened(wanted, line.open, say)
         held.callback(let_go, log, resume)
+        if hub.state.study.stimulus is not None and line.device != "sim":
+            raise InputError(f"{study}: has no [renderer], and a device nothing to render; leave --device out.")
         hub.gap = served.gap
         _serve(hub, place, served, as_json)
 
@@ -97,8 +99,8 @@ def session(
 def _serve(hub, place, served, as_json) -> None:
     from hilbo.app import serve
 
-    def invite():
-        link = place.link("participant")
+    def invite(role):
+        link = place.link(role)
         return {"link": link, "qr": serve.qr_image(link)}
 
     hub.invite = invite
@@ -109,7 +111,8 @@ def _started(hub, place, served, as_json) -> None:
     """Links on the terminal; with --json in one line on stdout, for programs."""
     from hilbo.app import serve
 
-    links = place.links()
+    presents = hub.state.study.stimulus is not None
+    links = place.links(("stimulus", "participant", "experimenter") if presents else ("participant", "experimenter"))
     for note in hub.rig.notes:
         print(f"hilbo: {note}", file=sys.stderr)
     print(f"log:          {hub.log.path}" + (f"  ({hub.log.dropped})" if hub.log.dropped else ""), file=sys.stderr)
@@ -119,7 +122,7 @@ def _started(hub, place, served, as_json) -> None:
         print(serve.qr_text(links["participant"]), file=sys.stderr)
     print("Each link opens once. Ctrl-C ends the server; --resume goes on.", file=sys.stderr, flush=True)
     if as_json:
-        print(json.dumps(links | {"log": str(hub.log.path), "device": hub.rig.device.link.name}), flush=True)
+        print(json.dumps(links | {"log": str(hub.log.path), "device": hub.rig.words.partition(",")[0]}), flush=True)
     if served.browse:
         import webbrowser
 

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from typing import Any, Protocol, runtime_checkable
 
 from hilbo.errors import InputError
+from hilbo.session.confirmed import check_confirmed
+from hilbo.session.header_check import study_of
 from hilbo.session.records import Block, Event, Header, Need, Planned, RefusedError, Trial
 from hilbo.session.state import LiveSession, Screen
 from hilbo.study.protocols import protocol
@@ -32,6 +34,7 @@ __all__ = [
     "device",
     "go_on",
     "last_answered",
+    "missed",
     "more",
     "note",
     "pause",
@@ -86,22 +89,36 @@ def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
 
 
 def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event:
-    """The device has a rendering in force, as it says (`facts`: its CRC, what it read back, times)."""
+    """A rendering is in force, as a device says (`facts`: its CRC, what it read back, times), or as the program that
+    presents it does (`values`: parameter -> physical unit). Raises RefusedError for values that are too far off."""
     found = _live(state, trial)
     if side not in found.renderings:
         raise RefusedError("bad-answer", f'trial {trial} has no side "{side}".')
+    if state.study.stimulus is not None:
+        here = study_of(state.study, state.header.blocks[found.block].material)
+        check_confirmed(here, found.renderings[side], facts.get("values"))
     return _event(state, "sent", at, id=trial, side=side, **facts)
 
 
 def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> Event:
-    """A step of a trial begins (`on`) or ends. None begins in a break, or after the end."""
+    """A step of a trial begins (`on`) or ends. None begins in a break, or after the end, nor with a rendering that its
+    program has not confirmed."""
     found = _live(state, trial)
     if on and state.screen != "trial":
         raise RefusedError("paused", f"no step of trial {trial} begins now: the screen shows {state.screen}.")
     steps = steps_of(state, found)
     if not 0 <= step < len(steps):
         raise RefusedError("bad-answer", f"trial {trial} has {len(steps)} steps, none with the number {step}.")
-    return _event(state, "stimulus", at, id=trial, step=step, show=steps[step][0], on=bool(on))
+    show = steps[step][0]
+    if on and state.study.stimulus is not None and show in found.renderings and show not in found.confirmed:
+        raise RefusedError("unconfirmed", f'nobody has confirmed that side "{show}" of trial {trial} is presented.')
+    return _event(state, "stimulus", at, id=trial, step=step, show=show, on=bool(on))
+
+
+def missed(state: LiveSession, trial: int, show: str, reason: str, at: float) -> Event:
+    """What was to be presented was not: too late, too far off, or the program failed. The trial is void, by rule."""
+    _live(state, trial)
+    return _event(state, "missed", at, id=trial, show=show, reason=reason)
 
 
 def answer(

@@ -98,7 +98,7 @@ def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
                 rows.append(
                     _place(state, trial)
                     | {"response": trial.values["class_a"]}
-                    | trial.renderings["a"]
+                    | trial.presented["a"]
                     | {"voided": int(trial.status != "answered"), "status": trial.status}
                     | _times(trial)
                 )

@@ -33,24 +33,30 @@ _KEPT = 64  # posteriors, the newest: those of the present, of what may follow, 
 
 
 class Answers(NamedTuple):
-    """The answers of a block that count: their renderings in physical units, and their categories."""
+    """The answers of a block that count: their renderings in physical units, and their categories.
+
+    `points` are the renderings as they were presented, `proposed` as they were asked for: the same, but where a program
+    presents, and confirms what it could.
+    """
 
     block: int
     points: tuple[tuple[float, ...], ...] = ()
     categories: tuple[int, ...] = ()
+    proposed: tuple[tuple[float, ...], ...] = ()
 
     @classmethod
     def of(cls, state: LiveSession, block: int) -> "Answers":
         """The answers of a block so far."""
         answered = state.answers(block)
         names, responses = state.study.space.names, state.study.responses
-        points = tuple(_place(trial.renderings["a"], names) for trial in answered)
+        points = tuple(_place(trial.presented["a"], names) for trial in answered)
         given = [trial.values["class_a"] for trial in answered if trial.values is not None]
-        return cls(block, points, tuple(map(responses.index, given)))
+        proposed = tuple(_place(trial.renderings["a"], names) for trial in answered)
+        return cls(block, points, tuple(map(responses.index, given)), proposed)
 
-    def followed_by(self, point: tuple[float, ...], category: int) -> "Answers":
+    def followed_by(self, point: tuple[float, ...], category: int, proposed: tuple[float, ...]) -> "Answers":
         """With one more."""
-        return self._replace(points=(*self.points, point), categories=(*self.categories, category))
+        return Answers(self.block, (*self.points, point), (*self.categories, category), (*self.proposed, proposed))
 
 
 class _Situation(NamedTuple):
@@ -181,7 +187,7 @@ class LiveChooser:
         excluded = _rows(situation.excluded, study)
         if warm is not None:
             return Choice(apart.point_from_map(study, warm, fitted.posterior, excluded), "map")
-        initial, gone = session.step.initial, {*answers.points, *situation.excluded}
+        initial, gone = session.step.initial, {*answers.proposed, *situation.excluded}
         missing = [point for point in initial if tuple(point.tolist()) not in gone]
         if missing:  # in their order; one whose answer was voided comes again
             return Choice(missing[0], "latin hypercube")
@@ -210,8 +216,9 @@ def _following(state: LiveSession) -> list[Answers]:
     """The answers after each one that the pending trial may get."""
     trial = state.pending
     assert trial is not None
-    answers, point = Answers.of(state, trial.block), _place(trial.renderings["a"], state.study.space.names)
-    return [answers.followed_by(point, category) for category in range(len(state.study.responses))]
+    answers, names = Answers.of(state, trial.block), state.study.space.names
+    point, proposed = _place(trial.presented["a"], names), _place(trial.renderings["a"], names)
+    return [answers.followed_by(point, category, proposed) for category in range(len(state.study.responses))]
 
 
 def _checked_warm(state: LiveSession, warm: Mapping[str | None, WarmStart]) -> dict[str | None, WarmStart]:

@@ -85,7 +85,7 @@ def trust_of(state: LiveSession, block: int, chooser: LiveChooser) -> Trust | No
     trial = state.pending
     # The answer to a repeat does not count, and moves nothing.
     counts = trial is not None and trial.block == block and trial.repeats is None
-    upcoming = np.array([trial.renderings["a"][name] for name in study.space.names]) if trial and counts else None
+    upcoming = np.array([trial.presented["a"][name] for name in study.space.names]) if trial and counts else None
     following = chooser.fitted_after_each_answer(state) if counts else []
     return trust(study, chooser.fitted(answers), upcoming, following, lambda one: chooser.best(block, one))
 

@@ -18,8 +18,8 @@ Status = Literal["pending", "answered", "undone", "void", "dropped", "left out"]
 
 
 class RefusedError(InputError):
-    """What cannot be done now; `code` says why, for a program: old-trial, voided, answered, unfelt, bad-answer,
-    paused, over, nothing."""
+    """What cannot be done now; `code` says why, for a program: old-trial, voided, answered, unfelt, unconfirmed, off,
+    bad-answer, paused, over, nothing."""
 
     def __init__(self, code: str, sentence: str) -> None:
         super().__init__(sentence)
@@ -85,7 +85,10 @@ class Need(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class Trial:
-    """A proposal and what became of it. `number` is the row's trial in tables, counted within phase and material."""
+    """A proposal and what became of it. `number` is the row's trial in tables, counted within phase and material.
+
+    `confirmed`: side -> the values that count of what a program presented, where one does; of this presentation alone.
+    """
 
     id: int
     block: int
@@ -100,6 +103,7 @@ class Trial:
     felt: frozenset[str] = frozenset()
     on: str | None = None
     sent: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    confirmed: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     values: Mapping[str, str] | None = None
     client: str | None = None
     answered: Mapping[str, Any] | None = field(default=None, repr=False)
@@ -109,6 +113,11 @@ class Trial:
     def renderings(self) -> dict[str, dict[str, float]]:
         """Side -> parameters in physical units."""
         return self.data["renderings"]
+
+    @property
+    def presented(self) -> dict[str, dict[str, float]]:
+        """Side -> parameters in physical units, as they count: the confirmed ones where a program presents them."""
+        return {side: {**values, **self.confirmed.get(side, {})} for side, values in self.renderings.items()}
 
     @property
     def unfinished(self) -> bool:

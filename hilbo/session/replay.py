@@ -45,6 +45,7 @@ class _Propose(msgspec.Struct):
 class _Sent(msgspec.Struct):
     id: _Whole
     side: _Side
+    values: dict[str, float] | None = None
 
 
 class _Stimulus(msgspec.Struct):
@@ -52,6 +53,12 @@ class _Stimulus(msgspec.Struct):
     step: _Whole
     show: Show
     on: bool
+
+
+class _Missed(msgspec.Struct):
+    id: _Whole
+    show: Show
+    reason: str
 
 
 class _Answer(msgspec.Struct):
@@ -100,6 +107,7 @@ _KINDS: dict[str, tuple[type, _Again]] = {
     "propose": (_Propose, lambda s, d, raw, at: actions.propose(s, _Given(_without(raw, *_FIXED)), at)),
     "sent": (_Sent, lambda s, d, raw, at: actions.sent(s, d.id, d.side, at, **_without(raw, "id", "side"))),
     "stimulus": (_Stimulus, lambda s, d, raw, at: actions.present(s, d.id, d.step, d.on, at)),
+    "missed": (_Missed, lambda s, d, raw, at: actions.missed(s, d.id, d.show, d.reason, at)),
     "answer": (
         _Answer,
         lambda s, d, raw, at: actions.answer(s, d.id, d.client, d.values, at, browser=d.browser, felt=False),

@@ -3,7 +3,8 @@
 `LiveSession.fold(study, header, events)` is the state after a log, so that resuming is replaying. Renderings are in the
 events themselves: a fold computes no fit.
 
-Rules: a trial in which the device holds, stops or is lost after it began is void, and is asked again. A repeated,
+Rules: a trial in which the device holds, stops or is lost after it began is void, and is asked again; so is one in
+which a program that presents did not present what it was asked for, which counts as a stop (`missed`). A repeated,
 voided, undone or interrupted presentation starts from its first step, and so does one that a pause cut off. Whatever
 changes the answers drops a proposal that was made from the old ones.
 
@@ -22,6 +23,8 @@ from functools import cached_property
 from typing import Any, Literal
 
 from hilbo.errors import InputError
+from hilbo.session.confirmed import counted
+from hilbo.session.header_check import study_of
 from hilbo.session.records import Event, Header, Need, RefusedError, Trial
 from hilbo.study.study_file import AnyStudy
 
@@ -206,7 +209,12 @@ def _proposed(state, event):
 
 def _sent(state, event):
     trial = state.trial(event.data["id"])
-    return state.with_trial(trial.id, sent={**trial.sent, event.data["side"]: event.data})
+    side = event.data["side"]
+    state = state.with_trial(trial.id, sent={**trial.sent, side: event.data})
+    if state.study.stimulus is None:
+        return state
+    values = counted(study_of(state.study, state.header.blocks[trial.block].material), event.data["values"])
+    return state.with_trial(trial.id, confirmed={**trial.confirmed, side: values})
 
 
 def _stimulus(state, event):
@@ -262,7 +270,7 @@ def _undone(state, event):
 
 
 def _again(trial) -> dict[str, Any]:
-    return {"presentation": trial.presentation + 1, "step": None, "on": None, "felt": frozenset()}
+    return {"presentation": trial.presentation + 1, "step": None, "on": None, "felt": frozenset(), "confirmed": {}}
 
 
 def _repeated(state, event):
@@ -328,10 +336,17 @@ def _device(state, event):
     return replace(state, machine=data)
 
 
+def _missed(state, event):
+    trial = state.trial(event.data["id"])
+    reason = f"stimulus: {event.data['reason']}"
+    return _made_void(state, trial, "rule", reason, {event.data["show"]} & set(trial.renderings))
+
+
 _APPLY = {
     "propose": _proposed,
     "sent": _sent,
     "stimulus": _stimulus,
+    "missed": _missed,
     "answer": _answered,
     "undo": _undone,
     "repeat": _repeated,

@@ -151,6 +151,7 @@ def _whole_trial(state, trial: Trial):
         "step": trial.step,
         "on": trial.on,
         "sent": dict(trial.sent),
+        "presented": trial.presented,
         "values": trial.values,
         "answered": trial.answered,
         "voided": trial.voided,

@@ -12,6 +12,7 @@ from hilbo.population.learnt_posterior import NOTHING, Stated, prior_model
 from hilbo.population.maps import AnyRule
 from hilbo.search.space import SearchSpace
 from hilbo.study.protocols import SessionTable
+from hilbo.study.stimulus_table import StimulusTable
 from hilbo.study.study_file import StudyFile, checked, hash_of, made_of_material, materials_in, read_study
 from hilbo.study.study_tables import Inference, ReportTable, Selection
 
@@ -40,6 +41,8 @@ class Study(eqx.Module):
     content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON
     session: SessionTable = eqx.field(static=True, repr=False, default=SessionTable())
     report: ReportTable = eqx.field(static=True, repr=False, default=ReportTable())
+    stimulus: StimulusTable | None = eqx.field(static=True, repr=False, default=None)
+    """What is asked of the program that presents the renderings; None where a device does."""
     stated: Stated = eqx.field(static=True, repr=False, default=NOTHING)
     """What the file states of the model, where the rule learns the rest."""
     learnt: Learnt | None = eqx.field(repr=False, default=None)
@@ -74,6 +77,7 @@ class Study(eqx.Module):
             content=file.content,
             session=file.session,
             report=file.tables.report,
+            stimulus=file.stimulus,
             stated=stated,
         )
 

@@ -21,6 +21,7 @@ from hilbo.errors import InputError
 from hilbo.search.box import Box, Mechanics, Parameter
 from hilbo.study.fields import enclosing, lines_of, prefix
 from hilbo.study.protocols import SessionTable
+from hilbo.study.stimulus_table import StimulusTable
 from hilbo.study.study_tables import Selection, Tables, box_of, check_together, of_material, read
 
 __all__ = ["AnyStudy", "StudyFile", "checked", "hash_of", "made_of_material", "materials_in", "read_study"]
@@ -61,6 +62,11 @@ class StudyFile:
     def session(self) -> SessionTable:
         """What is said of live sessions."""
         return self.tables.session
+
+    @property
+    def stimulus(self) -> StimulusTable | None:
+        """What is asked of the program that presents the renderings; None where a device does."""
+        return None if self.space.mechanics is not None else self.tables.stimulus or StimulusTable()
 
     @cached_property
     def content(self) -> str:
@@ -117,6 +123,9 @@ class AnyStudy(Protocol):
 
     @property
     def session(self) -> SessionTable: ...
+
+    @property
+    def stimulus(self) -> StimulusTable | None: ...
 
     @property
     def hash(self) -> str: ...

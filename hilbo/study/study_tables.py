@@ -19,6 +19,7 @@ from hilbo.study.fields import Table as _Table
 from hilbo.study.fields import check_keys, check_table, read_table, shown
 from hilbo.study.fields import words as _text
 from hilbo.study.protocols import SessionTable
+from hilbo.study.stimulus_table import StimulusTable
 
 __all__ = [
     "GPTable",
@@ -120,6 +121,7 @@ class Tables(_Table, frozen=True):
     materials: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
     session: SessionTable = SessionTable()
     report: ReportTable = ReportTable()
+    stimulus: StimulusTable | None = None
 
 
 _TABLES = {
@@ -129,20 +131,10 @@ _TABLES = {
     "aggregation": _AggregationTable,
     "session": SessionTable,
     "report": ReportTable,
+    "stimulus": StimulusTable,
 }
 _REQUIRED = ("schema", "study", "parameters")
-_KEYS = (
-    "schema",
-    "study",
-    "parameters",
-    "renderer",
-    "gp",
-    "selection",
-    "aggregation",
-    "session",
-    "report",
-    "materials",
-)
+_KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "materials")
 _OVERRIDES = ("renderer", "parameters")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
 
@@ -192,6 +184,10 @@ def check_together(tables: Tables) -> None:
             f"selection.space_filling is {selection.space_filling}, it must be at most trials = {selection.trials}."
         )
     tables.session.check(labels)
+    if tables.stimulus is not None:
+        tables.stimulus.check(tuple(tables.parameters))
+        if tables.renderer is not None:
+            raise InputError("stimulus stands beside renderer, a study has one: a program presents, or a device.")
     _check_gp(tables.gp, tables.aggregation.rule, len(labels), len(tables.parameters))
 
 

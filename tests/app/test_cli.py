@@ -46,7 +46,9 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")  # commands would choose the user's
     logs = tmp_path / "logs"
     place = ("--logs", logs, "--port", 0, "--participant", "P01")
-    assert "has no [renderer]" in refused(DATA.parent / "video_quality.toml", *place, "--dry-run")
+    device = ("--device", tmp_path / "none")
+    words = refused(DATA.parent / "video_quality.toml", *place, "--dry-run", *device)
+    assert "has no [renderer], and a device nothing to render; leave --device out" in words
     assert "cannot be read" in refused(tmp_path / "none.toml", *place)
     assert "participants.csv: cannot be read" in refused(DATA, *place)
     assert "an id has" in refused(DATA, "--logs", logs, "--port", 0, "--participant", "Jane Doe")

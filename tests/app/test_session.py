@@ -1,12 +1,10 @@
 """Live sessions through the server, its hub and a simulated device: trials, commands, windows, and their log."""
 
-import contextlib
-import http.client
 import json
 import threading
 
 import pytest
-from live_server import PATIENCE, Live, ask, refused
+from live_server import PATIENCE, Live, check_blinding, listen, refused
 
 from hilbo.app.views import choice_rows
 from hilbo.session.export import validation_table
@@ -54,32 +52,7 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
         state = live.hub.state
     listening.join(PATIENCE)
     assert any(line.startswith("event: view") for line in heard)
-    check_blinding("\n".join(heard), state)
-
-
-def listen(live, heard):
-    """Everything that comes as server-sent events, until the server ends; and the page itself."""
-    key = {"Authorization": f"Bearer {live.participant._key}"}
-    with (
-        ask(live, "/api/participant/events?page=ear", **key) as stream,
-        contextlib.suppress(OSError, http.client.HTTPException),
-    ):
-        for kind in ("html", "js"):
-            with ask(live, f"/static/participant.{kind}") as page:
-                heard.append(page.read().decode())
-        for line in stream:
-            heard.append(line.decode())
-
-
-def check_blinding(heard, state):
-    """Nothing of what a participant must not know is in what their browser was told."""
-    words = ["best", "mid", "worst", "mean", "margin", "certificate", "K1", "B1", "alpha", "renderings", "choice"]
-    for word in [*words, "passiv", "probabilit", "aggregate", "individual", "validation"]:
-        assert word not in heard, word
-    for values in [values for trial in state.trials for values in trial.renderings.values()]:
-        for value in values.values():
-            assert f"{value:.4g}" not in heard
-            assert str(value) not in heard
+    check_blinding("\n".join(heard), state, "K1", "B1", "alpha")
 
 
 def check_order(events):

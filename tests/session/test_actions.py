@@ -151,7 +151,7 @@ def device_stops(driver, step):
     """The pending trial is felt up to a step, in which the device holds."""
     trial = driver.state.pending
     for k in range(step + 1):
-        driver.log(live.present(driver.state, trial.id, k, True, 1.0))
+        driver.begin(trial, k)
         if k < step:
             driver.log(live.present(driver.state, trial.id, k, False, 1.0))
     driver.log(live.device(driver.state, "hold", 1.0, reason="speed"))
@@ -252,7 +252,7 @@ def test_a_pause_in_mid_trial_begins_the_trial_again():
     driver = to_first_answerable("validation")
     trial = driver.state.pending
     for step in (0, 1):
-        driver.log(live.present(driver.state, trial.id, step, True, 1.0))
+        driver.begin(trial, step)
     assert driver.state.pending.felt == {"a"}
     driver.do("pause", 0)
     assert driver.state.screen == "paused" and participant_view(driver.state)["screen"] == "paused"
@@ -273,7 +273,7 @@ def test_a_rendering_that_was_cut_off_by_a_pause_has_not_been_felt(steps):
     driver = to_first_answerable("validation")
     trial = driver.state.pending
     for step in range(steps):
-        driver.log(live.present(driver.state, trial.id, step, True, 1.0))
+        driver.begin(trial, step)
         if step + 1 < steps:
             driver.log(live.present(driver.state, trial.id, step, False, 1.0))
     assert driver.state.pending.unfinished

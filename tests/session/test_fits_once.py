@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 from fits import count_fits
-from live import STUDY, header
+from live import STUDY, beginning, header
 
 from hilbo.app.slices import Maps
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
@@ -58,7 +58,8 @@ def test_a_live_trial_fits_each_data_set_once():
             """A rendering is proposed and felt, the next is sought, and the experimenter looks."""
             state = state.after(live.propose(state, chooser, 0.0))
             for step in range(len(live.steps_of(state, state.pending))):
-                state = state.after(live.present(state, state.pending.id, step, True, 0.0))
+                for event in beginning(state, state.pending.id, step, 0.0):
+                    state = state.after(event)
             chooser.lookahead(state)
             look(state)
             return state

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import msgspec
 import numpy as np
 import pytest
-from live import RAW, STUDY, header
+from live import RAW, STUDY, beginning, header
 
 from hilbo import Session, Study
 from hilbo.errors import InputError
@@ -77,7 +77,8 @@ def test_a_rendering_stopped_twice_is_replaced_by_a_feasible_one_apart(chooser, 
     state = asked(state, chooser)
     point = state.pending.renderings["a"]
     for again in range(2):
-        state = state.after(live.present(state, state.pending.id, 1, True, 0.5))
+        for event in beginning(state, state.pending.id, 1, 0.5):
+            state = state.after(event)
         state = asked(state.after(live.device(state, "hold", 1.0)), chooser)
         assert (state.pending.renderings["a"] == point) == (again == 0)
     unit = [STUDY.space.to_unit(np.array([p["u"], p["v"]])) for p in (point, state.pending.renderings["a"])]
@@ -246,7 +247,8 @@ def test_a_space_filling_point_that_is_not_shown_again_is_replaced_once(chooser)
     state = asked(start(), chooser)
     point = state.pending.renderings["a"]
     for _ in range(2):
-        state = state.after(live.present(state, state.pending.id, 1, True, 0.5))
+        for event in beginning(state, state.pending.id, 1, 0.5):
+            state = state.after(event)
         state = asked(state.after(live.device(state, "hold", 1.0)), chooser)
     by = []
     for response in ANSWERS[:3]:

@@ -14,7 +14,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from live import RAW
+from live import RAW, beginning
 
 from hilbo import Study
 from hilbo.session import actions as live
@@ -117,7 +117,8 @@ class Lab:
         steps = live.steps_of(self.state, trial)
         last = len(steps) if self.rng.random() < 0.7 else int(self.rng.integers(1, len(steps) + 1))
         for step in range(last):
-            self.log(live.present(self.state, trial.id, step, True, self.clock))
+            for event in beginning(self.state, trial.id, step, self.clock):
+                self.log(event)
             if step + 1 < last or self.rng.random() < 0.6:
                 self.log(live.present(self.state, trial.id, step, False, self.clock))
 
@@ -149,6 +150,18 @@ class Lab:
         self.log(live.device(self.state, condition, self.clock, trial=None if trial is None else trial.id))
         if trial is not None and trial.on in trial.renderings:
             key = tuple(trial.renderings[trial.on].items()) if trial.planned is None else trial.planned
+            self.stops[trial.block, key] += 1
+
+    def missed(self):
+        """A program does not present what it is asked for: a stop in that rendering."""
+        trial = self.state.pending
+        if trial is None:
+            return
+        steps = live.steps_of(self.state, trial)
+        show = steps[self.rng.integers(len(steps))][0]
+        self.log(live.missed(self.state, trial.id, show, "late", self.clock))
+        if show in trial.renderings:
+            key = tuple(trial.renderings[show].items()) if trial.planned is None else trial.planned
             self.stops[trial.block, key] += 1
 
     def again(self):
@@ -243,6 +256,7 @@ class Lab:
 DRAWING = Drawing()
 HAPPENINGS = (
     *("feel", "answer", "answer", "answer", "answer", "answer", "go_on", "go_on", "stop", "stop", "stop_late"),
+    "missed",
     *("again", "begin_again", "undo", "void", "void", "restore", "restore", "pause", "resume", "resume", "more"),
     *("skip", "abort", "killed"),
 )

@@ -54,6 +54,19 @@ class FakeChooser:
 
 
 CHOOSER = FakeChooser()
+
+
+def beginning(state, id, step, at, values=None):
+    """The events with which a step begins: what it renders is confirmed, and then it is on."""
+    trial, events = state.trial(id), []
+    show = live.steps_of(state, trial)[step][0]
+    if show in trial.renderings:
+        confirmed = values or {name: trial.renderings[show][name] for name in state.study.space.names}
+        events.append(live.sent(state, id, show, at, values=confirmed))
+        state = state.after(events[0])
+    return [*events, live.present(state, id, step, True, at)]
+
+
 KINDS = (
     "go",
     "feel",
@@ -151,9 +164,13 @@ class Driver:
             return {"class_a": labels[number % 3]}
         return {"class_a": labels[number % 3], "class_b": labels[number // 3 % 3], "preferred": "ab"[number % 2]}
 
+    def begin(self, trial, step):
+        for event in beginning(self.state, trial.id, step, self.clock):
+            self.log(event)
+
     def feel(self, trial, off=True):
         for step in range(len(live.steps_of(self.state, trial))):
-            self.log(live.present(self.state, trial.id, step, True, self.clock))
+            self.begin(trial, step)
             if off:
                 self.log(live.present(self.state, trial.id, step, False, self.clock))
 

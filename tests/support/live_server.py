@@ -1,6 +1,8 @@
 """A live session for tests: the real server in a thread, on a simulated device, with planned trials of short steps."""
 
 import contextlib
+import functools
+import http.client
 import threading
 import time
 import urllib.error
@@ -10,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from hilbo.app import serve
+from hilbo.app.device_rig import DeviceRig
 from hilbo.app.hub import Hub
 from hilbo.app.rehearsal import example_sets, fast_study
 from hilbo.app.robot import Client
@@ -24,7 +27,7 @@ from hilbo.session.records import Block, Header, Planned
 from hilbo.session.state import LiveSession
 from hilbo.study.config import Study
 
-__all__ = ["DATA", "PATIENCE", "Live", "ask", "refused", "study_of", "until_held"]
+__all__ = ["DATA", "PATIENCE", "Live", "ask", "check_blinding", "listen", "refused", "study_of", "until_held"]
 
 DATA = Path(__file__).parents[2] / "hilbo" / "data" / "paper.toml"
 PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts a time
@@ -60,14 +63,26 @@ class Live:
         self.folder, self.device, self.warmed = folder, device, threading.Event()
         if warm:
             self.warmed.set()
-        self.study = study_of(folder, seconds, warm_up)
+        self.study = self.make_study(seconds, warm_up)
         self.blocks = blocks or (Block("validation", 3 * repeats, PAIRS * repeats),)
         self.path = folder / "P01_1.session.jsonl"
         self.failed: list[BaseException] = []
 
+    def make_study(self, seconds: float, warm_up: str) -> Study:
+        """What is asked."""
+        return study_of(self.folder, seconds, warm_up)
+
+    def sets(self):
+        """What is compared."""
+        return example_sets(self.study)
+
+    def rig(self):
+        """Makes what shows renderings."""
+        return functools.partial(DeviceRig, self.study, self.connect)
+
     def header(self) -> Header:
         """What the log begins with."""
-        sets = example_sets(self.study)
+        sets = self.sets()
         return Header(study=self.study.hash, participant="P01", session="1", seed=0, blocks=self.blocks, sets=sets)
 
     def connect(self) -> Renderer:
@@ -84,8 +99,8 @@ class Live:
         chooser = LiveChooser(self.log.state)
         compiled = chooser.warm
         chooser.warm = lambda: (self.warmed.wait(PATIENCE), compiled())
-        self.hub = Hub(self.log, chooser, self.connect, tag="tag", gap=0.0)
-        self.hub.invite = lambda: {"link": self.place.link("participant"), "qr": ""}
+        self.hub = Hub(self.log, chooser, self.rig(), tag="tag", gap=0.0)
+        self.hub.invite = lambda role: {"link": self.place.link(role), "qr": ""}
         ready = threading.Event()
         self.thread = threading.Thread(target=self._serve, args=(ready,))
         self.thread.start()
@@ -172,6 +187,32 @@ def ask(live, path, *, data=None, **headers):
     """A bare request."""
     address = live.participant.address + path
     return urllib.request.urlopen(urllib.request.Request(address, data=data, headers=headers), timeout=PATIENCE)
+
+
+def listen(live, heard):
+    """Everything that comes as server-sent events, until the server ends; and the page itself."""
+    key = {"Authorization": f"Bearer {live.participant._key}"}
+    with (
+        ask(live, "/api/participant/events?page=ear", **key) as stream,
+        contextlib.suppress(OSError, http.client.HTTPException),
+    ):
+        for kind in ("html", "js"):
+            with ask(live, f"/static/participant.{kind}") as page:
+                heard.append(page.read().decode())
+        for line in stream:
+            heard.append(line.decode())
+
+
+def check_blinding(heard, state, *names):
+    """Nothing of what a participant must not know is in what their browser was told."""
+    words = ["best", "mid", "worst", "mean", "margin", "certificate", "renderings", "choice", *names]
+    for word in [*words, "passiv", "probabilit", "aggregate", "individual", "validation"]:
+        assert word not in heard, word
+    pairs = [(trial.renderings, trial.presented) for trial in state.trials]
+    for values in [values for pair in pairs for sides in pair for values in sides.values()]:
+        for value in values.values():
+            assert f"{value:.4g}" not in heard
+            assert str(value) not in heard
 
 
 @contextlib.contextmanager

@@ -29,7 +29,7 @@ function draw() {
   document.body.dataset.phase = view.phase;
   list("trial", view.trial); list("trust", view.trust);
   drawDevice(); drawAlert(); drawAnswers(); drawLog();
-  put("watch", view.participant_here ? "Connected." : "Not connected.");
+  put("watch", view.participant_here ? "The participant's page is connected." : "The participant's page is not connected.");
   for (const b of document.querySelectorAll("[data-command]")) b.disabled = !view.may.includes(b.dataset.command);
   at("skip").hidden = !view.may.includes("skip");
   for (const b of document.querySelectorAll(".stop")) b.disabled = !view.may.includes("estop");
@@ -38,6 +38,7 @@ function draw() {
 
 function drawDevice() {
   const d = view.device;
+  put("device-name", d.title); at("invite-stimulus").hidden = d.title !== "Stimulus";
   put("device-state", d.state); at("device-state").dataset.level = d.level;
   put("device-words", d.words);
   list("device", d.rows);
@@ -159,13 +160,15 @@ at("note").addEventListener("submit", async (e) => {
   const text = at("note-text").value.trim();
   if (text && await command("note", { text })) at("note-text").value = "";
 });
-at("invite").addEventListener("click", async () => {
-  const found = await command("invite");
-  if (!found) return;
-  put("link-text", found.link);
-  at("qr").src = found.qr;
-  at("link").hidden = false;
-});
+for (const [id, role] of [["invite", "participant"], ["invite-stimulus", "stimulus"]]) {
+  at(id).addEventListener("click", async () => {
+    const found = await command("invite", { role });
+    if (!found) return;
+    put("link-text", found.link);
+    at("qr").src = found.qr;
+    at("link").hidden = false;
+  });
+}
 
 function listen() {
   const source = new EventSource("/api/experimenter/events");

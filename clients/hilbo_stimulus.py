@@ -1,0 +1,344 @@
+"""Present the stimuli of a hilbo session from a program of your own.
+
+hilbo does not guard your actuators, and certifies nothing about them. If your program moves something that people
+touch, an independent hardware stop beside the hand is yours to provide.
+
+One file, for Python 3.9 or newer, which needs nothing but the standard library: copy it beside your program.
+
+    from hilbo_stimulus import Stimulus
+
+    with Stimulus("http://127.0.0.1:8642/#…", name="my scene", version="1.0") as stimulus:
+        for order in stimulus:
+            if order.do == "present":
+                show(order.show, order.values)       # "test" with values, "reference" without
+                stimulus.presented()                 # or presented({"height": 540.0}): what is really in force
+            else:
+                blank()
+                stimulus.neutral()
+
+With asyncio: `async for order in stimulus.orders()`, and `await asyncio.to_thread(stimulus.presented)`.
+
+A program that moves something says `force=True` and gives `go_neutral`, a function that takes away all force. It is
+called in a thread of this module, as soon as the server says so, or has been silent for the time that it states
+(`silence_s`, 1 s unless the study says otherwise), or its connection fails; so it may be called while your own loop is
+busy, and often. Say `stimulus.contact = True` while somebody touches it: no order to present is handed to you until
+that is over. docs/stimulus.md of hilbo has the protocol.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import json
+import logging
+import math
+import os
+import socket
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+from urllib.parse import urlsplit
+
+__all__ = ["Order", "Stimulus", "StimulusError"]
+
+_FORCE_WAIT = 0.05  # s between two reports of a program that moves something: its contact has to be known
+_AGAIN = 0.2  # s until a server that does not answer is asked again
+_JOIN = 10.0  # s that the first answer may take
+_log = logging.getLogger("hilbo_stimulus")
+
+
+class StimulusError(RuntimeError):
+    """The session does not let this program in, and says why."""
+
+
+class Order(NamedTuple):
+    """What shall be the case from now on.
+
+    `do`: "present", "neutral" (show nothing, push nothing) or "stop" (the same, at once). `show`: "test", with the
+    `values` of its parameters in the study's units, or "reference"; `side`: "a" or "b" where two tests are compared.
+    It has to be confirmed within `within_s`.
+    """
+
+    number: int
+    do: str
+    show: str = ""
+    side: str = ""
+    trial: str = ""
+    step: int = 0
+    values: Mapping[str, float] = {}
+    within_s: float = 0.0
+
+
+_SILENCE = Order(0, "neutral")  # before a server has spoken, and after one is silent
+
+
+class Stimulus:
+    """This program's part in a session. `link`: the one that `hilbo session` prints for the stimulus, good once.
+
+    `key_file`: where the key that it was traded for is kept, readable by you alone, so that the program can be started
+    again in the same session. `neutral_within_s`: so soon is everything neutral after `go_neutral` was called, or after
+    an order, and the session is told so. Raises `StimulusError` if the session does not let it in.
+    """
+
+    def __init__(
+        self,
+        link: str,
+        name: str,
+        version: str = "",
+        *,
+        force: bool = False,
+        go_neutral: Callable[[], Any] | None = None,
+        neutral_within_s: float = 1.0,
+        key_file: str | None = None,
+    ):
+        if force and go_neutral is None:
+            raise ValueError("A program with force gives go_neutral, a function that takes all force away.")
+        self._hello = {"name": name, "version": version, "force": force, "neutral_within_s": neutral_within_s}
+        self._go_neutral, self.contact = go_neutral, False
+        self._address = urlsplit(link).netloc
+        self._key = self._keyed(urlsplit(link).fragment, key_file)
+        self.parameters: list = []  # of the study: name, unit, low, high, tolerance
+        self.silence_s, self._run = 1.0, ""
+        self._changed = threading.Condition()
+        self._order, self._handed = _SILENCE, _SILENCE
+        self._done = (0, "busy")  # the newest order that something was done about, and what
+        self._heard = time.monotonic()
+        self._why: str | None = None
+        self._closed = False
+        self._lines: dict = {}  # thread -> its connection
+        self._thread = threading.Thread(target=self._talk, name="hilbo-stimulus", daemon=True)
+        self._watch = threading.Thread(target=self._listen, name="hilbo-silence", daemon=True)
+        self._thread.start()
+        self._watch.start()
+
+    # What your program does.
+
+    @property
+    def order(self) -> Order:
+        """The newest order, for programs that look at every frame."""
+        return self._order
+
+    def next(self, timeout: float | None = None) -> Order | None:
+        """The newest order that was not handed out yet, once there is one; None after `timeout` s, or at the end.
+
+        Raises `StimulusError` when this program is no longer part of the session.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._why or self._is_due(), timeout)
+            if self._why:
+                raise StimulusError(self._why)
+            if self._closed or not self._is_due():
+                return None
+            self._handed = self._order
+            return self._handed
+
+    def __iter__(self) -> Iterator[Order]:
+        """All orders, until `close`; of several at once the newest."""
+        while True:
+            order = self.next(0.5)
+            if order is not None:
+                yield order
+            elif self._closed:
+                return
+
+    async def orders(self) -> AsyncIterator[Order]:
+        """The same for asyncio."""
+        while True:
+            order = await asyncio.get_running_loop().run_in_executor(None, self.next, 0.5)
+            if order is not None:
+                yield order
+            elif self._closed:
+                return
+
+    def presented(self, values: Mapping[str, float] | None = None) -> bool:
+        """What the last order asked for is shown from now on, with these values (by default those asked for). False if
+        that is not taken: too late, too far off; the trial is void then."""
+        order = self._handed
+        found = dict(order.values if values is None else values)
+        for name, value in found.items():
+            if not math.isfinite(value):
+                raise ValueError(f"{name} is {value}, which is no number.")
+        return self._say(order, "presented", **({"values": found} if found else {}))
+
+    def neutral(self) -> bool:
+        """Nothing is shown, and nothing pushes, from now on."""
+        return self._say(self._handed, "neutral")
+
+    def failed(self, why: str) -> bool:
+        """What the last order asked for cannot be shown; the trial is void."""
+        return self._say(self._handed, "failed", why=why[:500])
+
+    def close(self) -> None:
+        """Go neutral, and leave."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        self._neutral_now()
+        for line in list(self._lines.values()):
+            with contextlib.suppress(OSError, AttributeError):  # so that nobody waits for an answer
+                line.sock.shutdown(socket.SHUT_RDWR)
+        for thread in (self._thread, self._watch):
+            if thread is not threading.current_thread():
+                thread.join(2 * self.silence_s)
+        for line in list(self._lines.values()):
+            line.close()
+
+    def __enter__(self) -> Stimulus:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.close()
+
+    # What goes on beside it.
+
+    def _is_due(self) -> bool:
+        waits = self._hello["force"] and self.contact and self._order.do == "present"
+        return self._order is not self._handed and not waits
+
+    def _talk(self) -> None:
+        """Says how things are, again and again, and keeps the newest order."""
+        while not self._closed and not self._why:
+            try:
+                if not self._run:
+                    self._begin()
+                else:
+                    order, (number, state) = self._order, self._done
+                    wait = _FORCE_WAIT if self._hello["force"] else self.silence_s / 3
+                    self._report(order, state if number == order.number else "busy", wait_s=wait)
+            except (OSError, http.client.HTTPException, ValueError) as error:
+                self._lost(str(error) or type(error).__name__)
+                time.sleep(_AGAIN)
+
+    def _listen(self) -> None:
+        """Nobody waits longer for a server that says nothing than it stated."""
+        while not self._closed:
+            time.sleep(min(0.05, self.silence_s / 10))
+            if self._run and time.monotonic() - self._heard > self.silence_s:
+                self._lost(f"the server has been silent for {self.silence_s:g} s")
+
+    def _begin(self) -> None:
+        status, found = self._post("/api/stimulus/hello", self._hello)
+        if status == 200:
+            self.silence_s, self.parameters = found["silence_s"], found["parameters"]
+            self._heard, self._run = time.monotonic(), found["run"]
+            self._take(found)
+        elif status in (400, 401, 403):
+            self._end(found["error"])
+        else:
+            time.sleep(_AGAIN)
+
+    def _say(self, order: Order, state: str, **more: Any) -> bool:
+        """A report from the program's own thread; whether it was taken."""
+        if order.number != self._order.number:
+            return False  # it is over; the next one is there already
+        try:
+            taken = self._report(order, state, **more)
+        except (OSError, http.client.HTTPException, ValueError) as error:
+            self._lost(str(error) or type(error).__name__)
+            return False
+        if taken:
+            self._done = (order.number, state)
+        return taken
+
+    def _report(self, order: Order, state: str, **more: Any) -> bool:
+        """Says how things are; whether that was taken."""
+        report = {"run": self._run, "order": order.number, "state": state, "contact": bool(self.contact), **more}
+        if state == "presented":
+            report["trial"] = order.trial
+        status, found = self._post("/api/stimulus", report)
+        if status != 200:
+            _log.warning("%s", found.get("error", status))
+        if status in (401, 403):
+            self._end(found["error"])
+        elif "order" in found:
+            self._heard = time.monotonic()
+            self._take(found)
+        elif status == 409:  # another server, or one that gave this program up
+            self._lost(found["error"])
+        return status == 200
+
+    def _take(self, found: Mapping[str, Any]) -> None:
+        """A new order; one that asks for it is neutral at once."""
+        with self._changed:
+            if found["order"] <= self._order.number:
+                return
+            rest = {key: found[key] for key in Order._fields[2:] if key in found}
+            self._order = order = Order(found["order"], found["do"], **rest)
+            self._changed.notify_all()
+        if order.do != "present" and self._go_neutral is not None and self._neutral_now():
+            self._done = (order.number, "neutral")
+
+    def _neutral_now(self) -> bool:
+        try:
+            if self._go_neutral is not None:
+                self._go_neutral()
+            return True
+        except Exception:
+            _log.exception("go_neutral failed")
+            return False
+
+    def _lost(self, why: str) -> None:
+        """There is no server to be heard: neutral, and said to your program as an order."""
+        with self._changed:
+            if not self._run or self._closed:
+                return
+            self._run, self._order = "", Order(0, "neutral")
+            self._changed.notify_all()
+        _log.warning("neutral: %s", why)
+        self._neutral_now()
+
+    def _end(self, why: str) -> None:
+        with self._changed:
+            self._why = why
+            self._changed.notify_all()
+        self._neutral_now()
+
+    # The line.
+
+    def _keyed(self, token: str, file: str | None) -> str:
+        """The key for this session, from the file or for the link's token."""
+        kept = {}
+        if file:  # opened first: a link is good once, and its key has to go somewhere
+            with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o600), encoding="utf-8") as opened:
+                kept = _read(opened.read())
+        if kept.get("token") == token and kept.get("address") == self._address:
+            return kept["key"]
+        line = http.client.HTTPConnection(self._address, timeout=_JOIN)
+        status, found = _asked(line, "/api/join", {"token": token, "bearer": True}, {})
+        line.close()
+        if status != 200 or found.get("role") != "stimulus":
+            raise StimulusError(found.get("error", "This link is not the one for the stimulus."))
+        if file:
+            with open(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as opened:
+                json.dump({"address": self._address, "token": token, "key": found["key"]}, opened)
+        return found["key"]
+
+    def _post(self, path: str, content: Mapping[str, Any]) -> tuple:
+        """Status and content of the answer, on this thread's own connection."""
+        me = threading.get_ident()
+        line = self._lines.get(me) or http.client.HTTPConnection(self._address, timeout=self.silence_s)
+        self._lines[me], line.timeout = line, self.silence_s
+        if line.sock is not None:
+            line.sock.settimeout(self.silence_s)
+        try:
+            return _asked(line, path, content, {"Authorization": f"Bearer {self._key}"})
+        except BaseException:
+            self._lines.pop(me).close()
+            raise
+
+
+def _read(text: str) -> dict:
+    """What a key file says; nothing if it is none."""
+    try:
+        found = json.loads(text)
+    except ValueError:
+        found = {}
+    return found if isinstance(found, dict) else {}
+
+
+def _asked(line: http.client.HTTPConnection, path: str, content: Any, headers: Any) -> tuple:
+    line.request("POST", path, json.dumps(content, allow_nan=False), {"Content-Type": "application/json", **headers})
+    reply = line.getresponse()
+    return reply.status, json.loads(reply.read())

@@ -1,0 +1,219 @@
+"""The device of a session, in a thread of its own: one job after the other, its state looked at ten times a second.
+
+Nothing here knows of trials or answers. A job gives a `Future`; whatever the device or the line does wrong is the job's
+`DeviceError`, and the snapshot that everybody may read says `lost` with the sentence; so it does of a device that has
+restarted, or hears no heartbeats. A lost device is tried again once a second; it comes back stopped. Sets go over to
+the device out of contact only: a job waits until nobody presses.
+"""
+
+import asyncio
+import contextlib
+import math
+import queue
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import Any
+
+from hilbo.app.rig import Loaded, Showing, Snapshot
+from hilbo.device.reasons import HoldReason, held_because
+from hilbo.hardware_bridge import DeviceError, Renderer, State
+from hilbo.search.box import Mechanics
+from hilbo.session.header_check import study_of
+from hilbo.study.study_file import AnyStudy
+
+__all__ = ["DeviceRig"]
+
+_POLL = 0.1  # s between two looks at the device
+_NEAR = 0.01  # s between them while a set waits for the hand to leave
+_RETRY = 1.0  # s
+_PUSHED = 1.0  # s
+COUNTERS = ("holds", "estops", "overruns", "saturated", "slewed", "controlled", "input_held", "frames_dropped")
+
+
+class DeviceRig:
+    """A `Renderer` behind a queue, which renders a study's sets. `changed` is called in the rig's thread after every
+    look that found news, and `notice` with every sentence that the device told unasked."""
+
+    title = "Device"
+
+    def __init__(
+        self,
+        study: AnyStudy,
+        connect: Callable[[], Renderer],
+        changed: Callable[[Snapshot], Any] = lambda _: None,
+        notice: Callable[[str], Any] = lambda _: None,
+    ):
+        self._study, self._connect, self._changed, self._notice = study, connect, changed, notice
+        self._mechanics: dict[str | None, Mechanics | None] = {}
+        self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
+        self._ending = threading.Event()
+        self.device = connect()
+        self.notes = list(self.device.notes)
+        self.snapshot = self._look()
+        self._thread = threading.Thread(target=self._work, name="hilbo-device", daemon=True)
+        self._thread.start()
+
+    def do(self, job: Callable[[Renderer], Any]) -> Future:
+        """Has `job(device)` done after those before it."""
+        found: Future = Future()
+        self._jobs.put((lambda: job(self._ready()), found))
+        return found
+
+    @property
+    def words(self) -> str:
+        """Where it is, and its damping."""
+        return f"{self.device.link.name}, damping {self.device.device.damping_N_s_per_m:.3g} N·s/m"
+
+    async def prepare(self, showing: Showing, stop: threading.Event, may_push: Callable[[], bool]) -> Loaded:
+        """The set in force once nobody presses; cancelled if `stop` was set before that.
+
+        While `may_push()`, a handle that was left pressed is pushed back by the set that is in force.
+        """
+        wanted = self._wanted(showing)
+        found = await asyncio.wrap_future(self.do(lambda device: self._load(device, wanted, stop, may_push)))
+        if found is None:
+            raise asyncio.CancelledError
+        return found
+
+    async def show(self, showing: Showing) -> None:
+        """The set in force, from now on; nothing where it is rendered already. The reference is no business of ours."""
+        if showing.values is not None:
+            await asyncio.wrap_future(self.do(self._render))
+
+    async def blank(self) -> None:
+        """What is in force pushes the handle back when the hand leaves it, and stays."""
+
+    async def rest(self) -> None:
+        """The renderer rests; told even if this is left."""
+        told = asyncio.wrap_future(self.do(lambda device: device.stop()))
+        told.add_done_callback(_looked_at)
+        await asyncio.shield(told)
+
+    async def estop(self) -> None:
+        """Force to zero at once: overtakes everything that waits."""
+        await asyncio.get_running_loop().run_in_executor(None, self.device.estop)
+
+    async def clear(self) -> None:
+        """Go on after a hold."""
+        await asyncio.wrap_future(self.do(lambda device: device.clear()))
+
+    def hang_up(self) -> None:
+        """Nobody waits for a device."""
+
+    def close(self) -> None:
+        """Stop the device and let go of it."""
+        self._ending.set()
+        self._jobs.put(None)
+        self._thread.join(10)
+        with contextlib.suppress(DeviceError):
+            self.device.close()
+
+    def _wanted(self, showing: Showing) -> dict[str, Any]:
+        """What `Renderer.send` takes."""
+        if showing.material not in self._mechanics:
+            self._mechanics[showing.material] = study_of(self._study, showing.material).space.mechanics
+        m, values = self._mechanics[showing.material], showing.values
+        assert m is not None and values is not None  # a device renders, and a rendering
+        numbers = {name: values[name] for name in ("K0", "K1", "B1", "alpha")}
+        return numbers | {"N": m.N, "T": m.T, "memory": m.memory, "states": m.states}
+
+    def _ready(self) -> Renderer:
+        if self.snapshot.lost:
+            raise DeviceError(self.snapshot.lost)
+        return self.device
+
+    def _render(self, device) -> None:
+        self._see(self._look())
+        if self.snapshot.state != "RUNNING":
+            device.start()
+
+    def _load(self, device, wanted, stop, may_push):
+        patient = time.monotonic() + _PUSHED
+        while True:
+            self._see(self._look())
+            if not self.snapshot.contact:
+                break
+            if stop.wait(_NEAR) or self._ending.is_set():
+                return None
+            resting = time.monotonic() > patient and self.snapshot.state == "STOPPED"
+            if resting and may_push() and device.in_force() is not None:
+                device.start()  # nothing but the last set's force brings a handle back that was left pressed
+        begun = time.perf_counter()
+        found = device.send(**wanted)
+        took = time.perf_counter() - begun
+        return Loaded({"in_force": found._asdict(), "serial_s": took}, took)
+
+    def _work(self) -> None:
+        while not self._ending.is_set():
+            job, found = self._next()
+            if found is None:
+                self._regularly()
+            elif found.set_running_or_notify_cancel():
+                try:
+                    found.set_result(job())
+                except BaseException as error:  # the waiting side's to judge
+                    found.set_exception(error)
+
+    def _next(self) -> Any:
+        try:
+            return self._jobs.get(timeout=_RETRY if self.snapshot.lost else _POLL) or (None, None)
+        except queue.Empty:
+            return None, None
+
+    def _regularly(self) -> None:
+        if self._ending.is_set():
+            return
+        if self.snapshot.lost:
+            self._again()
+            return
+        try:
+            self._see(self._look())
+            for sentence in self.device.events():
+                self._notice(sentence)
+        except DeviceError as error:
+            self._see(self.snapshot._replace(lost=str(error), state="LOST", contact=False))
+
+    def _again(self) -> None:
+        """A device that is back is stopped, and has no set that anybody should count on."""
+        try:
+            if self.device.simulator is not None and not self.device.simulator.alive():
+                with contextlib.suppress(DeviceError):
+                    self.device.close()
+                self.device = self._connect()
+            else:
+                self.device.reconnect(timeout=0)
+            self._see(self._look())
+        except (DeviceError, OSError, ValueError) as error:
+            self._see(self.snapshot._replace(lost=str(error)))
+
+    def _look(self) -> Snapshot:
+        found = self.device.status()
+        if self.device.link.restarted or self.device.link.faint:  # which answer this question all the same
+            self.device.limits()  # and no other: `DeviceError` with what has happened
+        state = State(found.state).name if found.state in State._value2member_map_ else f"state {found.state}"
+        counters = {name: getattr(found, name) for name in COUNTERS}
+        force, position = (v if math.isfinite(v) else 0.0 for v in (found.force_N, found.position_mm))
+        rows = [("Contact", "yes" if found.contact else "no"), ("Position", f"{position:.2f} mm")]
+        rows += [("Force", f"{force:.2f} N"), *((n.replace("_", " "), str(v)) for n, v in counters.items() if v)]
+        return Snapshot(
+            state,
+            bool(found.contact),
+            None,
+            reason=held_because(found.hold_reason) if state in ("HOLD", "ESTOP") else "",
+            facts={"counters": counters},
+            rows=tuple(rows),
+            excused=state == "HOLD" and found.hold_reason == HoldReason.WATCHDOG,
+        )
+
+    def _see(self, seen: Snapshot) -> None:
+        before, self.snapshot = self.snapshot, seen
+        if seen != before:
+            self._changed(seen)
+
+
+def _looked_at(done: asyncio.Future) -> None:
+    """Its exception counts as seen, also where nobody waits for it."""
+    if not done.cancelled():
+        done.exception()

@@ -1,0 +1,39 @@
+"""What a program confirms that it has presented, held against what it was asked for; pure.
+
+The study says how far each value may be off (`hilbo.study.stimulus_table`). Within that, the confirmed value is what
+counts: fits, tables and maps have it, the proposal stays in the log. A value beyond an end of the parameter's range
+counts as that end: a 32-bit number of the end itself may lie beyond it, and no table holds what is outside.
+"""
+
+import math
+from collections.abc import Mapping
+
+from hilbo.session.records import RefusedError
+from hilbo.study.study_file import AnyStudy
+
+__all__ = ["check_confirmed", "counted"]
+
+
+def check_confirmed(study: AnyStudy, asked: Mapping[str, float], values: Mapping[str, float] | None) -> None:
+    """Refuse what is no confirmation of the values asked for (physical units, by name). Raises RefusedError with the
+    code "bad-answer" for what lacks a number, "off" for one that is too far off."""
+    names = study.space.names
+    if values is None or set(values) != set(names):
+        raise RefusedError("bad-answer", f"a confirmation has a value for {', '.join(names)}, and for nothing else.")
+    assert study.stimulus is not None  # whoever asks has looked
+    for parameter in study.space.parameters:
+        value, wanted, most = values[parameter.name], asked[parameter.name], study.stimulus.off_by(parameter)
+        if not math.isfinite(value):
+            raise RefusedError("bad-answer", f"{parameter.name} is confirmed as {value}, which is no number.")
+        if abs(value - wanted) > most:
+            raise RefusedError(
+                "off",
+                f"{parameter.name} is confirmed as {value:g}, {wanted:g} was asked for, and it may be off by {most:g}"
+                f" {parameter.unit}".rstrip()
+                + "; round less, or raise the study's tolerance.",
+            )
+
+
+def counted(study: AnyStudy, values: Mapping[str, float]) -> dict[str, float]:
+    """The values that count for a confirmation that was accepted."""
+    return {p.name: min(max(float(values[p.name]), p.low), p.high) for p in study.space.parameters}

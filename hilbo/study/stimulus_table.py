@@ -1,0 +1,41 @@
+"""[stimulus]: what a study asks of the program that presents its renderings, where no device of ours does."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import msgspec
+
+from hilbo.errors import InputError
+from hilbo.search.box import Parameter
+from hilbo.study.fields import Table, shown, words
+
+__all__ = ["StimulusTable"]
+
+_EXACT = 1e-6  # of a parameter's range: more than a number of 32 bits is off by
+_Seconds = Annotated[float, msgspec.Meta(ge=0.1, le=600), words("a number of seconds from 0.1 to 600", "1.0")]
+
+
+class StimulusTable(Table, frozen=True):
+    """`within`: s from an order until it is confirmed that it is presented. `silence`: s without a word from the
+    program until it counts as gone. `tolerance`: parameter -> how far the confirmed value may be off, physical units;
+    a millionth of the range where nothing is said."""
+
+    within: _Seconds = 1.0
+    silence: _Seconds = 1.0
+    tolerance: Annotated[dict[str, float], words("a table of numbers, 0 or above", "{height_px = 0.5}")] = (
+        msgspec.field(default_factory=dict)
+    )
+
+    def check(self, names: Sequence[str]) -> None:
+        """Refuse tolerances of what is no parameter, and those that are none. Raises `InputError`."""
+        for name, value in self.tolerance.items():
+            path = f"stimulus.tolerance.{name}"
+            if name not in names:
+                raise InputError(f"{path} is of no parameter of the study, those are {', '.join(names)}.")
+            if not 0 <= value < math.inf:
+                raise InputError(f"{path} is {shown(value)}, it must be a number, 0 or above.")
+
+    def off_by(self, parameter: Parameter) -> float:
+        """How far a confirmed value may be off, in the parameter's unit."""
+        return self.tolerance.get(parameter.name, _EXACT * (parameter.high - parameter.low))

@@ -1,0 +1,343 @@
+"""Sessions whose renderings a program presents: what it is told, what it confirms, what it may not do."""
+
+import json
+import threading
+import urllib.request
+
+import pytest
+from live_server import PATIENCE, Live, check_blinding, listen, refused
+from live_stimulus import SETS, ByHand, LiveStimulus, Presenter, module
+
+from hilbo.app.robot import Client
+from hilbo.session.export import trials_table
+from hilbo.session.records import Block, Planned
+
+SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
+
+
+@pytest.fixture
+def live(tmp_path):
+    with LiveStimulus(tmp_path) as found:
+        yield found
+
+
+@pytest.fixture
+def brief(tmp_path):
+    """A session that waits a moment for a confirmation."""
+    with LiveStimulus(tmp_path, within=0.3) as found:
+        yield found
+
+
+def voided(live, words, phase="hello"):
+    """Waits until a trial is void for this reason, and nothing goes on before Begin."""
+    view = live.until(lambda v: any(t["voided"] for t in v["whole"]["trials"]) and v["phase"] == phase, live.whole)
+    trial = next(t for t in view["whole"]["trials"] if t["voided"])
+    assert trial["voided"]["by"] == "rule" and words in trial["voided"]["reason"]
+    assert any(row["kind"] == "voided" for row in view["table"]["rows"])
+    assert not live.events("answer")
+    return trial
+
+
+def test_a_whole_session_by_the_shipped_client(tmp_path):
+    with LiveStimulus(tmp_path, repeats=2) as live, live.present() as program:
+        heard, own = [], live.participant._ask
+        live.participant._ask = lambda request: heard.append(json.dumps(found := own(request))) or found
+        listening = threading.Thread(target=listen, args=(live, heard))
+        listening.start()
+        live.begin()
+        for _ in range(6):
+            view = live.question()
+            assert {e.data["side"] for e in live.events("sent") if e.data["id"] == number(view)} == {"a", "b"}
+            live.answer(view)
+        live.until(lambda view: view["phase"] == "done")
+        sent, state = live.events("sent"), live.hub.state
+        assert {(e.data["program"], e.data["version"], e.data["force"]) for e in sent} == {("presenter", "1.2", False)}
+        tests = [order for order in program.shown if order.show == "test"]
+        assert [order.values for order in tests] == [e.data["values"] for e in sent]
+        shown = [(order.show, order.side) for order in program.shown[:3]]
+        assert shown == [("reference", ""), ("test", "a"), ("test", "b")]
+        live.replays()
+    listening.join(PATIENCE)
+    assert any(line.startswith("event: view") for line in heard)
+    check_blinding("\n".join(heard), state, "hue", "light")
+
+
+def number(view):
+    return int(view["trial"]["id"].split(":")[1].split(".")[0])
+
+
+def test_nothing_is_asked_before_it_was_confirmed(live):
+    program = live.by_hand()
+    live.begin()
+    order = program.asked(live)
+    assert live.until(lambda view: view["step"] is None)["questions"] is None
+    answers = {"class_a": "close", "class_b": "close", "preferred": "a"}
+    with refused(409, "not been felt"):
+        live.participant.post("/api/participant/answer", {"trial": order["trial"], "client": "me", "answers": answers})
+    program.report("presented", values=order["values"])
+    live.until(lambda _: live.events("sent"))
+    assert not live.events("answer")
+
+
+def test_what_is_confirmed_counts_and_the_proposal_stays_in_the_log(tmp_path):
+    with LiveStimulus(tmp_path, blocks=SINGLE) as live, live.present() as program:
+        program.off = 0.25
+        live.begin()
+        for _ in range(3):
+            live.answer()
+        live.until(lambda view: view["phase"] == "done")
+        table = trials_table([live.replayed()])
+        proposed = [event.data["renderings"]["a"]["hue"] for event in live.events("propose")]
+        assert table["hue"].tolist() == [hue + 0.25 for hue in proposed]
+        assert proposed == [values["hue"] for values in SETS.values()]
+
+
+def test_a_late_confirmation_voids_the_trial_and_is_refused(brief):
+    program = brief.by_hand()
+    brief.begin()
+    late = program.asked(brief)
+    trial = voided(brief, "late: nothing was confirmed within 0.3 s")
+    with refused(409, "comes too late"):
+        program.report("presented", order=late["order"], trial=late["trial"], values=late["values"])
+    program.report("busy", order=late["order"])
+    brief.begin()
+    again = program.asked(brief)
+    assert again["values"] == late["values"] and again["trial"] != late["trial"]
+    program.report("presented", values=again["values"])
+    brief.until(lambda _: brief.events("sent"))
+    assert trial["voided"]["sides"] == ["a"]
+
+
+def test_a_value_that_is_too_far_off_voids_the_trial(live):
+    program = live.by_hand()
+    live.begin()
+    order = program.asked(live)
+    with refused(409, "it may be off by 0.5 deg"):
+        program.report("presented", values=order["values"] | {"hue": order["values"]["hue"] + 0.51})
+    voided(live, "stimulus: off: hue is confirmed as")
+
+
+def test_a_program_that_fails_voids_the_trial_and_says_why(live):
+    program = live.by_hand()
+    live.begin()
+    program.asked(live)
+    program.report("failed", why="no such sample")
+    voided(live, "stimulus: failed: no such sample")
+
+
+def test_what_is_not_understood_or_not_of_the_order_changes_nothing(live):
+    program = live.by_hand()
+    live.begin()
+    order = program.asked(live)
+    good = {"state": "presented", "values": order["values"]}
+    for words, more in {
+        "There is no order 999 yet": {"order": 999},
+        "and no other": {"trial": "tag:9.1"},
+        "a value for hue, light": {"values": {"hue": 1.0}},
+        "and for nothing else": {"values": order["values"] | {"depth": 1.0}},
+    }.items():
+        with refused(409, words):
+            program.report(**good | more)
+    for words, more in {
+        "`float`": {"values": {"hue": "red", "light": 1.0}},
+        "not understood": {"state": "dancing"},
+        "order`": {"order": -1},
+        "unknown field": {"colour": 3},
+    }.items():
+        with refused(400, words):
+            program.report(**good | more)
+    bodies = [b'{"run": NaN}', json.dumps({"run": program.run, "order": order["order"]} | good).encode()[:-1]]
+    bodies.append(json.dumps({"run": program.run, "order": order["order"]} | good).replace("54.32", "1e999").encode())
+    for body in bodies:
+        with refused(400, "not understood"):
+            raw(program, body)
+    with refused(409, "say hello first"):
+        program.post("/api/stimulus", {"run": "another", "order": 1, "state": "neutral"})
+    assert not live.events("sent") and not live.events("missed")
+    program.report(**good)
+    live.until(lambda _: live.events("sent"))
+
+
+def raw(program, body):
+    """A report of these bytes."""
+    request = urllib.request.Request(program.address + "/api/stimulus", data=body, headers=program._headers())
+    return urllib.request.urlopen(request, timeout=PATIENCE)
+
+
+def test_a_confirmation_that_comes_twice_counts_once(tmp_path):
+    with LiveStimulus(tmp_path, seconds=1.0) as live:
+        program = live.by_hand()
+        live.begin()
+        order = program.asked(live)
+        for _ in range(3):
+            assert program.report("presented", values=order["values"])["order"] == order["order"]
+        with refused(409, "other values before"):
+            program.report("presented", values=order["values"] | {"hue": order["values"]["hue"] + 0.1})
+        live.until(lambda _: live.events("sent"))
+        assert len(live.events("sent")) == 1
+
+
+def test_a_key_opens_its_own_role_in_its_own_session_and_a_browser_takes_no_link_away(live, tmp_path):
+    link = live.link()
+    stranger = Client(live.place.link("participant"))
+    with refused(401):
+        stranger.post("/api/stimulus/hello", {"name": "x", "version": "", "force": False, "neutral_within_s": 1.0})
+    with refused(400, "not for a browser"):
+        stranger.post("/api/join", {"token": link.partition("/#")[2]})
+    program = ByHand(link)
+    for path in ("/api/experimenter", "/api/participant"):
+        with refused(401):
+            program.get(path)
+    with refused(401):
+        Client.post(program, "/api/experimenter/estop", {})
+    folder = tmp_path / "another"
+    folder.mkdir()
+    with LiveStimulus(folder) as other:
+        program.address = other.participant.address
+        with refused(401):
+            program.report("neutral")
+
+
+def test_a_flood_takes_nothing_from_others(live):
+    program = live.by_hand()
+    for _ in range(200):
+        program.report("neutral", wait_s=0)
+    live.begin()
+    program.asked(live)
+    assert live.whole()["device"]["state"] == "running"
+
+
+def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
+    with LiveStimulus(tmp_path, silence=0.3, seconds=2.0) as live:
+        program = live.by_hand()
+        live.begin()
+        order = live.until(lambda o: o["do"] == "present", lambda: program.report("neutral"))
+        program.report("presented")
+        live.until(lambda view: view["step"])
+        live.until(lambda v: v["device"]["state"] == "lost", live.whole)
+        voided(live, "device: lost (by hand has been silent for 0.3 s.)", "trouble")
+        with refused(409, "say hello first"):
+            program.report("presented", order=order["order"])
+        program.hello()
+        program.report("neutral")
+        live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+        assert [e.data["condition"] for e in live.events("device")] == ["stopped", "ready", "lost", "ready"]
+
+
+def test_a_second_program_takes_over_and_the_first_is_out(live):
+    first = live.by_hand()
+    second = ByHand.__new__(ByHand)
+    second.__dict__.update(first.__dict__)
+    second.hello()
+    second.report("neutral")
+    with refused(409, "say hello first"):
+        first.report("neutral")
+    live.until(lambda _: [e.data["condition"] for e in live.events("device")] == ["stopped", "ready", "lost", "ready"])
+
+
+def test_nobody_presents_before_the_stop_was_seen(live):
+    program = live.by_hand(force=True, ready=False)
+    assert program.order["do"] == "stop"
+    live.participant.post("/api/participant/begin", {})
+    assert live.whole()["device"]["state"] == "lost"
+    with refused(409, "is stop; there is nothing to present"):
+        program.report("presented", trial="tag:1.1")
+    program.report("neutral")
+    live.until(lambda v: "stopped within" in v["device"]["words"] and v["device"]["state"] == "stopped", live.whole)
+    live.until(lambda _: len(live.events("device")) > 1)
+    ready = live.events("device")[-1].data
+    assert (ready["condition"], ready["program"], ready["force"]) == ("ready", "by hand", True) and ready["stop_s"] >= 0
+
+
+def test_a_program_that_does_not_go_neutral_when_told_is_lost(tmp_path):
+    with LiveStimulus(tmp_path, seconds=0.05) as live:
+        program = live.by_hand(force=True, neutral_within_s=0.01)
+        live.begin()
+        order = program.asked(live, "reference")
+        program.report("presented")
+        live.until(lambda v: v["device"]["state"] == "running", live.whole)
+        live.command("pause")
+        live.until(lambda v: "has not said that it is neutral" in v["device"]["words"], live.whole)
+        with refused(409, "say hello"):
+            program.report("presented", order=order["order"])
+
+
+def test_an_emergency_stop_is_acknowledged_voids_and_holds_until_it_is_cleared(tmp_path):
+    with LiveStimulus(tmp_path, seconds=2.0) as live, live.present():
+        live.begin()
+        live.until(lambda view: view["step"] and view["step"]["show"] == "a")
+        live.command("estop")
+        seen = live.until(lambda v: v["device"]["state"] == "estop" and v["phase"] == "trouble", live.whole)
+        assert "clear" in seen["may"] and "stopped within" in seen["device"]["words"]
+        assert live.hub.state.trials[0].voided["by"] == "rule"
+        assert live.view()["step"] is None and live.view()["questions"] is None
+        live.command("clear")
+        live.until(lambda view: view["step"])
+        assert [e.data["condition"] for e in live.events("device")][-2:] == ["estop", "ready"]
+
+
+def test_a_stop_that_nobody_acknowledges_is_said(live):
+    live.by_hand(force=True, neutral_within_s=0.01)
+    with refused(409, "use the switch beside the hand"):
+        live.command("estop")
+    live.until(lambda v: v["device"]["state"] == "lost", live.whole)
+
+
+def test_parameters_change_only_while_nobody_touches(live):
+    program = live.by_hand(force=True)
+    live.begin()
+    program.asked(live, "reference")
+    program.report("presented")
+
+    def touched():
+        return program.report("presented", contact=True)
+
+    held = live.until(lambda _: live.view()["title"].startswith("Let go"), touched)
+    assert held["show"] == "reference"
+    live.until(lambda order: order.get("show") == "test", lambda: program.report("presented", contact=False))
+
+
+def test_pause_and_the_end_of_a_trial_are_neutral(live):
+    with live.present() as program:
+        live.begin()
+        view = live.question()
+        live.until(lambda _: program.stimulus.order.do == "neutral")
+        live.answer(view)
+        live.until(lambda _: program.stimulus.order.do == "present")
+        live.command("pause")
+        live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+        assert program.stimulus.order.do == "neutral"
+
+
+def test_a_client_with_force_is_neutral_when_the_server_is_gone(tmp_path):
+    calls = []
+    with LiveStimulus(tmp_path, seconds=5.0) as live:
+        program = Presenter(live.link(), force=True, go_neutral=lambda: calls.append(1), neutral_within_s=0.5)
+        live.begin()
+        live.until(lambda v: v["device"]["state"] == "running", live.whole)
+        calls.clear()
+    with program:
+        live.until(lambda _: calls and program.stimulus.order.number == 0, lambda: None)
+        assert program.stimulus.order.do == "neutral"
+
+
+def test_with_force_a_client_gives_what_makes_it_neutral():
+    with pytest.raises(ValueError, match="go_neutral"):
+        module("hilbo_stimulus").Stimulus("http://127.0.0.1:1/#x", "a", force=True)
+
+
+def test_a_link_that_is_not_the_stimulus_s_is_refused(live):
+    client = module("hilbo_stimulus")
+    with pytest.raises(client.StimulusError, match="not the one for the stimulus"):
+        client.Stimulus(live.place.link("participant"), "a")
+    with pytest.raises(client.StimulusError, match="has been used"):
+        client.Stimulus(live.link()[:-1] + "x", "a")
+
+
+def test_no_program_presents_where_a_device_does(tmp_path):
+    with Live(tmp_path) as live:
+        with refused(409, "a device renders"):
+            live.command("invite", role="stimulus")
+        program = Client(live.place.link("stimulus"))
+        with refused(400, "a device renders"):
+            program.post("/api/stimulus/hello", {"name": "x", "version": "", "force": False, "neutral_within_s": 1.0})

@@ -1,0 +1,139 @@
+"""What a program confirms counts in place of what it was asked for, within the study's tolerance and nowhere else."""
+
+import hypothesis.strategies as st
+import msgspec
+import pytest
+from hypothesis import given
+from live import CHOOSER, RAW, SETS, beginning, header
+
+from hilbo import Study
+from hilbo.errors import InputError
+from hilbo.session import actions as live
+from hilbo.session.actions import Block, LiveSession, RefusedError
+from hilbo.session.confirmed import check_confirmed, counted
+from hilbo.session.export import trials_table
+from hilbo.session.look_ahead import Answers
+
+STUDY = Study.from_dict(RAW | {"stimulus": {"tolerance": {"u": 0.01}, "within": 2.0}})
+ASKED = SETS["A"]
+
+
+def started():
+    """A session whose first rendering is proposed."""
+    first = msgspec.structs.replace(header(), study=STUDY.hash, blocks=(Block("optimisation", 6),))
+    state = LiveSession.start(STUDY, first)
+    return state.after(live.propose(state, CHOOSER, 1.0))
+
+
+def felt(state, values=None):
+    for step in range(2):
+        for event in beginning(state, state.pending.id, step, 2.0, values):
+            state = state.after(event)
+    return state
+
+
+def answered(state):
+    event = live.answer(state, state.pending.id, "c", {"class_a": "close"}, 3.0)
+    return state.after(event)
+
+
+@given(st.floats(-0.011, 0.011), st.floats(-2e-6, 2e-6))
+def test_a_value_is_taken_within_its_tolerance_and_nowhere_else(du, dv):
+    values = {"u": ASKED["u"] + du, "v": ASKED["v"] + dv}
+    off = {n: abs(values[n] - ASKED[n]) for n in "uv"}
+    if off["u"] <= 0.01 and off["v"] <= 1e-6:
+        check_confirmed(STUDY, ASKED, values)
+        return
+    with pytest.raises(RefusedError, match="was asked for") as caught:
+        check_confirmed(STUDY, ASKED, values)
+    assert caught.value.code == "off"
+
+
+@pytest.mark.parametrize(
+    "values", [None, {}, {"u": 0.1}, ASKED | {"w": 1.0}, ASKED | {"u": float("nan")}, ASKED | {"v": float("inf")}]
+)
+def test_what_is_no_confirmation_is_refused(values):
+    with pytest.raises(RefusedError) as caught:
+        check_confirmed(STUDY, ASKED, values)
+    assert caught.value.code == "bad-answer"
+
+
+@given(st.floats(-0.01, 1.01), st.floats(-0.01, 1.01))
+def test_what_counts_is_never_outside_the_ranges_and_nothing_else_is_changed(u, v):
+    found = counted(STUDY, {"u": u, "v": v})
+    assert all(0.0 <= x <= 1.0 for x in found.values())
+    assert all(found[n] == x for n, x in (("u", u), ("v", v)) if 0.0 <= x <= 1.0)
+
+
+def test_a_rendering_is_felt_and_answered_only_after_it_was_confirmed():
+    state = started()
+    state = state.after(live.present(state, 1, 0, True, 2.0))  # the reference has no values
+    with pytest.raises(RefusedError, match="nobody has confirmed") as caught:
+        live.present(state, 1, 1, True, 2.0)
+    assert caught.value.code == "unconfirmed"
+    with pytest.raises(RefusedError, match="not been felt"):
+        live.answer(state, 1, "c", {"class_a": "close"}, 3.0)
+    with pytest.raises(RefusedError, match="a confirmation has"):
+        live.sent(state, 1, "a", 2.0)
+    assert answered(felt(state)).trials[0].status == "answered"
+
+
+def test_a_presentation_that_begins_again_is_confirmed_again():
+    state = felt(started())
+    state = state.after(live.repeat(state, 3.0))
+    with pytest.raises(RefusedError, match="nobody has confirmed"):
+        live.present(state, 1, 1, True, 4.0)
+
+
+def test_fits_tables_and_views_have_the_confirmed_values_and_the_log_both():
+    state = started()
+    asked = state.pending.renderings["a"]
+    values = {"u": asked["u"] + 0.005, "v": asked["v"]}
+    state = answered(felt(state, values))
+    answers = Answers.of(state, 0)
+    assert answers.points == (tuple(values.values()),) and answers.proposed == (tuple(asked.values()),)
+    row = trials_table([state]).iloc[0]
+    assert (row["u"], row["v"]) == (values["u"], values["v"])
+    assert state.trials[0].sent["a"]["values"] == values and state.trials[0].renderings["a"] == asked
+
+
+def test_what_is_missed_is_void_by_rule_and_counts_as_a_stop_in_its_rendering():
+    state = started()
+    point = state.pending.renderings["a"]
+    for again in range(2):
+        state = state.after(live.missed(state, state.pending.id, "a", "late: 2 s", 2.0))
+        voided = state.trials[again].voided
+        assert (voided["by"], voided["reason"], voided["sides"]) == ("rule", "stimulus: late: 2 s", ["a"])
+        assert len(state.excluded(0)) == again
+        state = state.after(live.propose(state, CHOOSER, 3.0))
+        assert (state.pending.renderings["a"] == point) == (again == 0)
+    with pytest.raises(RefusedError):
+        live.missed(state, 1, "a", "late", 4.0)
+    state = state.after(live.missed(state, state.pending.id, "reference", "late", 4.0))
+    assert len(state.excluded(0)) == 1  # the reference is no rendering
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"within": 0.0}, "stimulus.within is 0.0, it must be a number of seconds from 0.1 to 600"),
+        ({"silence": "long"}, "stimulus.silence"),
+        ({"tolerance": {"w": 1.0}}, "stimulus.tolerance.w is of no parameter of the study, those are u, v"),
+        ({"tolerance": {"u": -1.0}}, "stimulus.tolerance.u is -1.0, it must be a number, 0 or above"),
+        ({"tolerance": {"u": float("nan")}}, "stimulus.tolerance.u"),
+        ({"tolerance": 3}, "stimulus.tolerance is 3, it must be a table"),
+        ({"late": 3}, "stimulus.late is not a key"),
+    ],
+)
+def test_a_bad_table_is_refused_in_one_sentence(table, words):
+    with pytest.raises(InputError) as caught:
+        Study.from_dict(RAW | {"stimulus": table})
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_a_device_and_a_program_do_not_both_present():
+    fosls = {n: {"low": 0.1, "high": 0.9} for n in ("K1", "B1", "alpha")}
+    raw = RAW | {"parameters": fosls, "renderer": {"K_eff": 0.44, "damping": 0.95}}
+    assert Study.from_dict(raw).stimulus is None and Study.from_dict(RAW).stimulus is not None
+    with pytest.raises(InputError, match="a study has one"):
+        Study.from_dict(raw | {"stimulus": {}})
