@@ -56,7 +56,7 @@ def checks(
     if study is not None:
         check, file = _study_file(study)
         yield check
-    yield from _device(connect, file)
+    yield from _device(connect, file) if file is None or file.stimulus is None else _stimulus(file)
     begin()
     yield _precision()
     if study is not None and file is not None:
@@ -167,7 +167,8 @@ def _study(path: Path) -> Iterator[Check]:
     except InputError as error:
         yield Check("feasible set", "bad", str(error), "mend the study file")
         return
-    yield _feasible(study)
+    if study.stimulus is None:
+        yield _feasible(study)
     yield _step(study)
 
 
@@ -211,6 +212,25 @@ def _device(connect: Callable[[float | None], Any], file: Any) -> Iterator[Check
         yield _loopback(device)
         if needs is not None:
             yield _damping(about.damping_N_s_per_m, needs)
+
+
+def _stimulus(file: Any) -> Iterator[Check]:
+    """What a study still lacks whose renderings a program presents."""
+    table, parameters = file.stimulus, file.space.parameters
+    off = ", ".join(f"{p.name} {table.off_by(p):.3g} {p.unit}".rstrip() for p in parameters)
+    words = f"a program presents, and confirms within {table.within:g} s; values may be off by {off}"
+    said = file.tables.stimulus is not None
+    yield Check("stimulus", "good" if said else "note", words, "" if said else "say so in a table [stimulus]")
+    left = [key for key in ("title", "hello", "feel_reference", "feel_test") if key not in file.session.texts]
+    yield Check(
+        "participants' texts",
+        "note" if left else "good",
+        f"{len(left)} speak of feeling a device: {', '.join(left)}" if left else "the study's own",
+        "write your own in [session.texts]" if left else "",
+    )
+    number = file.session.protocol_number
+    mend = "" if number else "write [session] protocol_number, so that it is compared with what people agreed to"
+    yield Check("protocol number", "good" if number else "note", number or "the study names none", mend)
 
 
 def _loopback(device: Any) -> Check:

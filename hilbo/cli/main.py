@@ -20,6 +20,7 @@ from hilbo.cli import study as cli_study
 from hilbo.cli.cache import cache
 from hilbo.cli.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, remark, results, start
 from hilbo.cli.demo import print_demo
+from hilbo.cli.init import init
 from hilbo.errors import InputError
 
 __all__ = ["app", "main"]
@@ -188,6 +189,7 @@ app.command()(cli_study.report)
 app.add_typer(device.app, name="device")
 app.command()(cli_live.session)
 app.command()(cli_live.doctor)
+app.command()(init)
 app.command()(session.plan)
 app.command()(session.export)
 app.add_typer(session.app_participants, name="participants")

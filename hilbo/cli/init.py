@@ -1,0 +1,44 @@
+"""`hilbo init`: a commented study file to begin with.
+
+hilbo init study.toml --parameter hue=0:360:deg --parameter light=20:80:%
+hilbo init study.toml --device
+"""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilbo.errors import InputError
+
+__all__ = ["init"]
+
+
+def init(
+    study: Annotated[Path, typer.Argument(help="Study file to write.")] = Path("study.toml"),
+    name: Annotated[str | None, typer.Option(help="What the study is called; by default as its file.")] = None,
+    parameter: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=LOW:HIGH:UNIT, with :log behind it if steps are ratios. Once for each parameter."),
+    ] = None,
+    responses: Annotated[str, typer.Option(help="The answers, lowest first.")] = "different,similar,close",
+    trials: Annotated[int, typer.Option(min=1, help="How many trials a participant has.")] = 25,
+    device: Annotated[bool, typer.Option("--device", help="Our device renders; else a program presents.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+) -> None:
+    """Write a commented study file, from a few words about the study."""
+    from hilbo.study.new_study import NewStudy, parameter_of, study_text
+
+    parameters = tuple(parameter_of(text) for text in parameter or [])
+    answers = tuple(text.strip() for text in responses.split(","))
+    text = study_text(NewStudy(name or study.stem, parameters, answers, trials, device))
+    if study.exists() and not force:
+        raise InputError(f"{study}: exists already; choose another name, or add --force to replace it.")
+    made = study.with_name(f".{study.name}-new")
+    try:
+        made.write_text(text, encoding="utf-8")
+        made.replace(study)
+    except OSError as error:
+        raise InputError(f"{study}: cannot be written ({error.strerror}); choose another place.") from error
+    print(f"{study}: written; read it, then hilbo doctor {study}", file=sys.stderr)

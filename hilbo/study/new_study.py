@@ -1,0 +1,171 @@
+"""A commented study file to begin with, made of a few words; what is written is read again and checked."""
+
+import json
+import re
+import tomllib
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from hilbo.errors import InputError
+from hilbo.search.box import Parameter
+from hilbo.study.study_file import StudyFile, checked
+
+__all__ = ["NewStudy", "parameter_of", "study_text"]
+
+_MODEL = """
+[renderer]                           # our device renders the FO-SLS; K1, B1 and alpha are its parameters
+K_eff = 0.44                         # N/mm, of the reference: measure yours (hilbo device characterise)
+damping = 0.95                       # N.s/m, of the device: measure yours (hilbo device measure-damping)
+"""
+_STIMULUS = """
+[stimulus]                           # a program of yours presents (docs/stimulus.md)
+within = 1.0                         # s until it has confirmed what is presented; later voids the trial
+silence = 1.0                        # s without a word until the program counts as gone
+# How far what is really presented may be off; else a millionth of the range. Answers count for what was confirmed.
+# tolerance = {tolerance}
+"""
+_TEXTS = """
+[session.texts]                      # what participants read; docs/sessions.md has all of them
+title = "Compare"
+hello = "One after the other is presented. Then say how similar they were. There is no right or wrong answer."
+feel_reference = "The reference"
+feel_test = "The test"
+feel_a = "Test A"
+feel_b = "Test B"
+neutral = "A short break"
+trouble = "One moment, please. The experimenter is looking after it."
+let_go = "Let go, please"
+question = "How similar is the test to the reference?"
+"""
+_DEFINITIONS = {
+    "different": "The test is clearly different from the reference.",
+    "similar": "The test is somewhat like the reference.",
+    "close": "The test is the same as the reference, or nearly.",
+}
+_DEVICE = (
+    Parameter("K1", 1.0, 32.0, "N/mm"),
+    Parameter("B1", 0.001, 32.0, "N.s^alpha/mm"),
+    Parameter("alpha", 0.01, 0.99),
+)
+_FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT or NAME=LOW:HIGH:UNIT:log"
+
+
+class NewStudy(NamedTuple):
+    """What is known of a study before it has a file. `device`: our device renders, else a program presents."""
+
+    name: str
+    parameters: tuple[Parameter, ...]
+    responses: tuple[str, ...] = ("different", "similar", "close")
+    trials: int = 25
+    device: bool = False
+
+
+def parameter_of(text: str) -> Parameter:
+    """A parameter as it is written on the command line. Raises InputError."""
+    name, equals, rest = text.partition("=")
+    low, *others = rest.split(":")
+    try:
+        ends = float(low), float(others[0])
+    except (ValueError, IndexError):
+        ends = None
+    scale = others[2] if len(others) > 2 else "linear"
+    named = bool(equals and name.strip()) and name.isprintable()
+    if not named or ends is None or len(others) > 3 or scale not in ("linear", "log"):
+        raise InputError(f"--parameter is {_quoted(text)}; write {_FORM}, for example hue=0:360:deg.")
+    return Parameter(name.strip(), *ends, others[1].strip() if len(others) > 1 else "", scale)
+
+
+def study_text(new: NewStudy) -> str:
+    """The file's text. Raises InputError for what no study file may say."""
+    parameters = _parameters(new)
+    text = "\n".join(
+        [
+            "# A study of hilbo. Change what you like; hilbo doctor FILE says what is missing.",
+            "schema = 1",
+            "",
+            "[study]",
+            f"name = {_quoted(new.name)}",
+            f"responses = [{', '.join(map(_quoted, new.responses))}]     # what people may answer, lowest first",
+            *(line for p in parameters for line in _table(p)),
+            _MODEL if new.device else _STIMULUS.replace("{tolerance}", _tolerance(parameters)),
+            "[gp]                                 # what is believed of people before any answer",
+            f"theta = {30.0 if new.device else 10.0}                         # how quickly answers change over a range;"
+            " hilbo aggregate --rule learnt-1 learns it",
+            "variance = 1.0",
+            f"thresholds = {_thresholds(len(new.responses))}            # between one answer and the next",
+            "noise = 0.5                          # how much one answer to the same thing differs from another",
+            "",
+            "[selection]",
+            f"space_filling = {min(5, new.trials)}                    # trials spread over the ranges, before any is"
+            " chosen",
+            f"trials = {new.trials}",
+            "",
+            "[session]",
+            'protocol_number = ""                 # of the ethics approval: consent is compared with it',
+            "",
+            *_phases(new.device),
+            "",
+        ]
+    )
+    text += "" if new.device else _TEXTS + _definitions(new.responses)
+    try:
+        checked(tomllib.loads(text), "", _checked)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"a name or an answer has what no file can hold ({error}); leave it out.") from error
+    return text
+
+
+def _checked(file: StudyFile) -> StudyFile:
+    return file
+
+
+def _parameters(new: NewStudy) -> Sequence[Parameter]:
+    if new.device:
+        if new.parameters:
+            raise InputError("--parameter: the device renders K1, B1 and alpha; leave it out, or --device.")
+        return _DEVICE
+    if not new.parameters:
+        raise InputError(f"--parameter: a study needs at least one; write {_FORM}, for example hue=0:360:deg.")
+    names = [p.name for p in new.parameters]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f"--parameter: {twice} is given twice; give each name once.")
+    return new.parameters
+
+
+def _table(p: Parameter) -> list[str]:
+    key = p.name if re.fullmatch(r"[A-Za-z0-9_-]+", p.name) else _quoted(p.name)
+    scale = ['scale = "log"                        # steps are ratios'] if p.scale == "log" else []
+    return ["", f"[parameters.{key}]", f"low = {p.low}", f"high = {p.high}", f"unit = {_quoted(p.unit)}", *scale]
+
+
+def _tolerance(parameters: Sequence[Parameter]) -> str:
+    return "{" + ", ".join(f"{_quoted(p.name)} = {(p.high - p.low) / 1000:.2g}" for p in parameters) + "}"
+
+
+def _thresholds(count: int) -> list[float]:
+    """One between each pair of neighbouring answers, 1 apart, as many below 0 as above."""
+    return [k - (count - 2) / 2 for k in range(count - 1)]
+
+
+def _phases(device: bool) -> list[str]:
+    seconds = 4 if device else 2
+    steps = f'[{{show = "reference", seconds = {seconds}}}, {{show = "a", seconds = {seconds}}}]'
+    return [
+        "[session.warm_up]                    # the first trials, which are not counted",
+        f"steps = {steps}",
+        f"count = {12 if device else 3}",
+        "",
+        "[session.optimisation]               # what is shown in a trial, and for how long",
+        f"steps = {steps}",
+    ]
+
+
+def _definitions(responses: Sequence[str]) -> str:
+    """What the usual answers mean; of others only their authors know that."""
+    known = [f"{_quoted(name)} = {_quoted(_DEFINITIONS[name])}" for name in responses if name in _DEFINITIONS]
+    return "\n".join(["", "[session.definitions]                # what each answer means", *known, ""])
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
