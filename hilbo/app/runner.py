@@ -38,6 +38,7 @@ class Runner:
         self._stop = threading.Event()
         self._in_force: tuple[int, int, str] | None = None
         self._showing: Showing | None = None  # what was asked for last
+        self._differs = False  # whether what is presented has ever been something else than what was asked for
         self._wake = asyncio.Event()
         self._ahead: Future | None = None
         self.fits_after = 0  # fits that a participant had to wait for
@@ -149,7 +150,8 @@ class Runner:
                 self._wake.clear()
                 self._at("hello")
                 await self._wake.wait()
-            self._look_ahead()
+            if not self._differs:
+                self._look_ahead()
             if hub.gap and trial.id > 1:
                 self._at("between")
                 await asyncio.sleep(hub.gap)
@@ -214,7 +216,8 @@ class Runner:
         self._note_times(loaded)
         await self.hub.commit(lambda state, at: actions.sent(state, trial.id, side, at, **loaded.facts), mine=True)
         now = self.hub.state.trial(trial.id)
-        if now.presented != now.renderings:
+        self._differs = self._differs or now.presented != now.renderings
+        if self._differs:
             self._look_ahead()
 
     def _showing_of(self, trial: Trial, step: int, show: Any) -> Showing:

@@ -92,6 +92,21 @@ def test_what_is_confirmed_counts_and_the_proposal_stays_in_the_log(tmp_path):
         assert proposed == [values["hue"] for values in SETS.values()]
 
 
+def test_nobody_waits_for_a_fit_though_something_else_is_presented_than_was_asked_for(tmp_path):
+    with LiveStimulus(tmp_path, blocks=(Block("optimisation", 5),)) as live, live.present() as program:
+        program.off = -0.25
+        live.begin()
+        for _ in range(5):
+            view = live.question()
+            live.hub.runner._ahead.result(PATIENCE)  # a person takes longer
+            live.answer(view)
+        live.until(lambda view: view["phase"] == "done")
+        assert live.hub.runner.fits_after == 0
+        proposed = [event.data for event in live.events("propose")]
+        assert [data["choice"]["by"] for data in proposed] == 3 * ["latin hypercube"] + 2 * ["ucb"]
+        live.replays()
+
+
 def test_a_late_confirmation_voids_the_trial_and_is_refused(brief):
     program = brief.by_hand()
     brief.begin()
@@ -309,16 +324,35 @@ def test_pause_and_the_end_of_a_trial_are_neutral(live):
         assert program.stimulus.order.do == "neutral"
 
 
-def test_a_client_with_force_is_neutral_when_the_server_is_gone(tmp_path):
+@pytest.fixture
+def arm(tmp_path):
+    """A session, a client with force that presents in it, and how often that went neutral since."""
     calls = []
-    with LiveStimulus(tmp_path, seconds=5.0) as live:
-        program = Presenter(live.link(), force=True, go_neutral=lambda: calls.append(1), neutral_within_s=0.5)
-        live.begin()
-        live.until(lambda v: v["device"]["state"] == "running", live.whole)
-        calls.clear()
-    with program:
-        live.until(lambda _: calls and program.stimulus.order.number == 0, lambda: None)
-        assert program.stimulus.order.do == "neutral"
+    with LiveStimulus(tmp_path, seconds=5.0, silence=0.5) as live:
+        said = {"force": True, "go_neutral": lambda: calls.append(1), "neutral_within_s": 0.5}
+        with Presenter(live.link(), **said) as program:
+            live.begin()
+            live.until(lambda v: v["device"]["state"] == "running", live.whole)
+            calls.clear()
+            yield live, program, calls
+
+
+def test_a_client_with_force_is_neutral_when_the_server_says_nothing_any_more(arm):
+    live, program, calls = arm
+    held = threading.Event()
+    live.hub._loop.call_soon_threadsafe(held.wait, PATIENCE)
+    live.until(lambda _: calls and program.stimulus.order.number == 0, lambda: None)
+    assert program.stimulus.order.do == "neutral"
+    held.set()
+    live.until(lambda v: v["device"]["state"] == "stopped", live.whole)  # and it is back, by hello
+
+
+def test_a_client_with_force_is_neutral_when_the_server_is_gone(arm):
+    live, program, calls = arm
+    live.hub.rig.hang_up = lambda: None  # as if killed: nobody is told
+    live.stop()
+    live.until(lambda _: calls and program.stimulus.order.number == 0, lambda: None)
+    assert program.stimulus.order.do == "neutral"
 
 
 def test_with_force_a_client_gives_what_makes_it_neutral():

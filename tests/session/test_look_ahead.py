@@ -17,7 +17,7 @@ from hilbo.session.actions import Block, LiveSession
 from hilbo.session.event_log import EventLog, log_name, read_log
 from hilbo.session.excluded import APART
 from hilbo.session.logged_session import LoggedSession
-from hilbo.session.look_ahead import LiveChooser
+from hilbo.session.look_ahead import Answers, LiveChooser
 from hilbo.session.progress import consistency, minutes_left, trust_of
 from hilbo.session.warm_start import informed, warm_start
 
@@ -67,6 +67,34 @@ def test_renderings_are_those_of_a_session_and_no_fit_runs_after_an_answer(choos
     for event in events[:4]:
         state = told(state.after(event), ANSWERS[event.data["trial"] - 1])
     assert live.propose(state, fresh, 0.0).data == events[4].data | {"planned": None}
+
+
+def test_what_a_program_confirmed_is_what_the_next_choice_is_made_from(chooser):
+    state, asks, confirmed, by = start(), [], [], []
+    for response in ANSWERS:
+        state = asked(state, chooser)
+        point = state.pending.renderings["a"]
+        by.append(state.pending.data["choice"]["by"])
+        asks.append(point)
+        confirmed.append({name: value + (5e-7 if value < 0.5 else -5e-7) for name, value in point.items()})
+        for event in beginning(state, state.pending.id, 1, 0.5, confirmed[-1]):
+            state = state.after(event)
+        chooser.lookahead(state)  # once it is known what is presented
+        fits = chooser.fits
+        state = told(state, response)
+        if state.need is not None:
+            live.propose(state, chooser, 1.0)
+        assert chooser.fits == fits
+        points = np.array([list(values.values()) for values in confirmed])
+        answers = Answers.of(state, 0)
+        np.testing.assert_array_equal(np.array(answers.points), points)
+        np.testing.assert_allclose(
+            np.asarray(chooser.fitted(answers).posterior.trials.x)[: len(points)],
+            np.asarray(STUDY.space.to_unit(points)),
+            atol=1e-12,
+        )
+    assert by == 2 * ["latin hypercube"] + 4 * ["ucb"]
+    assert asks[0] != asks[1]  # the first is not asked again, though it was not quite what was presented
 
 
 @pytest.mark.parametrize("count", [1, 3])

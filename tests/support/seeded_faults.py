@@ -110,6 +110,34 @@ FAULTS = (
         "device->heartbeat_age_ticks > device->config->watchdog_ticks",
         "tests/firmware tests/device",
     ),
+    Fault(
+        "a program's renderings are shown before they are confirmed",
+        "hilbo/session/actions.py",
+        "and show not in found.confirmed:",
+        "and show not in found.renderings:",
+        "tests/session/test_confirmed.py",
+    ),
+    Fault(
+        "a program's proposals count in place of what it confirmed",
+        "hilbo/session/look_ahead.py",
+        '_place(trial.presented["a"], names) for trial in answered',
+        '_place(trial.renderings["a"], names) for trial in answered',
+        "tests/session/test_confirmed.py",
+    ),
+    Fault(
+        "a program's parameters change in contact",
+        "hilbo/app/stimulus_rig.py",
+        "while self._moves and self.snapshot.contact:",
+        "while self._moves and not self.snapshot.contact and self.snapshot.lost:",
+        "tests/app/test_stimulus.py",
+    ),
+    Fault(
+        "a program that is not neutral in time is believed",
+        "hilbo/app/stimulus_rig.py",
+        'self._on("neutral", said.neutral_within_s + _TRAVEL, words)',
+        'self._off("neutral")',
+        "tests/app/test_stimulus.py",
+    ),
 )
 
 
