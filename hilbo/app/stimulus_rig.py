@@ -173,8 +173,9 @@ class StimulusRig:
             self._give("neutral")
         elif self.snapshot.state == "RUNNING":
             self._see(self.snapshot._replace(state="STOPPED"))
-        elif order.do == "stop":
+        elif order.do == "stop" and self._stopped is None:
             self._stopped = time.monotonic() - self._since
+            self._see(self.snapshot._replace(facts=self._who() | {"stop_s": self._stopped}))
         self._moved.set()
 
     def _miss(self, why: str) -> None:
@@ -223,13 +224,14 @@ class StimulusRig:
         if self.snapshot.lost:
             raise RuntimeError(self.snapshot.lost)
         assert self._hello is not None
-        self._see(self.snapshot._replace(state="ESTOP", reason="stopped by the experimenter"))
+        self._see(self.snapshot._replace(state="ESTOP", reason="stopped by the experimenter", facts=self._who()))
         self._stopped = None
         self._give("stop")
         end = time.monotonic() + self._hello.neutral_within_s + _TRAVEL
         while self._stopped is None:
             if time.monotonic() > end:
-                raise RuntimeError("it has not acknowledged the stop; use the switch beside the hand.")
+                what = "use the switch beside the hand" if self._moves else "look at it"
+                raise RuntimeError(f"it has not acknowledged the stop; {what}.")
             await self._after(self._moved, end - time.monotonic())
 
     async def clear(self) -> None:

@@ -288,7 +288,9 @@ def test_an_emergency_stop_is_acknowledged_voids_and_holds_until_it_is_cleared(t
         assert live.view()["step"] is None and live.view()["questions"] is None
         live.command("clear")
         live.until(lambda view: view["step"])
-        assert [e.data["condition"] for e in live.events("device")][-2:] == ["estop", "ready"]
+        stopped, ready = (event.data for event in live.events("device")[-2:])
+        assert (stopped["condition"], ready["condition"]) == ("estop", "ready")
+        assert "stop_s" not in stopped and ready["stop_s"] >= 0  # it was known when it had been acknowledged
 
 
 def test_a_stop_that_nobody_acknowledges_is_said(live):
