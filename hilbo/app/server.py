@@ -29,7 +29,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from hilbo.app import messages
-from hilbo.app.hub import COMMANDS, PRESSES, Hub, NotNowError
+from hilbo.app.hub import COMMANDS, PRESSES, NotNowError
 from hilbo.app.security import PAGES, Gate, Role
 from hilbo.app.stimulus_rig import OverError, StimulusRig
 from hilbo.errors import InputError
@@ -75,8 +75,8 @@ class _Guard:
             await (_error(403, why) if why else self.app)(scope, receive, sending)
 
 
-def application(hub: Hub, gate: Gate) -> Starlette:
-    """The server of one session, whose hub is open."""
+def application(hub: Any, gate: Gate) -> Starlette:
+    """The server of one session, whose `Hub` is open; or of what stands in a hub's place."""
     guarded = _for(hub, gate)
     routes = [
         Route("/", _page("join.html")),

@@ -17,7 +17,7 @@ from typing import Any, Literal, NamedTuple
 
 from hilbo.errors import InputError
 
-__all__ = ["Check", "checks"]
+__all__ = ["Check", "checks", "stimulus_checks"]
 
 Level = Literal["good", "note", "bad"]
 _PARTS = ("hilbo", "jax", "jaxlib", "equinox", "numpy", "starlette", "uvicorn", "pyserial")
@@ -25,6 +25,7 @@ _OPTIONAL = {"starlette": "live", "uvicorn": "live", "pyserial": "hardware"}
 _BROWSERS = ("chromium", "google-chrome", "chromium-browser", "firefox", "msedge", "open")
 _ROOM = 200  # MB; a session's log is below one
 _SLOW = 0.5  # s for a step: a participant would notice
+_JOINS = 120.0  # s that the program that presents has to join
 
 
 class Check(NamedTuple):
@@ -231,6 +232,35 @@ def _stimulus(file: Any) -> Iterator[Check]:
     number = file.session.protocol_number
     mend = "" if number else "write [session] protocol_number, so that it is compared with what people agreed to"
     yield Check("protocol number", "good" if number else "note", number or "the study names none", mend)
+
+
+def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator[Check]:
+    """Have the program join, present and stop; it is given a link on stderr. Raises `InputError` where a device
+    renders."""
+    from hilbo.app import serve
+    from hilbo.app.stimulus_check import StimulusCheck
+    from hilbo.study.study_file import StudyFile
+
+    study = StudyFile.load(path)
+    if study.stimulus is None:
+        raise InputError(f"{path}: has a [renderer], a device renders, and no program presents; leave --stimulus out.")
+    place = serve.bound(port)
+    check = StimulusCheck(study, patience)
+
+    def started(stop: Callable[[], None]) -> None:
+        words = f"start the program that presents, within {patience:g} s, with"
+        print(f"{words} {place.link('stimulus')}", file=sys.stderr, flush=True)
+        check.begin(stop)
+
+    serve.serve(place, check, started)
+    found = check.found
+    if found is None or found.why:
+        why = "nothing was measured" if found is None else found.why
+        yield Check("the program's stop", "bad", why, "mend the program; docs/stimulus.md has what it has to say")
+        return
+    for name, times in (("renderings", found.presented), ("the program's stop", found.stopped)):
+        slowest = f"{len(times)} times, the slowest after {1000 * max(times):.0f} ms"
+        yield Check(name, "good", f"{found.words.rpartition(', stopped')[0]}: {slowest}")
 
 
 def _loopback(device: Any) -> Check:

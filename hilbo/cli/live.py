@@ -6,6 +6,7 @@ hilbo doctor study.toml --device /dev/ttyACM0
 """
 
 import contextlib
+import itertools
 import json
 import sys
 from pathlib import Path
@@ -158,14 +159,24 @@ def doctor(
     study: Annotated[Path | None, typer.Argument(help="Study file (TOML).", show_default=False)] = None,
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the session logs.")] = Path("logs"),
     port: Annotated[int, typer.Option("--port", help="Port of the server.")] = _PORT,
+    stimulus: Annotated[
+        bool, typer.Option("--stimulus", help="Ask the program that presents for renderings, and stop it in them.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Is everything ready for a session? What is not, and how to mend it."""
-    from hilbo.cli.doctor import checks
+    from hilbo.cli.doctor import checks, stimulus_checks
 
+    if stimulus and study is None:
+        raise InputError("--stimulus: name the study whose renderings the program presents.")
     results = []
     marks = {"good": "ok  ", "note": "note", "bad": "BAD "}
-    for check in checks(study, line.open, logs, port, start):
+    found = checks(study, line.open, logs, port, start)
+    if stimulus:
+        _need_extra()
+        assert study is not None  # looked at above
+        found = itertools.chain(found, stimulus_checks(study, port))
+    for check in found:
         results.append(check)
         mend = f"\n       -> {check.mend}" if check.mend else ""
         print(f"{marks[check.level]}  {check.name}: {check.words}{mend}", file=sys.stderr, flush=True)

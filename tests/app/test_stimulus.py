@@ -1,16 +1,20 @@
 """Sessions whose renderings a program presents: what it is told, what it confirms, what it may not do."""
 
+import contextlib
 import json
 import threading
 import urllib.request
 
 import pytest
-from live_server import PATIENCE, Live, check_blinding, listen, refused
+from live_server import DATA, PATIENCE, Live, check_blinding, listen, refused
 from live_stimulus import SETS, ByHand, LiveStimulus, Presenter, module
 
 from hilbo.app.robot import Client
+from hilbo.cli import doctor
+from hilbo.errors import InputError
 from hilbo.session.export import trials_table
 from hilbo.session.records import Block, Planned
+from hilbo.study.new_study import NewStudy, parameter_of, study_text
 
 SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
 
@@ -367,7 +371,7 @@ def test_a_link_that_is_not_the_stimulus_s_is_refused(live):
     with pytest.raises(client.StimulusError, match="not the one for the stimulus"):
         client.Stimulus(live.place.link("participant"), "a")
     with pytest.raises(client.StimulusError, match="has been used"):
-        client.Stimulus(live.link()[:-1] + "x", "a")
+        client.Stimulus(live.link() + "x", "a")
 
 
 def test_no_program_presents_where_a_device_does(tmp_path):
@@ -377,3 +381,39 @@ def test_no_program_presents_where_a_device_does(tmp_path):
         program = Client(live.place.link("stimulus"))
         with refused(400, "a device renders"):
             program.post("/api/stimulus/hello", {"name": "x", "version": "", "force": False, "neutral_within_s": 1.0})
+
+
+def checked(tmp_path, program):
+    """What the doctor finds of a program that is given the link."""
+    file = tmp_path / "study.toml"
+    file.write_text(study_text(NewStudy("x", (parameter_of("hue=0:360:deg"), parameter_of("light=20:80:%")))))
+    found, links, closing = [], [], contextlib.ExitStack()
+
+    def join(text, **_):
+        links.append(text.split()[-1])
+        thread = threading.Thread(target=lambda: closing.enter_context(program(links[0])))
+        thread.start()
+        closing.callback(thread.join)
+
+    with pytest.MonkeyPatch.context() as patch, closing:
+        patch.setattr(doctor, "print", join, raising=False)
+        found += doctor.stimulus_checks(file, 0, PATIENCE)
+    return found
+
+
+def test_the_doctor_measures_renderings_and_stops(tmp_path):
+    shown, stop = checked(tmp_path, Presenter)
+    assert (shown.level, stop.level, stop.name) == ("good", "good", "the program's stop")
+    assert stop.words.startswith("presenter 1.2, no force: 5 times, the slowest after ")
+
+
+def test_the_doctor_says_what_a_program_does_not_do(tmp_path):
+    (found,) = checked(tmp_path, lambda link: Presenter(link, off=5.0))
+    assert found.level == "bad" and "it may be off by" in found.words
+    (found,) = doctor.stimulus_checks(tmp_path / "study.toml", 0, 0.2)
+    assert found.level == "bad" and "No program that presents has joined yet" in found.words
+
+
+def test_the_doctor_stops_no_program_where_a_device_renders():
+    with pytest.raises(InputError, match="a device renders"):
+        list(doctor.stimulus_checks(DATA, 0))
