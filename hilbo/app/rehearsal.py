@@ -26,6 +26,7 @@ from hilbo.session.plan import make_plan
 from hilbo.simulation import simulate
 from hilbo.simulation.presets import PRESETS
 from hilbo.study.config import Study
+from hilbo.study.study_file import StudyFile
 
 __all__ = ["HILBO", "Decider", "example_sets", "fast_study", "rehearse", "server"]
 
@@ -139,6 +140,8 @@ def rehearse(
     say: Callable[[str], Any] = lambda _: None,
 ) -> dict[str, Any]:
     """The session's log, screenshots of both pages, and how long answers took to be felt, in `out`."""
+    if StudyFile.load(source).stimulus is not None:
+        raise InputError(f"{source}: has no [renderer], and a rehearsal is with a simulated device; use --dry-run.")
     out.mkdir(parents=True, exist_ok=True)
     file = fast_study(source, out / "study.toml", seconds, warm_up)
     study = Study.load(file)

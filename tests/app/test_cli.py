@@ -15,7 +15,7 @@ from msgspec import to_builtins
 
 from hilbo.app import serve
 from hilbo.app.opening import Wanted, opened
-from hilbo.app.rehearsal import example_sets
+from hilbo.app.rehearsal import example_sets, rehearse
 from hilbo.cli import doctor
 from hilbo.cli.main import app
 from hilbo.device.simulator import Simulator
@@ -49,6 +49,9 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
     device = ("--device", tmp_path / "none")
     words = refused(DATA.parent / "video_quality.toml", *place, "--dry-run", *device)
     assert "has no [renderer], and a device nothing to render; leave --device out" in words
+    with pytest.raises(InputError, match="a rehearsal is with a simulated device"):
+        rehearse(DATA.parent / "video_quality.toml", tmp_path / "rehearsal")
+    assert not (tmp_path / "rehearsal").exists()
     assert "cannot be read" in refused(tmp_path / "none.toml", *place)
     assert "participants.csv: cannot be read" in refused(DATA, *place)
     assert "an id has" in refused(DATA, "--logs", logs, "--port", 0, "--participant", "Jane Doe")
