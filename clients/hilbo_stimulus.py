@@ -233,6 +233,8 @@ class Stimulus:
         """A report from the program's own thread; whether it was taken."""
         if order.number != self._order.number:
             return False  # it is over; the next one is there already
+        if not order.number:
+            return True  # nobody is there to be told
         try:
             taken = self._report(order, state, **more)
         except (OSError, http.client.HTTPException, ValueError) as error:
