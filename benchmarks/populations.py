@@ -185,7 +185,7 @@ def table(rows, design):
         cells = []
         for rule in RULES:
             values = np.array([row["rules"][rule]["regret"] for row in some if rule in row["rules"]])
-            cells.append(f"{values.mean():.3f} ± {error(values):.3f}")
+            cells.append(f"{values.mean():.3f} ± {error(values):.3f}" if len(values) > 1 else "–")
         _, gain = paired(some, "learnt-1")
         low, high = gain.mean() - 1.96 * error(gain), gain.mean() + 1.96 * error(gain)
         nrmse = 100 * np.median([row["rules"]["learnt-1"]["nrmse"] for row in some])
