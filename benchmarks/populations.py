@@ -38,7 +38,7 @@ from hilbo.study.optimum_region import optimum_region  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 RULES = ("learnt-1", "centre of its hill", "bcm", "average", "mean of the individual optima")
-LARGE = 0.05  # a regret of the committee machine that is worth mending
+LARGE = 0.05  # a regret of the committee machine that is worth fixing
 
 
 def main():

@@ -1,4 +1,4 @@
-"""The one exception that means "the person who gave this input can mend it"."""
+"""The one exception that means "the person who gave this input can fix it"."""
 
 __all__ = ["InputError"]
 

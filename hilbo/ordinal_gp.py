@@ -118,7 +118,7 @@ def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
         )
     if not np.all(np.isfinite(points)):
         row = int(np.argwhere(~np.isfinite(points))[0, 0])
-        raise InputError(f"Trials: x[{row}] holds a value that is not finite; remove that answer or mend it.")
+        raise InputError(f"Trials: x[{row}] holds a value that is not finite; remove that answer or fix it.")
     if len(answers) and (not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0):
         raise InputError("Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).")
 

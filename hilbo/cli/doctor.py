@@ -1,4 +1,4 @@
-"""Is everything ready for a session? Each check says what it found and, where something is wrong, what to mend.
+"""Is everything ready for a session? Each check says what it found and, where something is wrong, what to fix.
 
 Nothing is changed: a file of a few bytes is written and removed where logs will be, and the device is asked, stopped,
 and never started.
@@ -34,7 +34,7 @@ class Check(NamedTuple):
     name: str
     level: Level
     words: str
-    mend: str = ""
+    fix: str = ""
 
 
 def checks(
@@ -73,8 +73,8 @@ def _versions() -> Check:
             missing.append(package)
     extras = sorted({_OPTIONAL[package] for package in missing if package in _OPTIONAL})
     words = ", ".join(versions) + (f"; not installed: {', '.join(missing)}" if missing else "")
-    mend = f"pip install 'hilbo[{','.join(extras)}]'" if extras else ""
-    return Check("versions", "bad" if "live" in extras else "note" if missing else "good", words, mend)
+    fix = f"pip install 'hilbo[{','.join(extras)}]'" if extras else ""
+    return Check("versions", "bad" if "live" in extras else "note" if missing else "good", words, fix)
 
 
 def _disk(folder: Path) -> Check:
@@ -134,7 +134,7 @@ def _study_file(path: Path) -> tuple[Check, Any]:
     try:
         file = StudyFile.load(path)
     except InputError as error:
-        return Check("study", "bad", str(error), "mend the study file"), None
+        return Check("study", "bad", str(error), "fix the study file"), None
     words = f"{file.name}, {file.selection.trials} trials, hash {file.hash}"
     return Check("study", "good", words), file
 
@@ -166,7 +166,7 @@ def _study(path: Path) -> Iterator[Check]:
     try:
         study = Study.load(path)
     except InputError as error:
-        yield Check("feasible set", "bad", str(error), "mend the study file")
+        yield Check("feasible set", "bad", str(error), "fix the study file")
         return
     if study.stimulus is None:
         yield _feasible(study)
@@ -230,8 +230,8 @@ def _stimulus(file: Any) -> Iterator[Check]:
         "write your own in [session.texts]" if left else "",
     )
     number = file.session.protocol_number
-    mend = "" if number else "write [session] protocol_number, so that it is compared with what people agreed to"
-    yield Check("protocol number", "good" if number else "note", number or "the study names none", mend)
+    fix = "" if number else "write [session] protocol_number, so that it is compared with what people agreed to"
+    yield Check("protocol number", "good" if number else "note", number or "the study names none", fix)
 
 
 def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator[Check]:
@@ -256,7 +256,7 @@ def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator
     found = check.found
     if found is None or found.why:
         why = "nothing was measured" if found is None else found.why
-        yield Check("the program's stop", "bad", why, "mend the program; docs/stimulus.md has what it has to say")
+        yield Check("the program's stop", "bad", why, "fix the program; docs/stimulus.md has what it has to say")
         return
     for name, times in (("renderings", found.presented), ("the program's stop", found.stopped)):
         slowest = f"{len(times)} times, the slowest after {1000 * max(times):.0f} ms"

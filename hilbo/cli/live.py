@@ -164,7 +164,7 @@ def doctor(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Is everything ready for a session? What is not, and how to mend it."""
+    """Is everything ready for a session? What is not, and how to fix it."""
     from hilbo.cli.doctor import checks, stimulus_checks
 
     if stimulus and study is None:
@@ -178,8 +178,8 @@ def doctor(
         found = itertools.chain(found, stimulus_checks(study, port))
     for check in found:
         results.append(check)
-        mend = f"\n       -> {check.mend}" if check.mend else ""
-        print(f"{marks[check.level]}  {check.name}: {check.words}{mend}", file=sys.stderr, flush=True)
+        fix = f"\n       -> {check.fix}" if check.fix else ""
+        print(f"{marks[check.level]}  {check.name}: {check.words}{fix}", file=sys.stderr, flush=True)
     if as_json:
         print(json.dumps([check._asdict() for check in results], indent=2))
     if any(check.level == "bad" for check in results):

@@ -82,7 +82,8 @@ def aggregate(
     first: Annotated[int | None, typer.Option(min=1, help="Only everybody's first so many trials.")] = None,
     individuals: Annotated[bool, typer.Option(help="Seek everybody's own optimum: most of the work.")] = True,
     rule: Annotated[
-        str | None, typer.Option(help="How people are merged, in place of the study file's; learnt-1 learns [gp] too.")
+        str | None,
+        typer.Option(help="The rule of aggregation, in place of the study file's; learnt-1 learns [gp] too."),
     ] = None,
     compare: Annotated[
         bool, typer.Option("--compare", help="Besides, compare all rules: comparison.json, comparison.csv, figures.")
@@ -103,7 +104,7 @@ def aggregate(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Merge people's answers into one population map and find its optimum."""
+    """Aggregate people's answers into one population map and find its optimum."""
     start(devices)
     from hilbo.study.distributed import crew, digest
 

@@ -59,7 +59,7 @@ def measure_damping(line: Line, seed: Seed = 0, as_json: Json = False) -> None:
     believed = friction.damping.lower
     words.append(f"The device reports {reported:.4g} N.s/m; plan studies with at most {min(believed, reported):.4g}.")
     if reported > friction.damping.upper:
-        print("hilbo: the device reports more damping than it has; mend its configuration.", file=sys.stderr)
+        print("hilbo: the device reports more damping than it has; fix its configuration.", file=sys.stderr)
     rest = {
         "residual_N": friction.residual,
         "sweeps": friction.sweeps,

@@ -121,7 +121,7 @@ class NackReason(IntEnum):
 
 
 ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_TOO_SLOW, NackReason.DRIVE_RANGE}
-"""Refusals that whoever chose the numbers can mend."""
+"""Refusals that whoever chose the numbers can fix."""
 
 _HOLD = {
     HoldReason.NONE: "it was asked to",

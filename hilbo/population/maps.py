@@ -154,7 +154,7 @@ def rule_map(
             answers, people = int(np.asarray(trials.mask).sum()), trials.mask.shape[0]
             raise InputError(
                 f'The rule "pooled" fits one model to all answers at once, and {answers:,} of {people:,} people are too'
-                ' many; use "bcm", "hierarchical" or another rule that merges people point by point.'
+                ' many; use "bcm", "hierarchical" or another rule that aggregates people point by point.'
             )
         return RuleMap(rule, "exact", None, shared, one, prior)
     if posteriors is None:

@@ -169,7 +169,7 @@ def _convergence(results):
         return
     first = settled(counts, population_errors, _NEAR)
     how = in_place(analysis.aggregate.map)
-    how = f" (merged {how})" if how else ""
+    how = f" (aggregated {how})" if how else ""
     if first is None:
         yield Evidence(
             "contradicts",

@@ -124,7 +124,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     left_out = excluded(people, study.exclude)
     if len(left_out) == len(everybody.names):
         raise InputError(
-            f'the rule "{study.exclude}" leaves out all {len(left_out)} participants; there is nothing to merge.'
+            f'the rule "{study.exclude}" leaves out all {len(left_out)} participants; there is nothing to aggregate.'
         )
     cohort = everybody.of([name for name in everybody.names if name not in left_out]) if left_out else everybody
     population = _with_learnt(analyse_population(study, cohort, seed, say), seed, say)
@@ -241,9 +241,9 @@ def _merged_otherwise(map_: RuleMap) -> Iterator[str]:
     how = in_place(map_)
     if how:
         yield (
-            f"The map is merged by the rule {map_.rule} from all answers at once; maps of fewer trials, and"
-            f" those of bootstrap resamples for the ends of tolerance intervals, are merged {how}, so that their last"
-            " optimum need not be the map's."
+            f"The map is aggregated by the rule {map_.rule} from all answers at once; maps of fewer trials, and"
+            f" those of bootstrap resamples for the ends of tolerance intervals, are aggregated {how}, so that their"
+            " last optimum need not be the map's."
         )
 
 

@@ -152,7 +152,7 @@ def read_study(path: str | os.PathLike, made: Callable[[StudyFile], _T]) -> _T:
         reason, _, rest = str(error).partition(" (at line ")
         line = rest.partition(",")[0]
         place = f"{source}:{line or len(text.splitlines())}"
-        raise InputError(f"{place}: is not valid TOML ({reason}), mend that line.") from error
+        raise InputError(f"{place}: is not valid TOML ({reason}), fix that line.") from error
     return checked(raw, source, made, text)
 
 

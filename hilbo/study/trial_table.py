@@ -170,7 +170,7 @@ def _csv_pieces(path: Path, source: str, needs: str) -> Iterator[pd.DataFrame]:
                 header = header or row
                 if len(row) != len(header):
                     raise InputError(
-                        f"{source}:{line}: has {len(row)} cells, the header has {len(header)}; mend that line."
+                        f"{source}:{line}: has {len(row)} cells, the header has {len(header)}; fix that line."
                     )
                 rows.append(row)
                 lines.append(line)

@@ -1,4 +1,4 @@
-"""`hilbo session` refuses in one sentence, before anything is begun; `hilbo doctor` says what to mend."""
+"""`hilbo session` refuses in one sentence, before anything is begun; `hilbo doctor` says what to fix."""
 
 import contextlib
 import hashlib
@@ -254,10 +254,10 @@ def test_the_doctor_says_what_to_mend(tmp_path):
         port = other.getsockname()[1]
         found = {check.name: check for check in doctor.checks(DATA, connect, tmp_path / "no" / "where", port)}
     assert found["damping"].level == "bad"
-    assert "measure-damping" in found["damping"].mend
+    assert "measure-damping" in found["damping"].fix
     assert found["server's port"].level == "bad"
     assert found["disk"].level == "bad"
-    assert all(check.mend for check in found.values() if check.level == "bad")
+    assert all(check.fix for check in found.values() if check.level == "bad")
     (broken := tmp_path / "study.toml").write_text("schema = 2")
     (tmp_path / "out").mkdir()
     found = {check.name: check for check in doctor.checks(broken, lambda _: unplugged(), tmp_path / "out", 0)}

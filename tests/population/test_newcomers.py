@@ -102,7 +102,7 @@ def test_what_stands_in_place_of_a_map_is_said(posteriors):
     for rule, how in (("hierarchical", "by the rule hierarchical point by point"), ("pooled", "by bcm")):
         whole = RuleMap(rule, "exact", None, one, jnp.asarray(SHARE), jnp.asarray(1.0))
         (words,) = analysis._merged_otherwise(whole)
-        assert in_place(whole) == how and f"are merged {how}" in words and f"by the rule {rule} from" in words
+        assert in_place(whole) == how and f"are aggregated {how}" in words and f"by the rule {rule} from" in words
     share = jnp.asarray(SHARE)
     assert point_rule("hierarchical", share) == ("hierarchical", share)
     assert point_rule("bcm", share) == ("bcm", None) and point_rule("pooled", share) == ("bcm", None)

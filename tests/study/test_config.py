@@ -217,7 +217,7 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ("weight = 0.7", "weight = -1", "35: selection.weight is -1, it must be a number, 0 or above; "),
     ('rule = "bcm"', 'rule = "mean"', '37: aggregation.rule is "mean", it must be one of "bcm", '),
     ("[aggregation]\n", "[aggregation]\n[aggregation]\n", "37: is not valid TOML (Cannot declare ('aggregation',) "),
-    ("high = 0.99", "high = ", "16: is not valid TOML (Invalid value), mend that line."),
+    ("high = 0.99", "high = ", "16: is not valid TOML (Invalid value), fix that line."),
     ("high = 16", "high = 0.5", "40: materials.gel.parameters.K1.low is 1.0, it must be below high = 0.5."),
     ("high = 16", 'high = "16"', '41: materials.gel.parameters.K1.high is "16", it must be a finite number.'),
     ("high = 16", "top = 16", "41: materials.gel.parameters.K1.top is not a key of a study file, "),

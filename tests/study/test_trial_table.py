@@ -155,7 +155,7 @@ BAD = {
     ),
     "twice, spelt otherwise": ("A,1,close,1,2\nA,1.0,similar,1,3", "t.csv:3: participant A, trial 1 stands in line 2"),
     "underscore": ("A,1,close,1_5,2", 'gain is "1_5"'),
-    "one cell more": ("A,1,close,1,2,3", "t.csv:2: has 6 cells, the header has 5; mend that line"),
+    "one cell more": ("A,1,close,1,2,3", "t.csv:2: has 6 cells, the header has 5; fix that line"),
     "one cell less": ("A,1,close,1,2\nA,2,close,1", "t.csv:3: has 4 cells, the header has 5"),
     "an open quote": ('A,1,close,1,"2', "t.csv: is not a table that can be read"),
 }
