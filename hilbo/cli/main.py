@@ -31,6 +31,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+# What draws and writes, loaded beside the arithmetic. Packages that the arithmetic never imports, because two threads
+# that import one package at once may see half of it.
+_DRAW_AND_WRITE = ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2")
 _LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
@@ -254,7 +257,7 @@ def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False) -> d
 
         def told(sentences):
             say.tell(sentences)
-            other_core.submit(importlib.import_module, "hilbo.report.results")  # matplotlib too, meanwhile
+            other_core.submit(list, map(importlib.import_module, _DRAW_AND_WRITE))
 
         population = analyse_population(study, cohort, seed, say, told)
     from hilbo.report.results import write_results
