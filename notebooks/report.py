@@ -84,7 +84,7 @@ out = folder / "results"
 out.mkdir()
 content = write_study(read_folder(folder), out, comparison=False)
 for claim in content["hypotheses"]:
-    print(claim["number"], claim["verdict"])
+    print(claim["number"])
     for item in claim["evidence"]:
         print("   ", item["side"], "-", item["text"])
 print("written:", len(list(out.rglob("*"))), "files,", out / "report.html")

@@ -50,7 +50,7 @@ def maximise_judged(
     learned = _learnt(gp, trials, *settings, inference)
     if inference != "laplace":
         return Judged(learned, jnp.zeros_like(learned.log_evidence), jnp.zeros(learned.log_evidence.shape, bool))
-    error = _error(learned.gp, trials, shared)
+    error = _error(learned, trials, shared)
     again = ~(jnp.abs(error) <= TRUSTED)
     if bool(again.any()):
         other = _learnt(gp, trials, *settings, "ep")
@@ -84,15 +84,15 @@ def _learnt(
 
 
 @program
-def _error(gps: OrdinalGP, trials: Trials, shared: bool) -> Float[Array, "*M"]:
+def _error(learned: Learned, trials: Trials, shared: bool) -> Float[Array, "*M"]:
     """Laplace's log evidence less that of expectation propagation, an answer: of all, or (not `shared`) of each."""
 
-    def each(gp, trials):
-        by_laplace, by_ep = (fit(gp, trials, inference=name, throw=False) for name in ("laplace", "ep"))
-        return by_laplace.log_evidence - by_ep.log_evidence
+    def by_ep(gp, trials):
+        return fit(gp, trials, inference="ep", throw=False).log_evidence
 
     counts = jnp.sum(trials.mask, axis=1, dtype=trials.x.dtype)
     if shared:
-        return jnp.sum(jax.lax.map(lambda t: each(gps, t), trials)) / jnp.sum(counts)
-    errors = jax.lax.map(lambda pair: each(*pair), (gps, trials))
+        together = jnp.sum(jax.lax.map(lambda t: by_ep(learned.gp, t), trials))
+        return (learned.log_evidence - together) / jnp.sum(counts)
+    errors = learned.log_evidence - jax.lax.map(lambda pair: by_ep(*pair), (learned.gp, trials))
     return jnp.where(counts > 0, errors / jnp.where(counts > 0, counts, 1.0), 0.0)  # no answers, nothing to err in

@@ -36,7 +36,8 @@ def test_the_error_is_that_of_the_exact_evidence(noise):
     laplace = sum(
         float(fit(model(noise), jax.tree.map(lambda leaf, j=j: leaf[j], trials())).log_evidence) for j in range(PEOPLE)
     )
-    said = float(judged_evidence._error(model(noise), trials(), True)) * PEOPLE * ANSWERS
+    there = Learned(model(noise), jnp.asarray(laplace), jnp.asarray(1), *2 * [jnp.asarray(True)], ("noise",))
+    said = float(judged_evidence._error(there, trials(), True)) * PEOPLE * ANSWERS
     assert said == pytest.approx(laplace - exact, abs=0.1, rel=0.1)
     assert (said > 1.0) == (noise < 0.1)
 
@@ -46,6 +47,12 @@ def test_what_laplace_misjudges_is_learnt_again_and_said(monkeypatch):
     monkeypatch.setattr(judged_evidence, "TRUSTED", 10.0)
     held = maximise_judged(model(0.7), trials(), ("noise",))
     assert not bool(held.again) and judged_sentences(held) == []
+    people = [jax.tree.map(lambda leaf, j=j: leaf[j], trials()) for j in range(PEOPLE)]
+    laplace, ep = (
+        sum(float(fit(held.learned.gp, one, inference=name).log_evidence) for one in people)
+        for name in ("laplace", "ep")
+    )
+    assert float(held.error) * PEOPLE * ANSWERS == pytest.approx(laplace - ep, abs=1e-6)
     monkeypatch.setattr(judged_evidence, "TRUSTED", 0.0)
     again = maximise_judged(model(0.7), trials(), ("noise",))
     by_ep = maximise_judged(model(0.7), trials(), ("noise",), inference="ep")
