@@ -11,7 +11,7 @@ import os
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Protocol, TypeVar, runtime_checkable
 
@@ -182,6 +182,7 @@ def materials_in(content: str) -> tuple[str, ...]:
     return tuple(json.loads(content).get("materials", {}))
 
 
+@lru_cache(maxsize=32)  # every event of a log may ask for its block's
 def made_of_material(content: str, source: str, name: str, made: Callable[[StudyFile], _T]) -> _T:
     """What `made` makes of the study of one material, from the content of the whole one. Raises InputError."""
     if name not in materials_in(content):
