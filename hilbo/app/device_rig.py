@@ -97,7 +97,7 @@ class DeviceRig:
 
     async def clear(self) -> None:
         """Go on after a hold."""
-        await asyncio.wrap_future(self.do(lambda device: device.clear()))
+        await asyncio.wrap_future(self.do(self._clear))
 
     def hang_up(self) -> None:
         """Nobody waits for a device."""
@@ -128,6 +128,12 @@ class DeviceRig:
         self._see(self._look())
         if self.snapshot.state != "RUNNING":
             device.start()
+
+    def _clear(self, device) -> None:
+        try:
+            device.clear()
+        finally:
+            self._see(self._look())  # there is no other look while somebody presses again and again
 
     def _load(self, device, wanted, stop, may_push):
         patient = time.monotonic() + _PUSHED
