@@ -97,7 +97,7 @@ class DeviceRig:
 
     async def clear(self) -> None:
         """Go on after a hold."""
-        await asyncio.wrap_future(self.do(self._clear))
+        await asyncio.wrap_future(self.do(lambda device: device.clear()))
 
     def hang_up(self) -> None:
         """Nobody waits for a device."""
@@ -129,12 +129,6 @@ class DeviceRig:
         if self.snapshot.state != "RUNNING":
             device.start()
 
-    def _clear(self, device) -> None:
-        try:
-            device.clear()
-        finally:
-            self._see(self._look())  # there is no other look while somebody presses again and again
-
     def _load(self, device, wanted, stop, may_push):
         patient = time.monotonic() + _PUSHED
         while True:
@@ -152,19 +146,25 @@ class DeviceRig:
         return Loaded({"in_force": found._asdict(), "serial_s": took}, took)
 
     def _work(self) -> None:
+        looked = time.monotonic()
         while not self._ending.is_set():
             job, found = self._next()
-            if found is None:
-                self._regularly()
-            elif found.set_running_or_notify_cancel():
+            if found is not None and found.set_running_or_notify_cancel():
                 try:
                     found.set_result(job())
                 except BaseException as error:  # the waiting side's to judge
                     found.set_exception(error)
+            if found is None or time.monotonic() - looked > self._pause:  # jobs may leave no pause between them
+                self._regularly()
+                looked = time.monotonic()
+
+    @property
+    def _pause(self) -> float:
+        return _RETRY if self.snapshot.lost else _POLL
 
     def _next(self) -> Any:
         try:
-            return self._jobs.get(timeout=_RETRY if self.snapshot.lost else _POLL) or (None, None)
+            return self._jobs.get(timeout=self._pause) or (None, None)
         except queue.Empty:
             return None, None
 

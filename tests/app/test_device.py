@@ -6,8 +6,12 @@ import time
 
 from live_server import Live, refused, until_held
 
+from hilbo.app.device_rig import DeviceRig
 from hilbo.device.simulator import Simulator
 from hilbo.hardware_bridge import Renderer
+from hilbo.study.study_file import StudyFile
+
+PAPER = "hilbo/data/paper.toml"
 
 SET = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
 
@@ -56,6 +60,22 @@ def test_a_pressed_device_rests_until_begin_and_again_in_a_break(tmp_path):
         del seen[:]
         time.sleep(1.5)
         assert "RUNNING" not in seen
+
+
+def test_jobs_that_follow_each_other_put_off_no_look():
+    """A button that is pressed again and again must not keep the session from seeing what the device does."""
+    study = StudyFile.load(PAPER)
+    with contextlib.closing(Simulator(finger="rest")) as simulator:
+        rig = DeviceRig(study, lambda: Renderer.open(simulator.port, patience=10.0))
+        try:
+            jobs = [rig.do(lambda _: time.sleep(0.005)) for _ in range(400)]
+            assert not rig.snapshot.contact
+            simulator.tell("finger hold")
+            while not rig.snapshot.contact and not jobs[-1].done():
+                time.sleep(0.005)
+            assert rig.snapshot.contact and not jobs[-1].done()
+        finally:
+            rig.close()
 
 
 def test_a_pressed_device_rests_while_something_is_still_compiled(tmp_path):
