@@ -8,10 +8,14 @@ PYTEST_ARGS ?=
 
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.hilbo-setup
+DOCS_STAMP := $(VENV)/.hilbo-docs
+# Installed quietly first. Where that fails, once more and aloud: a registry may have been silent for a moment, and pip says
+# which requirements are in conflict only when it may speak.
+PIP := $(BIN)/pip install --disable-pip-version-check -c constraints.txt
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo firmware test test-deep lint bench clean
+.PHONY: help setup demo firmware test test-deep lint docs bench clean
 
 help:  ## show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
@@ -35,6 +39,10 @@ lint: $(STAMP)  ## ruff and pyright
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+docs: $(DOCS_STAMP)  ## the documentation as a site, into build/site; a broken link or anchor is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "open build/site/index.html"
+
 bench: $(STAMP)  ## time hilbo against the textbook NumPy form
 	$(BIN)/python benchmarks/run.py
 	$(BIN)/python benchmarks/mechanics.py
@@ -55,6 +63,14 @@ $(STAMP): pyproject.toml constraints.txt
 	  test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || { \
 	    echo "'$(PYTHON) -m venv' failed: install Python's venv module, on Debian the package python3-venv." >&2; exit 1; }; \
 	  set -x; \
-	  $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev,hardware,live,browser]'; \
+	  $(PIP) --quiet -e '.[dev,hardware,live,browser]' || $(PIP) -e '.[dev,hardware,live,browser]'; \
+	fi
+	@touch $@
+
+$(DOCS_STAMP): $(STAMP)
+	@set -x; if command -v uv >/dev/null; then \
+	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[docs]'; \
+	else \
+	  $(PIP) --quiet -e '.[docs]' || $(PIP) -e '.[docs]'; \
 	fi
 	@touch $@

@@ -1,0 +1,172 @@
+"""The pages of docs/: each is in the site's navigation, and what they link to is there. `make docs` builds the site."""
+
+import ast
+import importlib.util
+import re
+import tomllib
+from itertools import pairwise
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from hilbo.study import study_tables
+from hilbo.study.protocols import PhaseTable
+from hilbo.study.study_file import checked
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.rglob("*.md"))
+LINKING = [*PAGES, *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "firmware/PROTOCOL.md"))]
+FENCED = re.compile(r"^```.*?^```", re.M | re.S)
+LINK = re.compile(r"\[[^\]\n]+\]\(([^)\s]+)\)")
+each_file = pytest.mark.parametrize("file", LINKING, ids=lambda file: str(file.relative_to(ROOT)))
+
+
+def script(name):
+    """A module of docs/site."""
+    spec = importlib.util.spec_from_file_location(name, DOCS / "site" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def text_of(file: Path) -> str:
+    """A page without its code."""
+    return re.sub(
+        r"`[^`\n]*`", lambda code: code[0].replace("[", " "), FENCED.sub("", file.read_text(encoding="utf-8"))
+    )
+
+
+def anchors(file: Path) -> set[str]:
+    """The anchors of a page's headings, as code hosts and the site make them."""
+    titles = re.findall(r"^#+ (.*)$", text_of(file), re.M)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+def broken(file: Path) -> list[str]:
+    """The relative links of a page that lead to no file, or to no heading of it."""
+    found = []
+    for link in LINK.findall(text_of(file)):
+        if re.match(r"\w+:", link):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (file.parent / path).resolve() if path else file
+        if not target.is_file() or (anchor and anchor not in anchors(target)):
+            found.append(link)
+    return found
+
+
+def test_navigation_has_every_page_once_and_no_other():
+    listed = re.findall(r"^ +- .*: ([\w/-]+\.md)$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.M)
+    written = [page.relative_to(DOCS).as_posix() for page in PAGES]
+    assert sorted(listed) == sorted([*written, *script("hooks").generated()])
+
+
+@each_file
+def test_links_lead_to_files_and_headings(file):
+    assert broken(file) == []
+
+
+def test_a_broken_link_is_found(tmp_path):
+    (tmp_path / "other.md").write_text("# A title: with marks\n")
+    page = tmp_path / "page.md"
+    page.write_text("[a](other.md#a-title-with-marks) [b](missing.md) [c](other.md#no) `[d](e)`\n```\n[f](g)\n```\n")
+    assert broken(page) == ["missing.md", "other.md#no"]
+
+
+@each_file
+def test_lists_and_tables_stand_apart(file):
+    """MkDocs takes a list or a table for text where the line before is a paragraph."""
+    lines = text_of(file).split("\n")
+    mark = re.compile(r"(?:[-*] |\d+\. |\|)")
+    ended = re.compile(r"(?:[-*|#> ]|\d+\. |<!--|$)")
+    found = [line for before, line in pairwise(lines) if mark.match(line) and not ended.match(before)]
+    assert found == []
+
+
+def test_modules_of_the_reference_and_names_of_pages_in_the_code_are_there():
+    modules = " ".join(names for _, names in script("hooks").API.values()).split()
+    assert [name for name in modules if not (ROOT / "hilbo" / f"{name.replace('.', '/')}.py").is_file()] == []
+    missing = []
+    for folder in ("hilbo", "benchmarks", "firmware", "clients", "notebooks", "attacks", "tests"):
+        for file in (f for kind in ("py", "html", "toml", "h", "c") for f in (ROOT / folder).rglob(f"*.{kind}")):
+            for name in re.findall(r"\bdocs/[\w/-]+\.(?:md|svg)", file.read_text(encoding="utf-8")):
+                missing += [] if (ROOT / name).is_file() else [f"{file.relative_to(ROOT)}: {name}"]
+    assert missing == []
+
+
+def without_docstring(body: list[ast.stmt], place: str) -> list[str]:
+    """Public functions and classes, and public methods of these, that say nothing of themselves."""
+    kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    public = [node for node in body if isinstance(node, kinds) and not node.name.startswith("_")]
+    found = [f"{place}.{node.name}" for node in public if not ast.get_docstring(node)]
+    classes = [node for node in public if isinstance(node, ast.ClassDef)]
+    return sum((without_docstring(node.body, f"{place}.{node.name}") for node in classes), found)
+
+
+def test_every_name_of_the_reference_has_a_docstring():
+    found = []
+    for module in " ".join(names for _, names in script("hooks").API.values()).split():
+        text = (ROOT / "hilbo" / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
+        found += without_docstring(ast.parse(text).body, module)
+    assert found == []
+
+
+def test_tables_of_benchmarks_have_their_marks():
+    calls = re.compile(r'\bput\("([\w/.-]+)", "([\w ]+)"')
+    asked = [call for file in (ROOT / "benchmarks").glob("*.py") for call in calls.findall(file.read_text("utf-8"))]
+    assert len(asked) > 15
+    for page, name in asked:
+        text = (DOCS / page).read_text(encoding="utf-8")
+        assert text.count(f"<!-- {name} -->\n") == text.count(f"<!-- end of {name} -->") == 1, (page, name)
+
+
+def test_a_notebook_becomes_text_and_code(tmp_path):
+    made = script("hooks")
+    path = made.ROOT / "notebooks" / "quick_start.py"
+    page = made.notebook(path)
+    assert page.startswith("# Quick start\n")
+    assert page.count("```python\n") == page.count("\n```\n") == path.read_text("utf-8").count("# %%\n")
+
+
+def test_links_between_files_become_links_between_pages():
+    link = script("hooks").site_link
+    assert link("docs/guides/live.md", "../device/device.md#x") == "../device/device.md#x"
+    assert link("docs/design.md", "../firmware/PROTOCOL.md") == "device/protocol.md"
+    assert link("firmware/PROTOCOL.md", "../docs/device/firmware.md") == "firmware.md"
+    assert link("docs/index.md", "../notebooks/device.py") == "notebooks/device.md"
+    assert link("docs/index.md", "../LICENSE") is None
+
+
+def schemas():
+    """The tables of a study file by the heading of the page that describes them."""
+    tables = {f"[{name}]": kind for name, kind in study_tables._TABLES.items()}
+    own = {"[renderer]": study_tables._RendererTable, "[parameters.NAME]": study_tables._ParameterTable}
+    return tables | own | {"[session.PHASE]": PhaseTable}
+
+
+@pytest.mark.parametrize("table", schemas())
+def test_the_study_files_page_has_every_key_and_its_default(table):
+    text = (DOCS / "guides" / "study-file.md").read_text(encoding="utf-8")
+    section = text.split(f"## {table}\n")[1].split("\n## ")[0]
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*?) \|", section, re.M))
+    fields = [f for f in msgspec.structs.fields(schemas()[table]) if f.type not in (PhaseTable,)]
+    assert list(rows) == [field.encode_name for field in fields]
+    for field in fields:
+        if field.required:
+            assert rows[field.encode_name] == "needed"
+        elif isinstance(field.default, str | int | float | bool):
+            assert tomllib.loads(f"value = {rows[field.encode_name].strip('`')}")["value"] == field.default
+
+
+def test_the_study_files_on_the_page_are_good():
+    text = (DOCS / "guides" / "study-file.md").read_text(encoding="utf-8")
+    for block in re.findall(r"```toml\n(schema.*?)```", text, re.S):
+        assert checked(tomllib.loads(block), "page", lambda file: file.name)
+
+
+def test_the_page_of_mistakes_says_what_hilbo_says():  # fits once, for what is said in Python: 2 s
+    page = script("mistakes").page()
+    assert (DOCS / "guides" / "mistakes.md").read_text(encoding="utf-8") == page, "run python docs/site/mistakes.py"
+    assert page.count("\n| ") >= 3 * 2 + 20
