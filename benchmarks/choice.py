@@ -1,6 +1,6 @@
 """What sessions choose, against exhaustive searches, in random states of simulated sessions of the preset `paper`.
 
-    python benchmarks/choice.py --states 1000 --write      writes docs/choice.md
+    python benchmarks/choice.py --states 1000 --write      into docs/results/accuracy.md
 
 A state is what somebody answered to the first n of 25 trials, n from 5 to 24. In each one the acquisition's value (UCB,
 float64) at the session's choice is compared with that of the best of 20,000 points that fill the feasible set evenly,
@@ -12,6 +12,7 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from pages import put
 
 ROOT = Path(__file__).parents[1]
 POINTS, WALLS, PLACES = 20_000, 5_000, 24
@@ -82,8 +83,6 @@ def compare(study, trials):
 def report(values, count):
     own = values[:, 0]
     lines = [
-        "# What sessions choose",
-        "",
         f"Made by `python benchmarks/choice.py --states {count} --write`: {count} random states of simulated sessions",
         "of the preset `paper` (after 5 to 24 answers); differences of UCB, whose scale is the prior's sd, 1.",
         "",
@@ -115,7 +114,7 @@ def main():
     text = report(compare(study, trials), chosen.states)
     print(text)
     if chosen.write:
-        (ROOT / "docs" / "choice.md").write_text(text)
+        put("results/accuracy.md", "choice", text)
 
 
 if __name__ == "__main__":

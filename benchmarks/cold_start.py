@@ -1,6 +1,6 @@
 """What passes between the start of a process and the first chosen point of a session, part by part.
 
-    python benchmarks/cold_start.py --write      writes docs/cold_start.md
+    python benchmarks/cold_start.py --write      into docs/results/run_time.md
 
 Every row is a process of its own, the median over the rounds, with a warm compilation cache or an empty one.
 """
@@ -13,6 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 from statistics import median
+
+from pages import put
 
 ROOT = Path(__file__).parents[1]
 X64 = "import jax; jax.config.update('jax_enable_x64', True)\n"
@@ -30,7 +32,7 @@ PROCESSES = {
     "study loaded": X64 + STUDY,
     "session started: the first point to show": X64 + STUDY + START,
     "first chosen point, after 5 answers": WHOLE,
-    "the same with programs kept, as commands keep them (docs/programs.md)": KEPT,
+    "the same with programs kept, as commands keep them (docs/results/run_time.md)": KEPT,
     "the same by XLA's newer code generator (`hilbo/numerics/compiling.py`)": "import hilbo.numerics.compiling\n"
     "hilbo.numerics.compiling._TRIED = (0, 0)\n" + WHOLE,
 }
@@ -54,7 +56,7 @@ def main():
     text = document(chosen.rounds)
     print(text)
     if chosen.write:
-        (ROOT / "docs" / "cold_start.md").write_text(text)
+        put("results/run_time.md", "cold start", text)
 
 
 def seconds(code, cache):
@@ -78,8 +80,6 @@ def run(code, cache):
 
 def document(rounds):
     lines = [
-        "# Cold start",
-        "",
         f"Made by `python benchmarks/cold_start.py --write`: seconds of whole processes, medians of {rounds};",
         "the study is the preset `paper`. A warm cache is one that an earlier process filled",
         "(`JAX_COMPILATION_CACHE_DIR`). A live session compiles while the first, given points are felt",

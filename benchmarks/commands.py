@@ -1,6 +1,8 @@
 """What a person waits for: every command of the README on what is shipped, whole processes, beside `import jax`.
 
-    python benchmarks/commands.py [--before CHECKOUT] [--rounds 5] [--write]     docs/commands.md
+    python benchmarks/commands.py [--before CHECKOUT] [--rounds 5] [--write]
+
+--write puts the table into docs/results/run_time.md.
 
 Each round runs every command once with kept programs, once without and, with `--before`, once by another checkout of
 hilbo (in the same environment); `import jax` stands between them. `empty` is one run with empty caches. Memory is
@@ -16,6 +18,8 @@ import time
 from collections import defaultdict
 from pathlib import Path
 from statistics import median
+
+from pages import put
 
 ROOT = Path(__file__).parents[1]
 DATA = "hilbo/data"
@@ -46,7 +50,7 @@ def main():
         text = document(table(names, chosen.rounds, chosen.before, Path(folder)), chosen.rounds)
     print(text)
     if chosen.write:
-        (ROOT / "docs" / "commands.md").write_text(text)
+        put("results/run_time.md", "commands", text)
 
 
 def table(names, rounds, before, folder):
@@ -102,10 +106,8 @@ def process(words, root, cache, keep):
 def document(runs, rounds):
     unit = median(seconds for seconds, _, _ in runs[IMPORT, ""])
     lines = [
-        "# What a person waits for",
-        "",
         f"Made by `python benchmarks/commands.py --write`: whole processes, medians of {rounds}, beside `import jax`,",
-        f"which took {unit:.2f} s in the same run. Programs are kept from one command to the next (docs/programs.md);",
+        f"which took {unit:.2f} s in the same run. Programs are kept from one command to the next (docs/design.md);",
         "*traced* is with HILBO_KEEP_PROGRAMS=0, *empty* the first run of all, *before* another checkout, if one was",
         "named.",
         "",

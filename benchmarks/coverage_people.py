@@ -4,7 +4,7 @@
 
 People have a latent function drawn from the prior plus a level of their own (sd 1), answer at uniform points of the
 paper's box through the ordinal probit, lapse at a rate and drift over the session. --write puts the table into
-docs/report.md.
+docs/guides/report.md.
 """
 
 import argparse
@@ -20,12 +20,13 @@ import numpy as np  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
+from pages import put  # noqa: E402
+
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials  # noqa: E402
 from hilbo.kernels import gram  # noqa: E402
 from hilbo.population.response_quality import measure_people  # noqa: E402
 
 CASES = [(25, 0.0, 0.0), (25, 0.1, 0.0), (25, 0.3, 0.0), (25, 0.0, -1.0), (25, 0.1, -1.0), (100, 0.1, -1.0)]
-START, END = "<!-- coverage -->", "<!-- end of coverage -->"
 
 
 def crowd(gp, people, trials, lapse, drift, seed):
@@ -67,10 +68,7 @@ def main():
         lines.append("| " + " | ".join(cells) + " |")
         print(lines[-1])
     if chosen.write:
-        path = ROOT / "docs" / "report.md"
-        before, _, rest = path.read_text(encoding="utf-8").partition(START)
-        text = "\n".join(lines)
-        path.write_text(f"{before}{START}\n{text}\n{END}{rest.partition(END)[2]}", encoding="utf-8")
+        put("guides/report.md", "coverage", "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,8 @@ Classes: a logistic variable with the set's level, a participant's effect and a 
 comparisons each. Preferences: effects of participants and of 24 individual sets, each pair of them shown twice. The
 truth is what endless participants would give: the logit of the mean probability, or the ordered logit that is nearest
 to the mean probabilities, by Gauss-Hermite quadrature. Cases: people differ; they differ and answer unequally often,
-person i of G the first i/G of the plan; they are alike. --write puts the table into docs/statistics.md; ten minutes.
+person i of G the first i/G of the plan; they are alike. --write puts the table into
+docs/methods/statistics.md; ten minutes.
 """
 
 import argparse
@@ -23,6 +24,8 @@ from scipy.special import expit, logit
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
+from pages import put  # noqa: E402
+
 from hilbo.statistics.logits import binary_logit, ordered_logit  # noqa: E402
 from hilbo.statistics.preferences import rate  # noqa: E402
 
@@ -37,7 +40,6 @@ KINDS = {"II": PERSONS, "III": PERSONS, "rate": ["Wilson", "exact"]}
 KINDS["IV"] = [*PERSONS, "clustered by set", "clustered by participant and set"]
 NODES, WEIGHTS = hermegauss(60)
 WEIGHTS = WEIGHTS / WEIGHTS.sum()
-START, END = "<!-- coverage -->", "<!-- end of coverage -->"
 
 
 def class_truth(scale):
@@ -179,10 +181,7 @@ def main():
     text = page(results, chosen.studies)
     print(text)
     if chosen.write:
-        path = ROOT / "docs" / "statistics.md"
-        before, _, rest = path.read_text(encoding="utf-8").partition(START)
-        _, _, after = rest.partition(END)
-        path.write_text(f"{before}{START}\n{text}{END}{after}", encoding="utf-8")
+        put("methods/statistics.md", "coverage", text)
 
 
 if __name__ == "__main__":

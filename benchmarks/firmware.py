@@ -4,7 +4,7 @@
 
 Needs the cross compiler and the emulator (Debian: gcc-arm-none-eabi, libnewlib-arm-none-eabi, qemu-system-arm). The
 counts are exact and the same on every machine with the same compiler: in the emulator an instruction takes a fixed
-virtual time, and the processor's timer counts it. --write makes docs/firmware.md.
+virtual time, and the processor's timer counts it. --write puts the tables into docs/device/firmware.md.
 """
 
 import argparse
@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
 
 import jax  # noqa: E402
@@ -30,7 +29,7 @@ from device_wire import Type  # noqa: E402
 from hilbo.mechanics.exponentials import exponentials  # noqa: E402
 from hilbo.viscoelastic import FOSLS  # noqa: E402
 
-__all__ = ["DOCS", "MEMORIES", "measure", "sizes", "stack_of", "state_bytes"]
+__all__ = ["MEMORIES", "measure", "sizes", "stack_of", "state_bytes"]
 
 SET = (0.44, 1.40, 5.89, 0.203)  # K0, K1, B1, alpha: memory foam, so soft that all memories are passive with it
 FLAGS = {"m4": "-mcpu=cortex-m4 -mfpu=fpv4-sp-d16", "m7": "-mcpu=cortex-m7 -mfpu=fpv5-d16"}
@@ -178,11 +177,10 @@ def stack_of(cpu: str, folder: Path) -> dict[str, int]:
 
 
 def tables(folder: Path) -> str:
-    """The text of docs/firmware.md."""
+    """The tables of docs/device/firmware.md."""
     found = {cpu: measure(cpu, folder) for cpu in MACHINES}
     version = subprocess.run(["arm-none-eabi-gcc", "--version"], capture_output=True, text=True).stdout.split("\n")[0]
-    text = ["# Cost of the device's core", ""]
-    text += ["Made by `python benchmarks/firmware.py --write`; docs/porting.md says what a board needs beside it.", ""]
+    text = ["Made by `python benchmarks/firmware.py --write`.", ""]
     text += [f"Instructions, counted in the emulator (Cortex-M4F and M7, -O2, {version})."]
     text += ["", "| a tick (`hb_tick`) | M4 mean | M4 most | M7 mean | M7 most |", "|---|---:|---:|---:|---:|"]
     ticking = [name for name, cost in found["m4"].sections.items() if cost.ticks]
@@ -230,7 +228,7 @@ def memory_table(folder: Path, found: dict[str, Measured]) -> list[str]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--write", action="store_true", help="make docs/firmware.md")
+    parser.add_argument("--write", action="store_true", help="put the tables into docs/device/firmware.md")
     write = parser.parse_args().write
     jax.config.update("jax_enable_x64", True)
     for cpu in MACHINES:
@@ -239,7 +237,9 @@ def main() -> None:
         text = tables(Path(folder))
     print(text, end="")
     if write:
-        (DOCS / "firmware.md").write_text(text, encoding="utf-8")
+        from pages import put  # beside this file: found when it is run, not when a test imports it
+
+        put("device/firmware.md", "firmware", text)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
     python benchmarks/identification.py select                               N-selection on two materials
     python benchmarks/identification.py time                                 against scipy's least_squares and lfilter
     python benchmarks/identification.py example                              the shipped table, simulated again
-    python benchmarks/identification.py write                                the tables into docs/identification.md
+    python benchmarks/identification.py write                                into docs/methods/identification.md
 
 Every simulated data set is the set S of the paper (N = 101) under both loads, as a device would apply them (ramps of
 20 ms), each with 16 repeats and noise of 4 % of the curve's range if it is white, of 1 % if it is AR(1) with 0.9 from
@@ -23,6 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+from pages import put
 
 ROOT = Path(__file__).parents[1]
 TRUTH = (-2.89, 5.70, 5.89, 0.203)
@@ -207,9 +208,9 @@ def timing(rounds=5):
         K1 = (q[0] - q[1]) * (1 + kappa) * (kappa + S) / (kappa * (1 - S))
         top, bottom = rational(q[1] - K1 * S / (kappa + S), K1, K1 / kappa * 1e-3**alpha, alpha, 101)
         parts = []
-        for kind, put, out in means:
+        for kind, applied, out in means:
             pair = (top, bottom) if kind == "relaxation" else (bottom / top[0], top / top[0])
-            parts.append((out - lfilter(*pair, put)) / (np.ptp(out) * np.sqrt(out.size)))
+            parts.append((out - lfilter(*pair, applied)) / (np.ptp(out) * np.sqrt(out.size)))
         return np.concatenate(parts)
 
     def textbook():
@@ -257,17 +258,12 @@ def coverage_table(folder):
 
 
 def write(folder):
-    """Each table between its marks in docs/identification.md; a study that has not been run keeps its old table."""
-    path = ROOT / "docs" / "identification.md"
-    text = path.read_text()
+    """Each table into docs/methods/identification.md; a study that has not been run keeps its old table."""
     made = {"select": select, "time": timing}
     if folder.exists():
         made["coverage"] = lambda: coverage_table(folder)
     for name, make in made.items():
-        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
-        before, rest = text.split(begin)
-        text = before + begin + make().rstrip() + "\n" + end + rest.split(end)[1]
-    path.write_text(text)
+        put("methods/identification.md", name, make())
 
 
 def example():

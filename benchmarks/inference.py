@@ -1,4 +1,4 @@
-"""How wrong each inference is, and whether `exact` is as right as it says; writes both into docs/inference.md.
+"""How wrong each inference is, and whether `exact` is as right as it says; with --write into docs/methods/inference.md.
 
     python benchmarks/inference.py [--write]
 
@@ -26,6 +26,7 @@ jax.config.update("jax_enable_x64", True)
 
 from datasets import SIX, Dataset, near_separable, repeated, repeated_19  # noqa: E402
 from helpers import answers, model  # noqa: E402
+from pages import put  # noqa: E402
 from reference_exact import genz, quadrature, slice_sampled  # noqa: E402
 
 from hilbo import fit  # noqa: E402
@@ -39,7 +40,6 @@ KEYS = 200
 COVERED = 3  # points
 REPEATED = (near_separable, repeated, repeated_19)  # data sets whose coverage is counted
 APPROXIMATE = ("laplace", "ep", "ep_corrected")
-BEGIN, END = "<!-- made by benchmarks/inference.py -->", "<!-- end -->"
 
 
 def sampled(data: Dataset, key, samples: int) -> Posterior:
@@ -130,8 +130,7 @@ def page() -> str:
             shares.append(groups)
         print(f"{data.name} done", file=sys.stderr)
     mean = " | ".join(f"{100 * share:.1f}" for share in np.mean(shares, axis=0))
-    return f"""{BEGIN}
-| data (noise) | method | mean, RMS | mean, largest | sd | class probability | log evidence |
+    return f"""| data (noise) | method | mean, RMS | mean, largest | sd | class probability | log evidence |
 |---|---|---:|---:|---:|---:|---:|
 {chr(10).join(of_errors)}
 
@@ -146,17 +145,14 @@ Per cent of {KEYS} keys with the truth within two stated standard errors:
 | data | log evidence | means | variances | class probabilities |
 |---|---:|---:|---:|---:|
 {chr(10).join(of_coverage)}
-| all | {mean} |
-{END}"""
+| all | {mean} |"""
 
 
 def main():
-    text, target = page(), ROOT / "docs" / "inference.md"
+    text = page()
     print(text)
     if "--write" in sys.argv[1:]:
-        old = target.read_text(encoding="utf-8")
-        before, rest = old.split(BEGIN)
-        target.write_text(before + text + rest.split(END)[1], encoding="utf-8")
+        put("methods/inference.md", "inference", text)
 
 
 if __name__ == "__main__":

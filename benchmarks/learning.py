@@ -5,7 +5,7 @@
 
 Studies of the population `paper-individuals` (benchmarks/populations_people.py), sessions of 25 trials. --priors: every
 prior's standard deviation halved and doubled, seeds from 0; how far the optimum moves (NRMSE), and what that does to
-how often new people give the highest answer there. --write puts the tables into docs/which_method.md.
+how often new people give the highest answer there. --write puts the tables into docs/methods/which_method.md.
 """
 
 import argparse
@@ -41,7 +41,7 @@ from hilbo.study.aggregate import map_optimum  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 from hilbo.study.learnt_study import that_learns  # noqa: E402
 
-PAGE = Path(__file__).parents[1] / "docs" / "which_method.md"
+PAGE = Path(__file__).parents[1] / "docs" / "methods" / "which_method.md"
 POPULATION = POPULATIONS["paper-individuals"]
 SIZES = ((24, 3), (100, 15), (1000, 180))  # people, and the seconds that are asked
 EXACT = 1000  # features, of which all but the rounding is left

@@ -4,7 +4,7 @@
 
 Counted are samples against the device's own ticks, frames lost in either direction, repeated requests, HOLDs and late
 ticks. Round trips are times of this computer, which the device shares; nothing is asserted of them. --write puts the
-table into docs/device.md.
+table into docs/device/device.md.
 """
 
 import argparse
@@ -16,10 +16,11 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
+from pages import put
+
 from hilbo.device import protocol
 from hilbo.hardware_bridge import Renderer
 
-PAGE = Path(__file__).parents[1] / "docs" / "device.md"
 SETS = (
     {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176},
     {"K0": -2.89, "K1": 5.70, "B1": 5.89, "alpha": 0.203},
@@ -84,7 +85,7 @@ def measure(minutes):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--minutes", type=float, default=10.0)
-    parser.add_argument("--write", action="store_true", help="put the table into docs/device.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/device/device.md")
     chosen = parser.parse_args()
     rows, words = measure(chosen.minutes)
     table = "| | |\n|---|---:|\n" + "".join(f"| {name} | {value} |\n" for name, value in rows)
@@ -93,9 +94,7 @@ def main():
     table += f" Python {platform.python_version()}, {platform.system()}.\n"
     print(table)
     if chosen.write:
-        page = PAGE.read_text(encoding="utf-8")
-        begin, end = page.index("<!-- link -->") + len("<!-- link -->\n"), page.index("<!-- end of link -->")
-        PAGE.write_text(page[:begin] + table + page[end:], encoding="utf-8")
+        put("device/device.md", "link", table)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """How long a participant waits: from an answer to the next parameters in force on the device, through the real server.
 
-    python benchmarks/live.py --trials 500 --write      # into docs/live.md
+    python benchmarks/live.py --trials 500 --write      # into docs/guides/live.md
 
 Sessions of the paper's study follow each other, each a process of its own as `hilbo session` starts it, with short
 steps, on the simulated device (host port); a program answers. Times are parts of the server's own clock: the answer's
@@ -18,6 +18,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from pages import put
 
 from hilbo.app.rehearsal import Decider, fast_study, server
 from hilbo.app.robot import Client
@@ -27,6 +28,7 @@ from hilbo.session.ask_tell import Session
 from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.plan import header_for
 from hilbo.session.state import LiveSession
+from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 
 ROOT = Path(__file__).parents[1]
@@ -36,7 +38,7 @@ PAPER = ROOT / "hilbo" / "data" / "paper.toml"
 def one_session(file: Path, study: Study, folder: Path, number: int) -> tuple[list[dict], float, int]:
     """Delays of a whole session (s), the time from its start to the first Begin, and fits that somebody waited for."""
     arguments = [str(file), "--participant", f"P{number:02d}", "--logs", str(folder), "--port", "0", "--gap", "0"]
-    decide, begun = Decider(study, seed=number), time.perf_counter()
+    decide, begun = Decider(study, preset_of("paper"), number), time.perf_counter()
     with server(*arguments, "--seed", str(number), "--dry-run", "--sim", "finger=none") as (_, links):
         person, watch = Client(links["participant"]), Client(links["experimenter"])
         ready = None
@@ -67,7 +69,10 @@ def choices(study: Study, seed: int) -> tuple[list[float], list[float]]:
     )
     chooser.warm()
     bare.warm().join()
-    state, decide = LiveSession.start(study, header_for(study, "P", seed=seed, warm=False)), Decider(study, seed=seed)
+    state, decide = (
+        LiveSession.start(study, header_for(study, "P", seed=seed, warm=False)),
+        Decider(study, preset_of("paper"), seed),
+    )
     proposed, told = [], []
     while state.screen != "done":
         begun = time.perf_counter()
@@ -124,7 +129,7 @@ def table(delays, ready, imports, proposed, told, fits) -> str:
 
 
 def main() -> None:
-    """Run, print, and with --write put the table into docs/live.md."""
+    """Run, print, and with --write put the table into docs/guides/live.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=500)
     parser.add_argument("--seconds", type=float, default=0.25, help="of each step")
@@ -146,10 +151,7 @@ def main() -> None:
     text = table(delays, ready[1:] or ready, imports, proposed, told, fits)
     print(text)
     if options.write:
-        path = ROOT / "docs" / "live.md"
-        before, _, rest = path.read_text(encoding="utf-8").partition("<!-- times -->\n")
-        _, end, after = rest.partition("<!-- end of times -->")
-        path.write_text(f"{before}<!-- times -->\n{text}\n{end}{after}", encoding="utf-8")
+        put("guides/live.md", "times", text)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ data carry no licence and are not part of hilbo. Inputs are standardised on the 
 --ard one per input), noise and thresholds maximise the evidence, the prior variance is 1. A prediction is the most
 probable category. Published, for Laplace with one theta: 5 bins error 16.5 +- 3.6 %, mean absolute error .185 +- .040;
 10 bins 33.8 +- 3.9 %, .475 +- .073 (mean and sd over the partitions). --write puts the table into
-docs/machine_cpu.md.
+docs/results/accuracy.md.
 """
 
 import argparse
@@ -22,6 +22,8 @@ import pandas as pd
 from scipy.stats import norm
 
 jax.config.update("jax_enable_x64", True)
+
+from pages import put  # noqa: E402
 
 from hilbo.hyperparameters.maximum_evidence import maximise_evidence  # noqa: E402
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit  # noqa: E402
@@ -52,7 +54,7 @@ def main():
     text = table(rows, chosen.splits)
     print(text)
     if chosen.write:
-        (ROOT / "docs" / "machine_cpu.md").write_text(text, encoding="utf-8")
+        put("results/accuracy.md", "machine cpu", text)
 
 
 def row(data, splits, bins, inference, ard, count):
@@ -97,8 +99,6 @@ def predict(gp, trials, x, inference):
 
 def table(rows, count):
     lines = [
-        "# Machine CPU",
-        "",
         "Ordinal regression on the data of Chu & Ghahramani (2005), JMLR 6:1019, over their partitions (150",
         "training and 59 test rows): made by",
         "`python benchmarks/machine_cpu.py FOLDER --inference laplace ep --ard --write`.",

@@ -3,7 +3,7 @@
     python benchmarks/mechanics.py [--rounds 5] [--write]
 
 One core, float64; the two sides take turns, a row is the median over the rounds. --write makes
-docs/benchmarks_mechanics.md and docs/memory.svg.
+docs/results/run_time.md and docs/results/memory.svg.
 """
 
 import argparse
@@ -13,7 +13,6 @@ import os
 import platform
 import time
 import warnings
-from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -29,10 +28,11 @@ from scipy.signal import lfilter  # noqa: E402
 from scipy.stats import qmc  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+from pages import DOCS, put  # noqa: E402
+
 from hilbo import passivity, viscoelastic  # noqa: E402
 from hilbo.viscoelastic import FOSLS  # noqa: E402
 
-DOCS = Path(__file__).parents[1] / "docs"
 T, N, K_EFF = 1e-3, 101, 0.44
 FOAM = (0.44, 5.70, 5.89, 0.203)  # the K1, B1, α of memory foam, with the K0 >= 0 that full memory needs
 SAMPLES = 3000
@@ -168,13 +168,11 @@ def plot(rows):
     axes.set(xlabel="time per sample, plain recursion (µs)", ylabel="largest error / largest force")
     axes.legend()
     axes.grid(alpha=0.3)
-    figure.savefig(DOCS / "memory.svg", metadata={"Date": None})
+    figure.savefig(DOCS / "results" / "memory.svg", metadata={"Date": None})
 
 
 def text(rows, kept, rounds):
     lines = [
-        "# Run time of the mechanics",
-        "",
         f"Made by `python benchmarks/mechanics.py --write`: 1 core, float64, medians of {rounds} rounds in turn;",
         f"{platform.machine()}, Python {platform.python_version()}, jax {jax.__version__}.",
         "",
@@ -211,7 +209,7 @@ def main():
     page = text(rows, kept, chosen.rounds)
     print(page)
     if chosen.write:
-        (DOCS / "benchmarks_mechanics.md").write_text(page)
+        put("results/run_time.md", "mechanics", page)
         plot(kept)
 
 

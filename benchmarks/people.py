@@ -12,7 +12,7 @@ but the randomised probability integral transform (seed 0).
 Hyperparameters maximise the evidence of the hierarchical model on the training people of each fold, noise 1 (the scale
 of f is free), and serve every rule but learnt-1, which learns its own there. Beside the rules stand the training
 people's frequencies of the categories, and an ordinal probit that is quadratic in the two standardised parameters.
-Errors are clustered by person. --write puts the table into docs/people.md.
+Errors are clustered by person. --write puts the table into docs/methods/aggregation.md.
 """
 
 import argparse
@@ -26,6 +26,8 @@ import pandas as pd
 from scipy.stats import norm
 
 jax.config.update("jax_enable_x64", True)
+
+from pages import put  # noqa: E402
 
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials  # noqa: E402
 from hilbo.population.baselines import constant, quadratic  # noqa: E402
@@ -148,10 +150,7 @@ def main():
     text = table(chosen, data, chances, everybody, shares, wide)
     print(text)
     if chosen.write:
-        path = ROOT / "docs" / "people.md"
-        before, mark, rest = path.read_text(encoding="utf-8").partition(f"<!-- {chosen.data} -->\n")
-        after = rest.partition("<!-- end -->")[2]
-        path.write_text(f"{before}{mark}{text}<!-- end -->{after}", encoding="utf-8")
+        put("methods/aggregation.md", chosen.data, text)
 
 
 def by_learnt_1(data, people, x):

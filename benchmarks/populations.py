@@ -9,7 +9,7 @@ FILE (JSON Lines) collects a row for each study and design; a run that was stopp
 run with this recipe is in benchmarks/populations.jsonl. *Regret* is how much less often a new person of the population
 gives the highest answer at the optimum found than at the best feasible rendering. Choices of method were made on seeds
 0 to 99; what is reported begins at 1000. --chance: points by chance in place of sessions. --write puts the tables into
-docs/which_method.md.
+docs/methods/which_method.md.
 """
 
 import argparse
@@ -24,6 +24,7 @@ import equinox as eqx  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
+from rows import Rows  # noqa: E402
 
 from hilbo import acquisition  # noqa: E402
 from hilbo.ordinal_gp import Trials  # noqa: E402
@@ -51,18 +52,18 @@ def main():
     options.add_argument("--chance", action="store_true")
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
+    rows = Rows(chosen.file)
     if chosen.write:
-        write(rows_of(chosen.file))
+        write(rows.rows)
         return
-    known = {(row["population"], row["design"], row["seed"]) for row in rows_of(chosen.file)}
+    known = {(row["population"], row["design"], row["seed"]) for row in rows}
     design = chosen.design + (" by chance" if chosen.chance else "")
     for seed in range(chosen.first, chosen.first + chosen.studies):
         for name in POPULATIONS:
             if (name, design, seed) in known or chosen.only not in (None, name):
                 continue
             row = {"population": name, "design": design, "seed": seed} | one_study(name, design, seed)
-            with chosen.file.open("a") as file:
-                file.write(json.dumps(rounded(row)) + "\n")
+            rows.add(rounded(row))
             print(name, seed, {rule: round(row["rules"][rule]["regret"], 3) for rule in RULES}, flush=True)
 
 
@@ -71,10 +72,6 @@ def rounded(row):
     if isinstance(row, dict):
         return {name: rounded(value) for name, value in row.items()}
     return round(row, 6) if isinstance(row, float) else row
-
-
-def rows_of(path):
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
 def one_study(name, design, seed):
@@ -196,7 +193,7 @@ def table(rows, design):
 
 
 def write(rows):
-    page = ROOT / "docs" / "which_method.md"
+    page = ROOT / "docs" / "methods" / "which_method.md"
     text = page.read_text()
     for design in sorted({row["design"] for row in rows}, reverse=True):
         mark = f"<!-- {design} -->"

@@ -1,6 +1,6 @@
 """Float32 against float64 for every public result: how far apart they are, and whether that is enough.
 
-    python benchmarks/precision.py [--write] [PART ...]      writes docs/precision.md; PARTS are functions below
+    python benchmarks/precision.py [--write] [PART ...]      into docs/results/accuracy.md; PARTS are functions below
 
 Both get the same inputs, rounded to float32, so that the difference is that of the arithmetic. "Needed" is what the
 result is for: a hundredth of the answers' noise for latent values, a thousandth for probabilities, a thousandth of the
@@ -22,6 +22,7 @@ jax.config.update("jax_enable_x64", True)
 
 from datasets import SIX  # noqa: E402
 from helpers import answers, model  # noqa: E402
+from pages import put  # noqa: E402
 
 from hilbo import Study, acquisition, bcm, fit, passivity, viscoelastic  # noqa: E402
 from hilbo.errors import InputError  # noqa: E402
@@ -223,9 +224,7 @@ def closed_forms() -> Iterator[Row]:
 
 PARTS = (likelihood, inference, gradients, hyperparameters, committee, choices, renderings, closed_forms)
 
-PAGE = """# Float32 against float64
-
-Made by `python benchmarks/precision.py --write`. Both precisions get the same inputs, rounded to float32.
+PAGE = """Made by `python benchmarks/precision.py --write`. Both precisions get the same inputs, rounded to float32.
 
 "Needed" is what the result is for. The answers carry a noise of 0.5, or 0.1 at least: an error of a hundredth of that
 changes no decision. A force is held to a thousandth of the largest. NaN: a certificate does not hold in float32.
@@ -238,7 +237,7 @@ changes no decision. A force is held to a thousandth of the largest. NaN: a cert
 
 Identification is done in float64 (`hilbo identify` switches it on): its profile intervals take second differences of
 sums of squares, of which float32 leaves nothing. What float32 cannot do at all, a
-prior sd of more than about 100 noises, is in [stress.md](stress.md).
+prior sd of more than about 100 noises, is in [stress](#stress).
 """
 
 
@@ -264,7 +263,7 @@ def main():
     text = PAGE.format(rows="\n".join(lines), verdict=verdict)
     print(text)
     if "--write" in sys.argv[1:]:
-        (ROOT / "docs" / "precision.md").write_text(text, encoding="utf-8")
+        put("results/accuracy.md", "precision", text)
 
 
 if __name__ == "__main__":

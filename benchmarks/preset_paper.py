@@ -1,4 +1,4 @@
-"""The simulated preset `paper-individuals` over many seeds, beside the paper's figures, for docs/simulation.md.
+"""The simulated preset `paper-individuals` over many seeds, beside the paper's figures, for docs/methods/simulation.md.
 
     python benchmarks/preset_paper.py --seeds 20 --write
 
@@ -60,7 +60,7 @@ def main():
     text = report(found)
     print(text)
     if chosen.write:
-        path = ROOT / "docs" / "simulation.md"
+        path = ROOT / "docs" / "methods" / "simulation.md"
         head = path.read_text().split("<!-- measured -->")[0] if path.exists() else ""
         path.write_text(f"{head}<!-- measured -->\n{text}")
 

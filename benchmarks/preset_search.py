@@ -13,7 +13,6 @@ on fresh seeds.
 """
 
 import argparse
-import json
 import re
 from itertools import combinations
 from pathlib import Path
@@ -24,6 +23,7 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from rows import Rows  # noqa: E402
 
 from hilbo.errors import InputError  # noqa: E402
 from hilbo.population.maps import rule_map  # noqa: E402
@@ -38,6 +38,7 @@ DATA = Path(__file__).parents[1] / "hilbo" / "data"
 FILE, STUDY = DATA / "populations.toml", Study.load(DATA / "paper.toml")
 TRUTH = {"K1": 5.70, "B1": 5.89, "alpha": 0.203}
 CROWD = 1000  # new people who validate
+AGAIN = 101  # the first of the seeds on which the best are simulated again
 BEST, KEPT = 60, 30  # populations that a round is drawn near, and that become presets
 
 RANGES = {  # from, to; all but `contrast` and `lapse` on a logarithmic scale
@@ -93,13 +94,14 @@ def main():
         search.study(number, rng.uniform(size=len(NAMES)), seed=0)
     for round_ in range(chosen.rounds):
         rng = np.random.default_rng([18, 1 + round_])
-        best = np.array([place for _, place in search.ranked()[:BEST]])
+        begin = chosen.first + round_ * chosen.per_round
+        best = np.array([place for _, place in search.best(begin)])
         spread = 1.4 * np.linalg.cholesky(np.cov(best.T) + 1e-4 * np.eye(len(NAMES)))
         for k in range(chosen.per_round):
             near = reflected(best[rng.integers(len(best))] + spread @ rng.standard_normal(len(NAMES)))
-            search.study(chosen.first + round_ * chosen.per_round + k, near, seed=1 + round_)
-    for number, place in search.ranked()[:BEST]:
-        for seed in range(101, 101 + chosen.again):
+            search.study(begin + k, near, seed=1 + round_)
+    for number, place in search.best(chosen.first + chosen.rounds * chosen.per_round):
+        for seed in range(AGAIN, AGAIN + chosen.again):
             search.study(number, place, seed)
 
 
@@ -107,9 +109,8 @@ class Search:
     """Rows of a file: a population's number, its place in the unit cube of RANGES, a seed, and what came out."""
 
     def __init__(self, path):
-        self._path = path
-        self.rows = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-        self._known = {(row["number"], row["seed"]) for row in self.rows}
+        self._rows = Rows(path)
+        self._known = {(row["number"], row["seed"]) for row in self._rows}
 
     def study(self, number, place, seed):
         if (number, seed) in self._known:
@@ -117,19 +118,17 @@ class Search:
         came = one_study(population_at(place), seed, number)
         row = {"number": number, "seed": seed, "place": [round(float(p), 6) for p in place], "came": came}
         row["distance"] = distance([came])
-        self.rows.append(row)
+        self._rows.add(row)
         self._known.add((number, seed))
-        with self._path.open("a") as file:
-            file.write(json.dumps(row) + "\n")
         print(number, seed, round(row["distance"], 1), flush=True)
 
     def studies(self, number):
-        return sum(row["number"] == number for row in self.rows)
+        return sum(row["number"] == number for row in self._rows)
 
-    def ranked(self):
+    def ranked(self, rows=None):
         """Numbers and places of all populations, by the distance of what their studies had in the mean."""
         by_number = {}
-        for row in self.rows:
+        for row in self._rows if rows is None else rows:
             by_number.setdefault(row["number"], []).append(row)
         each = [
             (distance([row["came"] for row in rows]), number, np.array(rows[0]["place"]))
@@ -137,17 +136,17 @@ class Search:
         ]
         return [(number, place) for _, number, place in sorted(each, key=lambda row: row[:2])]
 
+    def best(self, before):
+        """Of the populations with smaller numbers, by their first study alone: the same for a run that goes on."""
+        return self.ranked([row for row in self._rows if row["number"] < before and row["seed"] < AGAIN])[:BEST]
+
 
 def write(places):
     """The presets in the order of their distance from the paper; `paper` is nearest to their middle."""
     middle = np.mean(places, axis=0)
     nearest = int(np.argmin([np.sum((place - middle) ** 2) for place in places]))
-    text = FILE.read_text()
-    lines = [
-        re.sub(
-            r'(?m)^paper = "[^"]*"', f'paper = "paper-{nearest + 1:02d}"', text.partition("\n[populations.paper-0")[0]
-        )
-    ]
+    head, _, _ = FILE.read_text().partition("[populations.paper-0")
+    lines = [re.sub(r'(?m)^paper = "[^"]*"', f'paper = "paper-{nearest + 1:02d}"', head.rstrip())]
     for k, place in enumerate(places):
         p = population_at(place)
         truth = ", ".join(f"{name} = {value}" for name, value in p.truth.items())

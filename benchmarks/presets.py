@@ -3,15 +3,14 @@
     python benchmarks/presets.py FILE [--studies 8] [--first 5000] [--only paper-03]
     python benchmarks/presets.py FILE --write
 
-FILE (JSON Lines) collects a row for each study; a run that was stopped goes on where it was. Individuals' figures and
-the classes of the validation were looked at when the populations were chosen (benchmarks/preset_search.py), on other
-seeds. All else is a prediction: the preferences, how often the aggregate's set is preferred to individuals' own, the
-distance of the optimum from the truth, and the intervals on which "close" is the likeliest answer. --write puts the
-tables into docs/simulation.md.
+FILE (JSON Lines) collects a row for each study; a run that was stopped goes on where it was. What has been run is in
+benchmarks/presets.jsonl. Individuals' figures and the classes of the validation were looked at when the populations
+were chosen (benchmarks/preset_search.py), on other seeds. All else is a prediction: the preferences, how often the
+aggregate's set is preferred to individuals' own, the distance of the optimum from the truth, and the intervals on which
+"close" is the likeliest answer. --write puts the tables into docs/methods/simulation.md.
 """
 
 import argparse
-import json
 from pathlib import Path
 
 import jax
@@ -22,6 +21,7 @@ import equinox as eqx  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from preset_search import CROWD, STUDY, distance, individuals, truth_of, validation  # noqa: E402
+from rows import Rows  # noqa: E402
 
 from hilbo.errors import InputError  # noqa: E402
 from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
@@ -33,7 +33,7 @@ from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
 from hilbo.study.map_summary import best_mid_worst, slice_through  # noqa: E402
 
-PAGE = Path(__file__).parents[1] / "docs" / "simulation.md"
+PAGE = Path(__file__).parents[1] / "docs" / "methods" / "simulation.md"
 RULES = ("bcm", "learnt-1")
 PARAMETERS = ("K1", "B1", "alpha")
 
@@ -46,18 +46,17 @@ def main():
     options.add_argument("--only")
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    rows = [json.loads(line) for line in chosen.file.read_text().splitlines()] if chosen.file.exists() else []
+    rows = Rows(chosen.file)
     if chosen.write:
-        write(rows)
+        write(rows.rows)
         return
     known = {(row["population"], row["seed"]) for row in rows}
     for seed in range(chosen.first, chosen.first + chosen.studies):
-        for name in PRESETS.keys() - {"paper"} if chosen.only is None else [chosen.only]:
-            if (name, seed) in known:
+        for name in PRESETS:
+            if name == "paper" or (name, seed) in known or chosen.only not in (None, name):
                 continue
             row = {"population": name, "seed": seed} | one_study(PRESETS[name], seed)
-            with chosen.file.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            rows.add(row)
             print(name, seed, {rule: round(row["rules"][rule]["error"], 1) for rule in RULES}, flush=True)
 
 

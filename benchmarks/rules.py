@@ -11,7 +11,7 @@ The true map at x is the latent value under which the population's own probabili
 what infinitely many answers at x would lead to. For the hierarchical rule the noise includes how people differ. A
 person's true function likewise; the true share is the mean square of the functions' mean over their mean square.
 Optima are the best of 2,048 feasible points, refined three times among 256 around the best. --write puts table and
-figure into docs/aggregation.md and docs/aggregation.svg.
+figure into docs/methods/aggregation.md and docs/methods/aggregation.svg.
 """
 
 import argparse
@@ -26,6 +26,7 @@ from scipy.special import ndtr
 jax.config.update("jax_enable_x64", True)
 
 import equinox as eqx  # noqa: E402
+from pages import DOCS, put  # noqa: E402
 
 from hilbo.errors import InputError  # noqa: E402
 from hilbo.ordinal_gp import Trials, fit  # noqa: E402
@@ -212,10 +213,8 @@ def figure(rows):
 def write(rows, true_share, chosen):
     if not all(rows.values()):
         return
-    path = ROOT / "docs" / "aggregation.md"
-    head = path.read_text(encoding="utf-8").partition("<!-- measured -->\n")[0] if path.exists() else ""
-    path.write_text(f"{head}<!-- measured -->\n{table(rows, true_share, chosen)}", encoding="utf-8")
-    figure(rows).savefig(ROOT / "docs" / "aggregation.svg")
+    put("methods/aggregation.md", "rules", table(rows, true_share, chosen))
+    figure(rows).savefig(DOCS / "methods" / "aggregation.svg")
 
 
 if __name__ == "__main__":

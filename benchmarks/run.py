@@ -2,7 +2,7 @@
 
     python benchmarks/run.py            one core, one BLAS thread, for both
     python benchmarks/run.py --cores 2  both may use two cores
-    python benchmarks/run.py --write    both of these, and what limits them, into docs/benchmarks.md
+    python benchmarks/run.py --write    both of these, and what limits them, into docs/results/run_time.md
 
 The two take turns, round by round, hilbo once with Laplace and once with expectation propagation; a row is the median
 over the rounds and the ratio of medians. The live step is repeated many times, for its 99th percentile; it and the
@@ -17,6 +17,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from pages import put
 from run_document import document, floor_text, table
 
 ROOT = Path(__file__).parents[1]
@@ -33,7 +34,7 @@ def main():
     chosen = options.parse_args()
     if chosen.write:
         runs = [measured_elsewhere(cores, chosen.rounds) for cores in (1, 2)]
-        (ROOT / "docs" / "benchmarks.md").write_text(document(runs, chosen.rounds))
+        put("results/run_time.md", "run", document(runs, chosen.rounds))
         return
     limit_cores(chosen.cores)
     found = measure(chosen.rounds)

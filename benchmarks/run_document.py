@@ -9,7 +9,7 @@ NAMES = {
     "live step, alone": "the same, each in a loop of its own",
     "session": "25-trial session, `Session.start` to the last `tell`; NumPy: 5 given points, 20 such steps",
     "session, alone": "the same, each in a loop of its own",
-    "cohort": "24 people x 25 trials fitted, merged (BCM) at 20,000 points; screening in float32",
+    "cohort": "24 people x 25 trials fitted, aggregated (BCM) at 20,000 points; screening in float32",
     "cohort, float64": "the same in float64",
     "pooled": "one GP on 600 answers, and the best of 20,000 points",
     "pooled, all": "the same with mean and sd at all 20,000 points, float64",
@@ -53,25 +53,23 @@ def table(found):
 
 
 def document(runs, rounds):
-    """docs/benchmarks.md, from a run on one core and one on two."""
+    """A part of docs/results/run_time.md, from a run on one core and one on two."""
     import jax
 
     lines = [
-        "# Run time",
-        "",
         "Made by `python benchmarks/run.py --write` (`make bench` prints the first table). hilbo and the textbook",
         "NumPy form, benchmarks/reference_numpy.py, take turns in one run; medians of",
         f"{rounds} rounds ({40 * rounds} of the live step); {platform.machine()}, Python {platform.python_version()},",
-        f"jax {jax.__version__}. What the chosen points are worth: [choice.md](choice.md). Cold start:",
-        "[cold_start.md](cold_start.md). What is skipped: [skipping.md](skipping.md).",
+        f"jax {jax.__version__}. What the chosen points are worth:",
+        "[what sessions choose](accuracy.md#what-sessions-choose).",
         "",
-        "## One core, one BLAS thread",
+        "### One core, one BLAS thread",
         "",
         table(runs[0]),
-        "## Two cores, two BLAS threads",
+        "### Two cores, two BLAS threads",
         "",
         table(runs[1]),
-        "## What this machine needs for the operations alone",
+        "### What this machine needs for the operations alone",
         "",
         "Nanoseconds per exponential, and per multiplication with addition; by XLA on one core (two).",
         "",

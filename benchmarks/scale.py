@@ -1,7 +1,7 @@
 """Populations of 100 to 100,000 people refitted and merged: time per participant, memory, and agreement of processes.
 
     python benchmarks/scale.py                     the figures, on this machine's CPU
-    python benchmarks/scale.py --write             and docs/scale.md from them
+    python benchmarks/scale.py --write             and these into docs/results/run_time.md
     python benchmarks/scale.py --device gpu        participants and map points per second where JAX finds a GPU
     python benchmarks/scale.py --people 100 1000   other sizes
 
@@ -20,11 +20,14 @@ import sys
 import time
 from pathlib import Path
 
+from pages import put
+
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 POINTS, TRIALS = 2000, 25
 HEAD = (
-    "| participants | read, µs each | refit + merge, µs each | and optimum, µs each | own optima, µs each | peak MB |"
+    "| participants | read, µs each | refit + aggregate, µs each | and optimum, µs each | own optima, µs each"
+    " | peak MB |"
 )
 
 
@@ -44,13 +47,8 @@ def main():
         os.environ["JAX_PLATFORMS"] = "cpu"
     text = cpu_report(chosen) if chosen.device == "cpu" else gpu_report(chosen)
     print(text)
-    page = ROOT / "docs" / "scale.md"
     if chosen.write:
-        keep = page.read_text() if page.exists() else INTRODUCTION
-        mark = f"<!-- {chosen.device} -->"
-        parts = {m: keep.partition(m)[2].partition("<!--")[0] for m in ("<!-- cpu -->", "<!-- gpu -->") if m in keep}
-        parts[mark] = f"\n{text}\n"
-        page.write_text(keep.partition("<!--")[0] + "".join(m + parts[m] for m in sorted(parts)))
+        put("results/run_time.md", f"scale {chosen.device}", text)
 
 
 def cpu_report(chosen):
@@ -264,34 +262,6 @@ def run_gpu(people):
 
 def machine():
     return f"{len(os.sched_getaffinity(0))} cores ({platform.machine()}), Python {platform.python_version()}"
-
-
-INTRODUCTION = f"""# Scale
-
-How many participants can be refitted and merged, how long it takes and how much memory, measured by
-`python benchmarks/scale.py --write`: {TRIALS} answers each, the map at {POINTS:,} points, the paper's study, float64.
-
-`hilbo aggregate` works like this above 1,000 participants, on several devices (`--devices 4`, or all the GPUs there
-are), in several processes (`--distributed`), and with `--no-individuals`, which leaves out everybody's own optimum.
-
-* Read: the table is checked piece by piece; 60 bytes of each answer stay in memory.
-* Refit and merge: a fit takes about half of the time, the map the rest. Posteriors live in blocks of at most 256 people
-  on each device; the mode of each person stays, n numbers.
-* Optimum: passes over everybody for value, gradient and Hessian of the map, one for each Newton step.
-* Own optima: a search for each person, several times the rest together.
-
-Several processes are started by Slurm (`srun hilbo aggregate … --distributed`), Open MPI (`mpirun hilbo aggregate …
---distributed`), or by hand, here two on one machine:
-
-    export JAX_COORDINATOR_ADDRESS=localhost:9000 JAX_NUM_PROCESSES=2    # or --coordinator and --processes
-    hilbo aggregate trials.csv --study study.toml --out results --distributed --process-id 0 &
-    hilbo aggregate trials.csv --study study.toml --out results --distributed --process-id 1
-
-Each reads the table, and the first one writes. Blocks depend on the number of people alone and are added in their
-order, whichever process made them. If one process meets bad input, all end with one sentence and exit code 2; if one
-dies, the others end with an error within a minute or two.
-
-"""
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What hilbo does not compute, what that saves and what it costs in accuracy; writes docs/skipping.md with --write.
+"""What hilbo does not compute, what that saves and what it costs in accuracy; --write: into docs/results/run_time.md.
 
     python benchmarks/skipping.py --write
 
@@ -10,9 +10,9 @@ import argparse
 
 import numpy as np
 import run
+from pages import put
 
-HEAD = """# What a scene does not need
-
+HEAD = """\
 Made by `python benchmarks/skipping.py --write`, on one core: the fastest of {rounds} rounds, with and without the skip
 in turn. Errors are the largest over all points, in units of the prior's sd. "Bound" is what the code guarantees.
 
@@ -167,7 +167,7 @@ def main():
     text = HEAD.format(rounds=chosen.rounds) + "\n".join([*lines, *notes]) + "\n"
     print(text)
     if chosen.write:
-        (run.ROOT / "docs" / "skipping.md").write_text(text)
+        put("results/run_time.md", "skipping", text)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Fit settings that nobody should choose by every inference in both precisions; writes docs/stress.md.
+"""Fit settings that nobody should choose by every inference in both precisions; for docs/results/accuracy.md.
 
     python benchmarks/stress.py [--write] [--quick] [--small]
 
@@ -10,7 +10,6 @@ minutes on one core; --quick fits a tenth of the cases, --small those of up to 2
 """
 
 import functools
-import os
 import sys
 import time
 from dataclasses import dataclass
@@ -203,9 +202,7 @@ def _committee(count, prior, strongest, dtype):
     return np.max(np.abs(mean - true_mean) / size), np.max(np.abs(variance / true_variance - 1))
 
 
-PAGE = """# Stress
-
-Made by `python benchmarks/stress.py --write`; `tests/inference/test_stress.py` holds a part of it,
+PAGE = """Made by `python benchmarks/stress.py --write`; `tests/inference/test_stress.py` holds a part of it,
 `tests/inference/test_hostile.py` and `tests/inference/test_ep.py` a full grid of 540 milder cases.
 
 Noise 1e-4 to 10, theta 1e-3 to 1e5, prior variance 1e-6 to 1e6, gaps between thresholds 1e-4 to 1e2, 2 to 10
@@ -226,7 +223,7 @@ Fits that said no, by the prior's standard deviation over the noise:
 So: keep the prior's sd below about 1e4 times the noise, in float32 below 1e2 times; beyond it answers that contradict
 each other ask for more digits than there are.
 
-## Committees
+### Committees
 
 1 to 10,000 experts who explain from 1e-12 to all but 1e-4 of the prior variance (1e-6, 1, 1e6), against 50 digits.
 Relative to the variance, and to the sum of the sizes of the mean's terms; in float32 the variances handed over are
@@ -250,10 +247,9 @@ def main() -> None:
     )
     print(text)
     if "--write" in sys.argv[1:]:
-        target = ROOT / "docs" / "stress.md"
-        temporary = target.with_suffix(".tmp")
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, target)
+        from pages import put  # beside this file: found when it is run, not when a test imports it
+
+        put("results/accuracy.md", "stress", text)
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""Run time against error: inference, the committee machine, the acquisition's optimum; writes docs/work_precision.md
-and .svg.
+"""Run time against error: inference, the committee machine, the acquisition's optimum; into docs/results/accuracy.md
+and work_precision.svg beside it.
 
     python benchmarks/work_precision.py            everything (half an hour on one core, most of it compilation)
     python benchmarks/work_precision.py 10 25      these numbers of answers only, and nothing written
@@ -27,6 +27,7 @@ import numpy as np
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
+from benchmarks import pages  # noqa: E402
 from benchmarks import work_precision_maps as maps  # noqa: E402
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Study, Trials, fit  # noqa: E402
 from hilbo.inference.ep import ep  # noqa: E402
@@ -258,14 +259,12 @@ def main():
     text = PAGE.format(table=table(results, sizes), kinds=by_kind(results, sizes), bcm=maps.committee(REFERENCE),
                        optimum=maps.optimum())  # fmt: skip
     print(text)
-    folder = ROOT / "docs" if not asked else Path(os.environ.get("TMPDIR", "/tmp"))
-    draw(results, floors, sizes, folder / "work_precision.svg")
-    (folder / "work_precision.md").write_text(text, encoding="utf-8")
+    if not asked:
+        draw(results, floors, sizes, ROOT / "docs" / "results" / "work_precision.svg")
+        pages.put("results/accuracy.md", "work precision", text)
 
 
-PAGE = """# Run time against error
-
-Made by `python benchmarks/work_precision.py`, one thread, x86-64. Low and left is good.
+PAGE = """Made by `python benchmarks/work_precision.py`, one thread, x86-64. Low and left is good.
 
 ![Run time against error of the mean and of the log evidence](work_precision.svg)
 
@@ -278,9 +277,9 @@ reference's posterior, the point has that the method would ask next. "exact, N":
 
 "ep_corrected" costs a little more than EP and errs no more than `exact` with thousands of samples, at a small part of
 its price.
-Float32 changes none of the errors and saves a third of the time of `exact` ([precision.md](precision.md)).
+Float32 changes none of the errors and saves a third of the time of `exact` ([below](#float32-against-float64)).
 
-## By kind of data
+### By kind of data
 
 RMS errors of mean and sd over 200 points, and of the log evidence. The noise is 0.5, of near-separable data 0.1, of
 real people 0.47.
@@ -289,9 +288,9 @@ real people 0.47.
 
 EP stays within .002 in the mean and .03 in the evidence at noise 0.5 up to 25 answers, within .003 and .15 at noise
 0.1. With more answers its own error, the third cumulants of neighbouring answers, exceeds that
-([inference.md](inference.md)); the corrected one stays within.
+([inference](../methods/inference.md)); the corrected one stays within.
 
-## The committee machine
+### The committee machine
 
 100 answers of one latent function, shared out among people: the committee's map (BCM) against the pooled exact
 posterior (noise 0.5, theta 10, RMS over 200 points, in prior sds), by what the people's posteriors were fitted with.
@@ -299,7 +298,7 @@ What is left with `exact` is the committee's own approximation, that people are 
 
 {bcm}
 
-## The acquisition's optimum
+### The acquisition's optimum
 
 UCB maximised over the passive set of the preset `paper`, in 24 states of 5 to 25 answers: how much less than the best
 known (65,536 points inside and 16,384 on the walls, 24 of them polished), and the time of a choice. Candidates are
