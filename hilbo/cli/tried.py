@@ -1,0 +1,128 @@
+"""`hilbo try`: take part in a session in three minutes, with a mouse in place of a device.
+
+hilbo try
+hilbo try --trials 25 --seed 7 --out tried
+"""
+
+import contextlib
+import re
+import secrets
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hilbo.cli.console import progress, seed_option, start
+from hilbo.cli.live import need_extra
+from hilbo.errors import InputError
+
+__all__ = ["study_text", "tried"]
+
+_LINE = re.compile(r"^trials = \d+$", re.MULTILINE)
+_TRIALS = 20
+
+
+def tried(
+    study: Annotated[
+        Path | None,
+        typer.Argument(help="Study file of K1, B1 and alpha that a program presents; by default hilbo's own."),
+    ] = None,
+    trials: Annotated[int | None, typer.Option(min=15, max=25, help=f"How many blocks; {_TRIALS} by default.")] = None,
+    seed: Annotated[int | None, seed_option("of what is hidden and of the first blocks; else by chance")] = None,
+    port: Annotated[int, typer.Option("--port", help="Port of the server; 0 takes any.")] = 0,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for study and log; by default a new one.")] = None,
+    browse: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in this computer's browser.")] = True,
+) -> None:
+    """Take part yourself: compare soft blocks under the mouse, and see your own map. No device is needed."""
+    need_extra()
+    from hilbo.app import serve
+
+    text = study_text(study, trials)
+    if browse:
+        _need_browser()
+    seed = secrets.randbelow(2**31) if seed is None else seed
+    with contextlib.ExitStack() as held:
+        place = serve.bound(port)
+        held.callback(place.socket.close)
+        folder = held.enter_context(_folder(out))
+        (folder / "study.toml").write_text(text, encoding="utf-8")
+        with progress() as say:
+            say("loading")
+            start()
+            hub, log, page = _opened(folder, seed, say)
+        held.callback(log.close)
+        serve.serve(place, hub, lambda _: _started(place, log.path, browse), page)
+
+
+def _opened(folder, seed, say):
+    """The hub of a session whose reference is hidden, its log, and what its page is told."""
+    from hilbo.app.opening import Wanted, opened
+    from hilbo.app.tried import Tried, hidden_reference
+    from hilbo.study.study_file import StudyFile
+
+    study = StudyFile.load(folder / "study.toml")
+    reference = hidden_reference(study, seed)
+    wanted = Wanted(folder / "study.toml", f"try-{seed}", seed=seed, logs=folder / "logs", reference=reference)
+    hub, log = opened(wanted, lambda _: None, say)
+    hub.gap = 0.4
+    return hub, log, Tried(study, reference)
+
+
+def study_text(source: Path | None, trials: int | None) -> str:
+    """The study file of a session: hilbo's own with so many trials, or a given one as it is. Raises `InputError`."""
+    from importlib.resources import files
+
+    if source is None:
+        text = (files("hilbo") / "data" / "try.toml").read_text(encoding="utf-8")
+        return _LINE.sub(f"trials = {_TRIALS if trials is None else trials}", text)
+    if trials is not None:
+        raise InputError(f"--trials: {source} says how many there are ([selection] trials); leave the option out.")
+    from hilbo.app.tried import check_study
+    from hilbo.study.study_file import StudyFile
+
+    check_study(StudyFile.load(source))
+    return source.read_text(encoding="utf-8-sig")
+
+
+@contextlib.contextmanager
+def _folder(out):
+    """A folder for study and log: a new one stays if there is an answer in it."""
+    if out is not None:
+        if out.exists() and (not out.is_dir() or any(out.iterdir())):
+            raise InputError(f"{out}: exists already; choose another --out.")
+        out.mkdir(parents=True, exist_ok=True)
+        yield out
+        return
+    folder = Path(tempfile.mkdtemp(prefix="hilbo-try-"))
+    try:
+        yield folder
+    finally:
+        if not any('"kind":"answer"' in path.read_text("utf-8") for path in folder.glob("logs/*.jsonl")):
+            shutil.rmtree(folder)
+
+
+def _need_browser() -> None:
+    import webbrowser
+
+    try:
+        webbrowser.get()
+    except webbrowser.Error:
+        raise InputError(
+            "no browser was found on this computer; add --no-open, and open the link that is printed."
+        ) from None
+
+
+def _started(place, log: Path, browse: bool) -> None:
+    """The page's link, with the tokens of the two roles that it has."""
+    links = place.links(("participant", "stimulus"))
+    address, _, token = links["participant"].partition("/#")
+    link = f"{address}/try#{token}.{links['stimulus'].partition('/#')[2]}"
+    print(f"page: {link}\nlog:  {log}", file=sys.stderr)
+    print("The link opens once. Ctrl-C ends it.", file=sys.stderr, flush=True)
+    if browse:
+        import webbrowser
+
+        webbrowser.open(link)
