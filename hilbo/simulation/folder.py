@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hilbo.simulation import simulate
-from hilbo.simulation.presets import preset_of
+from hilbo.simulation.presets import placed, population_of
 from hilbo.simulation.simulate import Population
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
@@ -27,14 +27,15 @@ class Simulated(NamedTuple):
     truth: Float[np.ndarray, " d"]
 
 
-def simulate_folder(folder: Path, preset: str, count: int, seed: int, source: Path | None = None) -> Simulated:
-    """Simulate `count` people of a preset and write trials.csv, truth.csv and study.toml.
+def simulate_folder(folder: Path, preset: str | None, count: int, seed: int, source: Path | None = None) -> Simulated:
+    """Simulate `count` people and write trials.csv, truth.csv and study.toml.
 
-    `source`: a study file in place of the paper's. Raises InputError for a preset that there is not.
+    `preset`: whose people, as in `population_of`. `source`: a study file in place of the paper's. Raises
+    InputError for a preset that there is not.
     """
-    population = preset_of(preset)
     path = Path(str(files("hilbo") / "data" / "paper.toml")) if source is None else source
     study = Study.load(path)
+    population = placed(study, population_of(study, preset)[1], seed)
     people = simulate.people(study, population, count, seed)
     table = simulate.to_table(study, simulate.simulate_study(study, people, seed))
     write_trials(table, folder / "trials.csv")

@@ -1,23 +1,30 @@
-"""Populations by name, from hilbo/data/populations.toml; docs/simulation.md says how they were made.
+"""Populations by name, from hilbo/data/populations.toml; docs/methods/simulation.md says how they were made.
 
 `paper-01` to `paper-30` agree with the paper's individuals and with its validation as well as could be; `paper` is the
 one of them that is nearest to their middle. `paper-individuals` agrees with the individuals alone.
 """
 
+import dataclasses
 import tomllib
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
+
 from hilbo.errors import InputError
 from hilbo.simulation.simulate import Population
+from hilbo.study.config import Study
+from hilbo.study.simulation_table import SimulationTable, each
 
-__all__ = ["PRESETS", "preset_of"]
+__all__ = ["PRESETS", "placed", "population_of", "preset_of"]
+
+_STEP = 1.5  # from one criterion to the next, in tolerances, where a study states none
 
 
 def _read() -> dict[str, Population]:
     content = tomllib.loads((files("hilbo") / "data" / "populations.toml").read_text(encoding="utf-8"))
-    each = {name: _population(table) for name, table in content["populations"].items()}
-    return {"paper": each[content["paper"]]} | each
+    populations = {name: _population(table) for name, table in content["populations"].items()}
+    return {"paper": populations[content["paper"]]} | populations
 
 
 def _population(table: dict[str, Any]) -> Population:
@@ -33,3 +40,56 @@ def preset_of(name: str) -> Population:
     if name not in PRESETS:
         raise InputError(f'--preset is "{name}"; there are {", ".join(PRESETS)}.')
     return PRESETS[name]
+
+
+def population_of(study: Study, preset: str | None = None) -> tuple[str, Population]:
+    """What a study's simulated people are called, and the population that they are drawn from: the preset if one is
+    asked for, else the study's [simulation], else `paper` for a study like the paper's, else that table's defaults.
+
+    Its truth may be missing: see `placed`. Raises InputError for a preset that there is not or of other parameters."""
+    paper = PRESETS["paper"]
+    fits = _of_these_ranges(study, paper) and len(study.responses) == 1 + len(paper.criteria)
+    if preset is None and not (study.simulation is None and fits):
+        words = (
+            "the study's [simulation]" if study.simulation else "people of no preset, with the defaults of [simulation]"
+        )
+        return words, _stated(study, study.simulation or SimulationTable())
+    name = preset or "paper"
+    population = preset_of(name)
+    if not _of_these_ranges(study, population):
+        truth = ", ".join(f"{key} = {value:g}" for key, value in population.truth.items())
+        ranges = ", ".join(f"{p.name} from {p.low:g} to {p.high:g}" for p in study.space.parameters)
+        raise InputError(
+            f'--preset is "{name}", whose people like {truth}, and the study has {ranges}; leave --preset out, and'
+            " state [simulation] in the study file."
+        )
+    return name, population
+
+
+def _of_these_ranges(study: Study, population: Population) -> bool:
+    """Whether the population's truth is one of the study's renderings."""
+    parameters, truth = study.space.parameters, population.truth
+    return {p.name for p in parameters} == set(truth) and all(p.low <= truth[p.name] <= p.high for p in parameters)
+
+
+def _stated(study: Study, table: SimulationTable) -> Population:
+    dim, steps = study.space.dim, len(study.responses) - 1
+    return Population(
+        truth=table.truth,
+        spread=each(table.spread, dim),
+        tolerance=each(table.tolerance, dim),
+        tolerance_sd=table.tolerance_sd,
+        criteria=table.criteria or tuple(1 + _STEP * k for k in reversed(range(steps))),
+        noise=table.noise,
+        lapse=table.lapse,
+        drift_sd=table.drift_sd,
+    )
+
+
+def placed(study: Study, population: Population, seed: int) -> Population:
+    """The population with its truth; where it states none, with one drawn evenly from what may be rendered."""
+    if population.truth:
+        return population
+    points = np.asarray(study.space.to_physical(study.space.candidates(256, 0)))
+    drawn = points[np.random.default_rng([seed, 17]).integers(len(points))]
+    return dataclasses.replace(population, truth=dict(zip(study.space.names, drawn.tolist(), strict=True)))

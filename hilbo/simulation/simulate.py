@@ -26,6 +26,8 @@ from hilbo.study.config import Study
 
 __all__ = ["Person", "Population", "people", "simulate_study", "to_table", "truth_table"]
 
+_MOST_DRAWS = 2000  # of 64 people each
+
 
 class Person(eqx.Module):
     """A simulated participant; leading axes for several. All in unit-cube coordinates."""
@@ -40,7 +42,10 @@ class Person(eqx.Module):
     drift: Float[Array, "*M"]
 
     def answer(self, key: PRNGKeyArray, x: Float[Array, " d"], progress: Float[Array, ""]) -> Int[Array, ""]:
-        """Category of the answer to the rendering `x` after the share `progress` of the session."""
+        """Category of the answer to the rendering `x` after the share `progress` of the session.
+
+        `x` (d,) in the unit cube, `progress` from 0 to 1 -> a scalar in 0..C-1.
+        """
         perceive, lapse, guess = jax.random.split(key, 3)
         distance = jnp.sqrt(jnp.sum(((x - self.optimum) / self.tolerance) ** 2))
         felt = distance + self.drift * progress + self.noise * jax.random.normal(perceive, (), x.dtype)
@@ -70,7 +75,10 @@ class Population(eqx.Module):
 
 
 def people(study: Study, population: Population, count: int, seed: int) -> Person:
-    """`count` people drawn from the population, stacked."""
+    """`count` people drawn from the population, stacked.
+
+    Raises `InputError` if their criteria do not fit the study's number of responses.
+    """
     if len(population.criteria) != len(study.responses) - 1:
         raise InputError(
             f"simulate: the population has {len(population.criteria)} criteria, but the study's {len(study.responses)}"
@@ -79,11 +87,18 @@ def people(study: Study, population: Population, count: int, seed: int) -> Perso
     rng = np.random.default_rng(seed)
     truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
     optima = np.empty((0, study.space.dim))
-    while len(optima) < count:
+    for _ in range(_MOST_DRAWS):
+        if len(optima) >= count:
+            break
         drawn = truth + np.array(population.spread) * rng.standard_normal((64, study.space.dim))
         inside = np.all((drawn >= 0) & (drawn <= 1), axis=1)
         drawn = drawn[inside]
         optima = np.concatenate([optima, drawn[np.asarray(study.space.feasible(drawn))]])
+    if len(optima) < count:
+        raise InputError(
+            f"simulate: of {64 * _MOST_DRAWS:,} people drawn around the truth only {len(optima)} like a rendering of"
+            " this study; move the truth of [simulation] into what may be rendered, or make its spread smaller."
+        )
     factor = np.exp(population.tolerance_sd * rng.standard_normal((count, 1)))
     return Person(
         optimum=jnp.asarray(optima[:count]),

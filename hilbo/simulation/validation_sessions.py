@@ -27,7 +27,9 @@ _TWICE = 2  # that a judge compares an individual's set with the aggregate's
 
 def sets_table(study: Study, sets: Sets, individuals: Float[np.ndarray, "M d"]) -> pd.DataFrame:
     """Best, mid and worst of the aggregate map (the aggregate's set is best), and everybody's own under a code, as in a
-    plan: a sets table with a column `role`."""
+    plan: a sets table with a column `role`.
+    `individuals` (M, d) in the unit cube.
+    """
     rows = [
         {"set_id": role, "source": "aggregate", "role": role} | set_of(study.space, x)
         for role, x in zip(("best", "mid", "worst"), np.asarray(sets.x), strict=True)

@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition, bcm
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.shown import shown
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
@@ -66,6 +67,10 @@ class Optimum(eqx.Module):
     sd: Float[Array, "*s"]
     class_probabilities: Float[Array, "*s C"]
 
+    def __repr__(self) -> str:
+        f, chances = f"{shown(self.mean)} ± {shown(self.sd)}", shown(self.class_probabilities)
+        return f"Optimum(x={shown(self.x)} of the unit cube, f = {f}, answers {chances})"
+
 
 First = Callable[[Optimum, RuleMap], None]
 
@@ -101,7 +106,7 @@ class Aggregate(eqx.Module):
 
     @property
     def asked_variance(self) -> Float[Array, ""]:
-        """Largest variance of the map at a point that somebody answered."""
+        """Largest variance of the map at a point that somebody answered. A scalar."""
         return asked_variance(self.map, self.cohort)
 
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
@@ -120,7 +125,7 @@ class Aggregate(eqx.Module):
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"]:
-        """Plain average of the individuals' optima in the unit cube: what the paper compares the map with."""
+        """Plain average of the individuals' optima in the unit cube: what the paper compares the map with. (d,)."""
         return jnp.mean(self.individuals.x, axis=0)
 
 
@@ -173,7 +178,10 @@ def population_optimum(
     rule: Rule = "bcm",
     share: Float[Array, ""] | None = None,
 ) -> Optimum:
-    """Where the population map's mean is largest in the feasible set."""
+    """Where the population map's mean is largest in the feasible set.
+
+    `posteriors`: stacked, M people; `candidates` (m, d) feasible points of the unit cube.
+    """
     return _population_optimum(study.gp, study.space, posteriors, candidates, rule, share)
 
 
@@ -185,7 +193,9 @@ def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidate
 
 def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
     """Where a rule's map has its largest mean in the feasible set; by learnt-1 where a new person answers with the
-    highest category most often, among points of which the answers tell as much as of some that were asked."""
+    highest category most often, among points of which the answers tell as much as of some that were asked.
+    `candidates` (m, d): feasible points of the unit cube, where the search begins.
+    """
     return _map_optimum(study.gp.likelihood, study.space, found, candidates)
 
 
@@ -237,7 +247,11 @@ def _optimum(
 
 
 def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
-    """Where each participant's posterior mean is largest in the feasible set, stacked; one after the other."""
+    """Where each participant's posterior mean is largest in the feasible set, stacked; one after the other.
+
+    `posteriors`: stacked, M people; `candidates` (m, d) feasible points of the unit cube. All arrays of the result
+    begin with M.
+    """
     return _individual_optima(study.space, posteriors, candidates)
 
 
@@ -345,7 +359,7 @@ def _rule_map(
 
 
 def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""]:
-    """Largest variance of a map at a point that somebody answered."""
+    """Largest variance of a map at a point that somebody answered. A scalar."""
     if map_.reach is not None:
         return map_.reach
     points = np.unique(np.asarray(cohort.trials.x)[np.asarray(cohort.trials.mask)], axis=0)
@@ -353,5 +367,8 @@ def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""]:
 
 
 def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array, "*s"]:
-    """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube."""
+    """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube.
+
+    `x` (..., d), `reference` (d,) -> (...,), shares of the ranges.
+    """
     return jnp.sqrt(jnp.mean((x - jnp.broadcast_to(reference, x.shape)) ** 2, axis=-1))

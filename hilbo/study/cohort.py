@@ -35,7 +35,7 @@ class Cohort(eqx.Module):
         return Cohort(jax.vmap(lambda t: t.first(count))(self.trials), self.physical, self.names)
 
     def of(self, names: Sequence[str]) -> "Cohort":
-        """Only these participants."""
+        """Only these participants. Raises `InputError` for a name that the table does not have."""
         present = set(self.names)
         unknown = [name for name in names if name not in present]
         if unknown:
@@ -46,12 +46,12 @@ class Cohort(eqx.Module):
         return self.rows(np.array([places[name] for name in names]))
 
     def rows(self, rows: Int[np.ndarray, " k"]) -> "Cohort":
-        """Only the participants in these places."""
+        """Only the participants in these places. `rows` (k,): numbers from 0."""
         names = tuple(self.names[row] for row in rows)
         return Cohort(rows_of(self.trials, rows), self.physical[rows], names)
 
     def counts(self) -> Int[np.ndarray, " M"]:
-        """Answers of each participant."""
+        """Answers of each participant. (M,)."""
         return np.asarray(self.trials.mask.sum(axis=1))
 
 
@@ -59,6 +59,7 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     """Participants from a checked trial table (`trial_table.read_trials`), in order of their first appearance.
 
     `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
+    Raises `InputError` for a `capacity` that somebody's answers exceed.
     """
     person, names = pd.factorize(table["participant"])
     counts = np.bincount(person)

@@ -12,6 +12,7 @@ from hilbo.population.learnt_posterior import NOTHING, Stated, prior_model
 from hilbo.population.maps import AnyRule
 from hilbo.search.space import SearchSpace
 from hilbo.study.protocols import SessionTable
+from hilbo.study.simulation_table import SimulationTable
 from hilbo.study.stimulus_table import StimulusTable
 from hilbo.study.study_file import StudyFile, checked, hash_of, made_of_material, materials_in, read_study
 from hilbo.study.study_tables import Inference, ReportTable, Selection
@@ -43,6 +44,8 @@ class Study(eqx.Module):
     report: ReportTable = eqx.field(static=True, repr=False, default=ReportTable())
     stimulus: StimulusTable | None = eqx.field(static=True, repr=False, default=None)
     """What is asked of the program that presents the renderings; None where a device does."""
+    simulation: SimulationTable | None = eqx.field(static=True, repr=False, default=None)
+    """Of whom `hilbo simulate` and `hilbo power` draw people, if the file states it."""
     stated: Stated = eqx.field(static=True, repr=False, default=NOTHING)
     """What the file states of the model, where the rule learns the rest."""
     learnt: Learnt | None = eqx.field(repr=False, default=None)
@@ -78,8 +81,13 @@ class Study(eqx.Module):
             session=file.session,
             report=file.tables.report,
             stimulus=file.stimulus,
+            simulation=file.tables.simulation,
             stated=stated,
         )
+
+    def __repr__(self) -> str:
+        ranges = ", ".join(f"{p.name} {p.low:g} to {p.high:g} {p.unit}".rstrip() for p in self.space.parameters)
+        return f'Study("{self.name}": {ranges}; {", ".join(self.responses)}; rule {self.rule}; hash {self.hash})'
 
     @property
     def hash(self) -> str:

@@ -22,9 +22,11 @@ __all__ = [
     "Positive",
     "Table",
     "check_keys",
+    "check_present",
     "check_table",
     "enclosing",
     "lines_of",
+    "missing_keys",
     "prefix",
     "read_table",
     "shown",
@@ -53,7 +55,7 @@ _T = TypeVar("_T", bound=Table)
 def read_table(kind: type[_T], raw: Any, path: str) -> _T:
     """A parsed table as its record. Raises `InputError` with the key's path first."""
     fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
-    check_keys(raw, path, fields, [key for key, field in fields.items() if field.required])
+    check_present(missing_keys(kind, raw, path))
     return kind(**{key: _read_field(fields[key].type, value, f"{path}.{key}") for key, value in raw.items()})
 
 
@@ -81,24 +83,45 @@ def _read_value(kind: Any, raw: Any, path: str) -> Any:
     raise InputError(f"{path} is {shown(raw)}, it must be {must}{example}.")
 
 
-def check_keys(raw: Any, path: str, known: Iterable[str], required: Iterable[str] = ()) -> None:
-    """Refuse what is no table, has a key that is not known, or lacks a required one."""
+def check_keys(raw: Any, path: str, known: Iterable[str]) -> None:
+    """Refuse what is no table, or has a key that is not known."""
     check_table(raw, path)
     dot = f"{path}." if path else ""
     for key in raw:
         if key not in known:
             raise InputError(f"{dot}{key} is not a key of a study file, those known here are {', '.join(known)}.")
-    for key in required:
-        if key not in raw:
-            raise InputError(f"{dot}{key} is missing, add it.")
 
 
-def check_table(raw: Any, path: str) -> None:
-    """Refuse what is no table, and a table whose name would be run as a formula at the head of a column."""
+def missing_keys(kind: type[Table], raw: Any, path: str) -> Iterator[str]:
+    """Paths of the required keys that a parsed table lacks, and of those that the tables within it lack.
+
+    Raises `InputError` for what is no table, or has a key that is not known: it may be a missing one, misspelt."""
+    fields = msgspec.structs.fields(kind)
+    check_keys(raw, path, [field.encode_name for field in fields])
+    for field in fields:
+        key = f"{path}.{field.encode_name}"
+        if field.encode_name in raw and isinstance(field.type, type) and issubclass(field.type, Table):
+            yield from missing_keys(field.type, raw[field.encode_name], key)
+        elif field.required and field.encode_name not in raw:
+            yield key
+
+
+def check_present(missing: Iterable[str], rest: str = "") -> None:
+    """Refuse what lacks these keys, all of them in one sentence, which `rest` ends."""
+    keys = list(missing)
+    if keys:
+        first, *others = keys
+        also = f" and so {'is' if len(others) == 1 else 'are'} {', '.join(others)}" if others else ""
+        raise InputError(f"{first} is missing{also}, add {'them' if others else 'it'}{rest}.")
+
+
+def check_table(raw: Any, path: str) -> Mapping[str, Any]:
+    """The table; refuses what is none, and one whose name would be run as a formula at the head of a column."""
     if runs_in_a_spreadsheet(path.partition(".")[2]):
         raise InputError(f"{path} has a name {FORMULA_WORDS}.")
     if not isinstance(raw, Mapping):
         raise InputError(f"{path} is {shown(raw)}, it must be a table; write it as [{path}].")
+    return raw
 
 
 def shown(value: Any) -> str:

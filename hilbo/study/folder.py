@@ -19,9 +19,10 @@ import pandas as pd
 from jaxtyping import Float
 
 from hilbo.errors import InputError
+from hilbo.study.cells import numbers, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
-from hilbo.study.trial_table import check_texts, numbers, read_cells, read_trials
+from hilbo.study.trial_table import check_texts, read_trials
 from hilbo.study.validation_table import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]

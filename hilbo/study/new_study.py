@@ -18,14 +18,14 @@ K_eff = 0.44                         # N/mm, of the reference: measure yours (hi
 damping = 0.95                       # N.s/m, of the device: measure yours (hilbo device measure-damping)
 """
 _STIMULUS = """
-[stimulus]                           # a program of yours presents (docs/stimulus.md)
+[stimulus]                           # a program of yours presents (docs/guides/stimulus.md)
 within = 1.0                         # s until it has confirmed what is presented; later voids the trial
 silence = 1.0                        # s without a word until the program counts as gone
 # How far what is really presented may be off; else a millionth of the range. Answers count for what was confirmed.
 # tolerance = {tolerance}
 """
 _TEXTS = """
-[session.texts]                      # what participants read; docs/sessions.md has all of them
+[session.texts]                      # what participants read; docs/guides/sessions.md has all of them
 title = "Compare"
 hello = "One after the other is presented. Then say how similar they were. There is no right or wrong answer."
 feel_reference = "The reference"
@@ -89,8 +89,8 @@ def study_text(new: NewStudy) -> str:
             *(line for p in parameters for line in _table(p)),
             _MODEL if new.device else _STIMULUS.replace("{tolerance}", _tolerance(parameters)),
             "[gp]                                 # what is believed of people before any answer",
-            f"theta = {30.0 if new.device else 10.0}                         # how quickly answers change over a range;"
-            " hilbo aggregate --rule learnt-1 learns it",
+            f"length = {0.13 if new.device else 0.22}                       # over what part of a range answers change:"
+            " rule learnt-1 learns it",
             "variance = 1.0",
             f"thresholds = {_thresholds(len(new.responses))}            # between one answer and the next",
             "noise = 0.5                          # how much one answer to the same thing differs from another",

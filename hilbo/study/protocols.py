@@ -7,10 +7,11 @@ The study file's optional table [session] changes them:
 
     [session]
     protocol_number = "2025-17"            # of the ethics approval
+    language = "de"                        # hilbo/data/texts has the texts of each
     [session.optimisation]
     steps = [{show = "reference", seconds = 4}, {show = "a", seconds = 4}]
     [session.texts]
-    question = "…"                         # any key of TEXTS
+    question = "…"                         # any key of hilbo/data/texts/en.toml
     [session.labels]
     close = "…"                            # how an answer is written on its button
     [session.definitions]
@@ -26,8 +27,9 @@ import msgspec
 
 from hilbo.errors import InputError
 from hilbo.study.fields import Positive, Table, shown, words
+from hilbo.study.languages import LANGUAGES, LanguageName, language
 
-__all__ = ["PHASES", "TEXTS", "Ask", "Phase", "PhaseTable", "Protocol", "SessionTable", "Show", "Step", "protocol"]
+__all__ = ["PHASES", "Ask", "Phase", "PhaseTable", "Protocol", "SessionTable", "Show", "Step", "protocol"]
 
 Show = Literal["reference", "a", "b", "neutral"]
 Phase = Literal["warm-up", "optimisation", "validation", "aggregate-best"]
@@ -89,6 +91,7 @@ class SessionTable(Table, frozen=True):
     """[session]: what a study says of its live sessions."""
 
     protocol_number: Annotated[str, words("a text", '"2025-17"')] = ""
+    language: Annotated[LanguageName, words("one of " + ", ".join(f'"{name}"' for name in LANGUAGES), '"de"')] = "en"
     texts: _Texts = msgspec.field(default_factory=dict)
     labels: _Texts = msgspec.field(default_factory=dict)
     definitions: _Texts = msgspec.field(default_factory=dict)
@@ -100,7 +103,7 @@ class SessionTable(Table, frozen=True):
     def check(self, responses: Sequence[str]) -> None:
         """Refuse texts that nobody asks for, and steps that do not show what is asked about. Raises `InputError`."""
         for name, table, allowed in (
-            ("texts", self.texts, tuple(TEXTS)),
+            ("texts", self.texts, tuple(language("en").texts)),
             ("labels", self.labels, tuple(responses)),
             ("definitions", self.definitions, tuple(responses)),
         ):
@@ -111,16 +114,21 @@ class SessionTable(Table, frozen=True):
             _check_steps(phase, protocol(self, phase))
 
     def text(self, key: str) -> str:
-        """A text that participants see, in the study's words or the shipped English ones."""
-        return self.texts.get(key, TEXTS[key])
+        """A text that participants see, in the study's words or the shipped ones of its language."""
+        return self.texts.get(key, language(self.language).texts[key])
+
+    def untranslated(self, responses: Sequence[str]) -> list[str]:
+        """The answers whose words on the buttons are in no language but the study file's."""
+        known = {**language(self.language).labels, **self.labels}
+        return [] if self.language == "en" else [response for response in responses if response not in known]
 
     def label(self, response: str) -> str:
         """How an answer is written on its button."""
-        return self.labels.get(response, response.capitalize())
+        return self.labels.get(response, language(self.language).labels.get(response, response.capitalize()))
 
     def definition(self, response: str) -> str:
         """What an answer means."""
-        return self.definitions.get(response, DEFINITIONS.get(response, ""))
+        return self.definitions.get(response, language(self.language).definitions.get(response, ""))
 
 
 def protocol(session: SessionTable, phase: Phase) -> Protocol:
@@ -152,48 +160,3 @@ _PRESETS: dict[Phase, Protocol] = {
     "validation": Protocol("validation", _COMPARED, ("class_a", "class_b", "preferred"), 4),
     "aggregate-best": Protocol("aggregate-best", _COMPARED, ("preferred",), 2, rest=600.0),
 }
-
-DEFINITIONS = {
-    "close": "The tested haptic interface feels the same or highly close to the reference haptic interface.",
-    "similar": "The tested haptic interface feels moderately similar to the reference haptic interface.",
-    "different": "The tested haptic interface feels significantly different from the reference haptic interface.",
-}
-"""The paper's, verbatim."""
-
-TEXTS = {
-    "lang": "en",
-    "title": "Feel and compare",
-    "hello": "Feel one after the other, then say how similar they were. There is no right or wrong answer.",
-    "start": "Begin",
-    "space_key": "Space",
-    "let_go": "Let go of both handles, please",
-    "trouble": "One moment, please. The experimenter is looking after the device.",
-    "moved": "This session goes on in another window.",
-    "question": "What is the similarity between the test and the reference?",
-    "question_a": "What is the similarity between rendering A and the reference?",
-    "question_b": "What is the similarity between rendering B and the reference?",
-    "question_preferred": "Which rendering felt more similar to the reference?",
-    "a": "Rendering A",
-    "b": "Rendering B",
-    "feel_reference": "Feel the reference",
-    "feel_test": "Feel the test",
-    "feel_a": "Feel rendering A",
-    "feel_b": "Feel rendering B",
-    "neutral": "Let go for a moment",
-    "wait": "One moment, please",
-    "warm_up": "Warm-up",
-    "progress": "{done} of {of}",
-    "ready": "That was the warm-up. Do you want to feel another one, or shall we begin?",
-    "another": "Another one",
-    "begin": "Begin",
-    "break": "I need a break",
-    "paused": "A break. Tell the experimenter when you want to go on.",
-    "go_on": "Go on",
-    "rest": "Time for a longer break. The experimenter will tell you when it goes on.",
-    "again": "Let us feel this one again.",
-    "sent": "Thank you",
-    "offline": "The connection is lost; your answer is kept and will be sent.",
-    "done": "That was the last one. Thank you very much!",
-    "ended": "The session has ended. Thank you very much!",
-}
-"""Every text that a participant sees, in English; a study's [session.texts] puts its own in their place."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hilbo.errors import InputError
-from hilbo.study.text_cells import check_id, check_text
+from hilbo.study.text_cells import check_id, check_text, csv_rows, say_delimiter, without_decimal_comma
 
 __all__ = ["ROLES", "read_sets", "role_of", "source_kind", "source_of"]
 
@@ -34,7 +34,7 @@ def read_sets(path: str | os.PathLike, needs: Sequence[str] = ("K1", "B1", "alph
     `InputError`, one sentence with file and line.
     """
     source = str(path)
-    columns, rows = _table(Path(path), source)
+    columns, rows, comma = _table(Path(path), source)
     again = [name for name in columns if columns.count(name) > 1]
     if again:
         raise InputError(f'{source}:1: column "{again[0]}" stands there twice; keep one of them.')
@@ -57,7 +57,7 @@ def read_sets(path: str | os.PathLike, needs: Sequence[str] = ("K1", "B1", "alph
         check_text(name, "set_id", place)
         if name in sets:
             raise InputError(f'{place}: set_id "{name}" stands there already; name every set once.')
-        sets[name] = {column: _value(column, text, needs, place) for column, text in given.items() if text}
+        sets[name] = {column: _value(column, text, needs, place, comma) for column, text in given.items() if text}
         empty = next((column for column in needs if column not in sets[name]), None)
         if empty is not None:
             raise InputError(f'{place}: {empty} is ""; every set has one.')
@@ -89,25 +89,26 @@ def source_of(name: str, material: str | None = None) -> str:
     return last if source_kind(last) else "aggregate"
 
 
-def _table(path: Path, source: str) -> tuple[list[str], Iterator[tuple[int, list[str]]]]:
-    """Column names, and each row's line and cells as text."""
+def _table(path: Path, source: str) -> tuple[list[str], Iterator[tuple[int, list[str]]], bool]:
+    """Column names, each row's line and cells as text, and whether a comma may be the decimal point."""
     if path.suffix == ".parquet":
-        from hilbo.study.trial_table import read_cells
+        from hilbo.study.cells import read_cells
 
         frame = read_cells(path, "a sets table needs a header and a parameter set")
-        return list(frame.columns), zip(frame.index, frame.to_numpy().tolist(), strict=True)
+        return list(frame.columns), zip(frame.index, frame.to_numpy().tolist(), strict=True), False
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
+            reader, delimiter = csv_rows(file, source)
+            say_delimiter(delimiter, source)
             rows = [(reader.line_num, cells) for cells in reader if cells]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{source}: cannot be read ({error}); a sets table is a CSV file.") from error
     if not rows:
         raise InputError(f"{source}: is empty; a sets table needs a header and a parameter set.")
-    return [name.strip() for name in rows[0][1]], iter(rows[1:])
+    return [name.strip() for name in rows[0][1]], iter(rows[1:]), delimiter != ","
 
 
-def _value(column: str, text: str, needs: Sequence[str], place: str) -> Any:
+def _value(column: str, text: str, needs: Sequence[str], place: str, comma: bool) -> Any:
     """A cell as what its column holds: a number, a whole number, or text."""
     if column == "source":
         if "source" in needs and source_kind(text) is None:
@@ -116,6 +117,8 @@ def _value(column: str, text: str, needs: Sequence[str], place: str) -> Any:
             check_id(text.removeprefix(_INDIVIDUAL), place)
         check_text(text, "source", place)
         return text
+    if comma and column in (*_WHOLE, *_NUMBERS, "T", *needs):
+        text = without_decimal_comma(text)
     if column in _WHOLE:
         if not re.fullmatch(r"\d+(\.0*)?", text) or int(float(text)) < 1:
             raise InputError(f'{place}: {column} is "{text}"; it must be a whole number from 1.')

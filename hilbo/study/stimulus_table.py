@@ -19,13 +19,15 @@ _Seconds = Annotated[float, msgspec.Meta(ge=0.1, le=600), words("a number of sec
 class StimulusTable(Table, frozen=True):
     """`within`: s from an order until it is confirmed that it is presented. `silence`: s without a word from the
     program until it counts as gone. `tolerance`: parameter -> how far the confirmed value may be off, physical units;
-    a millionth of the range where nothing is said."""
+    a millionth of the range where nothing is said. `unblinded`: who takes part is presented to by their own page, which
+    knows the parameters; answers to any other study that were given so are not aggregated with others'."""
 
     within: _Seconds = 1.0
     silence: _Seconds = 1.0
     tolerance: Annotated[dict[str, float], words("a table of numbers, 0 or above", "{height_px = 0.5}")] = (
         msgspec.field(default_factory=dict)
     )
+    unblinded: Annotated[bool, words("true or false", "false")] = False
 
     def check(self, names: Sequence[str]) -> None:
         """Refuse tolerances of what is no parameter, and those that are none. Raises `InputError`."""

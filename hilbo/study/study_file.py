@@ -172,8 +172,13 @@ def checked(raw: Mapping[str, Any], source: str, made: Callable[[StudyFile], _T]
     return whole
 
 
+@lru_cache(maxsize=64)
 def hash_of(content: str) -> str:
-    """First 16 hex digits of the SHA-256 of a study's content."""
+    """First 16 hex digits of the SHA-256 of a study's content, without the people of its simulations: they change
+    nothing that is asked or computed of real ones."""
+    tables = json.loads(content)
+    if tables.pop("simulation", None) is not None:
+        content = json.dumps(tables, ensure_ascii=False, separators=(",", ":"))
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 
@@ -194,9 +199,9 @@ def made_of_material(content: str, source: str, name: str, made: Callable[[Study
 def _file(raw: Mapping[str, Any], source: str) -> StudyFile:
     """The file itself, without its materials' overrides."""
     tables = read(raw)
-    file = StudyFile(tables, box_of(tables), source)
-    check_together(tables)
-    return file
+    box = box_of(tables)
+    check_together(tables, box.parameters)
+    return StudyFile(tables, box, source)
 
 
 def _itself(file: StudyFile) -> StudyFile:

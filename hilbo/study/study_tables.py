@@ -4,7 +4,7 @@ Each table is a schema, whose annotations carry the type, the range and the word
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal, get_args
 
 import msgspec
@@ -16,9 +16,10 @@ from hilbo.study.fields import NotNegative as _NotNegative
 from hilbo.study.fields import Number as _Number
 from hilbo.study.fields import Positive as _Positive
 from hilbo.study.fields import Table as _Table
-from hilbo.study.fields import check_keys, check_table, read_table, shown
+from hilbo.study.fields import check_keys, check_present, check_table, missing_keys, read_table, shown
 from hilbo.study.fields import words as _text
 from hilbo.study.protocols import SessionTable
+from hilbo.study.simulation_table import SimulationTable
 from hilbo.study.stimulus_table import StimulusTable
 
 __all__ = [
@@ -70,12 +71,22 @@ class _RendererTable(_Table, frozen=True):
     effective_damping: Annotated[tuple[float, float] | None, _text("a list of two numbers", "[10, 80]")] = None
 
 
+_Length = Annotated[float, msgspec.Meta(ge=1e-3, le=1e3)]
+
+
 class GPTable(_Table, frozen=True):
-    """[gp]. What is left out is learnt; every key but `inference` is required by rules that do not learn."""
+    """[gp]. What is left out is learnt; rules that do not learn require theta or length, and all but `inference`.
+
+    `length`: over which answers change, as a part of a parameter's range; theta = 1/(2 length^2).
+    """
 
     theta: Annotated[
         _Positive | Annotated[tuple[_Positive, ...], msgspec.Meta(min_length=1)] | None,
         _text("a number above 0, or a list of one for each parameter", "30.0"),
+    ] = None
+    length: Annotated[
+        _Length | Annotated[tuple[_Length, ...], msgspec.Meta(min_length=1)] | None,
+        _text("a number from 0.001 to 1000, or a list of one for each parameter", "0.3"),
     ] = None
     variance: Annotated[_Positive | None, _text("a number above 0", "1.0")] = None
     thresholds: Annotated[tuple[float, ...] | None, _text("a list of rising numbers", "[-0.5, 0.5]")] = None
@@ -122,6 +133,7 @@ class Tables(_Table, frozen=True):
     session: SessionTable = SessionTable()
     report: ReportTable = ReportTable()
     stimulus: StimulusTable | None = None
+    simulation: SimulationTable | None = None
 
 
 _TABLES = {
@@ -132,30 +144,63 @@ _TABLES = {
     "session": SessionTable,
     "report": ReportTable,
     "stimulus": StimulusTable,
+    "simulation": SimulationTable,
 }
 _REQUIRED = ("schema", "study", "parameters")
 _KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "materials")
+_LEARNT = ("theta", "variance", "thresholds", "noise")
 _OVERRIDES = ("renderer", "parameters")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
 
 
 def read(raw: Mapping[str, Any]) -> Tables:
     """The parsed file as records, every key known and of its type. Raises `InputError`."""
-    check_keys(raw, "", _KEYS, _REQUIRED)
+    check_keys(raw, "", _KEYS)
+    _check_complete(raw)
     if raw["schema"] is True or raw["schema"] != 1:
         raise InputError(f"schema is {shown(raw['schema'])}, it must be 1: this hilbo reads no other.")
     tables = {key: read_table(kind, raw[key], key) for key, kind in _TABLES.items() if key in raw}
+    if "gp" in tables:
+        tables["gp"] = _with_theta(tables["gp"], len(raw["parameters"]))
     if "renderer" in raw:
         tables["renderer"] = read_table(_RendererTable, raw["renderer"], "renderer")
-    check_table(raw["parameters"], "parameters")
     parameters = {
         name: read_table(_ParameterTable, table, f"parameters.{name}") for name, table in raw["parameters"].items()
     }
-    materials = raw.get("materials", {})
-    check_table(materials, "materials")
+    materials = check_table(raw.get("materials", {}), "materials")
     for name, table in materials.items():
         check_keys(table, f"materials.{name}", _OVERRIDES)
     return Tables(parameters=parameters, materials=dict(materials), **tables)
+
+
+def _check_complete(raw: Mapping[str, Any]) -> None:
+    """Refuse a file that lacks keys: all of them at once. Raises `InputError`."""
+    missing = [key for key in _REQUIRED if key not in raw]
+    kinds = _TABLES | {"renderer": _RendererTable}
+    missing += (key for name, kind in kinds.items() if name in raw for key in missing_keys(kind, raw[name], name))
+    for name, table in check_table(raw.get("parameters", {}), "parameters").items():
+        missing += missing_keys(_ParameterTable, table, f"parameters.{name}")
+    rule = raw.get("aggregation", {}).get("rule", "bcm")  # one that is none is refused with its value
+    stated = {"theta" if key == "length" else key for key in raw.get("gp", {})}
+    fixed = rule != _LEARNS and rule in get_args(Rule)
+    unstated = [f"gp.{key}" for key in _LEARNT if fixed and key not in stated]
+    hint = f'; rule = "{_LEARNS}" in [aggregation] learns what [gp] does not state' if unstated else ""
+    check_present([*missing, *unstated], hint)
+
+
+def _with_theta(table: GPTable, dim: int) -> GPTable:
+    """The same model with its lengths as theta: how they are written is not part of a study's hash."""
+    for name, values in (("theta", table.theta), ("length", table.length)):
+        if isinstance(values, tuple) and len(values) != dim:
+            count = len(values)
+            raise InputError(f"gp.{name} has {count} numbers, it must be one number or {dim}, one per parameter.")
+    if table.length is None:
+        return table
+    if table.theta is not None:
+        raise InputError("gp.length stands beside theta = 1/(2 length^2), they say the same; keep one of them.")
+    each = table.length if isinstance(table.length, tuple) else (table.length,)
+    theta = tuple(1 / (2 * length**2) for length in each)
+    return msgspec.structs.replace(table, theta=theta if isinstance(table.length, tuple) else theta[0], length=None)
 
 
 def box_of(tables: Tables) -> Box:
@@ -174,8 +219,8 @@ def box_of(tables: Tables) -> Box:
     return Box(parameters, Mechanics(**renderer))
 
 
-def check_together(tables: Tables) -> None:
-    """Refuse tables that do not fit each other. Raises `InputError`."""
+def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
+    """Refuse tables that do not fit each other, or the parameters. Raises `InputError`."""
     labels, selection = tables.study.responses, tables.selection
     if len(set(labels)) < len(labels):
         raise InputError(f"study.responses is {shown(labels)}, it must not have one label twice.")
@@ -188,28 +233,25 @@ def check_together(tables: Tables) -> None:
         tables.stimulus.check(tuple(tables.parameters))
         if tables.renderer is not None:
             raise InputError("stimulus stands beside renderer, a study has one: a program presents, or a device.")
-    _check_gp(tables.gp, tables.aggregation.rule, len(labels), len(tables.parameters))
+    if tables.simulation is not None:
+        tables.simulation.check(parameters, len(labels))
+    _check_gp(tables.gp, tables.aggregation.rule, len(labels))
 
 
-def _check_gp(table: GPTable, rule: Rule, count: int, dim: int) -> None:
-    """For `count` responses and `dim` parameters."""
-    theta, thresholds = table.theta, table.thresholds
+def _check_gp(table: GPTable, rule: Rule, count: int) -> None:
+    """For `count` responses."""
+    thresholds = table.thresholds
     if thresholds is not None:
         if len(thresholds) != count - 1:
             raise InputError(
-                f"gp.thresholds has {len(thresholds)} numbers, it must have one fewer than the {count} responses."
+                f"gp.thresholds is {shown(thresholds)}, it must have one number fewer than the {count} responses."
             )
         if any(low >= high for low, high in itertools.pairwise(thresholds)):
             raise InputError(f"gp.thresholds is {shown(thresholds)}, it must rise from each number to the next.")
-    if isinstance(theta, tuple) and len(theta) != dim:
-        raise InputError(f"gp.theta has {len(theta)} numbers, it must be one number or {dim}, one per parameter.")
     if rule == _LEARNS:
         if table.inference != "laplace":
             raise InputError(f'gp.inference is {shown(table.inference)}, it must be "laplace" with rule = "{_LEARNS}".')
         return
-    missing = [name for name in ("theta", "variance", "thresholds", "noise") if getattr(table, name) is None]
-    if missing:
-        raise InputError(f'gp.{missing[0]} is missing, add it; rule = "{_LEARNS}" learns it from the answers.')
 
 
 def of_material(raw: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -1,30 +1,41 @@
-"""The rule for participants' ids, and the one for text that ends up in the cell of a table; loads no JAX, no pandas.
+"""The rule for participants' ids, the one for text in the cells of a table, and what stands between those cells.
+
+Loads no JAX, no pandas.
 
 A spreadsheet runs a text cell that begins with =, @, + or - (OWASP, "CSV injection"). hilbo refuses such text where it
 comes in, and writes every text as it is: a mark put before it would be another text. Plain numbers and lone dashes are
 no such text.
 """
 
+import csv
 import re
+import warnings
 from collections.abc import Iterable
+from typing import Any, TextIO
 
-from hilbo.errors import InputError
+from hilbo.errors import InputError, InputRemark
 
 __all__ = [
     "FORMULA_WORDS",
     "ID_WORDS",
     "check_id",
     "check_text",
+    "csv_rows",
     "formulas",
+    "is_decimal",
     "is_id",
     "no_ids",
     "runs_in_a_spreadsheet",
+    "say_delimiter",
+    "without_decimal_comma",
 ]
 
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 ID_WORDS = 'an id has up to 32 letters, digits, "_", "-", ".", begins with a letter or digit, and is nobody\'s name'
 FORMULA_WORDS = "which a spreadsheet would run as a formula; begin it with a letter or a digit"
-_NUMERAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
+_NUMERAL = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?")
+_QUOTED = re.compile(r'"[^"]*"')
+_DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 _DASHES = "-+ \t\r\n"
 _BEGINS = ("=", "@", "+", "-", "\t", "\r", "\n", "＝", "＠", "＋", "－")  # noqa: RUF001 (some spreadsheets take these too)
 
@@ -59,3 +70,31 @@ def check_text(text: str, name: str, place: str = "") -> None:
     """Refuse text that a spreadsheet would run; `name` says what it is, `place` where it stands."""
     if runs_in_a_spreadsheet(text):
         raise InputError(f'{place + ": " if place else ""}{name} is "{text}", {FORMULA_WORDS}.')
+
+
+def csv_rows(file: TextIO, source: str) -> tuple[Any, str]:
+    """The reader of a CSV table, and what stands between its cells: of comma, semicolon and tab what its header has
+    most of. Blanks before a cell are none of it. Raises `InputError` for a first line that only spreadsheets read."""
+    header = next((line for line in file if line.strip()), "")
+    if header.lower().startswith("sep="):
+        raise InputError(f'{source}:1: is "{header.strip()}", which only spreadsheets read; delete that line.')
+    file.seek(0)
+    delimiter = max(_DELIMITERS, key=_QUOTED.sub("", header).count)
+    return csv.reader(file, delimiter=delimiter, skipinitialspace=True, strict=True), delimiter
+
+
+def say_delimiter(delimiter: str, source: str) -> None:
+    """Warn where it is no comma: a comma in a number is then the decimal point."""
+    if delimiter != ",":
+        sentence = f"{source}: is read with {_DELIMITERS[delimiter]} between its cells; 1,5 is one and a half."
+        warnings.warn(InputRemark(sentence), stacklevel=2)
+
+
+def is_decimal(cell: str, mark: str) -> bool:
+    """Whether a cell is a number with this decimal mark."""
+    return mark in cell and _NUMERAL.fullmatch(cell.strip()) is not None
+
+
+def without_decimal_comma(cell: str) -> str:
+    """A number as it is written with a decimal point; anything else as it was, to be refused."""
+    return cell.replace(",", ".") if is_decimal(cell, ",") else cell

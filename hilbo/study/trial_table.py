@@ -1,14 +1,13 @@
-"""Trial tables: CSV or Parquet, one row per answer, read and checked before anything is fitted.
+"""Trial tables: CSV or Parquet, one row per answer, checked before anything is fitted.
 
 Columns: `participant`, `trial`, `response` and one per parameter in physical units; optional `session`, `phase`,
-`material`, `voided`; others are kept. A number means what its decimals say (correctly rounded), so that a table and
-the log it came from give the same bits. Whatever is wrong is one sentence with the file and the line (Parquet: row).
-A table is read piece by piece, and a piece's text is gone when its numbers are known.
+`material`, `voided`, `unblinded`; others are kept. A number means what its decimals say (correctly rounded), so that a
+table and the log it came from give the same bits. Whatever is wrong is one sentence with the file and the line
+(Parquet: row). A table is read piece by piece, and a piece's text is gone when its numbers are known.
 """
 
-import csv
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
+from hilbo.study.cells import cell_pieces, numbers, place, refuse
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, check_text, formulas, no_ids
 
@@ -23,21 +23,16 @@ __all__ = [
     "NOT_FITTED",
     "check_people",
     "check_texts",
-    "numbers",
     "of_material",
-    "place",
-    "read_cells",
     "read_trials",
-    "refuse",
     "write_trials",
 ]
 
 NOT_FITTED = ("warm-up", "repeat")
 """Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
 _KEY = ("participant", "session", "phase", "material", "trial")
-_TRUE = {"1", "1.0", "true", "yes"}
-_FALSE = {"", "0", "0.0", "false", "no", "nan", "none", "<na>"}
-_PIECE = 50_000  # rows
+_TRUE = {"1", "1.0", "1,0", "true", "yes"}
+_FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
 
 
 def read_trials(
@@ -55,7 +50,7 @@ def read_trials(
     are nobody's business. `say` is told how many rows have been read. Raises `InputError`.
     """
     source, texts, pieces, rows = str(path), {}, [], 0
-    for text in _pieces(path):
+    for text in cell_pieces(path):
         _check_columns(text, study, source)
         pieces.append(_checked(text, study, source, others, texts))
         say(rows := rows + len(text))
@@ -65,6 +60,7 @@ def read_trials(
     del pieces
     _check_duplicates(table, source)
     table = table[table.pop("_fitted")]
+    _check_blinded(table.pop("_blinded"), study, source)
     if table.empty:
         raise InputError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
     table = of_material(table, material, source)
@@ -90,6 +86,7 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
     for parameter in study.space.parameters:
         table[parameter.name] = _parameter_values(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
+    table["_blinded"] = text["unblinded"].str.strip().str.lower().isin(_FALSE) if "unblinded" in text else True
     table["_fitted"] = ~_flags(text, "voided", source) & (~text["phase"].isin(NOT_FITTED) if "phase" in text else True)
     return table
 
@@ -108,94 +105,6 @@ def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:
         table.to_csv(path, index=False)  # pandas writes the shortest decimals that read back the same
 
 
-def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a header and an answer") -> pd.DataFrame:
-    """Every cell as text, so that nothing is guessed; the index is the line (CSV) or the row (Parquet).
-
-    Raises `InputError` for what is no table; `needs` is said of an empty file.
-    """
-    return pd.concat(_pieces(path, needs))
-
-
-def _pieces(
-    path: str | os.PathLike, needs: str = "a trial table needs a header and an answer"
-) -> Iterator[pd.DataFrame]:
-    """The cells of a table as text, some rows at a time; at least one piece, which may have none."""
-    source, path = str(path), Path(path)
-    try:
-        for frame in _parquet_pieces(path) if path.suffix == ".parquet" else _csv_pieces(path, source, needs):
-            again = frame.columns[frame.columns.duplicated()]
-            if len(again):
-                raise InputError(f'{place(source)}column "{again[0]}" stands there twice; keep one of them.')
-            yield frame
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"{source}: cannot be read ({error.strerror or error}); check the path.") from error
-    except (ValueError, csv.Error) as error:  # pyarrow's errors, and text that is no UTF-8, are ValueErrors
-        reason = str(error).strip().splitlines()[-1]
-        raise InputError(f"{source}: is not a table that can be read ({reason}); save it as CSV or Parquet.") from error
-
-
-def _parquet_pieces(path: Path) -> Iterator[pd.DataFrame]:
-    """The first piece is empty: a table without rows has columns too."""
-    from pyarrow.parquet import ParquetFile
-
-    with ParquetFile(path) as file:
-        first_row = 1
-        yield _as_text(file.schema_arrow.empty_table().to_pandas(), first_row)
-        for batch in file.iter_batches(_PIECE):
-            yield _as_text(batch.to_pandas(), first_row)
-            first_row += batch.num_rows
-
-
-def _as_text(frame: pd.DataFrame, first_row: int) -> pd.DataFrame:
-    columns = {i: _column_as_text(frame.iloc[:, i]) for i in range(frame.shape[1])}  # a name may stand there twice
-    index = np.arange(first_row, first_row + len(frame))
-    return pd.DataFrame(columns, index=index, dtype=object).set_axis(frame.columns, axis=1)
-
-
-def _column_as_text(column: pd.Series) -> list[str]:
-    if column.dtype.kind == "f":
-        return [repr(v) for v in column.tolist()]
-    return ["" if v is None or v is pd.NA else repr(v) if isinstance(v, float) else str(v) for v in column.tolist()]
-
-
-def _csv_pieces(path: Path, source: str, needs: str) -> Iterator[pd.DataFrame]:
-    """By Python's csv module: it knows the line of a row, and a row that is too long is no reason to guess."""
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        reader = csv.reader(file, skipinitialspace=True, strict=True)
-        rows, lines, header, line, pieces = [], [], [], 1, 0
-        for row in reader:
-            if any(row):  # not an empty line, nor a spreadsheet's row of commas
-                header = header or row
-                if len(row) != len(header):
-                    raise InputError(
-                        f"{source}:{line}: has {len(row)} cells, the header has {len(header)}; fix that line."
-                    )
-                rows.append(row)
-                lines.append(line)
-                if len(rows) > _PIECE:
-                    yield _piece(rows, lines, header, pieces)
-                    rows, lines, pieces = [], [], pieces + 1
-            line = reader.line_num + 1
-        if not header:
-            raise InputError(f"{source}: is empty; {needs}.")
-        if rows:
-            yield _piece(rows, lines, header, pieces)
-
-
-def _piece(rows: list[list[str]], lines: list[int], header: list[str], pieces: int) -> pd.DataFrame:
-    skip = 0 if pieces else 1  # the first row of the first piece is the header
-    return pd.DataFrame(rows[skip:], index=lines[skip:], columns=header, dtype=object)
-
-
-def place(source: str, row: object = None) -> str:
-    """Where in a table: the line of a CSV file, the row of a Parquet file, or the heads of its columns."""
-    if str(source).endswith(".parquet"):
-        return f"{source}: " if row is None else f"{source}: row {row}: "
-    return f"{source}:{1 if row is None else row}: "
-
-
 def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
     needed = ("participant", "trial", "response", *study.space.names)
     missing = [name for name in needed if name not in text.columns]
@@ -203,27 +112,6 @@ def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
         raise InputError(
             f'{place(source)}column "{missing[0]}" is missing; a trial table of this study has {", ".join(needed)}.'
         )
-
-
-def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> pd.Series:
-    """A column as float64, each cell correctly rounded; `valid` says which values may be, `words` which those are."""
-
-    cells = text[column].tolist()
-    try:
-        floats = [] if "_" in "".join(cells) else [float(cell) for cell in cells]
-    except ValueError:
-        floats = []
-    values = pd.Series(floats if len(floats) == len(cells) else [_number(c) for c in cells], text.index, dtype=float)
-    wrong = ~(np.isfinite(values) & valid(values))
-    refuse(wrong, source, lambda row: f'{column} is "{text.at[row, column]}"; it must be {words}.')
-    return values
-
-
-def _number(cell: str) -> float:
-    try:
-        return np.nan if "_" in cell else float(cell)  # Python reads 1_5 as 15
-    except ValueError:
-        return np.nan
 
 
 def _parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> pd.Series:
@@ -237,7 +125,7 @@ def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.S
     ranks_allowed = not any(label.strip().lstrip("+-").isdigit() for label in responses)
     lookup = {label: i for i, label in enumerate(responses)}
     if ranks_allowed:
-        lookup |= {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0")}
+        lookup |= {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0", f"{i + 1},0")}
     categories = cells.map(lookup)
     ranks = f", or a rank from 1 to {len(responses)}" if ranks_allowed else ""
     refuse(
@@ -257,6 +145,17 @@ def _flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:
     return cells.isin(_TRUE)
 
 
+def _check_blinded(blinded: pd.Series, study: AnyStudy, source: str) -> None:
+    """Refuse answers of people who knew the parameters beside answers of people who did not."""
+    expected = study.stimulus is not None and study.stimulus.unblinded
+    if not expected and blinded.any() and not blinded.all():
+        row = (~blinded).idxmax()
+        raise InputError(
+            f"{place(source, row)}is an unblinded answer, as hilbo try gives, beside others that are blinded; leave"
+            " the unblinded ones out."
+        )
+
+
 def _check_duplicates(table: pd.DataFrame, source: str) -> None:
     key = [column for column in _KEY if column in table]
     again = table.duplicated(key)
@@ -271,7 +170,10 @@ def _check_duplicates(table: pd.DataFrame, source: str) -> None:
 
 
 def of_material(table: pd.DataFrame, material: str | None, source: str) -> pd.DataFrame:
-    """The rows of one material; which one must be said where there are several."""
+    """The rows of one material; which one must be said where there are several.
+
+    Raises `InputError` if it is not said, or is not there.
+    """
     if "material" not in table:
         if material is not None:
             raise InputError(f'{place(source)}column "material" is missing; without it no material can be chosen.')
@@ -301,10 +203,3 @@ def check_texts(text: pd.DataFrame, source: str, numeric: Collection[str] = ()) 
             cells = text[column]
             wrong = cells.isin(formulas(cells))
             refuse(wrong, source, lambda row, c=column: f'{c} is "{text.at[row, c]}", {FORMULA_WORDS}.')
-
-
-def refuse(wrong: pd.Series, source: str, sentence: Callable[[object], str]) -> None:
-    """Raise `InputError` with `sentence(row)` for the first row that is wrong."""
-    if wrong.any():
-        row = wrong.idxmax()
-        raise InputError(f"{place(source, row)}{sentence(row)}")

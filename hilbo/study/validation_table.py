@@ -13,8 +13,9 @@ from collections.abc import Sequence
 import pandas as pd
 
 from hilbo.errors import InputError
+from hilbo.study.cells import numbers, read_cells, refuse
 from hilbo.study.set_table import read_sets
-from hilbo.study.trial_table import check_people, check_texts, numbers, read_cells, refuse
+from hilbo.study.trial_table import check_people, check_texts
 
 __all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_validation", "sets_frame"]
 
@@ -43,7 +44,10 @@ def read_validation(
 def check_validation(
     table: pd.DataFrame, responses: Sequence[str] = RESPONSES, source: str = "validation table"
 ) -> pd.DataFrame:
-    """Check a table however it was made, and bring it into the form that `read_validation` gives."""
+    """Check a table however it was made, and bring it into the form that `read_validation` gives.
+
+    Raises `InputError` for a missing column, a table without rows, and values that cannot be.
+    """
     missing = [name for name in _NEEDED if name not in table.columns]
     if missing:
         raise InputError(
@@ -85,7 +89,10 @@ def check_validation(
 
 
 def of_material(table: pd.DataFrame, material: str | None, source: str = "validation table") -> pd.DataFrame:
-    """The rows of one material, which must be named if there are several."""
+    """The rows of one material, which must be named if there are several.
+
+    Raises `InputError` if it is not said, or is not there.
+    """
     materials = list(table["material"].unique()) if "material" in table else []
     if material is None:
         if len(materials) > 1:

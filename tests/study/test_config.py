@@ -143,7 +143,21 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     ("noise = 0.5", "nose = 0.5", "29: gp.nose is not a key of a study file, those known here are theta, "),
     ("[aggregation]", "[agregation]", "36: agregation is not a key of a study file, those known here are schema, "),
     ("low = 0.001", "lowest = 0.001", "11: parameters.B1.lowest is not a key of a study file, "),
-    ("noise = 0.5\n", "", '25: gp.noise is missing, add it; rule = "learnt-1" learns it from the answers.'),
+    ("noise = 0.5\n", "", "25: gp.noise is missing, add it; "),
+    ('unit = "N/mm"\nscale', "length = 1\nscale", "8: parameters.K1.length is not a key"),
+    ("theta = 30.0", "length = 0.3\ntheta = 30.0", "26: gp.length stands beside theta"),
+    (
+        "theta = 30.0",
+        "length = [0.3, 0.3]",
+        "26: gp.length has 2 numbers, it must be one number or 3, one per parameter.",
+    ),
+    ("theta = 30.0", "length = 0", "26: gp.length is 0, it must be a number from 0.001 to 1000"),
+    ("theta = 30.0", "length = 1e-200", "26: gp.length is 1e-200, it must be a number from 0.001 to 1000"),
+    (
+        "theta = 30.0",
+        "length = [1e200, 1, 1]",
+        "26: gp.length is [1e+200, 1, 1], it must be a number from 0.001 to 1000",
+    ),
     ("low = 0.001\n", "", "10: parameters.B1.low is missing, add it."),
     ("schema = 1\n", "", " schema is missing, add it."),
     ("schema = 1", "schema = 2", "1: schema is 2, it must be 1: this hilbo reads no other."),
@@ -170,7 +184,7 @@ BAD = [  # text of the good file, what stands there instead, the whole sentence 
     (
         "[-0.5, 0.5]",
         "[0.5]",
-        "28: gp.thresholds has 1 numbers, it must have one fewer than the 3 responses.",
+        "28: gp.thresholds is [0.5], it must have one number fewer than the 3 responses.",
     ),
     ('inference = "laplace"', 'inference = "vb"', '30: gp.inference is "vb", it must be "laplace", "ep", "ep_correct'),
     ('"similar", ', '"close", ', '4: study.responses is ["different", "close", "close"], it must not have one label '),
@@ -233,6 +247,23 @@ def test_a_bad_file_gets_one_sentence_with_its_place(load, old, new, sentence):
     message = str(caught.value)
     assert message.startswith(f"study.toml:{sentence}"), message
     assert message.endswith(".") and "\n" not in message
+
+
+def test_all_that_is_missing_stands_in_one_sentence():
+    with pytest.raises(InputError) as caught:
+        Study.from_dict({"schema": 1, "study": {"name": "a"}, "parameters": {"u": {"low": 0}}, "gp": {"theta": 1.0}})
+    assert str(caught.value) == (
+        "study.responses is missing and so are parameters.u.high, gp.variance, gp.thresholds, gp.noise, add them;"
+        ' rule = "learnt-1" in [aggregation] learns what [gp] does not state.'
+    )
+
+
+@pytest.mark.parametrize("length", ["0.25", "[0.25, 0.25, 0.5]"])
+def test_a_length_is_a_theta_written_otherwise(load, length):
+    study = load(GOOD.replace("theta = 30.0", f"length = {length}"))
+    theta = {"0.25": 8.0, "[0.25, 0.25, 0.5]": [8.0, 8.0, 2.0]}[length]
+    np.testing.assert_array_equal(study.gp.kernel.theta, theta)
+    assert study.hash == load(GOOD.replace("theta = 30.0", f"theta = {theta}")).hash
 
 
 def test_tables_may_hold_numpys_numbers():

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from studies import SOUND
 
 from hilbo.ordinal_gp import Trials
 from hilbo.report.results import result
@@ -14,22 +15,7 @@ from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.learnt_study import resolved
 
-STUDY = Study.from_dict(
-    tomllib.loads("""\
-schema = 1
-[study]
-name = "sound"
-responses = ["bad", "fair", "good"]
-[parameters.level]
-low = 0
-high = 10
-[parameters.tone]
-low = -1
-high = 1
-[aggregation]
-rule = "learnt-1"
-""")
-)
+STUDY = Study.from_dict(tomllib.loads(SOUND))
 PEOPLE, ANSWERS = 6, 12
 NOWHERE = "The best rendering is not located"
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commands import run
+from studies import SOUND
 
 from hilbo import Session
 from hilbo.errors import InputError
@@ -20,24 +21,10 @@ from hilbo.study.learnt_study import learnt_content, learnt_sentences, resolved,
 from hilbo.study.robustness import robustness
 from hilbo.study.trial_table import read_trials
 
-FILE = """\
-schema = 1
-[study]
-name = "sound"
-responses = ["bad", "fair", "good"]
-[parameters.level]
-low = 0
-high = 10
-[parameters.tone]
-low = -1
-high = 1
-[aggregation]
-rule = "learnt-1"
-"""
 PEOPLE, ANSWERS = 4, 12
 
 
-def study_of(text=FILE) -> Study:
+def study_of(text=SOUND) -> Study:
     return Study.from_dict(tomllib.loads(text))
 
 
@@ -64,7 +51,7 @@ def test_a_session_starts_from_the_medians():
 
 
 def test_what_the_file_states_is_kept():
-    study = study_of(FILE + "[gp]\nnoise = 0.5\ntheta = 3.0\n")
+    study = study_of(SOUND + "[gp]\nnoise = 0.5\ntheta = 3.0\n")
     np.testing.assert_allclose(study.gp.kernel.theta, 3.0)
     np.testing.assert_allclose(study.gp.likelihood.noise, 0.5)
     assert study.stated.theta == (3.0, 3.0)
@@ -73,10 +60,13 @@ def test_what_the_file_states_is_kept():
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        (FILE.replace("learnt-1", "bcm"), 'gp.theta is missing, add it; rule = "learnt-1" learns it'),
-        (FILE + '[gp]\ninference = "ep"\n', 'gp.inference is "ep", it must be "laplace" with rule = "learnt-1"'),
-        (FILE + "[gp]\nthresholds = [0.0]\n", "gp.thresholds has 1 numbers, it must have one fewer than the 3"),
-        (FILE.replace("learnt-1", "learnt-2"), 'aggregation.rule is "learnt-2", it must be one of'),
+        (
+            SOUND.replace("learnt-1", "bcm"),
+            "gp.theta is missing and so are gp.variance, gp.thresholds, ",
+        ),
+        (SOUND + '[gp]\ninference = "ep"\n', 'gp.inference is "ep", it must be "laplace" with rule = "learnt-1"'),
+        (SOUND + "[gp]\nthresholds = [0.0]\n", "gp.thresholds is [0.0], it must have one number fewer than the 3"),
+        (SOUND.replace("learnt-1", "learnt-2"), 'aggregation.rule is "learnt-2", it must be one of'),
     ],
 )
 def test_bad_files_get_one_sentence(text, sentence):
@@ -129,7 +119,7 @@ def test_there_is_nothing_fixed_to_compare_with(table):
 
 
 def test_another_rule_has_no_model_to_go_by(tmp_path, table, capsys, monkeypatch):
-    (tmp_path / "study.toml").write_text(FILE)
+    (tmp_path / "study.toml").write_text(SOUND)
     command = ["aggregate", str(table), "--study", str(tmp_path / "study.toml"), "--out", str(tmp_path / "out")]
     code, _, said = run(capsys, monkeypatch, *command, "--rule", "bcm")
     assert code == 2

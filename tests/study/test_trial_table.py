@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hilbo.errors import InputError
-from hilbo.study import trial_table
+from hilbo.errors import InputError, InputRemark
+from hilbo.study import cells
 from hilbo.study.config import Study
 from hilbo.study.trial_table import read_trials, write_trials
 
@@ -13,11 +13,11 @@ GP = {"theta": 3.0, "variance": 1.0, "thresholds": [-0.5, 0.5], "noise": 0.5}
 HEADER = "participant,trial,response,gain,delay\n"
 
 
-def study(responses=("different", "similar", "close")):
+def study(responses=("different", "similar", "close"), **tables):
     gp = GP | {"thresholds": np.linspace(-0.5, 0.5, len(responses) - 1).tolist()}
     parameters = {"gain": {"low": 0.0, "high": 2.0, "unit": "N/mm"}, "delay": {"low": 1.0, "high": 100.0}}
     table = {"name": "any", "responses": list(responses)}
-    return Study.from_dict({"schema": 1, "study": table, "parameters": parameters, "gp": gp})
+    return Study.from_dict({"schema": 1, "study": table, "parameters": parameters, "gp": gp} | tables)
 
 
 def written(tmp_path, text, name="t.csv"):
@@ -184,12 +184,6 @@ def test_a_column_twice_is_refused(tmp_path):
     )
 
 
-def test_semicolons_are_no_commas(tmp_path):
-    assert 't.csv:1: column "participant" is missing' in refusal(
-        tmp_path, (HEADER + "A,1,close,1,2\n").replace(",", ";")
-    )
-
-
 def test_rows_of_commas_are_nobodys(tmp_path):
     assert len(read_trials(written(tmp_path, HEADER + ",,,,\nA,1,close,1,2\n\n,,,,\n"), study())) == 1
 
@@ -202,6 +196,17 @@ def test_warm_up_alone_is_refused(tmp_path):
 def test_a_voided_flag_is_yes_or_no(tmp_path):
     text = HEADER.replace("\n", ",voided\n") + "A,1,close,1,2,maybe\n"
     assert 't.csv:2: voided is "maybe"; write 1 or 0' in refusal(tmp_path, text)
+
+
+def test_unblinded_answers_are_not_read_beside_others(tmp_path):
+    head = HEADER.replace("\n", ",unblinded,voided\n")
+    text = head + "A,1,close,1,2,,0\nB,1,close,1,2,try,0\n"
+    assert refusal(tmp_path, text, others=False).startswith(
+        "t.csv:3: is an unblinded answer, as hilbo try gives, beside"
+    )
+    for kept in (head + "B,1,close,1,2,try,0\nB,2,close,1,2,try,0\n", text.replace("try,0", "try,1")):
+        assert len(read_trials(written(tmp_path, kept), study())) == kept.count(",0\n")
+    assert len(read_trials(written(tmp_path, text), study(stimulus={"unblinded": True}))) == 2
 
 
 @pytest.mark.parametrize(("text", "words"), [("", "is empty"), (HEADER, "has no rows")])
@@ -232,13 +237,13 @@ def test_pieces_make_the_same_table(tmp_path, monkeypatch, name):
     if name.endswith("parquet"):
         pd.read_csv(written(tmp_path, HEADER + many(53))).to_parquet(path)
     whole, told = read_trials(path, study()), []
-    monkeypatch.setattr(trial_table, "_PIECE", 10)
+    monkeypatch.setattr(cells, "_PIECE", 10)
     pd.testing.assert_frame_equal(read_trials(path, study(), say=told.append), whole)
     assert told[-1] == 53 and told == sorted(told) and len(told) > 4
 
 
 def test_a_damaged_row_far_down_is_found_with_its_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(trial_table, "_PIECE", 10)
+    monkeypatch.setattr(cells, "_PIECE", 10)
     text = HEADER + many(53)
     assert 't.csv:41: response is "near"' in refusal(tmp_path, text.replace("P7,5,close", "P7,5,near"))
     assert "t.csv:41: has 4 cells" in refusal(tmp_path, text.replace("P7,5,close,1", "P7,5,close"))
@@ -267,3 +272,59 @@ def test_a_parquet_file_has_rows_and_no_lines(tmp_path):
     mixed = good.astype({"gain": object})
     mixed.loc[2, "gain"] = None
     assert 't.parquet: row 3: gain is ""' in refused(mixed).replace('"nan"', '""')
+
+
+def test_a_table_with_semicolons_has_decimal_commas_and_it_is_said(tmp_path):
+    text = HEADER.replace(",", ";").replace("\n", ";note\n") + "A;1;close;1,25;2,5;so, so\nA;2;similar;0;1e2;3,4\n"
+    with pytest.warns(InputRemark, match=r"t\.csv: is read with semicolons between its cells; 1,5 is one and a half\."):
+        table = read_trials(written(tmp_path, text), study())
+    assert table[["gain", "delay"]].to_numpy().tolist() == [[1.25, 2.5], [0.0, 100.0]]
+    assert table["note"].tolist() == ["so, so", "3,4"]  # other columns are as they are
+
+
+def test_tabs_and_decimal_points_are_read_too(tmp_path):
+    text = HEADER.replace(",", "\t") + "A\t1\tclose\t1.25\t2.5\n"
+    with pytest.warns(InputRemark, match="with tabs"):
+        assert read_trials(written(tmp_path, text), study())["gain"].tolist() == [1.25]
+
+
+@pytest.mark.filterwarnings("ignore::hilbo.errors.InputRemark")
+@pytest.mark.parametrize(
+    ("cells", "words"),
+    [
+        ("1,25;2\nA;2;close;1.5;2", r't.csv:3: gain has decimal commas and decimal points \("1,25" and "1.5"\); write'),
+        ("1.250,5;2", "gain is .*; it must be a number"),
+        ("1,2,3;2", "gain is .*; it must be a number"),
+    ],
+)
+def test_numbers_written_in_two_ways_are_refused(tmp_path, cells, words):
+    with pytest.raises(InputError, match=words):
+        read_trials(written(tmp_path, HEADER.replace(",", ";") + f"A;1;close;{cells}\n"), study())
+
+
+@pytest.mark.filterwarnings("ignore::hilbo.errors.InputRemark")
+def test_every_number_of_a_table_may_have_a_decimal_comma(tmp_path):
+    text = "voided;note;" + HEADER.replace(",", ";") + '0,0; "-0,5";A;1,0;3,0;1,5;2\n1,0;-3;A;2;close;1;2\n'
+    table = read_trials(written(tmp_path, text), study())
+    assert table["note"].tolist() == ["-0,5"] and table["trial"].tolist() == [1] and table["category"].tolist() == [2]
+
+
+def test_what_is_quoted_in_the_header_parts_no_cells(tmp_path):
+    text = '"note (a; b; c; d; e; f)",' + HEADER + "x,A,1,close,1.5,2\n"
+    assert read_trials(written(tmp_path, text), study())["gain"].tolist() == [1.5]
+
+
+def test_a_line_that_only_spreadsheets_read_is_named(tmp_path):
+    sentence = refusal(tmp_path, "sep=;\n" + HEADER + "A,1,close,1,2\n")
+    assert sentence == 't.csv:1: is "sep=;", which only spreadsheets read; delete that line.'
+
+
+def test_a_decimal_comma_in_a_table_with_commas_gets_a_hint(tmp_path):
+    assert refusal(tmp_path, HEADER + 'A,1,close,"1,5",2\n').endswith("; write 1.5 for one and a half.")
+
+
+@pytest.mark.filterwarnings("ignore::hilbo.errors.InputRemark")
+def test_labels_with_commas_stay_labels_where_commas_are_decimal(tmp_path):
+    text = HEADER.replace(",", ";") + "A;1;0,5;1;2\nA;2;1.5;1;2\n"
+    table = read_trials(written(tmp_path, text), study(("0,5", "1.5", "2")))
+    assert table["category"].tolist() == [0, 1]
