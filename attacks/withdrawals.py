@@ -27,6 +27,7 @@ from hilbo.cli.console import start
 
 PEOPLE, JUDGES = 24, 2
 SENTENCES = re.compile(r"Traceback|Error:")
+_PICTURE = re.compile(r"base64,[A-Za-z0-9+/=\s]+")
 
 __all__ = ["withdrawal_case"]
 
@@ -111,8 +112,9 @@ def _resume_all() -> None:
 
 
 def _naming(root: Path, person: str) -> list[Path]:
-    """The files that hold the id as a word: in their names, text, cells, or netCDF names, attributes and variables. Of
-    binary files the bytes are not searched: in a megabyte of numbers any three letters come up by chance."""
+    """The files that hold the id as a word: in their names, text, cells, or netCDF names, attributes and variables.
+    Bytes are not searched, of binary files or of pictures in a page: in a megabyte of them any three letters come up by
+    chance."""
     word = re.compile(rf"(?<![A-Za-z0-9]){person}(?![A-Za-z0-9])")
     found = []
     for path in sorted(path for path in root.rglob("*") if path.is_file() and path.suffix != ".png"):
@@ -125,7 +127,7 @@ def _naming(root: Path, person: str) -> list[Path]:
         elif path.suffix == ".parquet":
             texts.append(pd.read_parquet(path).to_csv())
         else:
-            texts.append(path.read_bytes().decode("utf-8", "replace"))
+            texts.append(_PICTURE.sub("", path.read_bytes().decode("utf-8", "replace")))
         if any(word.search(text) for text in texts):
             found.append(path)
     return found

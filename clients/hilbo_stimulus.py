@@ -22,7 +22,7 @@ A program that moves something says `force=True` and gives `go_neutral`, a funct
 called in a thread of this module, as soon as the server says so, or has been silent for the time that it states
 (`silence_s`, 1 s unless the study says otherwise), or its connection fails; so it may be called while your own loop is
 busy, and often. Say `stimulus.contact = True` while somebody touches it: no order to present is handed to you until
-that is over. docs/stimulus.md of hilbo has the protocol.
+that is over. docs/guides/stimulus.md of hilbo has the protocol.
 """
 
 from __future__ import annotations

@@ -177,6 +177,7 @@ def climb(
     start, whichever is better: there walls are flat, but the function inside is bent wherever the wall is.
     One start after the other: each stops when it is done, where a batch would wait for its slowest, or on the way to
     where an earlier one ended: once a hill stands out, most good starts are on its slopes.
+    `starts` (s, d) in the unit cube, `usable` (s,).
     """
 
     def may_end(x):
@@ -211,7 +212,10 @@ def climb(
 
 
 def spread(values: Float[Array, " m"], candidates: Float[Array, "m d"], count: int, apart: float = 0.1):
-    """Rows of good candidates from different places: the best, the best further than `apart` from it, and so on."""
+    """Rows of good candidates from different places: the best, the best further than `apart` from it, and so on.
+
+    `values` (m,), `candidates` (m, d) -> (count,) row numbers.
+    """
 
     def pick(remaining, _):
         row = jnp.argmax(remaining)

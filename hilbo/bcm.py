@@ -1,4 +1,4 @@
-"""Bayesian committee machine: the posteriors of M participants merged into one population map.
+"""Bayesian committee machine: the posteriors of M participants aggregated into one population map.
 
 Paper, section V, for one latent score with prior variance k and participants' posteriors N(mu_j, sigma_j^2):
 

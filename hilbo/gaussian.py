@@ -2,7 +2,7 @@
 
 Laplace's method and expectation propagation end in this form, W being curvatures or the precisions of sites. K is never
 inverted, nothing is added to it, and W = 0 (padding, or an answer that says nothing) is no special case. At new points,
-k* the prior covariances with eta, the mean is k*'a and the variance k - k*'C k*.
+`k*` the prior covariances with eta, the mean is `k*'a` and the variance `k - k*'C k*`.
 """
 
 from collections.abc import Callable
@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.numerics.linalg import cholesky, eigh, solve_lower
+from hilbo.numerics.shown import shown
 
 __all__ = [
     "Certificate",
@@ -66,6 +67,9 @@ class Certificate(eqx.Module):
     """residual <= tolerance, evidence_error <= evidence_tolerance, evidence_error + evidence_rounding <= 0.02 +
     max(eps^(1/2), 1e-5) |log evidence|, no variance below its resolution, all finite."""
 
+    def __repr__(self) -> str:
+        return f"Certificate({', '.join(f'{name}={shown(value)}' for name, value in vars(self).items())})"
+
 
 class GaussianPosterior(eqx.Module):
     """Gaussian approximation N(mode, K - K C K) of p(eta | data), C = (K + 1/W)^-1."""
@@ -96,6 +100,7 @@ def certify(
 
     K a, which predictions use, and the mode are equal but for rounding, and may differ by eps^(1/4) prior standard
     deviations.
+    `covariance` and `factor` (n, n); `mode`, `weights` and `curvature` (n,).
     """
     epsilon, prior = jnp.finfo(weights.dtype).eps, jnp.diagonal(covariance)
     largest, sd = jnp.max(prior), jnp.sqrt(prior)
@@ -136,6 +141,7 @@ def evidence_error(
     sum W d^2 / 2; log|I + KW| / 2 moves by sum s dW / 2, s being the posterior variances, dW the change of the
     curvatures within d. Where the noise is far below the prior's standard deviation, these notice what a residual in
     units of the latter cannot.
+    `covariance` (n, n); `mode`, `weights` and `curvature` (n,) -> a scalar, in nats.
     """
     epsilon, (variance, explain) = jnp.finfo(weights.dtype).eps, posterior
     rounding = epsilon * (jnp.abs(covariance) @ jnp.abs(weights))
@@ -151,6 +157,7 @@ def evidence_rounding(covariance: Float[Array, "n n"], weights: Float[Array, "k 
 
     Equal elements of K are rounded in the same way, so that answers which contradict each other at one place lose
     nothing. So K is rounded once more, in several ways, and the differences are what is counted.
+    `covariance` (n, n), `weights` (k, n) -> a scalar, in nats.
     """
     ways = jnp.asarray(_WAYS, weights.dtype)[:, None, None]
     rounded = covariance[None, :, :] * ways / ways - covariance[None, :, :]
@@ -158,14 +165,17 @@ def evidence_rounding(covariance: Float[Array, "n n"], weights: Float[Array, "k 
 
 
 def evidence_known(value: Float[Array, ""], error: Float[Array, ""], rounding: Float[Array, ""]) -> Bool[Array, ""]:
-    """Whether a log evidence with this `error` and `rounding` is finite and close enough (see [`Certificate`][])."""
+    """Whether a log evidence with this `error` and `rounding` is finite and close enough (see [`Certificate`][]).
+
+    All are scalars, in nats.
+    """
     share = max(float(jnp.finfo(value.dtype).eps) ** 0.5, _SHARE)
     near = error + rounding <= _NATS + share * jnp.abs(value)
     return jnp.isfinite(value) & (error <= evidence_tolerance(value)) & near
 
 
 def evidence_tolerance(log_evidence: Float[Array, ""]) -> Float[Array, ""]:
-    """How far off the search may leave a log evidence: 0.02 + eps^(1/2) |log evidence|."""
+    """How far off the search may leave a log evidence: 0.02 + eps^(1/2) |log evidence|. Scalars, in nats."""
     return _NATS + jnp.finfo(log_evidence.dtype).eps ** 0.5 * jnp.abs(log_evidence)
 
 
@@ -207,7 +217,7 @@ def still(terms: Terms) -> Terms:
 def mean_and_explained(
     weights: Float[Array, " n"], factor: Float[Array, "n n"], inverse: Float[Array, "n n"], cross: Float[Array, "n m"]
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Posterior mean k*'a at m points, and k*'C k*, the prior variance less the posterior's.
+    """Posterior mean `k*'a` at m points, and `k*'C k*`, the prior variance less the posterior's.
 
     The latter is a sum of squares: never negative, with all its digits however little is explained.
 
@@ -236,6 +246,7 @@ def square_root(covariance: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], F
     One Cholesky step takes out what all eta's share, which is most of a large K; the eigenvectors of the rest are found
     to eps times a much smaller norm. What is left is positive semi-definite, so a negative eigenvalue is rounding and
     is dropped; what that and all other rounding did to K is measured, as the product says.
+    (n, n) -> (n, n) and a scalar.
     """
     first = covariance[0, 0]
     shared = covariance[:, 0] / jnp.sqrt(jnp.where(first > 0, first, 1.0))
@@ -250,7 +261,10 @@ def square_root(covariance: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], F
 def factorise(
     covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"], Float[Array, "n n"]]:
-    """W^(1/2) as a vector, B = I + W^(1/2) K W^(1/2), and its Cholesky factor L."""
+    """W^(1/2) as a vector, B = I + W^(1/2) K W^(1/2), and its Cholesky factor L.
+
+    `covariance` (n, n), `curvature` (n,) -> (n,), (n, n), (n, n).
+    """
     root = jnp.sqrt(curvature)
     matrix = jnp.eye(root.shape[0], dtype=root.dtype) + root[:, None] * covariance * root[None, :]
     return root, matrix, cholesky(matrix)
@@ -259,7 +273,10 @@ def factorise(
 def factor(
     covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """V = L^-1 W^(1/2) with B = L L', so V'V = C; and a bound on B's condition, as B has no eigenvalue below 1."""
+    """V = L^-1 W^(1/2) with B = L L', so V'V = C; and a bound on B's condition, as B has no eigenvalue below 1.
+
+    `covariance` (n, n), `curvature` (n,) -> (n, n) and a scalar.
+    """
     root, matrix, lower = factorise(covariance, curvature)
     return solve_lower(lower, jnp.diag(root)), jnp.linalg.norm(matrix)
 
@@ -268,7 +285,7 @@ def factor(
 def inverse_and_log_determinant(
     covariance: Float[Array, "n n"], curvature: Float[Array, " n"]
 ) -> tuple[Float[Array, "n n"], Float[Array, ""]]:
-    """C, and log|B| = log|I + K W|."""
+    """C, and log|B| = log|I + K W|. `covariance` (n, n), `curvature` (n,) -> (n, n) and a scalar."""
     root, _, lower = factorise(covariance, curvature)
     factor = solve_lower(lower, jnp.diag(root))
     return factor.T @ factor, 2.0 * jnp.sum(jnp.log(jnp.diagonal(lower)))

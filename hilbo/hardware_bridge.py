@@ -158,6 +158,8 @@ class Renderer:
 
         In contact the device first warms the set's own history; `wait` is how long (s) that may take. `force_limit`
         (N) is the device's own if not given. A set that is in force already is not sent again.
+        K0, K1 in N/mm, B1 in N·s^α/mm, T in s. Raises `InputError` for numbers that do not fit and for a set
+        that the device refuses, `DeviceError` if the line fails.
         """
         numbers = {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "N": N, "T": T, "memory": memory, "states": states}
         wanted = wanted_for(self.device, **numbers, force_limit=force_limit)
@@ -168,7 +170,10 @@ class Renderer:
         return in_force(self._link.request(protocol.GetSet(bank=0)))
 
     def start(self) -> None:
-        """Render the set that is in force. Telemetry from before is dropped."""
+        """Render the set that is in force. Telemetry from before is dropped.
+
+        Raises `DeviceError` if no set is in force.
+        """
         current = self.in_force()
         if current is None:
             raise DeviceError("The device has no set in force; send one first.")
@@ -231,7 +236,10 @@ class Renderer:
         period: SupportsFloat = 0.0,
         duration: SupportsFloat,
     ) -> None:
-        """The device moves by itself for `duration` s: see DRIVE in PROTOCOL.md. Force in N, position in mm, s."""
+        """The device moves by itself for `duration` s: see DRIVE in PROTOCOL.md. Force in N, position in mm, s.
+
+        Raises `InputError` for another mode or shape, `DeviceError` for a device that cannot move by itself.
+        """
         if not self.can & Capability.DRIVE:
             raise DeviceError(
                 f"{self._link.name}: this device cannot move by itself; use one that can, or the simulator."
@@ -254,11 +262,15 @@ class Renderer:
         """A pandas table of everything since `start` or the last call, after `seconds` more of the device's time.
 
         Columns: tick, time_s, position_mm, force_N (commanded), sensed_N (NaN without sensor), flags (`SampleFlag`).
+        Raises `DeviceError` if the line is lost or no telemetry comes.
         """
         return self.samples(seconds).table(self.tick_s)
 
     def samples(self, seconds: SupportsFloat = 1.0) -> Samples:
-        """The same as columns of numbers, without pandas."""
+        """The same as columns of numbers, without pandas.
+
+        Arrays (n,), in the units of `telemetry`. Raises `DeviceError` if the line is lost or no telemetry comes.
+        """
         buffer, quiet, ticks = self._buffer, 0, float(seconds) / self.tick_s
         first = buffer.tick
         while buffer.tick - first < ticks:
@@ -301,6 +313,7 @@ class Renderer:
         """Connect again after the line or the device was away; True if the device has not restarted meanwhile.
 
         It is left stopped, and a restarted one without a set: send it again, and start it when somebody is ready.
+        `timeout` in s. Raises `DeviceError` if a simulated device has ended.
         """
         before, give_up = self.device.boot_id, time.monotonic() + float(timeout)
         self._link.close()

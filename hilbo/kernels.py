@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from hilbo.numerics.shown import check_positive, shown
+
 __all__ = ["RBF", "Kernel", "gram"]
 
 
@@ -27,7 +29,10 @@ class Kernel(Protocol):
         ...
 
     def diagonal(self, x: Float[Array, " d"], /) -> Float[Array, ""]:
-        """Variance of the latent function at a point: the covariance with itself, without its rounding."""
+        """Variance of the latent function at a point: the covariance with itself, without its rounding.
+
+        `x` (d,) -> a scalar.
+        """
         ...
 
 
@@ -38,6 +43,8 @@ class RBF(eqx.Module):
 
     - `theta`: inverse squared length, > 0, scalar or (d,), per squared unit of x.
     - `variance`: prior variance of the latent function, > 0.
+
+    Raises `InputError` for numbers that are not above 0; what is traced is not checked.
     """
 
     theta: Float[Array, "*d"]
@@ -46,6 +53,10 @@ class RBF(eqx.Module):
     def __init__(self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0):
         self.theta = jnp.asarray(theta, dtype=_float_dtype(theta))
         self.variance = jnp.asarray(variance, dtype=_float_dtype(variance))
+        check_positive("RBF", theta=self.theta, variance=self.variance)
+
+    def __repr__(self) -> str:
+        return f"RBF(theta={shown(self.theta)}, variance={shown(self.variance)})"
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
         """Covariance of the latent function at `x` and at `y`, both (d,)."""
@@ -61,12 +72,15 @@ class RBF(eqx.Module):
         return jnp.exp(-theta.astype(x.dtype) * (x[:, None] - y[None, :]) ** 2)
 
     def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
-        """The prior variance, the same everywhere."""
+        """The prior variance, the same everywhere. `x` (d,) -> a scalar."""
         return self.variance.astype(x.dtype)
 
 
 def gram(kernel: Kernel, x: Float[Array, "n d"], y: Float[Array, "m d"]) -> Float[Array, "n m"]:
-    """Matrix of covariances between the rows of `x` and the rows of `y`."""
+    """Matrix of covariances between the rows of `x` and the rows of `y`.
+
+    (n, d), (m, d) -> (n, m), in the units of the latent function squared.
+    """
     return jax.vmap(lambda p: jax.vmap(lambda r: kernel(p, r))(y))(x)
 
 

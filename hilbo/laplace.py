@@ -120,6 +120,7 @@ def find_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array,
     """The mode, sought from weights `start` and then, if need be, from 0.
 
     Under `vmap` one matrix after the other on CPUs, each stopping when it is done; elsewhere all at once in v.
+    `covariance` (n, n), `start` (n,).
     """
     arrays, rest = eqx.partition(terms, eqx.is_array)
 
@@ -144,7 +145,7 @@ class _PlainState(NamedTuple):
 
 
 def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array, " n"], max_steps: int) -> Mode:
-    """Full Newton steps on the weights, as long as the log posterior rises."""
+    """Full Newton steps on the weights, as long as the log posterior rises. `covariance` (n, n), `start` (n,)."""
     epsilon = jnp.finfo(start.dtype).eps
     tolerance = jnp.asarray(epsilon ** (2 / 3), start.dtype)
 

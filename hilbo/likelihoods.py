@@ -31,7 +31,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
+from hilbo.errors import InputError
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
+from hilbo.numerics.shown import check_positive, concrete, shown
 from hilbo.numerics.tracing import traced_once
 
 __all__ = ["OrdinalProbit", "confined_normal"]
@@ -39,6 +41,12 @@ __all__ = ["OrdinalProbit", "confined_normal"]
 # An interval is narrow below this width, and below this product of width and distance from the middle of the bell.
 _NARROW_WIDTH, _NARROW_PRODUCT = 1.0, 4.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+
+
+def _rising(thresholds: np.ndarray) -> bool:
+    """Whether there is one threshold at least, all are finite, and each is above the one before; for several people."""
+    some = thresholds.ndim > 0 and thresholds.shape[-1] > 0
+    return bool(some and np.all(np.isfinite(thresholds)) and np.all(np.diff(thresholds) > 0))
 
 
 class OrdinalProbit(eqx.Module):
@@ -49,8 +57,8 @@ class OrdinalProbit(eqx.Module):
     - `thresholds`: C - 1 increasing numbers, in units of the latent f; the outermost categories are unbounded.
     - `noise`: standard deviation c_o > 0 of the classification noise, in units of f.
 
-    Nothing is checked here, because both may be traced: thresholds out of order or a noise <= 0 give NaN, never a
-    plausible number. `Study` refuses them in a sentence.
+    Raises `InputError` for thresholds that do not rise and a noise that is not above 0. What is traced is not checked:
+    there such values give NaN, never a plausible number.
     """
 
     thresholds: Float[Array, " edges"]
@@ -60,6 +68,13 @@ class OrdinalProbit(eqx.Module):
         dtype = getattr(thresholds, "dtype", None)
         self.thresholds = jnp.asarray(thresholds, dtype if dtype is not None else jnp.result_type(float))
         self.noise = jnp.asarray(noise, dtype=self.thresholds.dtype)
+        check_positive("OrdinalProbit", noise=self.noise)
+        if concrete(self.thresholds) and not _rising(np.asarray(self.thresholds)):
+            given = shown(self.thresholds)
+            raise InputError(f"OrdinalProbit: thresholds is {given}; it must be a list of finite numbers that rise.")
+
+    def __repr__(self) -> str:
+        return f"OrdinalProbit(thresholds={shown(self.thresholds)}, noise={shown(self.noise)})"
 
     @property
     def categories(self) -> int:
@@ -70,12 +85,16 @@ class OrdinalProbit(eqx.Module):
         """log p(q | f) for one latent value `f` and one category `q` in 0..C-1.
 
         Differentiable to any order in `f`, the thresholds and the noise; exact in both tails.
+        Both are scalars, and so is the result; `jax.vmap` for several.
         """
         f, lower, upper, noise = self._edges(f, q)
         return _truncated(f, lower, upper, noise).log_mass
 
     def expand(self, f: ArrayLike, q: ArrayLike) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """log p(q | f), its derivative in `f`, and minus its second derivative (in [0, 1 / noise^2]), at one price."""
+        """log p(q | f), its derivative in `f`, and minus its second derivative (in [0, 1 / noise^2]), at one price.
+
+        All are scalars; `jax.vmap` for several.
+        """
         f, lower, upper, noise = self._edges(f, q)
         truncated = _truncated(f, lower, upper, noise)
         return truncated.log_mass, truncated.mean / noise, truncated.curvature / noise**2

@@ -11,6 +11,7 @@ Reference: paper, section IV.
 """
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -29,6 +30,7 @@ from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.shown import concrete, shown
 from hilbo.numerics.tracing import traced_once
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "OrdinalTerms", "Posterior", "Trials", "fit"]
@@ -39,6 +41,7 @@ _SOUGHT = {
     "ep_corrected": "fixed point of expectation propagation, corrected,",
     "exact": "exact posterior",
 }
+_PointsLike = ArrayLike | Sequence[Sequence[float]]
 _CACHED, _PARTS = 2**16, 8  # covariances held at a time when many points are predicted, in at most so many parts
 _BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
 
@@ -53,6 +56,9 @@ class OrdinalGP(eqx.Module):
     kernel: Any
     """A `Kernel`: the RBF, or one of yours; only hyperparameters are learnt for the RBF alone."""
     likelihood: OrdinalProbit
+
+    def __repr__(self) -> str:
+        return f"OrdinalGP({self.kernel!r}, {self.likelihood!r})"
 
 
 class Trials(eqx.Module):
@@ -96,7 +102,10 @@ class Trials(eqx.Module):
         return self.x.shape[-2]
 
     def append(self, x: Float[Array, " d"], q: ArrayLike) -> "Trials":
-        """With one more answer in the first free row: the shapes stay, nothing recompiles. A full table becomes NaN."""
+        """With one more answer in the first free row: the shapes stay, nothing recompiles. A full table becomes NaN.
+
+        `x` (d,) in the unit cube, `q` a category in 0..C-1.
+        """
         row = jnp.sum(self.mask)
         full = row >= self.capacity
         return Trials(
@@ -106,7 +115,7 @@ class Trials(eqx.Module):
         )
 
     def first(self, count: ArrayLike) -> "Trials":
-        """Only the first `count` rows, with the same capacity."""
+        """Only the first `count` rows, with the same capacity. `count`: an int, from 0 to the capacity."""
         keep = jnp.arange(self.capacity) < count
         return Trials(self.x, self.q, self.mask & keep)
 
@@ -162,7 +171,7 @@ class Posterior(eqx.Module):
 
     @property
     def log_evidence(self) -> Float[Array, ""]:
-        """log p(answers) under the approximation."""
+        """log p(answers) under the approximation. A scalar, in nats."""
         return self.latent.log_evidence
 
     @property
@@ -170,44 +179,66 @@ class Posterior(eqx.Module):
         """Residual, iterations, jitter, condition and smallest variance of this fit; standard errors if sampled."""
         return self.latent.certificate
 
-    def mean(self, x: Float[Array, "m d"]) -> Float[Array, " m"]:
-        """Posterior mean (m,) of f at points of the unit cube: the variance is not computed."""
-        return _mean(self, x)
+    def mean(self, x: _PointsLike) -> Float[Array, " m"]:
+        """Posterior mean (m,) of f at points (m, d) of the unit cube: the variance is not computed."""
+        return _mean(self, self._points(x))
 
-    def predict(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    def predict(self, x: _PointsLike) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Posterior mean and variance of f, (m,) each, at points (m, d) of the unit cube."""
-        return _predict(self, x)
+        return _predict(self, self._points(x))
 
-    def predict_explained(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Posterior mean, and the part of the prior variance that the answers explain, to all its digits."""
-        return _mean_and_explained(self, x)
+    def predict_explained(self, x: _PointsLike) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Posterior mean, and the part of the prior variance that the answers explain, to all its digits.
+
+        `x` (m, d) in the unit cube -> (m,), (m,).
+        """
+        return _mean_and_explained(self, self._points(x))
 
     def astype(self, dtype: DTypeLike) -> "Posterior":
         """The same posterior in another float dtype. Screening many points in float32 costs half as much, and errs by
         about 1e-6 of the prior's standard deviation."""
         return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self)
 
-    def class_probabilities(self, x: Float[Array, "m d"]) -> Float[Array, "m categories"]:
+    def class_probabilities(self, x: _PointsLike) -> Float[Array, "m categories"]:
         """Probabilities (m, C) of the answers to be expected at points (m, d).
 
         From mean and variance, f being taken for normal; after `inference="exact"` from the samples themselves.
         """
         if isinstance(self.latent, ExactPosterior):
-            return _sampled_probabilities(self, x)[0]
+            return _sampled_probabilities(self, self._points(x))[0]
         mean, variance = self.predict(x)
         return jax.vmap(self.gp.likelihood.class_probabilities)(mean, variance)
 
     def standard_errors(
-        self, x: Float[Array, "m d"]
+        self, x: _PointsLike
     ) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, "m categories"]]:
         """Of mean (m,), variance (m,) and class probabilities (m, C): of an exact posterior, which is sampled."""
-        latent = _sampled(self, "standard_errors")
+        latent, x = _sampled(self, "standard_errors"), self._points(x)
         mean, variance = latent.moment_errors(gram(self.gp.kernel, self.trials.x, x))
         return mean, variance, _sampled_probabilities(self, x)[1]
 
-    def draw(self, key: PRNGKeyArray, x: Float[Array, "m d"], count: int) -> Float[Array, "count m"]:
+    def draw(self, key: PRNGKeyArray, x: _PointsLike, count: int) -> Float[Array, "count m"]:
         """Independent draws (count, m) of the latent function from the exact posterior, jointly at all points."""
-        return _draw(self, key, x, count)
+        return _draw(self, key, self._points(x), count)
+
+    def _points(self, x: _PointsLike) -> Float[Array, "m d"]:
+        """Points as an array. Raises `InputError` for another shape than (m, d)."""
+        points = x if isinstance(x, jax.Array) else jnp.asarray(x, self.trials.x.dtype)
+        if self.trials.x.ndim != 2:
+            raise InputError("Posterior: holds several people; predict for each of them by jax.vmap.")
+        if points.ndim != 2 or points.shape[1] != self.trials.x.shape[1]:
+            dim = self.trials.x.shape[1]
+            raise InputError(f"Posterior: x has shape {points.shape}; give points of shape (m, {dim}).")
+        return points
+
+    def __repr__(self) -> str:
+        whole = all(isinstance(leaf, jax.Array) for leaf in (self.trials.mask, self.trials.x))
+        mask = self.trials.mask
+        if not whole or not concrete(self) or mask.ndim != 1:  # of several people, or a tree of something else
+            return eqx.tree_pformat(self)
+        sure = "certified" if self.certificate.converged else "NOT certified"
+        answers, dim = int(mask.sum()), self.trials.x.shape[1]
+        return f"Posterior({answers} answers, {dim} parameters, log evidence {shown(self.log_evidence)}, {sure})"
 
 
 @functools.partial(jax.jit, static_argnames="count")
@@ -284,8 +315,8 @@ def fit(
     - `trials`: the answers; none gives the prior.
     - `inference`: "laplace" (paper, section IV-1), or "ep", expectation propagation: the same kind of posterior with
       a far smaller error; or "ep_corrected", which is ten times nearer still and costs a little more; or "exact",
-      sampled, for up to about 100 answers and without derivatives (docs/inference.md). The samples are the same ones
-      in every fit.
+      sampled, for up to about 100 answers and without derivatives (docs/methods/inference.md). The samples are the
+      same ones in every fit.
     - `start`: `posterior.latent.weights` of a fit to nearly the same trials, to save Newton steps.
     - `throw`: raise `InferenceError` if the certificate does not hold. Use `False` under `vmap`, and read
       `posterior.certificate.converged`.
@@ -294,6 +325,11 @@ def fit(
     """
     if inference not in _SOUGHT:
         raise InputError(f'fit: inference is "{inference}"; it must be one of {", ".join(_SOUGHT)}.')
+    dim = trials.x.shape[-1]
+    if isinstance(gp.kernel, RBF) and gp.kernel.theta.shape not in ((), (dim,)):
+        raise InputError(
+            f"fit: theta has shape {gp.kernel.theta.shape} and x {dim} parameters; give one number or {dim}."
+        )
     posterior = _fit(gp, trials, start, inference)
     return _checked(posterior, _SOUGHT[inference]) if throw else posterior
 

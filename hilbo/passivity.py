@@ -4,7 +4,7 @@ A rendering H(z) on a device with physical damping b is passive (Colgate & Schen
 
     b > (T/2) / (1 - cos ωT) · Re{(1 - e^{-jωT})·H(e^{jωT})},  0 <= ω <= π/T,   and   H(1) >= 0.
 
-For odd N and for full memory the Nyquist frequency binds (docs/mechanics.md says what of this is proved):
+For odd N and for full memory the Nyquist frequency binds (docs/methods/mechanics.md says what of this is proved):
 b_min = (T/2)·H(-1). With K0 set by H(1) = K_eff, S = C(1), C = C(-1) (see
 `viscoelastic`) this is
 

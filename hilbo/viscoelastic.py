@@ -85,7 +85,10 @@ def K0_from_effective_stiffness(
     *,
     memory: Memory = "short",
 ) -> Float[Array, "..."]:
-    """K0 (N/mm) with which the rendering has the static stiffness H(1) = `K_eff` (N/mm); elementwise."""
+    """K0 (N/mm) with which the rendering has the static stiffness H(1) = `K_eff` (N/mm); elementwise.
+
+    K1 and `K_eff` in N/mm, B1 in N·s^α/mm, T in s; arrays that broadcast.
+    """
     return elementwise(_K0, span(memory, N), K1, B1, alpha, K_eff, T)
 
 

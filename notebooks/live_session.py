@@ -20,6 +20,7 @@ from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.plan import header_for
 from hilbo.session.views import participant_view
+from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 
 # %% [markdown]
@@ -38,7 +39,7 @@ header = header_for(study, "P01", seed=0)
 log = EventLog.create(folder / log_name(header), study, header)
 chooser = LiveChooser(log.state)
 chooser.warm()
-decide = Decider(study, seed=0)
+decide = Decider(study, preset_of("paper"), seed=0)
 device = Renderer.open("sim", options={"finger": "none"})
 
 # %% [markdown]

@@ -48,7 +48,7 @@ study = Study.load(folder / "study.toml")
 
 # %% [markdown]
 # ## Sessions
-# Everybody's trials are chosen by the session's own rule. The simulated people are those of docs/simulation.md.
+# Everybody's trials are chosen by the session's own rule. The simulated people are those of docs/methods/simulation.md.
 
 # %%
 answers, truths, sets, compared = [], [], [], []

@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).parents[1] / "hilbo"
 # errors.
 MAY_IMPORT = {
     "errors": set(),
-    "kernels": set(),
+    "kernels": {"numerics"},
     "programs": set(),
     "bcm": set(),
     "numerics": set(),

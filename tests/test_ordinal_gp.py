@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from datasets import near_separable, repeated, repeated_19, separated
-from helpers import assert_traces_once, check_grad
+from helpers import assert_traces_once, check_grad, unchecked
 from oracles import oracle
 from reference_laplace import mpmath_laplace
 
@@ -228,7 +228,7 @@ def test_one_answer_too_many_is_not_forgotten_in_silence():
 
 def test_a_failed_fit_says_so():
     data = separated()
-    gp = OrdinalGP(RBF(data.theta, data.variance), OrdinalProbit((0.5, -0.5), 0.5))  # out of order: NaN
+    gp = OrdinalGP(RBF(data.theta, data.variance), unchecked((0.5, -0.5), 0.5))  # out of order: NaN
     with pytest.raises(InferenceError, match=r"mode was not found: its residual is .* after \d+ steps and should be"):
         fit(gp, answers(data))
     assert not fit(gp, answers(data), throw=False).certificate.converged

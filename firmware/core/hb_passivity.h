@@ -2,7 +2,7 @@
  *
  *     S = C(1), C(-1), M1 = -sum i c_i;   H(1) = K0 + series(K1, beta S),   b_min = T/2 (K0 + series(K1, beta C(-1)))
  *
- * with series(p, q) = p q/(p + q). docs/mechanics.md says what of this is proved, and why N must be odd. */
+ * with series(p, q) = p q/(p + q). docs/methods/mechanics.md says what of this is proved, and why N must be odd. */
 #ifndef HB_PASSIVITY_H
 #define HB_PASSIVITY_H
 

@@ -3,7 +3,7 @@
     python3 firmware/tests/prove.py [FILE.c...]
 
 Prints the number of goals of each file; exit status 1 if one of them is not proved, 2 if a tool is missing. Needs
-frama-c, why3, z3 and cvc4 (on Debian: frama-c-base why3 z3 cvc4). docs/proofs.md says what the contracts say.
+frama-c, why3, z3 and cvc4 (on Debian: frama-c-base why3 z3 cvc4). docs/device/firmware.md says what the contracts say.
 """
 
 import os
@@ -22,8 +22,8 @@ TOOLS = ("frama-c", "why3", "z3", "cvc4")
 
 
 class Plan(NamedTuple):
-    """Functions of a file whose contracts are believed (docs/proofs.md says why), and those for which WP first takes
-    the goal apart, by a strategy that would cost minutes elsewhere."""
+    """Functions of a file whose contracts are believed (docs/device/firmware.md says why), and those for which WP first
+    takes the goal apart, by a strategy that would cost minutes elsewhere."""
 
     believed: tuple[str, ...] = ()
     apart: tuple[str, ...] = ()

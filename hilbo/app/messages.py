@@ -1,6 +1,6 @@
 """What the two pages, and programs in their place, may send: JSON, every key known, every value of its type and size.
 
-docs/live.md is the same for a reader. Whatever does not fit is refused with one sentence, and changes nothing.
+docs/guides/live.md is the same for a reader. Whatever does not fit is refused with one sentence, and changes nothing.
 """
 
 from typing import Annotated, Any, Literal

@@ -2,7 +2,7 @@
 
 import functools
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,6 +39,8 @@ class Wanted(NamedTuple):
     people: Path | None = None
     warm_start: Path | None = None
     dry_run: bool = False
+    reference: Mapping[str, float] | None = None
+    """Of the reference that the participant's own page presents (`hilbo try`): the answers are unblinded."""
 
 
 def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable[[str], Any]) -> tuple[Hub, EventLog]:
@@ -101,14 +103,18 @@ def _resumed(wanted, study) -> tuple[EventLog, LiveChooser]:
 def _header(wanted, study) -> Header:
     number = study.session.protocol_number
     facts: dict[str, Any] = {"protocol_number": number, "versions": _versions()}
-    if wanted.dry_run:
+    if wanted.reference is not None:
+        facts |= {"unblinded": "try", "warm": False}
+    elif wanted.dry_run:
         facts["dry_run"] = True
     else:
         people = read_people(wanted.people or wanted.logs / "participants.csv")
         facts["consent"] = check_consent(people, wanted.participant, number)["consent_time"]
     if wanted.plan is None:
         place = (wanted.participant, wanted.session, wanted.seed)
-        return header_for(study, *place, materials=(wanted.material,), **facts)
+        header = header_for(study, *place, materials=(wanted.material,), **facts)
+        shown = {} if wanted.reference is None else {"reference": dict(wanted.reference)}
+        return msgspec.structs.replace(header, sets=header.sets | shown)
     plan = read_plan(wanted.plan)
     try:
         return planned_header(plan, study, wanted.participant, **facts)

@@ -2,7 +2,7 @@
 
 The server is a process of its own, as `hilbo session` starts it; the device is the firmware's core on a
 pseudo-terminal, whose finger presses while a rendering is shown; the participant's page is in Chromium. The participant
-is one of `simulation.presets` and answers from what was really on the device.
+is drawn from the study's simulated population (`simulation.presets`) and answers from what was really on the device.
 """
 
 import contextlib
@@ -24,7 +24,8 @@ from hilbo.errors import InputError
 from hilbo.session.event_log import read_log
 from hilbo.session.plan import make_plan
 from hilbo.simulation import simulate
-from hilbo.simulation.presets import PRESETS
+from hilbo.simulation.presets import placed, population_of
+from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
 from hilbo.study.study_file import StudyFile
 
@@ -42,9 +43,9 @@ _STEPS = {
 class Decider:
     """A simulated person's answers about renderings, in the labels of the study."""
 
-    def __init__(self, study: Study, preset: str = "paper", seed: int = 0):
+    def __init__(self, study: Study, population: Population, seed: int = 0):
         self._study, self._key, self._count = study, jax.random.key(seed), 0
-        people = simulate.people(study, PRESETS[preset], 1, seed)
+        people = simulate.people(study, population, 1, seed)
         self._person = jax.tree.map(lambda leaf: leaf[0], people)
         self._answer = jax.jit(lambda key, x: self._person.answer(key, x, jnp.asarray(0.5, x.dtype)))
 
@@ -79,9 +80,9 @@ def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int |
     return target
 
 
-def example_sets(study: Study, preset: str = "paper") -> dict[str, dict[str, float]]:
+def example_sets(study: Study, population: Population) -> dict[str, dict[str, float]]:
     """Best, mid and worst renderings of a simulated population, by their distance from its truth."""
-    space, truth = study.space, PRESETS[preset].truth
+    space, truth = study.space, population.truth
     points = space.candidates(256, 0)
     centre = np.asarray(space.to_unit(np.array([truth[name] for name in space.names])))
     order = np.argsort(np.linalg.norm(points - centre, axis=1))
@@ -133,6 +134,7 @@ def rehearse(
     source: Path,
     out: Path,
     *,
+    preset: str | None = None,
     phase: str = "optimisation",
     seconds: float | None = None,
     warm_up: int | None = None,
@@ -145,6 +147,7 @@ def rehearse(
     out.mkdir(parents=True, exist_ok=True)
     file = fast_study(source, out / "study.toml", seconds, warm_up)
     study = Study.load(file)
+    population = placed(study, population_of(study, preset)[1], seed)
     arguments = [
         str(file),
         "--participant",
@@ -159,13 +162,13 @@ def rehearse(
     ]
     arguments += ["--gap", "0.7" if seconds is None else "0.05"]
     if phase != "optimisation":
-        arguments += ["--plan", str(_plan(study, out, phase, seed))]
+        arguments += ["--plan", str(_plan(study, population, out, phase, seed))]
     say("starting the server")
     finger = Simulator(finger="rest")
     try:
         with server(*arguments, "--device", finger.port) as (_, links), browser() as program:
             say("in session")
-            found = _session(program, links, Decider(study, seed=seed), finger, out, say)
+            found = _session(program, links, Decider(study, population, seed), finger, out, say)
         found["log"] = links["log"]
         found["events"] = len(read_log(links["log"], study)[1])
     finally:
@@ -174,8 +177,8 @@ def rehearse(
     return found
 
 
-def _plan(study, out, phase, seed) -> Path:
-    sets = example_sets(study)
+def _plan(study, population, out, phase, seed) -> Path:
+    sets = example_sets(study, population)
     if phase == "aggregate-best":
         sets = {"aggregate": sets["best"], "individual:S1": sets["mid"], "individual:S2": sets["worst"]}
     plan = make_plan(study, ["P01"], seed, phase, sets={"": sets}, source="aggregate")  # type: ignore[arg-type]

@@ -70,8 +70,9 @@ def bound(port: int = PORT, *, lan: bool = False, keys: Path | None = None) -> P
     return Place(listening, addresses, keys)
 
 
-def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) -> None:
+def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any], tried: Any = None) -> None:
     """Opens the hub, answers until Ctrl-C or SIGTERM, or until what `started` was given is called, and closes the hub.
+    `tried`: what the page of `hilbo try` is told, where this is one (`tried`).
 
     Raises what keeps the hub from opening, `InputError` or `DeviceError`; nobody has been answered then.
     """
@@ -83,7 +84,7 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any]) 
 
     sys.setswitchinterval(_SWITCH)
     config = uvicorn.Config(
-        application(hub, place.gate), log_level="error", access_log=False, lifespan="off", server_header=False,
+        application(hub, place.gate, tried), log_level="error", access_log=False, lifespan="off", server_header=False,
         timeout_graceful_shutdown=_LINGER, ws="none",
         http=functools.partial(Connection, Connections(place.gate)),  # type: ignore[arg-type]
     )  # fmt: skip

@@ -9,6 +9,7 @@
     POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite
     POST /api/stimulus/hello     a program that presents begins
     POST /api/stimulus           how it is; the answer is the newest order
+    GET  /try, /api/try, /api/try/map   the page of `hilbo try` (`tried`), what it presents, and its end
 
 Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 409 not now, 413 too large. The
 event loop only waits here: files, device and arithmetic have threads of their own.
@@ -32,6 +33,7 @@ from hilbo.app import messages
 from hilbo.app.hub import COMMANDS, PRESSES, NotNowError
 from hilbo.app.security import PAGES, Gate, Role
 from hilbo.app.stimulus_rig import OverError, StimulusRig
+from hilbo.app.tried import Tried
 from hilbo.errors import InputError
 from hilbo.session.event_log import LogError
 
@@ -75,8 +77,9 @@ class _Guard:
             await (_error(403, why) if why else self.app)(scope, receive, sending)
 
 
-def application(hub: Any, gate: Gate) -> Starlette:
-    """The server of one session, whose `Hub` is open; or of what stands in a hub's place."""
+def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
+    """The server of one session, whose `Hub` is open; or of what stands in a hub's place. `tried`: it is `hilbo try`'s,
+    and has its page."""
     guarded = _for(hub, gate)
     routes = [
         Route("/", _page("join.html")),
@@ -94,6 +97,9 @@ def application(hub: Any, gate: Gate) -> Starlette:
     routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
     routes += [Route("/api/stimulus", guarded("stimulus", _report), methods=["POST"])]
     routes += [Route("/api/stimulus/hello", guarded("stimulus", _hello), methods=["POST"])]
+    if tried is not None:
+        routes += [Route("/try", _page("try.html")), Route("/api/try", guarded("stimulus", _json_of(tried.facts)))]
+        routes += [Route("/api/try/map", guarded("stimulus", _json_of(tried.map)))]
     routes += [Route(f"/static/{name}", _page(name)) for name in _FILES]
     return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)])
 
@@ -177,6 +183,15 @@ async def _view(hub, role, _request) -> Response:
 async def _map(hub, _role, _request) -> Response:
     found = await hub.map()
     return _error(404, "This session has no map.") if found is None else _json(found)
+
+
+def _json_of(found):
+    """A handler of what is found in a hub."""
+
+    async def handle(hub, _role, _request) -> Response:
+        return _json(await found(hub))
+
+    return handle
 
 
 async def _answer(hub, role, request) -> Response:

@@ -5,7 +5,7 @@
 An order says what shall be the case from now on (`present`, `neutral`, `stop`), not what shall change, so that nothing
 is lost with a message: whoever asks is told the newest. The program says which order it knows and what it has done
 about it; it asks again and again, which is its sign of life, and the answer is the server's. All of it happens in the
-event loop. docs/stimulus.md has every message.
+event loop. docs/guides/stimulus.md has every message.
 """
 
 import asyncio

@@ -42,7 +42,7 @@ def trial_name(hub: Any) -> str | None:
 
 
 def participant(hub: Any) -> dict[str, Any]:
-    """The participant's view; docs/live.md describes it."""
+    """The participant's view; docs/guides/live.md describes it."""
     seen, session, stage = participant_view(hub.state), hub.state.study.session, hub.runner.stage
     trial, screen = seen["trial"], seen["screen"]
     step = _step(hub, trial) if screen == "trial" and stage == "step" else None

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from hilbo.cli.console import Json, cache_folder, print_result, remark
+from hilbo.cli.console import JsonToo, cache_folder, print_result, remark
 from hilbo.programs.entries import Entries
 
 __all__ = ["cache"]
@@ -13,7 +13,7 @@ __all__ = ["cache"]
 
 def cache(
     clear: Annotated[bool, typer.Option("--clear", help="Drop everything; it is made again when needed.")] = False,
-    as_json: Json = False,
+    as_json: JsonToo = False,
 ) -> None:
     """Show the programs that are kept from one command to the next, or drop them."""
     folder = cache_folder()

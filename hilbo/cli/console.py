@@ -13,21 +13,23 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
 
-from hilbo.errors import InputError
+from hilbo.errors import InputError, InputRemark
 
 __all__ = [
     "PARTS",
     "Force",
+    "ForceFile",
     "Json",
+    "JsonToo",
     "Out",
+    "Preset",
     "Say",
-    "Seed",
     "cache_folder",
     "fail",
     "finish",
@@ -35,18 +37,32 @@ __all__ = [
     "progress",
     "remark",
     "results",
+    "say_remarks",
+    "seed_option",
     "start",
 ]
 
 Out = Annotated[Path, typer.Option("--out", help="Folder for the results.")]
-Seed = Annotated[
-    int, typer.Option("--seed", min=0, max=2**31 - 1, help="Decides candidates, and in simulations everything random.")
+Preset = Annotated[
+    str | None,
+    typer.Option(
+        "--preset",
+        help="Whom the people are drawn from: paper, paper-individuals, or paper-01 to paper-30; by default what the"
+        " study states in [simulation].",
+    ),
 ]
 Force = Annotated[bool, typer.Option("--force", help="Replace an existing results folder.")]
+ForceFile = Annotated[bool, typer.Option("--force", help="Replace an existing file.")]
 Json = Annotated[bool, typer.Option("--json", help="Print result.json on stdout.")]
+JsonToo = Annotated[bool, typer.Option("--json", help="Print what is said as JSON on stdout.")]
 
 PARTS = ("video-quality", "simulated-memory-foam")
 _EVERY = 10.0  # s
+
+
+def seed_option(what: str) -> Any:
+    """The option --seed of a command, for `Annotated`; `what` it decides ends its help."""
+    return typer.Option("--seed", min=0, max=2**31 - 1, help=f"Random seed {what}.")
 
 
 def start(devices: int | None = None) -> None:
@@ -212,6 +228,18 @@ def print_result(content: Any, words: str, as_json: bool) -> None:
 def remark(sentence: str) -> None:
     """One sentence on stderr."""
     print(f"hilbo: {sentence}", file=sys.stderr)
+
+
+def say_remarks(show: Callable[..., None]) -> Callable[..., None]:
+    """`warnings.showwarning` that says an `InputRemark` in its one sentence, and everything else as `show` does."""
+
+    def said(message: Warning | str, category: type[Warning], *where: Any) -> None:
+        if issubclass(category, InputRemark):
+            remark(str(message))
+        else:
+            show(message, category, *where)
+
+    return said
 
 
 def fail(sentence: str, code: int) -> NoReturn:

@@ -14,14 +14,17 @@ from typing import Annotated, Any
 import typer
 
 from hilbo.cli import measure
-from hilbo.cli.console import Force, Json, fail, print_result
+from hilbo.cli.console import ForceFile, JsonToo, fail, print_result
 from hilbo.cli.device_options import Chosen, Line, chosen_set, opened, sets_of, takes
-from hilbo.cli.device_output import check_free, decoded, said, set_words, write_table
+from hilbo.cli.device_output import decoded, said, set_words
+from hilbo.cli.new_file import check_free, new_file
 from hilbo.errors import InputError
 
 __all__ = ["app"]
 
-app = typer.Typer(no_args_is_help=True, help="A rendering device: connect, send sets, feel, measure.")
+app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="A rendering device: connect, send sets, feel, measure."
+)
 for name, command in measure.COMMANDS.items():
     app.command(name)(command)
 
@@ -29,7 +32,7 @@ Seconds = Annotated[float | None, typer.Option(help="End after so many seconds o
 
 
 @app.command()
-def ports(as_json: Json = False) -> None:
+def ports(as_json: JsonToo = False) -> None:
     """The serial ports of this computer."""
     from hilbo.device.ports import list_ports
 
@@ -40,7 +43,7 @@ def ports(as_json: Json = False) -> None:
 
 @app.command()
 @takes(line=Line)
-def hello(line: Line, as_json: Json = False) -> None:
+def hello(line: Line, as_json: JsonToo = False) -> None:
     """Who is there: version, limits, damping, stroke, and what it can do."""
     from dataclasses import asdict
 
@@ -68,7 +71,7 @@ def hello(line: Line, as_json: Json = False) -> None:
 
 @app.command("set")
 @takes(chosen=Chosen, line=Line)
-def set_(chosen: Chosen, line: Line, as_json: Json = False) -> None:
+def set_(chosen: Chosen, line: Line, as_json: JsonToo = False) -> None:
     """Put a set in force, and read it back bit for bit. Nothing is started."""
     wanted = chosen_set(chosen, line)
     if wanted is None:
@@ -80,7 +83,7 @@ def set_(chosen: Chosen, line: Line, as_json: Json = False) -> None:
 
 @app.command()
 @takes(chosen=Chosen, line=Line)
-def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: Json = False) -> None:
+def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
     """Render the set that is in force, or the one that is given, until Ctrl-C; then stop."""
     from hilbo.cli.device_screen import watch
 
@@ -95,21 +98,21 @@ def start(chosen: Chosen, line: Line, seconds: Seconds = None, as_json: Json = F
 
 @app.command()
 @takes(line=Line)
-def stop(line: Line, as_json: Json = False) -> None:
+def stop(line: Line, as_json: JsonToo = False) -> None:
     """Force to zero, smoothly, whoever started it."""
     _at_once(line, "Stop", as_json)
 
 
 @app.command()
 @takes(line=Line)
-def estop(line: Line, as_json: Json = False) -> None:
+def estop(line: Line, as_json: JsonToo = False) -> None:
     """Force to zero at once, latched until `clear`."""
     _at_once(line, "Estop", as_json)
 
 
 @app.command()
 @takes(line=Line)
-def clear(line: Line, as_json: Json = False) -> None:
+def clear(line: Line, as_json: JsonToo = False) -> None:
     """Leave HOLD or ESTOP, once the reason is understood."""
     with opened(line) as device:
         device.clear()
@@ -119,7 +122,7 @@ def clear(line: Line, as_json: Json = False) -> None:
 
 @app.command()
 @takes(line=Line)
-def monitor(line: Line, seconds: Seconds = None, as_json: Json = False) -> None:
+def monitor(line: Line, seconds: Seconds = None, as_json: JsonToo = False) -> None:
     """State, force and position as they go by. Nothing is started."""
     from hilbo.cli.device_screen import watch
 
@@ -136,8 +139,8 @@ def record(
     line: Line,
     seconds: Annotated[float, typer.Option(min=0.001, help="So many seconds of the device's time.")] = 5.0,
     render: Annotated[bool, typer.Option("--render/--no-render", help="Start the set first, and stop after.")] = True,
-    force: Force = False,
-    as_json: Json = False,
+    force: ForceFile = False,
+    as_json: JsonToo = False,
 ) -> None:
     """Telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags."""
     check_free(out, force)
@@ -148,7 +151,8 @@ def record(
         device.samples(0.0)
         table = device.telemetry(seconds)
         state, counts = device.state().name, device.counts()
-    write_table(table, out)
+    with new_file(out) as path:
+        table.to_csv(path, index=False)
     content = {"file": str(out), "samples": len(table), "state": state, "counts": counts._asdict()}
     print_result(content, f"{out}: {len(table)} samples", as_json)
 
@@ -156,7 +160,7 @@ def record(
 @app.command()
 def decode(
     capture: Annotated[Path, typer.Argument(help="Bytes of a line, as --capture writes them.", show_default=False)],
-    as_json: Json = False,
+    as_json: JsonToo = False,
 ) -> None:
     """Captured bytes made readable: every frame, and what is wrong with the others."""
     from dataclasses import asdict
@@ -186,7 +190,7 @@ def feel(
     sets: Annotated[Path, typer.Argument(help="Sets table (CSV), one set for each key.", show_default=False)],
     line: Line,
     seconds: Seconds = None,
-    as_json: Json = False,
+    as_json: JsonToo = False,
 ) -> None:
     """Switch between sets with keys, the finger on the device: 1 to 9, space, e, c, q."""
     from hilbo.cli import device_screen

@@ -1,31 +1,6 @@
-"""What the commands of `hilbo device` put out: words about devices and their sets, and files that are never overwritten
-unasked."""
+"""What the commands of `hilbo device` say of devices, their sets and the frames of a capture."""
 
-import os
-from pathlib import Path
-from typing import Any
-
-from hilbo.errors import InputError
-
-__all__ = ["check_free", "decoded", "said", "set_words", "write_table"]
-
-
-def check_free(out: Path, force: bool) -> None:
-    """Raises `InputError` where `out` cannot be written, or would be overwritten without `force`."""
-    if out.exists() and not (force and out.is_file()):
-        raise InputError(f"{out}: exists already; choose another file, or add --force to replace it.")
-    if not out.resolve().parent.is_dir():
-        raise InputError(f"{out}: there is no folder {out.resolve().parent}; make it, or choose another file.")
-
-
-def write_table(table: Any, out: Path) -> None:
-    """A pandas table as CSV, whole or not at all. Raises `InputError`."""
-    unfinished = out.with_name(f".{out.name}.part")
-    try:
-        table.to_csv(unfinished, index=False)
-        os.replace(unfinished, out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another file.") from error
+__all__ = ["decoded", "said", "set_words"]
 
 
 def said(name, value) -> str:

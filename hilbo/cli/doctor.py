@@ -57,6 +57,8 @@ def checks(
     if study is not None:
         check, file = _study_file(study)
         yield check
+    if file is not None:
+        yield from _language(file)
     yield from _device(connect, file) if file is None or file.stimulus is None else _stimulus(file)
     begin()
     yield _precision()
@@ -215,6 +217,23 @@ def _device(connect: Callable[[float | None], Any], file: Any) -> Iterator[Check
             yield _damping(about.damping_N_s_per_m, needs)
 
 
+def _language(file: Any) -> Iterator[Check]:
+    """Whether participants can read all of it, and whether somebody has read it before them."""
+    from hilbo.study.languages import LANGUAGES, language
+
+    session = file.session
+    if session.language == "en":
+        return
+    name = LANGUAGES[session.language]
+    if left := session.untranslated(file.responses):
+        yield Check("language", "note", f"no {name} words for {', '.join(left)}", "write [session.labels]")
+    elif not language(session.language).reviewed:
+        fix = "have a native speaker read both pages of a session with --dry-run"
+        yield Check("language", "note", f"{name}: no native speaker has reviewed these texts", fix)
+    else:
+        yield Check("language", "good", name)
+
+
 def _stimulus(file: Any) -> Iterator[Check]:
     """What a study still lacks whose renderings a program presents."""
     table, parameters = file.stimulus, file.space.parameters
@@ -256,7 +275,7 @@ def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator
     found = check.found
     if found is None or found.why:
         why = "nothing was measured" if found is None else found.why
-        yield Check("the program's stop", "bad", why, "fix the program; docs/stimulus.md has what it has to say")
+        yield Check("the program's stop", "bad", why, "fix the program; docs/guides/stimulus.md has what it has to say")
         return
     for name, times in (("renderings", found.presented), ("the program's stop", found.stopped)):
         slowest = f"{len(times)} times, the slowest after {1000 * max(times):.0f} ms"

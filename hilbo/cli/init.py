@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from hilbo.errors import InputError
+from hilbo.cli.new_file import check_free, new_file
 
 __all__ = ["init"]
 
@@ -28,17 +28,12 @@ def init(
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a commented study file, from a few words about the study."""
+    check_free(study, force)
     from hilbo.study.new_study import NewStudy, parameter_of, study_text
 
     parameters = tuple(parameter_of(text) for text in parameter or [])
     answers = tuple(text.strip() for text in responses.split(","))
     text = study_text(NewStudy(name or study.stem, parameters, answers, trials, device))
-    if study.exists() and not force:
-        raise InputError(f"{study}: exists already; choose another name, or add --force to replace it.")
-    made = study.with_name(f".{study.name}-new")
-    try:
-        made.write_text(text, encoding="utf-8")
-        made.replace(study)
-    except OSError as error:
-        raise InputError(f"{study}: cannot be written ({error.strerror}); choose another place.") from error
+    with new_file(study) as path:
+        path.write_text(text, encoding="utf-8")
     print(f"{study}: written; read it, then hilbo doctor {study}", file=sys.stderr)

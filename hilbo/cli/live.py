@@ -14,11 +14,11 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from hilbo.cli.console import Json, Seed, progress, start
+from hilbo.cli.console import JsonToo, progress, seed_option, start
 from hilbo.cli.device_options import Baud, Sim, Where, sim_options, takes
 from hilbo.errors import InputError
 
-__all__ = ["doctor", "live", "session"]
+__all__ = ["doctor", "live", "need_extra", "session"]
 
 _PORT = 8642
 _EXTRA = "Live sessions need starlette, uvicorn and segno; install them with: pip install 'hilbo[live]'."
@@ -70,11 +70,11 @@ def session(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Nobody takes part: no consent is looked for, and the log says so.")
     ] = False,
-    seed: Seed = 0,
-    as_json: Json = False,
+    seed: Annotated[int, seed_option("of the points among which trials are chosen")] = 0,
+    as_json: JsonToo = False,
 ) -> None:
     """A live session: the participant's and the experimenter's page, what shows renderings, and the log."""
-    _need_extra()
+    need_extra()
     from hilbo.app import serve
 
     with contextlib.ExitStack() as held:
@@ -146,7 +146,8 @@ def _claimed(logs: Path, participant: str, name: str):
     yield logs / f".{participant}-{re.sub(r'[^A-Za-z0-9_.-]', '-', name)}.keys"
 
 
-def _need_extra() -> None:
+def need_extra() -> None:
+    """Refuse to serve where the packages for it are missing. Raises `InputError`."""
     import importlib.util
 
     if any(importlib.util.find_spec(package) is None for package in ("starlette", "uvicorn", "segno")):
@@ -162,7 +163,7 @@ def doctor(
     stimulus: Annotated[
         bool, typer.Option("--stimulus", help="Ask the program that presents for renderings, and stop it in them.")
     ] = False,
-    as_json: Json = False,
+    as_json: JsonToo = False,
 ) -> None:
     """Is everything ready for a session? What is not, and how to fix it."""
     from hilbo.cli.doctor import checks, stimulus_checks
@@ -173,7 +174,7 @@ def doctor(
     marks = {"good": "ok  ", "note": "note", "bad": "BAD "}
     found = checks(study, line.open, logs, port, start)
     if stimulus:
-        _need_extra()
+        need_extra()
         assert study is not None  # looked at above
         found = itertools.chain(found, stimulus_checks(study, port))
     for check in found:
@@ -186,9 +187,11 @@ def doctor(
         raise typer.Exit(1)
 
 
-def live(study: Path, out: Path, phase: str, seconds: float | None, seed: int, say: Any) -> dict[str, Any]:
+def live(
+    study: Path, out: Path, preset: str | None, phase: str, seconds: float | None, seed: int, say: Any
+) -> dict[str, Any]:
     """A whole session without people, into a new folder: `hilbo simulate --live`."""
-    _need_extra()
+    need_extra()
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: exists already; choose another --out.")
     start()
@@ -204,5 +207,12 @@ def live(study: Path, out: Path, phase: str, seconds: float | None, seed: int, s
             " 'hilbo[browser]')."
         )
     return rehearse(
-        study, out, phase=phase, seconds=seconds, warm_up=None if seconds is None else 3, seed=seed, say=say
+        study,
+        out,
+        preset=preset,
+        phase=phase,
+        seconds=seconds,
+        warm_up=None if seconds is None else 3,
+        seed=seed,
+        say=say,
     )

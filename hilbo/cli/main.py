@@ -7,6 +7,7 @@ one sentence.
 
 import contextlib
 import importlib
+import warnings
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,8 +18,23 @@ from hilbo.cli import device, session
 from hilbo.cli import live as cli_live
 from hilbo.cli import material as cli_material
 from hilbo.cli import study as cli_study
+from hilbo.cli import tried as cli_tried
 from hilbo.cli.cache import cache
-from hilbo.cli.console import PARTS, Force, Json, Out, Seed, fail, finish, progress, remark, results, start
+from hilbo.cli.console import (
+    PARTS,
+    Force,
+    Json,
+    Out,
+    Preset,
+    fail,
+    finish,
+    progress,
+    remark,
+    results,
+    say_remarks,
+    seed_option,
+    start,
+)
 from hilbo.cli.demo import print_demo
 from hilbo.cli.init import init
 from hilbo.errors import InputError
@@ -29,6 +45,7 @@ app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",  # brackets in help are names of tables
 )
 
 # What draws and writes, loaded beside the arithmetic. Packages that the arithmetic never imports, because two threads
@@ -62,6 +79,7 @@ def _all(
 
 def main() -> None:
     """Entry point: runs a command, and turns bad input into one sentence and exit code 2."""
+    warnings.showwarning = say_remarks(warnings.showwarning)
     try:
         app()
     except InputError as error:
@@ -79,14 +97,17 @@ def aggregate(
     trials: Table,
     study: StudyOption,
     out: Out,
-    seed: Seed = 0,
+    seed: Annotated[int, seed_option("of the points among which the optimum is sought")] = 0,
     material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
     participants: Annotated[str | None, typer.Option(help="Only these, separated by commas.")] = None,
     first: Annotated[int | None, typer.Option(min=1, help="Only everybody's first so many trials.")] = None,
     individuals: Annotated[bool, typer.Option(help="Seek everybody's own optimum: most of the work.")] = True,
     rule: Annotated[
         str | None,
-        typer.Option(help="The rule of aggregation, in place of the study file's; learnt-1 learns [gp] too."),
+        typer.Option(
+            help="Rule of aggregation in place of the study file's: bcm, rbcm, hierarchical, average, pooled, or"
+            " learnt-1, which learns [gp] too."
+        ),
     ] = None,
     compare: Annotated[
         bool, typer.Option("--compare", help="Besides, compare all rules: comparison.json, comparison.csv, figures.")
@@ -133,10 +154,12 @@ def aggregate(
 @app.command()
 def simulate(
     out: Out,
-    preset: Annotated[str, typer.Option(help="Population that the people are drawn from.")] = "paper",
+    preset: Preset = None,
     study: Annotated[Path | None, typer.Option("--study", help="Study file; by default the paper's.")] = None,
     participants: Annotated[int, typer.Option(min=1, help="How many people.")] = 24,
-    seed: Seed = 0,
+    seed: Annotated[
+        int, seed_option("of the people, of their answers and of the points among which optima are sought")
+    ] = 0,
     force: Force = False,
     as_json: Json = False,
     live: Annotated[
@@ -161,12 +184,12 @@ def robustness(
     trials: Table,
     study: StudyOption,
     out: Out,
-    seed: Seed = 0,
+    seed: Annotated[int, seed_option("of the points among which optima are sought")] = 0,
     own: Annotated[
         bool, typer.Option("--own", help="Each person's own hyperparameters instead of shared ones.")
     ] = False,
     learn: Annotated[
-        str, typer.Option(help="What the evidence chooses, separated by commas.")
+        str, typer.Option(help="What the evidence chooses of theta, noise and thresholds, separated by commas.")
     ] = "theta,noise,thresholds",
     material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
     force: Force = False,
@@ -193,6 +216,7 @@ app.command()(cli_study.report)
 app.add_typer(device.app, name="device")
 app.command()(cli_live.session)
 app.command()(cli_live.doctor)
+app.command("try")(cli_tried.tried)
 app.command()(init)
 app.command()(session.plan)
 app.command()(session.export)
@@ -201,7 +225,11 @@ app.command()(cache)
 
 
 @app.command()
-def demo(out: Out = Path("demo-results"), seed: Seed = 0, force: Force = False) -> None:
+def demo(
+    out: Out = Path("demo-results"),
+    seed: Annotated[int, seed_option("of the simulated people and of the points among which optima are sought")] = 0,
+    force: Force = False,
+) -> None:
     """Real people's answers, then a whole simulated haptic study of known truth and its report."""
     from importlib.resources import files
 
@@ -296,7 +324,7 @@ def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
 
     source = Path(str(files("hilbo") / "data" / "paper.toml")) if study is None else study
     with progress() as say:
-        summary = cli_live.live(source, out, phase, seconds, seed, say)
+        summary = cli_live.live(source, out, preset, phase, seconds, seed, say)
     print(
         json.dumps(summary, indent=2) if as_json else f"{summary['answers']} answers in {summary['seconds']} s: {out}"
     )

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, Json, Out, Seed, finish, progress, results, start
+from hilbo.cli.console import Force, Json, Out, finish, progress, results, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["identify", "passivity"]
@@ -30,7 +30,7 @@ def identify(
     model: Annotated[str, typer.Option(help='For moduli: "fosls" or "fractional-maxwell".')] = "fosls",
     weights: Annotated[str | None, typer.Option(help='For moduli: residuals over the "range", or "relative".')] = None,
     longest: Annotated[float | None, typer.Option(help="Use only the first so many seconds.")] = None,
-    seed: Seed = 0,
+    seed: Annotated[int, seed_option("of bootstrap resamples")] = 0,
     force: Force = False,
     as_json: Json = False,
 ) -> None:

@@ -9,9 +9,9 @@ from typing import Annotated
 
 import typer
 
-from hilbo.cli.console import Force, Json, Seed, fail, print_result, progress
+from hilbo.cli.console import ForceFile, JsonToo, fail, print_result, progress, seed_option
 from hilbo.cli.device_options import Line, opened, takes
-from hilbo.cli.device_output import check_free, write_table
+from hilbo.cli.new_file import check_free, new_file
 
 __all__ = ["COMMANDS"]
 
@@ -22,7 +22,7 @@ _FOAM = (-2.89, 5.70, 5.89, 0.203, 101)  # what lies under a simulated device th
 def selftest(
     line: Line,
     echoes: Annotated[int, typer.Option(min=1, help="Round trips.")] = 300,
-    as_json: Json = False,
+    as_json: JsonToo = False,
 ) -> None:
     """Loopback, latency, and whether the device lets go when the host falls silent."""
     from hilbo.identification import device_tests
@@ -45,7 +45,9 @@ def selftest(
 
 
 @takes(line=Line)
-def measure_damping(line: Line, seed: Seed = 0, as_json: Json = False) -> None:
+def measure_damping(
+    line: Line, seed: Annotated[int, seed_option("of the motion")] = 0, as_json: JsonToo = False
+) -> None:
     """Damping b and Coulomb friction of the free device, with 95 % intervals. It moves by itself."""
     from hilbo.identification import device_tests
 
@@ -79,9 +81,9 @@ def characterise(
     after: Annotated[float, typer.Option(help="Force of the recovery, N.")] = 0.5,
     hold: Annotated[float, typer.Option(help="How long each is held, s.")] = 3.0,
     rest: Annotated[float, typer.Option(help="Recovery before each test, s.")] = 2.0,
-    seed: Seed = 0,
-    force: Force = False,
-    as_json: Json = False,
+    seed: Annotated[int, seed_option("of the motion")] = 0,
+    force: ForceFile = False,
+    as_json: JsonToo = False,
 ) -> None:
     """Relaxation and creep of a material at position 0, pressed by the device itself."""
     from hilbo.identification import device_tests
@@ -91,7 +93,8 @@ def characterise(
         numbers = {"repeats": repeats, "depth": depth, "force": load, "after": after, "hold": hold, "rest": rest}
         table = device_tests.characterise(device, say, **numbers, seed=seed)
         damping = device.device.damping_N_s_per_m
-    write_table(table, out)
+    with new_file(out) as path:
+        table.to_csv(path, index=False)
     content = {"file": str(out), "samples": len(table), "repeats": repeats, "damping": damping}
     print_result(content, f"{out}: now  hilbo identify {out} --out results --damping {damping:.6g}", as_json)
 

@@ -9,13 +9,16 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, Json, Seed, progress, remark, results, start
+from hilbo.cli.console import Force, ForceFile, JsonToo, progress, remark, results, seed_option, start
+from hilbo.cli.new_file import check_free, new_file
 from hilbo.errors import InputError
 
 __all__ = ["app_participants", "export", "plan"]
 
 StudyPath = Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)]
-app_participants = typer.Typer(no_args_is_help=True, help="The list of participants, by pseudonymous id.")
+app_participants = typer.Typer(
+    no_args_is_help=True, rich_markup_mode="markdown", help="The list of participants, by pseudonymous id."
+)
 
 
 def plan(
@@ -32,9 +35,9 @@ def plan(
     source: Annotated[str, typer.Option(help="For a validation: aggregate or individual.")] = "aggregate",
     session: Annotated[str, typer.Option(help="Label of the session in tables and names of logs.")] = "",
     reissue: Annotated[str | None, typer.Option(help="OLD=NEW: give NEW the row of OLD in the plan --out.")] = None,
-    seed: Seed = 0,
-    force: Force = False,
-    as_json: Json = False,
+    seed: Annotated[int, seed_option("of orders, and of every session")] = 0,
+    force: ForceFile = False,
+    as_json: JsonToo = False,
 ) -> None:
     """Plan a whole study in advance: orders, seeds and validation sets, with a hash that every log will hold."""
     from hilbo.study.protocols import PHASES
@@ -42,7 +45,7 @@ def plan(
 
     file = StudyFile.load(study)
     if reissue is not None:
-        _write_plan(_reissued(out, file, reissue), out, True, as_json)
+        _write_plan(_reissued(out, file, reissue), out, as_json)
         return
     if kind not in PHASES[1:]:
         raise InputError(f'--kind is "{kind}"; it must be one of {", ".join(PHASES[1:])}.')
@@ -53,7 +56,7 @@ def plan(
     for name in materials:
         file.material(name)  # refuses what is none
     paths = {} if kind == "optimisation" else _by_material(materials, results_ or [])
-    _check_free(out, force)
+    check_free(out, force)
     start()
     from hilbo.session.plan import make_plan
 
@@ -74,7 +77,8 @@ def plan(
             sets=sets,
             source=source if kind == "validation" else None,
         )
-    _write_plan(made, out, force, as_json)
+    check_free(out, force)  # it may have been made in the meantime
+    _write_plan(made, out, as_json)
 
 
 def export(
@@ -221,20 +225,10 @@ def _reissued(path, study, text):
     return reissue(plan, old.strip(), new.strip())
 
 
-def _check_free(out, force):
-    if out.exists() and not force:
-        raise InputError(f"{out}: exists already; choose another --out, or add --force to replace it.")
-
-
-def _write_plan(plan, out, force, as_json):
-    _check_free(out, force)
+def _write_plan(plan, out, as_json):
     text = json.dumps(plan, indent=1, ensure_ascii=False) + "\n"
-    made = out.with_name(f".{out.name}-new")
-    try:
-        made.write_text(text, encoding="utf-8")
-        made.replace(out)
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
+    with new_file(out) as path:
+        path.write_text(text, encoding="utf-8")
     complete = "complete blocks" if plan["complete"] else f"incomplete: balance is exact at {plan['complete_at']}"
     typer.echo(f"{out}: {len(plan['participants'])} participants, {complete}, hash {plan['hash']}", err=True)
     if as_json:

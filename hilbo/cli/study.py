@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, Json, Out, Seed, finish, progress, results, start
+from hilbo.cli.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["power", "report", "simulated_report", "validate"]
@@ -21,7 +21,7 @@ def validate(
     out: Out,
     sets: Annotated[Path | None, typer.Option(help="Sets table: what each set is, and where it is from.")] = None,
     material: Annotated[str | None, typer.Option(help="Only this one of the table's materials.")] = None,
-    seed: Seed = 0,
+    seed: Annotated[int, seed_option("of bootstrap resamples")] = 0,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -38,7 +38,7 @@ def validate(
 def power(
     study: Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)],
     out: Out,
-    preset: Annotated[str, typer.Option(help="Population that the people are drawn from.")] = "paper",
+    preset: Preset = None,
     participants: Annotated[str, typer.Option(help="How many people, separated by commas.")] = "6,12,24",
     trials: Annotated[str, typer.Option(help="How many trials each, separated by commas.")] = "10,15,20,25",
     error: Annotated[
@@ -46,7 +46,7 @@ def power(
     ] = 0.15,
     studies: Annotated[int, typer.Option(min=2, help="How many studies to simulate.")] = 40,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; by default one for each core.")] = None,
-    seed: Seed = 0,
+    seed: Annotated[int, seed_option("of the simulated studies")] = 0,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -56,17 +56,18 @@ def power(
         start()
         from hilbo.report.power import write_power
         from hilbo.simulation.power import Plan, cores, simulate_power
-        from hilbo.simulation.presets import preset_of
+        from hilbo.simulation.presets import population_of
         from hilbo.study.config import Study
 
-        chosen, population = Study.load(study), preset_of(preset)
+        chosen = Study.load(study)
+        name, population = population_of(chosen, preset)
         plan = Plan(_numbers(participants, "--participants"), _numbers(trials, "--trials"), studies, seed)
         jobs = min(jobs or cores(), studies)
         say(f"simulating {studies} studies in {jobs} processes")
         errors = simulate_power(
             chosen, population, plan, jobs=jobs, begin=start, say=lambda done: say("studies", done, studies)
         )
-        cost = {"seconds": time.perf_counter() - begun, "jobs": jobs, "cores": cores(), "preset": preset}
+        cost = {"seconds": time.perf_counter() - begun, "jobs": jobs, "cores": cores(), "preset": name}
         content = write_power(chosen, errors, plan, error, cost, folder)
     finish(content, out, as_json)
 
@@ -87,7 +88,7 @@ def report(
     compare: Annotated[
         bool, typer.Option(help="Compare all rules of aggregation, each person left out in turn.")
     ] = True,
-    seed: Seed = 0,
+    seed: Annotated[int, seed_option("of bootstrap resamples, and of the points among which optima are sought")] = 0,
     force: Force = False,
     as_json: Json = False,
 ) -> None:

@@ -36,21 +36,25 @@ class SerialPort:
         self._serial: Any = _opened(name, baud)
 
     def fileno(self) -> int:
+        """The number by which the system knows the open line."""
         return self._serial.fileno()
 
     def read(self) -> bytes:
+        """What has arrived, after a short wait; empty if nothing has. Raises OSError if the line is gone."""
         try:
             return self._serial.read(max(1, self._serial.in_waiting))
         except TypeError as error:
             raise _closed() from error
 
     def write(self, data: bytes) -> None:
+        """All of the bytes. Raises OSError if the line is gone."""
         try:
             self._serial.write(data)
         except TypeError as error:
             raise _closed() from error
 
     def close(self) -> None:
+        """Give the line back; twice is no error."""
         with contextlib.suppress(OSError):
             self._serial.close()
 
@@ -64,9 +68,11 @@ class SocketPort:
         self._socket.settimeout(POLL)
 
     def fileno(self) -> int:
+        """The number by which the system knows the open line."""
         return self._socket.fileno()
 
     def read(self) -> bytes:
+        """What has arrived, after a short wait; empty if nothing has. Raises OSError if the other side has gone."""
         try:
             data = self._socket.recv(4096)
         except TimeoutError:
@@ -76,9 +82,11 @@ class SocketPort:
         return data
 
     def write(self, data: bytes) -> None:
+        """All of the bytes. Raises OSError if the other side has gone."""
         self._socket.sendall(data)
 
     def close(self) -> None:
+        """Give the line back; twice is no error."""
         self._socket.close()
 
 
@@ -97,7 +105,7 @@ def open_port(where: str, baud: int = BAUD) -> Port:
 
 
 def list_ports() -> list[PortInfo]:
-    """The serial ports of this computer."""
+    """The serial ports of this computer. Raises `InputError` without pyserial."""
     try:
         from serial.tools.list_ports import comports
     except ImportError as error:

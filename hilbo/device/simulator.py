@@ -58,7 +58,10 @@ class Simulator:
         return self._process.poll() is None
 
     def tell(self, command: str) -> str:
-        """One of the commands of `hilbo-device --help` ("restart", "finger sine", …); returns its answer."""
+        """One of the commands of `hilbo-device --help` ("restart", "finger sine", …); returns its answer.
+
+        Raises `DeviceError` if the device has ended.
+        """
         assert self._process.stdin is not None
         with self._telling:
             try:
@@ -100,7 +103,10 @@ class Simulator:
 
 
 def built() -> Path:
-    """The simulated device's program, built if this computer has not built it before."""
+    """The simulated device's program, built if this computer has not built it before.
+
+    Raises `DeviceError` where it cannot be built or run, and says what to install.
+    """
     if os.name != "posix":
         raise DeviceError(
             "This system has no pseudo-terminals for the simulated device; use WSL, or a device on a port."

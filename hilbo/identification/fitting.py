@@ -91,13 +91,33 @@ class Model(Protocol):
     labels: tuple[str, ...]
     kinds: tuple[str, ...]
 
-    def at(self, tests: Sequence[Test]) -> "Model": ...
-    def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]: ...
-    def starts(self, tests: Sequence[Test]) -> np.ndarray: ...
-    def prepare(self, test: Test) -> "Curve": ...
-    def predict(self, q: Array, curve: "Curve", weights: Array) -> Array: ...
-    def natural(self, q: Array) -> Array: ...
-    def parameters(self, q: Array) -> dict[str, Array]: ...
+    def at(self, tests: Sequence[Test]) -> "Model":
+        """The same model, made ready for the times of the tests."""
+        ...
+
+    def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest q, (4,) each."""
+        ...
+
+    def starts(self, tests: Sequence[Test]) -> np.ndarray:
+        """Where the search begins, (s, 4)."""
+        ...
+
+    def prepare(self, test: Test) -> "Curve":
+        """A test as this model needs it."""
+        ...
+
+    def predict(self, q: Array, curve: "Curve", weights: Array) -> Array:
+        """The curve's output (m,) at the coordinates q (4,), under `weights` (R,) of the repeats."""
+        ...
+
+    def natural(self, q: Array) -> Array:
+        """q (4,) under its labels, in physical units."""
+        ...
+
+    def parameters(self, q: Array) -> dict[str, Array]:
+        """Name -> value in physical units."""
+        ...
 
 
 class Curve(eqx.Module):
@@ -136,7 +156,7 @@ class Fit(eqx.Module):
 
     @property
     def q(self) -> Float[Array, " p"]:
-        """The coordinates of the fit."""
+        """The coordinates of the fit. (p,)."""
         return self.solution.q
 
     def parameters(self) -> dict[str, float]:
@@ -144,7 +164,7 @@ class Fit(eqx.Module):
         return {name: float(value) for name, value in self.model.parameters(self.q).items()}
 
     def held(self) -> Bool[Array, " p"]:
-        """Coordinates within a millionth of the box's width of a bound: the data pull them out of it."""
+        """Coordinates within a millionth of the box's width of a bound: the data pull them out of it. (p,)."""
         reach = 1e-6 * (self.upper - self.lower)
         return (self.q - self.lower <= reach) | (self.upper - self.q <= reach)
 
@@ -169,7 +189,7 @@ def fit(tests: Sequence[Test], model: Any) -> Fit:
 
 
 def polish(found: Fit, start: Float[Array, " p"]) -> Fit:
-    """The fit found from another start, if that is better."""
+    """The fit found from another start, if that is better. `start` (p,)."""
     again = _polished(found, start)
     better = again.cost < found.solution.cost
     return eqx.tree_at(lambda f: f.solution, found, again) if better else found
@@ -188,25 +208,34 @@ def _polished(current: Fit, start: Float[Array, " p"]) -> Solution:
 
 
 def residuals(model, curves, weights, q) -> Float[Array, " m"]:
-    """Residuals of all curves; their sum of squares is the sum over curves of NRMSE²."""
+    """Residuals of all curves; their sum of squares is the sum over curves of NRMSE².
+
+    `q` (p,) -> (m,), all curves one after the other.
+    """
     return jnp.concatenate([curve_residuals(model, c, w, q) for c, w in zip(curves, weights, strict=True)])
 
 
 def curve_residuals(model, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
-    """Mean of the weighted repeats less the model's, over the curve's scale and the root of its length."""
+    """Mean of the weighted repeats less the model's, over the curve's scale and the root of its length.
+
+    `weights` (R,), `q` (p,) -> (m,), without unit.
+    """
     misfit = weights @ curve.output - model.predict(q, curve, weights)
     return misfit / (curve.scale * np.sqrt(curve.time.size).astype(curve.scale.dtype))
 
 
 def nrmse(found: Fit) -> dict[str, float]:
-    """Root mean square of each test's residuals over its range."""
+    """Root mean square of each test's residuals over its range. Kind of test -> share of the range, without unit."""
     parts = [curve_residuals(found.model, c, w, found.q) for c, w in zip(found.curves, found.weights, strict=True)]
     return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(found.curves, parts, strict=True)}
 
 
 @program
 def search(model, curves, weights, starts, lower, upper) -> tuple[Solution, Float[Array, " starts"]]:
-    """All starts for a few steps, the best of them to the end; with the costs that the race ended in."""
+    """All starts for a few steps, the best of them to the end; with the costs that the race ended in.
+
+    `starts` (s, p), `lower` and `upper` (p,).
+    """
 
     def run(start, steps):
         return least_squares(lambda q: residuals(model, curves, weights, q), start, lower, upper, max_steps=steps)

@@ -226,7 +226,10 @@ def _pick(condition: Bool[Array, ""], yes: tuple[Array, ...], no: tuple[Array, .
 
 @program
 def refits(found: Fit, weights: tuple[Float[Array, "B R"], ...]) -> Float[Array, "B p"]:
-    """Coordinates fitted anew under other weights of the repeats, each from the fit."""
+    """Coordinates fitted anew under other weights of the repeats, each from the fit.
+
+    `weights`: (B, R) for each curve -> (B, p).
+    """
 
     def one(row):
         return least_squares(
@@ -243,6 +246,7 @@ def block_bootstrap(
 
     An estimate is moved by the mean of its repeats' influences A⁻¹ J_cᵀ r_ck, to first order; `exact` refits instead.
     Raises `InputError` where a test has fewer than 5 repeats.
+    Two arrays (p,), the ends.
     """
     fewest = min(w.size for w in found.weights)
     if fewest < FEWEST_REPEATS:

@@ -18,7 +18,8 @@ from jaxtyping import Float
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Test
-from hilbo.study.trial_table import numbers, of_material, place, read_cells, refuse
+from hilbo.study.cells import numbers, place, read_cells, refuse
+from hilbo.study.trial_table import of_material
 
 __all__ = ["Material", "read_material"]
 

@@ -46,12 +46,12 @@ class Continuous(eqx.Module):
         return Continuous(self.weights, jnp.asarray(np.sqrt(times.min() * times.max())))
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of q: moduli up to 50 times the largest, κ from 1e-5 to 1e5, α from 0.01 to 0.99."""
+        """Bounds of q: moduli up to 50 times the largest, κ from 1e-5 to 1e5, α from 0.01 to 0.99. Two arrays (4,)."""
         top, ends = max(_largest(test) for test in tests), np.log(0.99 / 0.01)
         return np.array([1e-3 * top, 0.0, np.log(1e-5), -ends]), np.array([50 * top, 50 * top, np.log(1e5), ends])
 
     def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts 4"]:
-        """Five places from weak and broad to strong and narrow relaxation."""
+        """Five places from weak and broad to strong and narrow relaxation. (5, 4)."""
         top, last = max(_largest(test) for test in tests), min(_smallest(test) for test in tests)
         pairs = [(1.0, 0.2), (1.0, 0.4), (1.0, 0.7), (0.1, 0.5), (10.0, 0.5)]
         return np.array([[1.2 * top, 0.5 * last, np.log(kappa), np.log(a / (1 - a))] for kappa, a in pairs])
@@ -61,7 +61,7 @@ class Continuous(eqx.Module):
         return _prepare(test, self.weights)
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
-        """G(t) or J(t) at the measured times."""
+        """G(t) or J(t) at the measured times. `q` (4,) -> (m,), in the unit of the table."""
         del weights
         alpha, change = jax.nn.sigmoid(q[3]), q[0] - q[1]
         z = jnp.exp(q[2]) * (curve.time / self.reference) ** alpha
@@ -70,11 +70,11 @@ class Continuous(eqx.Module):
         return 1 / q[0] + change / q[0] ** 2 * z * mittag_leffler_increment(alpha, z * q[1] / q[0])
 
     def natural(self, q: Float[Array, " 4"]) -> Float[Array, " 4"]:
-        """The coordinates under their labels."""
+        """The coordinates under their labels. (4,) -> (4,)."""
         return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])])
 
     def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
-        """K0, K1 and B1 (unit·s^α), α, and K_inst and K_eff beside them."""
+        """K0, K1 and B1 (unit·s^α), α, and K_inst and K_eff beside them. `q` (4,) -> scalars."""
         alpha, K1 = jax.nn.sigmoid(q[3]), q[0] - q[1]
         B1 = K1 * self.reference**alpha * jnp.exp(-q[2])
         return {"K0": q[1], "K1": K1, "B1": B1, "alpha": alpha, "K_inst": q[0], "K_eff": q[1]}
@@ -94,14 +94,14 @@ class FractionalMaxwell(eqx.Module):
         return self
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds: τ far beyond the data on both sides, α from 0.1 to 1, β up to 0.9 α."""
+        """Bounds: τ far beyond the data on both sides, α from 0.1 to 1, β up to 0.9 α. Two arrays (4,)."""
         first, last = min(test.time[0] for test in tests), max(test.time[-1] for test in tests)
         top = np.log(max(_largest(test) for test in tests))
         lower = [top - 25, np.log(first) - 10, 0.1, 0.0]
         return np.array(lower), np.array([top + 10, np.log(last) + 20, 1.0, 0.9])
 
     def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts 4"]:
-        """Five places from a narrow to a broad relaxation."""
+        """Five places from a narrow to a broad relaxation. (5, 4)."""
         times = np.concatenate([test.time for test in tests])
         middle, top = 0.5 * np.log(times.min() * times.max()), np.log(max(_largest(test) for test in tests))
         shapes = [(0.0, 0.5, 0.2), (3.0, 0.7, 0.2), (3.0, 0.9, 0.1), (6.0, 0.5, 0.5), (-3.0, 0.3, 0.2)]
@@ -112,7 +112,7 @@ class FractionalMaxwell(eqx.Module):
         return _prepare(test, self.weights)
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
-        """G(t) at the measured times."""
+        """G(t) at the measured times. `q` (4,) -> (m,), in the unit of the table."""
         del weights
         beta = q[2] * q[3]
         log_time = jnp.log(curve.time) - q[1]
@@ -120,11 +120,11 @@ class FractionalMaxwell(eqx.Module):
         return jnp.exp(q[0] - beta * log_time) * shape
 
     def natural(self, q: Float[Array, " 4"]) -> Float[Array, " 4"]:
-        """The coordinates under their labels."""
+        """The coordinates under their labels. (4,) -> (4,)."""
         return jnp.stack([jnp.exp(q[0]), jnp.exp(q[1]), q[2], q[3]])
 
     def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
-        """G (unit·s^β), V (unit·s^α), α and β."""
+        """G (unit·s^β), V (unit·s^α), α and β. `q` (4,) -> scalars."""
         alpha, beta = q[2], q[2] * q[3]
         return {"G": jnp.exp(q[0] + beta * q[1]), "V": jnp.exp(q[0] + alpha * q[1]), "alpha": alpha, "beta": beta}
 

@@ -58,6 +58,7 @@ class Sampled(eqx.Module):
 
         κ goes down to 1e-4, or 1e-6 with full memory. Far below S(α) the curve no longer depends on it, and K1 would
         grow as 1/κ for ever.
+        Two arrays (4,).
         """
         top = max(_secant(test) for test in tests)
         ends = np.log(0.99 / 0.01)
@@ -105,7 +106,10 @@ class Sampled(eqx.Module):
         )
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
-        """The response to the weighted mean of the inputs, at the measured times."""
+        """The response to the weighted mean of the inputs, at the measured times.
+
+        `q` (4,), `weights` (R,) -> (m,), in mm or N.
+        """
         assert curve.spectra is not None and curve.share is not None and curve.before is not None
         H = self._transfer(q, curve.length)
         creep = curve.kind == "creep"
@@ -118,7 +122,7 @@ class Sampled(eqx.Module):
         return rest + response[curve.before] * (1 - curve.share) + response[curve.before + 1] * curve.share
 
     def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
-        """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them."""
+        """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them. `q` (4,) -> scalars."""
         K_inst, K_eff, kappa, alpha = q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])
         S = self._taps(alpha)[1]
         K1 = (K_inst - K_eff) * (1 + kappa) * (kappa + S) / (kappa * (1 - S))
@@ -126,7 +130,7 @@ class Sampled(eqx.Module):
         return {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "K_inst": K_inst, "K_eff": K_eff}
 
     def natural(self, q: Float[Array, " 4"]) -> Float[Array, " 4"]:
-        """The coordinates under their labels: K_inst, K_eff (N/mm), κ and α."""
+        """The coordinates under their labels: K_inst, K_eff (N/mm), κ and α. (4,) -> (4,)."""
         return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])])
 
     def at(self, tests: Sequence[Test]) -> "Sampled":
@@ -137,7 +141,7 @@ class Sampled(eqx.Module):
         return Sampled(jnp.asarray(self.N), self.T, self.memory, max(_TAPS, int(self.N)))
 
     def coordinates(self, K0: float, K1: float, B1: float, alpha: float) -> Float[np.ndarray, " 4"]:
-        """q of a parameter set."""
+        """q of a parameter set. (4,); K0 and K1 in N/mm, B1 in N·s^α/mm."""
         kappa = K1 * self.T**alpha / B1
         S = float(self._taps(jnp.asarray(alpha))[1])
         ends = K0 + K1 / (1 + kappa), K0 + K1 * S / (kappa + S)

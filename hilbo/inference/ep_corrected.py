@@ -14,7 +14,8 @@ the second derivative -C; these say what the mean and the covariance are, withou
 
 the latter EP's linear response: how its own mean moves with h, cavities and all. Both come from the matrix J of EP's
 Newton steps in one inversion, so that the whole costs little more than two more steps. For Gaussian terms e = 0, and
-nothing changes. Where answers are many and all alike the series converges slowly; `docs/inference.md` has the errors.
+nothing changes. Where answers are many and all alike the series converges slowly; `docs/methods/inference.md` has
+the errors.
 
 References: Opper, Paquet & Winther (2013), JMLR 14:2857, equations for R at second order in the third cumulants;
 Opper & Winther (2005), JMLR 6:2177, for linear response.

@@ -11,9 +11,9 @@ from N(mu_i, 1) confined to what its interval leaves, with the weight exp(psi(x,
     psi(x, mu) = sum_i [mu_i^2 / 2 - mu_i x_i + log P(N(mu_i, 1) in interval_i(x_1 .. x_{i-1}))],
 
 concave in x and convex in mu. At its saddle point the weights vary little even for improbable boxes, and none exceeds
-exp(psi*), so that taking x with probability exp(psi - psi*) gives independent exact draws. The variables are ordered
-by how improbable their intervals are, and the uniform numbers are scrambled Sobol points: independent scrambles are
-the replicates from which the standard errors come.
+`exp(psi*)`, so that taking x with probability `exp(psi - psi*)` gives independent exact draws. The variables are
+ordered by how improbable their intervals are, and the uniform numbers are scrambled Sobol points: independent scrambles
+are the replicates from which the standard errors come.
 
 Good to about 100 answers. Any tilting gives a right answer with an honest error; a poor one a large error.
 References: Botev (2017), JRSS B 79:125; Genz (1992), J. Comput. Graph. Stat. 1:141; Gibson, Glasbey & Elston (1994)
@@ -95,7 +95,10 @@ class ExactPosterior(eqx.Module):
         return _weighted(self.shares, values)
 
     def moment_errors(self, cross: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Standard errors of the posterior means and variances at m points."""
+        """Standard errors of the posterior means and variances at m points.
+
+        `cross` (n, m): covariances of the asked and the new points -> (m,), (m,).
+        """
 
         def one(along):
             values = jnp.tensordot(along, self.samples, 1)

@@ -20,14 +20,14 @@ import math
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["decode", "exponentials"]
+__all__ = ["TABLE", "decode", "exponentials"]
 
 
 def exponentials(
     alpha: Float[Array, ""], states: int = 10
 ) -> tuple[Float[Array, " {states}"], Float[Array, " {states}"]]:
     """p_k and 1 - λ_k of order α in [0, 1], fastest first, for one of the numbers of `span.STATES`; differentiable."""
-    table = jnp.asarray(_TABLE[states], alpha.dtype)
+    table = jnp.asarray(TABLE[states], alpha.dtype)
     x = 2 * alpha - 1
     basis = [jnp.ones_like(x), x]
     while len(basis) < table.shape[1]:
@@ -52,7 +52,7 @@ def decode(
 
 # Chebyshev coefficients over α: one row for each log rate, then one for each log weight, but the fastest's.
 # fmt: off
-_TABLE = {
+TABLE = {
     8: (
         (-0.543340, 0.551520, -0.002135, -0.000931, -0.000301, 0.000375, 0.000142, -0.000070, -0.000034),
         (-1.827113, 0.618659, 0.002943, -0.002109, -0.000515, 0.000604, 0.000199, -0.000111, -0.000053),

@@ -86,34 +86,40 @@ class FOSLS(eqx.Module):
 
     @property
     def beta(self) -> Float[Array, ""]:
-        """β = B1·T^{-α}, N/mm."""
+        """β = B1·T^{-α}, N/mm. A scalar."""
         return pot_stiffness(self.B1, self.alpha, self.T)
 
     def frequency_response(self, omega: Real[ArrayLike, "*w"]) -> Complex[Array, "*w"]:
-        """H(e^{jωT}) (N/mm) at angular frequencies ω (rad/s) up to π/T."""
+        """H(e^{jωT}) (N/mm) at angular frequencies ω (rad/s) up to π/T.
+
+        `omega` of any shape -> complex, the same shape.
+        """
         return _frequency_response(self, jnp.asarray(omega, self.K0.dtype))
 
     def continuous_response(self, omega: Real[ArrayLike, "*w"]) -> Complex[Array, "*w"]:
-        """H(jω) (N/mm) of the continuous model with the same parameters; ω >= 0 in rad/s."""
+        """H(jω) (N/mm) of the continuous model with the same parameters; ω >= 0 in rad/s.
+
+        `omega` of any shape -> complex, the same shape.
+        """
         size = self.B1 * jnp.asarray(omega, self.K0.dtype) ** self.alpha
         lead = jnp.pi / 2 * self.alpha
         pot = jax.lax.complex(size * jnp.cos(lead), size * jnp.sin(lead))
         return self.K0.astype(pot.dtype) + series(self.K1, pot)
 
     def dc_gain(self) -> Float[Array, ""]:
-        """Static stiffness H(1), N/mm."""
+        """Static stiffness H(1), N/mm. A scalar."""
         return self.K0 + slow_stiffness(self.K1, self.beta, sums(self.alpha, self.span))
 
     def high_frequency_gain(self) -> Float[Array, ""]:
-        """H(-1), N/mm: the stiffness at the Nyquist frequency."""
+        """H(-1), N/mm: the stiffness at the Nyquist frequency. A scalar."""
         return self.K0 + series(self.K1, self.beta * sums(self.alpha, self.span).at_nyquist)
 
     def instantaneous_stiffness(self) -> Float[Array, ""]:
-        """K0 + k, N/mm: force per step of position in the sample of the step."""
+        """K0 + k, N/mm: force per step of position in the sample of the step. A scalar."""
         return self.K0 + series(self.K1, self.beta)
 
     def effective_damping(self) -> Float[Array, ""]:
-        """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1."""
+        """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1. A scalar."""
         return slow_damping(self.K1, self.beta, sums(self.alpha, self.span), self.T)
 
     def simulate(
@@ -124,6 +130,7 @@ class FOSLS(eqx.Module):
         `start`: from rest at x = 0, or from the equilibrium at x[0], held for ever before. `unilateral`: contact can
         only push: x below 0 counts as 0 in the history, and forces below 0 as 0. `block` = 1 is the plain recursion,
         sample by sample; larger blocks give the same numbers up to rounding, faster.
+        `x` (n,) -> (n,).
         """
         return _force(self, jnp.asarray(x, self.K0.dtype), start, unilateral, block)
 
@@ -133,6 +140,7 @@ class FOSLS(eqx.Module):
         """Position (mm) that follows forces `F` (N): the inverse of `simulate`, see there.
 
         An equilibrium under force needs H(1) > 0; without it, the positions from such a start are not finite.
+        `F` (n,) -> (n,).
         """
         return _position(self, jnp.asarray(F, self.K0.dtype), start, block)
 
@@ -141,6 +149,7 @@ class FOSLS(eqx.Module):
 
         0.9 for t90. With short memory counted sample by sample, `inf` beyond a million samples; with full memory the
         time t at which E_α(-(K1/B1)·t^α) = 1 - fraction, which may be years.
+        A scalar. Raises `InputError` for a `fraction` that is not at least 0 and below 1.
         """
         if not 0 <= fraction < 1:
             raise InputError(f"fraction is {fraction}, it must be at least 0 and below 1; write 0.9 for t90.")
@@ -149,7 +158,10 @@ class FOSLS(eqx.Module):
 
 
 def series(K1: Float[Array, "..."], pot: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
-    """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`."""
+    """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`.
+
+    N/mm; elementwise.
+    """
     firm = (jnp.abs(pot) <= K1) & (K1 > 0)
     compliance = (1 / jnp.where(firm, K1, 1)).astype(pot.dtype)
     spring, pot_of_soft = jnp.where(firm, 0, K1).astype(pot.dtype), jnp.where(firm | (pot == 0), 1, pot)
@@ -157,7 +169,10 @@ def series(K1: Float[Array, "..."], pot: Inexact[Array, "..."]) -> Inexact[Array
 
 
 def share(K1: Float[Array, "..."], pot: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf."""
+    """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf.
+
+    N/mm -> no unit; elementwise.
+    """
     firm = (pot <= K1) & (K1 > 0)
     ratio = jnp.where(firm, 0, K1) / jnp.where(firm | (pot == 0), 1, pot)
     return jnp.where(firm, 1 / (1 + pot / jnp.where(firm, K1, 1)), ratio / (1 + ratio))
@@ -166,19 +181,28 @@ def share(K1: Float[Array, "..."], pot: Float[Array, "..."]) -> Float[Array, "..
 def pot_stiffness(
     B1: Float[Array, "..."], alpha: Float[Array, "..."], T: float | Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """β = B1·T^{-α}, N/mm: the stiffness of the spring-pot in the sample of a step."""
+    """β = B1·T^{-α}, N/mm: the stiffness of the spring-pot in the sample of a step.
+
+    B1 in N·s^α/mm, T in s; elementwise.
+    """
     return B1 * T**-alpha
 
 
 def slow_stiffness(K1: Float[Array, ""], beta: Float[Array, ""], gl: GLSums) -> Float[Array, ""]:
-    """H(1) - K0, N/mm: what spring and spring-pot in series add to the static stiffness."""
+    """H(1) - K0, N/mm: what spring and spring-pot in series add to the static stiffness.
+
+    K1 and `beta` are scalars, in N/mm.
+    """
     return series(K1, beta * gl.at_dc)
 
 
 def slow_damping(
     K1: Float[Array, ""], beta: Float[Array, ""], gl: GLSums, T: float | Float[Array, ""]
 ) -> Float[Array, ""]:
-    """dH/ds at s = 0, N·s/m: T·K1²·β·M1/(K1 + β·S_N)²; 1000·T is T for stiffness in N/mm."""
+    """dH/ds at s = 0, N·s/m: T·K1²·β·M1/(K1 + β·S_N)²; 1000·T is T for stiffness in N/mm.
+
+    K1 and `beta` are scalars, in N/mm, T in s.
+    """
     return 1000 * T * beta * gl.moment * share(K1, beta * gl.at_dc) ** 2
 
 

@@ -63,37 +63,43 @@ PRESETS = {
 
 
 def spring(K: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """F = K·x. `memory`: N, T, memory and states of the record, here and below."""
+    """F = K·x. `memory`: N, T, memory and states of the record, here and below. K in N/mm, a scalar."""
     return FOSLS(K, 0.0, 0.0, 1.0, **memory)
 
 
 def springpot(B: Real[ArrayLike, ""], alpha: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """F = B·d^α x/dt^α."""
+    """F = B·d^α x/dt^α. B in N·s^α/mm, a scalar, as is `alpha`."""
     return FOSLS(0.0, np.inf, B, alpha, **memory)
 
 
 def kelvin_voigt(K: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Spring and dashpot side by side."""
+    """Spring and dashpot side by side. K in N/mm, B in N·s/mm, scalars."""
     return FOSLS(K, np.inf, B, 1.0, **memory)
 
 
 def maxwell(K: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Spring and dashpot in series."""
+    """Spring and dashpot in series. K in N/mm, B in N·s/mm, scalars."""
     return FOSLS(0.0, K, B, 1.0, **memory)
 
 
 def sls(K0: Real[ArrayLike, ""], K1: Real[ArrayLike, ""], B: Real[ArrayLike, ""], **memory) -> FOSLS:
-    """Standard linear solid: Maxwell beside a spring K0."""
+    """Standard linear solid: Maxwell beside a spring K0. K0 and K1 in N/mm, B in N·s/mm, scalars."""
     return FOSLS(K0, K1, B, 1.0, **memory)
 
 
 def relaxation_load(T: float = 1e-3, *, depth: float = 5.0, hold: float = 3.0) -> Float[np.ndarray, " n"]:
-    """Positions (mm) of the paper's stress relaxation: `depth` from the first sample on, for `hold` seconds."""
+    """Positions (mm) of the paper's stress relaxation: `depth` from the first sample on, for `hold` seconds.
+
+    -> (hold / T,); T in s, `depth` in mm.
+    """
     return np.full(round(hold / T), depth)
 
 
 def creep_load(
     T: float = 1e-3, *, force: float = 3.0, hold: float = 3.0, rest: float = 0.5, recovery: float = 3.0
 ) -> Float[np.ndarray, " n"]:
-    """Forces (N) of the paper's creep with recovery: `force` for `hold` seconds, then `rest` for `recovery` seconds."""
+    """Forces (N) of the paper's creep with recovery: `force` for `hold` seconds, then `rest` for `recovery` seconds.
+
+    -> ((hold + recovery) / T,); T in s.
+    """
     return np.repeat([force, rest], [round(hold / T), round(recovery / T)])

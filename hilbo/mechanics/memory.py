@@ -39,7 +39,7 @@ class GLSums(eqx.Module):
 
 
 def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:
-    """C(1), C(-1), their difference and the first moment of one order α, for either memory."""
+    """C(1), C(-1), their difference and the first moment of one order α, for either memory. `alpha` is a scalar."""
     if span.memory == "short":
         return gl_sums(alpha, span.N)
     alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
@@ -48,7 +48,10 @@ def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:
 
 
 def response(alpha: Real[ArrayLike, ""], angle: Real[Array, "*w"], span: Span) -> Complex[Array, "*w"]:
-    """C(e^{jθ}) at angles θ = ωT (rad per sample), by positive partial sums: no digit is lost towards θ = 0."""
+    """C(e^{jθ}) at angles θ = ωT (rad per sample), by positive partial sums: no digit is lost towards θ = 0.
+
+    `alpha` is a scalar, `angle` of any shape -> complex, the same shape.
+    """
     alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha, angle))
     angle = jnp.asarray(angle, alpha.dtype)
     difference = jax.lax.complex(2 * jnp.sin(angle / 2) ** 2, jnp.sin(angle))  # 1 - z^{-1}
@@ -75,7 +78,7 @@ def _short_response(
 
 @partial(jax.jit, static_argnames="N")
 def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"]:
-    """Coefficients c_0 … c_N of one order α; `jax.vmap` over `alpha` for several."""
+    """Coefficients c_0 … c_N of one order α; `jax.vmap` over `alpha` for several. -> (N + 1,), without unit."""
     alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
     _, tail = jax.lax.scan(partial(_tap, alpha), jnp.ones_like(alpha), _indices(alpha, N))
     return jnp.concatenate([jnp.ones(1, alpha.dtype), -tail])
@@ -83,7 +86,7 @@ def gl_coefficients(alpha: Real[ArrayLike, ""], N: int) -> Float[Array, " {N+1}"
 
 @partial(jax.jit, static_argnames="N")
 def gl_sums(alpha: Real[ArrayLike, ""], N: int) -> GLSums:
-    """C(1), C(-1), their difference and the first moment of one order α, without cancellation."""
+    """C(1), C(-1), their difference and the first moment of one order α, without cancellation. `alpha` is a scalar."""
     return _gl_sums_jet(jnp.asarray(alpha, jnp.result_type(1.0, alpha)), N, 0)[0]
 
 

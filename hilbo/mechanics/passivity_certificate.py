@@ -11,7 +11,7 @@ from below on the cell, and so p by a parabola. Towards the largest φ the cells
 from it, so that the bound is sharp to rounding. The result is an enclosure of the smallest passive damping, for even N
 as well as odd.
 
-With full memory the Nyquist frequency binds (docs/mechanics.md), and b_min is closed.
+With full memory the Nyquist frequency binds (docs/methods/mechanics.md), and b_min is closed.
 
 A violation is shown in time. The path between samples that loses least in the device's damping is straight, and the
 force is held, so that a cycle takes up the energy Σ F_n·Δx_n + b·Δx_n²/T: negative if it creates energy.
@@ -33,6 +33,7 @@ from jaxtyping import Array, Bool, Complex, Float, Real
 from hilbo.mechanics.exponentials import exponentials
 from hilbo.mechanics.fosls import FOSLS, series, share
 from hilbo.mechanics.memory import gl_coefficients
+from hilbo.numerics.shown import shown
 from hilbo.numerics.tracing import program
 
 __all__ = ["Certificate", "Witness", "certify", "needed_damping", "witness"]
@@ -52,6 +53,10 @@ class Certificate(eqx.Module):
     upper: Float[Array, ""]  # N·s/m
     static_stiffness: Float[Array, ""]  # H(1), N/mm
     frequency: Float[Array, ""]  # rad/s
+
+    def __repr__(self) -> str:
+        margin, stiffness = f"{shown(self.lower)} to {shown(self.upper)} N.s/m", f"{shown(self.static_stiffness)} N/mm"
+        return f"Certificate(margin {margin}, smallest at {shown(self.frequency)} rad/s, H(1) {stiffness})"
 
     @property
     def passive(self) -> Bool[Array, "..."]:
@@ -80,7 +85,10 @@ class Witness(eqx.Module):
 
 
 def needed_damping(model: FOSLS, omega: Real[ArrayLike, "*w"]) -> Float[Array, "*w"]:
-    """The damping (N·s/m) that passivity asks for at each ω in [0, π/T] (rad/s); at 0 the limit H(1)·T/2 - B_eff."""
+    """The damping (N·s/m) that passivity asks for at each ω in [0, π/T] (rad/s); at 0 the limit H(1)·T/2 - B_eff.
+
+    `omega` of any shape -> the same shape.
+    """
     angle = jnp.asarray(omega, model.K0.dtype) * model.T
     moving = angle > 0
     safe = jnp.where(moving, angle, 1)
@@ -95,6 +103,7 @@ def certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
     """Whether the rendering is passive on a device with physical damping `b` (N·s/m); `jax.vmap` for several.
 
     For any N. Not differentiable: see `minimum_damping`, and `needed_damping` at the certificate's frequency.
+    `b` is a scalar; so is every number of the certificate.
     """
     model = jax.lax.stop_gradient(model)
     b = jnp.asarray(b, model.K0.dtype)

@@ -28,6 +28,7 @@ def switched_force(
 
     The new history starts as if x[staged] had been held for ever. Raises InputError for samples out of order or of
     range, a `slew` (N/s) that is not above 0, and sets for different sampling times.
+    `x` (n,) -> (n,).
     """
     x = jnp.asarray(x, old.K0.dtype)
     if not 0 <= staged <= flip < x.shape[0]:

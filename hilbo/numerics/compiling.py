@@ -1,7 +1,8 @@
 """What XLA is told about compiling for a CPU: the older of its two code generators for fused loops.
 
-What hilbo compiles takes it about 0.6 of the time that the newer one takes, and runs as fast (docs/cold_start.md).
-Versions of jaxlib that this has not been tried with are told nothing. Processors of other kinds are not concerned.
+What hilbo compiles takes it about 0.6 of the time that the newer one takes, and runs as fast
+(docs/results/run_time.md). Versions of jaxlib that this has not been tried with are told nothing. Processors of other
+kinds are not concerned.
 """
 
 import os

@@ -62,7 +62,7 @@ class PersonKernel(eqx.Module):
         return self.kernel(x[:-1], y[:-1]) * jnp.where(same, jnp.ones_like(x[0]), self.share.astype(x.dtype))
 
     def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
-        """The prior variance of one person's function."""
+        """The prior variance of one person's function. `x` (d,) -> a scalar."""
         return self.kernel.diagonal(x[:-1])
 
 
@@ -85,14 +85,20 @@ class Share(eqx.Module):
 
     @property
     def against_one(self) -> Float[Array, ""]:
-        """Log Bayes factor of the hierarchical model, p unknown, against people who do not differ, p = 1."""
+        """Log Bayes factor of the hierarchical model, p unknown, against people who do not differ, p = 1.
+
+        A scalar, in nats.
+        """
         width = self.shares[1] - self.shares[0]
         top = jnp.max(self.log_evidence)
         return top + jnp.log(jnp.trapezoid(jnp.exp(self.log_evidence - top), dx=width)) - self.log_evidence[-1]
 
 
 def of_people(trials: Trials) -> Trials:
-    """One record (sum of answers) from stacked trials (M, n): each point with its person's number, from 0."""
+    """One record (sum of answers) from stacked trials (M, n): each point with its person's number, from 0.
+
+    Raises `InputError` if nobody gave an answer.
+    """
     mask = np.asarray(trials.mask)
     if not mask.any():
         raise InputError("hierarchical: nobody gave an answer; at least one person's answers are needed.")
@@ -145,6 +151,7 @@ def share_from(
 
     The evidence is computed at Chebyshev points of [0, 1], 9, 17 or 33 of them, and interpolated: it is smooth in p,
     and so the whole curve, its maximum and its intervals come at a small cost.
+    `evidence`: scalar -> scalar (nats), and whether it holds.
     """
     evaluated: dict[int, tuple[float, bool]] = {}  # by place among the finest nodes, in which the coarser ones are
     for step in (4, 2, 1):

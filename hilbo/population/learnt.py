@@ -25,6 +25,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
+from hilbo.numerics.shown import shown
 from hilbo.ordinal_gp import Posterior, Trials
 from hilbo.population.learnt_posterior import (
     LEFT,
@@ -77,6 +78,12 @@ class Learnt(eqx.Module):
     left: Float[Array, ""]
     """Largest part of the shared function's prior variance, at an answered point, that is not followed."""
     converged: Bool[Array, ""]
+
+    def __repr__(self) -> str:
+        model, sure = self.model, shown(self.converged)
+        values = {name: shown(getattr(model, name)) for name in ("theta", "thresholds", "noise")}
+        words = ", ".join(f"{name} {value}" for name, value in values.items())
+        return f"Learnt({words}, log evidence {shown(self.log_evidence)}, converged {sure})"
 
     @property
     def widths(self) -> bool:

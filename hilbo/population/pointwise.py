@@ -17,7 +17,7 @@ plain mean of the latents, in which everybody counts the same.
 
 The sums may be made at once (`aggregate`), or of blocks of people that are added up (`hilbo.study.batch`).
 References: Tresp (2000) bcm; Deisenroth & Ng (2015) rbcm. Products of experts and grbcm were measured beside these and
-won nowhere (docs/aggregation.md).
+won nowhere (docs/methods/aggregation.md).
 """
 
 from typing import Any, Literal, NamedTuple, get_args
@@ -58,7 +58,10 @@ class Sums(NamedTuple):
 def terms(
     rule: Rule, means: Float[Array, "*s"], explained: Float[Array, "*s"], prior: Float[Array, "..."], share: ArrayLike
 ) -> Sums:
-    """What each person adds to the sums of a rule; `share`: p, 1 for every rule but the hierarchical one."""
+    """What each person adds to the sums of a rule; `share`: p, 1 for every rule but the hierarchical one.
+
+    `means` and `explained` of any shape, and the sums of the same.
+    """
     remaining = prior - share * explained
     weight = -0.5 * jnp.log1p(-explained / prior) if rule == "rbcm" else jnp.ones_like(means)
     return Sums(weight * explained / (prior * remaining), weight * means / remaining, means, explained)

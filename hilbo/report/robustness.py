@@ -44,7 +44,18 @@ def robustness_page(study: Study, content: dict[str, Any], figures: Pictures) ->
         figures=figures,
         limit=LIMIT,
         sensitivity=sensitivity,
+        table=_table(content["learned"]) if content["learned"]["shared"] else None,
     )
+
+
+def _table(learned: dict[str, Any]) -> str:
+    """[gp] of a study file with what was learnt, to be copied into one."""
+    names = ("theta", "variance", "thresholds", "noise")
+    return "\n".join(["[gp]", *(f"{name} = {_four_digits(learned[name])}" for name in names)])
+
+
+def _four_digits(value: float | list[float]) -> str:
+    return f"[{', '.join(map(_four_digits, value))}]" if isinstance(value, list) else repr(float(f"{value:.4g}"))
 
 
 def _figures(study, cohort, check):
@@ -88,6 +99,7 @@ def robustness_result(study: Study, cohort: Cohort, found: Robustness, seed: int
             "learnt_again": np.asarray(found.judged.again).tolist(),
             "shared": found.shared,
             "theta": np.asarray(model.kernel.theta).tolist(),
+            "variance": np.asarray(model.kernel.variance).tolist(),
             "noise": np.asarray(model.likelihood.noise).tolist(),
             "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
         },

@@ -3,8 +3,8 @@
 `validate` computes one material; `write_validation` makes the folder of `hilbo validate` with one section for each
 material: result.json, the tables as CSV, the figures, and one page. `hilbo report` uses the same parts.
 
-Of every coefficient the page shows the widest of the iid and clustered intervals, which docs/statistics.md finds the
-safest; all kinds of error are in the CSV tables.
+Of every coefficient the page shows the widest of the iid and clustered intervals, which docs/methods/statistics.md
+finds the safest; all kinds of error are in the CSV tables.
 """
 
 from collections.abc import Sequence
@@ -20,8 +20,8 @@ from hilbo.report.results import as_json, save_figures, versions
 from hilbo.statistics.paper_tables import PaperTables, aggregate_comparisons, paper_tables, set_sources
 from hilbo.statistics.preferences import rate
 from hilbo.statistics.regression import Regression
+from hilbo.study.cells import read_cells
 from hilbo.study.config import Study
-from hilbo.study.trial_table import read_cells
 from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
 
 __all__ = [

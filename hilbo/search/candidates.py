@@ -13,5 +13,7 @@ CANDIDATES = 4096
 
 def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Float[Array, "m d"]:
     """Points of the unit cube among which to look for a maximum: `count` inside the feasible set, a quarter of that
-    on its walls, edges and corners."""
+    on its walls, edges and corners.
+    -> (`count` + `count` // 4, d).
+    """
     return jnp.concatenate([jnp.asarray(space.candidates(count, seed)), jnp.asarray(space.walls(count // 4, seed))])

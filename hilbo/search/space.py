@@ -80,12 +80,18 @@ class SearchSpace(eqx.Module):
         return tuple(parameter.name for parameter in self.parameters)
 
     def to_unit(self, physical: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Physical values to the unit cube, last axis = parameter; exact at both ends."""
+        """Physical values to the unit cube, last axis = parameter; exact at both ends.
+
+        (..., d) -> (..., d); each parameter in its own unit.
+        """
         physical = _floating(physical)
         return jnp.stack([p.to_unit(physical[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
     def to_physical(self, unit: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Unit cube to physical values, last axis = parameter; exact at both ends, and never outside them."""
+        """Unit cube to physical values, last axis = parameter; exact at both ends, and never outside them.
+
+        (..., d) -> (..., d); each parameter in its own unit.
+        """
         unit = _floating(unit)
         return jnp.stack([p.to_physical(unit[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
@@ -93,6 +99,7 @@ class SearchSpace(eqx.Module):
         """Optimiser's coordinates in [0, 1]^d to the unit cube; differentiable.
 
         In a column without a feasible point x_K1 is 0 and `feasible` says no.
+        (..., d) -> (..., d).
         """
         w = _floating(w)
         if self.mechanics is None:
@@ -104,7 +111,7 @@ class SearchSpace(eqx.Module):
         return w.at[..., K1].set(low + w[..., K1] * width)
 
     def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
-        """Inverse of `from_box`, for `x` in the feasible set."""
+        """Inverse of `from_box`, for `x` in the feasible set. (..., d) -> (..., d)."""
         x = _floating(x)
         if self.mechanics is None:
             return x
@@ -115,7 +122,10 @@ class SearchSpace(eqx.Module):
         return x.at[..., K1].set((x[..., K1] - low) / width)
 
     def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
-        """Whether points of the unit cube are in the box, passive with the search margin, and damped as asked for."""
+        """Whether points of the unit cube are in the box, passive with the search margin, and damped as asked for.
+
+        (..., d) -> (...,).
+        """
         x = _floating(x)
         inside = jnp.all((x >= 0) & (x <= 1), axis=-1)
         if self.mechanics is None:
@@ -123,11 +133,17 @@ class SearchSpace(eqx.Module):
         return inside & allowed(self.mechanics, self._split(self.to_physical(x)))
 
     def derived(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> dict[str, Float[Array, "..."]]:
-        """What follows from the parameters: K0 (N/mm) with mechanics, nothing without."""
+        """What follows from the parameters: K0 (N/mm) with mechanics, nothing without.
+
+        Parameter -> values in its unit, of one shape; the results have that shape.
+        """
         return {} if self.mechanics is None else {"K0": K0_of(self.mechanics, physical)}
 
     def passivity_margin(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> Float[Array, "..."] | None:
-        """Damping of the device less the smallest passive one, N·s/m; None without mechanics."""
+        """Damping of the device less the smallest passive one, N·s/m; None without mechanics.
+
+        Parameter -> values in its unit, of one shape; so is the result.
+        """
         return None if self.mechanics is None else self.mechanics.damping - minimum_damping(self.mechanics, physical)
 
     def volume(self) -> float:
@@ -135,11 +151,14 @@ class SearchSpace(eqx.Module):
         return 1.0 if self.mechanics is None else float(_cumulative_volume(self)[0][-1])
 
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
-        """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol')."""
+        """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol').
+
+        -> (m, d).
+        """
         return _take_feasible(self, m, sobol_chunks(self.dim, m, seed))
 
     def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
-        """`m` points on the walls, edges and corners of the feasible set, the passive boundary included."""
+        """`m` points on the walls, edges and corners of the feasible set, the passive boundary included. -> (m, d)."""
         count = 2 ** max(m - 1, 0).bit_length()
         return _take_feasible(self, m, sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed))
 
@@ -148,6 +167,7 @@ class SearchSpace(eqx.Module):
 
         Points that fall outside the feasible set (a few, at the foot of infeasible columns) are replaced from further
         hypercubes, at the price of the even spread.
+        -> (n, d).
         """
         return _take_feasible(self, n, latin_chunks(self.dim, n, seed))
 

@@ -102,7 +102,9 @@ def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event
 
 def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> Event:
     """A step of a trial begins (`on`) or ends. None begins in a break, or after the end, nor with a rendering that its
-    program has not confirmed."""
+    program has not confirmed.
+    Raises `RefusedError` for these, and for a step that the trial does not have. `at`: time in s.
+    """
     found = _live(state, trial)
     if on and state.screen != "trial":
         raise RefusedError("paused", f"no step of trial {trial} begins now: the screen shows {state.screen}.")
@@ -157,7 +159,7 @@ def answer(
 
 
 def undo(state: LiveSession, at: float, reason: str = "") -> Event:
-    """Take the last answer back; its rendering is asked again."""
+    """Take the last answer back; its rendering is asked again. Raises `RefusedError` if there is none."""
     _running(state)
     last = last_answered(state)
     if last is None:
@@ -169,6 +171,7 @@ def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
     """Feel the pending trial once more from its first step; or an answered one, later, as a check of consistency.
 
     The answer to a repeated trial of the second kind has the phase "repeat" and is never fitted.
+    Raises `RefusedError` if there is none, or if it is a repetition itself.
     """
     _running(state)
     found = state.pending if trial is None else state.trial(trial)
@@ -180,7 +183,10 @@ def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
 
 
 def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
-    """A trial shall not count; its rendering is asked again. This excludes nothing, however often."""
+    """A trial shall not count; its rendering is asked again. This excludes nothing, however often.
+
+    Raises `RefusedError` if it does not count already.
+    """
     _running(state)
     found = state.trial(trial)
     if found.status not in ("pending", "answered"):
@@ -237,7 +243,7 @@ def restorable(state: LiveSession, trial: int) -> bool:
 
 
 def pause(state: LiveSession, by: str, at: float) -> Event:
-    """A break, asked for by "participant" or "experimenter"."""
+    """A break, asked for by "participant" or "experimenter". Raises `RefusedError` in a break."""
     _running(state)
     if state.paused is not None:
         raise RefusedError("paused", "the session is paused already.")
@@ -245,7 +251,7 @@ def pause(state: LiveSession, by: str, at: float) -> Event:
 
 
 def resume(state: LiveSession, at: float) -> Event:
-    """The end of a break."""
+    """The end of a break. Raises `RefusedError` if there is none."""
     _running(state)
     if state.paused is None:
         raise RefusedError("nothing", "the session is not paused.")
@@ -264,7 +270,10 @@ def note(state: LiveSession, text: str, at: float) -> Event:
 
 
 def more(state: LiveSession, at: float) -> Event:
-    """Another rendering of the warm-up, at its end."""
+    """Another rendering of the warm-up, at its end.
+
+    Raises `RefusedError` elsewhere, and when all of its renderings have been felt.
+    """
     if state.screen != "ready" or state.block is None:
         raise RefusedError("nothing", "another rendering can be had at the end of the warm-up only.")
     before = state.block - 1
@@ -274,7 +283,7 @@ def more(state: LiveSession, at: float) -> Event:
 
 
 def go_on(state: LiveSession, at: float) -> Event:
-    """From the end of the warm-up, or of a rest, to the next block."""
+    """From the end of the warm-up, or of a rest, to the next block. Raises `RefusedError` anywhere else."""
     if state.screen not in ("ready", "rest"):
         raise RefusedError("nothing", "there is nothing to go on to: no warm-up or rest has come to its end.")
     return _event(state, "go_on", at, block=state.block)

@@ -58,6 +58,10 @@ class Session:
     seed: int
     step: Step = field(repr=False)
 
+    def __repr__(self) -> str:
+        of, asked = self.study.selection.trials, "" if self.proposal is None else f", asks {self.ask()}"
+        return f'Session("{self.study.name}": {len(self.answers)} of {of} answers{asked})'
+
     @classmethod
     def start(cls, study: Study, seed: int = 0) -> "Session":
         """A session without answers. The seed decides the space-filling trials and the candidates."""
@@ -98,21 +102,37 @@ class Session:
         """The next state, after the participant's answer (one of the study's responses) to the asked point.
 
         `at`: the point that was really presented, if it was not the asked one.
+        Raises `InputError` for a `response` that the study does not have.
         """
         step = self.step
         if response not in step.responses:
-            raise InputError(f'Session: "{response}" is no answer of this study; give one of {step.responses}.')
-        shown = _asked(self) if at is None else np.array([at[name] for name in step.names])
+            raise InputError(
+                f'Session: "{response}" is no answer of this study; give one of {", ".join(step.responses)}.'
+            )
+        shown = _asked(self) if at is None else self._point(at)
         points = np.concatenate([self.points, shown[None, :]])
         answers = np.append(self.answers, step.responses.index(response))
         return replace(self, points=points, answers=answers, proposal=step(points, answers))
+
+    def _point(self, at: Mapping[str, float]) -> np.ndarray:
+        """A rendering (d,) that was presented. Raises `InputError` for one that is none of this study's."""
+        if set(at) != set(self.step.names):
+            raise InputError(f"Session: at has {', '.join(at)}; give {', '.join(self.step.names)}.")
+        for p in self.study.space.parameters:
+            if not p.low <= at[p.name] <= p.high:
+                words = f"from {p.low:g} to {p.high:g} {p.unit}".rstrip()
+                raise InputError(f"Session: {p.name} is {at[p.name]}; it must be {words}.")
+        return np.array([at[name] for name in self.step.names], float)
 
     def posterior(self) -> Posterior:
         """The participant's posterior after the answers so far."""
         return fit(self.study.gp, self.trials, inference=self.study.inference)
 
     def best(self) -> dict[str, float]:
-        """The rendering with the largest posterior mean: parameter -> value in physical units."""
+        """The rendering with the largest posterior mean: parameter -> value in physical units. Raises `InputError`
+        before the first answer: the prior mean is the same everywhere."""
+        if not len(self.answers):
+            raise InputError("Session: there are no answers yet, and so no best rendering; tell one first.")
         return dict(zip(self.step.names, self.step.best(self.posterior()).tolist(), strict=True))
 
 

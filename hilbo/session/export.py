@@ -48,6 +48,7 @@ _WORDS = {
     "trial": "Number of the trial, counted within participant, session, phase and material",
     "response": "The participant's answer",
     "voided": "1 if the answer does not count",
+    "unblinded": "What showed the participant the parameters; empty where nothing did",
     "status": "answered, undone, void, dropped, left out (by a person, after the device stopped it twice) or pending",
     "response_time": "Time from the question to the answer, s, by the browser's clock",
     "answered_at": "Time of the answer, s since 1970, by the server's clock",
@@ -100,6 +101,7 @@ def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
                     | {"response": trial.values["class_a"]}
                     | trial.presented["a"]
                     | {"voided": int(trial.status != "answered"), "status": trial.status}
+                    | {"unblinded": state.header.unblinded or None}
                     | _times(trial)
                 )
     return _table(rows)
@@ -282,7 +284,7 @@ def _times(trial: Trial):
 def _table(rows):
     """Without columns that say nothing."""
     table = pd.DataFrame(rows)
-    for column in ("material", "response_time"):
+    for column in ("material", "response_time", "unblinded"):
         if column in table and table[column].isna().all():
             table = table.drop(columns=column)
     return table

@@ -56,7 +56,10 @@ class LoggedSession:
         return None if self.state.pending is None else self.state.pending.renderings["a"]
 
     def tell(self, response: str, **others: str) -> None:
-        """The answer to it; of a comparison `response` is that about a, `others` are class_b and preferred."""
+        """The answer to it; of a comparison `response` is that about a, `others` are class_b and preferred.
+
+        Raises `InputError` if nothing has been asked.
+        """
         trial = self.state.pending
         if trial is None:
             raise InputError("nothing has been asked; call ask() first.")

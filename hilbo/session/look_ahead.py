@@ -157,7 +157,7 @@ class LiveChooser:
         return [self.fitted(answers) for answers in _following(state)]
 
     def best(self, block: int, fitted: Fitted) -> Float[np.ndarray, " d"]:
-        """Where the posterior mean is largest, in physical units; nothing is fitted."""
+        """Where the posterior mean is largest, in physical units; nothing is fitted. (d,)."""
         return self._session(block).step.best(fitted.posterior)
 
     def _session(self, block: int) -> Session:

@@ -9,10 +9,11 @@ import datetime
 import os
 import tempfile
 from collections.abc import Mapping
+from itertools import zip_longest
 from pathlib import Path
 
 from hilbo.errors import InputError
-from hilbo.study.text_cells import check_id, check_text
+from hilbo.study.text_cells import check_id, check_text, csv_rows
 
 __all__ = ["COLUMNS", "add_person", "check_consent", "read_people"]
 
@@ -26,9 +27,9 @@ def read_people(path: str | os.PathLike) -> People:
     """participant -> row. Raises InputError with the line of what is wrong."""
     try:
         with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.DictReader(file, strict=True)
-            rows = [(reader.line_num, row) for row in reader]
-            columns = list(reader.fieldnames or ())
+            reader, _ = csv_rows(file, str(path))
+            rows = [(reader.line_num, row) for row in reader if any(row)]
+            columns = rows.pop(0)[1] if rows else []
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -40,7 +41,9 @@ def read_people(path: str | os.PathLike) -> People:
         )
     people: People = {}
     for line, row in rows:
-        found = {key: (value or "").strip() for key, value in row.items() if key is not None}
+        if len(row) > len(columns):
+            raise InputError(f"{path}:{line}: has {len(row)} cells, the header has {len(columns)}; fix that line.")
+        found = {key: value.strip() for key, value in zip_longest(columns, row, fillvalue="")}
         _check(found, f"{path}:{line}")
         if not found["participant"]:
             raise InputError(f"{path}:{line}: participant is empty; give each row a participant.")
@@ -60,7 +63,7 @@ def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
         raise InputError(f"{path}: participant {found['participant']} stands there already; choose another id.")
     people[found["participant"]] = found
     try:
-        _write(Path(path), people)
+        _write(Path(path), people, _delimiter(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place.") from error
     return people
@@ -106,18 +109,26 @@ def _check(row, place):
         raise InputError(f'{place}: handedness is "{row["handedness"]}"; it must be right, left, both, or empty.')
 
 
-def _write(path, people):
+def _delimiter(path) -> str:
+    """What stands between the cells of a list that is there already."""
+    if not Path(path).exists():
+        return ","
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        return csv_rows(file, str(path))[1]
+
+
+def _write(path, people, delimiter):
     columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
     rows = [[row.get(column, "") for column in columns] for row in people.values()]
     path.parent.mkdir(parents=True, exist_ok=True)
-    _replace(path, [columns, *rows])
+    _replace(path, [columns, *rows], delimiter)
 
 
-def _replace(path, rows):
+def _replace(path, rows, delimiter):
     handle, made = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
     try:
         with open(handle, "w", newline="", encoding="utf-8") as file:
-            csv.writer(file, lineterminator="\n").writerows(rows)
+            csv.writer(file, delimiter=delimiter, lineterminator="\n").writerows(rows)
             file.flush()
             os.fsync(file.fileno())
         os.chmod(made, path.stat().st_mode if path.exists() else 0o600)

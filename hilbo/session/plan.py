@@ -113,6 +113,11 @@ def header_for(
     rest = protocol(study.session, "optimisation").rest
     for i, name in enumerate(materials):
         blocks.append(Block("optimisation", study.selection.trials, material=name, rest=rest if i else 0.0))
+    return _made(study, participant, session, seed, blocks, sets, **others)
+
+
+def _made(study, participant, session, seed, blocks, sets, **others) -> Header:
+    """The header of these blocks, with what it says of the study."""
     return Header(
         study=study.hash,
         participant=participant,
@@ -120,6 +125,7 @@ def header_for(
         seed=seed,
         blocks=tuple(blocks),
         sets=sets,
+        language=study.session.language,
         **others,
     )
 
@@ -196,7 +202,10 @@ def read_plan(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def check_plan(plan: Mapping[str, Any], study: AnyStudy) -> _Plan:
-    """Refuse a plan that was changed after it was made, belongs to another study, or has sessions that cannot be."""
+    """Refuse a plan that was changed after it was made, belongs to another study, or has sessions that cannot be.
+
+    Raises `InputError`, with what to do.
+    """
     found = converted(plan, _Plan, "the plan", _WHAT)
     if found.hash != plan_hash(plan):
         raise InputError("the plan was changed after it was made (its hash does not fit); make a new one.")
@@ -239,7 +248,7 @@ def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
 
 def _for_plan(header: Header):
     content = msgspec.to_builtins(header)
-    return {key: content[key] for key in ("study", "participant", "session", "seed", "blocks", "sets")}
+    return {key: content[key] for key in ("study", "participant", "session", "seed", "blocks", "sets", "language")}
 
 
 def _of(study, material):
@@ -263,7 +272,7 @@ def _header(study, person, session, seed, phase, materials, sets, source, codes)
         rest = protocol(study.session, phase).rest if i else 0.0
         blocks.append(Block(phase, len(planned), planned, material, rest))
         found |= renamed
-    return Header(study=study.hash, participant=person, session=session, seed=seed, blocks=tuple(blocks), sets=found)
+    return _made(study, person, session, seed, blocks, found)
 
 
 def _compared(study, person, phase, sets, source, codes, seed):

@@ -58,7 +58,10 @@ class Block(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class Header(msgspec.Struct, frozen=True, kw_only=True):
-    """All that decides a session in advance: the first line of its log."""
+    """All that decides a session in advance: the first line of its log.
+
+    `unblinded`: what showed its participant the parameters, "try" for `hilbo try`; "" where nothing did.
+    """
 
     schema: int = 1
     study: str
@@ -73,6 +76,8 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     protocol_number: str = ""
     versions: dict[str, str] = {}
     dry_run: bool = False
+    language: str = "en"
+    unblinded: str = ""
 
 
 class Need(msgspec.Struct, frozen=True):

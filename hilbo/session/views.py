@@ -11,7 +11,8 @@ import msgspec
 from hilbo.session.actions import steps_of
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
-from hilbo.study.protocols import TEXTS, protocol
+from hilbo.study.languages import language
+from hilbo.study.protocols import protocol
 
 __all__ = ["experimenter_view", "participant_view"]
 
@@ -45,7 +46,7 @@ def participant_view(state: LiveSession) -> dict[str, Any]:
             "another": state.screen == "ready" and _spare(state),
             "go_on": state.screen == "ready",
         },
-        "texts": {key: session.text(key) for key in TEXTS},
+        "texts": {key: session.text(key) for key in language("en").texts},
     }
 
 
@@ -92,14 +93,17 @@ def _ask(state, ask, alone):
 
 
 def _progress(state):
-    """Answers of the present part, out of how many; of the last one at the end."""
+    """Answers of the present part, out of how many; of the last one at the end. In words the trial, from 1."""
     block = len(state.header.blocks) - 1 if state.block is None else state.block
     if state.pending is not None:
         block = state.pending.block
     elif state.screen == "ready":
         block -= 1
     done, of = len(state.answers(block)), state.quota(block)
-    text = state.study.session.text("progress").replace("{done}", str(done)).replace("{of}", str(of))
+    numbers = {"{trial}": min(done + 1, of), "{done}": done, "{of}": of}
+    text = state.study.session.text("progress")
+    for name, number in numbers.items():
+        text = text.replace(name, str(number))
     return {"done": done, "of": of, "warm_up": state.header.blocks[block].phase == "warm-up", "text": text}
 
 

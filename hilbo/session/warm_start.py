@@ -14,7 +14,7 @@ and where the map knows nothing the rule is the cold one's but for p. Point by p
 one answer says of h elsewhere is taken from the study's kernel.
 
 Aggregation, reports and the participant's own optimum are made from their answers under the study's prior alone;
-docs/sessions.md has how many trials this saves (benchmarks/warm_start.py).
+docs/guides/sessions.md has how many trials this saves (benchmarks/warm_start.py).
 """
 
 import os
@@ -53,7 +53,7 @@ def warm_start(
     source: str = "",
     share: float = SHARE,
 ) -> WarmStart:
-    """From the map's mean and variance at candidates of the unit cube."""
+    """From the map's mean and variance at candidates of the unit cube. `points` (m, d), `mean` and `variance` (m,)."""
     prior = float(study.gp.kernel.diagonal(points[0]))
     return WarmStart(points, mean, variance + (1.0 - share) * prior, source)
 

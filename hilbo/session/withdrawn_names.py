@@ -95,7 +95,7 @@ def _names_number(text: str, suffix: str, participant: str) -> bool:
 def _column_names(text: str, participant: str, delimiter: str) -> bool:
     """Whether a whole cell of a column of ids is this id."""
     try:
-        head, *rows = csv.reader(text.lstrip("\ufeff").splitlines(), delimiter=delimiter)
+        head, *rows = csv.reader(text.lstrip("\ufeff").splitlines(), delimiter=delimiter, skipinitialspace=True)
     except (ValueError, csv.Error):
         return False
     columns = [i for i, name in enumerate(head) if _ID_COLUMNS.fullmatch(name.strip())]

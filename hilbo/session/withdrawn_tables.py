@@ -14,8 +14,10 @@ from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from hilbo.errors import InputError
 from hilbo.session.set_codes import OWN
 from hilbo.session.withdrawn_names import CODED_OWN, renamed_set, replaced
+from hilbo.study.text_cells import csv_rows
 
 __all__ = [
     "Cells",
@@ -40,24 +42,25 @@ class Cells(NamedTuple):
 
     head: list[str]
     rows: list[list[str]]
+    delimiter: str = ","
 
 
 def read_table(path: Path) -> Cells | None:
     """A CSV or Parquet table; None for what is none that can be read."""
     try:
         if path.suffix == ".parquet":
-            from hilbo.errors import InputError
-            from hilbo.study.trial_table import read_cells
+            from hilbo.study.cells import read_cells
 
             with contextlib.suppress(InputError):
                 frame = read_cells(path)
                 return Cells(list(map(str, frame.columns)), frame.to_numpy().tolist())
             return None
         with open(path, newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error):
+            reader, delimiter = csv_rows(file, str(path))
+            rows = list(reader)
+    except (OSError, UnicodeDecodeError, csv.Error, InputError):
         return None
-    return Cells(rows[0], rows[1:]) if rows else None
+    return Cells(rows[0], rows[1:], delimiter) if rows else None
 
 
 class Edited(NamedTuple):
@@ -127,7 +130,7 @@ def without_person(
         renamed += made != row
         kept.append(number)
         rows.append(made)
-    return Edited(kept, Cells(table.head, rows), renamed)
+    return Edited(kept, table._replace(rows=rows), renamed)
 
 
 def _renamed(cell: str, column: str, names: Mapping[str, str]) -> str:
@@ -141,7 +144,8 @@ def write_table(path: Path, edited: Edited) -> None:
     handle, made = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     with open(handle, "w", newline="", encoding="utf-8") as file:
         if path.suffix != ".parquet":
-            csv.writer(file, lineterminator="\n").writerows([edited.table.head, *edited.table.rows])
+            writer = csv.writer(file, delimiter=edited.table.delimiter, lineterminator="\n")
+            writer.writerows([edited.table.head, *edited.table.rows])
         file.flush()
         os.fsync(file.fileno())
     if path.suffix == ".parquet":

@@ -36,6 +36,7 @@ def binary_logit(
 
     `clusters`: up to two columns that name the cluster of every answer, participants say. An outcome that never
     changes has no finite intercept and is answered with a one-sided interval.
+    Raises `InputError` for an outcome that is empty or not of 0 and 1.
     """
     success = np.asarray(outcome)
     if success.ndim != 1 or not success.size or not np.isin(success, (0, 1)).all():
@@ -93,6 +94,8 @@ def tied_preferences(
     ∓η. Without ties η = 0 and it is Bradley & Terry's model. `preferred` holds one of the two sets or "tie" for each
     comparison; the strength of `reference` (default: the last in the alphabet) is 0. `order` (+1 if `first` was shown
     first, -1 if not, 0 if not known) adds the term "shown first".
+    All sequences are (n,), one entry a comparison. Raises `InputError` for a preference that is neither set nor a tie,
+    and for a `reference` that is in no comparison.
     """
     left, right, chosen = (np.asarray(column, str) for column in (first, second, preferred))
     wrong = (chosen != left) & (chosen != right) & (chosen != "tie")

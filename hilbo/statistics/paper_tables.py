@@ -77,7 +77,10 @@ def paper_tables(
 
 
 def set_sources(table: pd.DataFrame, sets: pd.DataFrame | None) -> tuple[dict[str, str], dict[str, str]]:
-    """Source and role of every set of a validation table; without a sets table their names say both."""
+    """Source and role of every set of a validation table; without a sets table their names say both.
+
+    Raises `InputError` for a set that the sets table does not have.
+    """
     used = sorted({*table["set_a"], *table["set_b"]})
     if sets is None:
         return {name: name.rpartition(" ")[2] for name in used}, {name: role_of(name) or name for name in used}

@@ -7,8 +7,8 @@
 | clustered by A and B | answers that share neither independent; t with the smaller G - 1 |
 | profile likelihood | as iid; for a coefficient that has no finite estimate |
 
-`docs/statistics.md` says which to trust when, from their coverage in simulated studies. statsmodels fits and clusters;
-the table, its warnings and the separated coefficients are what it does not have.
+`docs/methods/statistics.md` says which to trust when, from their coverage in simulated studies. statsmodels fits and
+clusters; the table, its warnings and the separated coefficients are what it does not have.
 """
 
 from collections.abc import Mapping, Sequence

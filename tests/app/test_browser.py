@@ -11,6 +11,7 @@ from live_server import DATA, PATIENCE, Live
 from hilbo.app import rehearsal
 from hilbo.app.robot import Client, Participant, browser, find_browser
 from hilbo.session.event_log import EventLog, read_log
+from hilbo.session.records import Block, Planned
 from hilbo.study.config import Study
 
 pytestmark = [
@@ -41,9 +42,11 @@ def test_a_whole_session_by_one_command(tmp_path, kind, trials):
 
 
 @pytest.fixture
-def pages(tmp_path):
-    """A session in this process, the participant's page and the experimenter's."""
-    with Live(tmp_path, seconds=0.1) as live, browser() as program:
+def pages(tmp_path, request):
+    """A session in this process, the participant's page and the experimenter's; its blocks are of comparisons, or the
+    fixture's parameter."""
+    blocks = getattr(request, "param", None)
+    with Live(tmp_path, seconds=0.1, blocks=blocks) as live, browser() as program:
         links = live.place.links()
         experimenter = program.new_context().new_page()
         experimenter.goto(links["experimenter"])
@@ -225,9 +228,10 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     window.wait_for_selector("#options:visible, #go:visible")
     window.route("**/api/participant/answer", lambda route: (route.fetch(), route.abort()))  # arrives, answer lost
     count = len(live.events("answer"))
-    if window.is_visible("#go"):
-        window.click("#go")
-    window.wait_for_selector("#options:visible")
+    while not window.is_visible("#options"):
+        if window.is_visible("#go"):
+            window.click("#go")  # which counts when it has stood there for a moment
+        window.wait_for_timeout(50)
     for _ in range(3):
         window.keyboard.press("2")
     until_logged(live, window, count + 1)
@@ -263,6 +267,7 @@ def test_the_pages_load_nothing_from_elsewhere_and_names_reach_a_screen_reader(p
     assert all(url.startswith(("http://127.0.0.1:", "data:")) for url in asked)
     assert window.get_by_role("button", name="Begin").is_visible()
     assert window.get_attribute("#title", "aria-live") == "assertive"
+    window.wait_for_timeout(400)  # a key that comes sooner after Begin came up is not meant for it
     window.keyboard.press("Space")
     window.wait_for_selector("#options:visible")
     assert window.get_by_role("group", name=window.inner_text("#title")).is_visible()
@@ -276,3 +281,87 @@ def test_a_second_window_takes_over_and_the_first_says_so(pages):
     until(first, "document.body.dataset.phase === 'over'")
     assert "another window" in first.inner_text("#title")
     second.wait_for_selector("#go:visible")
+
+
+SINGLES = (Block("warm-up", 6, tuple(Planned(name) for name in ("best", "mid", "worst") * 2)),)
+WATCHING = """() => {
+    window.places = {};
+    const look = () => {
+        const box = document.getElementById("options");
+        if (!box.hidden && box.dataset.question) {
+            const boxes = [...box.children].map((b) => b.getBoundingClientRect());
+            const at = boxes.map((r) => [r.x, r.y, r.width, r.height]);
+            const known = window.places[box.dataset.question] ||= [];
+            const phase = document.body.dataset.phase;
+            const same = ([p, q]) => p === phase && JSON.stringify(q) === JSON.stringify(at);
+            if (!known.some(same)) known.push([phase, at]);
+        }
+        requestAnimationFrame(look);
+    };
+    look();
+}"""
+
+
+@pytest.mark.parametrize("pages", [SINGLES], indirect=True, ids=["one rendering"])
+@pytest.mark.parametrize("size", [(1440, 900), (1024, 768), (390, 844)])
+def test_answers_stay_where_they_are_and_fit_on_the_screen(pages, size):
+    live, participant, _ = pages
+    window = participant.window
+    window.set_viewport_size(dict(zip(("width", "height"), size, strict=True)))
+    window.evaluate(WATCHING)
+    end = time.monotonic() + PATIENCE
+    while len(live.events("answer")) < 4:
+        if participant.phase != "step":  # the last step ends before the answer
+            participant.act()
+        assert time.monotonic() < end, participant.phase
+    places = window.evaluate("window.places")
+    assert len(places) >= 4
+    both = 0
+    for question, seen in places.items():
+        at = {json.dumps(boxes) for _, boxes in seen}
+        assert len(at) == 1, f"{question}: {seen}"
+        both += {phase for phase, _ in seen} >= {"step", "answer"}
+        for x, y, width, height in seen[0][1]:
+            assert x >= 0 and y >= 0 and x + width <= size[0] and y + height <= size[1], seen
+    assert both, "no question stood there while a step ended"
+
+
+@pytest.mark.parametrize("pages", [SINGLES], indirect=True, ids=["one rendering"])
+def test_a_tap_at_the_moment_when_answers_come_up_is_none(pages):
+    live, participant, _ = pages
+    until_answered(participant, 1)
+    until_logged(live, participant.window, 1)
+    window = participant.window
+    window.evaluate(
+        "new MutationObserver(() => { const b = document.querySelector('#options button');"
+        " if (b) { window.tapped = (window.tapped || 0) + 1; b.click(); } })"
+        ".observe(document.getElementById('options'), {childList: true})"
+    )
+    until(window, "window.tapped > 0 && document.body.dataset.phase === 'answer'")
+    assert len(live.events("answer")) == 1
+    window.wait_for_timeout(400)
+    window.click("#options button")
+    until_logged(live, window, 2)
+
+
+@pytest.mark.parametrize("act", ["document.getElementById('go').click()", "document.dispatchEvent(SPACE)"])
+def test_a_second_tap_begins_nothing(pages, act):
+    _, participant, _ = pages
+    window = participant.window
+    window.wait_for_selector("#go:visible")
+    act = act.replace("SPACE", "new KeyboardEvent('keydown', {key: ' '})")
+    window.evaluate(f"at('go').hidden = true; draw(); {act}")  # Begin comes up, and is pressed in the same moment
+    window.wait_for_timeout(500)
+    assert participant.phase == "hello"
+    window.evaluate(act)
+    until(window, "document.body.dataset.phase !== 'hello'")
+
+
+def test_keys_are_shown_where_there_is_a_keyboard(tmp_path):
+    with Live(tmp_path, seconds=0.1) as live, browser() as program:
+        tablet = program.new_context(has_touch=True, is_mobile=True, viewport={"width": 800, "height": 1280}).new_page()
+        tablet.goto(live.place.links()["participant"])
+        tablet.wait_for_selector("#go:visible")
+        assert not tablet.is_visible("#go kbd")
+        tablet.keyboard.press("Shift")
+        assert tablet.is_visible("#go kbd")

@@ -26,6 +26,7 @@ from hilbo.session.event_log import read_log
 from hilbo.session.participants import add_person
 from hilbo.session.plan import header_for, make_plan, plan_hash
 from hilbo.session.warm_start import read_warm_start
+from hilbo.simulation.presets import preset_of
 
 PERSON = {"participant": "P01", "consent_time": "2026-03-02T10:00", "protocol_number": "7", "age": "", "handedness": ""}
 
@@ -148,7 +149,9 @@ def test_a_warm_start_that_is_refused_leaves_no_log(tmp_path):
     wanted = Wanted(tmp_path / "study.toml", "P01", logs=logs, warm_start=tmp_path / "none.nc", dry_run=True)
     with pytest.raises(InputError, match="is no map"):
         opened(wanted, lambda _: None, lambda _: None)
-    plan = make_plan(study, ["P01"], 0, "validation", sets={"": example_sets(study)}, source="aggregate")
+    plan = make_plan(
+        study, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
+    )
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     planned = wanted._replace(plan=tmp_path / "plan.json", warm_start=a_map(study, tmp_path / "map.nc"))
     with pytest.raises(InputError, match="nothing is chosen"):

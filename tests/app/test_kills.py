@@ -16,6 +16,7 @@ from live_server import DATA, until_held
 from hilbo.app.rehearsal import example_sets, fast_study
 from hilbo.device.simulator import Simulator
 from hilbo.session.plan import make_plan
+from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 
 KILLS = int(os.environ.get("HILBO_KILLS", "8"))
@@ -72,7 +73,9 @@ def test_killed_servers_lose_and_double_nothing(tmp_path, phase, share):
     study = Study.load(file)
     arguments = [str(file), "--participant", "P01"]
     if phase == "validation":
-        plan = make_plan(study, ["P01"], 0, phase, sets={"": example_sets(study)}, source="aggregate")
+        plan = make_plan(
+            study, ["P01"], 0, phase, sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
+        )
         (tmp_path / "plan.json").write_text(json.dumps(plan))
         arguments += ["--plan", str(tmp_path / "plan.json")]
     logs = [finished(study, tmp_path / name, arguments, n, 0.8) for name, n in (("killed", kills), ("whole", 0))]
@@ -82,7 +85,9 @@ def test_killed_servers_lose_and_double_nothing(tmp_path, phase, share):
 def test_a_kill_while_a_device_of_its_own_renders_loses_not_even_the_click(tmp_path):
     file = fast_study(DATA, tmp_path / "study.toml", 0.05, 2)
     study = Study.load(file)
-    plan = make_plan(study, ["P01"], 0, "validation", sets={"": example_sets(study)}, source="aggregate")
+    plan = make_plan(
+        study, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
+    )
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     with contextlib.closing(Simulator(finger="none")) as device:
         arguments = [str(file), "--participant", "P01", "--plan", str(tmp_path / "plan.json"), "--device", device.port]

@@ -126,6 +126,6 @@ class refused_somehow:  # noqa: N801  (read as a word)
 
 
 def test_the_documents_name_every_address():
-    text = (Path(__file__).parents[2] / "docs" / "live.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "guides" / "live.md").read_text(encoding="utf-8")
     for name in (*PRESSES, *COMMANDS, "answer", "events", "join"):
         assert f"`{name}`" in text or f"/{name}" in text, name

@@ -93,7 +93,7 @@ def test_set(device, sets):
         (["hello", "--study", "study.toml"], 2, "study.toml"),
         (["decode", "none.bin"], 2, "none.bin: cannot be read"),
         (["record", "sets.csv"], 2, "exists already"),
-        (["record", "no/where.csv"], 2, "there is no folder"),
+        (["record", "no/where.csv"], 2, "cannot be written"),
         (["characterise", "t.csv", "--repeats", "0"], 2, "--repeats"),
         (["feel", "none.csv"], 2, "cannot be read"),
         (["clear", *FAST], 1, "CLEAR is refused while the device is STOPPED"),

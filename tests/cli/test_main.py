@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import typer
 import xarray as xr
 from commands import run
+
+from hilbo.cli.main import app
 
 VIDEO = ["hilbo/data/video_quality.csv", "--study", "hilbo/data/video_quality.toml"]
 
@@ -93,7 +96,7 @@ def test_robustness_may_give_everybody_their_own(capsys, monkeypatch, tmp_path):
 
 STUDY = Path("hilbo/data/paper.toml").read_text()
 BAD_STUDIES = {
-    "unknown key": (STUDY.replace("[gp]", "[gp]\nlength = 3"), "gp.length is not a key"),
+    "unknown key": (STUDY.replace("[gp]", "[gp]\nlenght = 3"), "gp.lenght is not a key"),
     "wrong type": (STUDY.replace("theta = 30.0", 'theta = "long"'), 'gp.theta is "long"'),
     "thresholds out of order": (STUDY.replace("[-0.5, 0.5]", "[0.5, -0.5]"), "gp.thresholds"),
     "noise of 0": (STUDY.replace("noise = 0.5", "noise = 0"), "gp.noise is 0"),
@@ -189,3 +192,22 @@ def test_a_large_population_is_merged_without_its_individuals(capsys, monkeypatc
         xr.open_dataset(tmp_path / "small" / "map.nc", engine="h5netcdf") as other,
     ):
         assert float(abs(one["mean"] - other["mean"]).max()) < 1e-11
+
+
+def options(group, path=()):
+    """Every option of every command: the command, the option's names, its help."""
+    for name, command in group.commands.items():
+        if hasattr(command, "commands"):
+            yield from options(command, (*path, name))
+        else:
+            yield from (((*path, name), p.opts, p.help) for p in command.params if p.param_type_name == "option")
+
+
+def test_every_option_says_what_it_does():
+    unsaid = [(command, names) for command, names, text in options(typer.main.get_command(app)) if not text]
+    assert not unsaid
+
+
+def test_help_shows_the_names_of_tables(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert "study states in [simulation]" in run(capsys, monkeypatch, "power", "--help")[1]

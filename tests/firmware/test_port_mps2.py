@@ -14,7 +14,8 @@ from device_input import MACHINES, Recording, emulate, replay, rich_motion
 from device_port import FOAM, PATIENCE, SCHEMA, State, Talk, image
 from device_wire import Type, encode, set_params
 
-from benchmarks.firmware import DOCS, MEMORIES, measure, sizes, stack_of, state_bytes
+from benchmarks.firmware import MEMORIES, measure, sizes, stack_of, state_bytes
+from benchmarks.pages import DOCS
 from hilbo import passivity, viscoelastic
 from hilbo.mechanics.exponentials import exponentials
 
@@ -156,7 +157,7 @@ def test_what_a_tick_costs(cpu, tmp_path):
 
 @pytest.mark.deep
 def test_the_table_of_costs_is_that_of_this_core(tmp_path):
-    text = (DOCS / "firmware.md").read_text(encoding="utf-8")
+    text = (DOCS / "device" / "firmware.md").read_text(encoding="utf-8")
     rows = dict(re.findall(r"^\| (?:contact, )?(.*?) \| ([\d,]+) \|", text, re.M))
     for name, cost in measure("m4", tmp_path).sections.items():
         written = int(rows[name.removeprefix("contact, ")].replace(",", ""))

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from datasets import SMALL, hostile_cases, near_separable, noisy, repeated, repeated_19, separated
-from helpers import answers, assert_traces_once, complaint, model
+from helpers import answers, assert_traces_once, complaint, model, unchecked
 from jaxtyping import Array
 from reference_ep import textbook_ep, tilted_moments
 
@@ -262,7 +262,7 @@ def test_conflicting_repeats_at_tiny_noise(noise):
 
 def test_a_failed_fit_says_so():
     data = separated()
-    gp = OrdinalGP(RBF(data.theta, data.variance), OrdinalProbit((0.5, -0.5), 0.5))  # out of order: NaN
+    gp = OrdinalGP(RBF(data.theta, data.variance), unchecked((0.5, -0.5), 0.5))  # out of order: NaN
     with pytest.raises(InferenceError, match=r"expectation propagation was not found: its log evidence is not finite"):
         fit(gp, answers(data), inference="ep")
     assert not fit(gp, answers(data), inference="ep", throw=False).certificate.converged

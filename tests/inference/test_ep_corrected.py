@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from datasets import SMALL, near_separable, noisy, repeated, repeated_19, separated
-from helpers import answers, model
+from helpers import answers, model, unchecked
 from reference_ep import second_order
 from reference_exact import gram
 
@@ -148,6 +148,6 @@ def test_hyperparameters_can_be_learnt_by_it():
 def test_a_failed_fit_says_so():
     with pytest.raises(InputError, match="the likelihood has 2 thresholds"):
         fit(model(separated()), Trials.from_arrays(np.zeros((1, 3)), np.array([3])), inference="ep_corrected")
-    wrong = OrdinalGP(RBF(3.0), OrdinalProbit((0.5, -0.5), 0.5))
+    wrong = OrdinalGP(RBF(3.0), unchecked((0.5, -0.5), 0.5))
     with pytest.raises(InferenceError, match=r"expectation propagation, corrected, was not found"):
         fit(wrong, answers(separated()), inference="ep_corrected")

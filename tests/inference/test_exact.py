@@ -110,7 +110,7 @@ def test_one_answer_by_hand():
             assert errors_apart(value, expected, error) < 3 and error < 1e-3
 
 
-# --- what the approximations miss (docs/inference.md has the table)
+# --- what the approximations miss (docs/methods/inference.md has the table)
 
 BOUNDS = [(separated, 0.002, 0.03), (repeated, 0.002, 0.03), (repeated_19, 0.002, 0.03), (near_separable, 0.003, 0.15),
           pytest.param(noisy, 0.002, 0.03, marks=pytest.mark.deep)]  # fmt: skip

@@ -1,7 +1,8 @@
 """Hyperparameters and answers that nobody should choose: every fit converges, or says that it did not.
 
 Noise 1e-3 to 10, theta 1e-2 to 1e4, variance 1e-3 to 1e4; one category only, conflicting repeats, answers independent
-of x; 0, 1, 25 and 200 of them. Wider ranges and the other inferences: tests/inference/test_stress.py, docs/stress.md.
+of x; 0, 1, 25 and 200 of them. Wider ranges and the other inferences: tests/inference/test_stress.py,
+docs/results/accuracy.md.
 """
 
 from itertools import product

@@ -106,7 +106,7 @@ def rendered(sets, x, drive, block, **memory):
     return jax.vmap(lambda *q: getattr(FOSLS(*q, **memory), drive)(x, block=block))(*sets)
 
 
-# Largest error of a minute in float32, of the largest force or position: docs/mechanics.md quotes these.
+# Largest error of a minute in float32, of the largest force or position: docs/methods/mechanics.md quotes these.
 @pytest.mark.deep
 @pytest.mark.parametrize(
     ("drive", "memory", "block", "bound"),

@@ -44,7 +44,8 @@ def robust(shared, nrmse):
     study = plain_study(2)
     optimum = {"parameters": set_of(study.space, np.full(2, 0.5)), "mean": 1.0, "sd": 0.25}
     still = {"participant": "A", "nrmse": 0.01, "flagged": False, "converged": True, "runaway": False}
-    learned = {"parameters": ["theta", "noise"], "shared": shared, "theta": [5.0], "noise": 0.5, "thresholds": [0.0]}
+    learned = {"parameters": ["theta", "noise"], "shared": shared, "theta": [5.0, 1 / 3], "variance": 1.0}
+    learned |= {"noise": 0.5, "thresholds": [0.0]}
     content = {
         "warnings": ["a < b"],
         "fixed": optimum,
@@ -65,9 +66,10 @@ def test_the_page_of_a_robustness_check():
     assert (
         "one set for all; learnt: theta, noise" in page and "1.0 % of the search ranges (NRMSE), less than 3 %:" in page
     )
-    assert "Learnt: theta 5; noise 0.5; thresholds 0." in page and "a &lt; b" in page
+    table = "[gp] theta = [5.0, 0.3333] variance = 1.0 thresholds = [0.0] noise = 0.5"
+    assert table in page and "a &lt; b" in page
     assert "moved by 3 % or more: B." in page and "B 20.0 % flagged, search not converged" in page
     assert "ln theta +1.00 % -2.00 %" in page and "ln gap 2 +2.00 % +4.00 %" in page
     own = robust(shared=False, nrmse=0.03)
-    assert "each person's own" in own.replace("&#39;", "'") and "Learnt:" not in own
+    assert "each person's own" in own.replace("&#39;", "'") and "[gp]" not in own
     assert "which is 3 % or more: it is not robust" in own

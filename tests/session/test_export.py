@@ -194,6 +194,19 @@ def test_dry_runs_are_nobodys_answers(folder, tmp_path):
         read_sessions(tmp_path / "dry", STUDY)
 
 
+def test_answers_of_hilbo_try_are_marked_and_not_read_beside_others(folder, tmp_path):
+    write(folder, "try-1", "optimisation", "1", unblinded="try")
+    table = trials_table(read_sessions(folder, STUDY))
+    assert set(table.loc[table["unblinded"] == "try", "participant"]) == {"try-1"}
+    assert set(table.loc[table["unblinded"].isna(), "participant"]) == {"P01", "P02", "P03"}
+    with pytest.raises(InputError, match="is an unblinded answer, as hilbo try gives"):
+        read_log_trials(folder, STUDY)
+    write(tmp_path / "own", "try-1", "optimisation", "1", unblinded="try")
+    assert set(read_log_trials(tmp_path / "own", STUDY)["participant"]) == {"try-1"}
+    (folder / "try-1_1.session.jsonl").unlink()
+    assert "unblinded" not in read_log_trials(folder, STUDY)
+
+
 def test_folders_without_answers_are_refused(tmp_path):
     with pytest.raises(InputError, match="holds no session logs"):
         read_log_trials(tmp_path, STUDY)
@@ -237,4 +250,17 @@ def test_consent_comes_before_the_first_trial(tmp_path):
             add_person(path, row | change)
     path.write_text("participant,age\nP01,3\n")
     with pytest.raises(InputError, match='1: column "consent_time" is missing'):
+        read_people(path)
+
+
+@pytest.mark.parametrize("mark", [",", ";"])
+def test_a_list_of_people_keeps_what_stands_between_its_cells(tmp_path, mark):
+    path = tmp_path / "participants.csv"
+    head = mark.join(("participant", "consent_time", "protocol_number", "seat"))
+    path.write_text(f"{head}\n" + mark.join(("P1", "2026-05-04T10:00", "7", "left")) + "\n")
+    add_person(path, {"participant": "P2", "consent_time": "2026-05-04T11:00", "protocol_number": "7"})
+    assert {name: row["seat"] for name, row in read_people(path).items()} == {"P1": "left", "P2": ""}
+    assert all(line.count(mark) == 5 for line in path.read_text().splitlines())
+    path.write_text(f"{head}\n" + mark.join(("P1", "2026-05-04T10:00", "7", "left", "more")) + "\n")
+    with pytest.raises(InputError, match=r"participants.csv:2: has 5 cells, the header has 4; fix that line"):
         read_people(path)

@@ -65,6 +65,28 @@ def test_answers_of_others_about_their_set_stay_and_can_be_read(folder, capsys, 
         assert f"{name}: " in err
 
 
+@pytest.mark.filterwarnings("ignore::hilbo.errors.InputRemark")
+def test_tables_with_semicolons_stay_so(folder):
+    tables = {name: pd.read_csv(folder / name) for name in ("trials.csv", "sets.csv", "validation.csv")}
+    for name, table in tables.items():
+        table.to_csv(folder / name, index=False, sep=";", decimal=",")
+    delete_participant(folder, "P02")
+    left = read_trials(folder / "trials.csv", STUDY)
+    assert left["u"].tolist() == tables["trials.csv"].query("participant != 'P02'")["u"].tolist()
+    assert read_validation(folder / "validation.csv", STUDY.responses)["participant"].tolist() == ["P03"]
+    assert sets_frame(folder / "sets.csv", ("u", "v"))["u"].tolist() == tables["sets.csv"]["u"].tolist()
+    for name, table in tables.items():
+        assert (folder / name).read_text().splitlines()[0] == ";".join(table.columns)
+
+
+@pytest.mark.parametrize("mark", [",", ";", "\t"])
+def test_blanks_before_a_quoted_id_hide_nobody(tmp_path, mark):
+    path = tmp_path / "trials.csv"
+    path.write_text(f'trial{mark} participant\n1{mark} "P1"\n2{mark} P2\n')
+    delete_participant(tmp_path, "P1")
+    assert path.read_text() == f"trial{mark}participant\n2{mark}P2\n"
+
+
 def test_a_set_that_nobody_else_compared_goes(folder, capsys, monkeypatch):
     delete(capsys, monkeypatch, folder, "P01")
     assert set(sets_frame(folder / "sets.csv", ("u", "v")).index) == {"best", "own-P02"}

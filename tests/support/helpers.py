@@ -13,7 +13,7 @@ from datasets import Dataset
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.ordinal_gp import InferenceError
 
-__all__ = ["answers", "assert_traces_once", "check_grad", "complaint", "model"]
+__all__ = ["answers", "assert_traces_once", "check_grad", "complaint", "model", "unchecked"]
 
 
 def check_grad(fn: Callable, *args, rtol: float = 1e-6, atol: float = 0.0) -> None:
@@ -114,3 +114,8 @@ def complaint(case: Dataset, dtype: type, inference: str = "laplace") -> str:
         "jitter": certificate.jitter <= (1e-13 if dtype is np.float64 else 2e-4),
     }
     return ", ".join(name for name, good in checks.items() if not good)
+
+
+def unchecked(thresholds, noise) -> OrdinalProbit:
+    """A likelihood of any values, made within a program, where values are not looked at."""
+    return jax.jit(OrdinalProbit)(jnp.asarray(thresholds), jnp.asarray(noise))

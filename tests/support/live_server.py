@@ -25,6 +25,7 @@ from hilbo.session.event_log import EventLog, read_log
 from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.records import Block, Header, Planned
 from hilbo.session.state import LiveSession
+from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 
 __all__ = ["DATA", "PATIENCE", "Live", "ask", "check_blinding", "listen", "refused", "study_of", "until_held"]
@@ -74,7 +75,7 @@ class Live:
 
     def sets(self):
         """What is compared."""
-        return example_sets(self.study)
+        return example_sets(self.study, preset_of("paper"))
 
     def rig(self):
         """Makes what shows renderings."""

@@ -13,6 +13,7 @@ __all__ = [
     "MID",
     "PEOPLE",
     "PLAIN",
+    "SOUND",
     "STUDY",
     "TRIALS",
     "WORST",
@@ -33,6 +34,22 @@ PLAIN = {
     "parameters": {n: {"low": low, "high": high, "unit": ""} for n, low, high in (("u", 0.0, 1.0), ("v", 10.0, 20.0))},
     "gp": {"theta": 30.0, "variance": 1.0, "thresholds": [-0.5, 0.5], "noise": 0.5},
 }
+
+
+SOUND = """\
+schema = 1
+[study]
+name = "sound"
+responses = ["bad", "fair", "good"]
+[parameters.level]
+low = 0
+high = 10
+[parameters.tone]
+low = -1
+high = 1
+[aggregation]
+rule = "learnt-1"
+"""  # nothing about hyperparameters: they are learnt
 
 
 PEOPLE, TRIALS = 37, 6

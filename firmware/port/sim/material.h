@@ -1,6 +1,6 @@
 /* A viscoelastic material that the device presses by itself: the sampled FO-SLS, resisting for x > 0.
  *
- * At the ticks n it is exactly the model that `hilbo identify` fits (docs/mechanics.md), in double precision:
+ * At the ticks n it is exactly the model that `hilbo identify` fits (docs/methods/mechanics.md), in double precision:
  *     y_n = g x_n + sum w_i y_{n-i},  F_n = K0 x_n + K1 (x_n - y_n),  x = max(position, 0),  F = max(F, 0).
  * Between two ticks the past stays, so that the force follows the position with the instantaneous stiffness. */
 #ifndef SIM_MATERIAL_H

@@ -8,8 +8,8 @@ function colour(share) {
   return STOPS[i].map((v, k) => Math.round(v + f * (STOPS[i + 1][k] - v)));
 }
 
-function drawSlice(canvas, slice, range) {
-  const n = slice.mean.length, side = 240, c = canvas.getContext("2d");
+function drawSlice(canvas, slice, range, side = 240) {
+  const n = slice.mean.length, c = canvas.getContext("2d");
   canvas.width = canvas.height = side;
   const small = new OffscreenCanvas(n, n), p = small.getContext("2d"), image = p.createImageData(n, n);
   slice.mean.forEach((row, j) => row.forEach((value, i) => {
@@ -62,4 +62,36 @@ function drawMap(box, map) {
     figure.lastChild.lastChild.textContent = slice.held;
     drawSlice(figure.firstChild, slice, range);
   });
+}
+
+// One slice with its axes and, where it was hidden, the truth; the page of hilbo try.
+function drawWithAxes(canvas, slice, across, up, range) {
+  const ratio = devicePixelRatio, w = canvas.clientWidth, h = canvas.clientHeight, c = canvas.getContext("2d");
+  const side = Math.min(w - 78, h - 74), x = (w - side + 58) / 2, y = (h - side - 26) / 2, inner = document.createElement("canvas");
+  canvas.width = w * ratio; canvas.height = h * ratio;
+  c.scale(ratio, ratio);
+  drawSlice(inner, { ...slice, trials: [], best: [-1, -1] }, range, Math.round(side));
+  c.drawImage(inner, x, y, side, side);
+  for (const t of slice.trials) dot(c, x + t.x * side, y + (1 - t.y) * side, t);   // also those on the edge, whole
+  for (const [colour, width] of [["#fff", 4], ["#111", 1.8]]) {
+    c.strokeStyle = colour; c.lineWidth = width;
+    cross(c, x + slice.best[0] * side, y + (1 - slice.best[1]) * side);
+  }
+  for (const [colour, width] of [["#fff", 6], ["#d1495b", 3]]) {
+    c.strokeStyle = colour; c.lineWidth = width;
+    c.beginPath(); c.arc(x + across.hidden_unit * side, y + (1 - up.hidden_unit) * side, 9, 0, 7); c.stroke();
+  }
+  c.fillStyle = "#1d2733"; c.font = "14px system-ui, sans-serif"; c.textAlign = "center";
+  c.fillText(`at ${slice.held.replace(" ", " = ")}`, x + side / 2, y - 8);
+  const value = (p, u) => Number((p.scale === "log" ? p.low * (p.high / p.low) ** u : p.low + (p.high - p.low) * u).toPrecision(2));
+  for (const u of [0, 0.5, 1]) {
+    c.textAlign = u === 0 ? "left" : u === 1 ? "right" : "center";
+    c.fillText(value(across, u), x + u * side, y + side + 18);
+    c.textAlign = "right";
+    c.fillText(value(up, u), x - 6, y + (1 - u) * side + (u === 1 ? 11 : u === 0 ? 0 : 5));
+  }
+  const label = (p) => p.name + (p.unit ? ` (${p.unit})` : "");
+  c.font = "600 14px system-ui, sans-serif"; c.textAlign = "center";
+  c.fillText(label(across), x + side / 2, y + side + 40);
+  c.translate(x - 48, y + side / 2); c.rotate(-Math.PI / 2); c.fillText(label(up), 0, 0);
 }

@@ -14,6 +14,8 @@ const page = random();               // this window; the newest one of a partici
 let view = null;                     // what the server said last
 let answers = {}, asked = 0;         // of the question that is on the page
 let shownAt = 0, stepEnds = 0;       // performance.now()
+let laidOut = 0, goAt = 0;           // when the answers' buttons and Begin came up
+const SETTLES = 300;                 // ms: a tap that comes sooner was for what stood there before
 let trial = null;                    // id of the trial on the page
 let sending = false, connected = false, over = false;
 let source = null, calling = false, silent = false;   // the stream of views; a sign of life under way; none got through
@@ -71,6 +73,7 @@ function drawSteps() {
 }
 
 function drawButton(id, yes, text) {
+  if (yes && at(id).hidden) goAt = performance.now();
   show(id, yes);
   at(id).firstElementChild.textContent = text;
   at(id).lastElementChild.textContent = words("space_key");
@@ -81,6 +84,7 @@ function drawOptions(q) {
   show("options", !!q);
   if (box.dataset.question === mark) return;
   box.dataset.question = mark;
+  laidOut = performance.now();
   box.replaceChildren(...(q ? q.options : []).map((option, i) => {
     const b = document.createElement("button");
     for (const [kind, text] of [["label", option.label], ["text", option.text]]) {
@@ -88,7 +92,7 @@ function drawOptions(q) {
     }
     b.append(Object.assign(document.createElement("kbd"), { textContent: String(i + 1) }));
     b.dataset.value = option.value;
-    b.addEventListener("click", () => choose(i));
+    b.addEventListener("click", () => { if (performance.now() - laidOut > SETTLES) choose(i); });
     return b;
   }));
 }
@@ -187,12 +191,14 @@ function tick() {
 
 document.addEventListener("keydown", (e) => {
   if (e.repeat || e.ctrlKey || e.altKey || e.metaKey) return;
+  document.body.classList.add("keys");
   if (/^[1-9]$/.test(e.key)) { choose(Number(e.key) - 1); e.preventDefault(); }
   else if ((e.key === " " || e.key === "Enter") && !at("go").hidden && !(e.target instanceof HTMLButtonElement)) {
-    press("begin"); e.preventDefault();
+    go(); e.preventDefault();
   }
 });
-at("go").addEventListener("click", () => press("begin"));
+function go() { if (performance.now() - goAt > SETTLES) press("begin"); }
+at("go").addEventListener("click", go);
 at("more").addEventListener("click", () => press("more"));
 at("break").addEventListener("click", () => press("break"));
 setInterval(() => { if (kept()) hand(); }, 3000);

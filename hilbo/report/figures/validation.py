@@ -49,7 +49,7 @@ def aggregate_best_figure(people: pd.DataFrame, overall: pd.DataFrame) -> Figure
 
 
 def preference_rows(preferences: pd.DataFrame) -> pd.DataFrame:
-    """Of each pair the counts and its widest interval, docs/statistics.md."""
+    """Of each pair the counts and its widest interval, docs/methods/statistics.md."""
     if preferences.empty:
         return preferences
     groups = preferences.groupby(["set", "over"], sort=False)

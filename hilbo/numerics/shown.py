@@ -1,0 +1,35 @@
+"""Short words for records of arrays: what a notebook or a debugger shows of them."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from hilbo.errors import InputError
+
+__all__ = ["check_positive", "concrete", "shown"]
+
+
+def concrete(*values: Any) -> bool:
+    """Whether these are numbers, and not what JAX traces or maps over."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+
+
+def check_positive(whose: str, **values: Any) -> None:
+    """Raises `InputError` for numbers that are not above 0, or not finite; what is traced is not looked at."""
+    for name, value in values.items():
+        if concrete(value) and not np.all((np.asarray(value) > 0) & np.isfinite(value)):
+            raise InputError(f"{whose}: {name} is {shown(value)}; it must be a finite number above 0.")
+
+
+def shown(value: Any) -> str:
+    """A number with four digits, a short list of them, else shape and dtype; what is traced as JAX writes it."""
+    if isinstance(value, Tracer) or not isinstance(value, jax.Array | np.ndarray | np.generic):
+        return str(value)
+    array = np.asarray(value)
+    if array.ndim == 0 and array.dtype == bool:
+        return str(bool(array))
+    if array.ndim > 1 or array.size > 6:
+        return f"{array.dtype}[{', '.join(map(str, array.shape))}]"
+    return f"{array.item():.4g}" if array.ndim == 0 else f"[{', '.join(f'{v:.4g}' for v in array.tolist())}]"
