@@ -15,7 +15,7 @@ PIP := $(BIN)/pip install --disable-pip-version-check -c constraints.txt
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo firmware test test-deep lint docs bench clean
+.PHONY: help setup demo firmware test test-deep lint docs wheel bench clean
 
 help:  ## show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
@@ -42,6 +42,9 @@ lint: $(STAMP)  ## ruff and pyright
 docs: $(DOCS_STAMP)  ## the documentation as a site, into build/site; a broken link or anchor is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "open build/site/index.html"
+
+wheel:  ## the sdist and the wheel, into dist, and what a stranger does with them in fresh environments
+	.ci/wheel $(PYTHON)
 
 bench: $(STAMP)  ## time hilbo against the textbook NumPy form
 	$(BIN)/python benchmarks/run.py

@@ -255,7 +255,7 @@ def test_a_second_program_takes_over_and_the_first_is_out(live):
 
 
 def test_nobody_presents_before_the_stop_was_seen(live):
-    program = live.by_hand(force=True, ready=False)
+    program = live.by_hand(force=True, ready=False, neutral_within_s=10.0)
     assert program.order["do"] == "stop"
     live.participant.post("/api/participant/begin", {})
     assert live.whole()["device"]["state"] == "lost"
