@@ -35,6 +35,9 @@ def plan(
     source: Annotated[str, typer.Option(help="For a validation: aggregate or individual.")] = "aggregate",
     session: Annotated[str, typer.Option(help="Label of the session in tables and names of logs.")] = "",
     reissue: Annotated[str | None, typer.Option(help="OLD=NEW: give NEW the row of OLD in the plan --out.")] = None,
+    register: Annotated[
+        Path | None, typer.Option("--register", help="Besides, one page for a pre-registration, in Markdown.")
+    ] = None,
     seed: Annotated[int, seed_option("of orders, and of every session")] = 0,
     force: ForceFile = False,
     as_json: JsonToo = False,
@@ -44,6 +47,8 @@ def plan(
     from hilbo.study.study_file import StudyFile
 
     file = StudyFile.load(study)
+    if register is not None:
+        _check_register(register, out, reissue, force)
     if reissue is not None:
         _write_plan(_reissued(out, file, reissue), out, as_json)
         return
@@ -79,6 +84,8 @@ def plan(
         )
     check_free(out, force)  # it may have been made in the meantime
     _write_plan(made, out, as_json)
+    if register is not None:
+        _write_registration(file, made, register)
 
 
 def export(
@@ -223,6 +230,23 @@ def _reissued(path, study, text):
         raise InputError(f"{path}: is no plan that can be read; give the one to change with --out.") from error
     check_plan(plan, study)
     return reissue(plan, old.strip(), new.strip())
+
+
+def _check_register(register, out, reissue, force):
+    if reissue is not None:
+        raise InputError("--register belongs to a new plan, and --reissue changes one; the page of the old plan stays.")
+    if register.resolve() == out.resolve():
+        raise InputError(f"--register is {register}, where the plan is to be; name another file.")
+    check_free(register, force)
+
+
+def _write_registration(file, plan, out):
+    from hilbo import __version__
+    from hilbo.session.registration import registration
+
+    with new_file(out) as path:
+        path.write_text(registration(file, plan, __version__), encoding="utf-8")
+    typer.echo(f"{out}: read it, and fill in what is to be written by you", err=True)
 
 
 def _write_plan(plan, out, as_json):

@@ -5,6 +5,7 @@
     validation*.csv   optional: validation tables
     sets.csv          optional: sets table; a set of source "sysid" is what tables and figures are held against
     truth.csv         optional, of a simulated study: `source` "population" and the parameters that are the truth
+    plan.json         optional: the plan of `hilbo plan`, from which the answers may depart
 A study of several materials names them in [materials.NAME] (which overrides the renderer or parameters) or in the
 tables' column `material` alone, when they share everything. Whatever is wrong is one sentence with its file.
 """
@@ -22,6 +23,7 @@ from hilbo.errors import InputError
 from hilbo.study.cells import numbers, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
+from hilbo.study.departures import departures
 from hilbo.study.trial_table import check_texts, read_trials
 from hilbo.study.validation_table import check_validation, sets_frame
 
@@ -74,7 +76,8 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     }
     _check_materials_named(names, tables)
     materials = [_material(name, study, trials, compared, sets, truth) for name in names]
-    return StudyFolder(study, materials, sets, _missing_tables(materials, compared, sets))
+    limits = (*_departures(folder / "plan.json", study, materials), *_missing_tables(materials, compared, sets))
+    return StudyFolder(study, materials, sets, limits)
 
 
 def _with_exclusion(study: Study, exclude: str | None) -> Study:
@@ -202,6 +205,17 @@ def _reference(
                 ' column "material".'
             )
     return None, ""
+
+
+def _departures(path: Path, study: Study, materials: list[Material]) -> tuple[str, ...]:
+    """How the answers depart from the folder's plan, in sentences; none where there is no plan."""
+    if not path.exists():
+        return ()
+    counts: dict[str, list[int]] = {}
+    for material in materials:
+        for name, count in zip(material.cohort.names, material.cohort.counts().tolist(), strict=True):
+            counts.setdefault(name, []).append(count)
+    return departures(path, study.hash, study.selection.trials, counts)
 
 
 def _missing_tables(

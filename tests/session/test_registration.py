@@ -1,0 +1,100 @@
+"""The page for a pre-registration: what files fix stands there, and what they do not is left to its author."""
+
+import json
+from pathlib import Path
+
+import pytest
+from commands import run
+
+from hilbo.errors import InputError
+from hilbo.session.plan import make_plan
+from hilbo.session.registration import registration
+from hilbo.study.departures import departures
+from hilbo.study.study_file import StudyFile
+
+PAPER = Path("hilbo/data/paper.toml")
+TEXT = PAPER.read_text()
+
+
+@pytest.fixture
+def page(tmp_path):
+    def of(text=TEXT, people=("P01", "P02", "P03"), **others):
+        path = tmp_path / "study.toml"
+        path.write_text(text)
+        study = StudyFile.load(path)
+        return registration(study, make_plan(study, people, 5, **others), "1.2.3")
+
+    return of
+
+
+def test_what_is_fixed_stands_on_the_page(page):
+    text = page()
+    for part in (
+        "hash",
+        "seed 5",
+        "hilbo 1.2.3",
+        "3, P01 to P03",
+        "| K1 | 1 | 32 | N/mm | linear |",
+        "committee machine (`bcm`)",
+    ):
+        assert part in text
+    assert "25 trials that count" in text and "5 spread over" in text and "weight 0.7" in text
+    assert "theta 30, variance 1, thresholds (-0.5, 0.5), noise 0.5" in text
+    assert "passive on the device" in text and "Nobody is left out" in text
+    assert text.count("To be written by you") == 4
+
+
+def test_the_page_follows_the_study(page):
+    text = page(
+        PAPER.read_text()
+        .replace('rule = "bcm"', 'rule = "learnt-1"')
+        .replace("theta = 30.0\n", "")
+        .replace('name = "memory foam"', 'name = "memory foam"\nexclude = "trials < 10"')
+        .replace('acquisition = "ucb"', 'acquisition = "top_category"')
+    )
+    assert "recipe learnt-1" in text and "the rest learnt" in text and "theta" not in text
+    assert "`trials < 10` holds are left out" in text
+    assert "probability of the highest answer)" in text
+
+
+def planned(tmp_path, text="", **others):
+    study = StudyFile.load(PAPER)
+    path = tmp_path / "plan.json"
+    path.write_text(text or json.dumps(make_plan(study, ["P01", "P02"], 0, **others)))
+    return path, study.hash
+
+
+def test_departures_from_a_plan(tmp_path):
+    path, study = planned(tmp_path)
+    (nothing,) = departures(path, study, 25, {"P01": [25], "P02": [25]})
+    assert nothing.startswith("Nothing departs from the plan") and "2 participants, 25 answers each" in nothing
+    found = departures(path, "0" * 16, 25, {"P01": [12, 25], "P09": [25]})
+    assert all(sentence.startswith("Departs from the plan") for sentence in found)
+    text = " ".join(found)
+    for part in ("planned with (0000", "without answers here: P02 (1 of 2)", "Not in the plan", "P09.", "P01 (12, 25)"):
+        assert part in text
+    assert "P09 (25)" not in text
+
+
+def test_a_file_that_is_no_plan_is_refused(tmp_path):
+    path, study = planned(tmp_path, text='{"schema": 1}')
+    with pytest.raises(InputError, match="is no plan; make one with hilbo plan"):
+        departures(path, study, 25, {"P01": [25]})
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--register", "plan.json"], "where the plan is to be"),
+        (["--register", "old.md"], "exists already"),
+        (["--register", "new.md", "--reissue", "P01=P03"], "--register belongs to a new plan"),
+        (["--register", "nowhere/new.md"], "does not exist"),
+    ],
+)
+def test_nothing_is_written_where_the_page_cannot_be(options, words, tmp_path, monkeypatch, capsys):
+    study = PAPER.resolve()
+    monkeypatch.chdir(tmp_path)
+    Path("old.md").write_text("mine")
+    code, _, err = run(capsys, monkeypatch, "plan", study, "--participants", 2, *options)
+    assert code == 2 and words in err
+    assert [path.name for path in tmp_path.iterdir()] == ["old.md"] and Path("old.md").read_text() == "mine"
