@@ -9,9 +9,12 @@ PYTEST_ARGS ?=
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.hilbo-setup
 DOCS_STAMP := $(VENV)/.hilbo-docs
-# Installed quietly first. Where that fails, once more and aloud: a registry may have been silent for a moment, and pip says
-# which requirements are in conflict only when it may speak.
-PIP := $(BIN)/pip install --disable-pip-version-check -c constraints.txt
+# Installed quietly first. Where that fails, after a pause and aloud: a registry may have been silent for a moment (pip then takes
+# a version for one that does not exist), and pip says which requirements are in conflict only when it may speak.
+PIP = $(BIN)/pip install --disable-pip-version-check -c constraints.txt -e '$(WHAT)'
+PATIENTLY = $(PIP) --quiet || { sleep 20; $(PIP); } || { sleep 180; $(PIP); }
+$(STAMP): WHAT = .[dev,hardware,live,browser]
+$(DOCS_STAMP): WHAT = .[docs]
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 .DEFAULT_GOAL := help
@@ -61,19 +64,19 @@ $(STAMP): pyproject.toml constraints.txt
 	@if command -v uv >/dev/null; then \
 	  set -x; \
 	  test -x $(BIN)/python || uv venv --quiet --python $(PYTHON) $(VENV); \
-	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[dev,hardware,live,browser]'; \
+	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '$(WHAT)'; \
 	else \
 	  test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || { \
 	    echo "'$(PYTHON) -m venv' failed: install Python's venv module, on Debian the package python3-venv." >&2; exit 1; }; \
 	  set -x; \
-	  $(PIP) --quiet -e '.[dev,hardware,live,browser]' || $(PIP) -e '.[dev,hardware,live,browser]'; \
+	  $(PATIENTLY); \
 	fi
 	@touch $@
 
 $(DOCS_STAMP): $(STAMP)
 	@set -x; if command -v uv >/dev/null; then \
-	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '.[docs]'; \
+	  uv pip install --quiet --python $(BIN)/python -c constraints.txt -e '$(WHAT)'; \
 	else \
-	  $(PIP) --quiet -e '.[docs]' || $(PIP) -e '.[docs]'; \
+	  $(PATIENTLY); \
 	fi
 	@touch $@

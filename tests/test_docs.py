@@ -6,6 +6,7 @@ import re
 import tomllib
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pytest
@@ -137,6 +138,12 @@ def test_links_between_files_become_links_between_pages():
     assert link("firmware/PROTOCOL.md", "../docs/device/firmware.md") == "firmware.md"
     assert link("docs/index.md", "../notebooks/device.py") == "notebooks/device.md"
     assert link("docs/index.md", "../LICENSE") is None
+
+
+def test_pictures_of_the_readme_are_shown_on_its_page():
+    page = SimpleNamespace(file=SimpleNamespace(src_uri="readme.md"))
+    shown = script("hooks").on_page_markdown("![map](docs/population-map.png) [licence](LICENSE)", page, None, None)
+    assert shown == "![map](population-map.png) licence"
 
 
 def schemas():

@@ -114,9 +114,9 @@ def on_page_markdown(markdown, page, config, files):
         if match["target"].startswith(("#", "http://", "https://", "mailto:")):
             return match[0]
         place = site_link(file, match["target"])
-        return f"[{match['text']}]({place})" if place else match["text"]
+        return f"{match['image']}[{match['text']}]({place})" if place else match["text"]
 
-    return re.sub(r"(?<!!)\[(?P<text>[^\]\n]+)\]\((?P<target>[^)\s]+)\)", link, markdown)
+    return re.sub(r"(?P<image>!?)\[(?P<text>[^\]\n]+)\]\((?P<target>[^)\s]+)\)", link, markdown)
 
 
 def on_post_build(config):
