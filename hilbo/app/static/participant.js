@@ -17,6 +17,7 @@ let shownAt = 0, stepEnds = 0;       // performance.now()
 let laidOut = 0, goAt = 0;           // when the answers' buttons and Begin came up
 const SETTLES = 300;                 // ms: a tap that comes sooner was for what stood there before
 let trial = null;                    // id of the trial on the page
+let cued = null;                     // the trial whose question came up while it was still being felt
 let sending = false, connected = false, over = false;
 let source = null, calling = false, silent = false;   // the stream of views; a sign of life under way; none got through
 
@@ -46,16 +47,17 @@ function draw() {
   const waiting = kept(), q = waiting || over ? null : view.questions && view.questions[asked];
   document.body.dataset.phase = waiting ? "saving" : view.phase;
   document.body.dataset.trial = trial || "";
+  if (q && view.step) cued = trial;
   document.body.classList.toggle("choosing", !!q);
+  document.body.classList.toggle("cue", !!q && cued === trial);
   const bar = view.progress;
   put("progress-text", bar ? bar.text : "");
   at("progress").firstElementChild.style.width = bar ? `${100 * bar.done / bar.of}%` : "0";
   at("progress").setAttribute("aria-valuenow", bar ? bar.done : 0);
   at("progress").setAttribute("aria-valuemax", bar ? bar.of : 1);
   drawSteps();
-  const feeling = q && view.step;      // what to feel stays the title, and the question is there already
-  put("title", waiting ? words("saving") : q && !feeling ? q.text : view.title || "");
-  put("message", waiting ? "" : feeling ? q.text : q ? "" : view.message || "");
+  put("title", waiting ? words("saving") : q ? q.text : view.title || "");
+  put("message", waiting || q ? "" : view.message || "");
   show("clock", !waiting && !over && !!view.step && view.step.seconds > 0);
   drawOptions(q);
   drawButton("go", !waiting && !over && view.may.begin && !q, words("begin"));
