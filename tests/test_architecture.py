@@ -65,6 +65,7 @@ WITHOUT_JAX = {
         for name in ("actions", "confirmed", "event_log", "export", "header_check", "netcdf", "participants")
     ),
     *(f"session.{name}" for name in ("plan", "records", "replay", "state", "views", "withdrawal", "withdrawn_results")),
+    "session.pace",
 }
 # These import JAX for a set with full memory, and to convert a value, and not before.
 LATER = {"device.parameter_sets", "search.box"}

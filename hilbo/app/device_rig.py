@@ -18,7 +18,7 @@ from typing import Any
 
 from hilbo.app.rig import Loaded, Showing, Snapshot
 from hilbo.device.reasons import HoldReason, held_because
-from hilbo.hardware_bridge import DeviceError, Renderer, State
+from hilbo.hardware_bridge import Capability, DeviceError, Renderer, State
 from hilbo.search.box import Mechanics
 from hilbo.session.header_check import study_of
 from hilbo.study.study_file import AnyStudy
@@ -50,6 +50,7 @@ class DeviceRig:
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
         self._ending = threading.Event()
         self.device = connect()
+        self.simulated = bool(self.device.can & Capability.SIMULATED)
         self.notes = list(self.device.notes)
         self.snapshot = self._look()
         self._thread = threading.Thread(target=self._work, name="hilbo-device", daemon=True)

@@ -29,6 +29,7 @@ from hilbo.session.event_log import LogError
 
 __all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
 
+_RECENT = 200  # events that the experimenter's page may show
 PRESSES = ("begin", "break", "more", "here")
 COMMANDS = (
     *("pause", "resume", "repeat", "undo", "void", "restore", "skip", "abort", "note", "estop", "clear", "invite"),
@@ -64,7 +65,7 @@ class Hub:
         self.begun = False  # whether the participant has said so, since the server started or the page came back
         self.alert: str | None = None
         self.trust: list[list[str]] = []
-        self.recent: deque = deque(maxlen=200)
+        self.recent: deque = deque(reversed(log.before[-_RECENT:]), maxlen=_RECENT)
         self.delays: list[dict[str, float]] = []  # s, from each answer on
         self.invite: Callable[[Role], dict[str, str]] | None = None
         self._connect, self._make_maps, self._maps = connect, maps, None

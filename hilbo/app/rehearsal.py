@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hilbo.app.robot import Participant, browser, screenshots
+from hilbo.app.robot import SIZES, Participant, browser, held, screenshots
 from hilbo.device.simulator import Simulator
 from hilbo.errors import InputError
 from hilbo.session.event_log import read_log
@@ -38,6 +38,11 @@ _STEPS = {
     "validation": ("reference", "a", "neutral", "b"),
     "aggregate_best": ("reference", "a", "neutral", "b"),
 }
+
+
+_PICTURES = 14  # of the participant's page
+_PATIENCE = 10.0  # s
+_HEARD = "(count) => view && view.whole.trials.filter((t) => t.status === 'answered').length >= count"
 
 
 class Decider:
@@ -190,14 +195,15 @@ def _plan(study, population, out, phase, seed) -> Path:
 def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
     screens = out / "screens"
     screens.mkdir(exist_ok=True)
-    experimenter = program.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    desk = dict(zip(("width", "height"), SIZES[0], strict=True))
+    experimenter = program.new_context(viewport=desk).new_page()
     experimenter.goto(links["experimenter"])
     experimenter.wait_for_url("**/experimenter")
 
     def watch():
         return experimenter.evaluate("fetch('/api/experimenter').then(r => r.json())")
 
-    window = program.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    window = program.new_context(viewport=desk).new_page()
     mishaps: list[str] = []
     for page in (window, experimenter):
         page.on("pageerror", lambda error: mishaps.append(str(error)))
@@ -205,7 +211,7 @@ def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
     begun = time.monotonic()
     cleared = _lead(participant, window, experimenter, screens, say)
     view = watch()
-    screenshots(experimenter, screens, "experimenter-end")
+    _watched(experimenter, participant, screens, "end")
     screenshots(window, screens, "participant-end")
     return {
         "answers": participant.answered,
@@ -220,24 +226,43 @@ def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
 
 def _lead(participant, window, experimenter, screens, say) -> int:
     """The participant acts until the session ends, with screenshots of what is new; how many HOLDs were cleared."""
-    taken, cleared = set(), 0
+    taken: set[tuple[str, str]] = set()
+    watched, cleared = {1, 4, 8}, 0
     while True:
-        phase = participant.phase
-        question = window.is_visible("#options")
-        mark = (phase, question, window.inner_text("#title") if question else "")
-        if mark not in taken and len(taken) < 12 and phase != "wait":
-            taken.add(mark)
-            screenshots(window, screens, f"participant-{len(taken)}-{phase}{'-question' if question else ''}")
+        _pictured(window, screens, taken)
         before = participant.answered
         phase = participant.act()
         if participant.answered > before:
             say(f"{participant.answered} answers")
-            if participant.answered in (1, 3, 8):
-                screenshots(experimenter, screens, f"experimenter-{participant.answered}")
+        if participant.answered in watched:
+            watched.remove(participant.answered)
+            _watched(experimenter, participant, screens, f"{participant.answered}-answers")
         if phase in ("done", "ended"):
             return cleared
         cleared += phase == "wait" and _cleared(experimenter)
         time.sleep(0.02)
+
+
+def _pictured(window, screens, taken) -> None:
+    """The participant's page, where it is in a phase or asks a question of which there is no picture yet."""
+    seen = "[document.body.dataset.phase, document.querySelector('#options button') ? at('title').textContent : '']"
+    if len(taken) >= _PICTURES or (mark := tuple(window.evaluate(seen))) in taken or mark[0] == "wait":
+        return
+    with held(window):
+        phase, question = mark = tuple(window.evaluate(seen))  # another one may have come just now
+        if mark not in taken and phase != "wait":
+            taken.add(mark)
+            screenshots(window, screens, f"participant-{len(taken)}-{phase}{'-question' if question else ''}")
+
+
+def _watched(experimenter, participant, screens, name) -> None:
+    """The experimenter's page, once it has heard of all the answers."""
+    end = time.monotonic() + _PATIENCE  # of a page that hears nothing there is a picture too
+    while not experimenter.evaluate(_HEARD, participant.answered) and time.monotonic() < end:
+        time.sleep(0.05)
+    time.sleep(0.5)  # for the map, which comes after the answers
+    with held(experimenter):
+        screenshots(experimenter, screens, f"experimenter-{name}", whole=True)
 
 
 def _cleared(experimenter) -> bool:

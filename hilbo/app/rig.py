@@ -55,10 +55,11 @@ class MissedError(RuntimeError):
 
 
 class Rig(Protocol):
-    """What shows renderings. `notes`: what to tell whoever started it. Whatever fails is a RuntimeError with a
-    sentence."""
+    """What shows renderings. `notes`: what to tell whoever started it. `simulated`: nothing moves. Whatever fails is a
+    RuntimeError with a sentence."""
 
     title: str
+    simulated: bool
     notes: list[str]
     snapshot: Snapshot
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from hilbo.errors import InputError
 
-__all__ = ["BROWSERS", "Client", "Participant", "browser", "find_browser", "screenshots"]
+__all__ = ["BROWSERS", "SIZES", "Client", "Participant", "browser", "find_browser", "held", "screenshots"]
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 _ARGUMENTS = [
@@ -150,13 +150,31 @@ class Participant:
         return next((t for t in whole["trials"] if t["id"] == whole["pending"]), None)
 
 
-def screenshots(window: Any, folder: Path, name: str) -> list[Path]:
-    """The window as a laptop and as a tablet, both ways up, have it."""
+SIZES = ((1440, 900), (1024, 768), (800, 1280), (390, 844))
+"""Width and height in pixels: a desk, a tablet both ways up, a phone."""
+
+_HOLD = "() => { window.drawing ??= draw; draw = () => {}; }"
+_GO_ON = "() => { draw = window.drawing; draw(); }"
+
+
+@contextlib.contextmanager
+def held(window: Any) -> Iterator[None]:
+    """The page stays as it is, whatever the server tells it meanwhile: what is read from it and pictures belong
+    together."""
+    window.evaluate(_HOLD)
+    try:
+        yield
+    finally:
+        window.evaluate(_GO_ON)
+
+
+def screenshots(window: Any, folder: Path, name: str, whole: bool = False) -> list[Path]:
+    """The page as every size of `SIZES` has it; `whole`: with what is below the screen's edge."""
     made = []
-    for width, height in ((1280, 800), (1024, 768), (800, 1280)):
+    for width, height in SIZES:
         window.set_viewport_size({"width": width, "height": height})
-        window.wait_for_timeout(150)
+        window.wait_for_timeout(100)
         made.append(folder / f"{name}-{width}x{height}.png")
-        window.screenshot(path=made[-1])
-    window.set_viewport_size({"width": 1280, "height": 800})
+        window.screenshot(path=made[-1], animations="disabled", full_page=whole)
+    window.set_viewport_size(dict(zip(("width", "height"), SIZES[0], strict=True)))
     return made

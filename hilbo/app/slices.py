@@ -50,22 +50,25 @@ class Maps:
         twice = progress.consistency(state)
         if twice.pairs:
             rows.append(["Asked twice", f"{twice.alike} of {twice.pairs} alike"])
-        if state.screen not in ("done", "ended"):
-            rows.append(["Minutes left", f"{progress.minutes_left(state):.0f}"])
         return rows
 
     def slices(self, state: LiveSession) -> dict[str, Any] | None:
         """For each pair of parameters: mean on a grid (row by row, None where not feasible), the maximum, and the
-        trials with their distance from the slice. None where the session chooses nothing."""
+        trials with their distance from the slice; and the parameters' ranges. None where the session chooses nothing,
+        no slices before there is an answer."""
         blocks = self._chooser.chosen_blocks
         if not blocks:
             return None
         trial = state.pending
         block = trial.block if trial is not None and trial.block in blocks else blocks[0]
         asked = None if trial is None or trial.sets else trial.presented["a"]
-        return self._sliced(Answers.of(state, block), asked)
+        answers = Answers.of(state, block)
+        slices = self._sliced(answers, asked) if answers.categories else []
+        parameters = self._chooser.study(block).space.parameters
+        ranges = {p.name: {"unit": p.unit, "scale": p.scale, "low": p.low, "high": p.high} for p in parameters}
+        return {"slices": slices, "ranges": ranges}
 
-    def _sliced(self, answers: Answers, asked: Mapping[str, float] | None) -> dict[str, Any]:
+    def _sliced(self, answers: Answers, asked: Mapping[str, float] | None) -> list[dict[str, Any]]:
         """`slices` after some answers; `asked`: the rendering that is being felt."""
         study, fitted = self._chooser.study(answers.block), self._chooser.fitted(answers)
         names = study.space.names
@@ -75,7 +78,7 @@ class Maps:
         levels = np.array(answers.categories, int) / (len(study.responses) - 1)
         now = None if asked is None else np.asarray(study.space.to_unit(np.array([asked[name] for name in names])))
         pairs = itertools.combinations(range(len(names)), 2)
-        return {"slices": [_slice(study, made, k, pair, marks, levels, now) for k, pair in enumerate(pairs)]}
+        return [_slice(study, made, k, pair, marks, levels, now) for k, pair in enumerate(pairs)]
 
 
 class _Slices(NamedTuple):
@@ -90,7 +93,7 @@ def _slice(study, made: _Slices, k: int, pair: tuple[int, int], marks, levels, n
     """One grid, for the page; `marks` (n, d) and `levels` (n,) are the answers, `now` (d,) what is being felt."""
     best, names = made.best, study.space.names
     others = [i for i in range(len(names)) if i not in pair]
-    held = [f"{names[i]} {float(study.space.parameters[i].to_physical(jnp.asarray(best[i]))):.3g}" for i in others]
+    held = [f"{names[i]} = {float(study.space.parameters[i].to_physical(jnp.asarray(best[i]))):.3g}" for i in others]
     across, up = pair
     trials = [
         {"x": float(x[across]), "y": float(x[up]), "level": float(level), "now": False,

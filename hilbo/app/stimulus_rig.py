@@ -53,6 +53,7 @@ class StimulusRig:
     the session are known by."""
 
     title = "Stimulus"
+    simulated = False
 
     def __init__(
         self,

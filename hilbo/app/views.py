@@ -9,7 +9,9 @@ import time
 from datetime import datetime
 from typing import Any
 
-from hilbo.session.actions import LiveSession, Trial, last_answered, restorable, skippable, voidable
+from hilbo.app.log_words import line, meant, place_of, table
+from hilbo.session.actions import LiveSession, last_answered, skippable, voidable
+from hilbo.session.pace import minutes_left
 from hilbo.session.views import experimenter_view, participant_view
 
 __all__ = ["choice_rows", "experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
@@ -118,19 +120,20 @@ def experimenter(hub: Any) -> dict[str, Any]:
     return {
         "who": f"{header.participant}, session {header.session}",
         "what": f"{state.study.name}, study {state.study.hash}" + (f", plan {header.plan}" if header.plan else ""),
+        "banners": _banners(hub),
         "phase": state.screen if state.screen != "trial" else runner.stage,
         "phase_words": phase,
         "trial": _trial_rows(hub, trial),
         "device": _device(hub),
         "trust": hub.trust,
-        "table": _table(state),
-        "log": [_log_line(event) for event in list(hub.recent)[:60]],
+        "table": table(state),
+        "log": [line(state, event) for event in list(hub.recent)[:60]],
         "alert": hub.alert or hub.fault or (runner.trouble if runner.stage == "trouble" else None),
         "may": _may(hub),
         "means": {
-            "void": _meant(voidable(state)),
-            "undo": _meant(last_answered(state)),
-            "skip": _meant(skippable(state)),
+            "void": meant(voidable(state)),
+            "undo": meant(last_answered(state)),
+            "skip": meant(skippable(state)),
         },
         "map_version": map_version(state) + ("" if hub.draws else " later"),
         "participant_here": hub.watchers.participant_here,
@@ -138,6 +141,18 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "fits_after_an_answer": hub.runner.fits_after,
         "whole": experimenter_view(state),
     }
+
+
+def _banners(hub) -> list[str]:
+    """What this session is not: nobody shall take a rehearsal for one that counts."""
+    header, found = hub.state.header, []
+    if header.dry_run:
+        found.append("Dry run: nobody takes part, and no table has these answers")
+    if hub.rig.simulated:
+        found.append("Simulated device: nothing moves")
+    if header.unblinded:
+        found.append("Unblinded: the participant was shown the parameters")
+    return found
 
 
 def _phase_words(hub, trial):
@@ -155,11 +170,15 @@ def _trial_rows(hub, trial):
     for i, block in enumerate(state.header.blocks):
         name = block.phase + (f", {block.material}" if block.material else "")
         rows.append([("→ " if i == state.block else "") + name, _how_far(state, i)])
+    if state.screen not in ("done", "ended"):
+        left = minutes_left(state)
+        rows.append(["Time left", f"about {left:.0f} min" if left >= 1 else "below a minute"])
     if trial is None:
         return rows
+    units = {p.name: p.unit for p in state.study.space.parameters} | {"K0": "N/mm"}
     for side, values in trial.renderings.items():
         name = trial.sets.get(side)
-        rows.append([f"Rendering {side.upper()}" + (f" ({name})" if name else ""), _set_words(values)])
+        rows.append([f"Rendering {side.upper()}" + (f" ({name})" if name else ""), _set_words(values, units)])
     rows += choice_rows(trial.data.get("choice", {}))
     if hub.delays:
         rows.append(["Answer to device", f"{1000 * hub.delays[-1]['total']:.0f} ms"])
@@ -175,7 +194,7 @@ def choice_rows(choice: dict[str, Any]) -> list[list[str]]:
         rows.append(["Chosen by", choice["by"] + known])
     chances = {name: p for name, p in (choice.get("probabilities") or {}).items() if p is not None}
     if chances:
-        rows.append(["Answers", ", ".join(f"{name} {100 * p:.0f} %" for name, p in chances.items())])
+        rows.append(["Predicted answer", ", ".join(f"{name} {100 * p:.0f} %" for name, p in chances.items())])
     certificate = choice.get("certificate") or {}
     if certificate:
         residual = certificate.get("residual")
@@ -198,8 +217,8 @@ def _how_far(state: LiveSession, block: int) -> str:
     return "; ".join(words)
 
 
-def _set_words(values):
-    return ", ".join(f"{name} {value:.4g}" for name, value in values.items())
+def _set_words(values, units):
+    return ", ".join(f"{name} {value:.4g} {units.get(name, '')}".strip() for name, value in values.items())
 
 
 def _device(hub):
@@ -225,47 +244,6 @@ def _may(hub):
     found += ["void"] if answered or begun else []
     found += ["skip"] if skippable(state) else []
     return [*found, "abort"]
-
-
-def _meant(trial):
-    return None if trial is None else {"trial": trial.id, "name": place_of(trial)}
-
-
-def place_of(trial: Trial) -> str:
-    """What a trial is called on the experimenter's page: the letter of its phase and its number."""
-    return trial.data["phase"][0].upper() + str(trial.number)
-
-
-def _table(state: LiveSession):
-    names = list(state.study.space.names)
-    chosen = any(not trial.sets for trial in state.trials)
-    width = len(names) if chosen else 1
-    rows = []
-    for trial in reversed(state.trials):
-        kind = "now" if trial.status == "pending" else "" if trial.status == "answered" else "voided"
-        answer = " ".join((trial.values or {}).values())
-        place = place_of(trial)
-        if trial.sets:
-            cells = [place, " / ".join(trial.sets.values()), *[""] * (width - 1), answer or trial.status]
-        else:
-            cells = [place, *(trial.presented["a"][name] for name in names), answer or trial.status]
-        row = {"kind": kind, "cells": cells}
-        voided = trial.status == "void" and trial.values is not None
-        rows.append(row | ({"restore": _meant(trial)} if voided and restorable(state, trial.id) else {}))
-    return {"head": ["", *names, "answer"] if chosen else ["", "sets", "answer"], "rows": rows}
-
-
-def _log_line(event):
-    at = datetime.fromtimestamp(event.time).strftime("%H:%M:%S")
-    return [str(event.seq), at, event.kind, ", ".join(f"{k} {_text(v)}" for k, v in event.data.items() if _plain(v))]
-
-
-def _plain(value):
-    return isinstance(value, str | int | float | bool) and value != ""
-
-
-def _text(value):
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def map_version(state: LiveSession) -> str:

@@ -15,6 +15,7 @@ import os
 import re
 import time
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,10 +55,20 @@ class EventLog:
     """An open log: `create` a new one or `resume` one, then `append` events; `state` is always the fold of the file.
 
     `dropped`: what was wrong with the last line when the log was opened, or "". `sync_s`: the time the last fsync took.
+    `before`: the events that were in it when it was opened.
     """
 
-    def __init__(self, path: Path, file: int, state: LiveSession, previous: bytes, size: int, dropped: str) -> None:
-        self.path, self.state, self.dropped = path, state, dropped
+    def __init__(
+        self,
+        path: Path,
+        file: int,
+        state: LiveSession,
+        previous: bytes,
+        size: int,
+        dropped: str,
+        before: Sequence[Event] = (),
+    ) -> None:
+        self.path, self.state, self.dropped, self.before = path, state, dropped, before
         self.sync_s = 0.0
         self._file, self._previous, self._size = file, previous, size
 
@@ -105,7 +116,7 @@ class EventLog:
         if whole < len(content):
             os.ftruncate(file, whole)
             os.fsync(file)
-        return cls(path, file, state, lines[-1], whole, dropped)
+        return cls(path, file, state, lines[-1], whole, dropped, events)
 
     def append(self, event: Event) -> LiveSession:
         """Put an event on the disk, and only then into the state, which is returned. Raises LogError."""

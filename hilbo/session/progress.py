@@ -6,8 +6,8 @@
 - how far the best rendering is expected to move with one more answer: the mean over the answers that the posterior
   predicts for the rendering that comes next, of the NRMSE (share of the search ranges) between the bests.
 
-`consistency` looks at the repeated trials, `minutes_left` at the clock. The paper's fixed number of trials stays the
-default.
+`consistency` looks at the repeated trials, `hilbo.session.pace` at the clock. The paper's fixed number of trials stays
+the default.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,9 +21,8 @@ from hilbo.session.look_ahead import Answers, LiveChooser
 from hilbo.session.state import LiveSession
 from hilbo.session.step import Fitted
 from hilbo.study.config import Study
-from hilbo.study.protocols import protocol
 
-__all__ = ["Consistency", "Trust", "consistency", "minutes_left", "trust", "trust_of"]
+__all__ = ["Consistency", "Trust", "consistency", "trust", "trust_of"]
 
 
 @dataclass(frozen=True)
@@ -105,16 +104,3 @@ def consistency(state: LiveSession) -> Consistency:
             ]
     alike = sum(d == 0 for d in distances)
     return Consistency(len(distances), alike, float(np.mean(distances)) if distances else None)
-
-
-def minutes_left(state: LiveSession) -> float:
-    """Minutes to the end, rests included: the trials left at this participant's median pace, or, before the third
-    answer, at the protocol's seconds and half as many for the answer."""
-    times = sorted(t.answered["time"] for t in state.trials if t.answered is not None)
-    gaps = np.diff(times)
-    total = 0.0
-    for i, block in enumerate(state.header.blocks):
-        left = 0 if state.full(i) else state.quota(i) - len(state.answers(i)) - len(state.skipped(i))
-        pace = 1.5 * protocol(state.study.session, block.phase).seconds if len(gaps) < 2 else float(np.median(gaps))
-        total += left * pace + (block.rest if left and state.gate(i) == "rest" else 0.0)
-    return total / 60.0

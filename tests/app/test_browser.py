@@ -9,7 +9,8 @@ import pytest
 from live_server import DATA, PATIENCE, Live
 
 from hilbo.app import rehearsal
-from hilbo.app.robot import Client, Participant, browser, find_browser
+from hilbo.app.robot import Client, Participant, browser, find_browser, held
+from hilbo.app.slices import Maps
 from hilbo.session.event_log import EventLog, read_log
 from hilbo.session.records import Block, Planned
 from hilbo.study.config import Study
@@ -46,7 +47,7 @@ def pages(tmp_path, request):
     """A session in this process, the participant's page and the experimenter's; its blocks are of comparisons, or the
     fixture's parameter."""
     blocks = getattr(request, "param", None)
-    with Live(tmp_path, seconds=0.1, blocks=blocks) as live, browser() as program:
+    with Live(tmp_path, seconds=0.1, blocks=blocks, maps=Maps) as live, browser() as program:
         links = live.place.links()
         experimenter = program.new_context().new_page()
         experimenter.goto(links["experimenter"])
@@ -147,6 +148,44 @@ def test_the_emergency_stop_is_in_reach_while_something_is_asked(pages, way):
     until(experimenter, "view.device.state === 'estop'")
     until(experimenter, "!document.getElementById('sure').open")
     assert live.events("abort") == []
+
+
+FULL = "e.offsetParent && (e.textContent.trim() || e.querySelector('canvas'))"
+EMPTY = f"""[...document.querySelectorAll("section")].filter((s) => s.offsetParent)
+    .filter((s) => ![...s.children].slice(1).some((e) => {FULL})).map((s) => s.id)"""
+
+
+@pytest.mark.parametrize("pages", [(Block("optimisation", 9),)], indirect=True, ids=["optimisation"])
+def test_the_experimenter_sees_what_is_simulated_no_map_before_an_answer_and_no_empty_panel(pages):
+    _, participant, experimenter = pages
+    until(experimenter, "view && view.phase === 'hello'")
+    assert experimenter.inner_text("#banners").strip() == "Simulated device: nothing moves"
+    assert not experimenter.is_visible("#map-box") and not experimenter.is_visible("#trust-box")
+    assert experimenter.evaluate(EMPTY) == []
+    until_answered(participant, 2)
+    experimenter.wait_for_selector("#map-box:visible")
+    assert experimenter.locator("#map canvas").count() == 3
+    assert "Hatched: infeasible" in experimenter.inner_text("#legend")
+    press(experimenter, "void", "a cough")
+    until(experimenter, "document.querySelector('tr.voided td:nth-child(3)')?.textContent.includes('void: a cough')")
+    until(experimenter, "document.getElementById('log').textContent.includes('is made void: a cough.')")
+    assert experimenter.evaluate(EMPTY) == []
+    wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+    for width, height in SIZES:
+        experimenter.set_viewport_size({"width": width, "height": height})
+        experimenter.wait_for_timeout(50)
+        assert experimenter.evaluate(wide) <= 0 and experimenter.is_visible("#estop"), width
+
+
+def test_a_picture_and_its_name_are_of_the_same_page(pages):
+    _, participant, _ = pages
+    window = participant.window
+    window.wait_for_selector("#go:visible")
+    with held(window):
+        window.evaluate("press('begin')")
+        until(window, "view.phase === 'step'")
+        assert participant.phase == "hello" and window.is_visible("#go")
+    assert participant.phase != "hello"
 
 
 def test_a_dialog_names_its_trial_and_never_hits_another(pages):

@@ -226,5 +226,5 @@ def test_the_page_shows_what_there_is_of_a_choice(choice):
     rows = dict(choice_rows(choice))
     assert rows["Chosen by"] == ("ucb, mean 0.500 ± 0.100" if choice.get("mean") else "ucb")
     assert rows.get("Certificate") == ("fit NOT converged" if "certificate" in choice else None)
-    assert rows.get("Answers") == ("similar 25 %" if choice.get("probabilities") else None)
+    assert rows.get("Predicted answer") == ("similar 25 %" if choice.get("probabilities") else None)
     assert rows.get("Passivity margin") == ("b 0.5000 N·s/m" if choice.get("margin") else None)

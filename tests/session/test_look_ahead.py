@@ -18,7 +18,8 @@ from hilbo.session.event_log import EventLog, log_name, read_log
 from hilbo.session.excluded import APART
 from hilbo.session.logged_session import LoggedSession
 from hilbo.session.look_ahead import Answers, LiveChooser
-from hilbo.session.progress import consistency, minutes_left, trust_of
+from hilbo.session.pace import minutes_left
+from hilbo.session.progress import consistency, trust_of
 from hilbo.session.warm_start import informed, warm_start
 
 ANSWERS = ("similar", "different", "close", "close", "similar", "close")

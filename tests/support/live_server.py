@@ -60,7 +60,9 @@ class Live:
         device="sim",
         warm: bool = True,
         warm_up="",
+        maps=None,
     ):
+        self.maps = maps
         self.folder, self.device, self.warmed = folder, device, threading.Event()
         if warm:
             self.warmed.set()
@@ -100,7 +102,7 @@ class Live:
         chooser = LiveChooser(self.log.state)
         compiled = chooser.warm
         chooser.warm = lambda: (self.warmed.wait(PATIENCE), compiled())
-        self.hub = Hub(self.log, chooser, self.rig(), tag="tag", gap=0.0)
+        self.hub = Hub(self.log, chooser, self.rig(), tag="tag", maps=self.maps, gap=0.0)
         self.hub.invite = lambda role: {"link": self.place.link(role), "qr": ""}
         ready = threading.Event()
         self.thread = threading.Thread(target=self._serve, args=(ready,))

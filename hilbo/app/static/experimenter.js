@@ -4,7 +4,7 @@
 const at = (id) => document.getElementById(id);
 const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent = text; };
 const SAID = 10000;                  // ms that a refusal stays on the page
-let view = null, mapOf = null, lastEscape = 0;
+let view = null, mapOf = null, map = null, lastEscape = 0;
 let said = { text: "", until: 0 };   // what this page has to say itself, beside the server's alert
 
 function number(value, digits = 4) {
@@ -28,12 +28,22 @@ function draw() {
   document.title = `${view.who} – ${view.phase_words}`;
   document.body.dataset.phase = view.phase;
   list("trial", view.trial); list("trust", view.trust);
-  drawDevice(); drawAlert(); drawAnswers(); drawLog();
+  at("trust-box").hidden = !view.trust.length;
+  at("answers-box").hidden = !view.table.rows.length;
+  at("log-box").hidden = !view.log.length;
+  drawBanners(); drawDevice(); drawAlert(); drawAnswers(); drawLog();
   put("watch", view.participant_here ? "The participant's page is connected." : "The participant's page is not connected.");
   for (const b of document.querySelectorAll("[data-command]")) b.disabled = !view.may.includes(b.dataset.command);
   at("skip").hidden = !view.may.includes("skip");
   for (const b of document.querySelectorAll(".stop")) b.disabled = !view.may.includes("estop");
   if (view.map_version !== mapOf) { mapOf = view.map_version; loadMap(); }
+}
+
+function drawBanners() {
+  const mark = view.banners.join("\n");
+  if (at("banners").dataset.shown === mark) return;
+  at("banners").dataset.shown = mark;
+  at("banners").replaceChildren(...view.banners.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
 }
 
 function drawDevice() {
@@ -72,7 +82,7 @@ function drawAnswers() {
     const row = document.createElement("tr");
     row.className = r.kind;
     row.append(...r.cells.map((cell) => Object.assign(document.createElement("td"), { textContent: number(cell) })));
-    if (r.restore) row.lastChild.append(" ", restoring(r.restore));
+    if (r.restore) row.children[2].append(" ", restoring(r.restore));
     return row;
   }));
 }
@@ -94,18 +104,34 @@ function drawLog() {
   at("log").dataset.shown = mark;
   at("log").replaceChildren(...view.log.map((cells) => {
     const item = document.createElement("li");
-    item.append(...cells.map((cell, i) => Object.assign(document.createElement("span"), { textContent: cell, className: i === 2 ? "kind" : "" })));
+    item.append(...cells.map((cell) => Object.assign(document.createElement("span"), { textContent: cell })));
     return item;
   }));
 }
 
 async function loadMap() {
   try {
-    const reply = await fetch("/api/experimenter/map");
-    if (reply.ok) { const map = await reply.json(); if (map.slices) drawMap(at("map"), map); }
-    at("map-box").hidden = reply.status === 404;
+    const reply = await fetch("/api/experimenter/map"), found = reply.ok ? await reply.json() : {};
+    map = found.slices && found.slices.length ? found : null;
+    showMap();
   } catch { mapOf = null; }
 }
+
+function showMap() {
+  at("map-box").hidden = !map;
+  if (!map) return;
+  const { slices, ranges } = map, [low, high] = rangeOf(slices);      // equal as long as the answers say nothing of where
+  const marks = slices.flatMap((s) => s.trials);
+  put("scale-low", number(low, 2)); put("scale-high", number(high, 2));
+  put("map-title", high > low ? "Posterior mean, slices through its maximum" : "Posterior mean: the same everywhere so far");
+  put("legend", [
+    high > low ? "Cross: the maximum." : "", "Circles: rated stimuli, darker for higher answers, fainter away from the slice.",
+    marks.some((t) => t.now) ? "Red ring: what is presented now." : "",
+    infeasible(slices) ? "Hatched: infeasible." : "",
+  ].filter(Boolean).join(" "));
+  drawMap(at("map"), slices, ranges);
+}
+addEventListener("resize", showMap);
 
 // What the server says to a command; null if it was refused, or nobody answers.
 async function command(name, more = {}) {

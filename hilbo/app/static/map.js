@@ -1,4 +1,4 @@
-// Slices of the posterior mean on canvases: one for each pair of parameters.
+// Slices of the posterior mean, with axes and a colour scale: one canvas for each pair of parameters.
 "use strict";
 
 const STOPS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
@@ -8,33 +8,40 @@ function colour(share) {
   return STOPS[i].map((v, k) => Math.round(v + f * (STOPS[i + 1][k] - v)));
 }
 
-function drawSlice(canvas, slice, range, side = 240) {
-  const n = slice.mean.length, c = canvas.getContext("2d");
-  canvas.width = canvas.height = side;
-  const small = new OffscreenCanvas(n, n), p = small.getContext("2d"), image = p.createImageData(n, n);
+// The smallest and the largest mean of all slices, which share one scale.
+function rangeOf(slices) {
+  const values = slices.flatMap((s) => s.mean.flat()).filter((v) => v !== null);
+  return [Math.min(...values), Math.max(...values)];
+}
+
+const infeasible = (slices) => slices.some((s) => s.mean.some((row) => row.includes(null)));
+
+// The mean on a square of `side` pixels; hatched where nothing can be presented.
+function drawMean(c, slice, range, side) {
+  const n = slice.mean.length, d = side / n, small = new OffscreenCanvas(n, n), p = small.getContext("2d"), image = p.createImageData(n, n);
   slice.mean.forEach((row, j) => row.forEach((value, i) => {
-    const k = 4 * ((n - 1 - j) * n + i);
     const [r, g, b] = value === null ? [232, 229, 222] : colour((value - range[0]) / (range[1] - range[0] || 1));
-    image.data.set([r, g, b, 255], k);
+    image.data.set([r, g, b, 255], 4 * ((n - 1 - j) * n + i));
   }));
   p.putImageData(image, 0, 0);
   c.imageSmoothingEnabled = false;
   c.drawImage(small, 0, 0, side, side);
-  c.save();
   c.strokeStyle = "#9a948a"; c.lineWidth = 1;
   c.beginPath();
-  const d = side / n;
   slice.mean.forEach((row, j) => row.forEach((value, i) => {
     if (value === null && (i + j) % 3 === 0) { c.moveTo(i * d, side - j * d); c.lineTo((i + 1) * d, side - (j + 1) * d); }
   }));
-  c.stroke(); c.restore();
-  for (const t of slice.trials) dot(c, t.x * side, side - t.y * side, t);
-  const [x, y] = [slice.best[0] * side, side - slice.best[1] * side];
-  c.strokeStyle = "#fff"; c.lineWidth = 4; cross(c, x, y); c.strokeStyle = "#111"; c.lineWidth = 1.8; cross(c, x, y);
+  c.stroke();
 }
 
 function cross(c, x, y) {
   c.beginPath(); c.moveTo(x - 6, y); c.lineTo(x + 6, y); c.moveTo(x, y - 6); c.lineTo(x, y + 6); c.stroke();
+}
+
+function ring(c, x, y) { c.beginPath(); c.arc(x, y, 9, 0, 7); c.stroke(); }
+
+function twice(c, inner, widths, draw) {                          // a light outline, so that it is seen on any colour
+  for (const [style, width] of [["#fff", widths[0]], [inner, widths[1]]]) { c.strokeStyle = style; c.lineWidth = width; draw(); }
 }
 
 function dot(c, x, y, t) {
@@ -45,53 +52,41 @@ function dot(c, x, y, t) {
   c.globalAlpha = 1;
 }
 
-function drawMap(box, map) {
-  const values = map.slices.flatMap((s) => s.mean.flat()).filter((v) => v !== null);
-  const range = [Math.min(...values), Math.max(...values)];
-  map.slices.forEach((slice, k) => {
-    let figure = box.children[k];
-    if (!figure) {
-      figure = document.createElement("figure");
-      figure.append(document.createElement("canvas"), document.createElement("figcaption"));
-      figure.lastChild.append(document.createElement("span"), document.createElement("span"));
-      box.append(figure);
-    }
-    figure.firstChild.setAttribute("role", "img");
-    figure.firstChild.setAttribute("aria-label", `${slice.across} across, ${slice.up} up; ${slice.held}`);
-    figure.lastChild.firstChild.textContent = `→ ${slice.across}   ↑ ${slice.up}`;
-    figure.lastChild.lastChild.textContent = slice.held;
-    drawSlice(figure.firstChild, slice, range);
-  });
-}
-
-// One slice with its axes and, where it was hidden, the truth; the page of hilbo try.
-function drawWithAxes(canvas, slice, across, up, range) {
+// `across` and `up`: name, unit, scale, low, high; with `hidden_unit` in both, the truth is marked too.
+function drawSlice(canvas, slice, across, up, range) {
   const ratio = devicePixelRatio, w = canvas.clientWidth, h = canvas.clientHeight, c = canvas.getContext("2d");
-  const side = Math.min(w - 78, h - 74), x = (w - side + 58) / 2, y = (h - side - 26) / 2, inner = document.createElement("canvas");
+  const text = w < 320 ? 12 : 14, left = 3.4 * text + 10, foot = 2.9 * text + 4, head = 1.2 * text + 4, font = "px system-ui, sans-serif";
+  const side = Math.min(w - left - 8, h - head - foot), x = (w - side + left - 8) / 2, y = head + (h - head - foot - side) / 2;
   canvas.width = w * ratio; canvas.height = h * ratio;
   c.scale(ratio, ratio);
-  drawSlice(inner, { ...slice, trials: [], best: [-1, -1] }, range, Math.round(side));
-  c.drawImage(inner, x, y, side, side);
-  for (const t of slice.trials) dot(c, x + t.x * side, y + (1 - t.y) * side, t);   // also those on the edge, whole
-  for (const [colour, width] of [["#fff", 4], ["#111", 1.8]]) {
-    c.strokeStyle = colour; c.lineWidth = width;
-    cross(c, x + slice.best[0] * side, y + (1 - slice.best[1]) * side);
-  }
-  for (const [colour, width] of [["#fff", 6], ["#d1495b", 3]]) {
-    c.strokeStyle = colour; c.lineWidth = width;
-    c.beginPath(); c.arc(x + across.hidden_unit * side, y + (1 - up.hidden_unit) * side, 9, 0, 7); c.stroke();
-  }
-  c.fillStyle = "#1d2733"; c.font = "14px system-ui, sans-serif"; c.textAlign = "center";
-  c.fillText(`at ${slice.held.replace(" ", " = ")}`, x + side / 2, y - 8);
+  c.save(); c.translate(x, y); drawMean(c, slice, range, side); c.restore();
+  const place = (u, v) => [x + u * side, y + (1 - v) * side];
+  for (const t of slice.trials) dot(c, ...place(t.x, t.y), t);
+  if (range[1] > range[0]) twice(c, "#111", [4, 1.8], () => cross(c, ...place(...slice.best)));
+  if (across.hidden_unit !== undefined) twice(c, "#d1495b", [6, 3], () => ring(c, ...place(across.hidden_unit, up.hidden_unit)));
+  c.fillStyle = "#1d2733"; c.font = text + font; c.textAlign = "center";
+  if (slice.held) c.fillText(`at ${slice.held}`, x + side / 2, y - 6);
   const value = (p, u) => Number((p.scale === "log" ? p.low * (p.high / p.low) ** u : p.low + (p.high - p.low) * u).toPrecision(2));
   for (const u of [0, 0.5, 1]) {
     c.textAlign = u === 0 ? "left" : u === 1 ? "right" : "center";
-    c.fillText(value(across, u), x + u * side, y + side + 18);
+    c.fillText(value(across, u), x + u * side, y + side + 1.2 * text);
     c.textAlign = "right";
-    c.fillText(value(up, u), x - 6, y + (1 - u) * side + (u === 1 ? 11 : u === 0 ? 0 : 5));
+    c.fillText(value(up, u), x - 5, y + (1 - u) * side + (u === 1 ? .8 * text : u === 0 ? 0 : .35 * text));
   }
   const label = (p) => p.name + (p.unit ? ` (${p.unit})` : "");
-  c.font = "600 14px system-ui, sans-serif"; c.textAlign = "center";
-  c.fillText(label(across), x + side / 2, y + side + 40);
-  c.translate(x - 48, y + side / 2); c.rotate(-Math.PI / 2); c.fillText(label(up), 0, 0);
+  c.font = `600 ${text}${font}`; c.textAlign = "center";
+  c.fillText(label(across), x + side / 2, y + side + 2.6 * text);
+  c.translate(x - left + text, y + side / 2); c.rotate(-Math.PI / 2); c.fillText(label(up), 0, 0);
+}
+
+// A canvas for each slice in `box`; `parameters` is name -> what an axis needs.
+function drawMap(box, slices, parameters) {
+  const range = rangeOf(slices), axis = (name) => ({ name, ...parameters[name] });
+  if (box.childElementCount !== slices.length) box.replaceChildren(...slices.map(() => document.createElement("canvas")));
+  slices.forEach((slice, k) => {
+    const canvas = box.children[k];
+    canvas.setAttribute("role", "img");
+    canvas.setAttribute("aria-label", `${slice.across} across, ${slice.up} up` + (slice.held ? `, at ${slice.held}` : ""));
+    drawSlice(canvas, slice, axis(slice.across), axis(slice.up), range);
+  });
 }

@@ -270,10 +270,8 @@ async function results() {               // the end: one's own map
     row.append(...cells.map((text) => Object.assign(document.createElement("td"), { textContent: text })));
     return row;
   }));
-  at("maps").replaceChildren(...slices.map(() => document.createElement("canvas")));
-  const values = slices.flatMap((s) => s.mean.flat()), range = [Math.min(...values), Math.max(...values)];
   const by = Object.fromEntries(parameters.map((p) => [p.name, p]));
-  const all = () => slices.forEach((s, i) => drawWithAxes(at("maps").children[i], s, by[s.across], by[s.up], range));
+  const all = () => drawMap(at("maps"), slices, by);
   addEventListener("resize", all);
   all();
 }
