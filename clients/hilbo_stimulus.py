@@ -96,7 +96,7 @@ class Stimulus:
         if force and go_neutral is None:
             raise ValueError("A program with force gives go_neutral, a function that takes all force away.")
         self._hello = {"name": name, "version": version, "force": force, "neutral_within_s": neutral_within_s}
-        self._go_neutral, self.contact = go_neutral, False
+        self._go_neutral, self._contact = go_neutral, False
         self._address = urlsplit(link).netloc
         self._key = self._keyed(urlsplit(link).fragment, key_file)
         self.parameters: list = []  # of the study: name, unit, low, high, tolerance
@@ -119,6 +119,17 @@ class Stimulus:
     def order(self) -> Order:
         """The newest order, for programs that look at every frame."""
         return self._order
+
+    @property
+    def contact(self) -> bool:
+        """Whether somebody touches what moves; no order to present is handed out meanwhile."""
+        return self._contact
+
+    @contact.setter
+    def contact(self, yes: bool) -> None:
+        with self._changed:
+            self._contact = yes
+            self._changed.notify_all()
 
     def next(self, timeout: float | None = None) -> Order | None:
         """The newest order that was not handed out yet, once there is one; None after `timeout` s, or at the end.
@@ -223,7 +234,7 @@ class Stimulus:
         if status == 200:
             self.silence_s, self.parameters = found["silence_s"], found["parameters"]
             self._heard, self._run = time.monotonic(), found["run"]
-            self._take(found)
+            self._take(found["run"], found)
         elif status in (400, 401, 403):
             self._end(found["error"])
         else:
@@ -246,7 +257,10 @@ class Stimulus:
 
     def _report(self, order: Order, state: str, **more: Any) -> bool:
         """Says how things are; whether that was taken."""
-        report = {"run": self._run, "order": order.number, "state": state, "contact": bool(self.contact), **more}
+        run = self._run
+        if not run:
+            return False
+        report = {"run": run, "order": order.number, "state": state, "contact": bool(self.contact), **more}
         if state == "presented":
             report["trial"] = order.trial
         status, found = self._post("/api/stimulus", report)
@@ -255,15 +269,17 @@ class Stimulus:
         if status in (401, 403):
             self._end(found["error"])
         elif "order" in found:
-            self._heard = time.monotonic()
-            self._take(found)
+            self._take(run, found)
         elif status == 409:  # another server, or one that gave this program up
             self._lost(found["error"])
         return status == 200
 
-    def _take(self, found: Mapping[str, Any]) -> None:
-        """A new order; one that asks for it is neutral at once."""
+    def _take(self, run: str, found: Mapping[str, Any]) -> None:
+        """A new order of the run that goes on; one that asks for it is neutral at once."""
         with self._changed:
+            if run != self._run:
+                return  # it came after the silence
+            self._heard = time.monotonic()
             if found["order"] <= self._order.number:
                 return
             rest = {key: found[key] for key in Order._fields[2:] if key in found}

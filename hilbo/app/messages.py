@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from hilbo.app.lines import fields_of
 from hilbo.errors import InputError
 
 __all__ = ["LARGEST", "Answer", "Command", "Hello", "Join", "Press", "Report", "TooLargeError", "read"]
@@ -88,11 +89,13 @@ class Report(_Message, frozen=True):
     wait_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 0.0
 
 
-def read(kind: type, body: bytes) -> Any:
-    """The message in a request's body. Raises `InputError` with what is wrong with it."""
+def read(kind: type, body: bytes, form: bool = False) -> Any:
+    """The message in a request's body, JSON or a form (`lines`). Raises `InputError` with what is wrong with it."""
     if len(body) > LARGEST:
         raise TooLargeError(f"The message has more than {LARGEST} bytes, which are the most.")
     try:
+        if form:
+            return msgspec.convert(fields_of(body), kind, strict=False)
         return msgspec.json.decode(body or b"{}", type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"The message is not understood: {error}.") from None

@@ -8,7 +8,7 @@
     POST /api/participant/…      answer, begin, break, more, here
     POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite
     POST /api/stimulus/hello     a program that presents begins
-    POST /api/stimulus           how it is; the answer is the newest order
+    POST /api/stimulus           how it is; the answer is the newest order (these two, and join, also as form and lines)
     GET  /try, /api/try, /api/try/map   the page of `hilbo try` (`tried`), what it presents, and its end
 
 Errors are {"error": sentence}: 400 not understood, 401 no key, 403 from elsewhere, 409 not now, 413 too large. The
@@ -29,7 +29,7 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
-from hilbo.app import messages
+from hilbo.app import lines, messages
 from hilbo.app.hub import COMMANDS, PRESSES, NotNowError
 from hilbo.app.security import PAGES, Gate, Role
 from hilbo.app.stimulus_rig import OverError, StimulusRig
@@ -83,7 +83,7 @@ def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
     guarded = _for(hub, gate)
     routes = [
         Route("/", _page("join.html")),
-        Route("/api/join", _join(hub, gate), methods=["POST"]),
+        Route("/api/join", _either(_join(hub, gate)), methods=["POST"]),
         Route("/api/experimenter/map", guarded("experimenter", _map), methods=["GET"]),
     ]
     for role in PAGES:
@@ -95,8 +95,8 @@ def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
     routes += [Route("/api/participant/answer", guarded("participant", _answer), methods=["POST"])]
     routes += [Route(f"/api/participant/{n}", guarded("participant", _press), methods=["POST"]) for n in PRESSES]
     routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
-    routes += [Route("/api/stimulus", guarded("stimulus", _report), methods=["POST"])]
-    routes += [Route("/api/stimulus/hello", guarded("stimulus", _hello), methods=["POST"])]
+    routes += [Route("/api/stimulus", _either(guarded("stimulus", _report)), methods=["POST"])]
+    routes += [Route("/api/stimulus/hello", _either(guarded("stimulus", _hello)), methods=["POST"])]
     if tried is not None:
         routes += [Route("/try", _page("try.html")), Route("/api/try", guarded("stimulus", _json_of(tried.facts)))]
         routes += [Route("/api/try/map", guarded("stimulus", _json_of(tried.map)))]
@@ -124,10 +124,31 @@ def _role_page(gate, role):
     return page
 
 
+def _either(handler):
+    """The handler's answer in JSON, or in lines to whoever sent a form."""
+
+    async def handle(request: Request) -> Response:
+        answer = await handler(request)
+        if not _is_form(request):
+            return answer
+        text = lines.lines_of(answer.status_code, msgspec.json.decode(answer.body))
+        return Response(text, media_type="text/plain")
+
+    return handle
+
+
+def _is_form(request) -> bool:
+    return request.headers.get("content-type", "").partition(";")[0].strip().lower() == lines.FORM
+
+
+async def _message(kind, request) -> Any:
+    return messages.read(kind, await _body(request), _is_form(request))
+
+
 def _join(hub, gate):
     async def join(request: Request) -> Response:
         try:
-            message = messages.read(messages.Join, await _body(request))
+            message = await _message(messages.Join, request)
         except InputError as error:
             return _not_understood(error)
         if gate.asked_for(message.token) == "stimulus" and not message.bearer:
@@ -219,11 +240,11 @@ def _program(hub) -> StimulusRig:
 
 
 async def _hello(hub, _role, request) -> Response:
-    return _json(await _program(hub).hello(messages.read(messages.Hello, await _body(request))))
+    return _json(await _program(hub).hello(await _message(messages.Hello, request)))
 
 
 async def _report(hub, _role, request) -> Response:
-    return _json(await _program(hub).report(messages.read(messages.Report, await _body(request))))
+    return _json(await _program(hub).report(await _message(messages.Report, request)))
 
 
 async def _events(hub, role, request) -> Response:

@@ -5,6 +5,7 @@ import asyncio
 import contextlib
 import subprocess
 import sys
+import threading
 
 import pytest
 from live_server import PATIENCE
@@ -153,3 +154,31 @@ def test_a_program_whose_neutral_fails_is_lost_and_does_not_say_that_it_is(tmp_p
         with client.Stimulus(live.link(), "arm", "1", **said):
             live.until(lambda v: "has not said that it is neutral" in v["device"]["words"], live.whole)
             assert all(event.data["condition"] != "ready" for event in live.events("device"))
+
+
+def test_an_order_that_comes_after_the_silence_is_not_followed(live):
+    with Presenter(live.link()) as program:
+        live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+        stimulus = program.stimulus
+        run = stimulus._run
+        stimulus._take("a run that is over", {"order": 10**6, "do": "present"})
+        assert stimulus.order.number < 10**6
+        stimulus._take(run, {"order": 10**6, "do": "present", "trial": "x"})
+        assert stimulus.order.number == 10**6
+
+
+def test_an_order_is_handed_over_as_soon_as_the_hand_leaves(tmp_path):
+    with LiveStimulus(tmp_path, blocks=SINGLE) as live:
+        client = module("hilbo_stimulus")
+        said = {"force": True, "go_neutral": lambda: None, "neutral_within_s": 0.5}
+        with client.Stimulus(live.link(), "arm", "1", **said) as stimulus:
+            live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+            live.begin()
+            live.until(lambda _: stimulus.order.do == "present", lambda: None)
+            stimulus.contact = True
+            waiting = threading.Thread(target=lambda: found.append(stimulus.next(PATIENCE)))
+            found = []
+            waiting.start()
+            stimulus.contact = False
+            waiting.join(PATIENCE / 2)
+            assert not waiting.is_alive() and found[0] is not None

@@ -1,0 +1,61 @@
+"""The stimulus's messages for programs without a JSON parser: a form comes in, lines go out.
+
+    order=5&state=presented&value.hue=211.0     a request, application/x-www-form-urlencoded
+    status TAB 200, order TAB 6, do TAB neutral its answer, text/plain: a line each, fields between tabs
+
+HTTP's own status is 200 in every such answer, and the first line has the real one: libraries that post forms often keep
+the text of an answer with another status to themselves. docs/guides/stimulus.md has every line.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+from urllib.parse import parse_qsl
+
+from hilbo.errors import InputError
+
+__all__ = ["FORM", "fields_of", "lines_of"]
+
+FORM = "application/x-www-form-urlencoded"
+_VALUE = "value."  # before a parameter's name
+_MOST = 64  # fields of a form
+
+
+def fields_of(body: bytes) -> dict[str, Any]:
+    """The message in a form, all of its values text. Raises `InputError`."""
+    try:
+        pairs = parse_qsl(
+            body.decode(), keep_blank_values=True, strict_parsing=bool(body), errors="strict", max_num_fields=_MOST
+        )
+    except ValueError as error:
+        raise InputError(f"The form is not understood: {error}.") from None
+    found: dict[str, Any] = {}
+    values: dict[str, str] = {}
+    for key, text in pairs:
+        name = key.removeprefix(_VALUE)
+        place = found if name == key else values
+        if name in place:
+            raise InputError(f"The form has {key} twice.")
+        place[name] = text
+    return found | ({"values": values} if values else {})
+
+
+def lines_of(status: int, content: Mapping[str, Any]) -> str:
+    """An answer, the same as in JSON, as lines."""
+    return "".join("\t".join(map(_field, line)) + "\n" for line in (("status", status), *_lines(content)))
+
+
+def _lines(content: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
+    for key, value in content.items():
+        if key == "values":
+            yield from (("value", name, number) for name, number in value.items())
+        elif key == "parameters":
+            yield from (("parameter", p["name"], p["low"], p["high"], p["tolerance"], p["unit"]) for p in value)
+        else:
+            yield key, value
+
+
+def _field(value: Any) -> str:
+    """Numbers as their shortest decimals; a text has no tab and no line's end."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return " ".join(str(value).split()) if isinstance(value, str) else repr(value)

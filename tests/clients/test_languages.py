@@ -1,0 +1,115 @@
+"""The client of each language, by its two examples, in sessions of the real server: a whole session, and neutral within
+the stated time when the server is killed, or stopped so that it is silent."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from client_programs import each_language
+from killed_session import PATIENCE, Session
+from live_stimulus import SETS, LiveStimulus
+
+from hilbo.session.records import Block, Planned
+from hilbo.study.config import Study
+from hilbo.study.new_study import NewStudy, parameter_of, study_text
+
+pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")]
+SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
+SILENCE, OWN = 1.0, 0.05  # s: the study's, and what the examples state
+FORCE = re.compile(r"^(\d+\.\d+) (force|neutral)$", re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    return tmp_path_factory.mktemp("built")
+
+
+class Running:
+    """An example with a link; what it says, in the files `out` and `err`."""
+
+    def __init__(self, command, folder):
+        self.out, self.err = folder / "program.out", folder / "program.err"
+        with open(self.out, "w") as out, open(self.err, "w") as err:
+            self.process = subprocess.Popen(command, stdout=out, stderr=err)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.process.kill()
+        self.process.wait()
+
+    def force(self):
+        """When its loop set a force, or none: (s since 1970, whether there was one)."""
+        return [(float(at), what == "force") for at, what in FORCE.findall(self.err.read_text())]
+
+
+def all_answered(live):
+    """The participant takes part to the end."""
+
+    def acted():
+        view = live.view()
+        if view["may"]["begin"]:
+            live.participant.post("/api/participant/begin", {})
+        elif view["questions"]:
+            live.answer(view)
+        return view
+
+    live.until(lambda view: view["phase"] == "done", acted)
+    live.replays()
+    return [event.data for event in live.events("sent")]
+
+
+@each_language
+def test_the_example_presents_a_whole_session_and_confirms_what_was_asked_for(language, built, tmp_path):
+    command = language.build("example_patch", built)
+    with LiveStimulus(tmp_path, blocks=SINGLE) as live, Running([*command, live.link()], tmp_path) as program:
+        sent = all_answered(live)
+    assert [data["values"] for data in sent] == list(SETS.values())
+    assert all(data["program"].startswith("example_patch") and not data["force"] for data in sent)
+    assert all(word in program.out.read_text() for word in ("Reference", "Test"))
+
+
+@each_language
+def test_the_example_says_in_a_sentence_why_it_cannot_join(language, built, tmp_path):
+    command = language.build("example_patch", built)
+    with LiveStimulus(tmp_path, blocks=SINGLE) as live, Running([*command, live.link() + "x"], tmp_path) as program:
+        assert program.process.wait(PATIENCE) == 1
+    words = program.err.read_text().strip()
+    assert "This link has been used, or is not of this session" in words and words.count("\n") == 0
+
+
+@pytest.fixture
+def session(tmp_path):
+    """`hilbo session` as a process, with a study of a spring."""
+    new = NewStudy("spring", (parameter_of("stiffness=0.1:2:N/mm"), parameter_of("damping=0.001:0.02:N.s/mm")))
+    file = tmp_path / "study.toml"
+    file.write_text(study_text(new).replace("seconds = 2", "seconds = 5"))
+    assert Study.load(file).stimulus.silence == SILENCE
+    found = Session(tmp_path / "session", [str(file), "--participant", "P01"])
+    found.start()
+    found.until(found.ready)
+    yield found
+    with contextlib.suppress(ProcessLookupError):
+        found.kill()
+
+
+@each_language
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP], ids=["killed", "silent"])
+def test_with_force_it_is_neutral_within_the_stated_time_after_the_server(language, how, built, session, tmp_path):
+    link = json.loads(session.out.read_text())["stimulus"]
+    with Running([*language.build("example_spring", built), link], tmp_path) as program:
+        session.until(lambda: session.act() == "step" and program.force() and program.force()[-1][1])
+        at = time.time()
+        os.kill(session.process.pid, how)
+        session.until(lambda: not program.force()[-1][1])
+        assert program.process.poll() is None
+    gone = program.force()[-1][0] - at
+    print(f"{language.name}: neutral {1000 * gone:.0f} ms after {how.name}")
+    assert -0.001 < gone < SILENCE + 0.05 + OWN + language.slower
