@@ -30,15 +30,17 @@ static double now() {
   return std::chrono::duration<double>(std::chrono::system_clock::now().time_since_epoch()).count();
 }
 
-// Until the program ends: position and velocity, contact, force; on stderr when the spring comes and goes.
+// A force in N: here for your motor's call.
+static void set_motor(double) {}
+
+// Until the program ends; on stderr when the spring comes and goes.
 static void loop(Spring &spring, hilbo::Stimulus &stimulus) {
   bool touched = false, pushed = false;
-  double force = 0;
   for (long tick = 0; !ended; ++tick) {
     const double phase = 6.283185307 * static_cast<double>(tick % 600) / 600;      // a finger that comes every 0.6 s
     const double x = 4 * std::sin(phase) - 2, v = 4 * std::cos(phase) * 6.283185307 / 0.6; // mm, mm/s
     const double k = spring.stiffness, b = spring.damping;
-    force = x > 0 ? k * x + b * v : 0; // N; a real loop hands this to its motor
+    set_motor(x > 0 ? k * x + b * v : 0);
     if ((x > 0) != touched) stimulus.contact(touched = x > 0);
     if ((k > 0) != pushed) {
       pushed = k > 0;
@@ -46,7 +48,6 @@ static void loop(Spring &spring, hilbo::Stimulus &stimulus) {
     }
     std::this_thread::sleep_for(std::chrono::milliseconds(1));
   }
-  (void)force;
 }
 
 int main(int count, char **words) {

@@ -19,6 +19,10 @@ from hilbo_stimulus import Stimulus, StimulusError
 NEUTRAL, REFERENCE = (0.0, 0.0), (0.8, 0.005)
 
 
+def set_motor(force):
+    """A force in N: here for your motor's call."""
+
+
 class Spring:
     """Stiffness and damping, replaced as one; both 0: no force, whatever the position."""
 
@@ -36,13 +40,12 @@ class Spring:
             phase = 2 * math.pi * (time.perf_counter() - begun) / 0.6  # a finger that comes every 0.6 s
             x, v = 4 * math.sin(phase) - 2, 4 * math.cos(phase) * 2 * math.pi / 0.6  # mm, mm/s
             stiffness, damping = self.set
-            force = stiffness * x + damping * v if x > 0 else 0.0  # N; a real loop hands this to its motor
+            set_motor(stiffness * x + damping * v if x > 0 else 0.0)
             if (x > 0) != touched:
                 stimulus.contact = touched = x > 0
             if (stiffness > 0) != pushed:
                 pushed = stiffness > 0
                 print(f"{time.time():.3f} {'force' if pushed else 'neutral'}", file=sys.stderr, flush=True)
-            del force
             time.sleep(0.001)
 
 
