@@ -2,8 +2,8 @@
 
 A connection is a stranger's until a key of a role has come in on it; then it is the role's. Strangers and each role
 have numbers of connections of their own, and of too many the oldest is given up. An experimenter is heard at once,
-programs that present, participants and strangers by turns, each request of theirs anew. A stranger's connection ends
-with its first answer. A request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's
+who presents, participants and strangers by turns, each request of theirs anew. A stranger's connection ends with its
+first answer. A request has `PATIENCE` s and `LARGEST` bytes, header and body, and so has all of a stranger's
 connection.
 
 uvicorn and h11 do the rest; without this, they would wait for a header for ever, and read a body of any size.

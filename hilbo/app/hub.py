@@ -15,7 +15,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from hilbo.app import views
+from hilbo.app import blind, views
 from hilbo.app.interruptions import Interruptions
 from hilbo.app.messages import Answer, Command, Press
 from hilbo.app.rig import Rig, Snapshot
@@ -27,13 +27,19 @@ from hilbo.session import actions
 from hilbo.session.actions import LiveSession, RefusedError
 from hilbo.session.event_log import LogError
 
-__all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError"]
+__all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError", "others_present"]
 
 _RECENT = 200  # events that the experimenter's page may show
 PRESSES = ("begin", "break", "more", "here")
 COMMANDS = (
     *("pause", "resume", "repeat", "undo", "void", "restore", "skip", "abort", "note", "estop", "clear", "invite"),
 )
+
+
+def others_present(title: str) -> str:
+    """Why somebody is not who presents, by the title of the rig that does."""
+    who = {"Stimulus": "a program presents, and no person", "Preparer": "a person presents, and no program"}
+    return f"In this session {who.get(title, 'a device renders, and no program presents')}."
 
 
 class NotNowError(InputError):
@@ -163,7 +169,12 @@ class Hub:
 
     def view(self, role: Role) -> dict[str, Any]:
         """What a role may see now."""
-        return views.participant(self) if role == "participant" else views.experimenter(self)
+        if role == "participant":
+            return views.participant(self)
+        if role != "experimenter":  # who presents is given orders, and has no view
+            return {}
+        seen = views.experimenter(self)
+        return blind.experimenter(self, seen) if self._blinds else seen
 
     async def answer(self, message: Answer, page: str | None) -> dict[str, Any]:
         """A participant's answer, accepted once; on the disk when this returns. Raises `NotNowError`."""
@@ -214,8 +225,10 @@ class Hub:
         if what == "invite":
             if self.invite is None:
                 raise NotNowError("This session gives no links.")
-            if message.role == "stimulus" and self.state.study.stimulus is None:
-                raise NotNowError("In this session a device renders, and no program presents.")
+            stimulus = self.state.study.stimulus
+            if message.role not in ("participant", None if stimulus is None else stimulus.role):
+                assert self.rig is not None
+                raise NotNowError(others_present(self.rig.title))
             return self.invite(message.role)
         try:
             await self.commit(self._event_of(what, message))
@@ -268,6 +281,8 @@ class Hub:
         while they are being prepared."""
         state = self.state
         version = views.map_version(state)
+        if self._blinds:
+            return None
         if self._maps is None:
             return {}
         if self._map is None or self._map[0] != version:
@@ -275,6 +290,12 @@ class Hub:
             self.trust = await self._loop.run_in_executor(self._drawing, self._maps.trust, state)
             self.publish()
         return self._map[1]
+
+    @property
+    def _blinds(self) -> bool:
+        """Whether the experimenter is not to know the parameters."""
+        stimulus = self.state.study.stimulus
+        return stimulus is not None and "experimenter" not in stimulus.shown_to
 
     @property
     def draws(self) -> bool:

@@ -10,6 +10,7 @@ from hilbo.session.records import Event
 __all__ = ["line", "meant", "place_of", "sentence", "table"]
 
 _SHOWN = {"reference": "the reference", "a": "rendering A", "b": "rendering B", "neutral": "nothing"}
+_WHO = {"stimulus": "The program that presents", "preparer": "The preparer"}
 _DEVICE = {"ready": "is ready", "running": "renders", "stopped": "is at rest", "hold": "holds", "estop": "was stopped"}
 
 
@@ -75,7 +76,8 @@ def _repeated(trial, name, seq):
 
 
 def _device(state, name, data):
-    who = "The program that presents" if state.study.stimulus is not None else "The device"
+    stimulus = state.study.stimulus
+    who = "The device" if stimulus is None else _WHO[stimulus.role]
     told = data["condition"]
     reason = str(data.get("reason", ""))
     if told == "lost":

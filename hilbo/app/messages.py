@@ -59,12 +59,13 @@ class Command(_Message, frozen=True):
     reason: _Text = ""
     text: _Text = ""
     trial: _Number | None = None
-    role: Literal["participant", "stimulus"] = "participant"
+    role: Literal["participant", "stimulus", "preparer"] = "participant"
 
 
 class Hello(_Message, frozen=True):
-    """What a program that presents says of itself. `force`: it moves something that people touch. `neutral_within_s`:
-    so soon does it show nothing and push nothing when it is told, and when nobody tells it anything any more."""
+    """What who presents says of itself: a program, or the preparer's page. `force`: it moves something that people
+    touch. `neutral_within_s`: so soon does it show nothing and push nothing when it is told, and when nobody tells it
+    anything any more."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
     version: Annotated[str, msgspec.Meta(max_length=100)]

@@ -103,6 +103,8 @@ def _resumed(wanted, study) -> tuple[EventLog, LiveChooser]:
 def _header(wanted, study) -> Header:
     number = study.session.protocol_number
     facts: dict[str, Any] = {"protocol_number": number, "versions": _versions()}
+    if study.stimulus is not None:
+        facts["shown_to"] = study.stimulus.shown_to
     if wanted.reference is not None:
         facts |= {"unblinded": "try", "warm": False}
     elif wanted.dry_run:

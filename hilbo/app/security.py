@@ -1,4 +1,4 @@
-"""Who may ask the server for what: one-time links, keys for three roles, and where a request may come from.
+"""Who may ask the server for what: one-time links, keys for each role, and where a request may come from.
 
 A link ends in `#token`, which browsers do not send: the page that it opens trades the token, once, for the role's key,
 in a cookie that scripts cannot read (or, for programs, in the answer). Keys outlive the server, in a file beside the
@@ -25,9 +25,10 @@ from hilbo.errors import InputError
 
 __all__ = ["PAGES", "Gate", "Role", "lan_addresses"]
 
-Role = Literal["stimulus", "participant", "experimenter"]
-"""Who is in a session, the one who is heard first last. The stimulus is a program that presents renderings."""
-PAGES: tuple[Role, ...] = ("participant", "experimenter")
+Role = Literal["stimulus", "preparer", "participant", "experimenter"]
+"""Who is in a session, the one who is heard first last. The stimulus is a program that presents renderings, the
+preparer a person who does; a session has one of them at most."""
+PAGES: tuple[Role, ...] = ("preparer", "participant", "experimenter")
 """The roles that have a page in a browser; the other's key is told to a program."""
 _BYTES = 24
 _LENGTH = 32  # characters of a key: base64 of _BYTES

@@ -8,6 +8,7 @@
     POST /api/participant/…      answer, begin, break, more, here
     POST /api/experimenter/…     pause, resume, repeat, undo, void, abort, note, estop, clear, invite
     POST /api/stimulus/hello     a program that presents begins
+    GET  /preparer               the page of a person who presents; POST /api/preparer/hello and /api/preparer as below
     POST /api/stimulus           how it is; the answer is the newest order (these two, and join, also as form and lines)
     GET  /try, /api/try, /api/try/map   the page of `hilbo try` (`tried`), what it presents, and its end
 
@@ -30,7 +31,7 @@ from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from hilbo.app import lines, messages
-from hilbo.app.hub import COMMANDS, PRESSES, NotNowError
+from hilbo.app.hub import COMMANDS, PRESSES, NotNowError, others_present
 from hilbo.app.security import PAGES, Gate, Role
 from hilbo.app.stimulus_rig import OverError, StimulusRig
 from hilbo.app.tried import Tried
@@ -87,14 +88,17 @@ def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
         Route("/api/experimenter/map", guarded("experimenter", _map), methods=["GET"]),
     ]
     for role in PAGES:
+        routes += [Route(f"/{role}", _role_page(gate, role))]
+    for role in ("participant", "experimenter"):
         routes += [
-            Route(f"/{role}", _role_page(gate, role)),
             Route(f"/api/{role}", guarded(role, _view), methods=["GET"]),
             Route(f"/api/{role}/events", guarded(role, _events), methods=["GET"]),
         ]
     routes += [Route("/api/participant/answer", guarded("participant", _answer), methods=["POST"])]
     routes += [Route(f"/api/participant/{n}", guarded("participant", _press), methods=["POST"]) for n in PRESSES]
     routes += [Route(f"/api/experimenter/{n}", guarded("experimenter", _command), methods=["POST"]) for n in COMMANDS]
+    routes += [Route("/api/preparer", guarded("preparer", _report), methods=["POST"])]
+    routes += [Route("/api/preparer/hello", guarded("preparer", _hello), methods=["POST"])]
     routes += [Route("/api/stimulus", _either(guarded("stimulus", _report)), methods=["POST"])]
     routes += [Route("/api/stimulus/hello", _either(guarded("stimulus", _hello)), methods=["POST"])]
     if tried is not None:
@@ -232,19 +236,19 @@ async def _command(hub, _role, request) -> Response:
     return _json(await hub.command(request.url.path.rpartition("/")[2], message))
 
 
-def _program(hub) -> StimulusRig:
-    """The rig that a program is. Raises `InputError` where a device renders."""
-    if not isinstance(hub.rig, StimulusRig):
-        raise InputError("In this session a device renders, and no program presents.")
+def _presenter(hub, role) -> StimulusRig:
+    """The rig that a program is, or a person. Raises `InputError` where another presents."""
+    if not isinstance(hub.rig, StimulusRig) or hub.rig.role != role:
+        raise InputError(others_present(hub.rig.title))
     return hub.rig
 
 
-async def _hello(hub, _role, request) -> Response:
-    return _json(await _program(hub).hello(await _message(messages.Hello, request)))
+async def _hello(hub, role, request) -> Response:
+    return _json(await _presenter(hub, role).hello(await _message(messages.Hello, request)))
 
 
-async def _report(hub, _role, request) -> Response:
-    return _json(await _program(hub).report(await _message(messages.Report, request)))
+async def _report(hub, role, request) -> Response:
+    return _json(await _presenter(hub, role).report(await _message(messages.Report, request)))
 
 
 async def _events(hub, role, request) -> Response:

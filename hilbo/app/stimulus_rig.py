@@ -1,4 +1,5 @@
-"""A rig that is a program with a link of its own: what it is told, what it says, and when it is not believed.
+"""A rig that is a program with a link of its own, or a person with the preparer's page: what it is told, what it says,
+and when it is not believed.
 
     program --> hello, then reports --> this rig --> orders, one at a time, each with a number of its own
 
@@ -22,11 +23,13 @@ from hilbo.errors import InputError
 from hilbo.session.confirmed import check_confirmed
 from hilbo.session.header_check import study_of
 from hilbo.session.records import RefusedError
+from hilbo.session.set_codes import label_of
 from hilbo.study.study_file import AnyStudy
 
 __all__ = ["Order", "OverError", "StimulusRig"]
 
 _TRAVEL = 0.5  # s that a message there and back may take, and a busy computer
+_NOBODY = {"stimulus": "No program that presents has joined yet.", "preparer": "The preparer has not joined yet."}
 _PART = 3  # a question is held for so small a part of the silence that is borne
 
 
@@ -52,7 +55,6 @@ class StimulusRig:
     """The program that presents a study's renderings. `changed` is told of each new snapshot; `tag` is what trials of
     the session are known by."""
 
-    title = "Stimulus"
     simulated = False
 
     def __init__(
@@ -64,9 +66,11 @@ class StimulusRig:
     ):
         assert study.stimulus is not None  # nobody else presents
         self._study, self._table, self._tag, self._changed = study, study.stimulus, tag, changed
+        self.role = study.stimulus.role
+        self.title = self.role.capitalize()
         self.notes: list[str] = []
         self.order = Order(1, "neutral")
-        self.snapshot = Snapshot("LOST", False, "No program that presents has joined yet.", excused=True)
+        self.snapshot = Snapshot("LOST", False, _NOBODY[self.role], excused=True)
         self._hello: Hello | None = None
         self._run = ""
         self._news, self._moved = asyncio.Event(), asyncio.Event()
@@ -82,6 +86,8 @@ class StimulusRig:
     def words(self) -> str:
         """What the program says of itself."""
         said = self._hello
+        if self.role == "preparer":
+            return "a person presents, by hand"
         if said is None:
             return "a program that has not joined yet"
         stop = "" if self._stopped is None else f", stopped within {1000 * self._stopped:.0f} ms"
@@ -344,5 +350,6 @@ class StimulusRig:
             "show": "test" if rendering else showing.show,
             "side": showing.show if rendering else "",
             "values": dict(showing.values) if showing.values is not None else {},
+            "label": label_of(showing.values, self._tag) if showing.values is not None else "",
             "within_s": self._table.within,
         }

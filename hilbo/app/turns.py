@@ -1,5 +1,5 @@
-"""Whose turn it is: programs that present, participants and strangers wait in rows, and every few milliseconds the
-first of each goes on.
+"""Whose turn it is: who presents, participants and strangers wait in rows, and every few milliseconds the first of each
+goes on.
 
 So none can take more than a part of the one thread that serves everybody. Where nobody waits, nobody is kept.
 """
@@ -20,7 +20,7 @@ class Turns:
 
     def __init__(self, go: Callable[[Any, Role | None], Any]):
         self._go, self._due, self._waiting = go, 0.0, False
-        self._rows: dict[Role | None, dict[Any, None]] = {"stimulus": {}, "participant": {}, None: {}}
+        self._rows: dict[Role | None, dict[Any, None]] = {"stimulus": {}, "preparer": {}, "participant": {}, None: {}}
 
     def add(self, who: Any, role: Role | None) -> None:
         """At the end of its row, unless it is there."""

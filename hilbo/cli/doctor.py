@@ -238,7 +238,7 @@ def _stimulus(file: Any) -> Iterator[Check]:
     """What a study still lacks whose renderings a program presents."""
     table, parameters = file.stimulus, file.space.parameters
     off = ", ".join(f"{p.name} {table.off_by(p):.3g} {p.unit}".rstrip() for p in parameters)
-    words = f"a program presents, and confirms within {table.within:g} s; values may be off by {off}"
+    words = f"a {table.by} presents, and confirms within {table.within:g} s; values may be off by {off}"
     said = file.tables.stimulus is not None
     yield Check("stimulus", "good" if said else "note", words, "" if said else "say so in a table [stimulus]")
     left = [key for key in ("title", "hello", "feel_reference", "feel_test") if key not in file.session.texts]
@@ -261,6 +261,8 @@ def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator
     from hilbo.study.study_file import StudyFile
 
     study = StudyFile.load(path)
+    if study.stimulus is not None and study.stimulus.by == "person":
+        raise InputError(f"{path}: a person presents, and no program; leave --stimulus out, and try a --dry-run.")
     if study.stimulus is None:
         raise InputError(f"{path}: has a [renderer], a device renders, and no program presents; leave --stimulus out.")
     place = serve.bound(port)

@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from hilbo.cli.new_file import check_free, new_file
+from hilbo.errors import InputError
 
 __all__ = ["init"]
 
@@ -25,6 +26,7 @@ def init(
     responses: Annotated[str, typer.Option(help="The answers, lowest first.")] = "different,similar,close",
     trials: Annotated[int, typer.Option(min=1, help="How many trials a participant has.")] = 25,
     device: Annotated[bool, typer.Option("--device", help="Our device renders; else a program presents.")] = False,
+    by: Annotated[str, typer.Option(help="Without --device: a program presents, or a person by hand.")] = "program",
     force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
 ) -> None:
     """Write a commented study file, from a few words about the study."""
@@ -32,8 +34,12 @@ def init(
     from hilbo.study.new_study import NewStudy, parameter_of, study_text
 
     parameters = tuple(parameter_of(text) for text in parameter or [])
+    if by not in ("program", "person"):
+        raise InputError(f'--by is "{by}"; it must be program or person.')
+    if device and by == "person":
+        raise InputError("--by person stands beside --device; leave one of them out.")
     answers = tuple(text.strip() for text in responses.split(","))
-    text = study_text(NewStudy(name or study.stem, parameters, answers, trials, device))
+    text = study_text(NewStudy(name or study.stem, parameters, answers, trials, device, by))
     with new_file(study) as path:
         path.write_text(text, encoding="utf-8")
     print(f"{study}: written; read it, then hilbo doctor {study}", file=sys.stderr)

@@ -112,15 +112,17 @@ def _started(hub, place, served, as_json) -> None:
     """Links on the terminal; with --json in one line on stdout, for programs."""
     from hilbo.app import serve
 
-    presents = hub.state.study.stimulus is not None
-    links = place.links(("stimulus", "participant", "experimenter") if presents else ("participant", "experimenter"))
+    stimulus = hub.state.study.stimulus
+    presents = () if stimulus is None else (stimulus.role,)
+    links = place.links((*presents, "participant", "experimenter"))
     for note in hub.rig.notes:
         print(f"hilbo: {note}", file=sys.stderr)
     print(f"log:          {hub.log.path}" + (f"  ({hub.log.dropped})" if hub.log.dropped else ""), file=sys.stderr)
     for role, link in links.items():
         print(f"{role + ':':<13} {link}", file=sys.stderr)
-    if served.lan:
-        print(serve.qr_text(links["participant"]), file=sys.stderr)
+    for role in ("preparer", "participant") if served.lan else ():
+        if role in links:
+            print(f"{role}:\n{serve.qr_text(links[role])}", file=sys.stderr)
     print("Each link opens once. Ctrl-C ends the server; --resume goes on.", file=sys.stderr, flush=True)
     if as_json:
         print(json.dumps(links | {"log": str(hub.log.path), "device": hub.rig.words.partition(",")[0]}), flush=True)

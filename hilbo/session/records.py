@@ -61,6 +61,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     """All that decides a session in advance: the first line of its log.
 
     `unblinded`: what showed its participant the parameters, "try" for `hilbo try`; "" where nothing did.
+    `shown_to`: the roles that were shown the parameters of what is presented, where no device of ours does.
     """
 
     schema: int = 1
@@ -78,6 +79,7 @@ class Header(msgspec.Struct, frozen=True, kw_only=True):
     dry_run: bool = False
     language: str = "en"
     unblinded: str = ""
+    shown_to: tuple[str, ...] = ()
 
 
 class Need(msgspec.Struct, frozen=True):

@@ -1,7 +1,8 @@
 """Names of people's own sets: a code in the place of the participant's id.
 
 Others compare these sets, and their answers name them. A code is made from the sets' values alone, so that it leads to
-nobody once the results are gone in which the values stand beside the id.
+nobody once the results are gone in which the values stand beside the id. And labels of renderings, for those who are
+to speak of them without knowing them.
 """
 
 import json
@@ -11,9 +12,10 @@ from typing import Any
 from hilbo.study.set_table import ROLES
 from hilbo.study.typed_files import digest_of
 
-__all__ = ["OWN", "Sets", "code_of", "coded", "set_codes"]
+__all__ = ["OWN", "Sets", "code_of", "coded", "label_of", "set_codes"]
 
 OWN = "individual:"
+_LETTERS = "ABCDEFGHKLMNPRSTUVWXYZ"  # none that looks or sounds like another, or like a digit
 Sets = Mapping[str, Mapping[str, float]]
 """Name of a set -> parameters in physical units."""
 
@@ -23,6 +25,17 @@ def code_of(values: Any, taken: Iterable[str] = ()) -> str:
     code = "s" + digest_of(json.dumps(values, sort_keys=True).encode())[:8]
     again = sum(other.partition("-")[0] == code for other in taken)
     return f"{code}-{again + 1}" if again else code
+
+
+def label_of(values: Mapping[str, Any], session: str) -> str:
+    """A label for a rendering (parameter -> value), the same whenever it comes again in a session: three letters and
+    two digits, which say nothing of the values. `session`: what makes another session's labels others."""
+    number = int(digest_of(json.dumps([session, sorted(values.items())]).encode()), 16)
+    letters = ""
+    for _ in range(3):
+        number, letter = divmod(number, len(_LETTERS))
+        letters += _LETTERS[letter]
+    return f"{letters}-{number % 100:02d}"
 
 
 def set_codes(sets: Mapping[str, Sets]) -> dict[str, str]:

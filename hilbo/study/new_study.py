@@ -4,7 +4,7 @@ import json
 import re
 import tomllib
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
@@ -23,6 +23,15 @@ within = 1.0                         # s until it has confirmed what is presente
 silence = 1.0                        # s without a word until the program counts as gone
 # How far what is really presented may be off; else a millionth of the range. Answers count for what was confirmed.
 # tolerance = {tolerance}
+"""
+_PERSON = """
+[stimulus]                           # a person presents by hand (docs/guides/stimulus.md)
+by = "person"
+within = 120.0                       # s until they have confirmed what is presented; later voids the trial
+silence = 10.0                       # s without a word from their page until they count as gone
+# How far what is really presented may be off. Answers count for what was confirmed.
+tolerance = {tolerance}
+# experimenter_sees = true           # the experimenter's page shows parameters; else the preparer alone knows them
 """
 _TEXTS = """
 [session.texts]                      # what participants read; docs/guides/sessions.md has all of them
@@ -51,13 +60,15 @@ _FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT or NAME=LOW:HIGH:UNIT:log"
 
 
 class NewStudy(NamedTuple):
-    """What is known of a study before it has a file. `device`: our device renders, else a program presents."""
+    """What is known of a study before it has a file. `device`: our device renders; else `by` presents, a program or a
+    person."""
 
     name: str
     parameters: tuple[Parameter, ...]
     responses: tuple[str, ...] = ("different", "similar", "close")
     trials: int = 25
     device: bool = False
+    by: Literal["program", "person"] = "program"
 
 
 def parameter_of(text: str) -> Parameter:
@@ -87,7 +98,7 @@ def study_text(new: NewStudy) -> str:
             f"name = {_quoted(new.name)}",
             f"responses = [{', '.join(map(_quoted, new.responses))}]     # what people may answer, lowest first",
             *(line for p in parameters for line in _table(p)),
-            _MODEL if new.device else _STIMULUS.replace("{tolerance}", _tolerance(parameters)),
+            _presenting(new, parameters),
             "[gp]                                 # what is believed of people before any answer",
             f"length = {0.13 if new.device else 0.22}                       # over what part of a range answers change:"
             " rule learnt-1 learns it",
@@ -139,8 +150,16 @@ def _table(p: Parameter) -> list[str]:
     return ["", f"[parameters.{key}]", f"low = {p.low}", f"high = {p.high}", f"unit = {_quoted(p.unit)}", *scale]
 
 
-def _tolerance(parameters: Sequence[Parameter]) -> str:
-    return "{" + ", ".join(f"{_quoted(p.name)} = {(p.high - p.low) / 1000:.2g}" for p in parameters) + "}"
+def _presenting(new: NewStudy, parameters: Sequence[Parameter]) -> str:
+    """The table of what presents. A person is borne a hundredth of each range."""
+    if new.device:
+        return _MODEL
+    text, part = (_PERSON, 100) if new.by == "person" else (_STIMULUS, 1000)
+    return text.replace("{tolerance}", _tolerance(parameters, part))
+
+
+def _tolerance(parameters: Sequence[Parameter], part: int) -> str:
+    return "{" + ", ".join(f"{_quoted(p.name)} = {(p.high - p.low) / part:.2g}" for p in parameters) + "}"
 
 
 def _thresholds(count: int) -> list[float]:

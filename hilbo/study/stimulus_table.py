@@ -1,8 +1,9 @@
-"""[stimulus]: what a study asks of the program that presents its renderings, where no device of ours does."""
+"""[stimulus]: what a study asks of the program, or the person, that presents its renderings, where no device of ours
+does."""
 
 import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -13,6 +14,7 @@ from hilbo.study.fields import Table, shown, words
 __all__ = ["StimulusTable"]
 
 _EXACT = 1e-6  # of a parameter's range: more than a number of 32 bits is off by
+_PATIENCE = {"within": 5.0, "silence": 3.0}  # s that a person who presents needs at least, and a tablet that slumbers
 _Seconds = Annotated[float, msgspec.Meta(ge=0.1, le=600), words("a number of seconds from 0.1 to 600", "1.0")]
 
 
@@ -20,7 +22,9 @@ class StimulusTable(Table, frozen=True):
     """`within`: s from an order until it is confirmed that it is presented. `silence`: s without a word from the
     program until it counts as gone. `tolerance`: parameter -> how far the confirmed value may be off, physical units;
     a millionth of the range where nothing is said. `unblinded`: who takes part is presented to by their own page, which
-    knows the parameters; answers to any other study that were given so are not aggregated with others'."""
+    knows the parameters; answers to any other study that were given so are not aggregated with others'. `by`: whether a
+    program presents, or a person by hand, from the preparer's page. `experimenter_sees`: whether the experimenter is
+    shown the parameters; if nothing is said they are, but where a person presents."""
 
     within: _Seconds = 1.0
     silence: _Seconds = 1.0
@@ -28,6 +32,8 @@ class StimulusTable(Table, frozen=True):
         msgspec.field(default_factory=dict)
     )
     unblinded: Annotated[bool, words("true or false", "false")] = False
+    by: Annotated[Literal["program", "person"], words('"program" or "person"', '"program"')] = "program"
+    experimenter_sees: Annotated[bool | None, words("true or false", "true")] = None
 
     def check(self, names: Sequence[str]) -> None:
         """Refuse tolerances of what is no parameter, and those that are none. Raises `InputError`."""
@@ -37,6 +43,22 @@ class StimulusTable(Table, frozen=True):
                 raise InputError(f"{path} is of no parameter of the study, those are {', '.join(names)}.")
             if not 0 <= value < math.inf:
                 raise InputError(f"{path} is {shown(value)}, it must be a number, 0 or above.")
+        for key, least in _PATIENCE.items() if self.by == "person" else ():
+            if getattr(self, key) < least:
+                raise InputError(
+                    f"stimulus.{key} is {getattr(self, key):g} s, and a person presents; give them {least:g} s or more."
+                )
+
+    @property
+    def role(self) -> Literal["stimulus", "preparer"]:
+        """Who presents, as a role of a session."""
+        return "stimulus" if self.by == "program" else "preparer"
+
+    @property
+    def shown_to(self) -> tuple[str, ...]:
+        """The roles that are shown parameters."""
+        sees = self.by == "program" if self.experimenter_sees is None else self.experimenter_sees
+        return (self.role, "experimenter") if sees else (self.role,)
 
     def off_by(self, parameter: Parameter) -> float:
         """How far a confirmed value may be off, in the parameter's unit."""

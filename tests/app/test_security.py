@@ -35,7 +35,7 @@ def test_a_new_link_voids_the_one_that_nobody_has_used(gate):
 
 def test_cookies_of_two_ports_have_two_names(gate):
     other = Gate(["127.0.0.1:8643"])
-    assert set(gate.cookies.values()) == {"hilbo_participant_8642", "hilbo_experimenter_8642"}
+    assert set(gate.cookies.values()) == {f"hilbo_{role}_8642" for role in ("preparer", "participant", "experimenter")}
     assert not set(gate.cookies.values()) & set(other.cookies.values())
 
 

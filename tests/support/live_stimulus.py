@@ -62,8 +62,8 @@ def module(name):
 class LiveStimulus(Live):
     """`with LiveStimulus(folder) as live:` - comparisons of two parameters; a program joins with `live.join()`."""
 
-    def __init__(self, folder: Path, within: float = 20.0, silence: float = 20.0, **others):
-        self.text = _TEXT.format(within=within, silence=silence)
+    def __init__(self, folder: Path, within: float = 20.0, silence: float = 20.0, more: str = "", **others):
+        self.text = _TEXT.format(within=within, silence=silence) + more
         super().__init__(folder, **others)
 
     def make_study(self, seconds, warm_up):
@@ -99,7 +99,9 @@ class LiveStimulus(Live):
 
 
 class ByHand(Client):
-    """A program with the stimulus's key, report by report."""
+    """A program with the stimulus's key, report by report; or in the place of the preparer's page."""
+
+    role = "stimulus"
 
     def __init__(self, link, name="by hand", version="7", force=False, neutral_within_s=1.0, ready=True):
         super().__init__(link)
@@ -109,7 +111,7 @@ class ByHand(Client):
             self.report("neutral")
 
     def hello(self):
-        self.order = self.post("/api/stimulus/hello", self.said)
+        self.order = self.post(f"/api/{self.role}/hello", self.said)
         self.run = self.order["run"]
         return self.order
 
@@ -118,7 +120,7 @@ class ByHand(Client):
         number = self.order["order"] if order is None else order
         if state == "presented":
             more = {"trial": self.order.get("trial")} | more
-        self.order = self.post("/api/stimulus", {"run": self.run, "order": number, "state": state, **more})
+        self.order = self.post(f"/api/{self.role}", {"run": self.run, "order": number, "state": state, **more})
         return self.order
 
     def until(self, live, wanted):

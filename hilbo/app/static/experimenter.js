@@ -48,7 +48,10 @@ function drawBanners() {
 
 function drawDevice() {
   const d = view.device;
-  put("device-name", d.title); at("invite-stimulus").hidden = d.title !== "Stimulus";
+  put("device-name", d.title); 
+  const presents = d.title !== "Device";
+  at("invite-stimulus").hidden = !presents;
+  if (presents) { put("invite-stimulus", `New link for the ${d.title.toLowerCase()}`); at("invite-stimulus").dataset.role = d.title.toLowerCase(); }
   put("device-state", d.state); at("device-state").dataset.level = d.level;
   put("device-words", d.words);
   list("device", d.rows);
@@ -186,9 +189,9 @@ at("note").addEventListener("submit", async (e) => {
   const text = at("note-text").value.trim();
   if (text && await command("note", { text })) at("note-text").value = "";
 });
-for (const [id, role] of [["invite", "participant"], ["invite-stimulus", "stimulus"]]) {
+for (const id of ["invite", "invite-stimulus"]) {
   at(id).addEventListener("click", async () => {
-    const found = await command("invite", { role });
+    const found = await command("invite", { role: at(id).dataset.role || "participant" });
     if (!found) return;
     put("link-text", found.link);
     at("qr").src = found.qr;
