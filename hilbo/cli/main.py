@@ -277,7 +277,7 @@ def _by_rule(study, rule):
     return dataclasses.replace(study, rule=rule)
 
 
-def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False) -> dict[str, Any]:
+def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False, selection="") -> dict[str, Any]:
     """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
     from hilbo.study.analysis import analyse_population
 
@@ -290,13 +290,14 @@ def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False) -> d
         population = analyse_population(study, cohort, seed, say, told)
     from hilbo.report.results import write_results
 
-    content = write_results(population, folder, truth, say)
+    beside: dict[str, Any] = {}
     if compare:
         from hilbo.report.comparison import write_comparison
 
         say("every rule, with each person left out")
-        write_comparison(study, population.aggregate, folder, seed)
-    return content
+        compared = write_comparison(study, population.aggregate, folder, seed)
+        beside = {"comparison": compared.section, "pictures": compared.pictures}
+    return write_results(population, folder, truth, say, selection=selection, **beside)
 
 
 def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -> dict[str, Any]:
@@ -312,10 +313,12 @@ def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -
 def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
     say("simulating")
     start()
+    from hilbo.session.registration import selection_words
     from hilbo.simulation.folder import simulate_folder
 
     simulated = simulate_folder(folder, preset, count, seed, study)
-    return _aggregate(simulated.study, simulated.cohort, folder, seed, say, simulated.truth)
+    chosen = selection_words(simulated.study.selection)
+    return _aggregate(simulated.study, simulated.cohort, folder, seed, say, simulated.truth, selection=chosen)
 
 
 def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:

@@ -19,7 +19,6 @@ from hilbo.report.results import misses
 from hilbo.report.validation import Validated, safest
 from hilbo.study.analysis import Analysis
 from hilbo.study.heterogeneity import in_place
-from hilbo.study.progress import settled
 
 __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
@@ -70,14 +69,8 @@ def _individuals(results):
     analysis, study = results.found, results.found.study
     counts = analysis.progress.counts
     top, people = study.responses[-1], len(analysis.cohort.names)
-    if len(counts) > 2:
-        settled_from = [n for n in analysis.progress.settled(_NEAR) if n is not None]
-        median = f", the median of these from trial {np.median(settled_from):.0f} on" if settled_from else ""
-        yield Evidence(
-            _side(len(settled_from) > people / 2),
-            f"{len(settled_from)} of {people} individual optima stayed within {100 * _NEAR:.0f} % (NRMSE) of their"
-            f" final place before their last trial{median} (supports: more than half).",
-        )
+    if analysis.progress.splits and len(counts) > 2:
+        yield _nearer_to_others(analysis.progress)
     answers = np.asarray(analysis.cohort.trials.q) == len(study.responses) - 1
     mask = np.asarray(analysis.cohort.trials.mask)
     totals = (answers & mask).sum(axis=1)
@@ -101,6 +94,29 @@ def _individuals(results):
         f'At their own optimum "{top}" is the likeliest answer for {likeliest} of {people} participants (median'
         f" probability {100 * np.median(chances[:, -1]):.0f} %; supports: more than half of them).",
     )
+
+
+def _nearer_to_others(progress):
+    """Whether individual optima come nearer to those of people who are not among them."""
+    row = _early(progress.counts)
+    early, late = (100 * progress.own_to_half[k] for k in (row, -1))
+    nearer = early - late
+    error = nearer.std(ddof=1) / np.sqrt(len(nearer))
+    side: Side = (
+        "supports" if nearer.mean() > 2 * error else "contradicts" if nearer.mean() < -2 * error else "inconclusive"
+    )
+    return Evidence(
+        side,
+        f"From the optimum of a half of the people without them, individual optima are {np.median(early):.0f} % away"
+        f" after {progress.counts[row]} trials and {np.median(late):.0f} % after {progress.counts[-1]} (NRMSE,"
+        f" medians); they come nearer by {nearer.mean():.1f} ± {error:.1f} %"
+        " (supports: by more than two standard errors).",
+    )
+
+
+def _early(counts):
+    """The row of the first third of the trials."""
+    return int(np.searchsorted(counts, max(int(counts[-1]) // 3, 1)))
 
 
 def _population(results):
@@ -162,27 +178,22 @@ def _validation(validated, responses):
 
 def _convergence(results):
     analysis = results.found
-    counts, (population_errors, individual_errors) = analysis.progress.counts, analysis.progress.to_end()
-    people = len(analysis.cohort.names)
-    if len(counts) <= 2 or people < 2:
+    progress = analysis.progress
+    if len(progress.counts) <= 2 or not progress.splits:
         yield Evidence("inconclusive", "It takes several participants and trials to say.")
         return
-    first = settled(counts, population_errors, _NEAR)
     how = in_place(analysis.aggregate.map)
     how = f" (aggregated {how})" if how else ""
-    if first is None:
-        yield Evidence(
-            "contradicts",
-            f"The population optimum{how} still moved by more than {100 * _NEAR:.0f} % before the last trial.",
-        )
-        return
-    row = int(np.searchsorted(counts, first))
-    answering, open_ = int(np.isfinite(individual_errors[row]).sum()), int((individual_errors[row] > _NEAR).sum())
+    row = _early(progress.counts)
+    half, end, own = (
+        100 * float(np.median(v)) for v in (progress.halves[row], progress.halves[-1], progress.own_to_half[row])
+    )
     yield Evidence(
-        _side(open_ > 0),
-        f"From trial {first} on the population optimum{how} stayed within {100 * _NEAR:.0f} % (NRMSE) of its final"
-        f" place; {open_} of {answering} individual optima that could still move were further from theirs then"
-        " (supports: one at least).",
+        _side(half < own),
+        f"After {progress.counts[row]} trials the optimum of one half of the people{how} is {half:.0f} % (NRMSE,"
+        f" median of {progress.splits} random halves) from that of the other half after all trials, and individual"
+        f" optima are {own:.0f} % from it (supports: the half nearer than the individuals); after all trials the"
+        f" halves are {end:.0f} % apart.",
     )
     if results.reference is not None:
         miss = [
@@ -191,8 +202,9 @@ def _convergence(results):
         ]
         yield Evidence(
             _side(miss[0] <= miss[1] + _NEAR),
-            f"It was then {100 * miss[0]:.1f} % from {results.reference_name}, and {100 * miss[1]:.1f} % in the"
-            f" end{how} (supports: at most {100 * _NEAR:.0f} % more).",
+            f"The optimum of everybody's first {progress.counts[row]} answers is {100 * miss[0]:.1f} % from"
+            f" {results.reference_name}, that of all {100 * miss[1]:.1f} %{how}"
+            f" (supports: at most {100 * _NEAR:.0f} % more).",
         )
 
 

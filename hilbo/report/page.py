@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from hilbo.report.participants import People
 from hilbo.study.config import Study
 
-__all__ = ["Pictures", "rendered", "results_page"]
+__all__ = ["Pictures", "heads", "number", "percent", "rendered", "results_page"]
 
 Pictures = dict[str, dict[str, str]]
 """Figures by name, each with `png` (base64) and `width` (pixels), of `results.save_figures`."""
@@ -20,10 +20,24 @@ _SHOWN = 200  # participants in the page's table
 
 
 def results_page(
-    study: Study, content: dict[str, Any], figures: Pictures, people: People, how: str = "", drawn: Any = None
+    study: Study,
+    content: dict[str, Any],
+    figures: Pictures,
+    people: People,
+    *,
+    how: str = "",
+    drawn: Any = None,
+    selection: str = "",
+    comparison: Any = None,
+    halves: int = 0,
 ) -> str:
-    """The page of an aggregation. `how`: how maps of fewer trials are merged, where it is not as the map is; `drawn`:
-    of a large population, how many `participants` and individual `optima` its figures show."""
+    """The page of an aggregation.
+
+    **Arguments:** `how`: how maps of fewer trials are aggregated, where it is not as the map is; `drawn`: of a large
+    population, how many `participants` and individual `optima` its figures show; `selection`: how what was asked had
+    been chosen, where that is known; `comparison`: the section of `report.comparison`; `halves`: into
+    how many halves people were split to say how sure the optimum after fewer trials is.
+    """
     claims = {"aggregate": content["optimum"]} | content["alternatives"]
     if content["mean_of_optima"] is not None:
         claims["mean_of_optima"] = content["mean_of_optima"]
@@ -38,6 +52,9 @@ def results_page(
         claims=claims,
         how=how,
         drawn=drawn,
+        selection=selection,
+        comparison=comparison,
+        halves=halves,
     )
 
 
@@ -52,12 +69,12 @@ def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("hilbo.report"), autoescape=select_autoescape(), undefined=StrictUndefined
     )
-    environment.filters |= {"number": _number, "percent": _percent, "symbol": _symbol, "unit": _unit, "each": _each}
-    environment.globals |= {"heads": _heads, "zip": zip}
+    environment.filters |= {"number": number, "percent": percent, "symbol": _symbol, "unit": _unit, "each": _each}
+    environment.globals |= {"heads": heads, "zip": zip}
     return environment
 
 
-def _heads(study: Study, names: Iterable[str]) -> list[str]:
+def heads(study: Study, names: Iterable[str]) -> list[str]:
     """Parameters with their units, as heads of columns."""
     units = {"K0": "N/mm"} | {p.name: p.unit for p in study.space.parameters}
     return [f"{_symbol(name)} ({_unit(units[name])})" if units[name] else _symbol(name) for name in names]
@@ -71,15 +88,16 @@ def _unit(unit: str) -> str:
     return unit.replace("^alpha", "^α").replace("s^α", "sᵅ").replace(".", "·")
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     """Four significant digits, never with an exponent."""
     return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
 
 
-def _percent(share: float, digits: int = 0) -> str:
+def percent(share: float, digits: int = 0) -> str:
+    """A share in per cent."""
     return f"{100 * share:.{digits}f} %"
 
 
 def _each(values: Any, form: str | None = None) -> str:
     """Numbers of an array in a row, each by its form, or with four significant digits."""
-    return ", ".join(_number(v) if form is None else form % v for v in np.ravel(values))
+    return ", ".join(number(v) if form is None else form % v for v in np.ravel(values))

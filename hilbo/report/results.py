@@ -1,12 +1,11 @@
 """Results -> result.json, a population map in netCDF, figures, and one HTML page that explains itself.
 
 `write_results` makes a whole results folder from an analysis: result.json (DESIGN: "Results"), optima.csv, map.nc,
-the figures as PNG and SVG, and report.html with the figures inside.
+the figures as PNG, SVG and PDF, and report.html with the figures inside.
 """
 
 import base64
 import importlib.metadata
-import io
 import json
 import platform
 from collections.abc import Callable, Mapping
@@ -195,8 +194,16 @@ def write_results(
     folder: Path,
     truth: Float[np.ndarray, " d"] | None = None,
     say=lambda text: None,
+    *,
+    selection: str = "",
+    comparison: dict[str, Any] | None = None,
+    pictures: Pictures | None = None,
 ) -> dict[str, Any]:
-    """Write the results folder; returns the content of result.json. `say` is told what is being done."""
+    """Write the results folder; returns the content of result.json.
+
+    **Arguments:** `say` is told what is being done; `selection`, `comparison`: as `page.results_page`, whose further
+    `pictures` are those of the comparison.
+    """
     study, aggregate = population.study, population.aggregate
     people = people_of(study, aggregate)
     content = result(study, aggregate, population.seed, truth, people)
@@ -207,22 +214,20 @@ def write_results(
     data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     write_map(data, folder / "map.nc")
     say("figures and report")
-    page = results_page(
-        study, content, save_figures(_figures(population, truth), folder), people, in_place(aggregate.map)
-    )
+    pictures = save_figures(_figures(population, truth), folder) | (pictures or {})
+    told = {"how": in_place(aggregate.map), "halves": population.progress.splits}
+    page = results_page(study, content, pictures, people, selection=selection, comparison=comparison, **told)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content
 
 
 def save_figures(figures: Mapping[str, Any], folder: Path) -> Pictures:
-    """Write figures by name as PNG and SVG; returns what a page needs to hold them."""
+    """Write figures by name as PNG, SVG and PDF; returns what a page needs to hold them."""
+    from hilbo.report.figures.files import write_figure
+
     pictures = {}
     for name, figure in figures.items():
-        figure.savefig(folder / f"{name}.svg")
-        buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=200)
-        (folder / f"{name}.png").write_bytes(buffer.getvalue())
-        png = base64.b64encode(buffer.getvalue()).decode()
+        png = base64.b64encode(write_figure(figure, folder, name)).decode()
         pictures[name] = {"png": png, "width": str(round(_PIXELS * figure.get_figwidth()))}
     return pictures
 

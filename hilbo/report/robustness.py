@@ -20,14 +20,14 @@ _TENTH = 0.1  # of every search range: two renderings that a person would hardly
 _UNRELATED = 0.1
 
 
-def write_robustness(study: Study, cohort: Cohort, found: Robustness, folder: Path, seed: int = 0) -> dict[str, Any]:
+def write_robustness(study: Study, cohort: Cohort, check: Robustness, folder: Path, seed: int = 0) -> dict[str, Any]:
     """Write the folder of `hilbo robustness`; returns the content of result.json."""
-    content = robustness_result(study, cohort, found, seed)
+    content = robustness_result(study, cohort, check, seed)
     (folder / "result.json").write_text(as_json(content))
-    maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x)), found.fixed.x) for of in found.maps()]
+    maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x)), check.fixed.x) for of in check.maps()]
     both = xr.concat(maps, xr.DataArray(["fixed", "by evidence"], dims="hyperparameters", name="hyperparameters"))
     both.to_netcdf(folder / "map.nc", engine="h5netcdf")
-    pictures = save_figures(_figures(study, cohort, found), folder)
+    pictures = save_figures(_figures(study, cohort, check), folder)
     (folder / "report.html").write_text(robustness_page(study, content, pictures), encoding="utf-8")
     return content
 
@@ -70,15 +70,15 @@ def _figures(study, cohort, check):
     }
 
 
-def robustness_result(study: Study, cohort: Cohort, found: Robustness, seed: int) -> dict[str, Any]:
+def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int) -> dict[str, Any]:
     """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
-    learned, people = found.learned, len(cohort.names)
+    learned, people = check.learned, len(cohort.names)
     stacked = [np.broadcast_to(np.asarray(flags), (people,)) for flags in (learned.converged, learned.runaway)]
     rows = [
         {
             "participant": name,
-            "nrmse": float(found.individual_nrmse[j]),
-            "flagged": bool(found.flagged_individuals[j]),
+            "nrmse": float(check.individual_nrmse[j]),
+            "flagged": bool(check.flagged_individuals[j]),
             "converged": bool(stacked[0][j]),
             "runaway": bool(stacked[1][j]),
         }
@@ -86,24 +86,25 @@ def robustness_result(study: Study, cohort: Cohort, found: Robustness, seed: int
     ]
     model = learned.gp
     return {
-        "warnings": _warnings(found, stacked),
-        "fixed": optimum_content(study, found.fixed),
-        "optimised": optimum_content(study, found.optimised),
-        "nrmse": float(found.nrmse),
-        "flagged": bool(found.flagged),
-        "rule": found.rule,
+        "warnings": _warnings(check, stacked),
+        "fixed": optimum_content(study, check.fixed),
+        "optimised": optimum_content(study, check.optimised),
+        "nrmse": float(check.nrmse),
+        "flagged": bool(check.flagged),
+        "resampled": dict(zip(("median", "95 %"), np.percentile(check.resampled, [50, 95]).tolist(), strict=True)),
+        "rule": check.rule,
         "participants": rows,
         "learned": {
             "parameters": list(learned.learn),
-            "laplace_error": np.asarray(found.judged.error).tolist(),
-            "learnt_again": np.asarray(found.judged.again).tolist(),
-            "shared": found.shared,
+            "laplace_error": np.asarray(check.judged.error).tolist(),
+            "learnt_again": np.asarray(check.judged.again).tolist(),
+            "shared": check.shared,
             "theta": np.asarray(model.kernel.theta).tolist(),
             "variance": np.asarray(model.kernel.variance).tolist(),
             "noise": np.asarray(model.likelihood.noise).tolist(),
             "thresholds": np.asarray(model.likelihood.thresholds).tolist(),
         },
-        "sensitivity": {name: np.asarray(block).tolist() for name, block in found.sensitivity.items()},
+        "sensitivity": {name: np.asarray(block).tolist() for name, block in check.sensitivity.items()},
         "study": study.hash,
         "seed": seed,
         "versions": versions(),

@@ -17,15 +17,18 @@ import pandas as pd
 
 from hilbo.population.learnt import RECIPE
 from hilbo.report import validation
-from hilbo.report.comparison import comparison_table
+from hilbo.report.checklist import checklist
+from hilbo.report.comparison import comparison_section, comparison_table
+from hilbo.report.dictionary import dictionary
 from hilbo.report.hypotheses import Results, hypotheses
-from hilbo.report.page import Pictures, rendered
+from hilbo.report.page import Pictures, heads, number, percent, rendered
 from hilbo.report.participants import people_of
 from hilbo.report.results import as_json, map_dataset, moved, optima_table, result, save_figures, versions
 from hilbo.report.study_figures import comparison_figures, study_figures
 from hilbo.report.validation import Validated, slug, validate
 from hilbo.search.rendering import margin_of, set_of
 from hilbo.study.analysis import Analysis, analyse, moved_by_evidence
+from hilbo.study.config import Study
 from hilbo.study.folder import Material, StudyFolder
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
@@ -78,6 +81,7 @@ def write_study(
         study=folder.study,
         content=content,
         warnings=[*content["warnings"], *content["limits"]],
+        notes=folder.notes,
         sections=sections,
         people=sum(len(m.cohort.names) for m in folder.materials),
         hypotheses=claims,
@@ -133,7 +137,8 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
         "passivity": passivity_table(analysis),
     }
     shares = predictive_shares(data, len(study.responses))
-    pictures = save_figures(study_figures(analysis, material, shares), folder)
+    figures, hatched = study_figures(analysis, material, shares)
+    pictures = save_figures(figures, folder)
     if compared is not None:
         tables["comparison"] = comparison_table(compared)
         pictures |= save_figures(comparison_figures(compared), folder)
@@ -141,6 +146,7 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
         content["validation"] = validation.validation_content(validated)
         tables |= validation.validation_csv(validated)
         pictures |= save_figures(validation.validation_figures(validated), folder)
+    tables["dictionary"] = dictionary(tables, study)
     for name, table in tables.items():
         table.to_csv(folder / f"{name}.csv", index=False)
     content |= {
@@ -155,7 +161,9 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
         "tolerance": tables["tolerance"].to_dict("records"),
         "comparison": compared,
     }
-    return content, _section(material, analysis, validated, tables, pictures, content)
+    section = _section(material, analysis, validated, tables, pictures, content)
+    items = checklist(analysis, content, validated is not None)
+    return content, section | {"hatched": hatched, "checklist": items, "dictionary": tables["dictionary"]}
 
 
 def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
@@ -179,13 +187,18 @@ def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
 
 def convergence_table(found: Analysis) -> pd.DataFrame:
     """After each number of trials: NRMSE of the population's running optimum to its last, and of the individuals'
-    (median, quartiles, of those who gave as many answers), and answers in the highest category so far (paper, figures 5
-    and 7b)."""
+    (median, quartiles, of those who gave as many answers), both also to the optimum of a half of the people who are not
+    among them, and answers in the highest category so far (paper, figures 5 and 7b)."""
     study, counts = found.study, found.progress.counts
     population_errors, individual_errors = found.progress.to_end()
     top = np.asarray((found.cohort.trials.q == len(study.responses) - 1) & found.cohort.trials.mask)
     so_far = np.cumsum(top, axis=1)[:, counts - 1]
     table = pd.DataFrame({"trials": counts, "population": population_errors})
+    if found.progress.splits:
+        table["halves"] = np.median(found.progress.halves, axis=1)
+        table["individuals_to_half"] = np.nanmedian(
+            np.where(np.isnan(individual_errors), np.nan, found.progress.own_to_half), axis=1
+        )
     for name, values in (("individuals", individual_errors.T), ("top_answers", so_far)):
         table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.nanpercentile(values, [25, 50, 75], axis=0).T
     return table
@@ -259,8 +272,8 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "unknown": UNKNOWN,
         "how": in_place(analysis.aggregate.map),
         "reference": None if material.reference is None else material.reference_name,
-        "table_1": _shown(tables["table_I"]),
-        "passivity": _shown(tables["passivity"].dropna(axis=1, how="all")),
+        "table_1": _with_units(analysis.study, tables["table_I"]),
+        "alternatives": _alternatives(analysis.study, tables["passivity"]),
         "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
         "moved": content["optimised"]["nrmse"],
@@ -268,18 +281,33 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "without": [
             name for name, reading in readings.items() if all(i is None for i, _ in reading.tolerances.values())
         ],
-        "comparison": None if content["comparison"] is None else _comparison(content["comparison"]),
+        "comparison": content["comparison"] and comparison_section(analysis.study, content["comparison"]),
+        "halves": analysis.progress.splits,
         "validation": None if validated is None else validation.validation_section(validated),
     }
 
 
-def _comparison(compared):
-    """Recommendation and table of the rules."""
-    table = comparison_table(compared)
-    return {
-        "words": compared["recommendation"],
-        "table": _shown(table.drop(columns=["most_influential"]).dropna(axis=1, how="all")),
+def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
+    """Head and rows of the table of all optima on the page: no column without a number in it."""
+    forms: dict[str, tuple[str, Any]] = {
+        "f": ("f", "{:.2f}".format),
+        "sd": ("sd", "{:.2f}".format),
+        "p_top": (f'P("{study.responses[-1]}")', percent),
+        "passivity_margin": ("passivity margin (N·s/m)", "{:+.3f}".format),
     }
+    shown = table.dropna(axis=1, how="all").drop(columns="optimum")
+    parameters = [name for name in shown if name not in forms]
+    names = dict(zip(parameters, heads(study, parameters), strict=True)) | {k: head for k, (head, _) in forms.items()}
+    rows = [
+        [label, *("" if pd.isna(value) else forms.get(name, ("", number))[1](value) for name, value in row.items())]
+        for label, row in zip(table["optimum"], shown.to_dict("records"), strict=True)
+    ]
+    return {"head": ["", *(names[name] for name in shown)], "rows": rows}
+
+
+def _with_units(study: Study, table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:
+    """A table whose first column names parameters, these with their units."""
+    return _shown(table.assign(parameter=heads(study, table["parameter"])))
 
 
 def _shown(table: pd.DataFrame, digits: int = 4) -> tuple[list[str], list[list[str]]]:

@@ -12,19 +12,20 @@ __all__ = ["comparison_figures", "study_figures"]
 Figures = dict[str, Any]  # name -> figure
 
 
-def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray, np.ndarray]) -> Figures:
-    """Figures 4, 5, 6a, 7 and 8, people, individual optima and the predictive check; `shares` of
-    `inference_data.predictive_shares`."""
+def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray, np.ndarray]) -> tuple[Figures, bool]:
+    """Figures 4, 5, 6a, 7 and 8, people, individual optima and the predictive check; and whether a part of the map is
+    hatched. `shares`: of `inference_data.predictive_shares`."""
     from hilbo.report.figures import maps, study
 
     chosen, cohort, aggregate, progress = found.study, found.cohort, found.aggregate, found.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
     references = {} if material.reference is None else {material.reference_name: material.reference}
     regions = {"fixed hyperparameters": found.fixed, "optimised hyperparameters": found.optimised}
+    map_, hatched = study.sets_on_map(chosen, aggregate.surface, found.sets, best, cohort, prior)
     figures = {
         "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(found)),
         "convergence": study.individual_convergence(chosen, cohort, progress),
-        "map": study.sets_on_map(chosen, aggregate.surface, found.sets, best, cohort, prior),
+        "map": map_,
         "maps-after": maps.slices_after(chosen, progress),
         "population-convergence": study.population_convergence(progress, references),
         "classes": study.class_regions(regions),
@@ -34,7 +35,7 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
     if chosen.space.dim > 1:  # a scatter of one parameter is none
         marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)} | references
         figures["optima"] = maps.optima_scatter(chosen, np.asarray(aggregate.individuals.x), marks)
-    return figures
+    return figures, hatched
 
 
 def comparison_figures(content: dict[str, Any]) -> Figures:

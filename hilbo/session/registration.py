@@ -10,7 +10,7 @@ from typing import Any
 from hilbo.study.protocols import Phase, protocol
 from hilbo.study.study_file import StudyFile
 
-__all__ = ["registration"]
+__all__ = ["registration", "selection_words"]
 
 _OPEN = "**To be written by you.**"
 _ACQUISITIONS = {
@@ -89,17 +89,24 @@ def _trials(study: StudyFile, phase: Phase) -> list[str]:
     lines.append(f"* Before them at least {warm} trials of warm-up, which do not count.")
     if phase == "optimisation":
         chosen = study.selection
-        words = _ACQUISITIONS.get(chosen.acquisition, chosen.acquisition)
-        weight = f", weight {chosen.weight:g}" if chosen.acquisition == "ucb" else ""
         lines += [
-            f"* {chosen.trials} trials that count for each participant and material: {chosen.space_filling} spread over"
-            f" the stimuli, the others chosen from the participant's own answers ({words}{weight}).",
+            f"* {chosen.trials} trials that count for each participant and material: {selection_words(chosen)}.",
             f"* A session stops after {chosen.trials} answers, at no other result. A trial in which the presentation"
             " failed is void and comes again.",
         ]
     else:
         lines.append(f"* Each pair comes {shown.count} times; order and sides are in the plan.")
     return lines
+
+
+def selection_words(selection: Any) -> str:
+    """How the trials of a session are chosen, by the study file's table [selection]."""
+    words = _ACQUISITIONS.get(selection.acquisition, selection.acquisition)
+    weight = f", weight {selection.weight:g}" if selection.acquisition == "ucb" else ""
+    return (
+        f"{selection.space_filling} spread over the stimuli, the others chosen from the participant's own answers"
+        f" ({words}{weight})"
+    )
 
 
 def _exclusion(study: StudyFile) -> list[str]:

@@ -28,15 +28,17 @@ class _Plan(msgspec.Struct):
     participants: Annotated[tuple[_Row, ...], msgspec.Meta(min_length=1)]
 
 
-def departures(path: Path, study_hash: str, trials: int, counts: Mapping[str, Sequence[int]]) -> tuple[str, ...]:
-    """In sentences, from the plan in a file.
+def departures(
+    path: Path, study_hash: str, trials: int, counts: Mapping[str, Sequence[int]]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What departs from the plan in a file, in sentences; and what is as planned, if nothing does.
 
     **Arguments:** `study_hash`: of the study file of these answers; `trials`: that each person was to answer for each
     material; `counts`: person -> number of answers for each material. Raises InputError for a file that is no plan.
     """
     plan = decoded(read_bytes(path), _Plan, str(path), "is no plan; make one with hilbo plan")
     if plan.phase != _PHASE:
-        return (f"{path.name} is a plan of {plan.phase}, so that these answers are compared with no plan.",)
+        return (f"{path.name} is a plan of {plan.phase}, so that these answers are compared with no plan.",), ()
     planned = [row.participant for row in plan.participants]
     sentences = []
     if plan.study != study_hash:
@@ -51,5 +53,5 @@ def departures(path: Path, study_hash: str, trials: int, counts: Mapping[str, Se
     if other:
         sentences.append(f"Another number of answers than the planned {trials}: {', '.join(other)}.")
     if not sentences:
-        return (f"Nothing departs from the plan {plan.hash}: {len(planned)} participants, {trials} answers each.",)
-    return tuple(f"Departs from the plan {plan.hash}. {sentence}" for sentence in sentences)
+        return (), (f"Nothing departs from the plan {plan.hash}: {len(planned)} participants, {trials} answers each.",)
+    return tuple(f"Departs from the plan {plan.hash}. {sentence}" for sentence in sentences), ()

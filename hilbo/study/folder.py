@@ -50,6 +50,9 @@ class StudyFolder(NamedTuple):
     materials: list[Material]
     sets: pd.DataFrame | None
     limits: tuple[str, ...]
+    """What these tables cannot say, and what departs from the plan."""
+    notes: tuple[str, ...] = ()
+    """What is as it was planned."""
 
 
 def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
@@ -76,8 +79,9 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     }
     _check_materials_named(names, tables)
     materials = [_material(name, study, trials, compared, sets, truth) for name in names]
-    limits = (*_departures(folder / "plan.json", study, materials), *_missing_tables(materials, compared, sets))
-    return StudyFolder(study, materials, sets, limits)
+    departs, as_planned = _departures(folder / "plan.json", study, materials)
+    limits = (*departs, *_missing_tables(materials, compared, sets))
+    return StudyFolder(study, materials, sets, limits, as_planned)
 
 
 def _with_exclusion(study: Study, exclude: str | None) -> Study:
@@ -207,10 +211,10 @@ def _reference(
     return None, ""
 
 
-def _departures(path: Path, study: Study, materials: list[Material]) -> tuple[str, ...]:
-    """How the answers depart from the folder's plan, in sentences; none where there is no plan."""
+def _departures(path: Path, study: Study, materials: list[Material]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """How the answers depart from the folder's plan, and what is as planned; nothing where there is no plan."""
     if not path.exists():
-        return ()
+        return (), ()
     counts: dict[str, list[int]] = {}
     for material in materials:
         for name, count in zip(material.cohort.names, material.cohort.counts().tolist(), strict=True):

@@ -1,4 +1,4 @@
-"""What result.json says of the rule by which people were merged, and a warning where its assumptions fail."""
+"""What result.json says of the rule by which people were aggregated, and a warning where its assumptions fail."""
 
 import math
 from typing import Any
@@ -12,11 +12,11 @@ from hilbo.population.maps import RuleMap
 from hilbo.population.pointwise import RULES
 from hilbo.study.config import Study
 
-__all__ = ["heterogeneity", "in_place", "rule_warnings", "share_content"]
+__all__ = ["ALIKE", "SURE", "heterogeneity", "in_place", "rule_warnings", "share_content"]
 
-_ALIKE = ("bcm", "rbcm", "pooled")  # rules that take people to share one function
-_SURE = 3.0  # log Bayes factor, about 20 to 1
-_TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
+ALIKE = ("bcm", "rbcm", "pooled")  # rules that take people to share one function
+SURE = 3.0  # log Bayes factor, about 20 to 1
+_TOOSURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
 
 
 def heterogeneity(aggregate: Any) -> dict[str, Any] | None:
@@ -35,19 +35,19 @@ def share_content(share: Share) -> dict[str, Any]:
     }
 
 
-def in_place(found: RuleMap) -> str:
-    """How maps of fewer trials, or of bootstrap resamples, are merged where that is not as the map is; else nothing."""
-    if found.rule == RECIPE:
+def in_place(map_: RuleMap) -> str:
+    """How maps of fewer trials, and of bootstrap resamples, are aggregated where that differs; else nothing."""
+    if map_.rule == RECIPE:
         return "by the rule hierarchical point by point, with the learnt hyperparameters"
-    if found.rule not in RULES:
+    if map_.rule not in RULES:
         return "by bcm"
-    return "" if found.method == "by points" else f"by the rule {found.rule} point by point"
+    return "" if map_.method == "by points" else f"by the rule {map_.rule} point by point"
 
 
 def rule_warnings(study: Study, aggregate: Any) -> list[str]:
     """A sentence where the study's rule takes people to be alike and the answers say that they are not."""
     share = aggregate.share
-    if share is None or study.rule not in _ALIKE or float(share.against_one) < _SURE:
+    if share is None or study.rule not in ALIKE or float(share.against_one) < SURE:
         return []
     low, high = (float(end) for end in share.interval)
     words = (
@@ -55,12 +55,12 @@ def rule_warnings(study: Study, aggregate: Any) -> list[str]:
         f' and the rule "{study.rule}" takes that to be 1'
     )
     ratio = _sd_ratio(aggregate)
-    if ratio is not None and ratio >= _TOO_SURE:
+    if ratio is not None and ratio >= _TOOSURE:
         words += (
             f"; at its optimum the map says a standard deviation of {float(aggregate.optimum.sd):.2f}, the hierarchical"
             f" one {ratio:.1f} times as much"
         )
-    return [words + '. Where intervals matter, use rule = "hierarchical"; its optimum stands among the alternatives.']
+    return [words + '. Its intervals are too narrow; those of the rule "hierarchical" allow for differences.']
 
 
 def _sd_ratio(aggregate: Any) -> float | None:

@@ -1,28 +1,35 @@
 """How optima come about: the population's and everybody's own after everybody's first 1, 2, ... trials.
 
 A prefix of the trials is fitted like any cohort and searched from the same candidates; the last point is the aggregate
-itself, which is fitted already. Maps of prefixes are merged point by point: by the study's rule, or by bcm where the
-rule takes all answers at once.
+itself, which is fitted already. Maps of prefixes are aggregated point by point: by the study's rule, or by bcm
+where the rule takes all answers at once.
+
+The way to one's own last place ends at 0 whatever the answers. So people are also split into random halves, which share
+nobody: how far is the optimum of one half, after fewer trials, from that of the other half after all?
 """
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.maps import RuleMap, point_rule
+from hilbo.population.pointwise import Rule, aggregate
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, fit_cohort, individual_optima, map_optimum
 from hilbo.study.config import Study
 
-__all__ = ["Progress", "follow", "settled"]
+__all__ = ["Progress", "follow"]
 
-_SETTLED = 0.05  # NRMSE: an optimum that stays this near to its last place has settled
+_SPLITS = 50  # of the people into halves
+_FEWEST = 4  # people who can be split
+_POINTS = 1000  # at which the optimum of a half is sought
 _LONGEST = 25  # points of a progress curve
 _AT_A_TIME = 2  # of which so many are computed: each search keeps a core busy, and no more
 _MOMENTS = (5, 15, 25)  # numbers of trials whose maps are drawn, as in the paper, and all trials
@@ -36,8 +43,17 @@ class Progress(NamedTuple):
     own: Float[np.ndarray, "p M d"]
     ends: Int[np.ndarray, " M"]
     """How many answers each person gave."""
+    halves: Float[np.ndarray, "p s"]
+    """NRMSE of the optimum of one half of the people to the other half's after all trials, for every split and side."""
+    own_to_half: Float[np.ndarray, "p M"]
+    """The same of each person's own optimum, to the half without that person; median over the splits."""
     maps: dict[int, RuleMap]
     """The population's map, with everybody's posteriors in it, after some of `counts`: those that are drawn."""
+
+    @property
+    def splits(self) -> int:
+        """How many optima of halves there are; 0 where people were too few to be split."""
+        return self.halves.shape[1]
 
     @property
     def moments(self) -> list[int]:
@@ -59,47 +75,82 @@ class Progress(NamedTuple):
         individual = np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
         return population, np.where(self.counts[:, None] <= self.ends[None, :], individual, np.nan)
 
-    def settled(self, within: float) -> list[int | None]:
-        """Of everybody the trial from which their own optimum stayed within this NRMSE of its final place; None where
-        that cannot be said."""
-        _, individual = self.to_end()
-        lasts = np.searchsorted(self.counts, self.ends, side="right")
-        return [settled(self.counts[:k], individual[:k, j], within) for j, k in enumerate(lasts)]
 
-
-def follow(study: Study, aggregate: Aggregate, seed: int = 0, counts: Sequence[int] | None = None) -> Progress:
+def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[int] | None = None) -> Progress:
     """The optima of the aggregate's cohort after fewer trials, by the hyperparameters of `study`.
 
     `counts`: numbers of trials, ascending; by default at most 25 of them up to the longest session. The longest is
     always the last, and is not fitted again.
     """
-    cohort = aggregate.cohort
+    cohort = aggregated.cohort
     ends = cohort.counts()
     longest = int(ends.max())
     asked = _counts(ends) if counts is None else np.unique([*counts, longest])
     candidates = search_points(study.space, seed)
 
-    def after(count: int) -> tuple[np.ndarray, np.ndarray, RuleMap | None]:
+    split = _splits(len(cohort.names), seed)
+    points = candidates[: min(_POINTS, len(candidates))]
+
+    def after(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, RuleMap | None]:
         last = count == longest
-        posteriors = aggregate.posteriors if last else fit_cohort(study, cohort.first(count))
-        map_ = _map_by_points(study, aggregate.map.share, posteriors)
+        posteriors = aggregated.posteriors if last else fit_cohort(study, cohort.first(count))
+        map_ = _map_by_points(study, aggregated.map.share, posteriors)
         population = np.asarray(map_optimum(study, map_, candidates).x)
-        optima = aggregate.individuals if last else individual_optima(study, posteriors, candidates)
-        return population, np.asarray(optima.x), map_ if last or count in _MOMENTS else None
+        optima = aggregated.individuals if last else individual_optima(study, posteriors, candidates)
+        halves = np.asarray(points)[_tops(map_, points, split)]
+        return population, np.asarray(optima.x), halves, map_ if last or count in _MOMENTS else None
 
     found = [after(count) for count in asked[:1].tolist()]  # whose programs serve the others
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
         found += pool.map(after, asked[1:].tolist())
-    population, individual, maps = zip(*found, strict=True)
+    population, individual, halves, maps = zip(*found, strict=True)
     kept = {count: map_ for count, map_ in zip(asked.tolist(), maps, strict=True) if map_ is not None}
-    return Progress(asked, np.stack(population), np.stack(individual), ends, kept)
+    own, tops = np.stack(individual), np.stack(halves)
+    return Progress(asked, np.stack(population), own, ends, *_to_other_half(tops, own, split), kept)
 
 
-def settled(counts: Int[np.ndarray, " p"], errors: Float[np.ndarray, " p"], within: float = _SETTLED) -> int | None:
-    """The first of `counts` from which all errors are `within`; None if only the last one is, which says nothing."""
-    beyond = np.flatnonzero(errors > within)
-    first = 0 if not len(beyond) else int(beyond[-1]) + 1
-    return int(counts[first]) if first < len(counts) - 1 else None
+def _splits(people: int, seed: int) -> Bool[np.ndarray, "s M"]:
+    """Who is in the first half, of every split; no split where a half would be one person."""
+    if people < _FEWEST:
+        return np.zeros((0, people), bool)
+    rng = np.random.default_rng(seed)
+    order = np.stack([rng.permutation(people) for _ in range(_SPLITS)])
+    return order < people // 2
+
+
+def _tops(map_: RuleMap, points: Float[Array, "m d"], split: Bool[np.ndarray, "s M"]) -> Int[np.ndarray, "s 2"]:
+    """Of both halves of every split, the row of the point where the half's map is highest."""
+    if not len(split):
+        return np.zeros((0, 2), int)
+    sides = np.stack([split, ~split], axis=1).reshape(-1, split.shape[1])
+    return np.asarray(_highest(map_, points, jnp.asarray(sides))).reshape(-1, 2)
+
+
+@program
+def _highest(map_: RuleMap, points: Float[Array, "m d"], sides: Bool[Array, "k M"]) -> Int[Array, " k"]:
+    """For each choice of people, the row of the point where their map is highest."""
+    means, explained = jax.lax.map(lambda person: person.predict_explained(points), map_.experts)
+
+    share = map_.share if map_.rule == "hierarchical" else None
+
+    def one(chosen: Bool[Array, " M"]) -> Int[Array, ""]:
+        mean, _ = aggregate(cast(Rule, map_.rule), means, explained, map_.prior, share=share, mask=chosen)
+        return jnp.argmax(mean)
+
+    return jax.lax.map(one, sides)
+
+
+def _to_other_half(
+    tops: Float[np.ndarray, "p s 2 d"], own: Float[np.ndarray, "p M d"], split: Bool[np.ndarray, "s M"]
+) -> tuple[Float[np.ndarray, "p s2"], Float[np.ndarray, "p M"]]:
+    """NRMSE to where the other half's optimum is after all trials: of each half's optimum, and of each person's own."""
+    if not len(split):
+        return np.zeros((len(tops), 0)), np.full(own.shape[:2], np.nan)
+    last = tops[-1, :, ::-1]  # of a half, the other half's
+    halves = np.sqrt(np.mean((tops - last) ** 2, axis=-1)).reshape(len(tops), -1)
+    others = np.where(split[:, :, None], last[:, :1], last[:, 1:])  # of each person, the half without that person
+    person = np.sqrt(np.mean((own[:, None] - others) ** 2, axis=-1))
+    return halves, np.median(person, axis=1)
 
 
 def _map_by_points(study: Study, share: Float[Array, ""], posteriors: Posterior) -> RuleMap:

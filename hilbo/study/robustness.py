@@ -2,8 +2,9 @@
 
 The population optimum and everybody's own are found twice, under the study's fixed hyperparameters and under learnt
 ones (shared by all, or each person's own), and compared in units of the search ranges (NRMSE). Besides, the derivative
-of the population optimum with respect to each hyperparameter says which of them it leans on. People are merged by the
-study's rule, point by point; the share of the hierarchical rule is learnt anew, and held for the derivative.
+of the population optimum with respect to each hyperparameter says which of them it leans on. People are aggregated by
+the study's rule, point by point; the share of the hierarchical rule is learnt anew, and held for the derivative. Beside
+the shift stands what the choice of the people leaves open anyway: a bootstrap over people.
 Paper, section IV-3: less than 3 %.
 """
 
@@ -27,9 +28,11 @@ from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.resampled_optimum import resampled_tops
 
 __all__ = ["LIMIT", "Robustness", "robustness"]
 
+_POINTS = 1000  # among which the optimum of resampled people is sought
 LIMIT = 0.03
 """NRMSE from which an optimum is flagged as not robust (paper, section IV-3)."""
 
@@ -50,11 +53,13 @@ class Robustness(eqx.Module):
     nrmse: Float[Array, ""]
     """Between the population optima."""
     individual_nrmse: Float[Array, " M"]
+    resampled: Float[Array, " draws"]
+    """NRMSE of the population optimum of bootstrap resamples of the people to that of all, fixed hyperparameters."""
     sensitivity: dict[str, Float[Array, "..."]]
     """d(population optimum, unit cube) / d(log theta, log noise, first threshold, log gaps) at the fixed values."""
     shared: bool = eqx.field(static=True)
     rule: Rule = eqx.field(static=True)
-    """By which people were merged, point by point: the study's, or bcm where that takes all answers at once."""
+    """By which people were aggregated, point by point: the study's, or bcm where that takes all answers at once."""
     shares: tuple[Float[Array, ""] | None, Float[Array, ""] | None]
     """Of the hierarchical rule, under the fixed and under the learnt hyperparameters."""
 
@@ -130,11 +135,27 @@ def robustness(
         posteriors_learnt=again,
         nrmse=nrmse(optimised.x, fixed.x),
         individual_nrmse=jnp.sqrt(jnp.mean((after.x - before.x) ** 2, axis=1)),
+        resampled=_resampled(study, posteriors, candidates, fixed.x, rule, share, seed),
         sensitivity=_sensitivity(study, cohort.trials, fixed.x, tuple(learn), rule, share),
         shared=shared,
         rule=rule,
         shares=shares,
     )
+
+
+def _resampled(
+    study: Study,
+    posteriors: Posterior,
+    candidates: Float[Array, "m d"],
+    x: Float[Array, " d"],
+    rule: Rule,
+    share: Float[Array, ""] | None,
+    seed: int,
+) -> Float[Array, " draws"]:
+    """How far the optimum of resampled people is from x, sought among x and some of the candidates."""
+    points = jnp.concatenate([x[None, :], candidates[:_POINTS]])
+    tops = resampled_tops(posteriors, points, rule, share, study.gp.kernel.variance, seed)
+    return jnp.sqrt(jnp.mean((points[tops] - x) ** 2, axis=1))
 
 
 def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:

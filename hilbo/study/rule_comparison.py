@@ -2,8 +2,8 @@
 
 For each rule: the predictive density, calibration and reliability with each person left out (`leave_one_out`); its
 optimum; how the optimum is spread, by joint draws of the map (of bcm, hierarchical and pooled, whose joint posterior is
-known) and by a bootstrap over people (of the rules that merge people point by point); what each person moves; how it
-agrees with one model of all answers; and how much of the space the answers cover, the map's standard deviation over
+known) and by a bootstrap over people (of the rules that aggregate people point by point); what each person moves; how
+it agrees with one model of all answers; and how much of the space the answers cover, the map's standard deviation over
 what it is without answers. And, once, how people differ, with a recommendation in words.
 """
 
@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
-from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
 from hilbo.population.joint import joint_map, posterior_map
 from hilbo.population.learnt import RECIPE
@@ -38,10 +37,11 @@ from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, map_optimum, nrmse
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.heterogeneity import share_content
+from hilbo.study.heterogeneity import ALIKE, SURE, share_content
 from hilbo.study.learnt_study import resolved, that_learns
+from hilbo.study.resampled_optimum import resampled_tops
 
-__all__ = ["KNOWN", "compare", "recommendation"]
+__all__ = ["KNOWN", "compare", "differences", "recommendation"]
 
 KNOWN = 0.8
 """Where the map's standard deviation is below so much of what it is without answers, these cover the space."""
@@ -84,6 +84,8 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
         rules[rule]["hyperparameters"] = "given" if study.learnt is None else "learnt from all answers"
     if learns:
         left[RECIPE], rules[RECIPE] = _learnt_entry(study, cohort, everybody, posteriors, pooled, candidates, x, seed)
+    for rule, (difference, error) in differences(left).items():
+        rules[rule] |= {"difference": difference, "difference_error": error}
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
     return content | {"rules": rules, "recommendation": recommendation(left, rules, share, len(answered))}
 
@@ -176,17 +178,9 @@ def _by_bootstrap(
     """Quantiles of where the map of people drawn with replacement is largest; None for rules that take all at once."""
     if map_.rule not in RULES:
         return None
-    means, explained = jax.vmap(lambda person: person.predict_explained(x))(posteriors)
-    people = means.shape[0]
-    rows = np.random.default_rng(seed).integers(0, people, (_DRAWS // 4, people))
     share = map_.share if map_.rule == "hierarchical" else None
-
-    def top(rows):
-        mean, _ = pointwise.aggregate(map_.rule, means[rows], explained[rows], map_.prior, share=share)  # type: ignore[arg-type]
-        return jnp.argmax(mean)
-
-    rows_of_optima = np.asarray(jax.jit(lambda rows: jax.lax.map(top, rows))(jnp.asarray(rows)))
-    return _quantiles(study, x, np.bincount(rows_of_optima, minlength=x.shape[0]) / len(rows_of_optima))
+    tops = resampled_tops(posteriors, x, map_.rule, share, map_.prior, seed, _DRAWS // 4)
+    return _quantiles(study, x, np.bincount(tops, minlength=x.shape[0]) / len(tops))
 
 
 def _quantiles(study: Study, x: Float[Array, "p d"], weight: Float[np.ndarray, " p"]) -> dict[str, list[float]]:
@@ -207,7 +201,8 @@ def _parameters(study: Study, x: Float[Array, " d"]) -> dict[str, float]:
 
 def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Share, people: int) -> str:
     """How people differ and which rule predicts best, in a few sentences; `left`: what each rule predicted of
-    everybody's answers. A rule is recommended only if the others predict worse by more than two errors.
+    everybody's answers. A rule is recommended only if the others predict worse by more than two errors, and if it does
+    not take people to be alike where these differ.
 
     Costs are compared answer by answer, with errors by person: people are predicted well or badly by all rules alike,
     which the error of one rule's mean cost would take for doubt.
@@ -217,7 +212,7 @@ def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Sh
     low, high = (float(end) for end in share.interval)
     differ = float(share.against_one)
     evidence = (
-        "People differ" if differ > 3 else "Nothing says that people differ" if differ < 0 else "People may differ"
+        "People differ" if differ > SURE else "Nothing says that people differ" if differ < 0 else "People may differ"
     )
     words = (
         f"{evidence}: they share {float(share.mean):.2f} of the prior variance (95 % from {low:.2f} to {high:.2f}; log"
@@ -225,8 +220,10 @@ def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Sh
         f" ({scored[best]['negative_log_density']:.3f} ± {scored[best]['negative_log_density_error']:.3f} nats an"
         f" answer; {100 * scored[best]['central_95']:.1f} % of the answers lie in its central 95 %)."
     )
-    tied = [rule for rule in scored if rule != best and _near(left[rule], left[best])]
-    if tied:
+    tied = [rule for rule, gap in differences(left).items() if rule != best and _near(*gap)]
+    if best in ALIKE and differ > SURE:
+        words += f" No rule is recommended: {best} takes people to be alike, so that its intervals are too narrow."
+    elif tied:
         words += f" No rule is recommended: {', '.join(tied)} predict{'s' * (len(tied) == 1)} as well, within two"
         words += " standard errors of the difference."
     else:
@@ -236,7 +233,13 @@ def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Sh
     return words
 
 
-def _near(other: LeftOut, best: LeftOut) -> bool:
-    """Whether the difference of two rules' costs is within two of its errors by person."""
-    gap, error = clustered(other.cost - best.cost, best.person)
-    return not math.isfinite(error) or gap <= 2 * error
+def differences(left: Mapping[str, LeftOut]) -> dict[str, tuple[float, float]]:
+    """How much more each rule's mean cost is than the best rule's (nats an answer), with the standard error of that
+    difference, paired by answer and clustered by person; 0 and 0 for the best."""
+    best = min(left, key=lambda rule: left[rule].cost.mean())
+    return {rule: clustered(each.cost - left[best].cost, each.person) for rule, each in left.items()}
+
+
+def _near(difference: float, error: float) -> bool:
+    """Whether a difference is within two of its standard errors."""
+    return not math.isfinite(error) or difference <= 2 * error

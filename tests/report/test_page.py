@@ -52,6 +52,7 @@ def robust(shared, nrmse):
         "optimised": optimum,
         "nrmse": nrmse,
         "flagged": nrmse >= 0.03,
+        "resampled": {"median": 0.02, "95 %": 0.025},
         "rule": "bcm",
         "participants": [still, still | {"participant": "B", "nrmse": 0.2, "flagged": True, "converged": False}],
         "learned": learned,
@@ -70,6 +71,7 @@ def test_the_page_of_a_robustness_check():
     assert table in page and "a &lt; b" in page
     assert "moved by 3 % or more: B." in page and "B 20.0 % flagged, search not converged" in page
     assert "ln theta +1.00 % -2.00 %" in page and "ln gap 2 +2.00 % +4.00 %" in page
+    assert "open by 2.0 % (median" in page and "so that the shift is within that sampling error" in page
     own = robust(shared=False, nrmse=0.03)
     assert "each person's own" in own.replace("&#39;", "'") and "[gp]" not in own
-    assert "which is 3 % or more: it is not robust" in own
+    assert "which is 3 % or more: it is not robust" in own and "the shift is more than that" in own

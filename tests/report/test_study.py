@@ -18,9 +18,10 @@ from studies import paper_counts, plain
 
 from hilbo import Trials
 from hilbo.population.maps import RuleMap
+from hilbo.report.comparison import comparison_section
 from hilbo.report.figures.study import individual_convergence
-from hilbo.report.hypotheses import _convergence, _materials
-from hilbo.report.study import _comparison, _shown, _tolerances
+from hilbo.report.hypotheses import _convergence, _materials, _nearer_to_others
+from hilbo.report.study import _alternatives, _shown, _tolerances
 from hilbo.report.study_figures import comparison_figures
 from hilbo.report.validation import validate
 from hilbo.study.aggregate import fit_cohort, population
@@ -28,7 +29,7 @@ from hilbo.study.analysis import limits_of
 from hilbo.study.cohort import Cohort
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.map_summary import tolerance
-from hilbo.study.progress import Progress, _counts, settled
+from hilbo.study.progress import Progress, _counts, _splits, _to_other_half
 from hilbo.study.tolerance_intervals import tolerance_ends
 
 
@@ -60,32 +61,46 @@ def test_limits_are_named():
     assert "own, shrunk towards the prior, and nothing" in shrunk
 
 
-@pytest.mark.parametrize(
-    ("errors", "expected"), [([0.5, 0.2, 0.04, 0.01, 0], 3), ([0.5, 0.5, 0.5, 0.5, 0], None), ([0.0] * 5, 1)]
-)
-def test_when_an_optimum_has_settled(errors, expected):
-    assert settled(np.arange(1, 6), np.array(errors, float)) == expected
+def test_halves_share_nobody_and_people_are_held_against_the_half_without_them():
+    split = _splits(5, 0)
+    assert split.shape == (50, 5) and (split.sum(axis=1) == 2).all() and not len(_splits(3, 0))
+    tops = np.array([[[[0.0], [1.0]]], [[[0.2], [0.6]]]])  # after two numbers of trials, one split, two halves
+    halves, own = _to_other_half(tops, np.array([[[0.1], [0.1]], [[0.3], [0.5]]]), np.array([[True, False]]))
+    np.testing.assert_allclose(halves, [[0.6, 0.8], [0.4, 0.4]])
+    np.testing.assert_allclose(own, [[0.5, 0.1], [0.3, 0.3]])  # the first person is in the first half
+    none, nan = _to_other_half(tops[:, :0], np.zeros((2, 3, 1)), np.zeros((0, 3), bool))
+    assert none.shape == (2, 0) and np.isnan(nan).all()
 
 
 def test_who_stopped_early_has_not_converged_for_that():
     """One moves until the end, one stays from trial 2 on, and one stops after a trial or two, still moving."""
     ways = np.array([[0, 1, 2, 3, 4, 5], [0, 5, 5, 5, 5, 5], [0, 5, 5, 5, 5, 5]]).T / 10
-    progress = Progress(np.arange(1, 7), ways[:, 1:2], ways[:, :, None], np.array([6, 6, 2]), {})
-    assert progress.settled(0.05) == [None, 2, None]
+    halves, own = np.full((6, 4), 0.1), np.full((6, 3), 0.2)
+    progress = Progress(np.arange(1, 7), ways[:, 1:2], ways[:, :, None], np.array([6, 6, 2]), halves, own, {})
     assert np.isnan(progress.to_end()[1][2:, 2]).all() and np.isfinite(progress.to_end()[1][:, :2]).all()
     assert set(_counts(crowd([HILL, HILL[:4], HILL[:7]]).counts())) >= {4, 5, 7, 9}
-    (line,) = individual_convergence(plain(), crowd([HILL, HILL, HILL[:2]]), progress).axes[0].lines
+    line, others = individual_convergence(plain(), crowd([HILL, HILL, HILL[:2]]), progress).axes[0].lines
     np.testing.assert_allclose(line.get_ydata(), [50, 0, 15, 10, 5, 0], atol=1e-12)
+    np.testing.assert_allclose(others.get_ydata(), 20)
+
+
+def test_convergence_is_judged_by_people_who_are_not_among_them():
+    """Not by a study's own last point, to which everything comes, random answers too."""
     one = jnp.ones(())
     aggregate = SimpleNamespace(map=RuleMap("bcm", "by points", None, None, one, one))
-    for end, words in ((2, "1 of 3 individual optima"), (1, "1 of 2 individual optima")):
-        found = SimpleNamespace(
-            progress=progress._replace(ends=np.array([6, 6, end])),
-            cohort=SimpleNamespace(names=("A", "B", "C")),
-            aggregate=aggregate,
+    still = np.zeros((6, 3, 1))
+    for halves, own, side in ((0.1, 0.2, "supports"), (0.3, 0.2, "contradicts")):
+        progress = Progress(
+            np.arange(1, 7), still[:, 0], still, np.full(3, 6), np.full((6, 4), halves), np.full((6, 3), own), {}
         )
+        found = SimpleNamespace(progress=progress, aggregate=aggregate)
         (item,) = _convergence(SimpleNamespace(found=found, reference=None))
-        assert item.side == "supports" and words in item.text and "(supports: one at least)" in item.text
+        assert item.side == side and f"{100 * halves:.0f} % (NRMSE, median of 4" in item.text
+    own = np.linspace(0.5, 0.2, 6)[:, None] + np.array([0.0, 0.01, -0.01])
+    assert _nearer_to_others(progress._replace(own_to_half=own)).side == "supports"
+    assert _nearer_to_others(progress._replace(own_to_half=own[::-1])).side == "contradicts"
+    random = np.random.default_rng(0).uniform(size=(6, 3))
+    assert _nearer_to_others(progress._replace(own_to_half=random)).side == "inconclusive"
 
 
 def test_other_materials_are_the_others():
@@ -209,6 +224,8 @@ def test_the_comparison_of_rules_is_shown():
     scores = {
         "negative_log_density": 1.1,
         "negative_log_density_error": 0.1,
+        "difference": 0.0,
+        "difference_error": 0.0,
         "central_95": 0.94,
         "central_95_error": 0.01,
     }
@@ -221,17 +238,20 @@ def test_the_comparison_of_rules_is_shown():
         "optimum": {"u": 0.4, "v": 12.0},
     }
     found |= {"influence": {"A": 0.1, "B": 0.3}, "reliability": bins}
+    worse = found | {"negative_log_density": 1.3, "difference": 0.2, "difference_error": 0.05}
     content = {
-        "rules": {"bcm": found, "hierarchical": found, "pooled": {"refused": "too many"}},
-        "recommendation": "Use bcm.",
+        "rules": {"bcm": worse, "hierarchical": found, "pooled": {"refused": "too many"}},
+        "recommendation": "Use hierarchical.",
     }
-    shown = _comparison(content)
-    head, rows = shown["table"]
-    assert (
-        shown["words"] == "Use bcm."
-        and head[0] == "rule"
-        and [row[0] for row in rows] == ["bcm", "hierarchical", "pooled"]
-    )
-    assert "too many" in rows[2] and "–" in rows[2]
+    shown = comparison_section(plain(), content)
+    assert shown["words"] == "Use hierarchical." and shown["head"][:3] == ["rule", "negative log density", "difference"]
+    assert [row[:3] for row in shown["rows"]] == [["hierarchical", "1.100", ""], ["bcm", "1.300", "+0.200 ± 0.050"]]
+    assert shown["refused"] == ["pooled: too many"]
     figures = comparison_figures(content)
     assert set(figures) == {"comparison", "reliability"} and len(figures["comparison"].axes) == 2
+
+
+def test_no_column_of_what_is_not_there():
+    rows = {"optimum": ["population", "mid"], "u": [0.25, 1.0], "f": [0.123, np.nan], "passivity_margin": [None, None]}
+    shown = _alternatives(plain(), pd.DataFrame(rows))
+    assert shown == {"head": ["", "u", "f"], "rows": [["population", "0.25", "0.12"], ["mid", "1", ""]]}

@@ -75,6 +75,8 @@ def test_the_best_is_recommended_where_the_others_are_worse():
     """0.05 is a third of a mean cost's error, and far more than the difference's."""
     words = advice(share(0.5, 40.0), bcm=2.2, hierarchical=2.15, rbcm=2.3)
     assert "People differ" in words and "use hierarchical" in words and "Exploratory" in words
+    alike = advice(share(0.5, 40.0), bcm=2.1, hierarchical=2.15, rbcm=2.3)  # best, though people differ
+    assert "No rule is recommended: bcm takes people to be alike" in alike and "use bcm" not in alike
 
 
 def test_nothing_is_recommended_on_a_tie():

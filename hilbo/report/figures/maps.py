@@ -1,12 +1,12 @@
-"""Figures of population maps: slices, progress over trials, individual optima; and the style that all figures share.
+"""Figures of population maps: slices, progress over trials, individual optima.
 
-A figure is a function from results to a matplotlib `Figure`; nothing is shown or saved here. Maps use cividis and lines
-the Okabe-Ito colours, which people with colour-blindness can tell apart. Axes are in physical units.
+A figure is a function from results to a matplotlib `Figure`; nothing is shown or saved here. Axes are in physical
+units.
 """
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import matplotlib as mpl
@@ -16,8 +16,28 @@ from jaxtyping import Float
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
+from matplotlib.lines import Line2D
 
+from hilbo.report.figures.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ONE_COLUMN,
+    ORANGE,
+    RED,
+    STYLE,
+    TWO_COLUMNS,
+    answer_handles,
+    answer_look,
+    band,
+    few_ticks,
+    label_axes,
+    legend,
+    level_words,
+    mark_trials,
+    star,
+    title,
+)
 from hilbo.study.aggregate import predict_map
 from hilbo.study.analysis import Population
 from hilbo.study.cohort import Cohort
@@ -25,46 +45,33 @@ from hilbo.study.config import Study
 from hilbo.study.progress import Progress
 
 __all__ = [
-    "BLUE",
-    "GREEN",
-    "GREY",
-    "ORANGE",
-    "RED",
-    "STYLE",
-    "band",
+    "Slice",
     "grid_slice",
-    "label_axes",
-    "level_words",
+    "map_handles",
     "map_panels",
     "map_slices",
     "maps_beside",
-    "mark_trials",
     "moved_optima",
     "optima_scatter",
     "progress_figure",
     "sides",
     "slices_after",
-    "star",
 ]
 
-BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
-STYLE: dict = {
-    "font.size": 9,
-    "axes.titlesize": 9,
-    "axes.labelsize": 9,
-    "legend.fontsize": 8,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-}
 _CELLS = 101
-_NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are drawn on it
+_MEANS, _SDS = 8, 4  # contours of a map, about
 _APART = 0.15  # between slices, in the unit cube
-_OTHER: dict = {"s": 7, "marker": "o", "facecolor": "white", "edgecolor": "black", "linewidth": 0.4}
-_TOP: dict = {"s": 16, "marker": "o", "facecolor": ORANGE, "edgecolor": "black", "linewidth": 0.5}
 
 
 Surface = Callable[..., tuple[Any, Any]]
 """Mean and variance (m,) of a map at points (m, d) of the unit cube."""
+
+
+class Slice(NamedTuple):
+    """Mean and standard deviation (c, c) of a map over the first two parameters, NaN where nothing may be rendered."""
+
+    mean: Float[np.ndarray, "c c"]
+    sd: Float[np.ndarray, "c c"]
 
 
 def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
@@ -85,9 +92,8 @@ def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"],
         here = third is None or third == float(optimum[2])
         if here:
             star(axes, study, optimum)
-        axes.set_title(
-            "" if third is None else level_words(study, 2, third) + (" (optimum)" if here else ""), fontsize=9
-        )
+        title(axes, "" if third is None else level_words(study, 2, third) + (" (optimum)" if here else ""))
+    legend(figure, [*answer_handles(study), *map_handles()])
     return figure
 
 
@@ -109,7 +115,7 @@ def maps_beside(study: Study, maps: Mapping[str, Surface], optima: Float[np.ndar
     for axes, name, x, third, values in zip(panels, maps, optima, thirds, grids, strict=True):
         draw(axes, values)
         star(axes, study, x)
-        axes.set_title(name + (f", {level_words(study, 2, third)}" if third is not None else ""), fontsize=9)
+        title(axes, name + (f", {level_words(study, 2, third)}" if third is not None else ""))
     return figure
 
 
@@ -118,14 +124,14 @@ def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population
     percent = 100 * np.asarray(moves)
     order, rows = np.argsort(percent), np.arange(len(percent))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.6, 1.2 + 0.16 * len(percent)), layout="constrained")
+        figure = Figure(figsize=(ONE_COLUMN, 1.2 + 0.14 * len(percent)), layout="constrained")
         axes = figure.subplots()
         axes.scatter(percent[order], rows, s=20, color=np.where(percent[order] < 100 * limit, BLUE, ORANGE), zorder=3)
         axes.axvline(100 * population_move, color=RED, label="population map")
         axes.axvline(100 * limit, color=GREY, linestyle="--", linewidth=1, label=f"flagged from {100 * limit:g} %")
         axes.set_yticks(rows, [names[int(i)] for i in order], fontsize=7)
         axes.set(xlabel="NRMSE between the optima (%)", xlim=(0, None), ylim=(-0.7, len(percent) - 0.3))
-        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+        legend(figure, axes.get_legend_handles_labels()[0])
     return figure
 
 
@@ -140,21 +146,25 @@ def progress_figure(study: Study, population: Population, truth: Float[np.ndarra
         individual_errors = np.sqrt(np.mean((progress.own - truth) ** 2, axis=2))
     top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 3.0), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS, 2.7), layout="constrained")
         left, right = figure.subplots(1, 2)
         goal = "the final optimum" if truth is None else "the truth"
         band(left, trials, 100 * individual_errors.T, BLUE, "individuals: median, quartiles")
         left.plot(trials, 100 * from_goal, color=RED, marker="o", markersize=3, label="population map")
         if truth is not None:
             left.plot(trials, 100 * to_end, color=GREY, linestyle="--", label="population map, to its final optimum")
+        elif progress.splits:
+            halves = 100 * np.median(progress.halves, axis=1)
+            left.plot(trials, halves, color=GREY, linestyle="--", label="between halves of the people")
         left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
         left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
         left.legend(frameon=False, loc="upper right")
         band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
         right.set(xlabel="trials of each participant", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
         right.legend(frameon=False, loc="upper left")
+        few_ticks(right.yaxis, 5, integer=True)
         for axes in (left, right):
-            axes.xaxis.get_major_locator().set_params(integer=True)
+            few_ticks(axes.xaxis, 6, integer=True)
     return figure
 
 
@@ -166,7 +176,7 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
     points = {name: np.asarray(study.space.to_physical(x)) for name, x in marks.items()}
     styles = (("*", RED, 140), ("X", ORANGE, 60), ("P", "black", 60), ("D", GREEN, 40))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.4 if len(pairs) > 1 else 4.0, 2.9), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS if len(pairs) > 1 else ONE_COLUMN, 2.7), layout="constrained")
         for axes, (i, j) in zip(_row(figure, len(pairs)), pairs, strict=True):
             axes.scatter(
                 physical[:, i], physical[:, j], s=20, color=BLUE, alpha=0.7, label="individuals", clip_on=False
@@ -176,7 +186,7 @@ def optima_scatter(study: Study, optima: Float[np.ndarray, "M d"], marks: dict[s
                 axes.scatter(point[i], point[j], label=name, zorder=3, clip_on=False, **look)
             label_axes(axes, study, i, j)
         labels = figure.axes[0].get_legend_handles_labels()
-        figure.legend(*labels, loc="outside upper center", ncols=4 if len(pairs) > 1 else 2, frameon=False)
+        legend(figure, labels[0])
     return figure
 
 
@@ -196,12 +206,13 @@ def _levels(third):
 
 def map_panels(study: Study, grids):
     """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
-    low, high = min(np.nanmin(g) for g in grids), max(np.nanmax(g) for g in grids)
+    low, high = min(np.nanmin(g.mean) for g in grids), max(np.nanmax(g.mean) for g in grids)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.0 if len(grids) == 1 else 7.4, 2.7), layout="constrained")
+        figure = Figure(figsize=(ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
         scale = ScalarMappable(Normalize(low, high), "cividis")
-        figure.colorbar(scale, ax=list(panels), label=f"{study.attribute} f (mean)", fraction=0.05, pad=0.02)
+        bar = figure.colorbar(scale, ax=list(panels), label=f"{study.attribute} f", fraction=0.05, pad=0.02)
+        few_ticks(bar.ax.yaxis, 5)
         for axes in panels:
             label_axes(axes, study, 0, 1)
         for axes in panels[1:]:
@@ -209,9 +220,21 @@ def map_panels(study: Study, grids):
 
     def draw(axes, values):
         first, second = sides(study)
-        axes.pcolormesh(first, second, values, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
+        mean, sd = values
+        axes.pcolormesh(first, second, mean, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
+        if np.nanmax(mean) > np.nanmin(mean):
+            axes.contour(first, second, mean, levels=_MEANS, colors="white", linewidths=0.4, linestyles="solid")
+        if np.nanmax(sd) > np.nanmin(sd):
+            lines = axes.contour(first, second, sd, levels=_SDS, colors="black", linewidths=0.7, linestyles="dotted")
+            axes.clabel(lines, fmt="%.2g", fontsize=6)
 
     return figure, panels, draw
+
+
+def map_handles() -> list[Any]:
+    """What a legend shows of a map's lines."""
+    white = Line2D([], [], color="#bbbbbb", linewidth=0.8, label="mean")
+    return [white, Line2D([], [], color="black", linewidth=0.8, linestyle="dotted", label="standard deviation")]
 
 
 def sides(study: Study) -> list[np.ndarray]:
@@ -220,18 +243,17 @@ def sides(study: Study) -> list[np.ndarray]:
     return [np.asarray(p.to_physical(jnp.asarray(side))) for p in study.space.parameters[:2]]
 
 
-def grid_slice(
-    study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None
-) -> Float[np.ndarray, "c c"]:
-    """Mean of the population map over the first two parameters, NaN where nothing may be rendered."""
+def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None) -> Slice:
+    """A map over the first two parameters, at `third` of the third; `optimum` (d,): where the others stay."""
     side = np.linspace(0.0, 1.0, _CELLS)
     x = np.tile(np.asarray(optimum, float), (_CELLS, _CELLS, 1))
     x[..., 0], x[..., 1] = np.meshgrid(side, side)
     if third is not None:
         x[..., 2] = third
     flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
-    mean = np.asarray(surface(flat)[0])
-    return np.where(np.asarray(study.space.feasible(flat)), mean, np.nan).reshape(_CELLS, _CELLS)
+    feasible = np.asarray(study.space.feasible(flat))
+    mean, variance = (np.where(feasible, np.asarray(m), np.nan).reshape(_CELLS, _CELLS) for m in surface(flat))
+    return Slice(mean, np.sqrt(variance))
 
 
 def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -242,7 +264,7 @@ def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _curve_axes(study):
-    figure = Figure(figsize=(4.5, 2.9), layout="constrained")
+    figure = Figure(figsize=(ONE_COLUMN, 2.5), layout="constrained")
     axes = figure.subplots()
     label_axes(axes, study, 0, 0)
     axes.set(yscale="linear", ylabel=f"{study.attribute} f")
@@ -260,13 +282,14 @@ def _map_curve(study, surface, optimum, cohort):
         axes.autoscale(axis="y")
         mask = np.asarray(cohort.trials.mask)
         answers = np.asarray(study.space.to_physical(np.asarray(cohort.trials.x)[mask]))[:, 0]
-        top = np.asarray(cohort.trials.q)[mask] == len(study.responses) - 1
-        for shown, height, look in ((~top, 0.03, _OTHER), (top, 0.08, _TOP)):
-            at_height = np.full(int(shown.sum()), height)
-            axes.scatter(answers[shown], at_height, transform=axes.get_xaxis_transform(), clip_on=False, **look)
+        q, places = np.asarray(cohort.trials.q)[mask], axes.get_xaxis_transform()
+        for category in range(len(study.responses)):
+            shown = answers[q == category]
+            height = np.full(len(shown), 0.03 + 0.05 * category)
+            axes.scatter(shown, height, transform=places, clip_on=False, **answer_look(study, category))
         best = np.asarray(study.space.to_physical(np.asarray(optimum)))[0]
         axes.axvline(float(best), color=RED, linewidth=1, label="optimum")
-        axes.legend(frameon=False)
+        legend(figure, [*axes.get_legend_handles_labels()[0], *answer_handles(study)])
     return figure
 
 
@@ -281,57 +304,3 @@ def _curves_beside(study, maps, optima):
         axes.autoscale(axis="y")
         axes.legend(frameon=False)
     return figure
-
-
-def label_axes(axes, study: Study, i: int, j: int) -> None:
-    """Names, units, limits and scales of two parameters."""
-    for which, parameter in (("x", study.space.parameters[i]), ("y", study.space.parameters[j])):
-        unit = f" ({_unit(parameter.unit)})" if parameter.unit else ""
-        getattr(axes, f"set_{which}label")(_name(parameter.name) + unit)
-        getattr(axes, f"set_{which}lim")(parameter.low, parameter.high)
-        if parameter.scale == "log":
-            getattr(axes, f"set_{which}scale")("log")
-            axis = getattr(axes, f"{which}axis")
-            axis.set_major_locator(LogLocator(subs=(1.0,) if parameter.high > 20 * parameter.low else (1.0, 3.0, 5.0)))
-            axis.set_major_formatter(FormatStrFormatter("%g"))
-            axis.set_minor_formatter(NullFormatter())
-
-
-def _name(name: str) -> str:
-    symbols = {"alpha": "α", "K1": "$K_1$", "B1": "$B_1$"}
-    return symbols[name] if name in symbols else name.replace("_", " ")
-
-
-def _unit(unit):
-    return unit.replace("s^alpha", "s$^α$").replace(".", "·")
-
-
-def level_words(study: Study, index: int, unit_value: float) -> str:
-    """A parameter's name and physical value."""
-    parameter = study.space.parameters[index]
-    value = float(parameter.to_physical(jnp.asarray(float(unit_value))))
-    return f"{_name(parameter.name)} = {value:.3g} {parameter.unit}".strip()
-
-
-def mark_trials(axes, study: Study, cohort: Cohort, third: float | None) -> None:
-    """Renderings that were asked near a slice, those with the highest answer filled."""
-    mask = np.asarray(cohort.trials.mask)
-    x, q = np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
-    near = np.ones(len(x), bool) if third is None else np.abs(x[:, 2] - third) < _NEAR
-    physical = np.asarray(study.space.to_physical(x))[near]
-    top = q[near] == len(study.responses) - 1
-    axes.scatter(*physical[~top, :2].T, **_OTHER)
-    axes.scatter(*physical[top, :2].T, **_TOP)
-
-
-def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:
-    """An optimum, on axes of two of the parameters."""
-    point = np.asarray(study.space.to_physical(np.asarray(x)))[list(pair)]
-    axes.plot(*point, marker="*", markersize=13, color=RED, markeredgecolor="white", clip_on=False)
-
-
-def band(axes, trials, values, colour: str, label: str) -> None:
-    """Median over the first axis of `values` as a line, quartiles as a band; NaN is left out."""
-    low, middle, high = np.nanpercentile(values, [25, 50, 75], axis=0)
-    axes.fill_between(trials, low, high, color=colour, alpha=0.25, linewidth=0)
-    axes.plot(trials, middle, color=colour, label=label)

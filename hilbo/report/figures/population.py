@@ -1,4 +1,4 @@
-"""Figures of how people are merged: the rules side by side, and how much of the space the answers cover."""
+"""Figures of how people are aggregated: the rules side by side, and how much of the space the answers cover."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.maps import BLUE, GREY, ORANGE, STYLE
+from hilbo.report.figures.style import BLUE, GREY, ONE_COLUMN, ORANGE, STYLE, TWO_COLUMNS, few_ticks, label_axes
 from hilbo.study.config import Study
 
 __all__ = ["coverage_figure", "reliability_figure", "rules_figure"]
@@ -18,28 +18,31 @@ _CELLS = 61
 
 
 def rules_figure(content: dict[str, Any]) -> Figure:
-    """How every rule predicts people left out: density (lower is better), and the share within the central 95 %."""
+    """Out-of-sample prediction by every rule: how much worse than the best (density; bars: two standard errors of the
+    paired difference), and the share within the central 95 %."""
     rules = {rule: entry for rule, entry in content["rules"].items() if "negative_log_density" in entry}
     order = sorted(rules, key=lambda rule: -rules[rule]["negative_log_density"])
     rows = np.arange(len(order))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(6.4, 1.0 + 0.26 * len(order)), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS, 0.9 + 0.24 * len(order)), layout="constrained")
         left, right = figure.subplots(1, 2, sharey=True)
-        for axes, key, scale in ((left, "negative_log_density", 1.0), (right, "central_95", 100.0)):
+        for axes, key, scale, bars in ((left, "difference", 1.0, 2.0), (right, "central_95", 100.0, 1.0)):
             values = np.array([scale * rules[rule][key] for rule in order])
-            errors = np.array([scale * rules[rule][f"{key}_error"] for rule in order])
+            errors = bars * scale * np.array([rules[rule][f"{key}_error"] for rule in order])
             axes.errorbar(values, rows, xerr=errors, fmt="o", color=BLUE, ecolor=GREY, markersize=4, linewidth=1)
+            few_ticks(axes.xaxis, 5)
+        left.axvline(0, color=ORANGE, linewidth=1)
         right.axvline(95, color=ORANGE, linewidth=1)
         left.set_yticks(rows, order)
-        left.set_xlabel("mean negative log density of held-out answers")
-        right.set_xlabel("within the central 95 % (%)")
+        left.set_xlabel("worse than the best rule by (nats an answer)")
+        right.set_xlabel("answers in the central 95 % (%)")
     return figure
 
 
 def reliability_figure(content: dict[str, Any], rules: tuple[str, ...] = ("bcm", "hierarchical")) -> Figure:
     """Predicted probabilities of categories against how often they were chosen, for two rules."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(3.2, 3.0), layout="constrained")
+        figure = Figure(figsize=(ONE_COLUMN, 3.0), layout="constrained")
         axes = figure.subplots()
         axes.plot([0, 1], [0, 1], color=GREY, linewidth=1)
         for rule, colour, marker in zip(rules, (ORANGE, BLUE), ("s", "o"), strict=True):
@@ -68,14 +71,15 @@ def coverage_figure(
     parameters = study.space.parameters
     side = np.linspace(0.0, 1.0, _CELLS)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.2, 3.2), layout="constrained")
+        figure = Figure(figsize=(ONE_COLUMN, 2.9), layout="constrained")
         axes = figure.subplots()
         if len(parameters) == 1:
             ratio = np.sqrt(np.asarray(predict(jnp.asarray(side[:, None]))[1]) / prior)
             along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
             axes.plot(along, ratio, color=BLUE)
             axes.fill_between(along, 0, 1, where=ratio > known, hatch="///", facecolor="none", edgecolor=GREY)
-            axes.set(ylabel="sd of the map, over that without answers", ylim=(0, 1.05))
+            label_axes(axes, study, 0, 0)
+            axes.set(ylabel="sd of the map, over that without answers", yscale="linear", ylim=(0, 1.05))
         else:
             grid = np.tile(np.asarray(at), (_CELLS, _CELLS, 1))
             grid[..., 0], grid[..., 1] = np.meshgrid(side, side, indexing="ij")
@@ -84,15 +88,8 @@ def coverage_figure(
             feasible = np.asarray(study.space.feasible(flat)).reshape(_CELLS, _CELLS)
             ratio = np.where(feasible, ratio, np.nan)
             sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
-            shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud")
+            shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud", rasterized=True)
             axes.contourf(*sides, ratio.T, levels=[known, 10.0], hatches=["///"], colors="none")
             figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
-            for axis, p in zip((axes.set_xscale, axes.set_yscale), parameters[:2], strict=True):
-                axis(p.scale)
-            axes.set_ylabel(_head(parameters[1]))
-        axes.set_xlabel(_head(parameters[0]))
+            label_axes(axes, study, 0, 1)
     return figure
-
-
-def _head(parameter):
-    return f"{parameter.name} ({parameter.unit})" if parameter.unit else parameter.name

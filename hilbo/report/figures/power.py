@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.maps import BLUE, GREEN, GREY, ORANGE, RED, STYLE
+from hilbo.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, STYLE
 
 __all__ = ["power_figure"]
 
@@ -25,7 +25,7 @@ def power_figure(summary: pd.DataFrame, error: float) -> Figure:
     `summary`: of `power.summarise`. Lines differ by colour, marker and dashes.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.4, 3.0), layout="constrained")
+        figure = Figure(figsize=(7.13, 3.0), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         shift = 0.25 * (summary["trials"].max() - summary["trials"].min() + 1) / 25
         for i, (count, rows) in enumerate(summary.groupby("participants")):

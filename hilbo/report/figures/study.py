@@ -18,22 +18,25 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from hilbo.report.figures.maps import (
+from hilbo.report.figures.maps import Slice, grid_slice, map_handles, map_panels, maps_beside, sides
+from hilbo.report.figures.style import (
     BLUE,
     GREEN,
     GREY,
+    ONE_COLUMN,
     ORANGE,
     RED,
     STYLE,
+    TWO_COLUMNS,
+    answer_handles,
     band,
-    grid_slice,
+    few_ticks,
     label_axes,
+    legend,
     level_words,
-    map_panels,
-    maps_beside,
     mark_trials,
-    sides,
     star,
+    title,
 )
 from hilbo.study.analysis import Analysis, Reading
 from hilbo.study.cohort import Cohort
@@ -81,95 +84,99 @@ def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: in
         draw(axes, values)
         mark_trials(axes, study, person.first(n), third)
         star(axes, study, x)
-        axes.set_title(name, fontsize=9)
-    if third is not None:
-        figure.suptitle(level_words(study, 2, third), fontsize=9)
+        title(axes, name if third is None else f"{name}, {level_words(study, 2, third)}")
+    handles = [*answer_handles(study), *map_handles()]
+    legend(figure, handles)
     return figure
 
 
 def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> Figure:
-    """Left: everybody's running optimum against their final one. Right: answers in the highest category so far.
+    """Left: everybody's running optimum against their final one, and against that of a half of the people without them.
+    Right: answers in the highest category so far.
 
     Median and quartiles over people. Paper, figure 5.
     """
     trials, (_, errors) = progress.counts, progress.to_end()
     top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS, 2.6), layout="constrained")
         left, right = figure.subplots(1, 2)
-        band(left, trials, 100 * errors.T, BLUE, "median, quartiles")
-        left.set(xlabel="trials", ylabel="NRMSE to the final optimum (%)", ylim=(0, None))
+        band(left, trials, 100 * errors.T, BLUE, "to their own final optimum")
+        if progress.splits:
+            others = 100 * np.nanmedian(np.where(np.isnan(errors), np.nan, progress.own_to_half), axis=1)
+            left.plot(trials, others, color=GREY, linestyle="--", label="to that of half of the others")
+        left.set(xlabel="trials", ylabel="NRMSE of individual optima (%)", ylim=(0, None))
         left.legend(frameon=False)
         band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
         right.set(xlabel="trials", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
         right.legend(frameon=False, loc="upper left")
+        few_ticks(right.yaxis, 5, integer=True)
         for axes in (left, right):
-            axes.xaxis.get_major_locator().set_params(integer=True)
+            few_ticks(axes.xaxis, 6, integer=True)
     return figure
 
 
 def population_convergence(progress: Progress, references: Mapping[str, Float[np.ndarray, " d"]]) -> Figure:
     """The population's running optimum against its final one, and against named references (system identification,
-    the truth). Paper, figure 7b."""
+    the truth); dashed, that of one half of the people against the other half's. Paper, figure 7b."""
     looks = [(RED, "o", "-"), (BLUE, "s", "--"), (GREEN, "^", "-.")]
     targets = {"its final optimum": progress.population[-1]} | dict(references)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.4, 2.9), layout="constrained")
+        figure = Figure(figsize=(ONE_COLUMN, 2.7), layout="constrained")
         axes = figure.subplots()
         for (name, x), (colour, marker, dashes) in zip(targets.items(), looks, strict=False):
             miss = 100 * np.sqrt(np.mean((progress.population - x) ** 2, axis=1))
             axes.plot(
                 progress.counts, miss, color=colour, marker=marker, linestyle=dashes, markersize=3.5, label=f"to {name}"
             )
+        if progress.splits:
+            halves = 100 * np.median(progress.halves, axis=1)
+            axes.plot(progress.counts, halves, color=GREY, linestyle="--", label="between halves")
         axes.set(xlabel="trials of each participant", ylabel="NRMSE of the population optimum (%)", ylim=(0, None))
-        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+        few_ticks(axes.xaxis, 6, integer=True)
+        legend(figure, axes.get_legend_handles_labels()[0])
     return figure
 
 
 def sets_on_map(
     study: Study, surface, sets: Sets | None, best: Float[np.ndarray, " d"], cohort: Cohort, prior: ArrayLike
-) -> Figure:
-    """The population map through its best, mid and worst sets; hatched where it is not sampled. Paper, figure 6a.
-
-    `prior`: the map's variance where nobody answered (`RuleMap.map_prior`).
-    """
+) -> tuple[Figure, bool]:
+    """The population map through its best, mid and worst sets, hatched where it is hardly sampled, and whether there
+    is such a part. Paper, figure 6a. `prior`: the map's variance where nobody answered (`RuleMap.map_prior`)."""
     points: dict[str, Any] = {"best": best}
     if sets is not None:
         points = dict(zip(_MARKS, np.asarray(sets.x), strict=True))
     if study.space.dim == 1:
-        return _sets_on_curve(study, surface, points)
+        return _sets_on_curve(study, surface, points), False
     thirds = {name: float(x[2]) for name, x in points.items()} if study.space.dim > 2 else {"best": None}
     grids = [grid_slice(study, surface, best, third) for third in thirds.values()]
     figure, panels, draw = map_panels(study, grids)
+    hatched = False
     for axes, (name, third), values in zip(panels, thirds.items(), grids, strict=True):
         draw(axes, values)
-        _hatch(axes, study, surface, best, third, values, prior)
+        hatched |= _hatch(axes, study, values, prior)
         mark_trials(axes, study, cohort, third)
         for shown in points if third is None else [name]:
             _mark(axes, study, shown, points[shown])
-        axes.set_title("" if third is None else f"{level_words(study, 2, third)} ({name})", fontsize=9)
+        title(axes, "" if third is None else f"{level_words(study, 2, third)} ({name})")
     handles: list[Any] = [
         Line2D([], [], linestyle="", marker=_MARKS[n][0], color=_MARKS[n][2], markeredgecolor="black", label=n)
         for n in points
     ]
-    handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="not sampled"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=_columns(figure, handles), frameon=False)
-    return figure
+    handles += [*answer_handles(study), *map_handles()]
+    if hatched:
+        handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="hardly sampled"))
+    legend(figure, handles)
+    return figure, hatched
 
 
-def _columns(figure, handles):
-    """As many columns of a legend as the figure is wide enough for."""
-    return max(1, min(len(handles), int(figure.get_figwidth() / 1.25)))
-
-
-def _hatch(axes, study, surface, best, third, values, prior):
-    """Hatch what is feasible and of which the map knows less than `UNKNOWN`."""
-    spread = grid_slice(study, lambda x: (jnp.sqrt(surface(x)[1]), surface(x)[1]), best, third)
-    limit = UNKNOWN * np.sqrt(float(prior))
-    unknown = np.where(np.isnan(values), 0.0, np.where(spread > limit, 1.0, 0.0))
+def _hatch(axes, study: Study, values: Slice, prior: ArrayLike) -> bool:
+    """Hatch what is feasible and of which the map knows less than `UNKNOWN`; whether there is such a part."""
+    unknown = (values.sd > UNKNOWN * np.sqrt(np.asarray(prior))).astype(float)  # NaN is not
     if unknown.any():
         with mpl.rc_context({"hatch.linewidth": 0.5, "hatch.color": "white"}):
             axes.contourf(*sides(study), unknown, levels=[0.5, 1.5], colors="none", hatches=["////"])
+    return bool(unknown.any())
 
 
 def _mark(axes, study, name, x):
@@ -182,7 +189,7 @@ def _mark(axes, study, name, x):
 
 def _sets_on_curve(study, surface, points):
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.5, 3.0), layout="constrained")
+        figure = Figure(figsize=(ONE_COLUMN, 2.6), layout="constrained")
         axes = figure.subplots()
         side = jnp.linspace(0.0, 1.0, _CELLS)
         mean, variance = (np.asarray(moment) for moment in surface(side[:, None]))
@@ -206,28 +213,29 @@ def _sets_on_curve(study, surface, points):
 def class_regions(readings: Mapping[str, Reading]) -> Figure:
     """The most probable answer around each reading's optimum, and its tolerance intervals. Paper, figure 8.
 
-    One row for each reading (fixed and optimised hyperparameters); the slices are those of the first parameter with the
-    second, and with the third. White: may not be rendered.
+    One row for each reading (fixed and optimised hyperparameters), with slices of the first parameter with the second
+    and with the third; of two parameters or one, the readings stand side by side. White: may not be rendered.
     """
     study = next(iter(readings.values())).study
     d, labels = study.space.dim, study.responses
     pairs = [(0, 1), (0, 2)] if d > 2 else [(0, d - 1)]
     shades = ListedColormap(mpl.colormaps["cividis"](np.linspace(0.12, 1.0, len(labels))))
+    rows, across = (len(readings), len(pairs)) if len(pairs) > 1 else (1, len(readings))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(3.6 * len(pairs) + 0.2, 2.75 * len(readings) + 0.3), layout="constrained")
-        grid = np.atleast_2d(figure.subplots(len(readings), len(pairs), squeeze=False))
+        figure = Figure(figsize=(TWO_COLUMNS, 2.4 * rows + 0.4), layout="constrained")
+        grid = figure.subplots(rows, across, squeeze=False).reshape(len(readings), len(pairs))
         for (name, reading), row in zip(readings.items(), grid, strict=True):
             for axes, (i, j) in zip(row, pairs, strict=True):
                 if d == 1:
                     _class_curves(axes, reading, shades)
                 else:
                     _regions(axes, reading, i, j, shades)
-                axes.set_title(name, fontsize=9)
+                title(axes, name)
         handles: list[Any] = [
             Patch(facecolor=shades(k), edgecolor="black", linewidth=0.5, label=label) for k, label in enumerate(labels)
         ]
         handles.append(Line2D([], [], color=RED, linewidth=2, label="tolerance interval"))
-        figure.legend(handles=handles, loc="outside upper center", ncols=_columns(figure, handles), frameon=False)
+        legend(figure, handles)
     return figure
 
 
@@ -284,7 +292,7 @@ def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
     rows = np.arange(len(people))[::-1]
     out = people["participant"].isin(list(left_out)).to_numpy()
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.4, 1.2 + 0.15 * max(len(people), 4)), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS, 1.2 + 0.14 * max(len(people), 4)), layout="constrained")
         panels = figure.subplots(1, 3, sharey=True)
         words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
         for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
@@ -313,7 +321,7 @@ def predictive_check(
     positions = np.arange(len(responses))
     low, middle, high = 100 * np.percentile(predicted, [2.5, 50, 97.5], axis=0)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(4.2, 2.7), layout="constrained")
+        figure = Figure(figsize=(ONE_COLUMN, 2.5), layout="constrained")
         axes = figure.subplots()
         axes.bar(
             positions,
@@ -328,5 +336,5 @@ def predictive_check(
         axes.scatter(positions, middle, s=26, color=RED, zorder=3, label="would be given again")
         axes.set_xticks(positions, list(responses))
         axes.set(ylabel="share of the answers (%)", ylim=(0, None))
-        figure.legend(loc="outside upper center", ncols=2, frameon=False)
+        legend(figure, axes.get_legend_handles_labels()[0])
     return figure

@@ -1,0 +1,148 @@
+"""The style that all figures share: colours, widths, axes with units, marks of answers and of optima.
+
+Maps use cividis and lines the Okabe-Ito colours, which people with colour-blindness can tell apart; what differs
+does so by shape too. Widths are those of one and of two columns of a journal.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.colors import to_rgb
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+
+__all__ = [
+    "BLUE",
+    "GREEN",
+    "GREY",
+    "ONE_COLUMN",
+    "ORANGE",
+    "RED",
+    "STYLE",
+    "TWO_COLUMNS",
+    "answer_handles",
+    "answer_look",
+    "band",
+    "few_ticks",
+    "label_axes",
+    "legend",
+    "level_words",
+    "mark_trials",
+    "star",
+    "title",
+]
+
+BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#666666"
+ONE_COLUMN, TWO_COLUMNS = 3.46, 7.13
+"""Widths of figures, inches."""
+STYLE: dict = {
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "legend.fontsize": 7.5,
+    "legend.handlelength": 1.5,
+    "legend.columnspacing": 1.2,
+    "lines.linewidth": 1.3,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+_NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are drawn on it
+_WIDEST = 1.1  # inches of an entry of a legend
+_SHAPES = ("v", "s", "o", "^", "D", "P", "X", "p", "h", "<", ">")
+
+
+def answer_look(study: Study, category: int) -> dict[str, Any]:
+    """Marker of an answer: a shape of its own, filled the more the higher the answer is; the highest is a circle."""
+    count = len(study.responses)
+    top = category == count - 1
+    shapes = [shape for shape in _SHAPES if shape != "o"]
+    share = category / (count - 1)
+    fill = tuple(1 - share * (1 - part) for part in to_rgb(ORANGE))
+    look: dict[str, Any] = {"marker": "o" if top else shapes[category % len(shapes)], "s": 15 if top else 9}
+    return look | {"facecolor": fill, "edgecolor": "black", "linewidth": 0.5}
+
+
+def answer_handles(study: Study) -> list[Any]:
+    """What a legend shows of the answers, lowest first."""
+    looks = [answer_look(study, k) for k in range(len(study.responses))]
+    return [
+        Line2D([], [], linestyle="", marker=look["marker"], markerfacecolor=look["facecolor"], markeredgecolor="black",
+               markeredgewidth=0.5, markersize=4.5, label=label)
+        for look, label in zip(looks, study.responses, strict=True)
+    ]  # fmt: skip
+
+
+def mark_trials(axes, study: Study, cohort: Cohort, third: float | None) -> None:
+    """Tested stimuli near a slice, each with the mark of its answer."""
+    mask = np.asarray(cohort.trials.mask)
+    x, q = np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
+    near = np.ones(len(x), bool) if third is None else np.abs(x[:, 2] - third) < _NEAR
+    physical = np.asarray(study.space.to_physical(x))
+    for category in range(len(study.responses)):
+        axes.scatter(*physical[near & (q == category), :2].T, clip_on=False, zorder=3, **answer_look(study, category))
+
+
+def few_ticks(axis, count: int = 4, *, integer: bool = False) -> None:
+    """So few ticks along a linear axis that their numbers stand apart."""
+    axis.set_major_locator(MaxNLocator(count, integer=integer, steps=[1, 2, 2.5, 5, 10]))
+
+
+def legend(figure, handles) -> None:
+    """A legend above the axes, in as many columns as the figure is wide enough for."""
+    across = max(1, min(len(handles), int(figure.get_figwidth() / _WIDEST)))
+    size = STYLE["legend.fontsize"]
+    figure.legend(handles=handles, loc="outside upper center", ncols=across, frameon=False, fontsize=size)
+
+
+def title(axes, text: str) -> None:
+    """What stands above a panel."""
+    axes.set_title(text, fontsize=STYLE["axes.titlesize"])
+
+
+def label_axes(axes, study: Study, i: int, j: int) -> None:
+    """Names, units, limits and scales of two parameters."""
+    for which, parameter in (("x", study.space.parameters[i]), ("y", study.space.parameters[j])):
+        unit = f" ({_unit(parameter.unit)})" if parameter.unit else ""
+        getattr(axes, f"set_{which}label")(_name(parameter.name) + unit)
+        getattr(axes, f"set_{which}lim")(parameter.low, parameter.high)
+        if parameter.scale == "log":
+            getattr(axes, f"set_{which}scale")("log")
+            axis = getattr(axes, f"{which}axis")
+            axis.set_major_locator(LogLocator(subs=(1.0,) if parameter.high > 20 * parameter.low else (1.0, 3.0, 5.0)))
+            axis.set_major_formatter(FormatStrFormatter("%g"))
+            axis.set_minor_formatter(NullFormatter())
+        else:
+            few_ticks(getattr(axes, f"{which}axis"))
+
+
+def _name(name: str) -> str:
+    symbols = {"alpha": "α", "K1": "$K_1$", "B1": "$B_1$"}
+    return symbols[name] if name in symbols else name.replace("_", " ")
+
+
+def _unit(unit):
+    return unit.replace("s^alpha", "s$^α$").replace(".", "·")
+
+
+def level_words(study: Study, index: int, unit_value: float) -> str:
+    """A parameter's name and physical value."""
+    parameter = study.space.parameters[index]
+    value = float(parameter.to_physical(jnp.asarray(float(unit_value))))
+    return f"{_name(parameter.name)} = {value:.3g} {parameter.unit}".strip()
+
+
+def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:
+    """An optimum, on axes of two of the parameters."""
+    point = np.asarray(study.space.to_physical(np.asarray(x)))[list(pair)]
+    axes.plot(*point, marker="*", markersize=12, color=RED, markeredgecolor="white", clip_on=False, zorder=5)
+
+
+def band(axes, trials, values, colour: str, label: str) -> None:
+    """Median over the first axis of `values` as a line, quartiles as a band; NaN is left out."""
+    low, middle, high = np.nanpercentile(values, [25, 50, 75], axis=0)
+    axes.fill_between(trials, low, high, color=colour, alpha=0.25, linewidth=0)
+    axes.plot(trials, middle, color=colour, label=label)

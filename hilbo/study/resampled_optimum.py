@@ -1,0 +1,55 @@
+"""Where the population optimum would be, had other people of this kind been asked: a bootstrap over people.
+
+The map of each resample is aggregated from the same posteriors, and its maximum sought among given points: nothing is
+fitted again.
+"""
+
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int
+
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import Posterior
+from hilbo.population.pointwise import Rule, aggregate
+
+__all__ = ["resampled_tops"]
+
+
+def resampled_tops(
+    posteriors: Posterior,
+    points: Float[Array, "m d"],
+    rule: str,
+    share: ArrayLike | None,
+    prior: ArrayLike,
+    seed: int = 0,
+    draws: int = 200,
+) -> Int[np.ndarray, " draws"]:
+    """For each resample of the people, the row of `points` (unit cube) where their map is highest.
+
+    **Arguments:** `rule`: one of `pointwise.RULES`; `share`: of the hierarchical rule, else None; `prior`: variance of
+    the map where nobody answered.
+    """
+    people = posteriors.trials.mask.shape[0]
+    rows = np.random.default_rng(seed).integers(0, people, (draws, people))
+    return np.asarray(_tops(posteriors, points, jnp.asarray(rows), cast(Rule, rule), share, jnp.asarray(prior)))
+
+
+@program
+def _tops(
+    posteriors: Posterior,
+    points: Float[Array, "m d"],
+    rows: Int[Array, "draws M"],
+    rule: Rule,
+    share: ArrayLike | None,
+    prior: Float[Array, ""],
+) -> Int[Array, " draws"]:
+    means, explained = jax.lax.map(lambda person: person.predict_explained(points), posteriors)
+
+    def one(chosen: Int[Array, " M"]) -> Int[Array, ""]:
+        return jnp.argmax(aggregate(rule, means[chosen], explained[chosen], prior, share=share)[0])
+
+    return jax.lax.map(one, rows)

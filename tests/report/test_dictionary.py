@@ -1,0 +1,30 @@
+"""The data dictionary has every column of every table of a report."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from studies import paper_counts, plain
+
+from hilbo.report.comparison import _COLUMNS
+from hilbo.report.dictionary import dictionary
+from hilbo.report.validation import validate, validation_csv
+
+
+def test_every_column_has_a_unit_and_a_meaning():
+    tables = {"confusion": pd.DataFrame(columns=["set", "different", "similar", "close"])}
+    tables["comparison"] = pd.DataFrame(columns=["rule", *_COLUMNS, "u", "most_influential", "refused"])
+    shown = dictionary(tables, plain())
+    assert len(shown) == sum(len(table.columns) for table in tables.values())
+    assert (shown["meaning"].str.len() > 3).all() and set(shown["table"]) == {"comparison.csv", "confusion.csv"}
+    assert shown[shown["column"] == "close"]["meaning"].iloc[0] == 'in which the answer was "close"'
+
+
+@pytest.mark.deep
+def test_the_tables_of_validation_sessions_are_explained():
+    tables = validation_csv(validate(paper_counts(np.random.default_rng(4), ties=20)))
+    assert (dictionary(tables, plain())["meaning"].str.len() > 3).all() and "table_IV" in tables
+
+
+def test_a_column_that_nobody_explains_is_an_error():
+    with pytest.raises(KeyError):
+        dictionary({"people": pd.DataFrame(columns=["mood"])}, plain())
