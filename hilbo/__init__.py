@@ -14,7 +14,6 @@ _names, __dir__, __all__ = lazy_loader.attach(
         "app",
         "bcm",
         "cli",
-        "cli",
         "device",
         "errors",
         "gaussian",

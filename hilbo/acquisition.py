@@ -27,6 +27,11 @@ from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
 
 __all__ = ["UCB", "Choice", "LogEI", "Mean", "Score", "TopCategory", "climb", "maximise", "spread", "thompson"]
 
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 Score = Callable[[Float[Array, ""], Float[Array, ""]], Float[Array, ""]]
 """Posterior mean and variance at a point -> how much we want to ask there."""
 

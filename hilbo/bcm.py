@@ -20,7 +20,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
+from hilbo.errors import InputError
+
 __all__ = ["Evidence", "average", "combine", "combine_explained", "stream"]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 class Evidence(eqx.Module):
@@ -55,6 +61,7 @@ def combine(
 
     Where the explained variance is known directly, [`combine_explained`][] is more precise for weak experts.
     """
+    means, variances = _people(means, variances, "variances")
     prior = _checked_prior(prior_variance, means)
     return combine_explained(means, prior[None, :] - variances, prior, mask=mask, throw=throw)
 
@@ -68,6 +75,7 @@ def combine_explained(
     throw: bool = True,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """As [`combine`][], from the variances e_j = k - sigma_j^2 that the answers explain, (M, m)."""
+    means, explained = _people(means, explained, "explained")
     prior = _checked_prior(prior_variance, means)
     evidence = _evidence(means, explained, prior, mask)
     invalid = _invalid(explained, prior, mask) | ~(1.0 + prior * evidence.added > 0.0)
@@ -118,6 +126,7 @@ def average(
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Plain average of the latent functions, for comparison (paper, section II-C): every person counts the same,
     however little is known; mean (m,), and the variance (m,) of the mean of independent functions."""
+    means, variances = _people(means, variances, "variances")
     present = jnp.ones(means.shape[0], bool) if mask is None else mask
     present = present.astype(means.dtype)
     share = present / jnp.sum(present)
@@ -141,11 +150,24 @@ def _add(left: Evidence, right: Evidence) -> Evidence:
     return jax.tree.map(jnp.add, left, right)
 
 
+def _people(
+    means: Float[ArrayLike, "M m"], others: Float[ArrayLike, "M m"], name: str
+) -> tuple[Float[Array, "M m"], Float[Array, "M m"]]:
+    """Both as arrays of one shape. Raises `InputError` for others."""
+    means, others = jnp.asarray(means), jnp.asarray(others)
+    if means.ndim != 2 or means.shape != others.shape:
+        raise InputError(
+            f"bcm: means has shape {means.shape} and {name} {others.shape}; give both as (M, m): a row for each"
+            " participant, a column for each point."
+        )
+    return means, others
+
+
 def _checked_prior(prior_variance: ArrayLike, means: Float[Array, "M m"]) -> Float[Array, " m"]:
     """One value per point."""
     prior = jnp.asarray(prior_variance, means.dtype)
     if prior.ndim > 1 or (prior.ndim == 1 and prior.shape != means.shape[1:]):
-        raise ValueError(
+        raise InputError(
             f"bcm: the prior variance has shape {prior.shape}; the committee machine needs one prior for all experts,"
             f" a scalar or one value per point {means.shape[1:]}."
         )
@@ -168,5 +190,5 @@ def _raise_if(invalid: Bool[Array, " m"], evidence: Evidence) -> Evidence:
     if isinstance(invalid, jax.core.Tracer):
         return eqx.error_if(evidence, invalid, message)
     if bool(jnp.any(invalid)):
-        raise ValueError(f"{message} (first at point {int(jnp.argmax(invalid))}).")
+        raise InputError(f"{message} (first at point {int(jnp.argmax(invalid))}).")
     return evidence

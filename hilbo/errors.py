@@ -3,6 +3,10 @@
 __all__ = ["InputError", "InputRemark"]
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 class InputError(ValueError):
     """Bad input from outside: a study file, a table, an argument.
 

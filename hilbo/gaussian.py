@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.numerics.linalg import cholesky, eigh, solve_lower
-from hilbo.numerics.shown import shown
+from hilbo.numerics.shown import known, shown
 
 __all__ = [
     "Certificate",
@@ -33,6 +33,10 @@ __all__ = [
     "square_root",
     "still",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 Terms = TypeVar("Terms")
@@ -83,6 +87,11 @@ class GaussianPosterior(eqx.Module):
     """C, for derivatives."""
     log_evidence: Float[Array, ""]
     certificate: Certificate
+
+    def __repr__(self) -> str:
+        if not known(self.mode, self.log_evidence) or self.mode.ndim != 1:
+            return eqx.tree_pformat(self)
+        return f"GaussianPosterior({self.mode.shape[0]} values, log evidence {shown(self.log_evidence)})"
 
 
 def certify(

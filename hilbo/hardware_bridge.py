@@ -32,6 +32,11 @@ from hilbo.errors import InputError
 
 __all__ = ["Capability", "DeviceError", "InForce", "RefusalError", "Renderer", "State", "list_ports"]
 
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 _ANSWER = 0.1  # s
 _SIMULATED = 1.0  # s for an answer; the simulator shares this computer's processors
 _LOCKSTEP = 30.0  # s, where no time passes meanwhile

@@ -15,9 +15,13 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from hilbo.numerics.shown import check_positive, shown
+from hilbo.numerics.shown import check_positive, numbers, shown
 
 __all__ = ["RBF", "Kernel", "gram"]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 @runtime_checkable
@@ -51,8 +55,8 @@ class RBF(eqx.Module):
     variance: Float[Array, ""]
 
     def __init__(self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0):
-        self.theta = jnp.asarray(theta, dtype=_float_dtype(theta))
-        self.variance = jnp.asarray(variance, dtype=_float_dtype(variance))
+        self.theta = numbers("RBF", "theta", theta, _float_dtype(theta))
+        self.variance = numbers("RBF", "variance", variance, _float_dtype(variance))
         check_positive("RBF", theta=self.theta, variance=self.variance)
 
     def __repr__(self) -> str:

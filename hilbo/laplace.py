@@ -39,6 +39,11 @@ from hilbo.numerics.linalg import one_at_a_time, solve_lower, solve_lower_transp
 
 __all__ = ["Mode", "Pointwise", "Terms", "find_mode", "laplace", "plain_mode"]
 
+
+def __dir__() -> list[str]:
+    return __all__
+
+
 Terms = Callable[[Float[Array, " n"]], tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]]
 """Log-likelihood terms l_i(eta_i), their slopes l_i' and curvatures -l_i'' >= 0; [`Pointwise`][] derives the latter."""
 

@@ -33,10 +33,15 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
-from hilbo.numerics.shown import check_positive, concrete, shown
+from hilbo.numerics.shown import check_positive, concrete, numbers, shown
 from hilbo.numerics.tracing import traced_once
 
 __all__ = ["OrdinalProbit", "confined_normal"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 # An interval is narrow below this width, and below this product of width and distance from the middle of the bell.
 _NARROW_WIDTH, _NARROW_PRODUCT = 1.0, 4.0
@@ -66,8 +71,9 @@ class OrdinalProbit(eqx.Module):
 
     def __init__(self, thresholds: ArrayLike | Sequence[float], noise: ArrayLike):
         dtype = getattr(thresholds, "dtype", None)
-        self.thresholds = jnp.asarray(thresholds, dtype if dtype is not None else jnp.result_type(float))
-        self.noise = jnp.asarray(noise, dtype=self.thresholds.dtype)
+        dtype = dtype if dtype is not None else jnp.result_type(float)
+        self.thresholds = numbers("OrdinalProbit", "thresholds", thresholds, dtype)
+        self.noise = numbers("OrdinalProbit", "noise", noise, self.thresholds.dtype)
         check_positive("OrdinalProbit", noise=self.noise)
         if concrete(self.thresholds) and not _rising(np.asarray(self.thresholds)):
             given = shown(self.thresholds)

@@ -30,10 +30,15 @@ from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.numerics.shown import concrete, shown
+from hilbo.numerics.shown import concrete, known, numbers, shown
 from hilbo.numerics.tracing import traced_once
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "OrdinalTerms", "Posterior", "Trials", "fit"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
 
 _SOUGHT = {
     "laplace": "Laplace mode",
@@ -56,6 +61,10 @@ class OrdinalGP(eqx.Module):
     kernel: Any
     """A `Kernel`: the RBF, or one of yours; only hyperparameters are learnt for the RBF alone."""
     likelihood: OrdinalProbit
+
+    def __check_init__(self) -> None:
+        if isinstance(self.kernel, OrdinalProbit) or isinstance(self.likelihood, RBF):
+            raise InputError("OrdinalGP: kernel and likelihood are exchanged; give the kernel first, or both by name.")
 
     def __repr__(self) -> str:
         return f"OrdinalGP({self.kernel!r}, {self.likelihood!r})"
@@ -90,6 +99,14 @@ class Trials(eqx.Module):
         categories = np.zeros(capacity, np.int32)
         padded[:count], categories[:count] = points, answers
         return cls(jnp.asarray(padded), jnp.asarray(categories), jnp.arange(capacity) < count)
+
+    def __repr__(self) -> str:
+        if not known(self.x, self.mask):
+            return eqx.tree_pformat(self)
+        people = f"{self.x.shape[0]} people, " if self.mask.ndim == 2 else ""
+        return (
+            f"Trials({people}{int(self.mask.sum())} answers, {self.x.shape[-1]} parameters, room for {self.capacity})"
+        )
 
     @classmethod
     def empty(cls, capacity: int, dim: int) -> "Trials":
@@ -223,19 +240,26 @@ class Posterior(eqx.Module):
 
     def _points(self, x: _PointsLike) -> Float[Array, "m d"]:
         """Points as an array. Raises `InputError` for another shape than (m, d)."""
-        points = x if isinstance(x, jax.Array) else jnp.asarray(x, self.trials.x.dtype)
+        points = x if isinstance(x, jax.Array) else numbers("Posterior", "x", x, self.trials.x.dtype)
         if self.trials.x.ndim != 2:
             raise InputError("Posterior: holds several people; predict for each of them by jax.vmap.")
         if points.ndim != 2 or points.shape[1] != self.trials.x.shape[1]:
             dim = self.trials.x.shape[1]
             raise InputError(f"Posterior: x has shape {points.shape}; give points of shape (m, {dim}).")
+        if concrete(points) and not np.all(np.isfinite(points)):
+            row = int(np.argwhere(~np.isfinite(points))[0, 0])
+            raise InputError(f"Posterior: x[{row}] holds a value that is not finite; give points of the unit cube.")
         return points
 
     def __repr__(self) -> str:
-        whole = all(isinstance(leaf, jax.Array) for leaf in (self.trials.mask, self.trials.x))
         mask = self.trials.mask
-        if not whole or not concrete(self) or mask.ndim != 1:  # of several people, or a tree of something else
+        if not known(self.trials.x, mask) or not concrete(self) or mask.ndim > 2:
             return eqx.tree_pformat(self)
+        if mask.ndim == 2:
+            sure = np.asarray(self.latent.certificate.converged)
+            certified = "all certified" if sure.all() else f"{int(sure.sum())} certified"
+            answers, dim = int(mask.sum()), self.trials.x.shape[-1]
+            return f"Posterior({len(mask)} people, {answers} answers, {dim} parameters, {certified})"
         sure = "certified" if self.certificate.converged else "NOT certified"
         answers, dim = int(mask.sum()), self.trials.x.shape[1]
         return f"Posterior({answers} answers, {dim} parameters, log evidence {shown(self.log_evidence)}, {sure})"
@@ -323,6 +347,9 @@ def fit(
 
     **Returns:** a [`Posterior`][], differentiable in every array of `gp`.
     """
+    if not isinstance(gp, OrdinalGP) or not isinstance(trials, Trials):
+        given = f"{type(gp).__name__} and {type(trials).__name__}"
+        raise InputError(f"fit: takes an OrdinalGP and Trials, not {given}; write fit(gp, Trials.from_arrays(x, q)).")
     if inference not in _SOUGHT:
         raise InputError(f'fit: inference is "{inference}"; it must be one of {", ".join(_SOUGHT)}.')
     dim = trials.x.shape[-1]

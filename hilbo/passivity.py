@@ -26,11 +26,12 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
+from hilbo.errors import InputError
 from hilbo.mechanics.fosls import pot_stiffness, share
 from hilbo.mechanics.memory import sums
 from hilbo.mechanics.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
 from hilbo.mechanics.span import Memory, Span, span
-from hilbo.viscoelastic import elementwise
+from hilbo.viscoelastic import check_ranges, elementwise
 
 __all__ = [
     "Certificate",
@@ -41,6 +42,10 @@ __all__ = [
     "needed_damping",
     "witness",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__
 
 
 def minimum_damping(
@@ -56,8 +61,9 @@ def minimum_damping(
     """Smallest device damping b (N·s/m) with which the rendering is passive; elementwise.
 
     `inf` where `K_eff` < 0: a negative static stiffness is active whatever the damping. For a set with a K0 of its
-    own, `K_eff` is its `viscoelastic.dc_gain`. Raises ValueError for even N.
+    own, `K_eff` is its `viscoelastic.dc_gain`. Raises `InputError` for even N, and for values that no model has.
     """
+    check_ranges(K1=K1, B1=B1, alpha=alpha, T=T)
     return elementwise(_minimum_damping, _closed(memory, N), K1, B1, alpha, K_eff, T)
 
 
@@ -74,15 +80,16 @@ def largest_K1(
     """Largest passive K1 (N/mm) on a device with damping `b` (N·s/m); elementwise.
 
     `inf` where every K1 is passive, 0 where none is. Differentiable, with derivative 0 at `inf` and at 0.
-    Raises ValueError for even N.
+    Raises `InputError` for even N, and for values that no model or device has.
     """
+    check_ranges(B1=B1, alpha=alpha, b=b, T=T)
     return elementwise(_largest_K1, _closed(memory, N), B1, alpha, b, K_eff, T)
 
 
 def _closed(memory: Memory, N: int) -> Span:
     """The memory of a model, where the closed forms hold for it."""
     if memory == "short" and N % 2 == 0:
-        raise ValueError(f"N is {N}, it must be odd: the closed passivity bound is too low for an even number of taps.")
+        raise InputError(f"N is {N}, it must be odd: the closed passivity bound is too low for an even number of taps.")
     return span(memory, N)
 
 

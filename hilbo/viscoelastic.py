@@ -19,9 +19,11 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
+from hilbo.errors import InputError
 from hilbo.mechanics.continuous import creep_compliance, relaxation_modulus
 from hilbo.mechanics.fosls import FOSLS, pot_stiffness, slow_damping, slow_stiffness
 from hilbo.mechanics.materials import (
@@ -38,6 +40,7 @@ from hilbo.mechanics.materials import (
 from hilbo.mechanics.memory import GLSums, gl_coefficients, gl_sums, sums
 from hilbo.mechanics.span import Memory, Span, span
 from hilbo.mechanics.switching import switched_force
+from hilbo.numerics.shown import concrete, shown
 
 __all__ = [
     "FOSLS",
@@ -65,13 +68,19 @@ __all__ = [
 ]
 
 
+def __dir__() -> list[str]:
+    return __all__
+
+
 def gl_sum(alpha: Real[ArrayLike, "..."], N: int) -> Float[Array, "..."]:
     """S_N = C(1) = Π_{i=1..N} (1 - α/i), elementwise in `alpha`."""
+    check_ranges(alpha=alpha)
     return elementwise(_gl_sum, span("short", N), alpha)
 
 
 def gl_alternating_sum(alpha: Real[ArrayLike, "..."], N: int) -> Float[Array, "..."]:
     """C(-1) = Σ (-1)^i c_i, elementwise in `alpha`; within 3.4e-4 of 2^α at N = 101."""
+    check_ranges(alpha=alpha)
     return elementwise(_gl_alternating_sum, span("short", N), alpha)
 
 
@@ -87,8 +96,10 @@ def K0_from_effective_stiffness(
 ) -> Float[Array, "..."]:
     """K0 (N/mm) with which the rendering has the static stiffness H(1) = `K_eff` (N/mm); elementwise.
 
-    K1 and `K_eff` in N/mm, B1 in N·s^α/mm, T in s; arrays that broadcast.
+    K1 and `K_eff` in N/mm, B1 in N·s^α/mm, T in s; arrays that broadcast. Raises `InputError` for values that no
+    model has, here and below, except where they are traced.
     """
+    check_ranges(K1=K1, B1=B1, alpha=alpha, T=T)
     return elementwise(_K0, span(memory, N), K1, B1, alpha, K_eff, T)
 
 
@@ -103,6 +114,7 @@ def dc_gain(
     memory: Memory = "short",
 ) -> Float[Array, "..."]:
     """Static stiffness H(1) (N/mm) of the sampled model; elementwise."""
+    check_ranges(K1=K1, B1=B1, alpha=alpha, T=T)
     return elementwise(_dc_gain, span(memory, N), K0, K1, B1, alpha, T)
 
 
@@ -117,7 +129,24 @@ def effective_damping(
     states: int = 10,
 ) -> Float[Array, "..."]:
     """dH/ds at s = 0 (N·s/m): the damping felt in slow motion, T·K1²·β·M1/(K1 + β·S_N)²; elementwise."""
+    check_ranges(K1=K1, B1=B1, alpha=alpha, T=T)
     return elementwise(_effective_damping, span(memory, N, states), K1, B1, alpha, T)
+
+
+_RANGES = {
+    "alpha": (lambda v: (v > 0) & (v <= 1), "above 0 and at most 1: the order of the fractional element"),
+    "T": (lambda v: (v > 0) & np.isfinite(v), "a number of seconds above 0"),
+}
+_FROM_0 = (lambda v: v >= 0, "0 or above")
+
+
+def check_ranges(**values: Real[ArrayLike, "..."]) -> None:
+    """Raises `InputError` for numbers that no model, and no device, has; what is traced is not looked at."""
+    for name, value in values.items():
+        allowed, words = _RANGES.get(name, _FROM_0)
+        if concrete(value) and not np.all(fine := allowed(np.asarray(value, float))):
+            wrong = np.asarray(value, float)[~fine][0] if np.ndim(value) else value
+            raise InputError(f"{name} is {shown(wrong)}; it must be {words}.")
 
 
 def elementwise(function: Callable, span: Span, *args: Real[ArrayLike, "..."]):

@@ -1,5 +1,11 @@
 """What a notebook meets: mistakes in one sentence, and records whose words are short."""
 
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -7,7 +13,19 @@ import numpy as np
 import pytest
 from studies import PLAIN
 
-from hilbo import RBF, InputError, OrdinalGP, OrdinalProbit, Session, Study, Trials, fit
+from hilbo import (
+    RBF,
+    InputError,
+    OrdinalGP,
+    OrdinalProbit,
+    Session,
+    Study,
+    Trials,
+    bcm,
+    fit,
+    passivity,
+    viscoelastic,
+)
 
 
 @pytest.fixture(scope="module")
@@ -48,6 +66,27 @@ MISTAKES = {
         lambda p, s: p.predict(np.zeros((4, 3))),
         "Posterior: x has shape (4, 3); give points of shape (m, 2).",
     ),
+    "rows of different lengths": (
+        lambda p, s: p.predict([[0.1, 0.2], [0.3]]),
+        "Posterior: x is [[0.1, 0.2], [0.3]]; give numbers, in rows of one length.",
+    ),
+    "a point that is no number": (
+        lambda p, s: p.predict([[0.1, 0.2], [0.3, np.nan]]),
+        "Posterior: x[1] holds a value that is not finite; give points of the unit cube.",
+    ),
+    "a seed below 0": (
+        lambda p, s: Session.start(s.study, seed=-1),
+        "Session: seed is -1; it must be a whole number from 0.",
+    ),
+    "an order above 1": (
+        lambda p, s: passivity.minimum_damping(5.0, 7.0, np.array([0.5, 1.5])),
+        "alpha is 1.5; it must be above 0 and at most 1: the order of the fractional element.",
+    ),
+    "a damping below 0": (lambda p, s: passivity.largest_K1(7.0, 0.5, b=-1.0), "b is -1.0; it must be 0 or above."),
+    "a certificate for a damping below 0": (
+        lambda p, s: passivity.certify(viscoelastic.FOSLS(-3, 5, 7, 0.2), -0.95),
+        "b is -0.95; the damping of a device is 0 or above, in N.s/m.",
+    ),
     "one point": (lambda p, s: p.mean(np.zeros(2)), "Posterior: x has shape (2,); give points of shape (m, 2)."),
     "chances at one point": (
         lambda p, s: p.class_probabilities(jnp.full(2, 0.5)),
@@ -67,6 +106,36 @@ MISTAKES = {
         "Session: v is 0.5; it must be from 10 to 20.",
     ),
 }
+OF_ANOTHER_TYPE = {
+    "people of two sizes": (
+        lambda p, s: bcm.combine(jnp.zeros((3, 4)), jnp.ones((4, 3)), 1.0),
+        "bcm: means has shape (3, 4) and variances (4, 3); give both as (M, m): a row for each participant, a column"
+        " for each point.",
+    ),
+    "words for a theta": (lambda p, s: RBF("long"), "RBF: theta is 'long'; give numbers, in rows of one length."),
+    "the likelihood first": (
+        lambda p, s: OrdinalGP(p.gp.likelihood, p.gp.kernel),
+        "OrdinalGP: kernel and likelihood are exchanged; give the kernel first, or both by name.",
+    ),
+    "arrays in place of trials": (
+        lambda p, s: fit(p.gp, (np.zeros((1, 2)), [0])),
+        "fit: takes an OrdinalGP and Trials, not OrdinalGP and tuple; write fit(gp, Trials.from_arrays(x, q)).",
+    ),
+    "a path in place of a study": (
+        lambda p, s: Session.start("study.toml"),
+        "Session: study is a str; load it first, by Study.load(path).",
+    ),
+    "a study that is none": (
+        lambda p, s: Study.from_dict(None),
+        "Study: this is a NoneType; give a study file's tables, or Study.load(path).",
+    ),
+    "words at a point": (lambda p, s: s.tell("close", {"u": "low", "v": 12}), "Session: u is 'low'; give a number."),
+    "one position": (
+        lambda p, s: viscoelastic.FOSLS(-3, 5, 7, 0.2).simulate(1.0),
+        "FOSLS: x has shape (); give one sample every T, of shape (n,).",
+    ),
+}
+"""Which tests meet a type check before."""
 
 
 @pytest.mark.parametrize("what", MISTAKES)
@@ -75,6 +144,31 @@ def test_mistakes_get_one_sentence(posterior, session, what):
     with pytest.raises(InputError) as refused:
         mistake(posterior, session)
     assert str(refused.value) == sentence
+
+
+@pytest.mark.deep
+def test_mistakes_of_type_get_one_sentence_where_nobody_checks_types():
+    code = (
+        "import test_in_python as here\n"
+        "posterior, session = here.posterior.__wrapped__(), here.session.__wrapped__()\n"
+        "for what, (mistake, sentence) in here.OF_ANOTHER_TYPE.items():\n"
+        "    try:\n"
+        "        mistake(posterior, session)\n"
+        "    except here.InputError as error:\n"
+        "        assert str(error) == sentence, (what, str(error))\n"
+        "    else:\n"
+        "        raise AssertionError(what)\n"
+        "print('all')\n"
+    )
+    place = Path(__file__).parent
+    path = os.pathsep.join([str(place), str(place / "support"), str(place.parent)])
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env=os.environ | {"PYTHONPATH": path, "JAX_ENABLE_X64": "1"},
+    )
+    assert run.stdout == "all\n", run.stderr
 
 
 def test_lists_are_points(posterior):
@@ -92,9 +186,19 @@ def test_records_have_short_words(posterior, session):
     for record in (posterior, posterior.gp, posterior.gp.kernel, posterior.certificate, session, session.study):
         assert len(repr(record)) < 400 and "f64[" not in repr(record) and "Array(" not in repr(record)
     assert repr(posterior).startswith("Posterior(7 answers, 2 parameters, log evidence -")
+    assert repr(posterior.trials) == "Trials(7 answers, 2 parameters, room for 32)"
+    assert re.fullmatch(r"GaussianPosterior\(32 values, log evidence -[\d.]+\)", repr(posterior.latent))
+    two = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), posterior)
+    assert repr(two) == "Posterior(2 people, 14 answers, 2 parameters, all certified)"
+    assert repr(viscoelastic.FOSLS(-3, 5, 7, 0.2)) == "FOSLS(K0=-3, K1=5, B1=7, alpha=0.2, N=101, T=0.001)"
     assert repr(posterior.gp.likelihood) == "OrdinalProbit(thresholds=[-0.5, 0.5], noise=0.5)"
-    assert repr(session).startswith('Session("plain": 0 of ') and "asks {'u': " in repr(session)
+    assert re.fullmatch(r'Session\("plain": 0 of \d+ answers, asks u [\d.]+, v [\d.]+\)', repr(session))
     assert repr(session.study).startswith('Study("plain": u 0 to 1, v 10 to 20; ')
+
+
+@pytest.mark.parametrize("module", [bcm, passivity, viscoelastic])
+def test_a_module_offers_its_own_names_alone(module):
+    assert dir(module) == sorted(module.__all__)
 
 
 def test_trees_of_something_else_have_words_too(posterior):

@@ -23,6 +23,7 @@ from typing import NamedTuple, get_args
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
@@ -31,6 +32,7 @@ from hilbo.hyperparameters.coordinates import Coordinates, Learnable, coordinate
 from hilbo.hyperparameters.cost import divisor, evidence_cost
 from hilbo.numerics.linalg import eigh, one_at_a_time
 from hilbo.numerics.newton import Expansion, TrustRegionNewton, arrives
+from hilbo.numerics.shown import known, shown
 from hilbo.ordinal_gp import OrdinalGP, Trials
 
 __all__ = ["Learned", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
@@ -52,6 +54,14 @@ class Learned(eqx.Module):
     """A hyperparameter moved by more than a factor 1000, or may move by more than exp(30) at no cost: the evidence has
     no maximum in reach."""
     learn: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        if not known(self.log_evidence, self.steps, self.converged, self.runaway):
+            return eqx.tree_pformat(self)
+        ended = "a hyperparameter ran away" if np.any(self.runaway) else "converged"
+        ended = ended if np.all(self.converged) else "NOT converged"
+        learnt, evidence = ", ".join(self.learn), shown(self.log_evidence)
+        return f"Learned({self.gp!r}; learnt {learnt}; log evidence {evidence}, {ended})"
 
 
 def maximise_evidence(

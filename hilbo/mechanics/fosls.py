@@ -31,6 +31,7 @@ from hilbo.mechanics.memory import GLSums, gl_coefficients, response, sums
 from hilbo.mechanics.recursion import BLOCK, past_of
 from hilbo.mechanics.span import Memory, Span, span
 from hilbo.numerics.mittag_leffler import mittag_leffler
+from hilbo.numerics.shown import numbers, shown
 from hilbo.numerics.tracing import program
 
 __all__ = ["FOSLS", "Start", "pot_stiffness", "series", "share", "slow_damping", "slow_stiffness"]
@@ -71,6 +72,11 @@ class FOSLS(eqx.Module):
         dtype = jnp.result_type(1.0, K0, K1, B1, alpha)
         self.K0, self.K1, self.B1, self.alpha = (jnp.asarray(value, dtype) for value in (K0, K1, B1, alpha))
         self.N, self.T, self.memory, self.states = N, float(T), memory, states
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={shown(getattr(self, name))}" for name in ("K0", "K1", "B1", "alpha"))
+        memory = f"N={self.N}" if self.memory == "short" else f'memory="full", states={self.states}'
+        return f"FOSLS({values}, {memory}, T={self.T:g})"
 
     def __check_init__(self):
         span(self.memory, self.N, self.states)
@@ -132,7 +138,7 @@ class FOSLS(eqx.Module):
         sample by sample; larger blocks give the same numbers up to rounding, faster.
         `x` (n,) -> (n,).
         """
-        return _force(self, jnp.asarray(x, self.K0.dtype), start, unilateral, block)
+        return _force(self, self._series("x", x), start, unilateral, block)
 
     def simulate_force(
         self, F: Real[ArrayLike, " n"], *, start: Start = "rest", block: int = BLOCK
@@ -142,7 +148,14 @@ class FOSLS(eqx.Module):
         An equilibrium under force needs H(1) > 0; without it, the positions from such a start are not finite.
         `F` (n,) -> (n,).
         """
-        return _position(self, jnp.asarray(F, self.K0.dtype), start, block)
+        return _position(self, self._series("F", F), start, block)
+
+    def _series(self, name: str, value: Real[ArrayLike, " n"]) -> Float[Array, " n"]:
+        """Samples as an array. Raises `InputError` for another shape than (n,)."""
+        samples = numbers("FOSLS", name, value, self.K0.dtype)
+        if samples.ndim != 1:
+            raise InputError(f"FOSLS: {name} has shape {samples.shape}; give one sample every T, of shape (n,).")
+        return samples
 
     def settling_time(self, fraction: float) -> Float[Array, ""]:
         """Time (s) of the first sample at which this `fraction` of the relaxation after a step is over.

@@ -30,10 +30,11 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Complex, Float, Real
 
+from hilbo.errors import InputError
 from hilbo.mechanics.exponentials import exponentials
 from hilbo.mechanics.fosls import FOSLS, series, share
 from hilbo.mechanics.memory import gl_coefficients
-from hilbo.numerics.shown import shown
+from hilbo.numerics.shown import concrete, shown
 from hilbo.numerics.tracing import program
 
 __all__ = ["Certificate", "Witness", "certify", "needed_damping", "witness"]
@@ -103,8 +104,10 @@ def certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
     """Whether the rendering is passive on a device with physical damping `b` (N·s/m); `jax.vmap` for several.
 
     For any N. Not differentiable: see `minimum_damping`, and `needed_damping` at the certificate's frequency.
-    `b` is a scalar; so is every number of the certificate.
+    `b` is a scalar; so is every number of the certificate. Raises `InputError` for a `b` below 0.
     """
+    if concrete(b) and not np.all(np.asarray(b) >= 0):
+        raise InputError(f"b is {shown(b)}; the damping of a device is 0 or above, in N.s/m.")
     model = jax.lax.stop_gradient(model)
     b = jnp.asarray(b, model.K0.dtype)
     enclose = _full_enclosure if model.memory == "full" else _short_enclosure

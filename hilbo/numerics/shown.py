@@ -3,17 +3,33 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.typing import DTypeLike
 
 from hilbo.errors import InputError
 
-__all__ = ["check_positive", "concrete", "shown"]
+__all__ = ["check_positive", "concrete", "known", "numbers", "shown"]
 
 
 def concrete(*values: Any) -> bool:
     """Whether these are numbers, and not what JAX traces or maps over."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+
+
+def known(*values: Any) -> bool:
+    """Whether these are arrays with numbers in them: else a record is a tree of something else, or traced."""
+    return all(isinstance(value, jax.Array | np.ndarray) and not isinstance(value, Tracer) for value in values)
+
+
+def numbers(whose: str, name: str, value: Any, dtype: DTypeLike | None = None) -> jax.Array:
+    """A value as an array. Raises `InputError` for what holds no numbers, or rows of different lengths."""
+    try:
+        return jnp.asarray(value, dtype)
+    except (TypeError, ValueError):
+        words = repr(value)
+        raise InputError(f"{whose}: {name} is {words[:60]}; give numbers, in rows of one length.") from None
 
 
 def check_positive(whose: str, **values: Any) -> None:

@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.rows import rows_of
+from hilbo.numerics.shown import known
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
@@ -70,6 +71,14 @@ class RuleMap(eqx.Module):
     """By learnt-1 the largest variance of the map where somebody answered: beyond it no optimum is sought."""
     widths: bool = eqx.field(static=True, default=False)
     """Whether people differ in the widths of their middle categories."""
+
+    def __repr__(self) -> str:
+        people = (
+            f", {self.experts.trials.mask.shape[0]} participants"
+            if self.experts is not None and known(self.experts.trials.mask)
+            else ""
+        )
+        return f"RuleMap({self.rule}, {self.method}{people})"
 
     def predict(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the map at points (m, d)."""

@@ -13,6 +13,7 @@ log, of a table, on another day) gives the same points bit for bit.
 import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import SupportsFloat
 
 import jax.numpy as jnp
 import numpy as np
@@ -59,12 +60,23 @@ class Session:
     step: Step = field(repr=False)
 
     def __repr__(self) -> str:
-        of, asked = self.study.selection.trials, "" if self.proposal is None else f", asks {self.ask()}"
+        of, asked = self.study.selection.trials, ""
+        if self.proposal is not None:
+            units = [p.unit for p in self.study.space.parameters]
+            values = zip(self.ask().items(), units, strict=True)
+            asked = ", asks " + ", ".join(f"{name} {value:.4g} {unit}".rstrip() for (name, value), unit in values)
         return f'Session("{self.study.name}": {len(self.answers)} of {of} answers{asked})'
 
     @classmethod
     def start(cls, study: Study, seed: int = 0) -> "Session":
-        """A session without answers. The seed decides the space-filling trials and the candidates."""
+        """A session without answers. The seed decides the space-filling trials and the candidates.
+
+        Raises `InputError` for a `study` that has not been loaded, and a `seed` that is no whole number from 0.
+        """
+        if not isinstance(study, Study):
+            raise InputError(f"Session: study is a {type(study).__name__}; load it first, by Study.load(path).")
+        if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+            raise InputError(f"Session: seed is {seed!r}; it must be a whole number from 0.")
         plan = design(study, seed)
         step = Step(study, plan)
         points, answers = np.zeros((0, study.space.dim)), np.zeros(0, int)
@@ -119,6 +131,8 @@ class Session:
         if set(at) != set(self.step.names):
             raise InputError(f"Session: at has {', '.join(at)}; give {', '.join(self.step.names)}.")
         for p in self.study.space.parameters:
+            if not isinstance(at[p.name], SupportsFloat):
+                raise InputError(f"Session: {p.name} is {at[p.name]!r}; give a number.")
             if not p.low <= at[p.name] <= p.high:
                 words = f"from {p.low:g} to {p.high:g} {p.unit}".rstrip()
                 raise InputError(f"Session: {p.name} is {at[p.name]}; it must be {words}.")

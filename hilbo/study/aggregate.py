@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition, bcm
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.numerics.shown import shown
+from hilbo.numerics.shown import known, shown
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
@@ -92,6 +92,11 @@ class Aggregate(eqx.Module):
     """The maps by all rules that were asked for, the study's among them, and that by the other inference."""
     share: Share | None
     """What the answers say of how people differ; None if it was not asked, or fewer than two people answered."""
+
+    def __repr__(self) -> str:
+        if not known(self.optimum.x):
+            return eqx.tree_pformat(self)
+        return f"Aggregate({self.cohort!r}; {self.map!r}; {self.optimum!r})"
 
     @property
     def hierarchical(self) -> RuleMap | None:

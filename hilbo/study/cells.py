@@ -16,7 +16,10 @@ import pandas as pd
 from hilbo.errors import InputError
 from hilbo.study.text_cells import csv_rows, is_decimal, say_delimiter, without_decimal_comma
 
-__all__ = ["cell_pieces", "numbers", "place", "read_cells", "refuse"]
+__all__ = ["FRAME", "cell_pieces", "cells_of", "numbers", "place", "read_cells", "refuse"]
+
+FRAME = "DataFrame"
+"""What a table that is in memory is called in sentences."""
 
 _PIECE = 50_000  # rows
 
@@ -47,6 +50,16 @@ def cell_pieces(
     except (ValueError, csv.Error) as error:  # pyarrow's errors, and text that is no UTF-8, are ValueErrors
         reason = str(error).strip().splitlines()[-1]
         raise InputError(f"{source}: is not a table that can be read ({reason}); save it as CSV or Parquet.") from error
+
+
+def cells_of(frame: pd.DataFrame) -> pd.DataFrame:
+    """The cells of a table in memory as text, its rows counted from 1. Raises `InputError` for what is none."""
+    if not isinstance(frame, pd.DataFrame):
+        raise InputError(f"{FRAME}: this is a {type(frame).__name__}; give a pandas DataFrame.")
+    again = frame.columns[frame.columns.duplicated()]
+    if len(again):
+        raise InputError(f'{place(FRAME)}column "{again[0]}" stands there twice; keep one of them.')
+    return _as_text(frame, 1)
 
 
 def _parquet_pieces(path: Path) -> Iterator[pd.DataFrame]:
@@ -106,8 +119,9 @@ def _piece(rows: list[list[str]], lines: list[int], header: list[str], pieces: i
 
 
 def place(source: str, row: object = None) -> str:
-    """Where in a table: the line of a CSV file, the row of a Parquet file, or the heads of its columns."""
-    if str(source).endswith(".parquet"):
+    """Where in a table: the line of a CSV file, the row of a Parquet file or of one in memory, or the heads of its
+    columns."""
+    if str(source).endswith(".parquet") or source == FRAME:
         return f"{source}: " if row is None else f"{source}: row {row}: "
     return f"{source}:{1 if row is None else row}: "
 

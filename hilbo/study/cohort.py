@@ -12,10 +12,12 @@ from jaxtyping import Array, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.numerics.rows import rows_of
+from hilbo.numerics.shown import known
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
+from hilbo.study.trial_table import checked_trials
 
 __all__ = ["Cohort", "cohort_of"]
 
@@ -29,6 +31,13 @@ class Cohort(eqx.Module):
     trials: Trials
     physical: np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        if not known(self.trials.x, self.trials.mask):
+            return eqx.tree_pformat(self)
+        few = ", ".join(self.names[:6]) + (", ..." if len(self.names) > 6 else "")
+        answers, dim = int(np.sum(self.trials.mask)), self.trials.x.shape[-1]
+        return f"Cohort({len(self.names)} participants ({few}), {answers} answers, {dim} parameters)"
 
     def first(self, count: int) -> "Cohort":
         """Only everybody's first `count` trials."""
@@ -56,11 +65,14 @@ class Cohort(eqx.Module):
 
 
 def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
-    """Participants from a checked trial table (`trial_table.read_trials`), in order of their first appearance.
+    """Participants from a trial table, in order of their first appearance: one that `trial_table.read_trials` made, or
+    a DataFrame of yours with the same columns, which is checked as a file is.
 
     `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
-    Raises `InputError` for a `capacity` that somebody's answers exceed.
+    Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's answers exceed.
     """
+    if not isinstance(table, pd.DataFrame) or "category" not in table:
+        table = checked_trials(table, study)
     person, names = pd.factorize(table["participant"])
     counts = np.bincount(person)
     longest = int(counts.max())

@@ -6,6 +6,7 @@ from typing import Any
 
 import equinox as eqx
 
+from hilbo.errors import InputError
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.population.learnt import RECIPE, Learnt
 from hilbo.population.learnt_posterior import NOTHING, Stated, prior_model
@@ -60,6 +61,8 @@ class Study(eqx.Module):
     @staticmethod
     def from_dict(raw: Mapping[str, Any], source: str = "") -> "Study":
         """As `load`, from the parsed tables; numbers and lists may be NumPy's."""
+        if not isinstance(raw, Mapping):
+            raise InputError(f"Study: this is a {type(raw).__name__}; give a study file's tables, or Study.load(path).")
         return checked(_plain(raw), source, Study.of)
 
     @staticmethod

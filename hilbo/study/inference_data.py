@@ -25,7 +25,7 @@ from hilbo.ordinal_gp import Posterior
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
-__all__ = ["groups", "predictive_shares", "write_groups"]
+__all__ = ["groups", "inference_data", "predictive_shares", "write_groups"]
 
 _DIMS = ("chain", "draw", "participant", "trial")
 
@@ -57,6 +57,13 @@ def groups(
         "observed_data": xr.Dataset({"response": (("participant", "trial"), observed, say)}, coords),
         "constant_data": xr.Dataset(constants, coords, {"study": study.hash, "inference": study.inference}),
     }
+
+
+def inference_data(study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0) -> Any:
+    """The groups as ArviZ has them (`arviz.InferenceData`): what `arviz.from_netcdf` reads from inference.nc."""
+    import arviz
+
+    return arviz.InferenceData(**groups(study, cohort, posteriors, draws, seed))  # type: ignore[arg-type]
 
 
 def write_groups(found: dict[str, xr.Dataset], path: str | os.PathLike) -> None:

@@ -7,15 +7,16 @@ table and the log it came from give the same bits. Whatever is wrong is one sent
 """
 
 import os
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
-from hilbo.study.cells import cell_pieces, numbers, place, refuse
+from hilbo.study.cells import FRAME, cell_pieces, cells_of, numbers, place, refuse
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, check_text, formulas, no_ids
 
@@ -23,6 +24,7 @@ __all__ = [
     "NOT_FITTED",
     "check_people",
     "check_texts",
+    "checked_trials",
     "of_material",
     "read_trials",
     "write_trials",
@@ -49,8 +51,19 @@ def read_trials(
     `material` selects the rows of one material, and must be given if there are several. `others`: keep the columns that
     are nobody's business. `say` is told how many rows have been read. Raises `InputError`.
     """
-    source, texts, pieces, rows = str(path), {}, [], 0
-    for text in cell_pieces(path):
+    return _read(cell_pieces(path), study, material, str(path), others, say)
+
+
+def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = None) -> pd.DataFrame:
+    """As `read_trials`, from a table in memory: the same columns, the same checks, the same sentences."""
+    return _read([cells_of(frame)], study, material, FRAME, True, lambda rows: None)
+
+
+def _read(
+    whole: Iterable[pd.DataFrame], study: AnyStudy, material: str | None, source: str, others: bool, say: Any
+) -> pd.DataFrame:
+    texts, pieces, rows = {}, [], 0
+    for text in whole:
         _check_columns(text, study, source)
         pieces.append(_checked(text, study, source, others, texts))
         say(rows := rows + len(text))
@@ -162,7 +175,7 @@ def _check_duplicates(table: pd.DataFrame, source: str) -> None:
     if again.any():
         row = again.idxmax()
         same = (table[key] == table.loc[row, key]).all(axis=1).idxmax()
-        line = "row" if source.endswith(".parquet") else "line"
+        line = "row" if source.endswith(".parquet") or source == FRAME else "line"
         raise InputError(
             f"{place(source, row)}participant {table.at[row, 'participant']}, trial {table.at[row, 'trial']} stands in"
             f" {line} {same} already; each ({', '.join(key)}) may occur once."

@@ -1,0 +1,99 @@
+"""A map on axes of yours: for notebooks, and figures of several panels.
+
+figure, axes = pyplot.subplots(1, 2)
+draw_map(study, posterior, ax=axes[0])
+draw_map(study, aggregate, ("K1", "alpha"), ax=axes[1])
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from hilbo.errors import InputError
+from hilbo.ordinal_gp import Posterior
+from hilbo.report.figures.maps import BLUE, STYLE, label_axes, level_words, star
+from hilbo.search.candidates import search_points
+from hilbo.study.aggregate import Aggregate, best_point
+from hilbo.study.config import Study
+
+__all__ = ["draw_map"]
+
+_CELLS = 61
+
+
+def draw_map(
+    study: Study, model: Posterior | Aggregate, pair: tuple[str, str] | None = None, *, ax: Axes | None = None
+) -> Axes:
+    """The mean of one participant's posterior, or of the population map, over two parameters through its maximum.
+
+    **Arguments:**
+
+    - `pair`: names of the parameters across and up; the first two without it. Of a study with one parameter the mean
+      is drawn as a curve with its standard deviation.
+    - `ax`: the axes to draw on; new ones without it.
+
+    **Returns:** the axes. Infeasible renderings are left white, the maximum is a star; the others are named in the
+    title. Raises `InputError` for parameters that the study does not have.
+    """
+    names = study.space.names
+    with mpl.rc_context(STYLE):
+        axes = Figure(figsize=(4.0, 3.2), layout="constrained").subplots() if ax is None else ax
+        best = _maximum(study, model)
+        if len(names) == 1 and pair is None:
+            _curve(axes, study, model)
+            return axes
+        i, j = _places(names, names[:2] if pair is None else pair)
+        mean = _slice(study, model, best, i, j)
+        sides = [np.asarray(study.space.parameters[k].to_physical(jnp.linspace(0.0, 1.0, _CELLS))) for k in (i, j)]
+        drawn = axes.pcolormesh(*sides, mean, cmap="cividis", shading="nearest", rasterized=True)
+        axes.figure.colorbar(drawn, ax=axes, label=f"{study.attribute} f (mean)")
+        label_axes(axes, study, i, j)
+        star(axes, study, best, (i, j))
+        held = [level_words(study, k, float(best[k])) for k in range(len(names)) if k not in (i, j)]
+        axes.set_title(", ".join(held))
+    return axes
+
+
+def _maximum(study: Study, model: Any) -> np.ndarray:
+    """Where the mean is largest in the feasible set, in the unit cube. (d,)."""
+    if isinstance(model, Aggregate):
+        return np.asarray(model.optimum.x)
+    if not isinstance(model, Posterior):
+        raise InputError(f"draw_map: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
+    return np.asarray(best_point(study.space, model, search_points(study.space, 0)).x)
+
+
+def _places(names: tuple[str, ...], pair: Any) -> tuple[int, int]:
+    if len(pair) != 2 or len(set(pair)) != 2 or not set(pair) <= set(names):
+        raise InputError(f"draw_map: pair is {tuple(pair)}; give two of {', '.join(names)}.")
+    return names.index(pair[0]), names.index(pair[1])
+
+
+def _mean_and_variance(model: Any, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    mean, variance = model.surface(x) if isinstance(model, Aggregate) else model.predict(x)
+    return np.asarray(mean), np.asarray(variance)
+
+
+def _slice(study: Study, model: Any, best: np.ndarray, i: int, j: int) -> np.ndarray:
+    """The mean on a grid (rows: up), NaN where nothing may be rendered."""
+    side = np.linspace(0.0, 1.0, _CELLS)
+    x = np.tile(best, (_CELLS, _CELLS, 1))
+    x[..., i], x[..., j] = np.meshgrid(side, side)
+    flat = x.reshape(-1, len(best))
+    mean = _mean_and_variance(model, flat)[0]
+    return np.where(np.asarray(study.space.feasible(jnp.asarray(flat))), mean, np.nan).reshape(_CELLS, _CELLS)
+
+
+def _curve(axes: Axes, study: Study, model: Any) -> None:
+    side = np.linspace(0.0, 1.0, _CELLS)
+    mean, variance = _mean_and_variance(model, side[:, None])
+    physical, sd = np.asarray(study.space.parameters[0].to_physical(jnp.asarray(side))), np.sqrt(variance)
+    axes.fill_between(physical, mean - sd, mean + sd, color=BLUE, alpha=0.25, linewidth=0)
+    axes.plot(physical, mean, color=BLUE)
+    label_axes(axes, study, 0, 0)
+    axes.set(yscale="linear", ylabel=f"{study.attribute} f")
+    axes.autoscale(axis="y")
