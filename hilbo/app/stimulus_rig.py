@@ -233,6 +233,7 @@ class StimulusRig:
         assert self._hello is not None
         self._see(self.snapshot._replace(state="ESTOP", reason="stopped by the experimenter", facts=self._who()))
         self._stopped = None
+        self._break_off("stopped by the experimenter")
         self._give("stop")
         end = time.monotonic() + self._hello.neutral_within_s + _TRAVEL
         while self._stopped is None:
@@ -293,10 +294,14 @@ class StimulusRig:
         for what in list(self._timers):
             self._off(what)
         self._run = ""
-        if self._asked is not None and not self._asked.done():
-            self._asked.set_exception(RuntimeError(words))
+        self._break_off(words)
         self._set(Order(self.order.number + 1, "neutral"))
         self._see(self.snapshot._replace(lost=words, state="LOST", contact=False, facts=self._who(), excused=False))
+
+    def _break_off(self, words: str) -> None:
+        """Nobody waits any more for a confirmation, which is no fault of the trial."""
+        if self._asked is not None and not self._asked.done():
+            self._asked.set_exception(RuntimeError(words))
 
     def _set(self, order: Order) -> None:
         """Whoever waits for an order has this one."""

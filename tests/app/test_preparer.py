@@ -11,7 +11,7 @@ from live_stimulus import SETS, ByHand, LiveStimulus
 
 from hilbo.app.blind import _SAME
 from hilbo.app.opening import Wanted, _header
-from hilbo.app.robot import Participant, browser, find_browser, screenshots
+from hilbo.app.robot import Client, Participant, browser, find_browser, screenshots
 from hilbo.app.slices import Maps
 from hilbo.cli import doctor
 from hilbo.errors import InputError
@@ -169,7 +169,7 @@ def test_the_doctor_has_no_person_stop(tmp_path):
 @pytest.mark.deep
 @pytest.mark.skipif(find_browser() is None, reason="needs playwright and Chromium (Debian: chromium)")
 def test_the_preparer_s_page_from_ready_to_the_end(tmp_path):
-    with LiveStimulus(tmp_path, more=BY_PERSON, blocks=SINGLE, seconds=0.5) as live, browser() as program:
+    with LiveStimulus(tmp_path, within=600.0, more=BY_PERSON, blocks=SINGLE, seconds=0.5) as live, browser() as program:
         errors = []
         page = program.new_context(viewport={"width": 1024, "height": 768}).new_page()
         page.on("pageerror", lambda error: errors.append(str(error)))
@@ -189,18 +189,41 @@ def test_the_preparer_s_page_from_ready_to_the_end(tmp_path):
                 screenshots(page, pictures, name)
             return found
 
-        def acted():
+        def acted(but=""):
             if participant.phase != "done":
                 participant.act()
-            if phase() in ("ready", "present", "away", "stop"):
+            if phase() in ("ready", "present", "away", "stop") and page.evaluate("order.show") != but:
                 page.wait_for_timeout(350)
                 page.click("#go")
             return participant.phase
 
         page.wait_for_selector("#go")
         assert phase() == "ready"
+        live.until(lambda _: phase() == "present", lambda: acted("reference"))
+        stopping = threading.Thread(target=live.command, args=("estop",))
+        stopping.start()
+        page.wait_for_selector("body[data-phase=stop]")
+        assert phase() == "stop"
+        page.wait_for_timeout(350)
+        page.click("#go")
+        stopping.join(PATIENCE)
+        assert live.whole()["device"]["state"] == "estop"
+        live.command("clear")
+        live.until(lambda _: phase() == "present" and page.evaluate("order.show") == "test", lambda: acted("test"))
+        page.click("#could-not")
+        page.fill("#why-text", "the box is empty")
+        page.wait_for_timeout(350)
+        screenshots(page, pictures, "why")
+        page.click("#why button")
+        live.until(lambda _: live.events("missed"), lambda: None)
+        assert live.events("missed")[0].data["reason"] == "failed: the box is empty"
+        experimenter = program.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        experimenter.goto(live.place.link("experimenter"))
+        experimenter.wait_for_selector("#log li")
+        experimenter.screenshot(path=pictures / "experimenter.png")
+        live.experimenter = Client(live.place.link("experimenter"))
         live.until(lambda found: found == "done", acted)
-        assert {"ready-neutral", "present-reference", "present-test", "shown-test", "away-neutral"} <= taken or taken
+        assert {"ready-neutral", "present-reference", "present-test", "stop-stop"} <= taken
         assert len(live.events("answer")) == 3 and errors == []
         confirmed = [event.data["values"] for event in live.events("sent")]
         for found, asked in zip(confirmed, SETS.values(), strict=True):

@@ -297,6 +297,22 @@ def test_an_emergency_stop_is_acknowledged_voids_and_holds_until_it_is_cleared(t
         assert "stop_s" not in stopped and ready["stop_s"] >= 0  # it was known when it had been acknowledged
 
 
+@pytest.mark.deep  # what was broken off is tried again after a second
+def test_a_stop_while_a_confirmation_is_waited_for_ends_the_wait(tmp_path):
+    with LiveStimulus(tmp_path, within=600.0) as live:  # as long as a person may take
+        program = live.by_hand()
+        live.begin()
+        program.until(live, lambda order: order["do"] == "present")  # the first step: the trial has not begun
+        stopping = threading.Thread(target=live.command, args=("estop",))
+        stopping.start()
+        program.until(live, lambda order: order["do"] == "stop")
+        program.report("neutral")
+        stopping.join(PATIENCE)
+        live.command("clear")
+        program.until(live, lambda order: order["do"] == "present")
+        assert not live.events("missed")
+
+
 def test_a_stop_that_nobody_acknowledges_is_said(live):
     live.by_hand(force=True, neutral_within_s=0.01)
     with refused(409, "use the switch beside the hand"):
