@@ -5,7 +5,9 @@ and the acquisition function at one point. Nothing needs scaling, and the end is
 
 The variables that sit at a bound with the gradient pressing against it are held. Along each eigenvector of the others'
 Hessian the step is -g_i / (|h_i| + |g| / radius): Newton's where the gradient is small, never longer than the radius,
-downhill along negative curvature; and where it would leave the box, it is cut off at the wall. A step is taken if the
+downhill along negative curvature; and where it would leave the box, it is cut off at the wall. Between linear walls of
+any direction the same: what walls hold is left out, and the step ends at the nearest point between them, in the metric
+of its own stiffness (`hilbo.numerics.polytope`). A step is taken if the
 function falls by a share of what the quadratic model promised, else the radius shrinks and the step turns towards
 steepest descent, so that every start converges. One evaluation an iteration.
 References: Nocedal & Wright (2006), chapter 4; Bertsekas (1982), SIAM J. Control Optim. 20:221 (held variables).
@@ -22,11 +24,13 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.numerics.linalg import eigh
+from hilbo.numerics.polytope import Polytope, nearest, projector, walls_of_cube
 
 __all__ = ["Expansion", "TrustRegionNewton", "arrives", "expanded"]
 
 _FIRST_RADIUS = 1.0
 _SAME = 1e-2  # points so near to each other lie below the same minimum: of functions of logarithms, that is
+_TOUCHES = 1e-10  # of a range: so near to a wall, a point is at it
 _ENOUGH, _GOOD = 1e-4, 0.75  # shares of the promised fall: to take a step, and to trust the model further
 
 
@@ -68,6 +72,8 @@ class TrustRegionNewton(optx.AbstractMinimiser):
     """For `optimistix.minimise`. `options` may hold
 
     - "lower" and "upper": bounds, each like the variables;
+    - "walls" (a `Polytope`) and "held": in their place, linear walls within the unit cube, and which variables stay as
+      they are. The start is between the walls;
     - "expand": a function of the variables, and of what the function returned besides its value at the best point so
       far, that gives an [`Expansion`][] in the variables as one vector, in place of automatic differentiation;
     - "begun": what "expand" gave at the start, which then is not evaluated again;
@@ -91,7 +97,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         flat, _ = ravel_pytree(y)
         if "begun" in options:
             expansion = options["begun"]
-            return _plan(expansion, flat, jnp.full_like(flat[0], _FIRST_RADIUS), *_bounds(options))
+            return _planned(expansion, flat, jnp.full_like(flat[0], _FIRST_RADIUS), options)
         infinite = jnp.full_like(flat, jnp.inf)
         aux = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), aux_struct)
         nowhere = Expansion(infinite[0], infinite, jnp.zeros((flat.size, flat.size), flat.dtype), aux)
@@ -115,7 +121,7 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         radius = state.radius * jnp.where(good, 2.0, jnp.where(taken, 1.0, 0.25))
         best = jax.tree.map(lambda new, old: jnp.where(taken, new, old), expansion, state.here)
         flat = jnp.where(taken, trial, flat)
-        return restore(flat), _plan(best, flat, radius, *_bounds(options)), best.aux
+        return restore(flat), _planned(best, flat, radius, options), best.aux
 
     def terminate(self, fn, y, args, options, state, tags):
         """Stationary within the box, or stuck, or on the way to a known end."""
@@ -142,6 +148,40 @@ def _bounds(options: dict[str, Any]) -> tuple[Float[Array, " p"] | None, Float[A
     """Lower and upper, as vectors."""
     lower, upper = (ravel_pytree(options[side])[0] if side in options else None for side in ("lower", "upper"))
     return lower, upper
+
+
+def _planned(
+    expansion: Expansion, point: Float[Array, " p"], radius: Float[Array, ""], options: dict[str, Any]
+) -> _State:
+    """The state at `point`, within whatever the options bound it by."""
+    if "walls" in options:
+        return _plan_between(expansion, point, radius, options["walls"], options["held"])
+    return _plan(expansion, point, radius, *_bounds(options))
+
+
+def _plan_between(
+    expansion: Expansion, point: Float[Array, " p"], radius: Float[Array, ""], walls: Polytope, held: Bool[Array, " p"]
+) -> _State:
+    """As `_plan`, between linear walls within the unit cube."""
+    seen = walls_of_cube(walls, held, point)
+    plain = jnp.eye(point.size, dtype=point.dtype)
+    touching = seen.offsets <= _TOUCHES
+    corner = Polytope(jnp.where(touching[:, None], seen.normals, 0.0), jnp.where(touching, 0.0, 1.0))
+    downhill = nearest(corner, jnp.where(held, 0.0, -expansion.gradient), plain)
+    pressing = -downhill.point  # what is left of the gradient where walls hold
+    hessian = jnp.where(held[:, None] | held[None, :], plain, expansion.hessian)
+    free = projector(seen.normals, downhill.multipliers > 0.0)
+    eigenvalues, vectors = eigh(free @ hessian @ free + (plain - free))
+    steepness = jnp.linalg.norm(pressing)
+    stiffness = jnp.abs(eigenvalues) + steepness / radius
+    stiffness = jnp.where(stiffness > 0, stiffness, 1.0)
+    turned = jnp.where(held, 0.0, expansion.gradient) @ vectors
+    move = nearest(seen, -vectors @ (turned / stiffness), vectors / jnp.sqrt(stiffness)[None, :]).point
+    along = move @ vectors
+    promised = -(turned @ along + 0.5 * along @ (stiffness * along))
+    slow = jnp.abs(eigenvalues) + steepness
+    fall = 0.5 * jnp.sum((pressing @ vectors) ** 2 / jnp.where(slow > 0, slow, 1.0))
+    return _State(expansion, move, promised, radius, jnp.max(jnp.abs(pressing)), fall)
 
 
 def _plan(

@@ -17,7 +17,7 @@ from hilbo.report.results import map_dataset, optima_table, result, save_figures
 from hilbo.study.batch_optimum import Merged
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.map_file import write_map
+from hilbo.study.map_file import on_grid, write_map
 from hilbo.study.typed_files import sealed
 
 __all__ = ["population_map", "write_population"]
@@ -29,10 +29,9 @@ _DOTS = 2000  # individual optima in a figure
 
 
 def population_map(study: Study, merged: Merged) -> xr.Dataset:
-    """The map on a grid of at most 5,000 points: a pass over all people, by the whole crew."""
-    shown = min(study.space.dim, 3) if study.space.dim <= 3 else 2
-    cells = min(_CELLS, int(_POINTS ** (1 / shown)))
-    return map_dataset(study, merged.surface, merged.optimum.x, cells)
+    """The map on a grid of at most 5,000 points, or at as many: a pass over all people, by the whole crew."""
+    cells = min(_CELLS, int(_POINTS ** (1 / min(study.space.dim, 3))))
+    return map_dataset(study, merged.surface, cells)
 
 
 def write_population(
@@ -59,7 +58,7 @@ def _figures(study, aggregate, grid):
     from hilbo.report.figures import maps
 
     figures, best, drawn = {}, np.asarray(aggregate.optimum.x), {}
-    if study.space.dim <= 3:
+    if on_grid(study.space):
         some = _some(aggregate.cohort)
         figures["map"] = maps.map_slices(study, _from(grid), best, some)
         drawn["participants"] = len(some.names)

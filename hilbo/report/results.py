@@ -26,9 +26,10 @@ from hilbo.study.aggregate import Aggregate, Optimum, asked_variance, nrmse, oth
 from hilbo.study.analysis import Population
 from hilbo.study.batch_optimum import Merged
 from hilbo.study.config import Study
+from hilbo.study.effects import effects_of
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
 from hilbo.study.learnt_study import learnt_content, learnt_sentences
-from hilbo.study.map_file import write_map
+from hilbo.study.map_file import map_at_points, on_grid, write_map
 from hilbo.study.model_check import check_sentences, model_check
 from hilbo.study.optimum_location import location_notes, location_sentences
 from hilbo.study.optimum_region import optimum_region, region_content, region_sentences
@@ -210,7 +211,7 @@ def write_results(
     (folder / "result.json").write_text("".join(sealed(json_lines(content))), encoding="utf-8")
     optima_table(content, people).to_csv(folder / "optima.csv", index=False)
     say("the population map on a grid")
-    data = map_dataset(study, aggregate.surface, aggregate.optimum.x)
+    data = map_dataset(study, aggregate.surface)
     data.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     write_map(data, folder / "map.nc")
     say("figures and report")
@@ -242,17 +243,14 @@ def optima_table(content: dict[str, Any], people: People) -> pd.DataFrame:
     return pd.concat([pd.DataFrame(rows), people.table()])
 
 
-def map_dataset(
-    study: Study, surface: Callable[..., Any], at: Float[Array, " d"], cells: int = MAP_CELLS
-) -> xr.Dataset:
-    """The population map on a grid of all dimensions, or of the first two where there are more than three (then
-    through the point `at` of the unit cube). `surface`: points (m, d) -> mean and variance, (m,) each."""
-    parameters = study.space.parameters
-    shown = parameters if len(parameters) <= 3 else parameters[:2]
+def map_dataset(study: Study, surface: Callable[..., Any], cells: int = MAP_CELLS) -> xr.Dataset:
+    """The population map on a grid of all dimensions, or at points where there is none (`map_file.on_grid`).
+    `surface`: points (m, d) of the unit cube -> mean and variance, (m,) each."""
+    if not on_grid(study.space):
+        return map_at_points(study, surface)
+    shown = parameters = study.space.parameters
     side = np.linspace(0.0, 1.0, cells)
-    x = np.tile(np.asarray(at), (*(cells,) * len(shown), 1))
-    for i, grid in enumerate(np.meshgrid(*(side,) * len(shown), indexing="ij")):
-        x[..., i] = grid
+    x = np.stack(np.meshgrid(*(side,) * len(shown), indexing="ij"), axis=-1)
     flat = x.reshape(-1, len(parameters))
     mean, variance = surface(flat)
     names = [p.name for p in shown]
@@ -279,6 +277,7 @@ def map_dataset(
 def _figures(population: Population, truth: Float[np.ndarray, " d"] | None) -> dict[str, Any]:
     """Name -> figure."""
     from hilbo.report.figures import maps
+    from hilbo.report.figures.effects import effects_figure
 
     study, aggregate = population.study, population.aggregate
     best = np.asarray(aggregate.optimum.x)
@@ -287,6 +286,8 @@ def _figures(population: Population, truth: Float[np.ndarray, " d"] | None) -> d
         "progress": maps.progress_figure(study, population, truth),
         "slices": maps.slices_after(study, population.progress),
     }
+    if not on_grid(study.space):
+        figures["effects"] = effects_figure(study, effects_of(study, aggregate.surface, best, population.seed), best)
     if study.space.dim > 1:
         marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)}
         marks |= {} if truth is None else {"truth": truth}

@@ -24,7 +24,7 @@ def write_robustness(study: Study, cohort: Cohort, check: Robustness, folder: Pa
     """Write the folder of `hilbo robustness`; returns the content of result.json."""
     content = robustness_result(study, cohort, check, seed)
     (folder / "result.json").write_text(as_json(content))
-    maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x)), check.fixed.x) for of in check.maps()]
+    maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x))) for of in check.maps()]
     both = xr.concat(maps, xr.DataArray(["fixed", "by evidence"], dims="hyperparameters", name="hyperparameters"))
     both.to_netcdf(folder / "map.nc", engine="h5netcdf")
     pictures = save_figures(_figures(study, cohort, check), folder)

@@ -125,7 +125,7 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
     content = result(study, analysis.aggregate, seed, truth, people)
     data = groups(study, analysis.cohort, analysis.aggregate.posteriors, seed=seed)
     write_groups(data, folder / "inference.nc")
-    grid = map_dataset(study, analysis.aggregate.surface, analysis.aggregate.optimum.x)
+    grid = map_dataset(study, analysis.aggregate.surface)
     grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     write_map(grid, folder / "map.nc")
     tables = {

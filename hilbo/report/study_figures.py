@@ -5,7 +5,9 @@ from typing import Any
 import numpy as np
 
 from hilbo.study.analysis import Analysis
+from hilbo.study.effects import effects_of
 from hilbo.study.folder import Material
+from hilbo.study.map_file import on_grid
 
 __all__ = ["comparison_figures", "study_figures"]
 
@@ -16,6 +18,7 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
     """Figures 4, 5, 6a, 7 and 8, people, individual optima and the predictive check; and whether a part of the map is
     hatched. `shares`: of `inference_data.predictive_shares`."""
     from hilbo.report.figures import maps, study
+    from hilbo.report.figures.effects import effects_figure
 
     chosen, cohort, aggregate, progress = found.study, found.cohort, found.aggregate, found.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
@@ -32,6 +35,9 @@ def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray,
         "people": study.people_figure(found.people, found.left_out),
         "predictive": study.predictive_check(chosen.responses, *shares),
     }
+    if not on_grid(chosen.space):
+        effects = effects_of(chosen, aggregate.surface, best, found.population.seed)
+        figures["effects"] = effects_figure(chosen, effects, best)
     if chosen.space.dim > 1:  # a scatter of one parameter is none
         marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)} | references
         figures["optima"] = maps.optima_scatter(chosen, np.asarray(aggregate.individuals.x), marks)

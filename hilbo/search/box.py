@@ -1,6 +1,9 @@
-"""What a study file says of its search space: named bounded parameters with units, and the renderer that shows them.
+"""What a study file says of its search space: named parameters with units or levels, linear constraints, and the
+renderer that shows them.
 
 Numbers alone, checked against each other; loads no JAX. `space` searches in it, and knows which part of it is passive.
+A parameter is continuous, whole numbers, or unordered levels. In physical numbers a level is its place in the list,
+from 0; `Parameter.shown` and `Parameter.number` are the way to its text and back.
 """
 
 import math
@@ -12,27 +15,104 @@ from jaxtyping import Float, Real
 from hilbo.errors import InputError
 from hilbo.mechanics.span import STATES, Memory
 
-__all__ = ["Box", "Mechanics", "Parameter"]
+__all__ = ["MOST_PARAMETERS", "Box", "Constraint", "Mechanics", "Parameter"]
+
+
+MOST_PARAMETERS = 8
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One named parameter, `low` to `high` in `unit`; `scale` says how it lies on [0, 1]."""
+    """One named parameter, `low` to `high` in `unit`; `scale` says how it lies on [0, 1].
+
+    `integer`: only whole numbers may be rendered. `levels`: their names, for a parameter of unordered levels, which
+    runs from 0 to their number less 1; `correlation`: of the latent score at two of them, before any answer.
+    """
 
     name: str
     low: float
     high: float
     unit: str = ""
     scale: Literal["linear", "log"] = "linear"
+    integer: bool = False
+    levels: tuple[str, ...] = ()
+    correlation: float = 0.5
 
     def __post_init__(self):
         path = f"parameters.{self.name}"
+        if self.levels:
+            self._check_levels(path)
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             raise InputError(f"{path} runs from {self.low} to {self.high}, both ends must be finite numbers.")
         if not self.low < self.high:
             raise InputError(f"{path}.low is {self.low}, it must be below high = {self.high}.")
         if self.scale == "log" and self.low <= 0:
             raise InputError(f'{path}.low is {self.low}, it must be above 0 on a scale = "log".')
+        for key, end in (("low", self.low), ("high", self.high)):
+            if self.integer and end != round(end):
+                raise InputError(f"{path}.{key} is {end}, it must be a whole number where integer = true.")
+
+    @classmethod
+    def of_levels(cls, name: str, levels: tuple[str, ...], correlation: float = 0.5) -> "Parameter":
+        """A parameter of unordered levels. Raises `InputError`."""
+        return cls(name, 0.0, len(levels) - 1.0, levels=levels, correlation=correlation)
+
+    def _check_levels(self, path: str) -> None:
+        if len(self.levels) < 2:
+            raise InputError(f"{path}.levels is {list(self.levels)}, it must have two levels or more.")
+        twice = next((level for level in self.levels if self.levels.count(level) > 1), None)
+        if twice is not None:
+            raise InputError(f'{path}.levels has "{twice}" twice, give each level once.')
+        if not 0 < self.correlation < 1:
+            raise InputError(f"{path}.correlation is {self.correlation}, it must be between 0 and 1.")
+
+    @property
+    def discrete(self) -> bool:
+        """Whether only some values may be rendered: whole numbers or levels."""
+        return self.integer or bool(self.levels)
+
+    @property
+    def steps(self) -> int:
+        """How many values may be rendered, of a discrete parameter."""
+        return round(self.high - self.low) + 1
+
+    def shown(self, value: float) -> float | int | str:
+        """A physical number as tables and people see it: a level's name, a whole number, or the number itself."""
+        if self.levels:
+            return self.levels[round(value)]
+        return round(value) if self.integer else float(value)
+
+    def words(self, value: float) -> str:
+        """A physical number in a sentence, without its unit."""
+        return str(self.shown(value)) if self.discrete else f"{value:.4g}"
+
+    def number(self, value: float | str) -> float:
+        """What is shown as a physical number; NaN for the name of no level and for what is no number."""
+        if self.levels:
+            return float(self.levels.index(value)) if value in self.levels else math.nan
+        return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
+
+    def holds(self, value: float) -> bool:
+        """Whether a physical number is one that may be rendered."""
+        return self.low <= value <= self.high and (not self.discrete or value == round(value))
+
+    @property
+    def range_words(self) -> str:
+        """What a value must be, in words."""
+        if self.levels:
+            return "one of " + ", ".join(self.levels)
+        kind = "a whole number" if self.integer else "a number"
+        return f"{kind} from {self.low:g} to {self.high:g} {self.unit}".rstrip()
+
+    def axis(self, cells: int) -> Float[Any, " k"]:
+        """Values on [0, 1] along an axis of a figure: `cells` even ones, or as many steps at most."""
+        import numpy as np
+
+        even = np.linspace(0.0, 1.0, cells)
+        if not self.discrete:
+            return even
+        step = np.linspace(self.low, self.high, min(cells, self.steps)).round()
+        return np.asarray(self.to_unit(step))
 
     def to_unit(self, value: Real[Any, "..."]) -> Float[Any, "..."]:
         """Physical value, an array, to [0, 1]; measured from the nearer end, so that both ends are met exactly."""
@@ -46,7 +126,8 @@ class Parameter:
         return jnp.where(above < below, above / width, 1 - below / width)
 
     def to_physical(self, unit: Real[Any, "..."]) -> Float[Any, "..."]:
-        """Inverse of `to_unit`; never leaves [low, high] for a `unit` in [0, 1]."""
+        """Inverse of `to_unit`; never leaves [low, high] for a `unit` in [0, 1]. A discrete parameter has its nearest
+        value."""
         import jax.numpy as jnp
 
         if self.scale == "log":
@@ -55,7 +136,17 @@ class Parameter:
         else:
             width = self.high - self.low
             upwards, downwards = self.low + width * unit, self.high - width * (1 - unit)
-        return jnp.where(unit < 0.5, upwards, downwards)
+        value = jnp.where(unit < 0.5, upwards, downwards)
+        return jnp.round(value) if self.discrete else value
+
+
+@dataclass(frozen=True)
+class Constraint:
+    """`least` <= the sum of weight times parameter over `terms` <= `most`, in physical units; either may be missing."""
+
+    terms: tuple[tuple[str, float], ...]
+    least: float | None = None
+    most: float | None = None
 
 
 @dataclass(frozen=True)
@@ -94,18 +185,44 @@ class Mechanics:
 @dataclass(frozen=True)
 class Box:
     """Named parameters, and with `mechanics` what renders them; these must then include K1 (N/mm), B1 (N·s^α/mm) and
-    alpha, in any order."""
+    alpha, in any order. `constraints`: linear inequalities between parameters that are no levels."""
 
     parameters: tuple[Parameter, ...]
     mechanics: Mechanics | None = None
+    constraints: tuple[Constraint, ...] = ()
 
     def __post_init__(self):
         if not self.parameters:
             raise InputError("parameters is empty, a search space needs at least one.")
+        if self.dim > MOST_PARAMETERS:
+            raise InputError(
+                f"parameters are {self.dim}, {', '.join(self.names)}; a study has {MOST_PARAMETERS} at most."
+            )
         if len(set(self.names)) < self.dim:
             raise InputError(f"parameters has one name twice: {', '.join(self.names)}.")
         if self.mechanics is not None:
             self._check_model()
+        for number, constraint in enumerate(self.constraints, 1):
+            self._check_constraint(constraint, f"constraints.{number}")
+
+    def _check_constraint(self, constraint: Constraint, path: str) -> None:
+        """Refuse one that is none, or of what is no number."""
+        for name, weight in constraint.terms:
+            if name not in self.names:
+                raise InputError(
+                    f"{path}.terms names {name}, which is no parameter of the study; those are {', '.join(self.names)}."
+                )
+            if self.parameters[self.names.index(name)].levels:
+                raise InputError(f"{path}.terms names {name}, whose levels are no numbers; leave it out.")
+            if not math.isfinite(weight):
+                raise InputError(f"{path}.terms.{name} is {weight}, it must be a finite number.")
+        if not any(weight for _, weight in constraint.terms):
+            raise InputError(f"{path}.terms has no weight but 0; write for example terms = {{a = 1, b = 2}}.")
+        if constraint.least is None and constraint.most is None:
+            raise InputError(f"{path} has no least and no most, it must have one of them, or both.")
+        least, most = constraint.least, constraint.most
+        if least is not None and most is not None and not least < most:
+            raise InputError(f"{path}.least is {least}, it must be below most = {most}.")
 
     def _check_model(self) -> None:
         """What the FO-SLS asks of its parameters."""
@@ -114,6 +231,8 @@ class Box:
             raise InputError(f"parameters.{missing[0]} is missing, the renderer's model needs K1, B1 and alpha.")
         for name in ("K1", "B1", "alpha"):
             parameter = self.parameters[self.names.index(name)]
+            if parameter.discrete:
+                raise InputError(f"parameters.{name} has steps, it must be continuous for the FO-SLS.")
             if parameter.low <= 0:
                 raise InputError(f"parameters.{name}.low is {parameter.low}, it must be above 0 for the FO-SLS.")
         alpha = self.parameters[self.names.index("alpha")]

@@ -8,6 +8,8 @@ The search keeps `SEARCH_MARGIN` away from the device's damping, so that a devic
 float32 never refuses a proposal.
 """
 
+import functools
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -19,15 +21,17 @@ from hilbo import passivity, viscoelastic
 from hilbo.mechanics.fosls import pot_stiffness
 from hilbo.mechanics.memory import sums
 from hilbo.mechanics.span import Span, span
-from hilbo.search.box import Mechanics
+from hilbo.search.box import Constraint, Mechanics, Parameter
+from hilbo.search.linear import MARGIN
 
-__all__ = ["SEARCH_MARGIN", "K0_of", "K1_range", "allowed", "largest_K1", "minimum_damping"]
+__all__ = ["SEARCH_MARGIN", "K0_of", "K1_interval", "K1_range", "allowed", "keeps", "largest_K1", "minimum_damping"]
 
 SEARCH_MARGIN = 1e-3
 """The search uses the damping b·(1 - SEARCH_MARGIN)."""
 # The search puts points on the boundary; rounding, which differs from one compilation to the next, must not refuse
 # them.
 _ROUNDING = 64
+_SUM_ROUNDING = 8  # units of eps
 _Batch = Float[Array, "*batch"]
 _Physical = Mapping[str, Real[ArrayLike, "..."]]
 
@@ -67,6 +71,40 @@ def K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
     memory = span(m.memory, m.N, m.states)
     low, high = (viscoelastic.elementwise(_K1_of, memory, end, B1, alpha, m.T) for end in m.effective_damping)
     return low, high
+
+
+def keeps(constraint: Constraint, physical: _Physical) -> Bool[Array, "..."]:
+    """Whether parameter sets keep a linear constraint, to the rounding of its sum."""
+    parts = [weight * jnp.asarray(physical[name]) for name, weight in constraint.terms]
+    total, size = functools.reduce(jnp.add, parts), functools.reduce(jnp.add, map(jnp.abs, parts))
+    slack = _SUM_ROUNDING * jnp.finfo(total.dtype).eps * size
+    low = -jnp.inf if constraint.least is None else constraint.least
+    high = jnp.inf if constraint.most is None else constraint.most
+    return (total >= low - slack) & (total <= high + slack)
+
+
+def K1_interval(
+    m: Mechanics, K1: Parameter, constraints: tuple[Constraint, ...], physical: Mapping[str, _Batch]
+) -> tuple[_Batch, _Batch]:
+    """Lowest and highest K1 on [0, 1] that effective damping and constraints on K1 leave beside other parameters."""
+    low, high = jnp.zeros_like(physical["B1"]), jnp.ones_like(physical["B1"])
+    ends = [] if m.effective_damping is None else [K1_range(m, physical["B1"], physical["alpha"])]
+    for first, last in (*ends, *(_within(constraint, K1, physical) for constraint in constraints)):
+        low = jnp.maximum(low, K1.to_unit(jnp.clip(first, K1.low, K1.high)))
+        high = jnp.minimum(high, K1.to_unit(jnp.clip(last, K1.low, K1.high)))
+    return low, high
+
+
+def _within(constraint: Constraint, K1: Parameter, physical: Mapping[str, _Batch]) -> tuple[_Batch, _Batch]:
+    """Lowest and highest K1 (N/mm) that a constraint on it leaves, a margin inside."""
+    terms, none = dict(constraint.terms), jnp.zeros_like(physical["B1"])
+    weight, margin = terms.pop("K1"), MARGIN * (K1.high - K1.low)
+    others = functools.reduce(jnp.add, (each * physical[name] for name, each in terms.items()), none)
+    least, most = (
+        none + math.copysign(math.inf, side) if end is None else (end - others) / weight
+        for side, end in ((-weight, constraint.least), (weight, constraint.most))
+    )
+    return jnp.minimum(least, most) + margin, jnp.maximum(least, most) - margin
 
 
 def _K1_of(

@@ -1,5 +1,7 @@
 """A point of the unit cube as what is rendered: its parameter set with the derived K0, and its passivity margin."""
 
+from typing import Any
+
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -8,11 +10,12 @@ from hilbo.search.space import SearchSpace
 __all__ = ["K0_range", "margin_of", "set_of"]
 
 
-def set_of(space: SearchSpace, x: ArrayLike) -> dict[str, float]:
+def set_of(space: SearchSpace, x: ArrayLike) -> dict[str, Any]:
     """A point of the unit cube as a parameter set in physical units, derived K0 included."""
     physical = np.asarray(space.to_physical(np.asarray(x)))
     values = dict(zip(space.names, physical.tolist(), strict=True))
-    return {name: float(value) for name, value in space.derived(values).items()} | values
+    shown = {p.name: p.shown(values[p.name]) for p in space.parameters}
+    return {name: float(value) for name, value in space.derived(values).items()} | shown
 
 
 def margin_of(space: SearchSpace, x: ArrayLike) -> float | None:

@@ -1,11 +1,15 @@
-"""The space that is searched: named bounded parameters with units, the unit cube, and its passive part.
+"""The space that is searched: named parameters, the unit cube, and the part of it that is feasible.
 
 Three coordinates of one point:
 
-- *physical*: the numbers of tables and devices, in the units of the parameters;
+- *physical*: the numbers of tables and devices, in the units of the parameters; of a level its place in the list;
 - *unit cube* x: every parameter on [0, 1] over its full range, linear or logarithmic; kernels see only these;
-- *box* w: the optimiser's coordinates. With mechanics, x_K1 = w_K1 · x_K1max(B1, α), where K1max is the largest
-  passive K1 (`passivity.largest_K1`), so that the feasible set is the whole of [0, 1]^d; without, w = x.
+- *box* w: the optimiser's coordinates, in which the feasible set is a polytope within [0, 1]^d. With mechanics,
+  x_K1 = w_K1 · x_K1max(B1, α), where K1max is the largest passive K1 (`passivity.largest_K1`). A parameter in a linear
+  constraint is linear in its unit (`linear`); all others are w = x.
+
+Without constraints the polytope is the whole cube. With mechanics, a constraint on K1 bounds its column instead. Whole
+numbers and levels are steps of their coordinate: a search changes the others, then tries `neighbours`.
 
 With a range of effective damping the column starts above the lowest K1 too, and x_K1 = start + w_K1 · width
 (`feasibility` has both ends).
@@ -17,6 +21,7 @@ Rosenblatt (1952), Ann. Math. Stat. 23:470.
 
 import functools
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,10 +30,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
 from hilbo.errors import InputError
+from hilbo.numerics.polytope import Polytope
 from hilbo.numerics.tracing import program
-from hilbo.search.box import Box, Mechanics, Parameter
-from hilbo.search.feasibility import K0_of, K1_range, allowed, largest_K1, minimum_damping
-from hilbo.search.space_filling import Chunks, latin_chunks, sobol_chunks, take, wall_chunks
+from hilbo.search import linear
+from hilbo.search.box import Box, Constraint, Mechanics, Parameter
+from hilbo.search.feasibility import K0_of, K1_interval, allowed, keeps, largest_K1, minimum_damping
+from hilbo.search.space_filling import HELD, Chunks, latin_chunks, sobol_chunks, spread_out, take, wall_chunks
+from hilbo.search.steps import neighbours, steps_of
 
 __all__ = ["COLUMNS", "ROWS", "SearchSpace", "column_ends", "column_table"]
 
@@ -37,23 +45,30 @@ __all__ = ["COLUMNS", "ROWS", "SearchSpace", "column_ends", "column_table"]
 _CELLS = 256
 ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
 COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
+_ROOMY, _PILOT = 0.02, 4096  # share of the cube, of so many points, from which constrained points are drawn in it
+_CLUSTERED = 200  # points for each of a space-filling design between walls
 _Batch = Float[Array, "*batch"]
 
 
 class SearchSpace(eqx.Module):
-    """Named parameters, and with `mechanics` the passive part of their box.
+    """Named parameters; with `mechanics` the passive part of their box, with `constraints` what they leave.
 
-    With mechanics the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order; further ones are
-    unconstrained. Raises InputError if no column (B1, alpha) holds a passive K1.
+    With mechanics the parameters must include K1 (N/mm), B1 (N·s^α/mm) and alpha, in any order. Raises InputError if
+    no column (B1, alpha) holds a passive K1, or if the constraints leave nothing.
     """
 
     parameters: tuple[Parameter, ...] = eqx.field(static=True)
     mechanics: Mechanics | None = eqx.field(static=True, default=None)
+    constraints: tuple[Constraint, ...] = eqx.field(static=True, default=())
 
     def __check_init__(self):
-        Box(self.parameters, self.mechanics)  # refuses what is no box
+        Box(self.parameters, self.mechanics, self.constraints)  # refuses what is no box
         if self.mechanics is not None:
             self._check_volume(self.mechanics)
+        if self.constraints:
+            linear.check_room(self.parameters, self.constraints)
+            if self.mechanics is not None or any(self.discrete):
+                self.candidates(1, 0)  # or says that nothing is left
 
     def _check_volume(self, mechanics: Mechanics) -> None:
         if not _cumulative_volume(self)[0][-1] > 0:
@@ -79,6 +94,42 @@ class SearchSpace(eqx.Module):
         """Names in the order of the coordinates."""
         return tuple(parameter.name for parameter in self.parameters)
 
+    @property
+    def discrete(self) -> tuple[bool, ...]:
+        """Which parameters have steps: whole numbers and levels."""
+        return tuple(parameter.discrete for parameter in self.parameters)
+
+    @property
+    def even(self) -> bool:
+        """Whether the space is a plain box, or the passive part of one, of continuous parameters."""
+        return not self.constraints and not any(self.discrete)
+
+    @property
+    def searched(self) -> dict[str, Any]:
+        """What a maximisation over this space is given (`acquisition.maximise`)."""
+        functions = {"from_box": self.from_box, "to_box": self.to_box, "feasible": self.feasible}
+        if self.even:
+            return functions
+        walls, coupled = self._walls, bool(self.constraints)
+        between = Polytope(jnp.asarray(walls.normals), jnp.asarray(walls.offsets))
+        return functions | {
+            "walls": between,
+            "held": jnp.asarray(self.discrete),
+            "neighbours": functools.partial(neighbours, self.parameters, coupled) if any(self.discrete) else None,
+        }
+
+    @property
+    def _walls(self) -> linear.Walls:
+        """In box coordinates; of K1, whose column is bounded instead, there is none."""
+        return linear.rows_of(self.parameters, self.constraints, None if self.mechanics is None else "K1")
+
+    @property
+    def _linear(self) -> tuple[bool, ...]:
+        """Which parameters are linear in the box, and logarithmic in the unit cube."""
+        named = {name for constraint in self.constraints for name, weight in constraint.terms if weight}
+        named -= set() if self.mechanics is None else {"K1"}
+        return tuple(p.name in named and p.scale == "log" for p in self.parameters)
+
     def to_unit(self, physical: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Physical values to the unit cube, last axis = parameter; exact at both ends.
 
@@ -102,35 +153,46 @@ class SearchSpace(eqx.Module):
         (..., d) -> (..., d).
         """
         w = _floating(w)
+        for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
+            w = w.at[..., i].set(p.to_unit(p.low + (p.high - p.low) * w[..., i])) if linear_in_box else w
         if self.mechanics is None:
             return w
-        if self.mechanics.effective_damping is None:
-            return w.at[..., self._index("K1")].multiply(self._limit(self.mechanics, w))
-        low, width = self._interval(self.mechanics, w)
         K1 = self._index("K1")
+        if not self._between:
+            return w.at[..., K1].multiply(self._limit(self.mechanics, w))
+        low, width = self._interval(self.mechanics, w)
         return w.at[..., K1].set(low + w[..., K1] * width)
 
     def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Inverse of `from_box`, for `x` in the feasible set. (..., d) -> (..., d)."""
         x = _floating(x)
+        w = x
+        for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
+            w = w.at[..., i].set((p.to_physical(x[..., i]) - p.low) / (p.high - p.low)) if linear_in_box else w
         if self.mechanics is None:
-            return x
-        if self.mechanics.effective_damping is None:
-            return x.at[..., self._index("K1")].divide(self._limit(self.mechanics, x))
-        low, width = self._interval(self.mechanics, x)
+            return w
         K1 = self._index("K1")
-        return x.at[..., K1].set((x[..., K1] - low) / width)
+        if not self._between:
+            return w.at[..., K1].divide(self._limit(self.mechanics, x))
+        low, width = self._interval(self.mechanics, x)
+        return w.at[..., K1].set((x[..., K1] - low) / width)
 
     def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
-        """Whether points of the unit cube are in the box, passive with the search margin, and damped as asked for.
+        """Whether points of the unit cube are in the box, passive with the search margin, damped as asked for, and
+        within the constraints as their values are rendered.
 
         (..., d) -> (...,).
         """
         x = _floating(x)
         inside = jnp.all((x >= 0) & (x <= 1), axis=-1)
-        if self.mechanics is None:
+        if self.mechanics is None and not self.constraints:
             return inside
-        return inside & allowed(self.mechanics, self._split(self.to_physical(x)))
+        physical = self.to_physical(x)
+        if self.mechanics is not None:
+            inside &= allowed(self.mechanics, self._split(physical))
+        for constraint in self.constraints:
+            inside &= keeps(constraint, self._split(physical))
+        return inside
 
     def derived(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> dict[str, Float[Array, "..."]]:
         """What follows from the parameters: K0 (N/mm) with mechanics, nothing without.
@@ -147,7 +209,7 @@ class SearchSpace(eqx.Module):
         return None if self.mechanics is None else self.mechanics.damping - minimum_damping(self.mechanics, physical)
 
     def volume(self) -> float:
-        """Share of the unit cube that is feasible: the mean width of its columns, on a grid; 1 without mechanics."""
+        """Share of the unit cube that is passive: the mean width of its columns, on a grid; 1 without mechanics."""
         return 1.0 if self.mechanics is None else float(_cumulative_volume(self)[0][-1])
 
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
@@ -155,10 +217,14 @@ class SearchSpace(eqx.Module):
 
         -> (m, d).
         """
+        if self.constraints and self.mechanics is None:
+            return _take_between(self, m, seed)
         return _take_feasible(self, m, sobol_chunks(self.dim, m, seed))
 
     def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points on the walls, edges and corners of the feasible set, the passive boundary included. -> (m, d)."""
+        if self.constraints and self.mechanics is None:
+            return self._on_walls(m, seed)
         count = 2 ** max(m - 1, 0).bit_length()
         return _take_feasible(self, m, sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed))
 
@@ -166,10 +232,32 @@ class SearchSpace(eqx.Module):
         """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
 
         Points that fall outside the feasible set (a few, at the foot of infeasible columns) are replaced from further
-        hypercubes, at the price of the even spread.
+        hypercubes, at the price of the even spread. Between the walls of constraints the points are those nearest to
+        the centres of `n` clusters of many.
         -> (n, d).
         """
+        if self.constraints and n:
+            return spread_out(self.candidates(_CLUSTERED * n, seed), n, seed)
         return _take_feasible(self, n, latin_chunks(self.dim, n, seed))
+
+    def _on_walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
+        """Points (m, d) on the walls of the constraints and of the cube, for a space without mechanics."""
+        starts, free = self.candidates(m, seed + 1), ~np.array(self.discrete)
+        ends = linear.ends_of_rays(self._walls, np.asarray(_to_box(self, starts)), free, seed, HELD)
+        x, feasible = _from_box(self, ends)
+        return np.where(np.asarray(feasible)[:, None], np.asarray(x), starts)
+
+    @property
+    def _between(self) -> bool:
+        """Whether a column of K1 has a lower end, and an upper one besides the passive wall."""
+        mechanics = self.mechanics
+        return mechanics is not None and (mechanics.effective_damping is not None or self._bounds_K1 != ())
+
+    @property
+    def _bounds_K1(self) -> tuple[Constraint, ...]:
+        """The constraints on K1, with mechanics."""
+        found = [c for c in self.constraints if any(name == "K1" and weight for name, weight in c.terms)]
+        return () if self.mechanics is None else tuple(found)
 
     def _index(self, name: str) -> int:
         return self.names.index(name)
@@ -184,11 +272,9 @@ class SearchSpace(eqx.Module):
         return K1.to_unit(jnp.clip(largest_K1(m, B1, alpha), K1.low, K1.high))
 
     def _interval(self, m: Mechanics, x: Float[Array, "*batch d"]) -> tuple[_Batch, _Batch]:
-        """Start and width of the column of each point, in x_K1, with a range of effective damping."""
+        """Start and width of the column of each point, in x_K1, with a range of effective damping or constraints."""
         K1 = self.parameters[self._index("K1")]
-        B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
-        first, last = K1_range(m, B1, alpha)
-        low, high = K1.to_unit(jnp.clip(first, K1.low, K1.high)), K1.to_unit(jnp.clip(last, K1.low, K1.high))
+        low, high = K1_interval(m, K1, self._bounds_K1, self._split(self.to_physical(x)))
         high = jnp.minimum(high, self._limit(m, x))
         return low, jnp.maximum(high - low, 0)
 
@@ -246,6 +332,36 @@ def column_ends(space: SearchSpace, x: Float[ArrayLike, "*batch d"]) -> tuple[_B
     return low, low + width
 
 
+@functools.lru_cache(maxsize=16)
+def _share_of_cube(space: SearchSpace) -> float:
+    """The share of even points of the unit cube that is feasible, from some thousand."""
+    points = next(sobol_chunks(space.dim, _PILOT, 0))
+    return float(np.asarray(_feasible(space, steps_of(space.parameters, points))).mean())
+
+
+def _take_between(space: SearchSpace, count: int, seed: int) -> Float[np.ndarray, "count d"]:
+    """`count` feasible points of the unit cube, evenly between the walls of constraints without mechanics."""
+    chunks = sobol_chunks(space.dim, count, seed)
+    if _share_of_cube(space) < _ROOMY:
+        chunks = (np.asarray(_from_box(space, w)[0]) for w in linear.inside(space._walls, count, seed))
+
+    def place(uniform):
+        x = steps_of(space.parameters, uniform)
+        return x, np.asarray(_feasible(space, x))
+
+    return _enough(space, count, *take(count, chunks, place))
+
+
+@program
+def _feasible(space: SearchSpace, x: Float[ArrayLike, "n d"]) -> Bool[Array, " n"]:
+    return space.feasible(x)
+
+
+@program
+def _to_box(space: SearchSpace, x: Float[ArrayLike, "n d"]) -> Float[Array, "n d"]:
+    return space.to_box(x)
+
+
 @program
 def _from_box(space: SearchSpace, w: Float[ArrayLike, "n d"]) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
     x = space.from_box(w)
@@ -262,13 +378,19 @@ def _take_feasible(
         if hold is not None:
             ends = next(hold)
             w = np.where(np.isnan(ends), w, ends)
-        x, feasible = _from_box(space, w)
+        x, feasible = _from_box(space, steps_of(space.parameters, w))
         return np.asarray(x), np.asarray(feasible)
 
-    kept, count_feasible, tried = take(count, chunks, place)
-    if count_feasible < count:
-        raise InputError(
-            f"renderer.effective_damping leaves {count_feasible} of {tried} passive points, too few to search;"
-            " widen it."
-        )
+    return _enough(space, count, *take(count, chunks, place))
+
+
+def _enough(
+    space: SearchSpace, count: int, kept: list[Float[np.ndarray, "_ d"]], found: int, tried: int
+) -> Float[np.ndarray, "count d"]:
+    """The points that were taken. Raises `InputError` for fewer than `count`."""
+    if found < count:
+        left = f"{found} of {tried} {'points' if space.mechanics is None else 'passive points'}, too few to search"
+        if space.constraints:
+            raise InputError(f"constraints leave {left}; widen them.")
+        raise InputError(f"renderer.effective_damping leaves {left}; widen it.")
     return np.concatenate(kept) if kept else np.zeros((0, space.dim))

@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-__all__ = ["crossings", "latin_chunks", "sobol_chunks", "take", "wall_chunks"]
+__all__ = ["HELD", "crossings", "latin_chunks", "sobol_chunks", "spread_out", "take", "wall_chunks"]
 
 Chunks = Iterator[Float[np.ndarray, "n d"]]
 
 LEAST_SHARE = 1e-4
 """`take` gives up where fewer of the points are usable."""
 _LARGEST_CHUNK = 2**18
-_HELD = (0.7, 0.2, 0.1)  # shares of the wall points with one, two and three coordinates at an end
+HELD = (0.7, 0.2, 0.1)  # shares of the wall points with one, two and three coordinates at an end
 
 
 def take(
@@ -55,7 +55,7 @@ def latin_chunks(dim: int, count: int, seed: int) -> Chunks:
 def wall_chunks(dim: int, count: int, seed: int) -> Chunks:
     """What is held at 0 or 1, NaN where a coordinate is free: one or more of each point's, drawn at random."""
     rng = np.random.default_rng(seed)
-    shares = np.array(_HELD[:dim]) / sum(_HELD[:dim])
+    shares = np.array(HELD[:dim]) / sum(HELD[:dim])
     for size in _sizes(max(count, 1)):
         held = np.argsort(rng.random((size, dim)), axis=1) < rng.choice(len(shares), size, p=shares)[:, None] + 1
         yield np.where(held, rng.integers(0, 2, (size, dim)), np.nan)
@@ -70,6 +70,19 @@ def crossings(
     left, right = table[line, before], table[line, before + 1]
     share = (levels[level] - left) / (right - left)
     return line, positions[before] + share * (positions[before + 1] - positions[before])
+
+
+def spread_out(points: Float[np.ndarray, "m d"], count: int, seed: int) -> Float[np.ndarray, "count d"]:
+    """The points that are nearest to the centres of as many clusters, each another one."""
+    from scipy.cluster.vq import kmeans2
+    from scipy.spatial.distance import cdist
+
+    centres, _ = kmeans2(points, count, seed=np.random.default_rng(seed), minit="++")
+    left, rows = cdist(centres, points), []
+    for row in left:
+        rows.append(int(row.argmin()))
+        left[:, rows[-1]] = np.inf
+    return points[rows]
 
 
 def _sizes(size: int) -> Iterator[int]:

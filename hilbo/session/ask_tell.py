@@ -133,9 +133,8 @@ class Session:
         for p in self.study.space.parameters:
             if not isinstance(at[p.name], SupportsFloat):
                 raise InputError(f"Session: {p.name} is {at[p.name]!r}; give a number.")
-            if not p.low <= at[p.name] <= p.high:
-                words = f"from {p.low:g} to {p.high:g} {p.unit}".rstrip()
-                raise InputError(f"Session: {p.name} is {at[p.name]}; it must be {words}.")
+            if not p.holds(at[p.name]):
+                raise InputError(f"Session: {p.name} is {at[p.name]}; it must be {p.range_words}.")
         return np.array([at[name] for name in self.step.names], float)
 
     def posterior(self) -> Posterior:

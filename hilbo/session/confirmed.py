@@ -2,7 +2,8 @@
 
 The study says how far each value may be off (`hilbo.study.stimulus_table`). Within that, the confirmed value is what
 counts: fits, tables and maps have it, the proposal stays in the log. A value beyond an end of the parameter's range
-counts as that end: a 32-bit number of the end itself may lie beyond it, and no table holds what is outside.
+counts as that end: a 32-bit number of the end itself may lie beyond it, and no table holds what is outside. Of a
+parameter with steps the nearest one counts.
 """
 
 import math
@@ -36,4 +37,5 @@ def check_confirmed(study: AnyStudy, asked: Mapping[str, float], values: Mapping
 
 def counted(study: AnyStudy, values: Mapping[str, float]) -> dict[str, float]:
     """The values that count for a confirmation that was accepted."""
-    return {p.name: min(max(float(values[p.name]), p.low), p.high) for p in study.space.parameters}
+    inside = {p.name: min(max(float(values[p.name]), p.low), p.high) for p in study.space.parameters}
+    return {p.name: float(round(inside[p.name])) if p.discrete else inside[p.name] for p in study.space.parameters}

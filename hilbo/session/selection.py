@@ -51,7 +51,7 @@ class Design(eqx.Module):
     """What a seed decides in advance: where the first trials are, and among which points the others are searched.
 
     The latter are a lattice in two or three dimensions, whose nodes are products and cost a hundredth of other points;
-    else, and for Thompson's draws, `candidates`.
+    else, for constraints, whole numbers and levels, and for Thompson's draws, `candidates`.
     """
 
     initial: Float[Array, "s d"]
@@ -63,7 +63,7 @@ class Design(eqx.Module):
 def design(study: Study, seed: int, count: int = CANDIDATES) -> Design:
     """The seeded part of a session: space-filling points (s, d), and the points to search, in the unit cube."""
     space, nodes = study.space, nodes_for(float(np.asarray(study.gp.kernel.theta).max()))
-    on_lattice = space.dim in (2, 3) and study.selection.acquisition != "thompson"
+    on_lattice = space.even and space.dim in (2, 3) and study.selection.acquisition != "thompson"
     return Design(
         jax.device_put(space.latin_hypercube(study.selection.space_filling, seed)),
         None if on_lattice else search_points(space, seed, count),
@@ -119,7 +119,7 @@ def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
         mean, variance = posterior.predict(x[None, :])
         return score(mean[0], variance[0])
 
-    space = {"from_box": study.space.from_box, "to_box": study.space.to_box, "feasible": study.space.feasible}
+    space = study.space.searched
     if study.selection.acquisition in _IN_UNITS_OF_F:
         space["gain"] = _GAIN * jnp.sqrt(study.gp.kernel.variance)
     short = posterior.astype(jnp.float32)

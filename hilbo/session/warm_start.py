@@ -84,15 +84,19 @@ def warm_point(
 
 
 def read_warm_start(path: str | os.PathLike, study: Study, seed: int = 0, share: float = SHARE) -> WarmStart:
-    """From the map.nc of a results folder, interpolated linearly. Raises InputError if it is of other parameters, or
-    damaged."""
+    """From the map.nc of a results folder: at its points, or from its grid, interpolated linearly. Raises InputError if
+    it is of other parameters, or damaged."""
     from scipy.interpolate import RegularGridInterpolator
 
-    from hilbo.study.map_file import read_map
+    from hilbo.study.map_file import on_grid, read_map
 
     grid = read_map(path, study)
     source = digest_of(read_bytes(path))
     mean, variance = np.asarray(grid["mean"]), np.asarray(grid["variance"])
+    if not on_grid(study.space):
+        values = np.stack([grid[name].values for name in study.space.names], axis=-1)
+        points = jnp.asarray(study.space.to_unit(values))
+        return warm_start(study, points, jnp.asarray(mean), jnp.asarray(variance), source=source, share=share)
     sides = [np.linspace(0.0, 1.0, size) for size in mean.shape]
     points = search_points(study.space, seed)
     at = np.asarray(points)

@@ -240,9 +240,7 @@ def _optimum(
         height(*predict(candidates)),
         candidates,
         lambda x: height(*predict(x[None, :]))[0],
-        from_box=space.from_box,
-        to_box=space.to_box,
-        feasible=space.feasible,
+        **space.searched,
         allowed=allowed,
         steps=300,
     )
@@ -278,9 +276,7 @@ def best_point(space: SearchSpace, posterior: Posterior, candidates: Float[Array
         posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
         candidates,
         lambda x: posterior.mean(x[None, :])[0],
-        from_box=space.from_box,
-        to_box=space.to_box,
-        feasible=space.feasible,
+        **space.searched,
     )
 
 

@@ -9,7 +9,7 @@ under it. Usually one pass is left to do, in which the whole population corrects
 """
 
 import dataclasses
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import equinox as eqx
 import jax
@@ -210,7 +210,9 @@ def optimum_near(
             break
     x, mean, variance = last if tolerance else state.here.aux
     return [
-        _optimum_at(study, x[i], mean[i], variance[i], _variance_apart(study, rules[i], population.share))
+        _optimum_at(
+            study, jnp.clip(x[i], 0.0, 1.0), mean[i], variance[i], _variance_apart(study, rules[i], population.share)
+        )
         for i in range(count)
     ]
 
@@ -256,7 +258,9 @@ def _newton_step(
     Float[Array, "s d"], PyTree, Bool[Array, " s"], tuple[Float[Array, "s d"], Float[Array, " s"], Float[Array, " s"]]
 ]:
     """A step of the solver, whose function is the map expanded at the point it asks for."""
-    bounds = {"lower": jnp.zeros(w.shape[1:], w.dtype), "upper": jnp.ones(w.shape[1:], w.dtype)}
+    searched = study.space.searched
+    bounds: dict[str, Any] = {key: searched[key] for key in ("walls", "held") if key in searched}
+    bounds |= {"lower": jnp.zeros(w.shape[1:], w.dtype), "upper": jnp.ones(w.shape[1:], w.dtype)}
 
     def one(w, state, jets, point, plain):
         def expanded(w, _):

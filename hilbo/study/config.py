@@ -71,7 +71,7 @@ class Study(eqx.Module):
         gp, stated = _gp(file)
         return Study(
             gp=gp,
-            space=SearchSpace(file.space.parameters, file.space.mechanics),
+            space=SearchSpace(file.space.parameters, file.space.mechanics, file.space.constraints),
             name=file.name,
             responses=file.responses,
             attribute=file.tables.study.attribute,

@@ -7,6 +7,7 @@ itself a `Table` is a table within the table.
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, TypeVar
 
@@ -145,11 +146,15 @@ def enclosing(path: str, place: str) -> Iterator[str]:
 
 def lines_of(text: str) -> dict[str, int]:
     """Line number of every table and key in the file."""
-    lines, table = {}, ""
+    lines, table, counts = {}, "", Counter()
     for number, line in enumerate(text.splitlines(), 1):
         if header := re.match(r"\s*\[([^\[\]]+)\]", line):
             table = _path(header[1])
             lines.setdefault(table, number)
+        elif header := re.match(r"\s*\[\[([^\[\]]+)\]\]", line):  # tables of one name, called by their number
+            counts[_path(header[1])] += 1
+            table = f"{_path(header[1])}.{counts[_path(header[1])]}"
+            lines[table] = number
         elif key := re.match(r"""\s*([\w."' -]+?)\s*=""", line):
             lines.setdefault(f"{table}.{_path(key[1])}" if table else _path(key[1]), number)
     return lines

@@ -1,23 +1,57 @@
-"""map.nc: the population map on a grid, written with a digest of its numbers and read back checked."""
+"""map.nc: the population map on a grid or at points, written with a digest of its numbers and read back checked.
+
+A grid where there are up to three continuous parameters, else points: feasible ones of low discrepancy, a fifth of them
+on walls, edges and corners, each with its values in physical units and the map's mean and variance there.
+"""
 
 import hashlib
 import json
 import os
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
 
 from hilbo.errors import InputError
+from hilbo.search.box import Parameter
+from hilbo.search.candidates import search_points
+from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
 
-__all__ = ["read_map", "write_map"]
+__all__ = ["map_at_points", "on_grid", "read_map", "write_map"]
 
 _LARGEST = 10_000_000  # numbers in a variable: a damaged size is not to ask for all the memory
 _FARTHEST = 100.0  # prior standard deviations from 0 that a map's mean may be
 _WIDEST = 10.0  # prior variances that a map's variance may be
+
+
+def on_grid(space: SearchSpace) -> bool:
+    """Whether maps of a space are on a grid of all its parameters."""
+    return space.dim <= 3 and not any(space.discrete)
+
+
+def map_at_points(study: Study, surface: Callable[..., Any], seed: int = 0) -> xr.Dataset:
+    """The map at points that fill the feasible set. `surface`: points (m, d) of the unit cube -> mean and variance."""
+    x = search_points(study.space, seed)
+    mean, variance = (np.asarray(moment) for moment in surface(np.asarray(x)))
+    physical = np.asarray(study.space.to_physical(x)).T.tolist()
+    columns = {
+        p.name: ("point", [p.shown(value) for value in values], {"units": p.unit})
+        for p, values in zip(study.space.parameters, physical, strict=True)
+    }
+    words = f"{study.attribute}, posterior"
+    return xr.Dataset(
+        {
+            "mean": ("point", mean, {"long_name": f"{words} mean"}),
+            "variance": ("point", variance, {"long_name": f"{words} variance"}),
+        },
+        coords=columns,
+        attrs={"study": study.hash},
+    )
 
 
 def write_map(grid: xr.Dataset, path: str | os.PathLike) -> None:
@@ -26,7 +60,8 @@ def write_map(grid: xr.Dataset, path: str | os.PathLike) -> None:
 
 
 def read_map(path: str | os.PathLike, study: Study) -> xr.Dataset:
-    """A map over all parameters of a study, its numbers checked. Raises InputError."""
+    """A map over all parameters of a study, on a grid or at points, its numbers checked; the coordinates of points are
+    physical numbers. Raises InputError."""
     try:
         Path(path).open("rb").close()
     except OSError as error:
@@ -35,7 +70,7 @@ def read_map(path: str | os.PathLike, study: Study) -> xr.Dataset:
         grid = _loaded(path)
         changed = "digest" in grid.attrs and grid.attrs["digest"] != _digest(grid)
         mean, variance = (np.asarray(grid[name].values, float) for name in ("mean", "variance"))
-        axes = {name: np.asarray(grid[name].values, float) for name in study.space.names if name in grid.coords}
+        axes = {p.name: _numbers(p, grid[p.name].values) for p in study.space.parameters if p.name in grid.coords}
     except Exception as error:  # a damaged file makes the HDF5 library raise nearly everything
         raise InputError(
             f"{path}: is no map that can be read ({_words(error)}); give a results folder's map.nc."
@@ -45,9 +80,15 @@ def read_map(path: str | os.PathLike, study: Study) -> xr.Dataset:
             f"{path}: has been changed since hilbo wrote it (its digest does not fit); restore it from a copy, or"
             " aggregate the answers again."
         )
-    _check_grid(path, study, axes, mean.shape, grid["mean"].dims, grid["variance"].dims)
+    check = _check_grid if on_grid(study.space) else _check_points
+    check(path, study, axes, mean.shape, grid["mean"].dims, grid["variance"].dims)
     _check_numbers(path, study, mean, variance)
-    return grid
+    return grid if on_grid(study.space) else grid.assign_coords({name: ("point", v) for name, v in axes.items()})
+
+
+def _numbers(parameter: Parameter, values: np.ndarray) -> np.ndarray:
+    """A coordinate as physical numbers; NaN where it is none of the parameter's."""
+    return np.array([parameter.number(value) for value in values.tolist()], float)
 
 
 def _loaded(path: str | os.PathLike) -> xr.Dataset:
@@ -89,6 +130,17 @@ def _check_grid(path, study, axes, shape, *dims) -> None:
         whole = whole and here is not None and here.shape == wanted.shape and np.allclose(here, wanted, rtol=1e-6)
     if not whole:
         raise InputError(f"{path}: is a map of other parameters or ranges; give one of this study.")
+
+
+def _check_points(path, study, axes, shape, *dims) -> None:
+    whole = all(d == ("point",) for d in dims) and set(axes) == set(study.space.names)
+    for p in study.space.parameters if whole else ():
+        whole = whole and axes[p.name].shape == shape and all(p.holds(value) for value in axes[p.name].tolist())
+    if not whole:
+        raise InputError(f"{path}: is a map of other parameters or ranges; give one of this study.")
+    values = np.stack([axes[name] for name in study.space.names], axis=-1)
+    if not np.asarray(study.space.feasible(study.space.to_unit(values))).all():
+        raise InputError(f"{path}: has points that may not be rendered in this study; aggregate the answers again.")
 
 
 def _check_numbers(path, study, mean, variance) -> None:

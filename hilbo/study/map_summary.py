@@ -124,10 +124,10 @@ def slice_through(
 def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: str) -> Tolerance | None:
     """The tolerance interval of a parameter through the optimum `x` (d,); None if another answer is likelier there."""
     index = study.space.names.index(parameter)
-    here = float(x[index])
-    grid = np.unique(np.append(np.linspace(0.0, 1.0, _GRID), here))
+    here, searched = float(x[index]), study.space.parameters[index]
+    grid = searched.axis(_GRID) if searched.discrete else np.unique(np.append(np.linspace(0.0, 1.0, _GRID), here))
     inside, passive = _tolerated(study, predict, x, parameter, jnp.asarray(grid, x.dtype))
-    middle = int(np.searchsorted(grid, here))
+    middle = int(np.argmin(np.abs(grid - here)))
     if not inside[middle]:
         return None
     ends = []
@@ -140,8 +140,11 @@ def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: 
             ends.append((grid[last], "range"))
             continue
         kind: End = "other answer" if passive[beyond] else "passive boundary"
+        if searched.discrete:
+            ends.append((grid[last], kind))
+            continue
         ends.append((_bisect(study, predict, x, parameter, grid[last], grid[beyond]), kind))
-    to_physical = study.space.parameters[index].to_physical
+    to_physical = searched.to_physical
     (low, low_end), (high, high_end) = ((float(to_physical(jnp.asarray(end))), kind) for end, kind in ends)
     return Tolerance(parameter, low, high, low_end, high_end)
 
@@ -223,9 +226,7 @@ def _maximum(
         values,
         candidates,
         height,
-        from_box=space.from_box,
-        to_box=space.to_box,
-        feasible=space.feasible,
+        **space.searched,
         starts=starts,
         steps=300,
     )

@@ -11,7 +11,7 @@ import msgspec
 
 from hilbo.errors import InputError
 from hilbo.mechanics.span import Memory
-from hilbo.search.box import Box, Mechanics, Parameter
+from hilbo.search.box import Box, Constraint, Mechanics, Parameter
 from hilbo.study.fields import NotNegative as _NotNegative
 from hilbo.study.fields import Number as _Number
 from hilbo.study.fields import Positive as _Positive
@@ -58,6 +58,17 @@ class _ParameterTable(_Table, frozen=True):
     high: _Number
     unit: Annotated[str, _text("a text", '"N/mm"')] = ""
     scale: Annotated[Literal["linear", "log"], _text('"linear" or "log"', '"linear"')] = "linear"
+    integer: Annotated[bool, _text("true or false", "true")] = False
+
+
+class _ConstraintTable(_Table, frozen=True):
+    """`least` <= the sum of weight times parameter <= `most`, in physical units."""
+
+    terms: Annotated[
+        dict[str, float], msgspec.Meta(min_length=1), _text("a table of weights", "{gain = 1, delay = 0.5}")
+    ]
+    least: _Number | None = None
+    most: _Number | None = None
 
 
 class _RendererTable(_Table, frozen=True):
@@ -134,6 +145,7 @@ class Tables(_Table, frozen=True):
     report: ReportTable = ReportTable()
     stimulus: StimulusTable | None = None
     simulation: SimulationTable | None = None
+    constraints: tuple[_ConstraintTable, ...] = ()
 
 
 _TABLES = {
@@ -147,7 +159,7 @@ _TABLES = {
     "simulation": SimulationTable,
 }
 _REQUIRED = ("schema", "study", "parameters")
-_KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "materials")
+_KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "constraints", "materials")
 _LEARNT = ("theta", "variance", "thresholds", "noise")
 _OVERRIDES = ("renderer", "parameters")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
@@ -167,10 +179,19 @@ def read(raw: Mapping[str, Any]) -> Tables:
     parameters = {
         name: read_table(_ParameterTable, table, f"parameters.{name}") for name, table in raw["parameters"].items()
     }
+    if "constraints" in raw:
+        tables["constraints"] = _constraints(raw["constraints"])
     materials = check_table(raw.get("materials", {}), "materials")
     for name, table in materials.items():
         check_keys(table, f"materials.{name}", _OVERRIDES)
     return Tables(parameters=parameters, materials=dict(materials), **tables)
+
+
+def _constraints(raw: Any) -> tuple[_ConstraintTable, ...]:
+    """[[constraints]], each called by its number from 1. Raises `InputError`."""
+    if not isinstance(raw, list):
+        raise InputError(f"constraints is {shown(raw)}, it must be tables; write each as [[constraints]].")
+    return tuple(read_table(_ConstraintTable, table, f"constraints.{i}") for i, table in enumerate(raw, 1))
 
 
 def _check_complete(raw: Mapping[str, Any]) -> None:
@@ -206,8 +227,9 @@ def _with_theta(table: GPTable, dim: int) -> GPTable:
 def box_of(tables: Tables) -> Box:
     """[parameters] and [renderer]. Raises `InputError`."""
     parameters = tuple(Parameter(name, **msgspec.structs.asdict(p)) for name, p in tables.parameters.items())
+    constraints = tuple(Constraint(tuple(c.terms.items()), c.least, c.most) for c in tables.constraints)
     if tables.renderer is None:
-        return Box(parameters)
+        return Box(parameters, None, constraints)
     for p in parameters:
         unit = p.unit.replace("·", ".").replace("α", "alpha")
         if p.name in _UNITS and unit not in ("", _UNITS[p.name]):
@@ -216,7 +238,7 @@ def box_of(tables: Tables) -> Box:
             )
     renderer = msgspec.structs.asdict(tables.renderer)
     del renderer["model"]
-    return Box(parameters, Mechanics(**renderer))
+    return Box(parameters, Mechanics(**renderer), constraints)
 
 
 def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:

@@ -50,8 +50,10 @@ def tolerance_ends(
     `share` is the hierarchical rule's.
     """
     index = study.space.names.index(parameter)
-    grid = np.unique(np.append(np.linspace(0.0, 1.0, _GRID), float(x[index])))
-    grid = np.interp(np.linspace(0, 1, _GRID + 1), np.linspace(0, 1, len(grid)), grid)  # one shape, one compilation
+    grid = study.space.parameters[index].axis(_GRID)
+    if not study.space.parameters[index].discrete:
+        grid = np.unique(np.append(grid, float(x[index])))
+        grid = np.interp(np.linspace(0, 1, _GRID + 1), np.linspace(0, 1, len(grid)), grid)  # one shape, one compilation
     middle = int(np.argmin(np.abs(grid - float(x[index]))))
     points, feasible = slice_through(study, x, parameter, jnp.asarray(grid, x.dtype))
     means, explained, prior = _predictions(posteriors, points)

@@ -128,9 +128,10 @@ def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
 
 
 def _parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> pd.Series:
-    unit = f" {parameter.unit}" if parameter.unit else ""
-    words = f"a number from {parameter.low:g} to {parameter.high:g}{unit}, the study's range"
-    return numbers(text, parameter.name, source, words, lambda v: (v >= parameter.low) & (v <= parameter.high))
+    def valid(values):
+        return (values >= parameter.low) & (values <= parameter.high) & ((values % 1 == 0) | (not parameter.integer))
+
+    return numbers(text, parameter.name, source, f"{parameter.range_words}, the study's range", valid)
 
 
 def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.Series:

@@ -17,7 +17,7 @@ def grid():
         x = np.asarray(x)
         return x.sum(axis=1) - 1.0, 0.1 + 0.2 * x[:, 0]
 
-    return map_dataset(STUDY, surface, STUDY.space.to_unit(np.array([0.5, 0.5])), 5).assign_attrs(rule="bcm")
+    return map_dataset(STUDY, surface, 5).assign_attrs(rule="bcm")
 
 
 def write(path, dataset):

@@ -68,10 +68,10 @@ Surface = Callable[..., tuple[Any, Any]]
 
 
 class Slice(NamedTuple):
-    """Mean and standard deviation (c, c) of a map over the first two parameters, NaN where nothing may be rendered."""
+    """Mean and standard deviation (r, c) of a map over the first two parameters, NaN where nothing may be rendered."""
 
-    mean: Float[np.ndarray, "c c"]
-    sd: Float[np.ndarray, "c c"]
+    mean: Float[np.ndarray, "r c"]
+    sd: Float[np.ndarray, "r c"]
 
 
 def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"], cohort: Cohort) -> Figure:
@@ -83,7 +83,7 @@ def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"],
     """
     if study.space.dim == 1:
         return _map_curve(study, surface, optimum, cohort)
-    thirds = [None] if study.space.dim == 2 else _levels(float(optimum[2]))
+    thirds = [None] if study.space.dim == 2 else _levels(study.space.parameters[2], float(optimum[2]))
     grids = [grid_slice(study, surface, optimum, third) for third in thirds]
     figure, panels, draw = map_panels(study, grids)
     for axes, third, values in zip(panels, thirds, grids, strict=True):
@@ -194,19 +194,27 @@ def _row(figure, count):
     return np.atleast_1d(figure.subplots(1, count))
 
 
-def _levels(third):
-    """The optimum's value of the third parameter and one on either side, as far as the unit cube goes."""
+def _levels(parameter, third):
+    """The optimum's value of the third parameter and one on either side, as far as the unit cube goes; of levels all,
+    up to three."""
+    if parameter.levels:
+        others = [x for x in parameter.axis(parameter.steps).tolist() if abs(x - third) > 1e-9]
+        return sorted((third, *others[:2]))
     beside = (third - _APART, third + _APART)
     if beside[0] < 0:
         beside = (third + _APART, third + 2 * _APART)
     elif beside[1] > 1:
         beside = (third - 2 * _APART, third - _APART)
+    if parameter.discrete:
+        beside = np.unique(np.asarray(parameter.to_unit(parameter.to_physical(jnp.asarray(beside))))).tolist()
+        return sorted({third, *(x for x in beside if abs(x - third) > 1e-9)})
     return sorted((third, *beside))
 
 
 def map_panels(study: Study, grids):
     """A figure with a panel for each grid, and what draws a grid on one, all on one colour scale."""
-    low, high = min(np.nanmin(g.mean) for g in grids), max(np.nanmax(g.mean) for g in grids)
+    heights = np.concatenate([g.mean.ravel() for g in grids])
+    low, high = np.nanmin(heights), np.nanmax(heights)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(ONE_COLUMN, 2.9) if len(grids) == 1 else (TWO_COLUMNS, 2.6), layout="constrained")
         panels = np.atleast_1d(figure.subplots(1, len(grids), sharey=True))
@@ -222,6 +230,8 @@ def map_panels(study: Study, grids):
         first, second = sides(study)
         mean, sd = values
         axes.pcolormesh(first, second, mean, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
+        if np.isnan(mean).all() or min(mean.shape) < 2:  # nothing may be rendered, or nothing is between the steps
+            return
         if np.nanmax(mean) > np.nanmin(mean):
             axes.contour(first, second, mean, levels=_MEANS, colors="white", linewidths=0.4, linestyles="solid")
         if np.nanmax(sd) > np.nanmin(sd):
@@ -239,26 +249,25 @@ def map_handles() -> list[Any]:
 
 def sides(study: Study) -> list[np.ndarray]:
     """Physical values of the first two parameters along a slice."""
-    side = np.linspace(0.0, 1.0, _CELLS)
-    return [np.asarray(p.to_physical(jnp.asarray(side))) for p in study.space.parameters[:2]]
+    return [np.asarray(p.to_physical(jnp.asarray(p.axis(_CELLS)))) for p in study.space.parameters[:2]]
 
 
 def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None) -> Slice:
     """A map over the first two parameters, at `third` of the third; `optimum` (d,): where the others stay."""
-    side = np.linspace(0.0, 1.0, _CELLS)
-    x = np.tile(np.asarray(optimum, float), (_CELLS, _CELLS, 1))
-    x[..., 0], x[..., 1] = np.meshgrid(side, side)
+    first, second = (p.axis(_CELLS) for p in study.space.parameters[:2])
+    x = np.tile(np.asarray(optimum, float), (len(second), len(first), 1))
+    x[..., 0], x[..., 1] = np.meshgrid(first, second)
     if third is not None:
         x[..., 2] = third
     flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
     feasible = np.asarray(study.space.feasible(flat))
-    mean, variance = (np.where(feasible, np.asarray(m), np.nan).reshape(_CELLS, _CELLS) for m in surface(flat))
+    mean, variance = (np.where(feasible, np.asarray(m), np.nan).reshape(x.shape[:-1]) for m in surface(flat))
     return Slice(mean, np.sqrt(variance))
 
 
 def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Physical values, mean and standard deviation of a map of one parameter."""
-    side = jnp.linspace(0.0, 1.0, _CELLS)
+    side = jnp.asarray(study.space.parameters[0].axis(_CELLS))
     mean, variance = surface(side[:, None])
     return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
 

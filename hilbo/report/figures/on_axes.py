@@ -48,7 +48,8 @@ def draw_map(
             return axes
         i, j = _places(names, names[:2] if pair is None else pair)
         mean = _slice(study, model, best, i, j)
-        sides = [np.asarray(study.space.parameters[k].to_physical(jnp.linspace(0.0, 1.0, _CELLS))) for k in (i, j)]
+        searched = (study.space.parameters[k] for k in (i, j))
+        sides = [np.asarray(p.to_physical(jnp.asarray(p.axis(_CELLS)))) for p in searched]
         drawn = axes.pcolormesh(*sides, mean, cmap="cividis", shading="nearest", rasterized=True)
         axes.figure.colorbar(drawn, ax=axes, label=f"{study.attribute} f (mean)")
         label_axes(axes, study, i, j)
@@ -80,12 +81,12 @@ def _mean_and_variance(model: Any, x: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _slice(study: Study, model: Any, best: np.ndarray, i: int, j: int) -> np.ndarray:
     """The mean on a grid (rows: up), NaN where nothing may be rendered."""
-    side = np.linspace(0.0, 1.0, _CELLS)
-    x = np.tile(best, (_CELLS, _CELLS, 1))
-    x[..., i], x[..., j] = np.meshgrid(side, side)
+    across, up = (study.space.parameters[k].axis(_CELLS) for k in (i, j))
+    x = np.tile(best, (len(up), len(across), 1))
+    x[..., i], x[..., j] = np.meshgrid(across, up)
     flat = x.reshape(-1, len(best))
     mean = _mean_and_variance(model, flat)[0]
-    return np.where(np.asarray(study.space.feasible(jnp.asarray(flat))), mean, np.nan).reshape(_CELLS, _CELLS)
+    return np.where(np.asarray(study.space.feasible(jnp.asarray(flat))), mean, np.nan).reshape(x.shape[:-1])
 
 
 def _curve(axes: Axes, study: Study, model: Any) -> None:

@@ -241,14 +241,15 @@ def class_regions(readings: Mapping[str, Reading]) -> Figure:
 
 def _regions(axes, reading, i, j, shades):
     study, best = reading.study, np.asarray(reading.aggregate.optimum.x)
-    side = np.linspace(0.0, 1.0, _CELLS)
-    x = np.tile(best, (_CELLS, _CELLS, 1))
-    x[..., i], x[..., j] = np.meshgrid(side, side)
+    across, up = (study.space.parameters[k].axis(_CELLS) for k in (i, j))
+    x = np.tile(best, (len(up), len(across), 1))
+    x[..., i], x[..., j] = np.meshgrid(across, up)
     flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
     likeliest = np.argmax(np.asarray(_probabilities(reading, flat)), axis=1).astype(float)
-    values = np.where(np.asarray(study.space.feasible(flat)), likeliest, np.nan).reshape(_CELLS, _CELLS)
+    values = np.where(np.asarray(study.space.feasible(flat)), likeliest, np.nan).reshape(x.shape[:-1])
     label_axes(axes, study, i, j)
-    first, second = (np.asarray(study.space.parameters[k].to_physical(jnp.asarray(side))) for k in (i, j))
+    sides = ((i, across), (j, up))
+    first, second = (np.asarray(study.space.parameters[k].to_physical(jnp.asarray(side))) for k, side in sides)
     count = len(study.responses)
     axes.pcolormesh(first, second, values, cmap=shades, vmin=-0.5, vmax=count - 0.5, shading="nearest", rasterized=True)
     for index in (i, j):

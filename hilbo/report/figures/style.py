@@ -109,14 +109,25 @@ def label_axes(axes, study: Study, i: int, j: int) -> None:
         unit = f" ({_unit(parameter.unit)})" if parameter.unit else ""
         getattr(axes, f"set_{which}label")(_name(parameter.name) + unit)
         getattr(axes, f"set_{which}lim")(parameter.low, parameter.high)
+        if parameter.discrete:
+            _steps_on(axes, which, parameter)
         if parameter.scale == "log":
             getattr(axes, f"set_{which}scale")("log")
             axis = getattr(axes, f"{which}axis")
             axis.set_major_locator(LogLocator(subs=(1.0,) if parameter.high > 20 * parameter.low else (1.0, 3.0, 5.0)))
             axis.set_major_formatter(FormatStrFormatter("%g"))
             axis.set_minor_formatter(NullFormatter())
-        else:
+        elif not parameter.discrete:
             few_ticks(getattr(axes, f"{which}axis"))
+
+
+def _steps_on(axes, which, parameter) -> None:
+    """An axis of steps: half a step of room at both ends, levels by their names."""
+    getattr(axes, f"set_{which}lim")(parameter.low - 0.5 * (parameter.scale == "linear"), parameter.high + 0.5)
+    if parameter.levels:
+        getattr(axes, f"set_{which}ticks")(range(len(parameter.levels)), parameter.levels)
+    elif parameter.scale == "linear":
+        getattr(axes, f"{which}axis").get_major_locator().set_params(integer=True)
 
 
 def _name(name: str) -> str:
@@ -132,7 +143,8 @@ def level_words(study: Study, index: int, unit_value: float) -> str:
     """A parameter's name and physical value."""
     parameter = study.space.parameters[index]
     value = float(parameter.to_physical(jnp.asarray(float(unit_value))))
-    return f"{_name(parameter.name)} = {value:.3g} {parameter.unit}".strip()
+    words = parameter.words(value) if parameter.discrete else f"{value:.3g}"
+    return f"{_name(parameter.name)} = {words} {parameter.unit}".strip()
 
 
 def star(axes, study: Study, x, pair: tuple[int, int] = (0, 1)) -> None:

@@ -1,0 +1,122 @@
+"""The nearest point of a polytope, in any quadratic metric: what keeps a search between linear walls.
+
+    minimise (v - target)' (spread spread')^-1 (v - target)   where   normals v <= offsets,   offsets >= 0
+
+The dual active-set method: from the target, the most violated wall is taken into the active set, whose multipliers stay
+above 0 because walls that would pull are let go on the way. The end is exact, walls, edges and vertices included, and
+walls that say the same twice do no harm. Reference: Goldfarb & Idnani (1983), Math. Programming 27:1.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.numerics.linalg import cholesky, eigh, solve_lower, solve_lower_transposed
+
+__all__ = ["Nearest", "Polytope", "nearest", "projector", "walls_of_cube"]
+
+_ROUNDING = 64.0  # units of eps: what a wall may be violated by, of its normal's length
+_DEPENDENT = 1e-10  # of a normal's squared length: less than that lies outside the span of the others
+_STEPS = 4  # for each wall, which bounds the search where rounding would let it go round
+
+
+class Polytope(NamedTuple):
+    """The points w (d,) with `normals` (k, d) w <= `offsets` (k,); normals of length 1."""
+
+    normals: Float[Array, "k d"]
+    offsets: Float[Array, " k"]
+
+
+class Nearest(NamedTuple):
+    """The nearest point (d,), and the multipliers (k,) of the walls that hold it: above 0 for those."""
+
+    point: Float[Array, " d"]
+    multipliers: Float[Array, " k"]
+
+
+def walls_of_cube(walls: Polytope, held: Bool[Array, " d"], at: Float[Array, " d"]) -> Polytope:
+    """The walls and those of the unit cube as seen from a point `at` of the polytope: normals v <= offsets for a step v
+    whose `held` coordinates stay 0. Offsets are never below 0."""
+    unit = jnp.eye(at.size, dtype=at.dtype)
+    free = jnp.where(held, 0.0, 1.0).astype(at.dtype)
+    normals = jnp.concatenate([walls.normals.astype(at.dtype), unit, -unit]) * free[None, :]
+    left = walls.offsets.astype(at.dtype) - walls.normals.astype(at.dtype) @ at
+    return Polytope(normals, jnp.maximum(jnp.concatenate([left, 1.0 - at, at]), 0.0))
+
+
+def projector(normals: Float[Array, "k d"], active: Bool[Array, " k"]) -> Float[Array, "d d"]:
+    """What leaves of a vector its part along the active walls."""
+    rows = jnp.where(active[:, None], normals, 0.0)
+    eigenvalues, vectors = eigh(rows.T @ rows)
+    free = jnp.where((eigenvalues <= _DEPENDENT)[None, :], vectors, 0.0)
+    return free @ free.T
+
+
+class _State(NamedTuple):
+    active: Bool[Array, " k"]
+    multipliers: Float[Array, " k"]
+    entering: Int[Array, ""]  # index of the wall that is being taken in, -1: the next is to be chosen
+    count: Int[Array, ""]
+
+
+def nearest(walls: Polytope, target: Float[Array, " d"], spread: Float[Array, "d d"]) -> Nearest:
+    """The point between the walls that is nearest to the target. `spread` is a square root of the inverse metric, the
+    identity for plain distances."""
+    turned = walls.normals @ spread  # in coordinates in which the metric is plain
+    sizes = jnp.sqrt(jnp.sum(turned**2, axis=1))
+    eps = jnp.finfo(target.dtype).eps
+    tolerance = _ROUNDING * eps * (1.0 + jnp.sqrt(jnp.sum(walls.normals**2, axis=1)))
+    beyond = walls.normals @ target - walls.offsets
+    usable = sizes > 0.0
+
+    def violations(multipliers):
+        return beyond - turned @ (turned.T @ multipliers)
+
+    def going(state):
+        wrong = jnp.where(usable & ~state.active, violations(state.multipliers) - tolerance, -1.0)
+        return ((state.entering >= 0) | jnp.any(wrong > 0.0)) & (state.count < _STEPS * len(walls.offsets))
+
+    def step(state):
+        left = violations(state.multipliers)
+        worst = jnp.argmax(
+            jnp.where(usable & ~state.active & (left > tolerance), left / jnp.where(usable, sizes, 1.0), -jnp.inf)
+        )
+        entering = jnp.where(state.entering >= 0, state.entering, worst.astype(state.entering.dtype))
+        normal = turned[entering]
+        share = _in_the_span_of(turned, state.active, normal)
+        outside = normal - turned.T @ share
+        square = outside @ outside
+        blocked = state.active & (share > 0.0)
+        lengths = jnp.where(blocked, state.multipliers / jnp.where(blocked, share, 1.0), jnp.inf)
+        partial = jnp.min(lengths)
+        free = square > _DEPENDENT * (normal @ normal)
+        full = jnp.where(free, left[entering] / jnp.where(free, square, 1.0), jnp.inf)
+        length = jnp.minimum(partial, full)
+        ends = ~jnp.isfinite(length)  # a wall that no point can keep: rounding alone
+        length = jnp.where(ends, 0.0, length)
+        multipliers = (state.multipliers - length * share).at[entering].add(length)
+        whole = full <= partial
+        active = jnp.where(whole, state.active.at[entering].set(~ends), state.active.at[jnp.argmin(lengths)].set(False))
+        settled = whole | ends
+        kept = active | (jnp.arange(len(active), dtype=entering.dtype) == entering)
+        multipliers = jnp.where(kept, jnp.maximum(multipliers, 0.0), 0.0)
+        count = jnp.where(ends, _STEPS * len(walls.offsets), state.count + 1)
+        return _State(active, multipliers, jnp.where(settled, -1, entering), count)
+
+    none = jnp.zeros(len(walls.offsets), target.dtype)
+    start = _State(none > 0, none, jnp.asarray(-1, jnp.int32), jnp.asarray(0, jnp.int32))
+    multipliers = jax.lax.while_loop(going, step, start).multipliers
+    return Nearest(target - spread @ (turned.T @ multipliers), multipliers)
+
+
+def _in_the_span_of(
+    turned: Float[Array, "k d"], active: Bool[Array, " k"], normal: Float[Array, " d"]
+) -> Float[Array, " k"]:
+    """The coefficients (k,) of the active normals whose sum is nearest to a normal."""
+    rows = jnp.where(active[:, None], turned, 0.0)
+    gram = rows @ rows.T + jnp.diag(jnp.where(active, 0.0, 1.0).astype(rows.dtype))
+    factor = cholesky(gram)
+    right = rows @ normal
+    return jnp.where(active, solve_lower_transposed(factor, solve_lower(factor, right[:, None]))[:, 0], 0.0)

@@ -1,0 +1,148 @@
+"""Linear constraints between parameters: a polytope in the optimiser's coordinates, and points in it and on its walls.
+
+Numbers of NumPy, made once for a space. A constraint is linear in physical units, so that a parameter on a logarithmic
+scale that is in one is searched in its unit, from 0 at its low end to 1 at its high one. A wall stands `MARGIN` of the
+ranges inside what the study says: rounding must not carry a choice beyond it.
+
+Where few points of the cube are feasible, others are found by hit and run (Smith 1984, Oper. Res. 32:1296): many
+chains, which all begin in the middle of the largest ball within.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hilbo.errors import InputError
+from hilbo.search.box import Constraint, Parameter
+
+__all__ = ["MARGIN", "Walls", "check_room", "ends_of_rays", "inside", "rows_of"]
+
+MARGIN = 1e-9
+"""Of the ranges: how far inside the stated inequalities the search has its walls."""
+_LEAST = 1e-6  # radius of the largest ball, in units of the ranges: less is no volume
+_CHAINS, _BURN_IN, _APART = 512, 200, 20  # steps of hit and run
+
+
+class Walls(NamedTuple):
+    """Points w (d,) with `normals` (k, d) w <= `offsets` (k,), normals of length 1; `source`: the number of the
+    constraint, from 1."""
+
+    normals: Float[np.ndarray, "k d"]
+    offsets: Float[np.ndarray, " k"]
+    source: tuple[int, ...]
+
+
+def rows_of(parameters: Sequence[Parameter], constraints: Sequence[Constraint], without: str | None = None) -> Walls:
+    """The constraints as walls in linear units of the ranges; but for those that name the parameter `without`."""
+    names, low = [p.name for p in parameters], np.array([p.low for p in parameters])
+    width = np.array([p.high for p in parameters]) - low
+    normals, offsets, source = [], [], []
+    for number, constraint in enumerate(constraints, 1):
+        weights = np.zeros(len(names))
+        for name, weight in constraint.terms:
+            weights[names.index(name)] = weight
+        if without is not None and weights[names.index(without)]:
+            continue
+        size = np.linalg.norm(weights * width)
+        for side, end in ((1.0, constraint.most), (-1.0, constraint.least)):
+            if end is not None:
+                normals.append(side * weights * width / size)
+                offsets.append(side * (end - weights @ low) / size - MARGIN)
+                source.append(number)
+    return Walls(np.array(normals).reshape(-1, len(names)), np.array(offsets), tuple(source))
+
+
+def check_room(parameters: Sequence[Parameter], constraints: Sequence[Constraint]) -> None:
+    """Refuse constraints that leave nothing of the ranges, alone, in pairs or together. Raises `InputError`."""
+    if _radius(rows_of(parameters, constraints))[0] > _LEAST:
+        return
+    numbers = range(1, len(constraints) + 1)
+    for number in numbers:
+        if _radius(rows_of(parameters, [constraints[number - 1]]))[0] <= _LEAST:
+            raise InputError(f"constraints.{number} leaves nothing of the ranges; change its least or most.")
+    for a in numbers:
+        for b in range(a + 1, len(constraints) + 1):
+            if _radius(rows_of(parameters, [constraints[a - 1], constraints[b - 1]]))[0] <= _LEAST:
+                raise InputError(
+                    f"constraints.{b} contradicts the {_ordinal(a)} within the ranges: together they leave nothing."
+                )
+    raise InputError("constraints leave nothing of the ranges, all together; change one of them.")
+
+
+def _ordinal(number: int) -> str:
+    return {1: "first", 2: "second", 3: "third"}.get(number, f"{number}th")
+
+
+def _radius(walls: Walls) -> tuple[float, Float[np.ndarray, " d"]]:
+    """Radius and middle of the largest ball between the walls and those of the cube; below 0 where there is none."""
+    from scipy.optimize import linprog  # slow to import, and only studies with constraints need it
+
+    normals, offsets = _with_cube(walls)
+    goal = np.append(np.zeros(normals.shape[1]), -1.0)
+    rows = np.column_stack([normals, np.linalg.norm(normals, axis=1)])
+    found = linprog(goal, A_ub=rows, b_ub=offsets, bounds=[(0, 1)] * normals.shape[1] + [(None, None)])
+    return (float(found.x[-1]), found.x[:-1]) if found.success else (-1.0, goal[:-1])
+
+
+def _with_cube(walls: Walls) -> tuple[Float[np.ndarray, "r d"], Float[np.ndarray, " r"]]:
+    d = walls.normals.shape[1]
+    return (
+        np.concatenate([walls.normals, np.eye(d), -np.eye(d)]),
+        np.concatenate([walls.offsets, np.ones(d), np.zeros(d)]),
+    )
+
+
+def inside(walls: Walls, count: int, seed: int) -> Iterator[Float[np.ndarray, "n d"]]:
+    """Chunks of `count` points or more, uniform between the walls and within the cube."""
+    rng, (_, middle) = np.random.default_rng(seed), _radius(walls)
+    w = np.tile(middle, (_CHAINS, 1))
+    for _ in range(_BURN_IN):
+        w = _hit(walls, w, rng)
+    while True:
+        kept = []
+        for _ in range(-(-count // _CHAINS)):
+            for _ in range(_APART):
+                w = _hit(walls, w, rng)
+            kept.append(w)
+        yield np.concatenate(kept)
+
+
+def _hit(walls: Walls, w: Float[np.ndarray, "n d"], rng: np.random.Generator) -> Float[np.ndarray, "n d"]:
+    """A uniform point on a random line through each point."""
+    direction = rng.standard_normal(w.shape)
+    ahead, behind = (_reach(*_with_cube(walls), w, side * direction)[0] for side in (1.0, -1.0))
+    return w + (rng.random(len(w)) * (ahead + behind) - behind)[:, None] * direction
+
+
+def _reach(normals, offsets, w, direction) -> tuple[Float[np.ndarray, " n"], np.ndarray]:
+    """How far each point may go in its direction, and the row of the wall that it then meets."""
+    speed, left = direction @ normals.T, np.maximum(offsets - w @ normals.T, 0.0)
+    moving = speed > 1e-12
+    lengths = np.where(moving, left / np.where(moving, speed, 1.0), np.inf)
+    return lengths.min(axis=1), lengths.argmin(axis=1)
+
+
+def ends_of_rays(
+    walls: Walls, w: Float[np.ndarray, "n d"], free: Bool[np.ndarray, " d"], seed: int, shares: Sequence[float]
+) -> Float[np.ndarray, "n d"]:
+    """Points on the walls: from each point a random ray to its end, from there another along the wall that it met, and
+    so on; `shares` of them after one wall, two, and so on, the rest at corners. What is not `free` stays."""
+    rng, (normals, offsets) = np.random.default_rng(seed), _with_cube(walls)
+    d = int(free.sum())
+    if d == 0:
+        return w
+    ends = np.minimum(np.searchsorted(np.cumsum(shares), rng.random(len(w))) + 1, d)
+    ends = np.where(rng.random(len(w)) < 1 - sum(shares), d, ends)
+    met = np.zeros((len(w), w.shape[1], w.shape[1]))  # the normals of walls that were met
+    met[:] = np.diag(np.where(free, 0.0, 1.0))
+    for turn in range(d):
+        direction = rng.standard_normal(w.shape)
+        direction -= np.einsum("nij,nj->ni", np.linalg.pinv(met, rcond=1e-9) @ met, direction)
+        length, row = _reach(normals, offsets, w, direction)
+        going = (turn < ends) & np.isfinite(length) & (np.linalg.norm(direction, axis=1) > 1e-9)
+        w = np.where(going[:, None], w + np.where(going, length, 0.0)[:, None] * direction, w)
+        new = np.flatnonzero(going)
+        met[new, np.flatnonzero(free)[turn]] = normals[row[new]]
+    return np.clip(w, 0.0, 1.0)
