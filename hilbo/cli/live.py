@@ -45,7 +45,7 @@ class Served(NamedTuple):
     """Where a session is served, and where its log goes."""
 
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the session logs.")] = Path("logs")
-    port: Annotated[int, typer.Option("--port", help="Port of the server; 0 takes any.")] = _PORT
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server; 0 takes any.")] = _PORT
     lan: Annotated[bool, typer.Option("--lan", help="Reachable from the network, by one-time links.")] = False
     gap: Annotated[float, typer.Option("--gap", min=0.0, help="Pause between two trials, s.")] = 0.7
     browse: Annotated[bool, typer.Option("--open", help="Open the experimenter's page in this computer's browser.")] = (
@@ -161,7 +161,7 @@ def doctor(
     line: Device,
     study: Annotated[Path | None, typer.Argument(help="Study file (TOML).", show_default=False)] = None,
     logs: Annotated[Path, typer.Option("--logs", help="Folder of the session logs.")] = Path("logs"),
-    port: Annotated[int, typer.Option("--port", help="Port of the server.")] = _PORT,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server.")] = _PORT,
     stimulus: Annotated[
         bool, typer.Option("--stimulus", help="Ask the program that presents for renderings, and stop it in them.")
     ] = False,

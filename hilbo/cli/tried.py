@@ -32,7 +32,7 @@ def tried(
     ] = None,
     trials: Annotated[int | None, typer.Option(min=15, max=25, help=f"How many blocks; {_TRIALS} by default.")] = None,
     seed: Annotated[int | None, seed_option("of what is hidden and of the first blocks; else by chance")] = None,
-    port: Annotated[int, typer.Option("--port", help="Port of the server; 0 takes any.")] = 0,
+    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="Port of the server; 0 takes any.")] = 0,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for study and log; by default a new one.")] = None,
     browse: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in this computer's browser.")] = True,
 ) -> None:

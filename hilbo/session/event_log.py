@@ -102,6 +102,8 @@ class EventLog:
         path = Path(path)
         try:
             file = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
+        except FileNotFoundError:
+            raise InputError(f"{path}: is not there, no such session was begun; begin it without --resume.") from None
         except OSError as error:
             raise InputError(f"{path}: cannot be opened ({error.strerror}); check the path.") from error
         try:

@@ -22,6 +22,8 @@ FRAME = "DataFrame"
 """What a table that is in memory is called in sentences."""
 
 _PIECE = 50_000  # rows
+_SPREADSHEETS = (".xlsx", ".xls", ".ods")
+_SPREADSHEET = "is a spreadsheet; save it as CSV, by the spreadsheet's own menu"
 
 
 def read_cells(path: str | os.PathLike, needs: str = "a trial table needs a header and an answer") -> pd.DataFrame:
@@ -37,6 +39,8 @@ def cell_pieces(
 ) -> Iterator[pd.DataFrame]:
     """The cells of a table as text, some rows at a time; at least one piece, which may have none."""
     source, path = str(path), Path(path)
+    if path.suffix.lower() in _SPREADSHEETS and path.is_file():
+        raise InputError(f"{source}: {_SPREADSHEET}.")
     try:
         for frame in _parquet_pieces(path) if path.suffix == ".parquet" else _csv_pieces(path, source, needs):
             again = frame.columns[frame.columns.duplicated()]
@@ -46,10 +50,25 @@ def cell_pieces(
     except InputError:
         raise
     except OSError as error:
-        raise InputError(f"{source}: cannot be read ({error.strerror or error}); check the path.") from error
+        why = error.strerror or ("it is a stream, and no file" if "seekable" in str(error) else error)
+        raise InputError(f"{source}: cannot be read ({why}); check the path.") from error
     except (ValueError, csv.Error) as error:  # pyarrow's errors, and text that is no UTF-8, are ValueErrors
-        reason = str(error).strip().splitlines()[-1]
-        raise InputError(f"{source}: is not a table that can be read ({reason}); save it as CSV or Parquet.") from error
+        raise InputError(f"{source}: {_unreadable(path, error)}.") from error
+
+
+def _unreadable(path: Path, error: Exception) -> str:
+    """Why a file is no table, and what to do."""
+    with path.open("rb") as file:
+        begin = file.read(4)
+    if begin == b"PK\x03\x04":
+        return _SPREADSHEET
+    if isinstance(error, UnicodeDecodeError):
+        kind = "is UTF-16 text" if begin[:2] in (b"\xff\xfe", b"\xfe\xff") else "is no UTF-8 text"
+        return f"{kind}; save the table as CSV with the encoding UTF-8"
+    if isinstance(error, csv.Error) and "unexpected end of data" in str(error):
+        return "has a quotation mark that nothing closes; remove it, or close it"
+    reason = str(error).strip().splitlines()[-1]
+    return f"is not a table that can be read ({reason}); save it as CSV or Parquet"
 
 
 def cells_of(frame: pd.DataFrame) -> pd.DataFrame:

@@ -140,6 +140,8 @@ def read_study(path: str | os.PathLike, made: Callable[[StudyFile], _T]) -> _T:
     """What `made` makes of a study file, of that of each material too, to find mistakes now. InputError says in one
     sentence what is wrong, with the file or for `made`, and where."""
     source = str(path)
+    if Path(path).suffix.lower() in (".csv", ".parquet", ".tsv"):
+        raise InputError(f"{source}: is a table by its name, and no study file; give a file such as study.toml.")
     try:
         text = Path(path).read_bytes().decode("utf-8-sig")
     except OSError as error:

@@ -56,7 +56,10 @@ def read_trials(
 
 def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = None) -> pd.DataFrame:
     """As `read_trials`, from a table in memory: the same columns, the same checks, the same sentences."""
-    return _read([cells_of(frame)], study, material, FRAME, True, lambda rows: None)
+    text = cells_of(frame)
+    for column in text.columns.intersection(_KEY):
+        text.loc[frame[column].isna().to_numpy(), column] = ""  # a missing participant is nobody called "nan"
+    return _read([text], study, material, FRAME, True, lambda rows: None)
 
 
 def _read(
@@ -122,8 +125,11 @@ def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
     needed = ("participant", "trial", "response", *study.space.names)
     missing = [name for name in needed if name not in text.columns]
     if missing:
+        alike = [str(name) for name in text.columns if str(name).strip().lower() == missing[0].lower()]
+        hint = f' (there is "{alike[0]}")' if alike else ""
+        wants = ", ".join(needed)
         raise InputError(
-            f'{place(source)}column "{missing[0]}" is missing; a trial table of this study has {", ".join(needed)}.'
+            f'{place(source)}column "{missing[0]}" is missing{hint}; a trial table of this study has {wants}.'
         )
 
 

@@ -56,7 +56,7 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
     assert "cannot be read" in refused(tmp_path / "none.toml", *place)
     assert "participants.csv: cannot be read" in refused(DATA, *place)
     assert "an id has" in refused(DATA, "--logs", logs, "--port", 0, "--participant", "Jane Doe")
-    assert "cannot be opened" in refused(DATA, *place, "--resume")
+    assert "no such session was begun" in refused(DATA, *place, "--resume")
     (tmp_path / "plan.json").write_text("{}")
     assert "is no plan" in refused(DATA, *place, "--plan", tmp_path / "plan.json", "--dry-run")
     add_person(logs / "participants.csv", PERSON | {"participant": "P02"})

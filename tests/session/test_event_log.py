@@ -132,7 +132,7 @@ def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driv
         run = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
         assert "written by another hilbo" in run.stderr
     EventLog.resume(path, STUDY).close()  # and is free again
-    with pytest.raises(InputError, match="cannot be opened"):
+    with pytest.raises(InputError, match="no such session was begun"):
         EventLog.resume(tmp_path / "none.jsonl", STUDY)
     for content, sentence in ((b"", "no whole first line"), (b"participant,trial\n", "is damaged")):
         path.write_bytes(content)

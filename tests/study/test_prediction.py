@@ -64,7 +64,7 @@ def test_ones_own_table_is_a_cohort_with_the_bits_of_a_file(table, cohort, tmp_p
             'DataFrame: row 1: u is "9.0"; it must be a number from 0 to 1, the study\'s range.',
         ),
         (lambda t: t.drop(columns="v"), 'DataFrame: column "v" is missing; a trial table of this study has'),
-        (lambda t: t.assign(participant=None), "DataFrame: row 1: participant is empty"),
+        (lambda t: t.assign(participant=np.nan), "DataFrame: row 1: participant is empty"),
         (lambda t: t.assign(response="fine"), 'DataFrame: row 1: response is "fine"; it must be one of'),
         (lambda t: pd.concat([t, t]), "DataFrame: row 13: participant 7, trial 1 stands in row 1 already"),
         (lambda t: t.iloc[:0], "DataFrame: has no rows"),

@@ -35,6 +35,30 @@ def refusal(tmp_path, text, of=None, **options):
     return sentence.replace(f"{tmp_path}/", "")
 
 
+NO_TABLES = {
+    "t.csv": [
+        (HEADER.encode("utf-16"), "is UTF-16 text; save the table as CSV with the encoding UTF-8."),
+        ((HEADER + "Zo\xe9,1,close,1,2\n").encode("latin-1"), "is no UTF-8 text; save the table as CSV with"),
+        (b"\x89PNG\r\n\x1a\n\x00\xff", "is no UTF-8 text; save the table as CSV with the encoding UTF-8."),
+        (b"PK\x03\x04\xff\xff", "is a spreadsheet; save it as CSV, by the spreadsheet's own menu."),
+        ((HEADER + '"A,1,close,1,2\n').encode(), "has a quotation mark that nothing closes; remove it, or close it."),
+        (
+            (HEADER.replace("gain", "Gain ") + "A,1,close,1,2\n").encode(),
+            '1: column "gain" is missing (there is "Gain ")',
+        ),
+    ],
+    "t.xlsx": [(b"PK\x03\x04", "is a spreadsheet; save it as CSV, by the spreadsheet's own menu.")],
+}
+
+
+@pytest.mark.parametrize(("name", "content", "words"), [(n, *case) for n, cases in NO_TABLES.items() for case in cases])
+def test_a_file_that_is_no_table_is_told_what_it_is(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError) as refused:
+        read_trials(tmp_path / name, study())
+    assert str(refused.value).replace(f"{tmp_path}/", "").removeprefix(f"{name}:").strip().startswith(words)
+
+
 def test_rows_come_by_participant_in_the_order_of_the_table_and_of_their_trials(tmp_path):
     text = HEADER + "B,2,close,1,2\nA,10,similar,1,3\nB,1,different,1,4\nA,9,close,1,5\n"
     table = read_trials(written(tmp_path, text), study())
@@ -157,7 +181,7 @@ BAD = {
     "underscore": ("A,1,close,1_5,2", 'gain is "1_5"'),
     "one cell more": ("A,1,close,1,2,3", "t.csv:2: has 6 cells, the header has 5; fix that line"),
     "one cell less": ("A,1,close,1,2\nA,2,close,1", "t.csv:3: has 4 cells, the header has 5"),
-    "an open quote": ('A,1,close,1,"2', "t.csv: is not a table that can be read"),
+    "an open quote": ('A,1,close,1,"2', "t.csv: has a quotation mark that nothing closes"),
 }
 
 
@@ -223,7 +247,7 @@ def test_what_cannot_be_read_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"t\.parquet: is not a table"):
         read_trials(tmp_path / "t.parquet", study())
     (tmp_path / "latin.csv").write_bytes(HEADER.encode() + "Zoë,1,close,1,2\n".encode("latin-1"))
-    with pytest.raises(InputError, match=r"latin\.csv: is not a table"):
+    with pytest.raises(InputError, match=r"latin\.csv: is no UTF-8 text"):
         read_trials(tmp_path / "latin.csv", study())
 
 
