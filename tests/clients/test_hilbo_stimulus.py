@@ -68,7 +68,7 @@ def test_an_example_says_in_a_sentence_why_it_cannot_join(live):
 
 
 def test_the_example_for_psychopy_uses_what_the_client_has():
-    """PsychoPy is not here to run it."""
+    """PsychoPy itself needs a screen; docs/guides/stimulus.md says when it ran."""
     client = module("hilbo_stimulus").Stimulus
     tree = ast.parse((CLIENTS / "example_psychopy.py").read_text())
     used = {n.attr for n in ast.walk(tree) if isinstance(n, ast.Attribute) and getattr(n.value, "id", "") == "stimulus"}
