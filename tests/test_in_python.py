@@ -103,7 +103,7 @@ MISTAKES = {
     "another parameter": (lambda p, s: s.tell("close", {"u": 0.5, "w": 0.5}), "Session: at has u, w; give u, v."),
     "out of range": (
         lambda p, s: s.tell("close", {"u": 0.5, "v": 0.5}),
-        "Session: v is 0.5; it must be from 10 to 20.",
+        "Session: v is 0.5; it must be a number from 10 to 20.",
     ),
 }
 OF_ANOTHER_TYPE = {
