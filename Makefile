@@ -18,7 +18,7 @@ $(DOCS_STAMP): WHAT = .[docs]
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo firmware test test-deep lint docs wheel bench clean
+.PHONY: help setup demo firmware test test-deep lint docs notebooks wheel bench clean
 
 help:  ## show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
@@ -45,6 +45,9 @@ lint: $(STAMP)  ## ruff and pyright
 docs: $(DOCS_STAMP)  ## the documentation as a site, into build/site; a broken link or anchor is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 	@echo "open build/site/index.html"
+
+notebooks: $(DOCS_STAMP)  ## the notebooks as .ipynb with their outputs, into build/notebooks; make docs shows what is there
+	$(BIN)/python docs/site/notebooks.py
 
 wheel:  ## the sdist and the wheel, into dist, and what a stranger does with them in fresh environments
 	.ci/wheel $(PYTHON)

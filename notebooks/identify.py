@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+import hilbo
 from hilbo import Study
 from hilbo.identification.characterise import characterise
 from hilbo.identification.fitting import fit, nrmse
@@ -21,7 +22,9 @@ from hilbo.identification.material_tables import read_material
 from hilbo.identification.sampled import Sampled
 from hilbo.report.material import renderer_block
 
-material = read_material("hilbo/data/memory_foam_simulated.csv")
+DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
+
+material = read_material(DATA / "memory_foam_simulated.csv")
 for test in material.tests:
     print(test.kind, "-", test.repeats, "repeats,", test.time.size, "points to", test.time[-1], "s")
 
@@ -65,7 +68,7 @@ if "HILBO_NOTEBOOK_TRIALS" not in os.environ:  # the tests of the notebooks skip
 # %%
 block = renderer_block(result, damping=0.95)
 print(block)
-paper = tomllib.loads(Path("hilbo/data/paper.toml").read_text())
+paper = tomllib.loads((DATA / "paper.toml").read_text())
 study = Study.from_dict(paper | tomllib.loads(block))
 candidates = study.space.candidates(1000, seed=0)
 values = result.fit.parameters()

@@ -13,6 +13,7 @@ import tempfile
 import time
 from pathlib import Path
 
+import hilbo
 from hilbo.app.rehearsal import Decider
 from hilbo.hardware_bridge import Renderer
 from hilbo.session.actions import answer, go_on, present, propose, sent, steps_of
@@ -23,12 +24,14 @@ from hilbo.session.views import participant_view
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 
+DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
+
 # %% [markdown]
 # ## The study and its session
 # 25 trials; here a few, so that the notebook is quick when it is tested.
 
 # %%
-paper = Path(__import__("hilbo").__file__).parent / "data" / "paper.toml"
+paper = DATA / "paper.toml"
 text = paper.read_text()
 if "HILBO_NOTEBOOK_TRIALS" in os.environ:
     text = text.replace("trials = 25", f"trials = {os.environ['HILBO_NOTEBOOK_TRIALS']}")

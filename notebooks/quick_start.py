@@ -4,15 +4,20 @@
 
 # %%
 import os
+from pathlib import Path
 
 import jax
 
 jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 
+import hilbo
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Session, Study, Trials, fit
+
+DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 
 # %% [markdown]
 # ## A posterior
@@ -25,6 +30,18 @@ posterior = fit(gp, Trials.from_arrays(x, np.array([0, 1, 2, 0])))
 mean, variance = posterior.predict(jnp.array([[0.5, 0.6], [0.0, 1.0]]))
 print("mean", mean, "sd", jnp.sqrt(variance))
 print("probabilities of different, similar, close:", posterior.class_probabilities(jnp.array([[0.5, 0.6]]))[0])
+
+# %% [markdown]
+# What this person would answer, from one corner of the space to the other.
+
+# %%
+line = jnp.linspace(0.0, 1.0, 101)
+chances = posterior.class_probabilities(jnp.stack([line, line], axis=1))
+plt.stackplot(line, chances.T, labels=["different", "similar", "close"])
+plt.xlabel("both parameters, in parts of their ranges")
+plt.ylabel("probability of each answer")
+plt.legend()
+plt.show()
 
 # %% [markdown]
 # Every fit certifies itself: the residual bounds the distance to the exact mode in prior standard deviations.
@@ -49,7 +66,7 @@ print(jax.grad(log_evidence, (0, 1))(30.0, 0.5))
 # The study file says what is asked; each answer gives the next state, and the next point is inside the passive set.
 
 # %%
-session = Session.start(Study.load("hilbo/data/paper.toml"), seed=1)
+session = Session.start(Study.load(DATA / "paper.toml"), seed=1)
 truth = np.array([5.70, 5.89, 0.203])
 for _ in range(int(os.environ.get("HILBO_NOTEBOOK_TRIALS", "25"))):
     point = session.ask()

@@ -1,23 +1,31 @@
 # %% [markdown]
 # # Re-aggregating a data set
 # Seventeen people rated compressed video clips from bad to excellent. Their answers become one population map over
-# bitrate and height; any subset of people and any prefix of trials can be merged again.
+# bitrate and height; any subset of people and any prefix of trials can be aggregated again. Put your own study file and
+# table in the place of these two.
 
 # %%
+from pathlib import Path
+
 import jax
 
 jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
+import matplotlib.pyplot as plt  # noqa: F401  (in a notebook, it shows figures below their cells)
 import numpy as np
 
+import hilbo
 from hilbo import Study
+from hilbo.report.figures.maps import map_slices
 from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population, population_optimum
 from hilbo.study.cohort import cohort_of
 from hilbo.study.trial_table import read_trials
 
-study = Study.load("hilbo/data/video_quality.toml")
-cohort = cohort_of(read_trials("hilbo/data/video_quality.csv", study), study)
+DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
+
+study = Study.load(DATA / "video_quality.toml")
+cohort = cohort_of(read_trials(DATA / "video_quality.csv", study), study)
 print(len(cohort.names), "people,", int(cohort.counts().sum()), "answers")
 
 # %% [markdown]
@@ -31,6 +39,9 @@ print(
     "answers to expect there:",
     dict(zip(study.responses, np.asarray(aggregate.optimum.class_probabilities), strict=True)),
 )
+
+# %%
+map_slices(study, aggregate.surface, aggregate.optimum.x, cohort)
 
 # %% [markdown]
 # ## Half the people, or a third of the trials

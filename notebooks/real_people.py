@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Real people
 # Two published data sets of ordinal answers: seventeen people who rated compressed video clips (shipped), and eight
-# people who judged orientations in eight graded categories (`../shared/data`, used if it is there). How consistent are
-# they, do they lapse, do they drift, and does one map do for all?
+# people who judged orientations in eight graded categories (not shipped: used if `orientation_confidence.csv` lies
+# here). How consistent are they, do they lapse, do they drift, and does one map do for all?
 
 # %%
 import os
@@ -13,14 +13,19 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+import matplotlib.pyplot as plt  # noqa: F401  (in a notebook, it shows figures below their cells)
 import numpy as np
 import pandas as pd
 
+import hilbo
 from hilbo import Study
 from hilbo.population.response_quality import excluded, measure_people
+from hilbo.report.figures.study import people_figure
 from hilbo.study.aggregate import aggregate_cohort, nrmse
 from hilbo.study.cohort import cohort_of
 from hilbo.study.trial_table import read_trials, write_trials
+
+DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 
 # %% [markdown]
 # ## Video quality
@@ -28,11 +33,14 @@ from hilbo.study.trial_table import read_trials, write_trials
 # these people were shown twice, so that the agreement is that of the rating, content and all.
 
 # %%
-study = Study.load("hilbo/data/video_quality.toml")
-cohort = cohort_of(read_trials("hilbo/data/video_quality.csv", study), study)
+study = Study.load(DATA / "video_quality.toml")
+cohort = cohort_of(read_trials(DATA / "video_quality.csv", study), study)
 measured = measure_people(study.gp, cohort.trials, cohort.names)
 print(measured[["participant", "trials", "consistency", "chance", "lapse", "drift"]].round(2).to_string(index=False))
 print("left out by 'lapse_low > 0.3':", excluded(measured, "lapse_low > 0.3") or "nobody")
+
+# %%
+people_figure(measured, left_out=excluded(measured, "lapse_low > 0.3"))
 
 # %% [markdown]
 # People's drift: how many intervals leave 0 out, where one in twenty would by chance.
@@ -57,7 +65,7 @@ print("population optimum", best, "; individual optima away from it, median NRMS
 # Eight categories, orientation and contrast. A hundred of each person's answers show how people differ.
 
 # %%
-path = Path("../shared/data/orientation_confidence.csv")
+path = Path("orientation_confidence.csv")
 count = int(os.environ.get("HILBO_NOTEBOOK_ANSWERS", "120"))
 if path.exists():
     raw = pd.read_csv(path).groupby("subject", sort=False).head(count)

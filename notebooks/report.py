@@ -16,6 +16,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 import pandas as pd
 
+import hilbo
 from hilbo import Study
 from hilbo.report.study import write_study
 from hilbo.search.candidates import search_points
@@ -27,6 +28,8 @@ from hilbo.study.cohort import cohort_of
 from hilbo.study.folder import read_folder
 from hilbo.study.map_summary import best_mid_worst
 from hilbo.study.trial_table import read_trials, write_trials
+
+DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
 
 folder = Path(tempfile.mkdtemp())
 participants, trials = 6, int(os.environ.get("HILBO_NOTEBOOK_TRIALS", "25"))
@@ -42,7 +45,7 @@ MATERIALS = {
     "medium silicone": {"K1": 4.00, "B1": 8.00, "alpha": 0.150},
     "stiff silicone": {"K1": 8.00, "B1": 4.00, "alpha": 0.120},
 }
-text = Path("hilbo/data/paper.toml").read_text().replace("trials = 25", f"trials = {trials}")
+text = (DATA / "paper.toml").read_text().replace("trials = 25", f"trials = {trials}")
 (folder / "study.toml").write_text(text)
 study = Study.load(folder / "study.toml")
 

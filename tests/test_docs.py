@@ -2,6 +2,7 @@
 
 import ast
 import importlib.util
+import json
 import re
 import tomllib
 from itertools import pairwise
@@ -114,6 +115,33 @@ def test_every_name_of_the_reference_has_a_docstring():
     assert found == []
 
 
+def silent_errors(tree: ast.Module) -> list[str]:
+    """Public functions and methods that raise InputError themselves, where neither they nor their class say so."""
+    silent = []
+    for top in tree.body:
+        functions = [top] if isinstance(top, ast.FunctionDef) else getattr(top, "body", [])
+        for function in functions:
+            if not isinstance(function, ast.FunctionDef) or function.name.startswith("_"):
+                continue
+            raised = {ast.unparse(node.exc) for node in ast.walk(function) if isinstance(node, ast.Raise) and node.exc}
+            said = " ".join(
+                ast.get_docstring(node) or "" for node in {top, function} if not isinstance(node, ast.Module)
+            )
+            if any("InputError(" in text for text in raised) and not re.search(r"[Rr]aise|InputError|[Rr]efuse", said):
+                silent.append(function.name)
+    return silent
+
+
+def test_every_name_of_the_reference_says_its_errors():
+    silent = []
+    for module in " ".join(names for _, names in script("hooks").API.values()).split():
+        tree = ast.parse((ROOT / "hilbo" / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
+        silent += [f"{module}.{name}" for name in silent_errors(tree)]
+    assert silent == []
+    bad = ast.parse('def f(x):\n    """Twice x."""\n    if x < 0:\n        raise InputError("x")\n')
+    assert silent_errors(bad) == ["f"]
+
+
 def test_tables_of_benchmarks_have_their_marks():
     calls = re.compile(r'\bput\("([\w/.-]+)", "([\w ]+)"')
     asked = [call for file in (ROOT / "benchmarks").glob("*.py") for call in calls.findall(file.read_text("utf-8"))]
@@ -123,12 +151,21 @@ def test_tables_of_benchmarks_have_their_marks():
         assert text.count(f"<!-- {name} -->\n") == text.count(f"<!-- end of {name} -->") == 1, (page, name)
 
 
-def test_a_notebook_becomes_text_and_code(tmp_path):
+def test_a_notebook_becomes_text_and_code(tmp_path, monkeypatch):
     made = script("hooks")
     path = made.ROOT / "notebooks" / "quick_start.py"
+    monkeypatch.setattr(made, "EXECUTED", tmp_path)
     page = made.notebook(path)
     assert page.startswith("# Quick start\n")
     assert page.count("```python\n") == page.count("\n```\n") == path.read_text("utf-8").count("# %%\n")
+    book = [{"cell_type": kind, "source": text} for kind, text in made.cells(path)]
+    book[1]["outputs"] = [{"name": "stdout", "text": ["one\n", "two\n"]}, {"data": {"image/png": "abc"}}]
+    (tmp_path / "quick_start.ipynb").write_text(json.dumps({"cells": book}))
+    shown = made.notebook(path)
+    assert "```text\none\ntwo\n```" in shown and "base64,abc" in shown and 'href="quick_start.ipynb"' in shown
+    book[1]["source"] += "\nmore()"  # not this script's any more
+    (tmp_path / "quick_start.ipynb").write_text(json.dumps({"cells": book}))
+    assert made.notebook(path) == page
 
 
 def test_links_between_files_become_links_between_pages():
@@ -171,6 +208,28 @@ def test_the_study_files_on_the_page_are_good():
     text = (DOCS / "guides" / "study-file.md").read_text(encoding="utf-8")
     for block in re.findall(r"```toml\n(schema.*?)```", text, re.S):
         assert checked(tomllib.loads(block), "page", lambda file: file.name)
+
+
+def test_the_first_study_is_that_of_its_script():
+    """The commands, words and figures; the script runs all of them, a deep test those that take seconds."""
+    made, text = script("first_study"), (DOCS / "guides" / "first-study.md").read_text(encoding="utf-8")
+    commands = re.findall(r"^```\n(hilbo .*)\n```", text, re.M)
+    assert commands == [step.command for step in made.STEPS]
+    for step in made.STEPS:
+        assert step.words in text
+        for name, caption in step.figures:
+            figure = name.replace("/", "-")
+            assert f"![{caption}](first-study/{figure})" in text and (made.FIGURES / figure).is_file()
+    assert not re.search(r"/(tmp|root|home|work)/", text)
+
+
+@pytest.mark.deep
+def test_the_first_study_begins_as_its_page_says(tmp_path):
+    made, text = script("first_study"), (DOCS / "guides" / "first-study.md").read_text(encoding="utf-8")
+    quick = [step for step in made.STEPS if step.command.split()[1] in ("init", "plan")]
+    assert len(quick) == 2
+    for step in quick:
+        assert made.section(step, tmp_path) in text, "run python docs/site/first_study.py"
 
 
 def test_the_page_of_mistakes_says_what_hilbo_says():  # fits once, for what is said in Python: 2 s

@@ -17,9 +17,10 @@ def test_there_are_notebooks():
 
 @pytest.mark.deep
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_notebook_runs(path):
+def test_notebook_runs(path, tmp_path):
+    """In an empty folder: a notebook finds what it needs wherever it is opened."""
     env = os.environ | {"HILBO_NOTEBOOK_TRIALS": "7"}
     command = [sys.executable, "-W", "ignore::DeprecationWarning", str(path)]
-    done = subprocess.run(command, cwd=ROOT, env=env, capture_output=True, text=True, timeout=600)
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
     assert done.stdout

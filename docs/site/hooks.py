@@ -4,6 +4,7 @@ A page of docs/ links to a file of the project by its path, so that it reads wel
 becomes one to the page that is made of the file, or plain text where the site has none.
 """
 
+import json
 import os
 import posixpath
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 FENCE = "```"
+EXECUTED = ROOT / "build" / "notebooks"  # what `make notebooks` makes; where it was not made, pages show the code alone
 
 # A page of the API reference: its title, and the modules in the order of reading.
 API = {
@@ -64,18 +66,36 @@ def generated() -> dict[str, str]:
     return text | {f"api/{name}.md": reference(*entry) for name, entry in API.items()}
 
 
+def cells(path: Path) -> list[tuple[str, str]]:
+    """Kind (markdown or code) and text of the cells of a percent script."""
+    parts = (part.partition("\n") for part in re.split(r"(?m)^# %%", path.read_text(encoding="utf-8"))[1:])
+    return [
+        ("markdown", re.sub(r"(?m)^# ?", "", body).strip()) if kind.strip() == "[markdown]" else ("code", body.strip())
+        for kind, _, body in parts
+    ]
+
+
 def notebook(path: Path) -> str:
-    """A percent script as Markdown: its text cells, and its code cells in fences."""
-    cells = re.split(r"(?m)^# %%", path.read_text(encoding="utf-8"))[1:]
-    name = path.relative_to(ROOT)
-    return "\n\n".join(map(_cell, cells)) + f"\n\nRun it with `python {name}`; editors show its cells.\n"
+    """A percent script as Markdown: its text, and its code in fences, with what `make notebooks` has made of it."""
+    executed = EXECUTED / f"{path.stem}.ipynb"
+    made = json.loads(executed.read_text(encoding="utf-8"))["cells"] if executed.exists() else []
+    parts, current = [], [(cell["cell_type"], "".join(cell["source"])) for cell in made] == cells(path)
+    for number, (kind, body) in enumerate(cells(path)):
+        parts.append(body if kind == "markdown" else f"{FENCE}python\n{body}\n{FENCE}")
+        parts += [_output(output) for output in made[number].get("outputs", [])] if current else []
+    parts.append(f"Run it with `python {path.relative_to(ROOT)}`; editors show its cells.")
+    if current:
+        parts[-1] += f' Or open <a href="{path.stem}.ipynb" download>the notebook</a>.'
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def _cell(cell: str) -> str:
-    kind, _, body = cell.partition("\n")
-    if kind.strip() == "[markdown]":
-        return re.sub(r"(?m)^# ?", "", body).strip()
-    return f"{FENCE}python\n{body.strip()}\n{FENCE}"
+def _output(output: dict) -> str:
+    """What a cell printed or drew."""
+    data = output.get("data", {})
+    if "image/png" in data:
+        return f'<img alt="Figure of the cell above" src="data:image/png;base64,{"".join(data["image/png"]).strip()}">'
+    text = "".join(output.get("text", data.get("text/plain", "")))  # Jupyter writes lines as lists
+    return f"{FENCE}text\n{text.rstrip()}\n{FENCE}" if output.get("name") != "stderr" and text.strip() else ""
 
 
 def reference(title: str, modules: str) -> str:
@@ -99,6 +119,8 @@ def on_files(files, config):
 
     for page, text in generated().items():
         files.append(File.generated(config, page, content=text))
+    for path in sorted(EXECUTED.glob("*.ipynb")):
+        files.append(File.generated(config, f"notebooks/{path.name}", content=path.read_text(encoding="utf-8")))
     worker = (ROOT / "docs/site/iframe-worker.js").read_text(encoding="utf-8")
     files.append(File.generated(config, "assets/iframe-worker.js", content=worker))
     style = (ROOT / "docs/site/extra.css").read_text(encoding="utf-8")

@@ -305,9 +305,9 @@ def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -
     from hilbo.report.large_population import population_map, write_population
     from hilbo.study.batch_optimum import aggregate_population
 
-    merged = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
-    grid = population_map(study, merged)
-    return {} if folder is None else write_population(study, merged, grid, folder, seed, say)
+    large = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
+    grid = population_map(study, large)
+    return {} if folder is None else write_population(study, large, grid, folder, seed, say)
 
 
 def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:

@@ -188,11 +188,11 @@ def fit(tests: Sequence[Test], model: Any) -> Fit:
     return Fit(model, curves, solution, lower, upper, costs, weights)
 
 
-def polish(found: Fit, start: Float[Array, " p"]) -> Fit:
+def polish(fitted: Fit, start: Float[Array, " p"]) -> Fit:
     """The fit found from another start, if that is better. `start` (p,)."""
-    again = _polished(found, start)
-    better = again.cost < found.solution.cost
-    return eqx.tree_at(lambda f: f.solution, found, again) if better else found
+    again = _polished(fitted, start)
+    better = again.cost < fitted.solution.cost
+    return eqx.tree_at(lambda f: f.solution, fitted, again) if better else fitted
 
 
 @program
@@ -224,10 +224,10 @@ def curve_residuals(model, curve: Curve, weights: Float[Array, " R"], q: Float[A
     return misfit / (curve.scale * np.sqrt(curve.time.size).astype(curve.scale.dtype))
 
 
-def nrmse(found: Fit) -> dict[str, float]:
+def nrmse(fitted: Fit) -> dict[str, float]:
     """Root mean square of each test's residuals over its range. Kind of test -> share of the range, without unit."""
-    parts = [curve_residuals(found.model, c, w, found.q) for c, w in zip(found.curves, found.weights, strict=True)]
-    return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(found.curves, parts, strict=True)}
+    parts = [curve_residuals(fitted.model, c, w, fitted.q) for c, w in zip(fitted.curves, fitted.weights, strict=True)]
+    return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(fitted.curves, parts, strict=True)}
 
 
 @program

@@ -82,14 +82,14 @@ class Intervals(eqx.Module):
 
 
 @program
-def noise(found: Fit) -> tuple[Noise, ...]:
+def noise(fitted: Fit) -> tuple[Noise, ...]:
     """The autoregressions of the residuals, curve by curve."""
-    return tuple(_autoregression(r) for r in _residuals(found, found.q))
+    return tuple(_autoregression(r) for r in _residuals(fitted, fitted.q))
 
 
-def spread(found: Fit, quantile: float = 1.959964) -> Spread:
+def spread(fitted: Fit, quantile: float = 1.959964) -> Spread:
     """Sandwich variance of the coordinates, with those at a bound held there unless it is their own turn."""
-    return _spread(found, quantile)
+    return _spread(fitted, quantile)
 
 
 @program
@@ -125,9 +125,9 @@ def _across(
     return jnp.sqrt(jnp.maximum(more, 1)), jnp.where(more > 1, few, freedom)
 
 
-def profile_intervals(found: Fit, quantile: float = 1.959964) -> Intervals:
+def profile_intervals(fitted: Fit, quantile: float = 1.959964) -> Intervals:
     """Profile-likelihood intervals at the level of a normal `quantile` (95 %), all ends in one compiled search."""
-    return _profile(found, _spread(found, quantile))
+    return _profile(fitted, _spread(fitted, quantile))
 
 
 class _Search(NamedTuple):
@@ -225,7 +225,7 @@ def _pick(condition: Bool[Array, ""], yes: tuple[Array, ...], no: tuple[Array, .
 
 
 @program
-def refits(found: Fit, weights: tuple[Float[Array, "B R"], ...]) -> Float[Array, "B p"]:
+def refits(fitted: Fit, weights: tuple[Float[Array, "B R"], ...]) -> Float[Array, "B p"]:
     """Coordinates fitted anew under other weights of the repeats, each from the fit.
 
     `weights`: (B, R) for each curve -> (B, p).
@@ -233,14 +233,14 @@ def refits(found: Fit, weights: tuple[Float[Array, "B R"], ...]) -> Float[Array,
 
     def one(row):
         return least_squares(
-            lambda q: residuals(found.model, found.curves, row, q), found.q, found.lower, found.upper, max_steps=40
+            lambda q: residuals(fitted.model, fitted.curves, row, q), fitted.q, fitted.lower, fitted.upper, max_steps=40
         ).q
 
     return jax.lax.map(one, weights)
 
 
 def block_bootstrap(
-    found: Fit, key: PRNGKeyArray, resamples: int = 2000, quantile: float = 1.959964, *, exact: bool = False
+    fitted: Fit, key: PRNGKeyArray, resamples: int = 2000, quantile: float = 1.959964, *, exact: bool = False
 ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
     """Studentised bootstrap interval of each coordinate; the repeats of every test are drawn anew, as wholes.
 
@@ -248,10 +248,10 @@ def block_bootstrap(
     Raises `InputError` where a test has fewer than 5 repeats.
     Two arrays (p,), the ends.
     """
-    fewest = min(w.size for w in found.weights)
+    fewest = min(w.size for w in fitted.weights)
     if fewest < FEWEST_REPEATS:
         raise InputError(f"A test has {fewest} repeats; the bootstrap over repeats needs at least {FEWEST_REPEATS}.")
-    return _bootstrap(found, key, resamples, quantile, exact)
+    return _bootstrap(fitted, key, resamples, quantile, exact)
 
 
 @program

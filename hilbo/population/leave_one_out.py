@@ -182,24 +182,24 @@ def clustered(values: Float[np.ndarray, " n"], person: Int[np.ndarray, " n"]) ->
     return float(mean), float(np.sqrt(len(people) / (len(people) - 1) * np.sum(sums**2)) / len(values))
 
 
-def calibration(found: LeftOut, seed: int = 0) -> dict[str, float]:
+def calibration(left: LeftOut, seed: int = 0) -> dict[str, float]:
     """Mean cost, share in the central 95 % and z^2, each with its error by person."""
-    u = integral_transform(found.probabilities, found.q, seed)
+    u = integral_transform(left.probabilities, left.q, seed)
     parts = {
-        "negative_log_density": found.cost,
+        "negative_log_density": left.cost,
         "central_95": ((u > 0.025) & (u < 0.975)).astype(float),
-        "z2": normal_scores(found.probabilities, found.q, seed) ** 2,
+        "z2": normal_scores(left.probabilities, left.q, seed) ** 2,
     }
     content = {}
     for name, values in parts.items():
-        content[name], content[f"{name}_error"] = clustered(values, found.person)
+        content[name], content[f"{name}_error"] = clustered(values, left.person)
     return content
 
 
-def reliability(found: LeftOut, bins: int = 10) -> list[dict[str, float]]:
+def reliability(left: LeftOut, bins: int = 10) -> list[dict[str, float]]:
     """Predicted against observed: in bins of the probability of a category, over all answers and categories."""
-    chance = found.probabilities.ravel()
-    chosen = (found.q[:, None] == np.arange(found.probabilities.shape[1])[None, :]).ravel()
+    chance = left.probabilities.ravel()
+    chosen = (left.q[:, None] == np.arange(left.probabilities.shape[1])[None, :]).ravel()
     place = np.minimum((chance * bins).astype(int), bins - 1)
     return [
         {

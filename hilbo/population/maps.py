@@ -1,6 +1,6 @@
 """A cohort's population map by any rule, as one record that predicts; and what the answers say of how people differ.
 
-Rules of `pointwise` merge everybody's own posterior point by point. Two rules look at the answers themselves:
+Rules of `pointwise` aggregate everybody's own posterior point by point. Two rules look at the answers themselves:
 
 * `hierarchical`, where the answers are few enough: the posterior of the shared function g, exact (`hierarchical`, or
   `counts` where people answered the same stimuli); point by point otherwise, at the committee's cost.
@@ -112,8 +112,8 @@ class RuleMap(eqx.Module):
 
 
 def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[pointwise.Rule, Float[Array, ""] | None]:
-    """By which rule, and with which share, everybody's posteriors are merged point by point in place of a map: by the
-    same rule, or by bcm where the rule takes all answers at once; learnt-1 is the hierarchical one."""
+    """By which rule, and with which share, everybody's posteriors are aggregated point by point in place of a map: by
+    the same rule, or by bcm where the rule takes all answers at once; learnt-1 is the hierarchical one."""
     if rule == RECIPE:
         return "hierarchical", share
     if rule not in pointwise.RULES:

@@ -84,6 +84,8 @@ def aggregate(
     - `prior_variance`: k, a scalar or (m,), of all participants.
     - `share`: p of the hierarchical rule, in (0, 1]: the part of the prior variance that people have in common.
     - `mask`: (M,), False for absent participants, whose numbers may be anything, NaN too.
+
+    Raises InputError for a rule that there is not, and for a share that does not belong to it.
     """
     if rule not in RULES:
         raise InputError(f'aggregate: the rule is "{rule}"; it must be one of {", ".join(RULES)}.')

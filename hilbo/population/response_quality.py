@@ -20,7 +20,7 @@ falls by less than 3.84. Those are approximate, since answers left out one at a 
 `benchmarks/coverage_people.py` measures how often they hold.
 
 An exclusion rule, "trials < 10 or lapse_low > 0.3", speaks of a person's own answers only, and is applied before
-anything is merged.
+anything is aggregated.
 """
 
 import re

@@ -30,7 +30,7 @@ class Results(NamedTuple):
     """What is known of one material."""
 
     name: str
-    found: Analysis
+    analysis: Analysis
     validated: Validated | None
     reference: np.ndarray | None
     reference_name: str
@@ -66,7 +66,7 @@ def _side(good: bool) -> Side:
 
 
 def _individuals(results):
-    analysis, study = results.found, results.found.study
+    analysis, study = results.analysis, results.analysis.study
     counts = analysis.progress.counts
     top, people = study.responses[-1], len(analysis.cohort.names)
     if analysis.progress.splits and len(counts) > 2:
@@ -120,7 +120,7 @@ def _early(counts):
 
 
 def _population(results):
-    analysis, study = results.found, results.found.study
+    analysis, study = results.analysis, results.analysis.study
     best = analysis.aggregate.optimum
     if results.reference is not None:
         ours, _ = misses(study, best.x, results.reference)
@@ -177,7 +177,7 @@ def _validation(validated, responses):
 
 
 def _convergence(results):
-    analysis = results.found
+    analysis = results.analysis
     progress = analysis.progress
     if len(progress.counts) <= 2 or not progress.splits:
         yield Evidence("inconclusive", "It takes several participants and trials to say.")
@@ -220,7 +220,7 @@ def _materials(results):
 def _near(one):
     if one.reference is None:
         return
-    analysis = one.found
+    analysis = one.analysis
     ours = float(misses(analysis.study, analysis.aggregate.optimum.x, one.reference)[0])
     individual_miss = float(np.median(misses(analysis.study, analysis.aggregate.individuals.x, one.reference)[0]))
     yield Evidence(

@@ -14,7 +14,7 @@ from scipy.interpolate import RegularGridInterpolator
 from hilbo.report.page import results_page
 from hilbo.report.participants import json_lines, people_of
 from hilbo.report.results import map_dataset, optima_table, result, save_figures
-from hilbo.study.batch_optimum import Merged
+from hilbo.study.batch_optimum import LargeAggregate
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.map_file import on_grid, write_map
@@ -28,18 +28,18 @@ _DRAWN = 200  # participants whose answers the figure shows
 _DOTS = 2000  # individual optima in a figure
 
 
-def population_map(study: Study, merged: Merged) -> xr.Dataset:
+def population_map(study: Study, large: LargeAggregate) -> xr.Dataset:
     """The map on a grid of at most 5,000 points, or at as many: a pass over all people, by the whole crew."""
     cells = min(_CELLS, int(_POINTS ** (1 / min(study.space.dim, 3))))
-    return map_dataset(study, merged.surface, cells)
+    return map_dataset(study, large.surface, cells)
 
 
 def write_population(
-    study: Study, merged: Merged, grid: xr.Dataset, folder: Path, seed: int = 0, say=lambda text: None
+    study: Study, large: LargeAggregate, grid: xr.Dataset, folder: Path, seed: int = 0, say=lambda text: None
 ) -> dict[str, Any]:
     """Write result.json, optima.csv, map.nc, figures and report.html; returns the content of result.json."""
-    people = people_of(study, merged)
-    content = result(study, merged, seed, None, people)
+    people = people_of(study, large)
+    content = result(study, large, seed, None, people)
     say("writing results")
     with (folder / "result.json").open("w", encoding="utf-8") as file:
         file.writelines(sealed(json_lines(content)))
@@ -47,7 +47,7 @@ def write_population(
     grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     write_map(grid, folder / "map.nc")
     say("figures and report")
-    figures, drawn = _figures(study, merged, grid)
+    figures, drawn = _figures(study, large, grid)
     page = results_page(study, content, save_figures(figures, folder), people, drawn=drawn)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content

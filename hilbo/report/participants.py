@@ -62,7 +62,7 @@ class People(NamedTuple):
 
 
 def people_of(study: Study, aggregate: Any) -> People:
-    """The participants of an `Aggregate` or of a `Merged`."""
+    """The participants of an `Aggregate` or of a `LargeAggregate`."""
     individuals = aggregate.individuals
     sets, margins = (None, None) if individuals is None else parameter_sets(study, np.asarray(individuals.x))
     cohort = aggregate.cohort

@@ -24,7 +24,7 @@ from hilbo.report.participants import People, as_json, json_lines, people_of
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import Aggregate, Optimum, asked_variance, nrmse, other_inference
 from hilbo.study.analysis import Population
-from hilbo.study.batch_optimum import Merged
+from hilbo.study.batch_optimum import LargeAggregate
 from hilbo.study.config import Study
 from hilbo.study.effects import effects_of
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
@@ -82,7 +82,7 @@ def versions() -> dict[str, str]:
 
 def result(
     study: Study,
-    aggregate: Aggregate | Merged,
+    aggregate: Aggregate | LargeAggregate,
     seed: int,
     truth: Float[np.ndarray, " d"] | None = None,
     people: People | None = None,
@@ -92,7 +92,7 @@ def result(
     best, mean = aggregate.optimum, aggregate.mean_of_optima
     content = {
         "optimum": optimum_content(study, best) | {"location": _location(study, aggregate, study.rule, best)},
-        "participants": people if isinstance(aggregate, Merged) else list(people.entries()),
+        "participants": people if isinstance(aggregate, LargeAggregate) else list(people.entries()),
         "alternatives": {
             name: optimum_content(study, optimum) | {"location": _location(study, aggregate, name, optimum)}
             for name, optimum in aggregate.alternatives.items()
@@ -113,22 +113,22 @@ def result(
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
     failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
     content["warnings"] = ([_not_converged(failed)] if failed else []) + rule_warnings(study, aggregate)
-    asked = None if isinstance(aggregate, Merged) else aggregate.asked_variance
-    region = None if isinstance(aggregate, Merged) else optimum_region(study, aggregate.map, seed)
+    asked = None if isinstance(aggregate, LargeAggregate) else aggregate.asked_variance
+    region = None if isinstance(aggregate, LargeAggregate) else optimum_region(study, aggregate.map, seed)
     content["optimum_region"] = region_content(study, region)
     content["warnings"] += learnt_sentences(study) + location_sentences(study, best.x, best.sd, asked)
     content["warnings"] += region_sentences(region)
-    content["model_check"] = None if isinstance(aggregate, Merged) else model_check(study, aggregate)
+    content["model_check"] = None if isinstance(aggregate, LargeAggregate) else model_check(study, aggregate)
     content["warnings"] += check_sentences(content["model_check"])
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content
 
 
-def _location(study: Study, aggregate: Aggregate | Merged, name: str, optimum: Optimum) -> list[str]:
+def _location(study: Study, aggregate: Aggregate | LargeAggregate, name: str, optimum: Optimum) -> list[str]:
     """What is to be known of where an optimum lies, by the map of its own that `name` says."""
-    map_ = None if isinstance(aggregate, Merged) else aggregate.maps.get(name)
-    asked = None if isinstance(aggregate, Merged) or map_ is None else asked_variance(map_, aggregate.cohort)
+    map_ = None if isinstance(aggregate, LargeAggregate) else aggregate.maps.get(name)
+    asked = None if isinstance(aggregate, LargeAggregate) or map_ is None else asked_variance(map_, aggregate.cohort)
     return location_notes(study, optimum.x, optimum.sd, asked)
 
 
@@ -152,16 +152,16 @@ def _not_converged(names):
     )
 
 
-def optimum_content(study: Study, found: Optimum) -> dict[str, Any]:
+def optimum_content(study: Study, optimum: Optimum) -> dict[str, Any]:
     """An optimum as result.json holds it."""
     labels = study.responses
     return {
-        "parameters": set_of(study.space, found.x),
-        "unit": np.asarray(found.x).tolist(),
-        "mean": float(found.mean),
-        "sd": float(found.sd),
-        "class_probabilities": dict(zip(labels, np.asarray(found.class_probabilities).tolist(), strict=True)),
-        "passivity_margin": margin_of(study.space, found.x),
+        "parameters": set_of(study.space, optimum.x),
+        "unit": np.asarray(optimum.x).tolist(),
+        "mean": float(optimum.mean),
+        "sd": float(optimum.sd),
+        "class_probabilities": dict(zip(labels, np.asarray(optimum.class_probabilities).tolist(), strict=True)),
+        "passivity_margin": margin_of(study.space, optimum.x),
     }
 
 

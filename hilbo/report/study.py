@@ -166,10 +166,10 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
     return content, section | {"hatched": hatched, "checklist": items, "dictionary": tables["dictionary"]}
 
 
-def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
+def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
     """The population optimum and the mean of the individual optima, beside the reference if there is one (paper,
     table I): `parameter`, `reference`, `aggregate`, `error_percent`, `mean_of_optima`, `sd_of_optima`, ..."""
-    study, aggregate = found.study, found.aggregate
+    study, aggregate = analysis.study, analysis.aggregate
     mean, best = aggregate.mean_of_optima, aggregate.optimum.x
     individual_sets = pd.DataFrame([set_of(study.space, x) for x in np.asarray(aggregate.individuals.x)])
     ours, theirs = set_of(study.space, best), set_of(study.space, mean)
@@ -185,30 +185,30 @@ def table_1(found: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
     return table
 
 
-def convergence_table(found: Analysis) -> pd.DataFrame:
+def convergence_table(analysis: Analysis) -> pd.DataFrame:
     """After each number of trials: NRMSE of the population's running optimum to its last, and of the individuals'
     (median, quartiles, of those who gave as many answers), both also to the optimum of a half of the people who are not
     among them, and answers in the highest category so far (paper, figures 5 and 7b)."""
-    study, counts = found.study, found.progress.counts
-    population_errors, individual_errors = found.progress.to_end()
-    top = np.asarray((found.cohort.trials.q == len(study.responses) - 1) & found.cohort.trials.mask)
+    study, counts = analysis.study, analysis.progress.counts
+    population_errors, individual_errors = analysis.progress.to_end()
+    top = np.asarray((analysis.cohort.trials.q == len(study.responses) - 1) & analysis.cohort.trials.mask)
     so_far = np.cumsum(top, axis=1)[:, counts - 1]
     table = pd.DataFrame({"trials": counts, "population": population_errors})
-    if found.progress.splits:
-        table["halves"] = np.median(found.progress.halves, axis=1)
+    if analysis.progress.splits:
+        table["halves"] = np.median(analysis.progress.halves, axis=1)
         table["individuals_to_half"] = np.nanmedian(
-            np.where(np.isnan(individual_errors), np.nan, found.progress.own_to_half), axis=1
+            np.where(np.isnan(individual_errors), np.nan, analysis.progress.own_to_half), axis=1
         )
     for name, values in (("individuals", individual_errors.T), ("top_answers", so_far)):
         table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.nanpercentile(values, [25, 50, 75], axis=0).T
     return table
 
 
-def tolerance_table(found: Analysis) -> pd.DataFrame:
+def tolerance_table(analysis: Analysis) -> pd.DataFrame:
     """Tolerance intervals under fixed and under optimised hyperparameters, with the bootstrap over people of their
     ends; empty where the highest answer is not the likeliest at the optimum (paper, section VII)."""
     rows = []
-    for name, reading in (("fixed", found.fixed), ("optimised", found.optimised)):
+    for name, reading in (("fixed", analysis.fixed), ("optimised", analysis.optimised)):
         for parameter, (interval, ends) in reading.tolerances.items():
             row: dict[str, Any] = {"hyperparameters": name, "parameter": parameter}
             if interval is not None:
@@ -230,19 +230,19 @@ def tolerance_table(found: Analysis) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*columns, "low_from", "low_to", "high_from", "high_to", "draws_without"])
 
 
-def passivity_table(found: Analysis) -> pd.DataFrame:
+def passivity_table(analysis: Analysis) -> pd.DataFrame:
     """Everything that could be rendered as an optimum: parameters, score, probability of the highest answer, and how
     far from the passive boundary (N.s/m; negative is not passive)."""
-    study, aggregate = found.study, found.aggregate
+    study, aggregate = analysis.study, analysis.aggregate
     claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
     claims |= {f"population, {name}": (other.x, other) for name, other in aggregate.alternatives.items()}
     claims["population, optimised hyperparameters"] = (
-        found.optimised.aggregate.optimum.x,
-        found.optimised.aggregate.optimum,
+        analysis.optimised.aggregate.optimum.x,
+        analysis.optimised.aggregate.optimum,
     )
     claims["mean of the individual optima"] = (aggregate.mean_of_optima, None)
-    if found.sets is not None:
-        claims |= {name: (found.sets.x[i], None) for i, name in enumerate(("best", "mid", "worst"))}
+    if analysis.sets is not None:
+        claims |= {name: (analysis.sets.x[i], None) for i, name in enumerate(("best", "mid", "worst"))}
     rows = []
     for name, (x, optimum) in claims.items():
         row = {"optimum": name} | set_of(study.space, x)

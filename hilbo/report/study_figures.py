@@ -14,29 +14,31 @@ __all__ = ["comparison_figures", "study_figures"]
 Figures = dict[str, Any]  # name -> figure
 
 
-def study_figures(found: Analysis, material: Material, shares: tuple[np.ndarray, np.ndarray]) -> tuple[Figures, bool]:
+def study_figures(
+    analysis: Analysis, material: Material, shares: tuple[np.ndarray, np.ndarray]
+) -> tuple[Figures, bool]:
     """Figures 4, 5, 6a, 7 and 8, people, individual optima and the predictive check; and whether a part of the map is
     hatched. `shares`: of `inference_data.predictive_shares`."""
     from hilbo.report.figures import maps, study
     from hilbo.report.figures.effects import effects_figure
 
-    chosen, cohort, aggregate, progress = found.study, found.cohort, found.aggregate, found.progress
+    chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
     references = {} if material.reference is None else {material.reference_name: material.reference}
-    regions = {"fixed hyperparameters": found.fixed, "optimised hyperparameters": found.optimised}
-    map_, hatched = study.sets_on_map(chosen, aggregate.surface, found.sets, best, cohort, prior)
+    regions = {"fixed hyperparameters": analysis.fixed, "optimised hyperparameters": analysis.optimised}
+    map_, hatched = study.sets_on_map(chosen, aggregate.surface, analysis.sets, best, cohort, prior)
     figures = {
-        "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(found)),
+        "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(analysis)),
         "convergence": study.individual_convergence(chosen, cohort, progress),
         "map": map_,
         "maps-after": maps.slices_after(chosen, progress),
         "population-convergence": study.population_convergence(progress, references),
         "classes": study.class_regions(regions),
-        "people": study.people_figure(found.people, found.left_out),
+        "people": study.people_figure(analysis.people, analysis.left_out),
         "predictive": study.predictive_check(chosen.responses, *shares),
     }
     if not on_grid(chosen.space):
-        effects = effects_of(chosen, aggregate.surface, best, found.population.seed)
+        effects = effects_of(chosen, aggregate.surface, best, analysis.population.seed)
         figures["effects"] = effects_figure(chosen, effects, best)
     if chosen.space.dim > 1:  # a scatter of one parameter is none
         marks = {"population map": best, "mean of optima": np.asarray(aggregate.mean_of_optima)} | references

@@ -99,24 +99,24 @@ def safest(table: Regression) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def validation_content(found: Validated) -> dict[str, Any]:
+def validation_content(validated: Validated) -> dict[str, Any]:
     """As result.json holds it."""
-    tables = found.tables
+    tables = validated.tables
     content: dict[str, Any] = {
-        "material": found.material,
-        "participants": found.participants,
-        "comparisons": found.comparisons,
+        "material": validated.material,
+        "participants": validated.participants,
+        "comparisons": validated.comparisons,
         "confusion": {str(name): {str(k): int(v) for k, v in row.items()} for name, row in tables.confusion.iterrows()},
         "preferences": _records(tables.preferences),
         "tables": {
             number: {"rows": _records(table.table), "answers": table.answers, "clusters": table.clusters}
-            for number, table in found.regressions().items()
+            for number, table in validated.regressions().items()
         },
         "limits": list(tables.limits),
-        "warnings": [w for table in found.regressions().values() for w in table.warnings],
+        "warnings": [w for table in validated.regressions().values() for w in table.warnings],
     }
-    if found.overall is not None and found.people is not None:
-        content["aggregate_best"] = {"overall": _records(found.overall), "people": _records(found.people)}
+    if validated.overall is not None and validated.people is not None:
+        content["aggregate_best"] = {"overall": _records(validated.overall), "people": _records(validated.people)}
     return content
 
 
@@ -128,37 +128,38 @@ def _plain(value):
     return value.item() if isinstance(value, np.generic) else value
 
 
-def validation_csv(found: Validated) -> dict[str, pd.DataFrame]:
+def validation_csv(validated: Validated) -> dict[str, pd.DataFrame]:
     """File name (without .csv) -> table."""
-    tables = found.tables
+    tables = validated.tables
     files = {"confusion": tables.confusion.reset_index(), "preferences": tables.preferences}
-    files |= {f"table_{number}": table.table for number, table in found.regressions().items()}
-    if found.overall is not None and found.people is not None:
-        files |= {"aggregate_best": found.overall, "aggregate_best_people": found.people}
+    files |= {f"table_{number}": table.table for number, table in validated.regressions().items()}
+    if validated.overall is not None and validated.people is not None:
+        files |= {"aggregate_best": validated.overall, "aggregate_best_people": validated.people}
     return files
 
 
-def validation_figures(found: Validated) -> dict[str, Any]:
+def validation_figures(validated: Validated) -> dict[str, Any]:
     """Name -> figure, those that there are."""
     from hilbo.report.figures import validation as plotting
 
     figures = {}
-    if found.tables.confusion.to_numpy().any() or not found.tables.preferences.empty:
-        figures["validation"] = plotting.validation_figure(found.tables.confusion, found.tables.preferences)
-    if found.overall is not None and found.people is not None:
-        figures["aggregate-best"] = plotting.aggregate_best_figure(found.people, found.overall)
+    if validated.tables.confusion.to_numpy().any() or not validated.tables.preferences.empty:
+        figures["validation"] = plotting.validation_figure(validated.tables.confusion, validated.tables.preferences)
+    if validated.overall is not None and validated.people is not None:
+        figures["aggregate-best"] = plotting.aggregate_best_figure(validated.people, validated.overall)
     return figures
 
 
-def validation_section(found: Validated) -> dict[str, Any]:
+def validation_section(validated: Validated) -> dict[str, Any]:
     """What the page says of one material."""
     return {
-        "material": found.material,
-        "participants": found.participants,
-        "comparisons": found.comparisons,
-        "limits": found.tables.limits,
+        "material": validated.material,
+        "participants": validated.participants,
+        "comparisons": validated.comparisons,
+        "limits": validated.tables.limits,
         "regressions": {
-            number: {"rows": _shown(table), "warnings": table.warnings} for number, table in found.regressions().items()
+            number: {"rows": _shown(table), "warnings": table.warnings}
+            for number, table in validated.regressions().items()
         },
     }
 

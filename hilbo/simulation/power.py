@@ -5,7 +5,7 @@ m are a study of m people, since people are drawn independently; of everybody's 
 of t trials would have asked and heard, since a session looks back only. Criteria drift by the trial (the population's
 drift over the study's own number of trials), so that a short session drifts less.
 
-For every (m, t) a study is merged by the study's rule, and two errors are taken:
+For every (m, t) a study is aggregated by the study's rule, and two errors are taken:
   optimum: NRMSE of the population optimum to the truth, in units of the search ranges;
   map: root mean square, over feasible points, of the difference between the probability of the highest answer that the
        map predicts for a new person and the one that the simulated population has (the mean over many people, in
@@ -76,7 +76,7 @@ def simulate_power(
 
     `jobs`: processes, by default as many as there are cores; each calls `begin` first (float64, a cache).
     `say` is told how many studies are done.
-    Raises `InputError` for numbers of people or of answers that the study's rule cannot merge.
+    Raises `InputError` for numbers of people or of answers that the study's rule cannot aggregate.
     """
     if study.rule == "hierarchical" and min(plan.participants) < 2:
         raise InputError(

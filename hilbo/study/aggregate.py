@@ -158,7 +158,7 @@ def _fit_own(gps: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
 def population(
     posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm", share: Float[Array, ""] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of the population map at points of the unit cube, merged point by point.
+    """Mean and variance (m,) of the population map at points of the unit cube, aggregated point by point.
 
     Of bcm, participants' predictions are made in blocks and never held all at once. `share`: of the hierarchical rule.
     """
@@ -196,31 +196,31 @@ def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidate
     return _optimum(gp.likelihood, space, lambda x: population(posteriors, x, rule, share), candidates, apart)
 
 
-def map_optimum(study: Study, found: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
+def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
     """Where a rule's map has its largest mean in the feasible set; by learnt-1 where a new person answers with the
     highest category most often, among points of which the answers tell as much as of some that were asked.
     `candidates` (m, d): feasible points of the unit cube, where the search begins.
     """
-    return _map_optimum(study.gp.likelihood, study.space, found, candidates)
+    return _map_optimum(study.gp.likelihood, study.space, map_, candidates)
 
 
 @program
 def _map_optimum(
-    likelihood: OrdinalProbit, space: SearchSpace, found: RuleMap, candidates: Float[Array, "m d"]
+    likelihood: OrdinalProbit, space: SearchSpace, map_: RuleMap, candidates: Float[Array, "m d"]
 ) -> Optimum:
-    if found.rule != RECIPE:
-        return _optimum(likelihood, space, lambda x: predict_map(found, x), candidates, found.apart)
+    if map_.rule != RECIPE:
+        return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, map_.apart)
 
     def chance(mean, variance):
-        return log_highest(likelihood, mean, variance + found.apart, found.widths)
+        return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
 
-    assert found.reach is not None
-    known = jnp.maximum(found.reach, jnp.min(found.predict(candidates)[1]))  # of which there is one at least
+    assert map_.reach is not None
+    known = jnp.maximum(map_.reach, jnp.min(map_.predict(candidates)[1]))  # of which there is one at least
 
     def told(x):
-        return found.predict(x[None, :])[1][0] <= known
+        return map_.predict(x[None, :])[1][0] <= known
 
-    return _optimum(likelihood, space, found.predict, candidates, found.apart, chance, told, found.widths)
+    return _optimum(likelihood, space, map_.predict, candidates, map_.apart, chance, told, map_.widths)
 
 
 def _optimum(
@@ -288,7 +288,7 @@ def other_inference(study: Study) -> Inference:
 def aggregate_cohort(
     study: Study, cohort: Cohort, seed: int = 0, alternatives: bool = True, first: First = lambda optimum, map_: None
 ) -> Aggregate:
-    """Fit everybody, merge, and find the optima; the study's `rule` decides the population optimum.
+    """Fit everybody, aggregate, and find the optima; the study's `rule` decides the population optimum.
 
     `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
     finds them in `posteriors.certificate`. A rule that learns the hyperparameters does so first, if they are not

@@ -1,7 +1,7 @@
 """Everything that a study's results say of one material, computed once for report, tables and figures.
 
 Exclusion comes first: everybody's answers are measured (`hilbo.population.response_quality`), the study's rule is
-applied, and only then is anything merged. Then: the aggregate, the optima after fewer trials, best, mid and worst,
+applied, and only then is anything aggregated. Then: the aggregate, the optima after fewer trials, best, mid and worst,
 tolerance intervals under the study's hyperparameters and under those of maximum evidence, with their bootstrap over
 people. What cannot be had from these answers is a sentence in `limits`, not an error.
 """
@@ -80,7 +80,7 @@ class Analysis(NamedTuple):
 
     @property
     def cohort(self) -> Cohort:
-        """The participants whose answers were merged."""
+        """The participants whose answers were aggregated."""
         return self.population.cohort
 
     @property
@@ -137,7 +137,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     best = aggregate.optimum
     location = location_sentences(study, best.x, best.sd, aggregate.asked_variance)
     limits = (*location, *learnt_sentences(study), *limits_of(study, cohort), *sentences)
-    limits += (*_merged_otherwise(aggregate.map), *judged_sentences(judged))
+    limits += (*_aggregated_otherwise(aggregate.map), *judged_sentences(judged))
     if bool(learned.runaway) or not bool(learned.converged):
         limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
     return Analysis(
@@ -236,8 +236,8 @@ def _best_mid_worst(study: Study, aggregate: Aggregate, seed: int) -> tuple[Sets
         return None, (f"No best, mid and worst sets: {str(error).removeprefix('best_mid_worst: ')}",)
 
 
-def _merged_otherwise(map_: RuleMap) -> Iterator[str]:
-    """A sentence where what stands beside the map is merged otherwise."""
+def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
+    """A sentence where what stands beside the map is aggregated otherwise."""
     how = in_place(map_)
     if how:
         yield (
@@ -247,6 +247,6 @@ def _merged_otherwise(map_: RuleMap) -> Iterator[str]:
         )
 
 
-def moved_by_evidence(found: Analysis) -> float:
+def moved_by_evidence(analysis: Analysis) -> float:
     """NRMSE between the optima under fixed and under optimised hyperparameters."""
-    return float(nrmse(found.optimised.aggregate.optimum.x, found.aggregate.optimum.x))
+    return float(nrmse(analysis.optimised.aggregate.optimum.x, analysis.aggregate.optimum.x))

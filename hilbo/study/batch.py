@@ -1,4 +1,4 @@
-"""A population of any size in bounded memory: everybody refitted and merged in blocks, on any number of devices.
+"""A population of any size in bounded memory: everybody refitted and aggregated in blocks, on any number of devices.
 
 The committee machine (`hilbo.bcm`) needs two sums over people, of the precision each adds to the prior and of their
 precision-weighted means. They are made block by block: a device fits the people of its block, adds up what they say at
@@ -122,12 +122,12 @@ def refit(population: Population, points: Float[np.ndarray, "m d"], individuals:
     return Fitted(fitted, total, per_person["certificate"], optima)
 
 
-def sums(population: Population, points: Float[np.ndarray, "m d"], words: str = "participants merged") -> Sums:
+def sums(population: Population, points: Float[np.ndarray, "m d"], words: str = "participants aggregated") -> Sums:
     """The sums over people at points (m, d)."""
     return _sum_over_people(population, "sums", points, words)[0]
 
 
-def jets(population: Population, points: Float[np.ndarray, "s d"], words: str = "participants merged") -> Jets:
+def jets(population: Population, points: Float[np.ndarray, "s d"], words: str = "participants aggregated") -> Jets:
     """The sums over people at points (s, d), with two derivatives."""
     return _sum_over_people(population, "jets", points, words)[0]
 

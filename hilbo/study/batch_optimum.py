@@ -31,7 +31,7 @@ from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.distributed import Crew
 
-__all__ = ["Merged", "aggregate_population", "optima_from", "optimum_near"]
+__all__ = ["LargeAggregate", "aggregate_population", "optima_from", "optimum_near"]
 
 _STEPS = 60
 _STATIONARY, _RESOLUTION = 1e-8, 1e-6  # as a session's optimum: gradient, and radius at a kink of the passive set
@@ -41,7 +41,7 @@ _FEWEST = 50  # and nobody if that is too few
 _SETTLED = 0.003  # of the search ranges: a Newton step of this size leaves an error of its square over a lengthscale
 
 
-class Merged(eqx.Module):
+class LargeAggregate(eqx.Module):
     """What `aggregate.Aggregate` is for a cohort whose posteriors are not kept."""
 
     cohort: Cohort
@@ -78,7 +78,7 @@ def aggregate_population(
     individuals: bool = True,
     alternatives: bool = True,
     say: Say | None = None,
-) -> Merged:
+) -> LargeAggregate:
     """As `aggregate.aggregate_cohort`, in bounded memory and by all devices of the crew.
 
     Without `individuals` nobody's own optimum is sought, which is most of the work. One model of all answers is no
@@ -95,7 +95,7 @@ def aggregate_population(
     others = {"average": best["average"]} if alternatives and rule != "average" else {}
     if alternatives:
         others[other_inference(study)] = _by_other_inference(fitted.population, best[rule])
-    return Merged(cohort, fitted.population, fitted.certificate, best[rule], fitted.individuals, others, share)
+    return LargeAggregate(cohort, fitted.population, fitted.certificate, best[rule], fitted.individuals, others, share)
 
 
 def _streamed(rule: str, people: int) -> Rule:
@@ -109,11 +109,11 @@ def _streamed(rule: str, people: int) -> Rule:
 
 
 def optima_from(
-    population: Population, candidates: Float[np.ndarray, "m d"], found: Sums, rules: tuple[Rule, ...] = ("bcm",)
+    population: Population, candidates: Float[np.ndarray, "m d"], totals: Sums, rules: tuple[Rule, ...] = ("bcm",)
 ) -> dict[str, Optimum]:
     """The maximum of the map by each rule in the feasible set, from the sums at candidates (m, d)."""
     prior = np.asarray(jax.vmap(population.study.gp.kernel.diagonal)(jnp.asarray(candidates)))
-    maps = {rule: found.merge(prior, population.people, rule, population.share) for rule in rules}
+    maps = {rule: totals.merge(prior, population.people, rule, population.share) for rule in rules}
     rows = {rule: _separate_rows(maps[rule][0], candidates) for rule in rules}
     starts = np.concatenate([candidates[rows[rule]] for rule in rules])
     reached = optimum_near(population, starts, tuple(rule for rule in rules for _ in range(_STARTS)))

@@ -60,7 +60,7 @@ class Study(eqx.Module):
 
     @staticmethod
     def from_dict(raw: Mapping[str, Any], source: str = "") -> "Study":
-        """As `load`, from the parsed tables; numbers and lists may be NumPy's."""
+        """As `load`, from the parsed tables; numbers and lists may be NumPy's. Raises InputError as `load` does."""
         if not isinstance(raw, Mapping):
             raise InputError(f"Study: this is a {type(raw).__name__}; give a study file's tables, or Study.load(path).")
         return checked(_plain(raw), source, Study.of)

@@ -66,17 +66,17 @@ def inference_data(study: Study, cohort: Cohort, posteriors: Posterior, draws: i
     return arviz.InferenceData(**groups(study, cohort, posteriors, draws, seed))  # type: ignore[arg-type]
 
 
-def write_groups(found: dict[str, xr.Dataset], path: str | os.PathLike) -> None:
+def write_groups(datasets: dict[str, xr.Dataset], path: str | os.PathLike) -> None:
     """One netCDF file with a group for each part."""
-    for i, (name, data) in enumerate(found.items()):
+    for i, (name, data) in enumerate(datasets.items()):
         data.to_netcdf(path, mode="a" if i else "w", group=name, engine="h5netcdf")
 
 
-def predictive_shares(found: dict[str, xr.Dataset], categories: int) -> tuple[np.ndarray, np.ndarray]:
+def predictive_shares(datasets: dict[str, xr.Dataset], categories: int) -> tuple[np.ndarray, np.ndarray]:
     """Share of every category (C,) among the answers, and in each draw of them (draws, C)."""
-    observed = found["observed_data"]["response"].values
+    observed = datasets["observed_data"]["response"].values
     held = observed >= 0
-    predicted = found["posterior_predictive"]["response"].values[0][:, held]
+    predicted = datasets["posterior_predictive"]["response"].values[0][:, held]
     count = [np.mean(predicted == k, axis=1) for k in range(categories)]
     return np.bincount(observed[held], minlength=categories) / held.sum(), np.stack(count, axis=1)
 

@@ -46,6 +46,7 @@ trouble = "One moment, please. The experimenter is looking after it."
 let_go = "Let go, please"
 question = "How similar is the test to the reference?"
 """
+_ATTRIBUTE = "perceived realism"
 _DEFINITIONS = {
     "different": "The test is clearly different from the reference.",
     "similar": "The test is somewhat like the reference.",
@@ -96,23 +97,22 @@ def study_text(new: NewStudy) -> str:
             "",
             "[study]",
             f"name = {_quoted(new.name)}",
-            f"responses = [{', '.join(map(_quoted, new.responses))}]     # what people may answer, lowest first",
+            _line(f"responses = [{', '.join(map(_quoted, new.responses))}]", "what people may answer, lowest first"),
+            _line(f"attribute = {_quoted(_ATTRIBUTE)}", "what is judged: labels of axes and captions"),
             *(line for p in parameters for line in _table(p)),
             _presenting(new, parameters),
-            "[gp]                                 # what is believed of people before any answer",
-            f"length = {0.13 if new.device else 0.22}                       # over what part of a range answers change:"
-            " rule learnt-1 learns it",
+            _line("[gp]", "what is believed of people before any answer; rule learnt-1 learns it"),
+            _line(f"length = {0.13 if new.device else 0.22}", "over what part of a range answers change"),
             "variance = 1.0",
-            f"thresholds = {_thresholds(len(new.responses))}            # between one answer and the next",
-            "noise = 0.5                          # how much one answer to the same thing differs from another",
+            _line(f"thresholds = {_thresholds(len(new.responses))}", "between one answer and the next"),
+            _line("noise = 0.5", "how much one answer to the same thing differs from another"),
             "",
             "[selection]",
-            f"space_filling = {min(5, new.trials)}                    # trials spread over the ranges, before any is"
-            " chosen",
+            _line(f"space_filling = {min(5, new.trials)}", "trials spread over the ranges, before any is chosen"),
             f"trials = {new.trials}",
             "",
             "[session]",
-            'protocol_number = ""                 # of the ethics approval: consent is compared with it',
+            _line('protocol_number = ""', "of the ethics approval: consent is compared with it"),
             "",
             *_phases(new.device),
             "",
@@ -124,6 +124,11 @@ def study_text(new: NewStudy) -> str:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"a name or an answer has what no file can hold ({error}); leave it out.") from error
     return text
+
+
+def _line(text: str, comment: str) -> str:
+    """A line with what is to be said of it, in one column where it fits."""
+    return f"{text:<36} # {comment}"
 
 
 def _checked(file: StudyFile) -> StudyFile:

@@ -49,7 +49,7 @@ class Region(NamedTuple):
 
 
 def optimum_region(study: Study, map_: RuleMap, seed: int = 0) -> Region | None:
-    """The region; None for maps without a joint posterior (those that are merged point by point)."""
+    """The region; None for maps without a joint posterior (those that are aggregated point by point)."""
     if map_.shared is None:
         return None
     x = search_points(study.space, seed, _POINTS)

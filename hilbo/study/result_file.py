@@ -43,28 +43,28 @@ class Result(msgspec.Struct, frozen=True):
 def read_result(path: str | os.PathLike, study: Study) -> Result:
     """A result.json of this study. Raises InputError."""
     source, content = str(path), read_bytes(path)
-    found: Result = decoded(content, Result, source, _WHAT)
-    unsealed(content, found.digest, source)
-    if found.study != study.hash:
+    result: Result = decoded(content, Result, source, _WHAT)
+    unsealed(content, result.digest, source)
+    if result.study != study.hash:
         raise InputError(
-            f"{path}: is the result of another study ({found.study}, not {study.hash}); aggregate the answers again"
+            f"{path}: is the result of another study ({result.study}, not {study.hash}); aggregate the answers again"
             " with this study file."
         )
-    if not found.participants:
+    if not result.participants:
         raise InputError(f"{path}: holds no participants; aggregate the answers again.")
-    names = [person.participant for person in found.participants]
+    names = [person.participant for person in result.participants]
     for name in names:
         check_id(name, source)
     if len(set(names)) < len(names):
         raise InputError(f"{path}: a participant stands there twice; aggregate the answers again.")
-    _check_optima(study, found, source)
-    return found
+    _check_optima(study, result, source)
+    return result
 
 
-def _check_optima(study: Study, found: Result, source: str) -> None:
+def _check_optima(study: Study, result: Result, source: str) -> None:
     """Refuse optima outside the study's ranges, and such as would not be passive."""
-    named = {"the optimum": found.optimum} | {
-        f"the optimum of {person.participant}": person.optimum for person in found.participants if person.optimum
+    named = {"the optimum": result.optimum} | {
+        f"the optimum of {person.participant}": person.optimum for person in result.participants if person.optimum
     }
     rows = [check_values(optimum.parameters, study.space.parameters, source, what) for what, optimum in named.items()]
     columns = {name: np.array([row[name] for row in rows]) for name in study.space.names}

@@ -29,11 +29,11 @@ class Listed(NamedTuple):
 def listed(folder: Path) -> Listed:
     """The list of a folder; an empty one where there is none, or none that can be read."""
     try:
-        found = msgspec.json.decode((folder / LIST).read_bytes(), type=dict[str, str])
+        entries = msgspec.json.decode((folder / LIST).read_bytes(), type=dict[str, str])
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return Listed({})
-    command, where = found.pop(_COMMAND, ""), found.pop(_WHERE, "")
-    return Listed(found, command, where)
+    command, where = entries.pop(_COMMAND, ""), entries.pop(_WHERE, "")
+    return Listed(entries, command, where)
 
 
 def list_files(folder: Path, command: str = "", where: str = "") -> None:
@@ -44,15 +44,15 @@ def list_files(folder: Path, command: str = "", where: str = "") -> None:
 
 def relist(folder: Path, changed: set[Path]) -> None:
     """Bring a folder's list up to date about files that hilbo changed or took away; of others it says what it said."""
-    found = listed(folder)
+    known = listed(folder)
     files = {}
-    for name, was in found.files.items():
+    for name, was in known.files.items():
         path = folder / name
         if path not in changed:
             files[name] = was
         elif path.is_file():
             files[name] = digest(path)
-    write_list(folder, found._replace(files=files))
+    write_list(folder, known._replace(files=files))
 
 
 def write_list(folder: Path, content: Listed) -> None:

@@ -37,7 +37,7 @@ __all__ = [
 
 Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
 Rule = Literal["bcm", "hierarchical", "rbcm", "average", "pooled", "learnt-1"]
-"""How people are merged; `hilbo.population.maps` has the rules."""
+"""How people are aggregated; `hilbo.population.maps` has the rules."""
 _LEARNS: Rule = "learnt-1"
 Acquisition = Literal["ucb", "log_ei", "thompson", "top_category", "mean"]
 

@@ -1,9 +1,9 @@
 """Tolerance intervals with their uncertainty: how far a parameter may move, had other people of this kind been asked.
 
 `map_summary.tolerance` reads the interval from a population map. Here people are resampled (a bootstrap), the map is
-merged anew from the same posteriors, and the interval through the same optimum is read off a grid; percentiles of its
-ends over these draws are what the choice of participants leaves open. A draw in which the highest answer is not the
-likeliest at the optimum has no interval, and counts as such. Nothing is refitted: a merge is a sum over people.
+aggregated anew from the same posteriors, and the interval through the same optimum is read off a grid; percentiles of
+its ends over these draws are what the choice of participants leaves open. A draw in which the highest answer is not the
+likeliest at the optimum has no interval, and counts as such. Nothing is refitted: aggregation is a sum over people.
 """
 
 import equinox as eqx

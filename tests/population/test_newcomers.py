@@ -19,6 +19,7 @@ from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.population.pointwise import RULES
 from hilbo.report.figures import study as plotting_study
+from hilbo.report.figures.maps import Slice
 from hilbo.study import analysis
 from hilbo.study.aggregate import Aggregate, fit_cohort, map_optimum, population
 from hilbo.study.batch_optimum import _optimum_at, _variance_apart
@@ -96,12 +97,12 @@ def test_what_stands_in_place_of_a_map_is_said(posteriors):
     """Of a rule that takes all answers at once, maps of fewer trials and of other people are merged otherwise."""
     for rule in ("bcm", "average", "hierarchical"):
         assert in_place(of_rule(rule, posteriors[True])) == "" and not list(
-            analysis._merged_otherwise(of_rule(rule, None))
+            analysis._aggregated_otherwise(of_rule(rule, None))
         )
     one = jax.tree.map(lambda leaf: leaf[0], posteriors[True])  # any posterior will do
     for rule, how in (("hierarchical", "by the rule hierarchical point by point"), ("pooled", "by bcm")):
         whole = RuleMap(rule, "exact", None, one, jnp.asarray(SHARE), jnp.asarray(1.0))
-        (words,) = analysis._merged_otherwise(whole)
+        (words,) = analysis._aggregated_otherwise(whole)
         assert in_place(whole) == how and f"are aggregated {how}" in words and f"by the rule {rule} from" in words
     share = jnp.asarray(SHARE)
     assert point_rule("hierarchical", share) == ("hierarchical", share)
@@ -140,16 +141,8 @@ def test_what_a_map_does_not_know_is_hatched(prior, hatched):
     """A map whose variance is 0.09 everywhere knows nothing if that is 0.9 of its own prior's."""
     drawn = []
     axes = SimpleNamespace(contourf=lambda *args, **named: drawn.append(args))
-    plotting_study._hatch(
-        axes,
-        STUDY,
-        lambda x: (jnp.zeros(len(x)), jnp.full(len(x), 0.09)),
-        np.zeros(2),
-        None,
-        np.zeros((101, 101)),
-        prior,
-    )
-    assert bool(drawn) == hatched
+    map_slice = Slice(np.zeros((101, 101)), np.full((101, 101), 0.3))
+    assert plotting_study._hatch(axes, STUDY, map_slice, prior) == bool(drawn) == hatched
 
 
 # Widths of people's middle categories are integrated out.

@@ -94,7 +94,7 @@ def test_convergence_is_judged_by_people_who_are_not_among_them():
             np.arange(1, 7), still[:, 0], still, np.full(3, 6), np.full((6, 4), halves), np.full((6, 3), own), {}
         )
         found = SimpleNamespace(progress=progress, aggregate=aggregate)
-        (item,) = _convergence(SimpleNamespace(found=found, reference=None))
+        (item,) = _convergence(SimpleNamespace(analysis=found, reference=None))
         assert item.side == side and f"{100 * halves:.0f} % (NRMSE, median of 4" in item.text
     own = np.linspace(0.5, 0.2, 6)[:, None] + np.array([0.0, 0.01, -0.01])
     assert _nearer_to_others(progress._replace(own_to_half=own)).side == "supports"
@@ -108,7 +108,7 @@ def test_other_materials_are_the_others():
     study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20))
     optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.9, 0.5]]))
     found = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
-    parts = {"found": found, "reference_name": "the truth"}
+    parts = {"analysis": found, "reference_name": "the truth"}
     first, second, third = (
         SimpleNamespace(name=name, validated=asked, reference=reference, **parts)
         for name, asked, reference in (("A", None, np.zeros(2)), ("B", validated, np.full(2, 0.5)), ("C", None, None))

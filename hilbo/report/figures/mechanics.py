@@ -15,7 +15,7 @@ from hilbo import passivity
 from hilbo.identification.characterise import Characterisation
 from hilbo.identification.fitting import Fit, Test
 from hilbo.identification.memory_selection import LIMIT, Row
-from hilbo.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, STYLE
+from hilbo.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, TWO_COLUMNS
 from hilbo.viscoelastic import FOSLS
 
 __all__ = ["bode_figure", "curves_figure", "memory_figure", "passive_set_figure", "passivity_figure", "predicted"]
@@ -29,10 +29,10 @@ _LABELS = {
 _LINES = ((ORANGE, "-."), (GREEN, "--"), (RED, ":"), ("#CC79A7", "--"), ("black", ":"), ("#56B4E9", "-."))
 
 
-def predicted(found: Fit, kind: str) -> np.ndarray:
+def predicted(fitted: Fit, kind: str) -> np.ndarray:
     """The fit's curve of one kind of test, at its times."""
-    place = [c.kind for c in found.curves].index(kind)
-    return np.asarray(found.model.predict(found.q, found.curves[place], found.weights[place]))
+    place = [c.kind for c in fitted.curves].index(kind)
+    return np.asarray(fitted.model.predict(fitted.q, fitted.curves[place], fitted.weights[place]))
 
 
 def curves_figure(
@@ -135,7 +135,7 @@ def passivity_figure(model: FOSLS, b: float) -> Figure:
     near = curve.real > lowest  # far to the left, in slow motion, nothing is decided
     frequency, near_curve = frequency[near], curve[near]
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.13, 3.2), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
         left.plot(near_curve.real, near_curve.imag, color=BLUE)
         left.plot(curve.real[worst], curve.imag[worst], "o", color=colour, markersize=5, clip_on=False)
@@ -164,7 +164,7 @@ def passive_set_figure(model: FOSLS, b: float, K_eff: float) -> Figure:
     limit = np.asarray(_largest(model, B1[None, :], alpha[:, None], b, K_eff))
     this_set = float(model.B1), float(model.alpha), float(model.K1)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.13, 3.2), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS, 3.0), layout="constrained")
         left, right = figure.subplots(1, 2)
         shown = np.clip(limit, 1, 32)
         picture = left.pcolormesh(

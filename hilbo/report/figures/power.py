@@ -5,7 +5,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, STYLE
+from hilbo.report.figures.style import BLUE, GREEN, GREY, ORANGE, RED, STYLE, TWO_COLUMNS, few_ticks
 
 __all__ = ["power_figure"]
 
@@ -25,7 +25,7 @@ def power_figure(summary: pd.DataFrame, error: float) -> Figure:
     `summary`: of `power.summarise`. Lines differ by colour, marker and dashes.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.13, 3.0), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS, 2.7), layout="constrained")
         left, middle, right = figure.subplots(1, 3)
         shift = 0.25 * (summary["trials"].max() - summary["trials"].min() + 1) / 25
         for i, (count, rows) in enumerate(summary.groupby("participants")):
@@ -37,7 +37,7 @@ def power_figure(summary: pd.DataFrame, error: float) -> Figure:
                         linewidth=0.8, alpha=0.7)  # fmt: skip
             below, above = rows["reached"] - rows["reached_low"], rows["reached_high"] - rows["reached"]
             bars = 100 * np.maximum([below, above], 0.0)  # 0 and 1 end their own intervals, to rounding
-            middle.errorbar(trials, 100 * rows["reached"], yerr=bars, capsize=2, **look)
+            middle.errorbar(trials + shift * (i - 1), 100 * rows["reached"], yerr=bars, capsize=2, **look)
             right.plot(trials, rows["map_median"], **look)
         left.axhline(100 * error, color=GREY, linewidth=0.8)
         left.set(ylabel="error of the optimum, NRMSE (%)", ylim=(0, None))
@@ -45,5 +45,7 @@ def power_figure(summary: pd.DataFrame, error: float) -> Figure:
         right.set(ylabel="error of the map, P(highest answer)", ylim=(0, None))
         for axes in (left, middle, right):
             axes.set_xlabel("trials of each participant")
+            few_ticks(axes.xaxis, 5, integer=True)
+            few_ticks(axes.yaxis, 5)
         figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
     return figure

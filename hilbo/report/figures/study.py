@@ -61,9 +61,9 @@ _MARKS = {"best": ("*", 170, GREEN), "mid": ("D", 45, ORANGE), "worst": ("X", 80
 _CELLS = 101
 
 
-def typical_person(found: Analysis) -> int:
+def typical_person(analysis: Analysis) -> int:
     """Whose own optimum is nearest to the median distance from the population's: shown as the example."""
-    x, best = np.asarray(found.aggregate.individuals.x), np.asarray(found.aggregate.optimum.x)
+    x, best = np.asarray(analysis.aggregate.individuals.x), np.asarray(analysis.aggregate.optimum.x)
     miss = np.sqrt(np.mean((x - best) ** 2, axis=1))
     return int(np.argsort(miss, kind="stable")[(len(miss) - 1) // 2])
 

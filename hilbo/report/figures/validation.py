@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from hilbo.report.figures.style import BLUE, GREY, ORANGE, RED, STYLE
+from hilbo.report.figures.style import BLUE, GREY, ORANGE, RED, STYLE, TWO_COLUMNS
 
 __all__ = ["aggregate_best_figure", "preference_rows", "validation_figure"]
 
@@ -20,7 +20,7 @@ def validation_figure(confusion: pd.DataFrame, preferences: pd.DataFrame) -> Fig
     `confusion`: counts, sets by classes; `preferences`: of `preferences.preference_rates`. Paper, figures 6b and 6c.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.13, 2.9), layout="constrained")
+        figure = Figure(figsize=(TWO_COLUMNS, 2.9), layout="constrained")
         left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.25))
         _matrix(left, confusion)
         _rates(right, preference_rows(preferences))

@@ -1,0 +1,159 @@
+"""A whole study without a device, command by command: `python docs/site/first_study.py` runs it and writes the page.
+
+What stands there is what the commands said, less times and what is of this machine alone; the figures are theirs.
+"""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+from PIL import Image
+
+PAGE = Path(__file__).parents[1] / "guides" / "first-study.md"
+FIGURES = PAGE.parent / "first-study"
+
+
+class Step(NamedTuple):
+    """Words, a command, which of its lines are shown (a pattern), files shown whole, and figures with captions."""
+
+    words: str
+    command: str
+    shown: str = r".*"
+    files: tuple[str, ...] = ()
+    figures: tuple[tuple[str, str], ...] = ()
+
+
+STEPS = (
+    Step(
+        """## A study file
+
+Two parameters of a patch of colour, which a program of yours presents. `hilbo init` writes a commented file;
+read it, and change what is asked.""",
+        "hilbo init colour.toml --parameter hue=0:360:deg --parameter light=20:80:% --trials 20",
+        files=("colour.toml",),
+    ),
+    Step(
+        """`hilbo doctor` says what is missing. Here only the lines about the study; those about your machine come
+before them.""",
+        "hilbo doctor colour.toml",
+        r"(ok|note|BAD) +(study|stimulus|participants' texts|protocol number)|  +->",
+    ),
+    Step(
+        """## How many people, how many trials
+
+Simulated studies of people as the study file states them: here two sizes and few studies, to be quick. Take
+40 studies or more for your own.""",
+        "hilbo power colour.toml --participants 4,8 --trials 10,20 --studies 6 --out power",
+        figures=(("power/power.png", "Error of the optimum, share of studies within the error, error of the map."),),
+    ),
+    Step(
+        """## Before the first answer
+
+The plan, and the same as one page for a registry. What only you know stands there as a line to fill in.""",
+        "hilbo plan colour.toml --participants 8 --register plan.md --out plan.json",
+        files=("plan.md",),
+    ),
+    Step(
+        """## Answers
+
+Real ones come from `hilbo session` and `hilbo export` ([running a session](running-a-session.md)). Here eight
+simulated people answer, so that the truth is known.""",
+        "hilbo simulate --study colour.toml --participants 8 --out simulated",
+    ),
+    Step(
+        """## The population map
+
+From the table of answers alone; `--compare` predicts each person from the others by every rule. The page is
+`results/report.html`.""",
+        "hilbo aggregate simulated/trials.csv --study colour.toml --compare --out results",
+        figures=(
+            (
+                "results/map.png",
+                "The population map: mean (colour, white lines), standard deviation (dotted), answers.",
+            ),
+            ("results/comparison.png", "Out-of-sample prediction by every rule, as differences to the best."),
+        ),
+    ),
+    Step(
+        """A warning is a result: read it, and say in the paper what you did about it. Does the optimum stay where it is
+under hyperparameters that the answers choose? The page of the next command has them as a `[gp]` table to
+copy.""",
+        "hilbo robustness simulated/trials.csv --study colour.toml --out robustness",
+        figures=(("robustness/maps.png", "The map under the study's hyperparameters, and under learnt ones."),),
+    ),
+    Step(
+        """## The results section
+
+A folder with the study file, the answers and the plan becomes one page with figures, tables, a checklist of
+Bayesian reporting, and what departs from the plan. Here `study` holds `colour.toml` as `study.toml`,
+`simulated/trials.csv` and `plan.json`. Eight people are few: two halves of them need not agree on the optimum, and
+the dashed line of the first figure says how far they are apart.""",
+        "hilbo report study --out report",
+        figures=(
+            (
+                "report/population-convergence.png",
+                "Convergence: to the last place of the optimum, and between halves of the people.",
+            ),
+            ("report/classes.png", "The likeliest answer of a new participant, and tolerance intervals."),
+        ),
+    ),
+)
+
+
+def run(step: Step, folder: Path) -> str:
+    """What a command says, of its lines those that are shown."""
+    if "report study" in step.command:
+        (folder / "study").mkdir()
+        for source, name in (
+            ("colour.toml", "study.toml"),
+            ("simulated/trials.csv", "trials.csv"),
+            ("plan.json", "plan.json"),
+        ):
+            shutil.copy(folder / source, folder / "study" / name)
+    _, *words = shlex.split(step.command)
+    command = [Path(sys.executable).with_name("hilbo"), *words]
+    env = os.environ | {"COLUMNS": "120", "NO_COLOR": "1"}
+    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(f"{step.command}: exit code {done.returncode}\n{done.stderr}")
+    lines = (done.stderr + done.stdout).splitlines()
+    kept = [line for line in lines if re.match(step.shown, line) and not re.match(r"done in|\d+ of \d+ studies", line)]
+    return "\n".join(kept)
+
+
+def section(step: Step, folder: Path) -> str:
+    """A step's part of the page; its figures are copied with few colours, which is smaller."""
+    said = run(step, folder)
+    parts = [step.words, f"```\n{step.command}\n```"]
+    parts += [f"```text\n{said}\n```"] if said else []
+    for name in step.files:
+        kind = "toml" if name.endswith(".toml") else "markdown"
+        parts.append(f"`{name}`:\n\n```{kind}\n{(folder / name).read_text(encoding='utf-8').strip()}\n```")
+    for name, caption in step.figures:
+        figure = name.replace("/", "-")
+        image = Image.open(folder / name).convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE)
+        image.save(FIGURES / figure, optimize=True)
+        parts.append(f"![{caption}](first-study/{figure})\n\n*{caption}*")
+    return "\n\n".join(parts)
+
+
+def page() -> str:
+    """The page as Markdown; runs everything, which takes minutes."""
+    head = """# A first study, from beginning to end
+
+Two visual parameters, no device, simulated answers: each command, what it says, and what it draws. The page
+is made by `python docs/site/first_study.py`, which runs the commands. In your own study the answers come from
+people; everything else stays."""
+    FIGURES.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        return "\n\n".join([head, *(section(step, Path(folder)) for step in STEPS)]) + "\n"
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
