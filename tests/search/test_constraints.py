@@ -5,14 +5,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hilltop import height, highest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from hilbo import acquisition
 from hilbo.errors import InputError
 from hilbo.search.box import Box, Constraint, Mechanics, Parameter
-from hilbo.search.candidates import search_points
 from hilbo.search.linear import check_room
 from hilbo.search.space import SearchSpace
 
@@ -57,21 +56,6 @@ def test_box_coordinates_are_inverted_where_constraints_make_them_linear(space):
     np.testing.assert_allclose(space.from_box(space.to_box(x)), x, atol=1e-14)
     half = space.from_box(jnp.array([0.5, 0.5, 0.5]))
     np.testing.assert_allclose(space.to_physical(half), [5.0, 50.5, 0.5])
-
-
-def height(x, top, sharpness):
-    return -jnp.sum(sharpness * (x - top) ** 2)
-
-
-def highest(space, top, sharpness):
-    """The maximum of a hill over a space, in the unit cube."""
-    return _highest(space, jnp.asarray(search_points(space, 0, 64)), jnp.asarray(top), jnp.asarray(sharpness))
-
-
-@eqx.filter_jit
-def _highest(space, candidates, top, sharpness):
-    values = jax.vmap(lambda x: height(x, top, sharpness))(candidates)
-    return acquisition.maximise(values, candidates, lambda x: height(x, top, sharpness), **space.searched)
 
 
 @eqx.filter_jit
