@@ -57,7 +57,7 @@ _DEVICE = (
     Parameter("B1", 0.001, 32.0, "N.s^alpha/mm"),
     Parameter("alpha", 0.01, 0.99),
 )
-_FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT or NAME=LOW:HIGH:UNIT:log"
+_FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT or NAME=LOW:HIGH:UNIT:log (or :integer)"
 
 
 class NewStudy(NamedTuple):
@@ -82,9 +82,12 @@ def parameter_of(text: str) -> Parameter:
         ends = None
     scale = others[2] if len(others) > 2 else "linear"
     named = bool(equals and name.strip()) and name.isprintable()
-    if not named or ends is None or len(others) > 3 or scale not in ("linear", "log"):
+    if not named or ends is None or len(others) > 3 or scale not in ("linear", "log", "integer"):
         raise InputError(f"--parameter is {_quoted(text)}; write {_FORM}, for example hue=0:360:deg.")
-    return Parameter(name.strip(), *ends, others[1].strip() if len(others) > 1 else "", scale)
+    unit = others[1].strip() if len(others) > 1 else ""
+    if scale == "integer":
+        return Parameter(name.strip(), *ends, unit, integer=True)
+    return Parameter(name.strip(), *ends, unit, scale)
 
 
 def study_text(new: NewStudy) -> str:
@@ -152,7 +155,16 @@ def _parameters(new: NewStudy) -> Sequence[Parameter]:
 def _table(p: Parameter) -> list[str]:
     key = p.name if re.fullmatch(r"[A-Za-z0-9_-]+", p.name) else _quoted(p.name)
     scale = ['scale = "log"                        # steps are ratios'] if p.scale == "log" else []
-    return ["", f"[parameters.{key}]", f"low = {p.low}", f"high = {p.high}", f"unit = {_quoted(p.unit)}", *scale]
+    steps = ["integer = true                       # only whole numbers may be presented"] if p.integer else []
+    return [
+        "",
+        f"[parameters.{key}]",
+        f"low = {p.low}",
+        f"high = {p.high}",
+        f"unit = {_quoted(p.unit)}",
+        *scale,
+        *steps,
+    ]
 
 
 def _presenting(new: NewStudy, parameters: Sequence[Parameter]) -> str:

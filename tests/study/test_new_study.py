@@ -46,6 +46,7 @@ def test_a_file_that_is_written_says_what_was_asked_for(tmp_path_factory, name, 
         ("hue=0:360:deg", Parameter("hue", 0.0, 360.0, "deg")),
         ("light=-1.5:2", Parameter("light", -1.5, 2.0)),
         ("rate=1e2:1e4:bit/s:log", Parameter("rate", 100.0, 10000.0, "bit/s", "log")),
+        ("count=0:5::integer", Parameter("count", 0.0, 5.0, integer=True)),
     ],
 )
 def test_a_parameter_is_read_as_it_is_written(text, parameter):
