@@ -173,7 +173,8 @@ def page(rows):
     lines += [
         "",
         "Within the highest category all answers are alike: once it is found a session stays there, and no answer",
-        "tells a good rendering from a better one. Even points go on to show the slopes around it.",
+        "tells a good rendering from a better one. Even points go on to show the slopes around it. Where nearly all",
+        "answers are the lowest, the largest posterior mean is where nothing was asked: nothing is found yet.",
     ]
     outside = sum(row["outside"] for row in judged)
     lines += [
