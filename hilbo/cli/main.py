@@ -279,7 +279,7 @@ def _by_rule(study, rule):
 
 def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False, selection="") -> dict[str, Any]:
     """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
-    from hilbo.study.analysis import analyse_population
+    from hilbo.study.population_results import analyse_population
 
     with ThreadPoolExecutor(1) as other_core:
 

@@ -3,12 +3,12 @@
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
 
 from hilbo.errors import InputError
+from hilbo.numerics.host import placed
 
 __all__ = ["check_positive", "concrete", "known", "numbers", "shown"]
 
@@ -26,7 +26,7 @@ def known(*values: Any) -> bool:
 def numbers(whose: str, name: str, value: Any, dtype: DTypeLike | None = None) -> jax.Array:
     """A value as an array. Raises `InputError` for what holds no numbers, or rows of different lengths."""
     try:
-        return jnp.asarray(value, dtype)
+        return placed(value, dtype)
     except (TypeError, ValueError):
         words = repr(value)
         raise InputError(f"{whose}: {name} is {words[:60]}; give numbers, in rows of one length.") from None

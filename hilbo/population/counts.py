@@ -17,6 +17,7 @@ arrived. The evidence has exact first derivatives: a last step from the mode, wh
 is 0 there. Reference: Rasmussen & Williams (2006), sections 3.4 and 5.5.1.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -30,6 +31,7 @@ from hilbo.errors import InputError
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
 from hilbo.kernels import RBF, gram
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.host import placed
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.tallies import Expansion, expand_counts
@@ -48,8 +50,8 @@ class Counts(eqx.Module):
 
     @property
     def people(self) -> int:
-        """M."""
-        return self.counts.shape[0]
+        """Of the M those who gave answers."""
+        return int(np.count_nonzero(np.asarray(self.counts).any(axis=(1, 2))))
 
     def of(self, rows) -> "Counts":
         """Only these people; the points stay."""
@@ -66,33 +68,38 @@ def counts_of(trials: Trials, categories: int) -> Counts:
     person = np.broadcast_to(np.arange(len(mask))[:, None], mask.shape)[mask]
     counts = np.zeros((len(mask), len(points), categories), points.dtype)
     np.add.at(counts, (person, place.reshape(-1), q), 1.0)
-    return Counts(jnp.asarray(points), jnp.asarray(counts))
+    return Counts(placed(points), placed(counts))
 
 
 def one_person(answers: Counts) -> Counts:
-    """The same answers as if one person had given them all: the pooled model's, whatever the share."""
-    return Counts(answers.x, jnp.sum(answers.counts, axis=0, keepdims=True))
+    """The same answers as if the first person had given them all: the pooled model's, whatever the share. The others
+    keep their rows without answers, so that it is fitted by the same program."""
+    counts = np.asarray(answers.counts)
+    pooled = np.zeros_like(counts)
+    pooled[0] = counts.sum(axis=0)
+    return Counts(answers.x, placed(pooled))
 
 
 @program
 def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Posterior:
-    """Posterior of the shared function g, whose prior variance is `share` in (0, 1] times that of `gp`.
+    """Posterior of the shared function g, whose prior variance is `share` in [0, 1] times that of `gp`.
 
     Its log evidence is that of all answers. Never raises: read `certificate.converged`.
     """
     covariance = gram(gp.kernel, answers.x, answers.x)
     mode, residual, steps = _mode(gp.likelihood, share, covariance, answers.counts)
-    system = _system(share, covariance, _expand(gp.likelihood, answers.counts, mode.eta).curvature)
+    terms = _expand(gp.likelihood, answers.counts, mode.eta)
+    system = _system(share, covariance, terms.curvature)
     weights, shared = jnp.sum(mode.weights, axis=0), share * covariance
     prior, explained = jnp.diagonal(shared), jnp.sum((system.factor @ shared) ** 2, axis=0)
     smallest, largest = jnp.min(prior - explained), jnp.max(jnp.diagonal(covariance))
     resolution = jnp.finfo(prior.dtype).eps * largest * prior.shape[0] ** 0.5
-    value = _log_evidence(gp.likelihood, answers.counts, mode, system)
-    tolerance = _tolerance(gp.likelihood, share, covariance, answers.counts, mode)
+    value = _log_evidence(terms, mode, system)
+    tolerance = _tolerance(share, covariance, terms, mode.weights)
     # One step more would change the evidence by so much; what is left is of the size of that change or smaller.
     last = _newton_step(gp.likelihood, share, covariance, answers.counts, mode)
-    beyond = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta).curvature)
-    error = jnp.abs(_log_evidence(gp.likelihood, answers.counts, last, beyond) - value)
+    beyond = _expand(gp.likelihood, answers.counts, last.eta)
+    error = jnp.abs(_log_evidence(beyond, last, _system(share, covariance, beyond.curvature)) - value)
     every = jnp.concatenate([share**0.5 * weights[None, :], (1.0 - share) ** 0.5 * mode.weights])
     rounding = evidence_rounding(covariance, every)
     certificate = Certificate(
@@ -124,9 +131,10 @@ def evidence(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> tuple[F
     mode, residual, _ = _mode(*fixed, answers.counts)
     mode = jax.lax.stop_gradient(mode)
     last = _newton_step(gp.likelihood, share, covariance, answers.counts, mode)
-    system = _system(share, covariance, _expand(gp.likelihood, answers.counts, last.eta).curvature)
-    arrived = residual <= _tolerance(*fixed, answers.counts, mode)
-    return _log_evidence(gp.likelihood, answers.counts, last, system), arrived
+    terms = _expand(gp.likelihood, answers.counts, last.eta)
+    at_mode = _expand(fixed[0], answers.counts, mode.eta)
+    arrived = residual <= _tolerance(*fixed[1:], at_mode, mode.weights)
+    return _log_evidence(terms, last, _system(share, covariance, terms.curvature)), arrived
 
 
 # --- the mode
@@ -151,15 +159,11 @@ class _System(NamedTuple):
 
 
 def _tolerance(
-    likelihood: OrdinalProbit,
-    share: Float[Array, ""],
-    covariance: Float[Array, "m m"],
-    counts: Float[Array, "M m C"],
-    state: _State,
+    share: Float[Array, ""], covariance: Float[Array, "m m"], terms: Expansion, weights: Float[Array, "M m"]
 ) -> Float[Array, ""]:
     """eps^(2/3), or the rounding error of the residual where that is larger, as in `laplace`."""
     epsilon = jnp.finfo(covariance.dtype).eps
-    terms, size = _expand(likelihood, counts, state.eta), jnp.abs(state.weights)
+    size = jnp.abs(weights)
     summed = terms.slopes + terms.curvature * _latent(share, jnp.abs(covariance), size) + size
     rounding = jnp.linalg.norm(summed) * jnp.linalg.norm(_latent(share, covariance, summed))
     return jnp.clip(4.0 * epsilon * jnp.sqrt(rounding), epsilon ** (2 / 3), epsilon**0.25)
@@ -173,28 +177,40 @@ def _latent(
     return (together[None, :] + (1.0 - share) * weights) @ covariance
 
 
+class _Place(NamedTuple):
+    """Where the search stands: the likelihood is expanded there once, for all that is asked of it."""
+
+    state: _State
+    height: Float[Array, ""]  # log posterior
+    size: Float[Array, ""]  # of what it is a sum of, by which its rounding is judged
+    residual: Float[Array, ""]
+    tolerance: Float[Array, ""]
+
+
 def _mode(
     likelihood: OrdinalProbit, share: Float[Array, ""], covariance: Float[Array, "m m"], counts: Float[Array, "M m C"]
 ) -> tuple[_State, Float[Array, ""], Int[Array, ""]]:
     """Full Newton steps on the weights from 0; the mode, its distance from stationarity, and the steps taken."""
-    start = jnp.zeros(counts.shape[:2], covariance.dtype)
 
-    def residual_of(state):
-        off = _expand(likelihood, counts, state.eta).slope - state.weights
-        return jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(_latent(share, covariance, off)))
+    def at(state):
+        terms = _expand(likelihood, counts, state.eta)
+        value, off = jnp.sum(terms.value), terms.slope - state.weights
+        residual = jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(_latent(share, covariance, off)))
+        tolerance = _tolerance(share, covariance, terms, state.weights)
+        return _Place(state, value - 0.5 * jnp.sum(state.weights * state.eta), jnp.abs(value), residual, tolerance)
 
     def forward(carry):
-        state, _, steps = carry
-        full = _newton_step(likelihood, share, covariance, counts, state)
-        state = _damped(likelihood, counts, state, full)
-        return state, residual_of(state), steps + 1
+        here, steps = carry
+        full = _newton_step(likelihood, share, covariance, counts, here.state)
+        return _damped(at, here, full), steps + 1
 
     def going(carry):
-        state, residual, steps = carry
-        return (residual > _tolerance(likelihood, share, covariance, counts, state)) & (steps < _STEPS)
+        here, steps = carry
+        return (here.residual > here.tolerance) & (steps < _STEPS)
 
-    first = _State(start, start)
-    return jax.lax.while_loop(going, forward, (first, residual_of(first), jnp.asarray(0)))
+    start = jnp.zeros(counts.shape[:2], covariance.dtype)
+    here, steps = jax.lax.while_loop(going, forward, (at(_State(start, start)), jnp.asarray(0)))
+    return here.state, here.residual, steps
 
 
 def _newton_step(
@@ -222,29 +238,34 @@ def _newton_step(
     return _State(weights, _latent(share, covariance, weights))
 
 
-def _damped(likelihood: OrdinalProbit, counts: Float[Array, "M m C"], state: _State, full: _State) -> _State:
+def _damped(at: Callable[[_State], _Place], here: _Place, full: _State) -> _Place:
     """The largest of a few shares of a step at which the log posterior has not fallen, beyond its rounding."""
-    scales = 0.5 ** jnp.arange(_HALVINGS, dtype=full.eta.dtype)
 
-    def height_at(scale):
-        between = jax.tree.map(lambda a, b: a + scale * (b - a), state, full)
-        value = jnp.sum(_expand(likelihood, counts, between.eta).value)
-        return value - 0.5 * jnp.sum(between.weights * between.eta), jnp.abs(value)
+    def between(scale):
+        return jax.tree.map(lambda a, b: jnp.where(scale == 1.0, b, a + scale * (b - a)), here.state, full)
 
-    heights, sizes = jax.vmap(height_at)(scales)
-    height, size = height_at(jnp.zeros_like(scales[0]))
-    slack = 8.0 * jnp.finfo(size.dtype).eps * (size + sizes)
-    scale = scales[jnp.argmax((heights >= height - slack).at[-1].set(True))]
-    return jax.tree.map(lambda a, b: jnp.where(scale == 1.0, b, a + scale * (b - a)), state, full)
+    def fallen(carry):
+        there, scale = carry
+        slack = 8.0 * jnp.finfo(there.size.dtype).eps * (here.size + there.size)
+        return (there.height < here.height - slack) & (scale > 0.5 ** (_HALVINGS - 1))
+
+    def halved(carry):
+        scale = 0.5 * carry[1]
+        return at(between(scale)), scale
+
+    # The whole step is tried first and is nearly always taken; the others wait until it is not.
+    return jax.lax.while_loop(fallen, halved, (at(full), jnp.ones_like(here.height)))[0]
 
 
 def _solve_people(system: _System, right: Float[Array, "M m"]) -> Float[Array, "M m"]:
     """D_j r_j for everybody, (M, m)."""
 
-    def one(person):
-        lower, root, r = person
+    def solved(lower, root, r):
         solve = jax.scipy.linalg.solve_triangular
         return root * solve(lower, solve(lower, root * r, lower=True), lower=True, trans=1)
+
+    def one(person):
+        return jax.lax.cond(jnp.any(person[1] > 0), solved, lambda lower, root, r: jnp.zeros_like(r), *person)
 
     return jax.lax.map(one, (system.own, system.root, right))
 
@@ -256,10 +277,13 @@ def _system(share: Float[Array, ""], covariance: Float[Array, "m m"], curvature:
     held = curvature > 0
     root = jnp.where(held, jnp.sqrt(jnp.where(held, curvature, 1.0)), 0.0)
 
-    def add(total, root):
+    def added(total, root):
         lower = jnp.linalg.cholesky(unit + (1.0 - share) * root[:, None] * covariance * root[None, :])
         half = jax.scipy.linalg.solve_triangular(lower, jnp.diag(root), lower=True)
         return total + half.T @ half, lower
+
+    def add(total, root):  # who gave no answers adds nothing
+        return jax.lax.cond(jnp.any(root > 0), added, lambda total, root: (total, unit), total, root)
 
     total, person_factors = jax.lax.scan(add, jnp.zeros_like(covariance), root)
     asked = jnp.any(held, axis=0)  # a point at which nobody answered stands apart from the rest
@@ -280,9 +304,6 @@ def _expand(likelihood: OrdinalProbit, counts: Float[Array, "M m C"], eta: Float
     return jax.vmap(jax.vmap(one))(eta, counts)
 
 
-def _log_evidence(
-    likelihood: OrdinalProbit, counts: Float[Array, "M m C"], state: _State, system: _System
-) -> Float[Array, ""]:
+def _log_evidence(terms: Expansion, state: _State, system: _System) -> Float[Array, ""]:
     """Laplace's approximation: log likelihood and log prior at the mode, less half of log|I + K_all W|."""
-    values = _expand(likelihood, counts, state.eta).value
-    return jnp.sum(values) - 0.5 * jnp.sum(state.weights * state.eta) - 0.5 * system.log_determinant
+    return jnp.sum(terms.value) - 0.5 * jnp.sum(state.weights * state.eta) - 0.5 * system.log_determinant

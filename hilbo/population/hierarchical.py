@@ -13,6 +13,7 @@ posterior, stands `aggregation.aggregate("hierarchical", ...)`, with the p learn
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -23,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.kernels import RBF, Kernel
+from hilbo.numerics.host import placed
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 
@@ -89,9 +91,9 @@ class Share(eqx.Module):
 
         A scalar, in nats.
         """
-        width = self.shares[1] - self.shares[0]
-        top = jnp.max(self.log_evidence)
-        return top + jnp.log(jnp.trapezoid(jnp.exp(self.log_evidence - top), dx=width)) - self.log_evidence[-1]
+        shares, logs = np.asarray(self.shares), np.asarray(self.log_evidence)
+        top = logs.max()
+        return placed(top + np.log(np.trapezoid(np.exp(logs - top), dx=shares[1] - shares[0])) - logs[-1])
 
 
 def of_people(trials: Trials) -> Trials:
@@ -144,9 +146,7 @@ def learn_share(gp: OrdinalGP, trials: Trials, *, inference: str = "laplace") ->
     return share_from(lambda share: _evidence(gp, trials, share, inference), trials.x.dtype)
 
 
-def share_from(
-    evidence: Callable[[Float[Array, ""]], tuple[Float[Array, ""], Bool[Array, ""]]], dtype: DTypeLike
-) -> Share:
+def share_from(evidence: Callable[[Float[Array, ""]], tuple[Any, Any]], dtype: DTypeLike) -> Share:
     """The posterior of the share from its log evidence: a function of a share to its value and whether the fit held.
 
     The evidence is computed at Chebyshev points of [0, 1], 9, 17 or 33 of them, and interpolated: it is smooth in p,
@@ -156,7 +156,7 @@ def share_from(
     evaluated: dict[int, tuple[float, bool]] = {}  # by place among the finest nodes, in which the coarser ones are
     for step in (4, 2, 1):
         for node in (i for i in range(0, _NODES, step) if i not in evaluated):
-            value, held = evidence(jnp.asarray((1 + _nodes()[node]) / 2, dtype))
+            value, held = evidence(placed((1 + _nodes()[node]) / 2, dtype))
             evaluated[node] = float(value), bool(held)
         every = sorted(evaluated)
         fitted = np.array([evaluated[i][0] for i in every])
@@ -169,13 +169,13 @@ def share_from(
     weight = np.exp(curve - curve.max())
     area = np.concatenate([[0.0], np.cumsum((weight[1:] + weight[:-1]) / 2)])
     return Share(
-        shares=jnp.asarray(grid),
-        log_evidence=jnp.asarray(curve),
-        best=jnp.asarray(grid[curve.argmax()]),
-        mean=jnp.asarray(np.trapezoid(weight * grid) / np.trapezoid(weight)),
-        interval=jnp.asarray(np.interp([0.025, 0.975], area / area[-1], grid)),
-        interpolation_error=jnp.asarray(error),
-        converged=jnp.asarray(error < _USABLE and all(good for _, good in evaluated.values())),
+        shares=placed(grid),
+        log_evidence=placed(curve),
+        best=placed(grid[curve.argmax()]),
+        mean=placed(np.trapezoid(weight * grid) / np.trapezoid(weight)),
+        interval=placed(np.interp([0.025, 0.975], area / area[-1], grid)),
+        interpolation_error=placed(error),
+        converged=placed(error < _USABLE and all(good for _, good in evaluated.values())),
     )
 
 

@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 from scipy.special import ndtri
 
 from hilbo.errors import InputError
+from hilbo.numerics.host import placed
 from hilbo.numerics.rows import rows_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
@@ -128,13 +129,13 @@ def left_out_by(
     people = trials.mask.shape[0]
     if people < 3:
         raise InputError(f"leave_one_out: {people} people; at least three are needed, of whom two are left each time.")
-    mask, q = np.asarray(trials.mask), np.asarray(trials.q)
+    x, mask, q = np.asarray(trials.x), np.asarray(trials.mask), np.asarray(trials.q)
     persons, categories, rows, again, maps = [], [], [], [], []
     for group in np.arange(people)[:, None] if groups is None else groups:
         gp, map_without = fold(group)
         maps.append(map_without)
         for person in group:
-            for part, values in zip((rows, again), _newcomer(gp, map_without, trials.x[person]), strict=True):
+            for part, values in zip((rows, again), _newcomer(gp, map_without, placed(x[person])), strict=True):
                 part.append(np.asarray(values)[mask[person]])
             persons.append(np.full(mask[person].sum(), person))
             categories.append(q[person][mask[person]])
@@ -234,4 +235,4 @@ def _converged(map_: RuleMap) -> bool:
     """Whether every fit behind a map held its certificate."""
     fits = map_.experts if map_.shared is None else map_.shared
     assert fits is not None
-    return bool(jnp.all(fits.certificate.converged))
+    return bool(np.all(np.asarray(fits.certificate.converged)))

@@ -17,16 +17,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.host import placed
 from hilbo.numerics.rows import rows_of
 from hilbo.numerics.shown import known
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
-from hilbo.population.counts import Counts, counts_of, evidence, fit_counts, one_person
+from hilbo.population.counts import Counts, counts_of, fit_counts, one_person
 from hilbo.population.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
 from hilbo.population.learnt import RECIPE, Learnt, learnt_function
 from hilbo.population.newcomer import class_probabilities
@@ -37,7 +39,7 @@ __all__ = [
     "LARGEST_EXACT",
     "AnyRule",
     "RuleMap",
-    "even_choice",
+    "even_rows",
     "learnt_map",
     "point_rule",
     "rule_map",
@@ -52,6 +54,7 @@ ALL_RULES: tuple[AnyRule, ...] = (*GIVEN_RULES, RECIPE)
 LARGEST_EXACT = 1500
 """Answers, or latent values, up to which the exact models are used: they are cubic in their number."""
 _SHARE = 600  # answers from which the share is learnt
+_IN_ROWS = 4  # times as many rows as people is too many
 
 
 class RuleMap(eqx.Module):
@@ -88,6 +91,10 @@ class RuleMap(eqx.Module):
         means, explained = jax.vmap(lambda person: person.predict_explained(x))(self.experts)
         share = self.share if self.rule == "hierarchical" else None
         return pointwise.aggregate(self.rule, means, explained, self.prior, share=share)  # type: ignore[arg-type]
+
+    def astype(self, dtype: DTypeLike) -> "RuleMap":
+        """The same map that predicts in another precision."""
+        return jax.tree.map(lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, self)
 
     @property
     def apart(self) -> Float[Array, ""]:
@@ -149,7 +156,7 @@ def rule_map(
     if rule not in GIVEN_RULES:
         raise InputError(f'rule_map: the rule is "{rule}"; it must be one of {", ".join(GIVEN_RULES)}.')
     prior = jnp.asarray(gp.kernel.variance)
-    one = jnp.ones_like(prior)
+    one = placed(1.0, prior.dtype)
     if rule == "hierarchical":
         map_share = jnp.asarray(share_of(gp, trials, inference).mean if share is None else share, prior.dtype)
         shared = _shared_function(gp, trials, map_share, inference, largest)
@@ -180,26 +187,38 @@ def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest:
             f' {len(answered)} of them gave an answer; use "bcm", whose map is then that person\'s.'
         )
     inference = "ep" if inference == "exact" else inference
-    trials = even_choice(rows_of(trials, answered), largest)
-    counts = _counts_if_cheaper(gp, trials, inference)
+    chosen = answered[even_rows(rows_of(trials, answered), largest)]
+    few = rows_of(trials, chosen)
+    counts = _counts_if_cheaper(gp, few, inference)
     if counts is None:
-        return learn_share(gp, of_people(trials), inference=inference)
-    return share_from(lambda share: _evidence(gp, counts, share), trials.x.dtype)
+        return learn_share(gp, of_people(few), inference=inference)
+    counts = _among_all(counts, counts_of(trials, gp.likelihood.categories), chosen)
+
+    def evidence(share):
+        fitted = fit_counts(gp, share, counts)
+        found = fitted.certificate
+        return float(fitted.log_evidence), float(found.residual) <= float(found.tolerance)
+
+    return share_from(evidence, trials.x.dtype)
 
 
-def even_choice(trials: Trials, largest: int) -> Trials:
-    """The people themselves, or so many of them, evenly chosen and at least two, that their answers are not more."""
+def _among_all(counts: Counts, everybody: Counts, chosen: Int[np.ndarray, " k"]) -> Counts:
+    """The counts of the chosen people in the rows of all, of whom the others have none: the same result by the program
+    of everybody's map. As they are where the others were asked elsewhere, or are many."""
+    people = everybody.counts.shape[0]
+    if people > _IN_ROWS * len(chosen) or not np.array_equal(everybody.x, counts.x):
+        return counts
+    rows = np.zeros(everybody.counts.shape, counts.counts.dtype)
+    rows[chosen] = np.asarray(counts.counts)
+    return Counts(everybody.x, placed(rows))
+
+
+def even_rows(trials: Trials, largest: int) -> Int[np.ndarray, " k"]:
+    """Places of all people, or of so many of them, evenly chosen and at least two, that their answers are not more."""
     answers = int(np.asarray(trials.mask).sum())
     people = trials.mask.shape[0]
     count = people if answers <= largest else max(2, int(people * largest / answers))
-    rows = np.unique(np.linspace(0, people - 1, count).round().astype(int))
-    return rows_of(trials, rows)
-
-
-@program
-def _evidence(gp: OrdinalGP, counts: Counts, share: Float[Array, ""]) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Log evidence of a share from counts, and whether the fit held its certificate."""
-    return evidence(gp, share, counts)
+    return np.unique(np.linspace(0, people - 1, count).round().astype(int))
 
 
 def _experts(gp: OrdinalGP, trials: Trials, inference: str) -> Posterior:
@@ -246,7 +265,7 @@ def _shared_function(
 def _pooled(gp: OrdinalGP, trials: Trials, inference: str, largest: int) -> Posterior | None:
     """One GP on everybody's answers, as if from one person; None if they are too many."""
     counts = _counts_if_cheaper(gp, trials, inference)
-    one = jnp.ones_like(gp.kernel.variance)
+    one = placed(1.0, gp.kernel.variance.dtype)
     posterior = _from_counts(gp, None if counts is None else one_person(counts), one, largest)
     mask = np.asarray(trials.mask)
     if posterior is not None or mask.sum() > largest:

@@ -23,7 +23,6 @@ from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, as_json, json_lines, people_of
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import Aggregate, Optimum, asked_variance, nrmse, other_inference
-from hilbo.study.analysis import Population
 from hilbo.study.batch_optimum import LargeAggregate
 from hilbo.study.config import Study
 from hilbo.study.effects import effects_of
@@ -33,6 +32,7 @@ from hilbo.study.map_file import map_at_points, on_grid, write_map
 from hilbo.study.model_check import check_sentences, model_check
 from hilbo.study.optimum_location import location_notes, location_sentences
 from hilbo.study.optimum_region import optimum_region, region_content, region_sentences
+from hilbo.study.population_results import Population
 from hilbo.study.typed_files import sealed
 
 __all__ = [
@@ -76,7 +76,7 @@ def versions() -> dict[str, str]:
     return installed | {
         "python": platform.python_version(),
         "device": str(jax.devices()[0]),
-        "dtype": str(jnp.zeros(0).dtype),
+        "dtype": str(jnp.result_type(float)),
     }
 
 
@@ -181,7 +181,8 @@ def _truth(study, aggregate, truth):
         if individual_misses_with_K0 is None
         else np.percentile(individual_misses_with_K0, [25, 50, 75]).tolist(),
     }
-    top = np.asarray((aggregate.cohort.trials.q == len(study.responses) - 1) & aggregate.cohort.trials.mask).sum(axis=1)
+    trials = aggregate.cohort.trials
+    top = ((np.asarray(trials.q) == len(study.responses) - 1) & np.asarray(trials.mask)).sum(axis=1)
     return {
         "parameters": set_of(study.space, truth),
         "nrmse": table,
@@ -269,7 +270,7 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = MAP_CELL
                 {"long_name": "may be rendered"},
             ),
         },
-        coords={p.name: (p.name, np.asarray(p.to_physical(jnp.asarray(side))), {"units": p.unit}) for p in shown},
+        coords={p.name: (p.name, p.to_physical(side), {"units": p.unit}) for p in shown},
         attrs={"study": study.hash},
     )
 

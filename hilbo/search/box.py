@@ -14,6 +14,7 @@ from jaxtyping import Float, Real
 
 from hilbo.errors import InputError
 from hilbo.mechanics.span import STATES, Memory
+from hilbo.numerics.host import namespace_of
 
 __all__ = ["MOST_PARAMETERS", "Box", "Constraint", "Mechanics", "Parameter"]
 
@@ -116,28 +117,26 @@ class Parameter:
 
     def to_unit(self, value: Real[Any, "..."]) -> Float[Any, "..."]:
         """Physical value, an array, to [0, 1]; measured from the nearer end, so that both ends are met exactly."""
-        import jax.numpy as jnp
-
+        xp = namespace_of(value)
         if self.scale == "log":
-            above, below = jnp.log1p((value - self.low) / self.low), jnp.log1p((self.high - value) / value)
+            above, below = xp.log1p((value - self.low) / self.low), xp.log1p((self.high - value) / value)
             width = math.log(self.high / self.low)
         else:
             above, below, width = value - self.low, self.high - value, self.high - self.low
-        return jnp.where(above < below, above / width, 1 - below / width)
+        return xp.where(above < below, above / width, 1 - below / width)
 
     def to_physical(self, unit: Real[Any, "..."]) -> Float[Any, "..."]:
         """Inverse of `to_unit`; never leaves [low, high] for a `unit` in [0, 1]. A discrete parameter has its nearest
         value."""
-        import jax.numpy as jnp
-
+        xp = namespace_of(unit)
         if self.scale == "log":
             ratio = self.high / self.low
             upwards, downwards = self.low * ratio**unit, self.high * ratio ** (unit - 1)
         else:
             width = self.high - self.low
             upwards, downwards = self.low + width * unit, self.high - width * (1 - unit)
-        value = jnp.where(unit < 0.5, upwards, downwards)
-        return jnp.round(value) if self.discrete else value
+        value = xp.where(unit < 0.5, upwards, downwards)
+        return xp.round(value) if self.discrete else value
 
 
 @dataclass(frozen=True)

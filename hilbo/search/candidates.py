@@ -1,8 +1,9 @@
 """Candidate points of the unit cube, among which a function is maximised before the best of them are polished."""
 
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from hilbo.numerics.host import placed
 from hilbo.search.space import SearchSpace
 
 __all__ = ["CANDIDATES", "search_points"]
@@ -16,4 +17,4 @@ def search_points(space: SearchSpace, seed: int, count: int = CANDIDATES) -> Flo
     on its walls, edges and corners.
     -> (`count` + `count` // 4, d).
     """
-    return jnp.concatenate([jnp.asarray(space.candidates(count, seed)), jnp.asarray(space.walls(count // 4, seed))])
+    return placed(np.concatenate([space.candidates(count, seed), space.walls(count // 4, seed)]))

@@ -30,6 +30,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
 from hilbo.errors import InputError
+from hilbo.numerics.host import namespace_of, placed
 from hilbo.numerics.polytope import Polytope
 from hilbo.numerics.tracing import program
 from hilbo.search import linear
@@ -135,7 +136,7 @@ class SearchSpace(eqx.Module):
 
         (..., d) -> (..., d); each parameter in its own unit.
         """
-        physical = _floating(physical)
+        physical = _on_device(physical)
         return jnp.stack([p.to_unit(physical[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
     def to_physical(self, unit: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
@@ -143,8 +144,9 @@ class SearchSpace(eqx.Module):
 
         (..., d) -> (..., d); each parameter in its own unit.
         """
-        unit = _floating(unit)
-        return jnp.stack([p.to_physical(unit[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
+        points = _floating(unit)
+        xp = namespace_of(points)
+        return placed(xp.stack([p.to_physical(points[..., i]) for i, p in enumerate(self.parameters)], axis=-1))
 
     def from_box(self, w: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Optimiser's coordinates in [0, 1]^d to the unit cube; differentiable.
@@ -152,7 +154,7 @@ class SearchSpace(eqx.Module):
         In a column without a feasible point x_K1 is 0 and `feasible` says no.
         (..., d) -> (..., d).
         """
-        w = _floating(w)
+        w = _on_device(w)
         for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
             w = w.at[..., i].set(p.to_unit(p.low + (p.high - p.low) * w[..., i])) if linear_in_box else w
         if self.mechanics is None:
@@ -165,7 +167,7 @@ class SearchSpace(eqx.Module):
 
     def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Inverse of `from_box`, for `x` in the feasible set. (..., d) -> (..., d)."""
-        x = _floating(x)
+        x = _on_device(x)
         w = x
         for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
             w = w.at[..., i].set((p.to_physical(x[..., i]) - p.low) / (p.high - p.low)) if linear_in_box else w
@@ -183,11 +185,12 @@ class SearchSpace(eqx.Module):
 
         (..., d) -> (...,).
         """
-        x = _floating(x)
-        inside = jnp.all((x >= 0) & (x <= 1), axis=-1)
-        if self.mechanics is None and not self.constraints:
-            return inside
-        physical = self.to_physical(x)
+        plain = self.mechanics is None and not self.constraints
+        points = _floating(x) if plain else _on_device(x)
+        inside = namespace_of(points).all((points >= 0) & (points <= 1), axis=-1)
+        if plain:
+            return placed(inside)
+        physical = self.to_physical(points)
         if self.mechanics is not None:
             inside &= allowed(self.mechanics, self._split(physical))
         for constraint in self.constraints:
@@ -279,8 +282,14 @@ class SearchSpace(eqx.Module):
         return low, jnp.maximum(high - low, 0)
 
 
-def _floating(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
-    return jnp.asarray(x, jnp.result_type(1.0, x))
+def _floating(x: Real[ArrayLike, "..."]) -> Any:
+    """Floating-point numbers; NumPy's where they are NumPy's, with which small things are computed faster."""
+    xp = namespace_of(x)
+    return xp.asarray(x, xp.result_type(1.0, x))
+
+
+def _on_device(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
+    return placed(x, jnp.result_type(1.0, x))
 
 
 @functools.lru_cache(maxsize=16)
@@ -323,7 +332,7 @@ def _rosenblatt(space: SearchSpace, uniform: Float[np.ndarray, "n d"]) -> Float[
 @program
 def column_ends(space: SearchSpace, x: Float[ArrayLike, "*batch d"]) -> tuple[_Batch, _Batch]:
     """Both ends (...,) of the column of each point (..., d) of the unit cube, in x_K1; equal where none is feasible."""
-    x, mechanics = _floating(x), space.mechanics
+    x, mechanics = _on_device(x), space.mechanics
     assert mechanics is not None
     if mechanics.effective_damping is None:
         high = space._limit(mechanics, x)

@@ -9,6 +9,7 @@ committee machine over their posteriors (`hilbo.bcm`), or what the study's rule 
 optimum is searched like a session's.
 """
 
+import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -21,6 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition, bcm
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.host import placed
 from hilbo.numerics.shown import known, shown
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
@@ -116,7 +118,7 @@ class Aggregate(eqx.Module):
 
     def surface(self, x: Float[ArrayLike, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
         """Mean and variance (m,) of the population map at points of the unit cube."""
-        return predict_map(self.map, jnp.asarray(x))
+        return predict_map(self.map, placed(x))
 
     def class_probabilities(self, likelihood: OrdinalProbit, x: Float[ArrayLike, "m d"]) -> Float[Array, "m C"]:
         """Probabilities (m, C) of a new person's answers at points of the unit cube."""
@@ -131,7 +133,7 @@ class Aggregate(eqx.Module):
     @property
     def mean_of_optima(self) -> Float[Array, " d"]:
         """Plain average of the individuals' optima in the unit cube: what the paper compares the map with. (d,)."""
-        return jnp.mean(self.individuals.x, axis=0)
+        return placed(np.asarray(self.individuals.x).mean(axis=0))
 
 
 def fit_cohort(
@@ -170,9 +172,13 @@ def population(
     return evidence.merge(prior)
 
 
-@program
 def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Mean and variance (m,) of a population map at points of the unit cube; bcm's as a stream over people."""
+    return _predict_map(_nameless(map_), x)
+
+
+@program
+def _predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     return population(map_.experts, x) if map_.rule == "bcm" and map_.experts is not None else map_.predict(x)
 
 
@@ -193,7 +199,8 @@ def population_optimum(
 @program
 def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidates, rule, share) -> Optimum:
     apart = 0.0 if share is None else (1.0 - share) * gp.kernel.variance
-    return _optimum(gp.likelihood, space, lambda x: population(posteriors, x, rule, share), candidates, apart)
+    values = population(posteriors, candidates, rule, share)[0]
+    return _optimum(gp.likelihood, space, lambda x: population(posteriors, x, rule, share), candidates, values, apart)
 
 
 def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
@@ -201,7 +208,14 @@ def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) ->
     highest category most often, among points of which the answers tell as much as of some that were asked.
     `candidates` (m, d): feasible points of the unit cube, where the search begins.
     """
-    return _map_optimum(study.gp.likelihood, study.space, map_, candidates)
+    return _map_optimum(study.gp.likelihood, study.space, _nameless(map_), candidates)
+
+
+def _nameless(map_: RuleMap) -> RuleMap:
+    """The map without the name of its rule where it predicts alike by all: from one function's posterior. One program
+    then serves them."""
+    exact = map_.method == "exact" and map_.rule != RECIPE
+    return dataclasses.replace(map_, rule="hierarchical") if exact else map_
 
 
 @program
@@ -209,7 +223,9 @@ def _map_optimum(
     likelihood: OrdinalProbit, space: SearchSpace, map_: RuleMap, candidates: Float[Array, "m d"]
 ) -> Optimum:
     if map_.rule != RECIPE:
-        return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, map_.apart)
+        single = jnp.float32  # which ranks the candidates; the best are scored again
+        values = predict_map(map_.astype(single), candidates.astype(single))[0]
+        return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, values, map_.apart)
 
     def chance(mean, variance):
         return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
@@ -220,7 +236,8 @@ def _map_optimum(
     def told(x):
         return map_.predict(x[None, :])[1][0] <= known
 
-    return _optimum(likelihood, space, map_.predict, candidates, map_.apart, chance, told, map_.widths)
+    values = chance(*map_.predict(candidates))
+    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, chance, told, map_.widths)
 
 
 def _optimum(
@@ -228,16 +245,18 @@ def _optimum(
     space: SearchSpace,
     predict: Callable,
     candidates: Float[Array, "m d"],
+    values: Float[Array, " m"],
     apart: ArrayLike,
     height: Callable[[Array, Array], Array] | None = None,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
     widths: bool = False,
 ) -> Optimum:
-    """`apart`: variance of one person's function about the map's; `height`: what is largest at the optimum, of means
-    and variances (m,), by default the mean; `allowed`: where it may be; `widths`: whether people differ in them."""
+    """`values`: of the candidates, by which they are ranked; `apart`: variance of one person's function about the
+    map's; `height`: what is largest at the optimum, of means and variances (m,), by default the mean; `allowed`: where
+    it may be; `widths`: whether people differ in them."""
     height = (lambda mean, _: mean) if height is None else height
     choice = acquisition.maximise(
-        height(*predict(candidates)),
+        values,
         candidates,
         lambda x: height(*predict(x[None, :]))[0],
         **space.searched,
@@ -364,7 +383,7 @@ def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""]:
     if map_.reach is not None:
         return map_.reach
     points = np.unique(np.asarray(cohort.trials.x)[np.asarray(cohort.trials.mask)], axis=0)
-    return jnp.max(predict_map(map_, jnp.asarray(points))[1])
+    return placed(np.asarray(predict_map(map_, placed(points))[1]).max())
 
 
 def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array, "*s"]:
@@ -372,4 +391,5 @@ def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array
 
     `x` (..., d), `reference` (d,) -> (...,), shares of the ranges.
     """
-    return jnp.sqrt(jnp.mean((x - jnp.broadcast_to(reference, x.shape)) ** 2, axis=-1))
+    away = np.asarray(x) - np.asarray(reference)
+    return placed(np.sqrt(np.mean(away**2, axis=-1)))

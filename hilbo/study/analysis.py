@@ -7,7 +7,7 @@ people. What cannot be had from these answers is a sentence in `limits`, not an 
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,34 +21,20 @@ from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import RuleMap, learnt_map, point_rule
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, aggregate_cohort, asked_variance, map_optimum, nrmse
+from hilbo.study.aggregate import Aggregate, aggregate_cohort, map_optimum, nrmse
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.learnt_study import learnt_sentences, resolved, that_learns
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
-from hilbo.study.optimum_location import location_sentences, optimum_sentence
-from hilbo.study.progress import Progress, follow
+from hilbo.study.optimum_location import location_sentences
+from hilbo.study.population_results import Population, Say, analyse_population
+from hilbo.study.progress import Progress
 from hilbo.study.tolerance_intervals import Ends, tolerance_ends
 
-__all__ = ["Analysis", "Population", "Reading", "analyse", "analyse_population", "limits_of", "moved_by_evidence"]
+__all__ = ["Analysis", "Reading", "analyse", "limits_of", "moved_by_evidence"]
 
-Say = Callable[[str], None]
 _LEARN = ("theta", "noise", "thresholds")
-
-
-class Population(NamedTuple):
-    """What the answers of one cohort say, and how it came about over the trials: what `hilbo aggregate` writes."""
-
-    study: Study
-    aggregate: Aggregate
-    progress: Progress
-    seed: int
-
-    @property
-    def cohort(self) -> Cohort:
-        """Whose answers these are."""
-        return self.aggregate.cohort
 
 
 class Reading(NamedTuple):
@@ -92,29 +78,6 @@ class Analysis(NamedTuple):
     def progress(self) -> Progress:
         """The optima after fewer trials."""
         return self.population.progress
-
-
-def analyse_population(
-    study: Study,
-    cohort: Cohort,
-    seed: int = 0,
-    say: Say = lambda text: None,
-    tell: Callable[[list[str]], None] = lambda sentences: None,
-) -> Population:
-    """The aggregate of a cohort, and its optima after fewer trials; everything is fitted once. `tell` is given the
-    optimum in sentences as soon as it is known."""
-    if study.rule == RECIPE:
-        say("learning the hyperparameters from all answers")
-    study = resolved(study, cohort)
-    say(f"fitting {len(cohort.names)} participants ({study.name})")
-
-    def first(optimum, map_):
-        asked = asked_variance(map_, cohort)
-        tell([optimum_sentence(study, optimum.x), *location_sentences(study, optimum.x, optimum.sd, asked)])
-
-    aggregate = aggregate_cohort(study, cohort, seed, first=first)
-    say("the optima after fewer trials")
-    return Population(study, aggregate, follow(study, aggregate, seed), seed)
 
 
 def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None) -> Analysis:

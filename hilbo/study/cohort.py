@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from hilbo.errors import InputError
+from hilbo.numerics.host import placed
 from hilbo.numerics.rows import rows_of
 from hilbo.numerics.shown import known
 from hilbo.numerics.tracing import program
@@ -41,7 +42,8 @@ class Cohort(eqx.Module):
 
     def first(self, count: int) -> "Cohort":
         """Only everybody's first `count` trials."""
-        return Cohort(jax.vmap(lambda t: t.first(count))(self.trials), self.physical, self.names)
+        mask = np.asarray(self.trials.mask) & (np.arange(self.trials.mask.shape[1]) < count)[None, :]
+        return Cohort(eqx.tree_at(lambda t: t.mask, self.trials, placed(mask)), self.physical, self.names)
 
     def of(self, names: Sequence[str]) -> "Cohort":
         """Only these participants. Raises `InputError` for a name that the table does not have."""
@@ -61,7 +63,7 @@ class Cohort(eqx.Module):
 
     def counts(self) -> Int[np.ndarray, " M"]:
         """Answers of each participant. (M,)."""
-        return np.asarray(self.trials.mask.sum(axis=1))
+        return np.asarray(self.trials.mask).sum(axis=1)
 
 
 def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
@@ -89,7 +91,7 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     held = np.arange(capacity)[None, :] < counts[:, None]
     middle = [(p.low + p.high) / 2 for p in study.space.parameters]
     x = _to_unit(study.space, np.where(held[..., None], physical, middle))
-    return Cohort(jax.vmap(Trials)(x, jnp.asarray(answers), jnp.asarray(held)), physical, tuple(names))
+    return Cohort(jax.vmap(Trials)(x, placed(answers), placed(held)), physical, tuple(names))
 
 
 @program

@@ -3,13 +3,14 @@
 import math
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
+from hilbo.numerics.host import placed
 from hilbo.population.hierarchical import Share
 from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import RuleMap
 from hilbo.population.pointwise import RULES
+from hilbo.study.aggregate import predict_map
 from hilbo.study.config import Study
 
 __all__ = ["ALIKE", "SURE", "heterogeneity", "in_place", "rule_warnings", "share_content"]
@@ -49,7 +50,7 @@ def rule_warnings(study: Study, aggregate: Any) -> list[str]:
     share = aggregate.share
     if share is None or study.rule not in ALIKE or float(share.against_one) < SURE:
         return []
-    low, high = (float(end) for end in share.interval)
+    low, high = np.asarray(share.interval).tolist()
     words = (
         f"People differ: of the prior variance they share {float(share.mean):.2f} (95 % from {low:.2f} to {high:.2f}),"
         f' and the rule "{study.rule}" takes that to be 1'
@@ -67,5 +68,5 @@ def _sd_ratio(aggregate: Any) -> float | None:
     """The hierarchical map's standard deviation over the map's, at the optimum."""
     if aggregate.hierarchical is None:
         return None
-    _, variance = aggregate.hierarchical.predict(jnp.asarray(aggregate.optimum.x)[None, :])
-    return math.sqrt(float(variance[0])) / float(aggregate.optimum.sd)
+    _, variance = predict_map(aggregate.hierarchical, placed(np.asarray(aggregate.optimum.x)[None, :]))
+    return math.sqrt(float(np.asarray(variance)[0])) / float(aggregate.optimum.sd)

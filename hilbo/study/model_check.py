@@ -35,7 +35,7 @@ def model_check(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
     names, trials = cohort.names, cohort.trials
     mask = np.asarray(trials.mask)
     order = np.concatenate([np.flatnonzero(mask[p]) * 3 // mask[p].sum() for p in _people(left)])
-    x = np.concatenate([np.asarray(trials.x[p])[mask[p]] for p in _people(left)])
+    x = np.concatenate([np.asarray(trials.x)[p][mask[p]] for p in _people(left)])
     chosen = (left.q[:, None] == np.arange(len(study.responses))[None, :]).astype(float)
     content: dict[str, Any] = {
         "hyperparameters": "as stated" if study.learnt is None else "learnt from all answers",

@@ -22,7 +22,7 @@ class _Edges(NamedTuple):
 
 def optimum_sentence(study: Study, x: Float[Array, " d"]) -> str:
     """The optimum x (d,) of the unit cube in the study's units."""
-    values = np.asarray(study.space.to_physical(x))
+    values = np.asarray(study.space.to_physical(np.asarray(x)))
     sets = (
         f"{parameter.name} = {value:.4g}{f' {parameter.unit}' if parameter.unit else ''}"
         for parameter, value in zip(study.space.parameters, values, strict=True)

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hilbo.numerics.host import placed
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.maps import RuleMap, point_rule
@@ -89,7 +90,7 @@ def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[
     candidates = search_points(study.space, seed)
 
     split = _splits(len(cohort.names), seed)
-    points = candidates[: min(_POINTS, len(candidates))]
+    points = placed(np.asarray(candidates)[:_POINTS])
 
     def after(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, RuleMap | None]:
         last = count == longest
@@ -123,7 +124,7 @@ def _tops(map_: RuleMap, points: Float[Array, "m d"], split: Bool[np.ndarray, "s
     if not len(split):
         return np.zeros((0, 2), int)
     sides = np.stack([split, ~split], axis=1).reshape(-1, split.shape[1])
-    return np.asarray(_highest(map_, points, jnp.asarray(sides))).reshape(-1, 2)
+    return np.asarray(_highest(map_, points, placed(sides))).reshape(-1, 2)
 
 
 @program
@@ -158,7 +159,7 @@ def _map_by_points(study: Study, share: Float[Array, ""], posteriors: Posterior)
     rule, rule_share = point_rule(study.rule, share)
     prior = jnp.asarray(study.gp.kernel.variance)
     return RuleMap(
-        rule, "by points", posteriors, None, jnp.ones_like(prior) if rule_share is None else rule_share, prior
+        rule, "by points", posteriors, None, placed(1.0, prior.dtype) if rule_share is None else rule_share, prior
     )
 
 

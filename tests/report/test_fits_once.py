@@ -8,8 +8,8 @@ from studies import answered, plain_study
 
 from hilbo.report.results import write_results
 from hilbo.report.study import write_study
-from hilbo.study.analysis import analyse_population
 from hilbo.study.folder import Material, StudyFolder
+from hilbo.study.population_results import analyse_population
 
 pytestmark = pytest.mark.deep
 PEOPLE, TRIALS = 3, 6

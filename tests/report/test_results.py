@@ -13,8 +13,8 @@ from studies import answered, plain_study
 from hilbo.report import participants, results
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import aggregate_cohort, population
-from hilbo.study.analysis import analyse_population
 from hilbo.study.config import Study
+from hilbo.study.population_results import analyse_population
 
 PAPER = Study.load("hilbo/data/paper.toml")
 SYSTEM_IDENTIFICATION = (5.70, 5.89, 0.203)

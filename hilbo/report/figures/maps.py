@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from jax.typing import ArrayLike
@@ -18,6 +17,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from hilbo.numerics.host import placed
 from hilbo.report.figures.style import (
     BLUE,
     GREEN,
@@ -39,9 +39,9 @@ from hilbo.report.figures.style import (
     title,
 )
 from hilbo.study.aggregate import predict_map
-from hilbo.study.analysis import Population
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.population_results import Population
 from hilbo.study.progress import Progress
 
 __all__ = [
@@ -144,7 +144,7 @@ def progress_figure(study: Study, population: Population, truth: Float[np.ndarra
     if truth is not None:
         from_goal = np.sqrt(np.mean((progress.population - truth) ** 2, axis=1))
         individual_errors = np.sqrt(np.mean((progress.own - truth) ** 2, axis=2))
-    top = np.asarray((cohort.trials.q == len(study.responses) - 1) & cohort.trials.mask)
+    top = (np.asarray(cohort.trials.q) == len(study.responses) - 1) & np.asarray(cohort.trials.mask)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(TWO_COLUMNS, 2.7), layout="constrained")
         left, right = figure.subplots(1, 2)
@@ -249,7 +249,7 @@ def map_handles() -> list[Any]:
 
 def sides(study: Study) -> list[np.ndarray]:
     """Physical values of the first two parameters along a slice."""
-    return [np.asarray(p.to_physical(jnp.asarray(p.axis(_CELLS)))) for p in study.space.parameters[:2]]
+    return [np.asarray(p.to_physical(p.axis(_CELLS))) for p in study.space.parameters[:2]]
 
 
 def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], third: float | None) -> Slice:
@@ -259,16 +259,16 @@ def grid_slice(study: Study, surface: Surface, optimum: Float[ArrayLike, " d"], 
     x[..., 0], x[..., 1] = np.meshgrid(first, second)
     if third is not None:
         x[..., 2] = third
-    flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
+    flat = x.reshape(-1, x.shape[-1])
     feasible = np.asarray(study.space.feasible(flat))
-    mean, variance = (np.where(feasible, np.asarray(m), np.nan).reshape(x.shape[:-1]) for m in surface(flat))
+    mean, variance = (np.where(feasible, np.asarray(m), np.nan).reshape(x.shape[:-1]) for m in surface(placed(flat)))
     return Slice(mean, np.sqrt(variance))
 
 
 def _curve(study: Study, surface: Surface) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Physical values, mean and standard deviation of a map of one parameter."""
-    side = jnp.asarray(study.space.parameters[0].axis(_CELLS))
-    mean, variance = surface(side[:, None])
+    side = np.asarray(study.space.parameters[0].axis(_CELLS))
+    mean, variance = surface(placed(side[:, None]))
     return np.asarray(study.space.parameters[0].to_physical(side)), np.asarray(mean), np.sqrt(np.asarray(variance))
 
 

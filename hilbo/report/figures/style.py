@@ -6,7 +6,6 @@ does so by shape too. Widths are those of one and of two columns of a journal.
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.lines import Line2D
@@ -142,7 +141,7 @@ def _unit(unit):
 def level_words(study: Study, index: int, unit_value: float) -> str:
     """A parameter's name and physical value."""
     parameter = study.space.parameters[index]
-    value = float(parameter.to_physical(jnp.asarray(float(unit_value))))
+    value = float(parameter.to_physical(np.asarray(float(unit_value))))
     words = parameter.words(value) if parameter.discrete else f"{value:.3g}"
     return f"{_name(parameter.name)} = {words} {parameter.unit}".strip()
 

@@ -1,0 +1,56 @@
+"""What the answers of one cohort say: the aggregate, and how it came about over the trials.
+
+What `hilbo aggregate` writes. `hilbo.study.analysis` adds what a report says besides, and takes longer to import.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from hilbo.population.learnt import RECIPE
+from hilbo.study.aggregate import Aggregate, aggregate_cohort, asked_variance
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+from hilbo.study.learnt_study import resolved
+from hilbo.study.optimum_location import location_sentences, optimum_sentence
+from hilbo.study.progress import Progress, follow
+
+__all__ = ["Population", "Say", "analyse_population"]
+
+Say = Callable[[str], None]
+
+
+class Population(NamedTuple):
+    """What the answers of one cohort say, and how it came about over the trials: what `hilbo aggregate` writes."""
+
+    study: Study
+    aggregate: Aggregate
+    progress: Progress
+    seed: int
+
+    @property
+    def cohort(self) -> Cohort:
+        """Whose answers these are."""
+        return self.aggregate.cohort
+
+
+def analyse_population(
+    study: Study,
+    cohort: Cohort,
+    seed: int = 0,
+    say: Say = lambda text: None,
+    tell: Callable[[list[str]], None] = lambda sentences: None,
+) -> Population:
+    """The aggregate of a cohort, and its optima after fewer trials; everything is fitted once. `tell` is given the
+    optimum in sentences as soon as it is known."""
+    if study.rule == RECIPE:
+        say("learning the hyperparameters from all answers")
+    study = resolved(study, cohort)
+    say(f"fitting {len(cohort.names)} participants ({study.name})")
+
+    def first(optimum, map_):
+        asked = asked_variance(map_, cohort)
+        tell([optimum_sentence(study, optimum.x), *location_sentences(study, optimum.x, optimum.sd, asked)])
+
+    aggregate = aggregate_cohort(study, cohort, seed, first=first)
+    say("the optima after fewer trials")
+    return Population(study, aggregate, follow(study, aggregate, seed), seed)
