@@ -22,15 +22,19 @@ refused; `certify` decides every N, and K1, B1 at their limits, for one paramete
 Units: K N/mm, B1 N·s^α/mm, T s, damping N·s/m.
 """
 
+from typing import Any
+
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hilbo.errors import InputError
-from hilbo.mechanics.fosls import pot_stiffness, share
+from hilbo.mechanics.fosls import FOSLS, pot_stiffness, share
 from hilbo.mechanics.memory import sums
 from hilbo.mechanics.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
 from hilbo.mechanics.span import Memory, Span, span
+from hilbo.numerics.host import namespace_of, on_host
 from hilbo.viscoelastic import check_ranges, elementwise
 
 __all__ = [
@@ -38,6 +42,7 @@ __all__ = [
     "Witness",
     "certify",
     "largest_K1",
+    "largest_K1_beside",
     "minimum_damping",
     "needed_damping",
     "witness",
@@ -86,6 +91,15 @@ def largest_K1(
     return elementwise(_largest_K1, _closed(memory, N), B1, alpha, b, K_eff, T)
 
 
+def largest_K1_beside(model: FOSLS, b: float) -> float:
+    """`largest_K1` (N/mm) beside the B1, α, memory, T and static stiffness of a model, by NumPy where its numbers are
+    NumPy's. Raises ValueError for even N."""
+    place = model.B1, model.alpha, b, model.dc_gain(), model.T
+    if not on_host(model.B1, model.alpha):
+        return float(elementwise(_largest_K1, _closed(model.memory, model.N), *place))
+    return float(_largest_K1(_closed(model.memory, model.N), *map(np.float64, place)))
+
+
 def _closed(memory: Memory, N: int) -> Span:
     """The memory of a model, where the closed forms hold for it."""
     if memory == "short" and N % 2 == 0:
@@ -111,13 +125,14 @@ def _minimum_damping(
 
 def _largest_K1(
     span: Span,
-    B1: Float[Array, ""],
-    alpha: Float[Array, ""],
-    b: Float[Array, ""],
-    K_eff: Float[Array, ""],
-    T: Float[Array, ""],
-) -> Float[Array, ""]:
+    B1: Float[Any, ""],
+    alpha: Float[Any, ""],
+    b: Float[Any, ""],
+    K_eff: Float[Any, ""],
+    T: Float[Any, ""],
+) -> Float[Any, ""]:
     """K1max of this module's head, N/mm, and its two limits."""
+    xp = namespace_of(B1, alpha, b, K_eff, T)
     beta = pot_stiffness(B1, alpha, T)
     gl = sums(alpha, span)
     room = b / (500 * T) - K_eff  # Y
@@ -126,7 +141,7 @@ def _largest_K1(
     unlimited = excess <= 0
     limited = ~impossible & ~unlimited
     # The root is taken of harmless numbers where it is not used, so that its derivative cannot turn into NaN.
-    room, excess = jnp.where(limited, room, 1), jnp.where(limited, excess, 1)
+    room, excess = xp.where(limited, room, 1), xp.where(limited, excess, 1)
     half = room * (gl.at_nyquist + gl.at_dc)
-    root = jnp.sqrt(half**2 + 4 * excess * room * gl.at_nyquist * gl.at_dc)
-    return jnp.where(impossible, 0, jnp.where(unlimited, jnp.inf, beta * (half + root) / (2 * excess)))
+    root = xp.sqrt(half**2 + 4 * excess * room * gl.at_nyquist * gl.at_dc)
+    return xp.where(impossible, 0, xp.where(unlimited, xp.inf, beta * (half + root) / (2 * excess)))

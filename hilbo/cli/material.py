@@ -98,19 +98,25 @@ def passivity(
     _positive("T", period)
     _positive("damping", damping)
     start()
+    import numpy as np
+
     from hilbo.report.json_text import quoted
     from hilbo.report.passivity import passivity_result, passivity_words
-    from hilbo.viscoelastic import FOSLS, K0_from_effective_stiffness
+    from hilbo.viscoelastic import FOSLS
 
     given = {"N": taps, "T": period, "memory": memory, "K_eff": K_eff, "damping": damping}
     renderer = _renderer(study) | {name: value for name, value in given.items() if value is not None}
     sampling = renderer["N"], renderer["T"]
+
+    def place(K0):  # of NumPy's numbers, so that NumPy computes, at once
+        return FOSLS(*map(np.float64, (K0, K1, B1, alpha)), *sampling, memory=renderer["memory"])  # type: ignore[call-arg]
+
     if K0 is None:
         _order(alpha)
-        K0 = float(K0_from_effective_stiffness(K1, B1, alpha, renderer["K_eff"], *sampling, memory=renderer["memory"]))
+        K0 = renderer["K_eff"] - float(place(0.0).dc_gain())
     elif K_eff is not None:
         raise InputError("--K0 and --K-eff are both given; one follows from the other, leave one out.")
-    model = FOSLS(K0, K1, B1, alpha, *sampling, memory=renderer["memory"])
+    model = place(K0)
     content = passivity_result(model, renderer["damping"])
     if out is not None:
         from hilbo.report.material import write_passivity

@@ -17,11 +17,12 @@ another material under another N. Reference: Podlubny (1999), Fractional Differe
 """
 
 import math
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Inexact, Real
@@ -30,6 +31,7 @@ from hilbo.errors import InputError
 from hilbo.mechanics.memory import GLSums, gl_coefficients, response, sums
 from hilbo.mechanics.recursion import BLOCK, past_of
 from hilbo.mechanics.span import Memory, Span, span
+from hilbo.numerics.host import namespace_of, on_host
 from hilbo.numerics.mittag_leffler import mittag_leffler
 from hilbo.numerics.shown import numbers, shown
 from hilbo.numerics.tracing import program
@@ -44,14 +46,15 @@ class FOSLS(eqx.Module):
     """One parameter set of the FO-SLS, with the memory (short: `N` taps; full: `states` exponentials) and T it is for.
 
     K0, K1 (N/mm), B1 (N·s^α/mm) and alpha are scalars of one floating dtype; `jax.vmap` over records or over
-    constructors for several. K1 may be `inf`: K0 beside a spring-pot. Raises InputError for K1 < 0, B1 < 0, α outside
+    constructors for several. Of NumPy's numbers, `dc_gain`, `beta` and the passivity certificate of short memory are
+    computed by NumPy, at once. K1 may be `inf`: K0 beside a spring-pot. Raises InputError for K1 < 0, B1 < 0, α outside
     (0, 1], numbers that are not finite, and for K0 < 0 with full memory; not inside `jit`, where values are unknown.
     """
 
-    K0: Float[Array, ""]
-    K1: Float[Array, ""]
-    B1: Float[Array, ""]
-    alpha: Float[Array, ""]
+    K0: Float[Any, ""]
+    K1: Float[Any, ""]
+    B1: Float[Any, ""]
+    alpha: Float[Any, ""]
     N: int = eqx.field(static=True)
     T: float = eqx.field(static=True)
     memory: Memory = eqx.field(static=True)
@@ -69,8 +72,9 @@ class FOSLS(eqx.Module):
         memory: Memory = "short",
         states: int = 10,
     ):
-        dtype = jnp.result_type(1.0, K0, K1, B1, alpha)
-        self.K0, self.K1, self.B1, self.alpha = (jnp.asarray(value, dtype) for value in (K0, K1, B1, alpha))
+        xp = np if on_host(K0, K1, B1, alpha) else jnp
+        dtype = xp.result_type(1.0, K0, K1, B1, alpha)
+        self.K0, self.K1, self.B1, self.alpha = (xp.asarray(value, dtype) for value in (K0, K1, B1, alpha))
         self.N, self.T, self.memory, self.states = N, float(T), memory, states
 
     def __repr__(self) -> str:
@@ -91,7 +95,7 @@ class FOSLS(eqx.Module):
         return span(self.memory, self.N, self.states)
 
     @property
-    def beta(self) -> Float[Array, ""]:
+    def beta(self) -> Float[Any, ""]:
         """β = B1·T^{-α}, N/mm. A scalar."""
         return pot_stiffness(self.B1, self.alpha, self.T)
 
@@ -112,19 +116,19 @@ class FOSLS(eqx.Module):
         pot = jax.lax.complex(size * jnp.cos(lead), size * jnp.sin(lead))
         return self.K0.astype(pot.dtype) + series(self.K1, pot)
 
-    def dc_gain(self) -> Float[Array, ""]:
+    def dc_gain(self) -> Float[Any, ""]:
         """Static stiffness H(1), N/mm. A scalar."""
         return self.K0 + slow_stiffness(self.K1, self.beta, sums(self.alpha, self.span))
 
-    def high_frequency_gain(self) -> Float[Array, ""]:
+    def high_frequency_gain(self) -> Float[Any, ""]:
         """H(-1), N/mm: the stiffness at the Nyquist frequency. A scalar."""
         return self.K0 + series(self.K1, self.beta * sums(self.alpha, self.span).at_nyquist)
 
-    def instantaneous_stiffness(self) -> Float[Array, ""]:
+    def instantaneous_stiffness(self) -> Float[Any, ""]:
         """K0 + k, N/mm: force per step of position in the sample of the step. A scalar."""
         return self.K0 + series(self.K1, self.beta)
 
-    def effective_damping(self) -> Float[Array, ""]:
+    def effective_damping(self) -> Float[Any, ""]:
         """dH/ds at s = 0, N·s/m: the damping felt in slow motion. B1 where K1 is infinite and α = 1. A scalar."""
         return slow_damping(self.K1, self.beta, sums(self.alpha, self.span), self.T)
 
@@ -170,30 +174,30 @@ class FOSLS(eqx.Module):
         return find(self, jnp.asarray(fraction, self.K0.dtype))
 
 
-def series(K1: Float[Array, "..."], pot: Inexact[Array, "..."]) -> Inexact[Array, "..."]:
+def series(K1: Float[Any, "..."], pot: Inexact[Any, "..."]) -> Inexact[Any, "..."]:
     """Stiffness of a spring and a pot in series, K1·pot/(K1 + pot), for every K1 from 0 to inf and complex `pot`.
 
     N/mm; elementwise.
     """
-    firm = (jnp.abs(pot) <= K1) & (K1 > 0)
-    compliance = (1 / jnp.where(firm, K1, 1)).astype(pot.dtype)
-    spring, pot_of_soft = jnp.where(firm, 0, K1).astype(pot.dtype), jnp.where(firm | (pot == 0), 1, pot)
-    return jnp.where(firm, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
+    xp = namespace_of(K1, pot)
+    firm = (xp.abs(pot) <= K1) & (K1 > 0)
+    compliance = (1 / xp.where(firm, K1, 1)).astype(pot.dtype)
+    spring, pot_of_soft = xp.where(firm, 0, K1).astype(pot.dtype), xp.where(firm | (pot == 0), 1, pot)
+    return xp.where(firm, pot / (1 + compliance * pot), spring / (1 + spring / pot_of_soft))
 
 
-def share(K1: Float[Array, "..."], pot: Float[Array, "..."]) -> Float[Array, "..."]:
+def share(K1: Float[Any, "..."], pot: Float[Any, "..."]) -> Float[Any, "..."]:
     """Share of the pot in the elongation of spring and pot in series, K1/(K1 + pot), for every K1 from 0 to inf.
 
     N/mm -> no unit; elementwise.
     """
+    xp = namespace_of(K1, pot)
     firm = (pot <= K1) & (K1 > 0)
-    ratio = jnp.where(firm, 0, K1) / jnp.where(firm | (pot == 0), 1, pot)
-    return jnp.where(firm, 1 / (1 + pot / jnp.where(firm, K1, 1)), ratio / (1 + ratio))
+    ratio = xp.where(firm, 0, K1) / xp.where(firm | (pot == 0), 1, pot)
+    return xp.where(firm, 1 / (1 + pot / xp.where(firm, K1, 1)), ratio / (1 + ratio))
 
 
-def pot_stiffness(
-    B1: Float[Array, "..."], alpha: Float[Array, "..."], T: float | Float[Array, "..."]
-) -> Float[Array, "..."]:
+def pot_stiffness(B1: Float[Any, "..."], alpha: Float[Any, "..."], T: float | Float[Any, "..."]) -> Float[Any, "..."]:
     """β = B1·T^{-α}, N/mm: the stiffness of the spring-pot in the sample of a step.
 
     B1 in N·s^α/mm, T in s; elementwise.
@@ -201,7 +205,7 @@ def pot_stiffness(
     return B1 * T**-alpha
 
 
-def slow_stiffness(K1: Float[Array, ""], beta: Float[Array, ""], gl: GLSums) -> Float[Array, ""]:
+def slow_stiffness(K1: Float[Any, ""], beta: Float[Any, ""], gl: GLSums) -> Float[Any, ""]:
     """H(1) - K0, N/mm: what spring and spring-pot in series add to the static stiffness.
 
     K1 and `beta` are scalars, in N/mm.
@@ -209,9 +213,7 @@ def slow_stiffness(K1: Float[Array, ""], beta: Float[Array, ""], gl: GLSums) -> 
     return series(K1, beta * gl.at_dc)
 
 
-def slow_damping(
-    K1: Float[Array, ""], beta: Float[Array, ""], gl: GLSums, T: float | Float[Array, ""]
-) -> Float[Array, ""]:
+def slow_damping(K1: Float[Any, ""], beta: Float[Any, ""], gl: GLSums, T: float | Float[Any, ""]) -> Float[Any, ""]:
     """dH/ds at s = 0, N·s/m: T·K1²·β·M1/(K1 + β·S_N)²; 1000·T is T for stiffness in N/mm.
 
     K1 and `beta` are scalars, in N/mm, T in s.

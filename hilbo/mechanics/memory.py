@@ -16,6 +16,7 @@ Reference: Podlubny (1999), Fractional Differential Equations, section 7.3 (shor
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,6 +26,7 @@ from jaxtyping import Array, Complex, Float, Real
 
 from hilbo.mechanics.exponentials import exponentials
 from hilbo.mechanics.span import Span
+from hilbo.numerics.host import namespace_of, on_host, scan
 
 __all__ = ["GLSums", "gl_coefficients", "gl_sums", "response", "sums"]
 
@@ -32,16 +34,16 @@ __all__ = ["GLSums", "gl_coefficients", "gl_sums", "response", "sums"]
 class GLSums(eqx.Module):
     """The four sums of Grünwald-Letnikov coefficients that the closed forms need."""
 
-    at_dc: Float[Array, ""]  # S_N = C(1)
-    at_nyquist: Float[Array, ""]  # C(-1), close to 2^α
-    spread: Float[Array, ""]  # C(-1) - C(1) = 2·Σ_{odd i} |c_i|
-    moment: Float[Array, ""]  # M1 = -Σ i·c_i
+    at_dc: Float[Any, ""]  # S_N = C(1)
+    at_nyquist: Float[Any, ""]  # C(-1), close to 2^α
+    spread: Float[Any, ""]  # C(-1) - C(1) = 2·Σ_{odd i} |c_i|
+    moment: Float[Any, ""]  # M1 = -Σ i·c_i
 
 
 def sums(alpha: Real[ArrayLike, ""], span: Span) -> GLSums:
     """C(1), C(-1), their difference and the first moment of one order α, for either memory. `alpha` is a scalar."""
     if span.memory == "short":
-        return gl_sums(alpha, span.N)
+        return _gl_sums(alpha, span.N) if on_host(alpha) else gl_sums(alpha, span.N)
     alpha = jnp.asarray(alpha, jnp.result_type(1.0, alpha))
     weight, loss = exponentials(alpha, span.states)
     return GLSums(jnp.zeros_like(alpha), 2**alpha, 2**alpha, jnp.sum(weight / loss))
@@ -124,30 +126,31 @@ def _longer(jet: Callable) -> Callable:
     return extended
 
 
-def _gl_sums(alpha: Float[Array, ""], N: int) -> GLSums:
+def _gl_sums(alpha: Float[Any, ""], N: int) -> GLSums:
     """The sums in one loop over the taps."""
+    xp = namespace_of(alpha)
 
     def add(sums, i):
         following, tap = _tap(alpha, sums.at_dc, i)
         odd = i % 2 == 1
         return GLSums(
             at_dc=following,
-            at_nyquist=sums.at_nyquist + jnp.where(odd, tap, -tap),
-            spread=sums.spread + jnp.where(odd, 2 * tap, 0),
+            at_nyquist=sums.at_nyquist + xp.where(odd, tap, -tap),
+            spread=sums.spread + xp.where(odd, 2 * tap, 0),
             moment=sums.moment + i * tap,
-        ), None
+        )
 
-    zero, one = jnp.zeros_like(alpha), jnp.ones_like(alpha)
-    return jax.lax.scan(add, GLSums(one, one, zero, zero), _indices(alpha, N))[0]
+    zero, one = xp.zeros_like(alpha), xp.ones_like(alpha)
+    return scan(add, GLSums(one, one, zero, zero), _indices(alpha, N))
 
 
 def _tap(
-    alpha: Float[Array, ""], partial_sum: Float[Array, ""], i: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    alpha: Float[Any, ""], partial_sum: Float[Any, ""], i: Float[Any, ""]
+) -> tuple[Float[Any, ""], Float[Any, ""]]:
     """From S_{i-1} to S_i and |c_i|."""
     return partial_sum * (1 - alpha / i), alpha / i * partial_sum
 
 
-def _indices(alpha: Float[Array, ""], N: int) -> Float[Array, " {N}"]:
+def _indices(alpha: Float[Any, ""], N: int) -> Float[Any, " {N}"]:
     """1 … N, in the dtype of `alpha`."""
-    return jnp.arange(1, N + 1, dtype=alpha.dtype)
+    return namespace_of(alpha).arange(1, N + 1, dtype=alpha.dtype)

@@ -22,6 +22,7 @@ Units: damping N·s/m, ω rad/s, x mm, F N, energy mJ (N·mm). Reference: Colgat
 
 import math
 from fractions import Fraction
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -34,6 +35,7 @@ from hilbo.errors import InputError
 from hilbo.mechanics.exponentials import exponentials
 from hilbo.mechanics.fosls import FOSLS, series, share
 from hilbo.mechanics.memory import gl_coefficients
+from hilbo.numerics.host import namespace_of, on_host, scan
 from hilbo.numerics.shown import concrete, shown
 from hilbo.numerics.tracing import program
 
@@ -50,22 +52,22 @@ _LONGEST_CYCLE = 4096  # samples
 class Certificate(eqx.Module):
     """What `certify` knows: bounds of the margin b - b_min, the static stiffness, and where the margin is smallest."""
 
-    lower: Float[Array, ""]  # N·s/m
-    upper: Float[Array, ""]  # N·s/m
-    static_stiffness: Float[Array, ""]  # H(1), N/mm
-    frequency: Float[Array, ""]  # rad/s
+    lower: Float[Any, ""]  # N·s/m
+    upper: Float[Any, ""]  # N·s/m
+    static_stiffness: Float[Any, ""]  # H(1), N/mm
+    frequency: Float[Any, ""]  # rad/s
 
     def __repr__(self) -> str:
         margin, stiffness = f"{shown(self.lower)} to {shown(self.upper)} N.s/m", f"{shown(self.static_stiffness)} N/mm"
         return f"Certificate(margin {margin}, smallest at {shown(self.frequency)} rad/s, H(1) {stiffness})"
 
     @property
-    def passive(self) -> Bool[Array, "..."]:
+    def passive(self) -> Bool[Any, "..."]:
         """Proved: enough damping at every frequency, and H(1) >= 0."""
         return (self.lower > 0) & (self.static_stiffness >= 0)
 
     @property
-    def violated(self) -> Bool[Array, "..."]:
+    def violated(self) -> Bool[Any, "..."]:
         """Proved: too little damping at `frequency`, or H(1) < 0."""
         return (self.upper <= 0) | (self.static_stiffness < 0)
 
@@ -99,17 +101,25 @@ def needed_damping(model: FOSLS, omega: Real[ArrayLike, "*w"]) -> Float[Array, "
     return jnp.where(moving, 500 * model.T * stiffness, 500 * model.T * model.dc_gain() - model.effective_damping())
 
 
-@program
 def certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
     """Whether the rendering is passive on a device with physical damping `b` (N·s/m); `jax.vmap` for several.
 
     For any N. Not differentiable: see `minimum_damping`, and `needed_damping` at the certificate's frequency.
-    `b` is a scalar; so is every number of the certificate. Raises `InputError` for a `b` below 0.
+    `b` is a scalar; so is every number of the certificate. Of a model of NumPy's numbers it is computed by NumPy.
+    Raises `InputError` for a `b` below 0.
     """
     if concrete(b) and not np.all(np.asarray(b) >= 0):
         raise InputError(f"b is {shown(b)}; the damping of a device is 0 or above, in N.s/m.")
-    model = jax.lax.stop_gradient(model)
-    b = jnp.asarray(b, model.K0.dtype)
+    host = model.memory == "short" and on_host(model.K0, model.K1, model.B1, model.alpha)
+    return _certificate(model, np.asarray(b, model.K0.dtype)) if host else _certify(model, b)
+
+
+@program
+def _certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
+    return _certificate(jax.lax.stop_gradient(model), jnp.asarray(b, model.K0.dtype))
+
+
+def _certificate(model: FOSLS, b: Float[Any, ""]) -> Certificate:
     enclose = _full_enclosure if model.memory == "full" else _short_enclosure
     low, high, angle = enclose(model)
     scale = 500 * model.T
@@ -123,101 +133,110 @@ def _full_enclosure(model: FOSLS) -> tuple[Float[Array, ""], Float[Array, ""], F
     return stiffness - error, stiffness + error, jnp.asarray(jnp.pi, stiffness.dtype)
 
 
-def _short_enclosure(model: FOSLS) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+def _short_enclosure(model: FOSLS) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
     """Bounds of max φ over all angles, and the angle of the largest φ found."""
     A, B, least = _polynomials(model)
+    xp = namespace_of(A)
     cells = 2 ** math.ceil(math.log2(_CELLS_PER_TAP * model.N + _LEAST_CELLS))
     width = math.pi / cells
     value = _on_grid(_rows(B, 1), cells)[0] / _on_grid(_rows(A, 1), cells)[0]  # φ - K0
-    best = jnp.argmax(value)
+    best = xp.argmax(value)
     peak = _climb(A, B, best.astype(A.dtype) * width, width)
-    largest = jnp.maximum(value[best], _ratio(A, B, peak)[0])
+    largest = xp.maximum(value[best], _ratio(A, B, peak)[0])
 
-    rounding = _ROUNDING * jnp.finfo(A.dtype).eps * (jnp.sum(jnp.abs(A)) * jnp.abs(largest) + jnp.sum(jnp.abs(B)))
+    rounding = _ROUNDING * xp.finfo(A.dtype).eps * (xp.sum(xp.abs(A)) * xp.abs(largest) + xp.sum(xp.abs(B)))
     p = _rows((largest + 4 * rounding) * A - B, _ORDER + 1)
-    beside = jnp.abs(jnp.arange(cells + 1) - best) <= 1
-    cell = _lowest(_on_grid(p, cells), jnp.asarray(width / 2, A.dtype), p)
-    ring = 2 * width * 0.5 ** jnp.arange(_RINGS, dtype=A.dtype)
-    centre = jnp.concatenate([0.75 * ring, -0.75 * ring, jnp.zeros_like(ring[:1])])
-    radius = jnp.concatenate([0.25 * ring, 0.25 * ring, 0.5 * ring[-1:]])
+    beside = xp.abs(xp.arange(cells + 1) - best) <= 1
+    cell = _lowest(_on_grid(p, cells), xp.asarray(width / 2, A.dtype), p)
+    ring = 2 * width * 0.5 ** xp.arange(_RINGS, dtype=A.dtype)
+    centre = xp.concatenate([0.75 * ring, -0.75 * ring, xp.zeros_like(ring[:1])])
+    radius = xp.concatenate([0.25 * ring, 0.25 * ring, 0.5 * ring[-1:]])
     near = _lowest(_at_angles(p, peak + centre), radius, p)
-    lowest = jnp.minimum(jnp.min(jnp.where(beside, jnp.inf, cell)), jnp.min(near)) - rounding
-    high = largest + 4 * rounding + jnp.maximum(-lowest, 0) / least
+    lowest = xp.minimum(xp.min(xp.where(beside, xp.inf, cell)), xp.min(near)) - rounding
+    high = largest + 4 * rounding + xp.maximum(-lowest, 0) / least
     return model.K0 + largest - 4 * rounding, model.K0 + high, peak
 
 
-def _polynomials(model: FOSLS) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, ""]]:
+def _polynomials(model: FOSLS) -> tuple[Float[Any, " n"], Float[Any, " n"], Float[Any, ""]]:
     """Cosine coefficients of A and B, and the least value of A."""
     beta = model.beta
+    xp = namespace_of(model.alpha)
     k = series(model.K1, beta)
-    g, h = jnp.where(k > 0, share(model.K1, beta), 1), jnp.where(k > 0, share(beta, model.K1), 0)
-    c = gl_coefficients(model.alpha, model.N)
-    partial = jnp.cumprod(1 - model.alpha / jnp.arange(1, model.N + 1, dtype=c.dtype))
+    g, h = xp.where(k > 0, share(model.K1, beta), 1), xp.where(k > 0, share(beta, model.K1), 0)
+    one = xp.ones(1, k.dtype)
+    i = xp.arange(1, model.N + 1, dtype=k.dtype)
+    partial = xp.concatenate([one, xp.cumprod(1 - model.alpha / i)])  # S_0 ... S_N
+    c = xp.concatenate([one, -(model.alpha / i) * partial[:-1]])
     last = partial[-1]
-    twice = jnp.ones_like(c).at[1:].set(2)
-    square = twice * jnp.correlate(c, c, mode="full")[model.N :]
+    square = xp.correlate(c, c, mode="full")[model.N :]
+    square = xp.concatenate([square[:1], 2 * square[1:]])
     # Re C = Σ c_j cos jθ
-    A = (h**2 * square + 2 * g * h * c).at[0].add(g**2)
-    V = jnp.concatenate([last[None], 2 * (last - jnp.concatenate([jnp.ones(1, c.dtype), partial[:-1]]))])
+    A = h**2 * square + 2 * g * h * c + xp.concatenate([g[None] ** 2, xp.zeros(model.N, k.dtype)])
+    V = xp.concatenate([last[None], 2 * (last - partial[:-1])])
     return A, k * (g * V + h * square), (g + h * last) ** 2
 
 
-def _rows(p: Float[Array, " n"], count: int) -> Float[Array, "{count} n"]:
+def _rows(p: Float[Any, " n"], count: int) -> Float[Any, "{count} n"]:
     """p_j·(j/N)^m/m! for m < `count`: with cos, -sin, -cos, sin of jθ in turn, Taylor terms of p in units of 1/N."""
-    j = jnp.arange(p.shape[0], dtype=p.dtype) / (p.shape[0] - 1)
+    xp = namespace_of(p)
+    j = xp.arange(p.shape[0], dtype=p.dtype) / (p.shape[0] - 1)
     rows = [p]
     for m in range(1, count):
         rows.append(rows[-1] * j / m)
-    return jnp.stack(rows)
+    return xp.stack(rows)
 
 
-def _on_grid(rows: Float[Array, "m n"], cells: int) -> Float[Array, "m {cells+1}"]:
+def _on_grid(rows: Float[Any, "m n"], cells: int) -> Float[Any, "m {cells+1}"]:
     """Taylor terms at the angles πi/cells, i = 0 … cells, as (m, i)."""
-    turn = jnp.asarray([1j**m for m in range(len(rows))], jax.lax.complex(rows, rows).dtype)
-    half = jax.lax.complex(rows.at[:, 0].multiply(2), jnp.zeros_like(rows)) * turn[:, None]
-    return cells * jnp.fft.irfft(half, 2 * cells, axis=1)[:, : cells + 1]
+    xp = namespace_of(rows)
+    turn = xp.asarray([1j**m for m in range(len(rows))], xp.result_type(rows.dtype, xp.complex64))
+    half = xp.concatenate([2 * rows[:, :1], rows[:, 1:]], axis=1) * turn[:, None]
+    return cells * xp.fft.irfft(half, 2 * cells, axis=1)[:, : cells + 1]
 
 
-def _at_angles(rows: Float[Array, "m n"], angles: Float[Array, " i"]) -> Float[Array, "m i"]:
+def _at_angles(rows: Float[Any, "m n"], angles: Float[Any, " i"]) -> Float[Any, "m i"]:
     """Taylor terms at any angles, as (m, i)."""
-    turned = jnp.arange(rows.shape[1], dtype=angles.dtype)[:, None] * angles[None, :]
-    cos, sin = rows @ jnp.cos(turned), rows @ jnp.sin(turned)
-    return jnp.stack([(cos[m], -sin[m], -cos[m], sin[m])[m % 4] for m in range(len(rows))])
+    xp = namespace_of(rows, angles)
+    turned = xp.arange(rows.shape[1], dtype=angles.dtype)[:, None] * angles[None, :]
+    cos, sin = rows @ xp.cos(turned), rows @ xp.sin(turned)
+    return xp.stack([(cos[m], -sin[m], -cos[m], sin[m])[m % 4] for m in range(len(rows))])
 
 
-def _lowest(taylor: Float[Array, "m i"], radius: Float[Array, "..."], rows: Float[Array, "m n"]) -> Float[Array, " i"]:
+def _lowest(taylor: Float[Any, "m i"], radius: Float[Any, "..."], rows: Float[Any, "m n"]) -> Float[Any, " i"]:
     """Least value that p can take within `radius` of each angle; the last of the `rows` bounds the remainder."""
+    xp = namespace_of(taylor, rows)
     order, scaled = len(rows) - 1, radius * (rows.shape[1] - 1)
     term = [taylor[m] * scaled**m for m in range(order)]
-    remainder = jnp.sum(jnp.abs(rows[order])) * scaled**order
+    remainder = xp.sum(xp.abs(rows[order])) * scaled**order
     # Half the second derivative is never less than this, in units of the radius.
-    bend = term[2] - sum(math.comb(m, 2) * jnp.abs(term[m]) for m in range(3, order)) - math.comb(order, 2) * remainder
-    slope = jnp.abs(term[1])
+    bend = term[2] - sum(math.comb(m, 2) * xp.abs(term[m]) for m in range(3, order)) - math.comb(order, 2) * remainder
+    slope = xp.abs(term[1])
     inside = 2 * bend > slope
-    return term[0] - jnp.where(inside, slope**2 / (4 * jnp.where(inside, bend, 1)), slope - bend)
+    return term[0] - xp.where(inside, slope**2 / (4 * xp.where(inside, bend, 1)), slope - bend)
 
 
 def _ratio(
-    A: Float[Array, " n"], B: Float[Array, " n"], angle: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    A: Float[Any, " n"], B: Float[Any, " n"], angle: Float[Any, ""]
+) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
     """B/A, with the slope and bend of (B/A)·A - B for the number B/A, per 1/N."""
     a, b = (_at_angles(_rows(p, 3), angle[None])[:, 0] for p in (A, B))
     value = b[0] / a[0]
     return value, value * a[1] - b[1], 2 * (value * a[2] - b[2])
 
 
-def _climb(A: Float[Array, " n"], B: Float[Array, " n"], start: Float[Array, ""], width: float) -> Float[Array, ""]:
+def _climb(A: Float[Any, " n"], B: Float[Any, " n"], start: Float[Any, ""], width: float) -> Float[Any, ""]:
     """The angle of the largest B/A within a cell's width of `start`: Newton, kept inside."""
     N = A.shape[0] - 1
-    low, high = jnp.maximum(start - width, 0), jnp.minimum(start + width, jnp.pi)
+    xp = namespace_of(A)
+    low, high = xp.maximum(start - width, 0), xp.minimum(start + width, xp.pi)
 
-    def step(_, angle):
+    def step(angle, _):
         _, slope, bend = _ratio(A, B, angle)
         curved = bend > 0
-        return jnp.where(curved, jnp.clip(angle - slope / jnp.where(curved, bend, 1) / N, low, high), angle)
+        return xp.where(curved, xp.clip(angle - slope / xp.where(curved, bend, 1) / N, low, high), angle)
 
-    angle = jax.lax.fori_loop(0, 8, step, start)
-    return jnp.where(_ratio(A, B, angle)[0] > _ratio(A, B, start)[0], angle, start)
+    angle = scan(step, start, xp.arange(8))
+    return xp.where(_ratio(A, B, angle)[0] > _ratio(A, B, start)[0], angle, start)
 
 
 def witness(model: FOSLS, b: float) -> Witness | None:

@@ -2,11 +2,13 @@
 own, which takes ten milliseconds to trace, lower and load and nothing to run.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
-__all__ = ["namespace_of", "placed"]
+__all__ = ["namespace_of", "on_host", "placed", "scan"]
 
 
 def namespace_of(*values: Any) -> Any:
@@ -17,6 +19,20 @@ def namespace_of(*values: Any) -> Any:
     import jax.numpy as jnp
 
     return jnp
+
+
+def on_host(*values: Any) -> bool:
+    """Whether all are NumPy's numbers: what is computed of them is computed by NumPy."""
+    return all(isinstance(value, np.ndarray | np.generic) for value in values)
+
+
+def scan(step: Callable[[Any, Any], Any], start: Any, over: Any) -> Any:
+    """The last of `step`'s results, from `start` over the numbers of an array: a loop of NumPy's or of JAX's."""
+    if on_host(over):
+        return functools.reduce(step, over, start)
+    import jax
+
+    return jax.lax.scan(lambda carry, value: (step(carry, value), None), start, over)[0]
 
 
 def placed(value: Any, dtype: Any = None) -> Any:

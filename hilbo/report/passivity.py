@@ -14,8 +14,7 @@ def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
     certificate = passivity.certify(model, b)
     status, K_eff, largest = certificate.status, float(certificate.static_stiffness), None
     if model.memory == "full" or model.N % 2 == 1:
-        place = (model.B1, model.alpha, b, K_eff, model.N, model.T)
-        largest = float(passivity.largest_K1(*place, memory=model.memory))
+        largest = passivity.largest_K1_beside(model, b)
     content: dict[str, Any] = {
         "status": status,
         "margin": [float(certificate.lower), float(certificate.upper)],
