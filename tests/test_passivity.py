@@ -1,6 +1,7 @@
 """The closed passivity bounds against the frequency response, the numbers of the paper, and each other."""
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -277,3 +278,14 @@ def test_needed_damping_at_both_ends():
     found = passivity.needed_damping(model, np.array([0.0, 1e-3, 1e3 * np.pi]))
     assert found[0] == pytest.approx(float(found[1]), rel=1e-6)
     assert found[2] == pytest.approx(0.91664, abs=5e-6)
+
+
+@pytest.mark.parametrize("numbers", [(-3.19, 5.58, 7.88, 0.176), (0.3, 0.0, 1.0, 0.5), (0.1, math.inf, 0.5, 0.9)])
+def test_of_numpys_numbers_numpy_computes_the_same(numbers):
+    ours, theirs = FOSLS(*map(np.float64, numbers)), FOSLS(*numbers)
+    host, device = passivity.certify(ours, 0.95), passivity.certify(theirs, 0.95)
+    assert isinstance(host.lower, np.generic) and isinstance(device.lower, jax.Array)
+    for name in ("lower", "upper", "static_stiffness", "frequency"):
+        np.testing.assert_allclose(getattr(host, name), getattr(device, name), rtol=1e-12, atol=1e-12)
+    largest = passivity.largest_K1(theirs.B1, theirs.alpha, 0.95, theirs.dc_gain())
+    np.testing.assert_allclose(passivity.largest_K1_beside(ours, 0.95), largest, rtol=1e-12)

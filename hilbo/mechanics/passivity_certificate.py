@@ -189,8 +189,8 @@ def _rows(p: Float[Any, " n"], count: int) -> Float[Any, "{count} n"]:
 def _on_grid(rows: Float[Any, "m n"], cells: int) -> Float[Any, "m {cells+1}"]:
     """Taylor terms at the angles πi/cells, i = 0 … cells, as (m, i)."""
     xp = namespace_of(rows)
-    turn = xp.asarray([1j**m for m in range(len(rows))], xp.result_type(rows.dtype, xp.complex64))
-    half = xp.concatenate([2 * rows[:, :1], rows[:, 1:]], axis=1) * turn[:, None]
+    turn = xp.asarray([1j**m for m in range(len(rows))], np.result_type(rows.dtype, np.complex64))
+    half = xp.concatenate([2 * rows[:, :1], rows[:, 1:]], axis=1).astype(turn.dtype) * turn[:, None]
     return cells * xp.fft.irfft(half, 2 * cells, axis=1)[:, : cells + 1]
 
 

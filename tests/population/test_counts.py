@@ -95,3 +95,14 @@ def test_learning_reaches_a_maximum():
 def test_nobody_answered():
     with pytest.raises(InputError, match="nobody gave an answer"):
         counts_of(jax.tree.map(lambda leaf: leaf[None], Trials.empty(8, 2)), 3)
+
+
+def test_people_without_answers_change_nothing():
+    """So that one program fits the share of a few, everybody's map and the pooled one."""
+    counts = counts_of(cohort(), 3)
+    rows = np.zeros((9, *counts.counts.shape[1:]))
+    rows[2:6] = np.asarray(counts.counts)
+    alone, among = (fit_counts(GP, jnp.asarray(0.6), c) for c in (counts, Counts(counts.x, jnp.asarray(rows))))
+    np.testing.assert_allclose(among.log_evidence, alone.log_evidence, rtol=1e-12)
+    np.testing.assert_allclose(among.latent.weights, alone.latent.weights, atol=1e-11)
+    assert bool(among.certificate.converged)
