@@ -206,7 +206,7 @@ def _levels(parameter, third):
     elif beside[1] > 1:
         beside = (third - 2 * _APART, third - _APART)
     if parameter.discrete:
-        beside = np.unique(np.asarray(parameter.to_unit(parameter.to_physical(jnp.asarray(beside))))).tolist()
+        beside = np.unique(np.asarray(parameter.to_unit(parameter.to_physical(np.asarray(beside))))).tolist()
         return sorted({third, *(x for x in beside if abs(x - third) > 1e-9)})
     return sorted((third, *beside))
 
