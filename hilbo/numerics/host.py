@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["namespace_of", "on_host", "placed", "scan"]
+__all__ = ["floating", "namespace_of", "on_host", "placed", "scan"]
 
 
 def namespace_of(*values: Any) -> Any:
@@ -42,3 +42,9 @@ def placed(value: Any, dtype: Any = None) -> Any:
     if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
         return jax.numpy.asarray(value, dtype)
     return jax.device_put(np.array(value, dtype))
+
+
+def floating(x: Any) -> Any:
+    """Floating-point numbers; NumPy's where they are NumPy's, with which small things are computed faster."""
+    xp = namespace_of(x)
+    return xp.asarray(x, xp.result_type(1.0, x))

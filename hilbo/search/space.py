@@ -30,7 +30,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
 from hilbo.errors import InputError
-from hilbo.numerics.host import namespace_of, placed
+from hilbo.numerics.host import floating, namespace_of, placed
 from hilbo.numerics.polytope import Polytope
 from hilbo.numerics.tracing import program
 from hilbo.search import linear
@@ -144,7 +144,7 @@ class SearchSpace(eqx.Module):
 
         (..., d) -> (..., d); each parameter in its own unit.
         """
-        points = _floating(unit)
+        points = floating(unit)
         xp = namespace_of(points)
         return placed(xp.stack([p.to_physical(points[..., i]) for i, p in enumerate(self.parameters)], axis=-1))
 
@@ -186,7 +186,7 @@ class SearchSpace(eqx.Module):
         (..., d) -> (...,).
         """
         plain = self.mechanics is None and not self.constraints
-        points = _floating(x) if plain else _on_device(x)
+        points = floating(x) if plain else _on_device(x)
         inside = namespace_of(points).all((points >= 0) & (points <= 1), axis=-1)
         if plain:
             return placed(inside)
@@ -280,12 +280,6 @@ class SearchSpace(eqx.Module):
         low, high = K1_interval(m, K1, self._bounds_K1, self._split(self.to_physical(x)))
         high = jnp.minimum(high, self._limit(m, x))
         return low, jnp.maximum(high - low, 0)
-
-
-def _floating(x: Real[ArrayLike, "..."]) -> Any:
-    """Floating-point numbers; NumPy's where they are NumPy's, with which small things are computed faster."""
-    xp = namespace_of(x)
-    return xp.asarray(x, xp.result_type(1.0, x))
 
 
 def _on_device(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
