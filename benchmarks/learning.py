@@ -32,7 +32,6 @@ from populations import chance_at  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
 
 from hilbo.population.learnt import learn  # noqa: E402
-from hilbo.population.learnt_posterior import PRIORS  # noqa: E402
 from hilbo.population.low_rank import shared_evidence  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
@@ -94,21 +93,21 @@ def evidence(model, trials, weights, rank, tolerance):
 
 
 def sensitivity(seeds):
-    study = that_learns(POPULATION.study)
-    moved = {(name, factor): [] for name in PRIORS for factor in (0.5, 2.0)}
+    study = that_learns(POPULATION.study, RECIPE.name)
+    moved = {(name, factor): [] for name in RECIPE.priors for factor in (0.5, 2.0)}
     for seed in range(seeds):
         trials, chance = answers(24, seed)
         candidates = search_points(study.space, seed)
 
         def best(priors, near=None, trials=trials, candidates=candidates, chance=chance):
             traced = jax.tree.map(jnp.asarray, priors)  # numbers, not constants: one compilation for all
-            learnt = learn(trials, 3, priors=traced, near=near)
+            learnt = learn(trials, 3, recipe=RECIPE._replace(priors=traced), near=near)
             x = _optimum(study, learnt, trials, candidates)
             return learnt, np.asarray(x), float(chance_at(chance, x[None, :])[0])
 
-        learnt, x, value = best(PRIORS)
+        learnt, x, value = best(RECIPE.priors)
         for name, factor in moved:
-            changed = PRIORS | {name: PRIORS[name]._replace(sd=factor * PRIORS[name].sd)}
+            changed = RECIPE.priors | {name: RECIPE.priors[name]._replace(sd=factor * RECIPE.priors[name].sd)}
             _, other, its_value = best(changed, learnt)
             moved[name, factor].append((100 * np.sqrt(np.mean((other - x) ** 2)), its_value - value))
         print(seed, flush=True)

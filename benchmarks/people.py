@@ -33,10 +33,11 @@ from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials  # noqa: E402
 from hilbo.population.baselines import constant, quadratic  # noqa: E402
 from hilbo.population.counts import Counts, fit_counts  # noqa: E402
 from hilbo.population.hierarchical_evidence import learn_people  # noqa: E402
-from hilbo.population.learnt import RECIPE, learn  # noqa: E402
+from hilbo.population.learnt import learn  # noqa: E402
 from hilbo.population.leave_one_out import clustered, integral_transform  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.population.pointwise import RULES, aggregate  # noqa: E402
+from hilbo.population.recipes import LEARNT_1, RECIPES  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 WORDS = {
@@ -140,8 +141,9 @@ def main():
         x = jnp.asarray(data.x[rows])
         found = predicted(learnt.gp, learnt.share, counts, None, jnp.asarray(mask), x)
         found = {rule: np.asarray(p)[: test.sum()] for rule, p in found.items()}
-        found[RECIPE], widths = by_learnt_1(data, np.flatnonzero(mask), data.x[test])
-        wide.append(widths)
+        by_recipe = {name: by(recipe, data, np.flatnonzero(mask), data.x[test]) for name, recipe in RECIPES.items()}
+        found |= {name: chance for name, (chance, _) in by_recipe.items()}
+        wide.append(by_recipe[LEARNT_1.name][1])
         found["probit"] = quadratic(data.x, data.q, data.categories, ~test)[test]
         found["marginal"] = constant(data.q, data.categories, ~test)[test]
         for rule, p in found.items():
@@ -153,12 +155,12 @@ def main():
         put("methods/aggregation.md", chosen.data, text)
 
 
-def by_learnt_1(data, people, x):
+def by(recipe, data, people, x):
     """Class probabilities (n, C) of a new person at x, and whether people have widths of their own."""
     trials = data.trials(people)
-    learnt = learn(trials, data.categories)
+    learnt = learn(trials, data.categories, recipe=recipe)
     if not bool(learnt.converged):
-        print("learnt-1: the search did not end well", flush=True)
+        print(f"{recipe.name}: the search did not end well", flush=True)
     return np.asarray(learnt_map(learnt, trials).class_probabilities(learnt.model.gp.likelihood, x)), learnt.widths
 
 

@@ -27,7 +27,7 @@ from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained, s
 from hilbo.inference.ep import ep
 from hilbo.inference.ep_corrected import ep_corrected
 from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
-from hilbo.kernels import RBF, gram
+from hilbo.kernels import RBF, Stationary, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.shown import concrete, known, numbers, shown
@@ -59,7 +59,7 @@ class OrdinalGP(eqx.Module):
     """Zero-mean Gaussian process prior on the latent realism f and an ordinal likelihood of the answers."""
 
     kernel: Any
-    """A `Kernel`: the RBF, or one of yours; only hyperparameters are learnt for the RBF alone."""
+    """A `Kernel`: one of `hilbo.kernels`, or one of yours; maximum evidence and sessions take the RBF alone."""
     likelihood: OrdinalProbit
 
     def __check_init__(self) -> None:
@@ -353,7 +353,7 @@ def fit(
     if inference not in _SOUGHT:
         raise InputError(f'fit: inference is "{inference}"; it must be one of {", ".join(_SOUGHT)}.')
     dim = trials.x.shape[-1]
-    if isinstance(gp.kernel, RBF) and gp.kernel.theta.shape not in ((), (dim,)):
+    if isinstance(gp.kernel, Stationary) and gp.kernel.theta.shape not in ((), (dim,)):
         raise InputError(
             f"fit: theta has shape {gp.kernel.theta.shape} and x {dim} parameters; give one number or {dim}."
         )

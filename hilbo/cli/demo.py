@@ -14,7 +14,7 @@ def print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> No
     from rich.console import Console
     from rich.table import Table as RichTable
 
-    from hilbo.population.learnt import RECIPE
+    from hilbo.population.recipes import RECOMMENDED
 
     console = Console(highlight=False, soft_wrap=True)
     best = real["optimum"]["parameters"]
@@ -36,7 +36,7 @@ def print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> No
         table.add_row(name, f"{100 * miss['nrmse']:.1f} %", f"{100 * miss['nrmse_with_K0']:.1f} %", passive, paper)
 
     row("population (BCM)", "aggregate", simulated["optimum"], "4 %, yes")
-    row(f"population ({RECIPE})", RECIPE, simulated["alternatives"][RECIPE], "")
+    row(f"population ({RECOMMENDED})", RECOMMENDED, simulated["alternatives"][RECOMMENDED], "")
     q, qk = truth["individuals"]["quartiles"], truth["individuals"]["with_K0"]
     spread = [f"{100 * v[1]:.0f} % ({100 * v[0]:.0f}–{100 * v[2]:.0f})" for v in (q, qk)]
     margins = [person["optimum"]["passivity_margin"] for person in simulated["participants"]]

@@ -106,7 +106,7 @@ def aggregate(
         str | None,
         typer.Option(
             help="Rule of aggregation in place of the study file's: bcm, rbcm, hierarchical, average, pooled, or"
-            " learnt-1, which learns [gp] too."
+            " learnt-1 and learnt-2, which learn [gp] too."
         ),
     ] = None,
     compare: Annotated[
@@ -264,14 +264,14 @@ def _read(trials, study, material, say):
 def _by_rule(study, rule):
     import dataclasses
 
-    from hilbo.population.learnt import RECIPE
     from hilbo.population.maps import ALL_RULES
+    from hilbo.population.recipes import RECIPES
     from hilbo.study.learnt_study import that_learns
 
-    if rule == RECIPE:
-        return study if study.rule == RECIPE else that_learns(study)
-    if study.rule == RECIPE:
-        raise InputError(f'--rule is "{rule}", and the study, whose rule is "{RECIPE}", has no [gp] for it.')
+    if rule in RECIPES:
+        return study if study.rule == rule else that_learns(study, rule)
+    if study.rule in RECIPES:
+        raise InputError(f'--rule is "{rule}", and the study, whose rule is "{study.rule}", has no [gp] for it.')
     if rule not in ALL_RULES:
         raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
     return dataclasses.replace(study, rule=rule)

@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
-from hilbo.kernels import RBF, gram
+from hilbo.kernels import gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.host import placed
 from hilbo.numerics.tracing import program
@@ -120,7 +120,7 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
     size = answers.x.shape[0]
     held = Trials(answers.x, jnp.zeros(size, jnp.int32), jnp.ones(size, bool))
     kernel = gp.kernel
-    return Posterior(OrdinalGP(RBF(kernel.theta, share * kernel.variance), gp.likelihood), held, latent)
+    return Posterior(OrdinalGP(type(kernel)(kernel.theta, share * kernel.variance), gp.likelihood), held, latent)
 
 
 def evidence(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> tuple[Float[Array, ""], Bool[Array, ""]]:

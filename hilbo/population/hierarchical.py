@@ -23,7 +23,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
-from hilbo.kernels import RBF, Kernel
+from hilbo.kernels import Kernel
 from hilbo.numerics.host import placed
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
@@ -128,17 +128,16 @@ def population(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Arra
 
 
 def shared_posterior(posterior: Posterior) -> Posterior:
-    """The posterior of g alone, from one of `fit_people` with an RBF: a GP of p times the prior variance.
+    """The posterior of g alone, from one of `fit_people` with a stationary kernel: a GP of p times the prior variance.
 
     What answers say of g, their weights and C, is what they say of everybody: g's covariance with f_j is p k.
     """
     kernel, trials, latent = posterior.gp.kernel, posterior.trials, posterior.latent
-    person_kernel = kernel.kernel
-    shared = OrdinalGP(
-        RBF(person_kernel.theta, kernel.share.astype(person_kernel.variance.dtype) * person_kernel.variance),
-        posterior.gp.likelihood,
+    person = kernel.kernel
+    of_shared = type(person)(person.theta, kernel.share.astype(person.variance.dtype) * person.variance)
+    return Posterior(
+        OrdinalGP(of_shared, posterior.gp.likelihood), Trials(trials.x[:, :-1], trials.q, trials.mask), latent
     )
-    return Posterior(shared, Trials(trials.x[:, :-1], trials.q, trials.mask), latent)
 
 
 def learn_share(gp: OrdinalGP, trials: Trials, *, inference: str = "laplace") -> Share:

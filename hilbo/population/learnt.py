@@ -1,21 +1,15 @@
-"""learnt-1: the hierarchical model with hyperparameters learnt from all answers, as a recipe that does not change.
+"""The hierarchical model with hyperparameters learnt from all answers, by a recipe of `recipes`.
 
-In units of the classification noise, with d parameters and C categories, people's functions and answers are those of
-`low_rank.PeopleModel`, and the hyperparameters have the priors
-
-    log theta_i ~ N(log(24 / d), 1.2^2)       log shared ~ N(log 3, 1)       log own ~ N(0, 1)
-    middle of the thresholds ~ N(0, 1.5^2)    log gap ~ N(log 0.8, 0.7^2)    log width_j ~ N(0, 0.4^2), if C > 2.
-
-What maximises the Laplace evidence of all answers times these priors is taken, by L-BFGS from the priors' medians, at
-first with the same widths for all; then with people's own, which are kept if they add 3 or more to the log evidence. A
-hyperparameter that the study states is kept, and with a stated noise, or variance, everything is in its unit. The
-normal approximation of their posterior says how well each is known; one that is known hardly better than before the
-answers is not identified.
+What maximises the Laplace evidence of all answers times the recipe's priors is taken, by L-BFGS from the priors'
+medians, at first with the same widths for all; then with people's own, which are kept if they add 3 or more to the log
+evidence. A hyperparameter that the study states is kept, and with a stated noise, or variance, everything is in its
+unit. The normal approximation of their posterior says how well each is known; one that is known hardly better than
+before the answers is not identified.
 """
 
 import dataclasses
-from collections.abc import Mapping, Set
-from typing import Final, NamedTuple
+from collections.abc import Set
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,9 +24,7 @@ from hilbo.ordinal_gp import Posterior, Trials
 from hilbo.population.learnt_posterior import (
     LEFT,
     NOTHING,
-    PRIORS,
     Coordinates,
-    Prior,
     Problem,
     Stated,
     cost_at,
@@ -40,17 +32,15 @@ from hilbo.population.learnt_posterior import (
     model_at,
 )
 from hilbo.population.low_rank import PeopleModel, shared_function
+from hilbo.population.recipes import LEARNT_1, Recipe
 from hilbo.population.shared_features import rank_for
 from hilbo.population.tallies import tallied
 
 __all__ = [
-    "RECIPE",
     "Learnt",
     "learn",
     "learnt_function",
 ]
-
-RECIPE: Final = "learnt-1"
 
 _STEPS, _FINE = 100, 1e-3  # of the search; of the finite differences for the curvature
 _NEAR = 2e-6  # of the evidence: another choice of features moves it as much as a nearer step would
@@ -63,6 +53,8 @@ _WHOLE = 32  # people, up to whom the curvature in all widths is made: a gradien
 class Learnt(eqx.Module):
     """Hyperparameters of all people's answers, and how well they are known."""
 
+    recipe: str = eqx.field(static=True)
+    """Its name."""
     model: PeopleModel
     weights: Float[Array, "M n"]
     """Near which the posterior's mode is; one for each point that a person was asked at (`tallied`)."""
@@ -94,29 +86,29 @@ class Learnt(eqx.Module):
 def learnt_function(learnt: Learnt, trials: Trials) -> Posterior:
     """The posterior of the shared function by learnt hyperparameters, from stacked trials (M, n)."""
     answers = tallied(trials, learnt.model.thresholds.size + 1)
-    return shared_function(learnt.model, answers, learnt.weights, rank_for(learnt.model.theta, answers))
+    return shared_function(learnt.model, answers, learnt.weights, rank_for(learnt.model.unit, answers))
 
 
 def learn(
     trials: Trials,
     categories: int,
     stated: Stated = NOTHING,
-    priors: Mapping[str, Prior] = PRIORS,
+    recipe: Recipe = LEARNT_1,
     near: Learnt | None = None,
 ) -> Learnt:
     """The hyperparameters of stacked trials (M, n) of answers in `categories`.
 
-    **Arguments:** `stated`: what is kept; `priors`: for studies of their influence; `near`: what was learnt from nearly
-    the same answers of as many people, where the search may begin. Raises InputError where nobody answered.
+    **Arguments:** `stated`: what is kept; `near`: what was learnt by the same recipe from nearly the same answers of as
+    many people, where the search may begin. Raises InputError where nobody answered.
     """
     if not np.asarray(trials.mask).any():
-        raise InputError("learnt-1: nobody gave an answer; at least one person's answers are needed.")
+        raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
     answers = tallied(trials, categories)
-    start = medians(answers, stated, priors)
+    start = medians(answers, stated, recipe.priors)
     common = frozenset(start) - {"widths"}
     if near is not None:
         start |= {name: near.coordinates[name] for name in common}
-    problem = Problem(answers, stated, priors, 0)
+    problem = Problem(answers, stated, recipe.priors, 0, recipe.kernel)
     alike = _Search(start, answers.blank, 0, True)
     alike, problem = _searched(alike, problem, common)
     chosen, free, gain = alike, common, 0.0
@@ -127,7 +119,8 @@ def learn(
             chosen, free, problem = different, frozenset(start), wider
     end = cost_at(chosen.coordinates, chosen.weights, problem, chosen.coordinates)
     return Learnt(
-        model=model_at(chosen.coordinates, answers, stated),
+        recipe=recipe.name,
+        model=model_at(chosen.coordinates, answers, stated, recipe.kernel),
         weights=end.weights,
         log_evidence=end.log_evidence,
         coordinates={name: value for name, value in chosen.coordinates.items() if name in free},
@@ -162,8 +155,8 @@ def _searched(search: _Search, problem: Problem, free: Set[str]) -> tuple[_Searc
 
 
 def _with_features(search: _Search, problem: Problem) -> Problem:
-    theta = model_at(search.coordinates, problem.answers, problem.stated).theta
-    needed = min(rank_for(theta, problem.answers, LEFT), _LARGEST)
+    kernel = model_at(search.coordinates, problem.answers, problem.stated, problem.kernel).unit
+    needed = min(rank_for(kernel, problem.answers, LEFT), _LARGEST)
     return dataclasses.replace(problem, rank=max(problem.rank, needed))
 
 

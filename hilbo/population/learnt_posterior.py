@@ -1,4 +1,4 @@
-"""What learnt-1 maximises: the hyperparameters' coordinates, their priors, and the log posterior with its gradient."""
+"""What a recipe maximises: the log posterior of the hyperparameters with its gradient, in their coordinates."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -10,18 +10,18 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
+from hilbo.kernels import RBF, Stationary
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP
 from hilbo.population.low_rank import PeopleModel, shared_evidence
+from hilbo.population.recipes import LEARNT_1, Prior
 from hilbo.population.tallies import Tallies
 
 __all__ = [
     "LEFT",
     "NOTHING",
-    "PRIORS",
     "Coordinates",
     "Cost",
-    "Prior",
     "Problem",
     "Stated",
     "cost_at",
@@ -33,23 +33,6 @@ __all__ = [
 Coordinates = dict[str, Float[Array, "..."]]
 LEFT = 1e-4
 """Of the shared function's prior variance, what the search may leave: 2e-4 of the log evidence of 600 answers."""
-
-
-class Prior(NamedTuple):
-    """Normal, of one coordinate."""
-
-    mean: float
-    sd: float
-
-
-PRIORS = {
-    "theta": Prior(float(np.log(24.0)), 1.2),  # less log d
-    "shared": Prior(float(np.log(3.0)), 1.0),
-    "own": Prior(0.0, 1.0),
-    "middle": Prior(0.0, 1.5),
-    "gaps": Prior(float(np.log(0.8)), 0.7),
-    "widths": Prior(0.0, 0.4),
-}
 
 
 class Stated(NamedTuple):
@@ -71,6 +54,7 @@ class Problem(eqx.Module):
     stated: Stated = eqx.field(static=True)
     priors: Mapping[str, Prior]
     rank: int = eqx.field(static=True)
+    kernel: type[Stationary] = eqx.field(static=True)
 
 
 class Cost(NamedTuple):
@@ -85,19 +69,20 @@ class Cost(NamedTuple):
 
 
 def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
-    """One person's model before any answer: what is stated, and the medians of the priors."""
+    """One person's model before any answer, by which sessions choose: what is stated, and the medians of the priors,
+    which all recipes have in common, with the RBF."""
     nobody = Tallies(jnp.zeros((1, 1, dim)), jnp.zeros((1, 1, categories)))
-    return model_at(medians(nobody, stated, PRIORS), nobody, stated).gp
+    return model_at(medians(nobody, stated, LEARNT_1.priors), nobody, stated, RBF).gp
 
 
 @program
 def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Problem, features: Coordinates) -> Cost:
     """At some coordinates, by the points of the features that the coordinates `features` have: with other points the
     value changes in a small step, which differences must not be taken across."""
-    lengths = model_at(features, problem.answers, problem.stated).theta
+    lengths = model_at(features, problem.answers, problem.stated, problem.kernel).theta
 
     def value(coordinates):
-        model = model_at(coordinates, problem.answers, problem.stated)
+        model = model_at(coordinates, problem.answers, problem.stated, problem.kernel)
         evidence = shared_evidence(model, problem.answers, start, problem.rank, LEFT, lengths)
         return -evidence.value - _log_prior(coordinates, problem), evidence
 
@@ -123,7 +108,7 @@ def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior]) -> Co
     return {name: value for name, value in every.items() if name not in kept and value.size}
 
 
-def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated) -> PeopleModel:
+def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel: type[Stationary]) -> PeopleModel:
     """The hyperparameters at some coordinates, in units of the stated noise, or variance, or else of a noise of 1."""
     (people, _, d), dtype = answers.x.shape, answers.x.dtype
     shared, own = jnp.exp(coordinates["shared"]), jnp.exp(coordinates["own"])
@@ -144,7 +129,8 @@ def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated) -> Peop
         thresholds = noise * (coordinates["middle"] + edges - jnp.mean(edges))
     else:
         thresholds = jnp.asarray(stated.thresholds, dtype)
-    return PeopleModel(theta, shared, own, thresholds, noise, coordinates.get("widths", jnp.zeros(people, dtype)))
+    widths = coordinates.get("widths", jnp.zeros(people, dtype))
+    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel)
 
 
 def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:

@@ -31,6 +31,7 @@ from hilbo.population.learnt import Learnt, learn
 from hilbo.population.learnt_posterior import Stated
 from hilbo.population.maps import RuleMap, learnt_map, rule_map
 from hilbo.population.newcomer import class_probabilities
+from hilbo.population.recipes import RECIPES
 
 __all__ = [
     "LeftOut",
@@ -104,7 +105,7 @@ def leave_one_out_learnt(
     again: bool = True,
     groups: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
-    """The same by learnt-1, from what was learnt of everybody's answers.
+    """The same by a recipe that learns, from what was learnt of everybody's answers.
 
     **Arguments:** `stated`: what the study states; `again`: whether the hyperparameters are learnt again in each fold;
     else those of all answers are kept, those of the person left out among them.
@@ -113,7 +114,7 @@ def leave_one_out_learnt(
 
     def fold(left: Int[np.ndarray, " k"]) -> tuple[OrdinalGP, RuleMap]:
         rest = eqx.tree_at(lambda t: t.mask, trials, trials.mask.at[left].set(False))  # all shapes stay
-        of_rest = learn(rest, categories, stated, near=learnt) if again else learnt
+        of_rest = learn(rest, categories, stated, RECIPES[learnt.recipe], learnt) if again else learnt
         return of_rest.model.gp, learnt_map(of_rest, rest)
 
     return left_out_by(trials, fold, groups)

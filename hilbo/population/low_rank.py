@@ -30,7 +30,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
-from hilbo.kernels import RBF, gram
+from hilbo.kernels import RBF, Stationary, gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.tracing import program
@@ -61,6 +61,8 @@ class PeopleModel(eqx.Module):
     noise: Float[Array, ""]
     log_widths: Float[Array, " M"]
     """Logarithm of each person's distances between thresholds, about their middle, in units of those above."""
+    kernel: type[Stationary] = eqx.field(static=True, default=RBF)
+    """Of g and of each h_j."""
 
     @property
     def share(self) -> Float[Array, ""]:
@@ -70,7 +72,12 @@ class PeopleModel(eqx.Module):
     @property
     def gp(self) -> OrdinalGP:
         """One person's model, with the median widths."""
-        return OrdinalGP(RBF(self.theta, self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
+        return OrdinalGP(self.kernel(self.theta, self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
+
+    @property
+    def unit(self) -> Stationary:
+        """The kernel with a variance of 1."""
+        return self.kernel(self.theta, jnp.ones_like(self.shared))
 
     @property
     def person_thresholds(self) -> Float[Array, "M edges"]:
@@ -111,8 +118,8 @@ class _System(NamedTuple):
 
 
 def _prior(model: PeopleModel, answers: Tallies, pivots: Pivots) -> _Prior:
-    unit = features_of(model.theta, pivots, answers.x)
-    kernel = RBF(model.theta, jnp.ones_like(model.shared))
+    kernel = model.unit
+    unit = features_of(kernel, pivots, answers.x)
 
     def block(person):
         x, own_features = person
@@ -239,7 +246,8 @@ def shared_evidence(
     if it is not given. With other points the value changes in a small step, so that differences of it want the same.
     """
     still = jax.lax.stop_gradient
-    pivots = pivots_of(still(model.theta if lengths is None else lengths), answers, rank, tolerance)
+    unit = model.unit if lengths is None else model.kernel(lengths, jnp.ones_like(model.shared))
+    pivots = pivots_of(still(unit), answers, rank, tolerance)
     prior = _prior(model, answers, pivots)
     mode = still(_mode(still(model), answers, still(prior), start))
     weights, _ = _newton_step(model, answers, prior, mode.weights)
@@ -258,7 +266,7 @@ def shared_function(
     k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Never raises: read
     `certificate.converged`.
     """
-    pivots = pivots_of(model.theta, answers, rank, tolerance)
+    pivots = pivots_of(model.unit, answers, rank, tolerance)
     prior = _prior(model, answers, pivots)
     mode = _mode(model, answers, prior, start)
     value, system = _value(model, answers, prior, mode.weights)
@@ -266,7 +274,7 @@ def shared_function(
     further, _ = _newton_step(model, answers, prior, mode.weights)
     error = jnp.abs(_value(model, answers, prior, further)[0] - value)
 
-    root = jnp.sqrt(model.shared) * root_of_pivots(model.theta, pivots)
+    root = jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
     together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
     weights = jnp.where(pivots.used, solve_triangular(root, together, lower=True, trans=1), 0.0)
     excess, vectors = eigh(system.precision - jnp.eye(root.shape[0], dtype=root.dtype))
@@ -274,7 +282,7 @@ def shared_function(
     factor = known[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
     factor = jnp.where(pivots.used[None, :], factor, 0.0)
 
-    kernel = RBF(model.theta, model.shared)
+    kernel = model.kernel(model.theta, model.shared)
     covariance = gram(kernel, pivots.points, pivots.points)
     smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
     resolution = jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5
@@ -316,6 +324,6 @@ def _rounding(
     of_pivots: Float[Array, " r"],
 ) -> Float[Array, ""]:
     """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
-    kernel = RBF(model.theta, model.own)
+    kernel = model.kernel(model.theta, model.own)
     each = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (answers.x, weights))
     return jnp.linalg.norm(each) + evidence_rounding(covariance, of_pivots[None, :])

@@ -5,7 +5,7 @@ Rules of `pointwise` aggregate everybody's own posterior point by point. Two rul
 * `hierarchical`, where the answers are few enough: the posterior of the shared function g, exact (`hierarchical`, or
   `counts` where people answered the same stimuli); point by point otherwise, at the committee's cost.
 * `pooled`: the same with a share of 1, one function for all.
-* `learnt-1`: hierarchical, with hyperparameters that are learnt from the answers as well (`learnt`).
+* `learnt-1`, `learnt-2`: hierarchical, with hyperparameters that are learnt from the answers as well (`learnt`).
 
 The share that people have in common is learnt by evidence, from an even choice of people if there are many, and its
 posterior mean is used: the most probable share may be 0 or 1, where nothing, or everything, would be common.
@@ -30,8 +30,9 @@ from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.counts import Counts, counts_of, fit_counts, one_person
 from hilbo.population.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
-from hilbo.population.learnt import RECIPE, Learnt, learnt_function
+from hilbo.population.learnt import Learnt, learnt_function
 from hilbo.population.newcomer import class_probabilities
+from hilbo.population.recipes import RECIPES
 
 __all__ = [
     "ALL_RULES",
@@ -46,10 +47,10 @@ __all__ = [
     "share_of",
 ]
 
-AnyRule = Literal[pointwise.Rule, "pooled", "learnt-1"]
+AnyRule = Literal[pointwise.Rule, "pooled", "learnt-1", "learnt-2"]
 GIVEN_RULES: tuple[AnyRule, ...] = (*get_args(pointwise.Rule), "pooled")
 """Rules that take the hyperparameters as they are."""
-ALL_RULES: tuple[AnyRule, ...] = (*GIVEN_RULES, RECIPE)
+ALL_RULES: tuple[AnyRule, ...] = (*GIVEN_RULES, *RECIPES)  # type: ignore[assignment]
 
 LARGEST_EXACT = 1500
 """Answers, or latent values, up to which the exact models are used: they are cubic in their number."""
@@ -71,9 +72,11 @@ class RuleMap(eqx.Module):
     prior: Float[Array, ""]
     """Prior variance of one person's function."""
     reach: Float[Array, ""] | None = None
-    """By learnt-1 the largest variance of the map where somebody answered: beyond it no optimum is sought."""
+    """By a recipe the largest variance of the map where somebody answered: beyond it no optimum is sought."""
     widths: bool = eqx.field(static=True, default=False)
     """Whether people differ in the widths of their middle categories."""
+    caution: float = eqx.field(static=True, default=0.0)
+    """Standard deviations of the map by which its mean is lowered where the optimum is sought; 0: see `map_optimum`."""
 
     def __repr__(self) -> str:
         people = (
@@ -120,8 +123,8 @@ class RuleMap(eqx.Module):
 
 def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[pointwise.Rule, Float[Array, ""] | None]:
     """By which rule, and with which share, everybody's posteriors are aggregated point by point in place of a map: by
-    the same rule, or by bcm where the rule takes all answers at once; learnt-1 is the hierarchical one."""
-    if rule == RECIPE:
+    the same rule, or by bcm where the rule takes all answers at once; a recipe is the hierarchical one."""
+    if rule in RECIPES:
         return "hierarchical", share
     if rule not in pointwise.RULES:
         return "bcm", None
@@ -134,7 +137,8 @@ def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
     _, variances = shared.predict(trials.x.reshape(-1, trials.x.shape[-1]))
     reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
     model = learnt.model
-    return RuleMap(RECIPE, "exact", None, shared, model.share, model.shared + model.own, reach, learnt.widths)
+    prior, caution = model.shared + model.own, RECIPES[learnt.recipe].caution
+    return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.widths, caution)
 
 
 def rule_map(

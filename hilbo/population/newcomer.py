@@ -8,7 +8,7 @@ from jax.scipy.special import log_ndtr, logsumexp
 from jaxtyping import Array, Float
 
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.population.learnt_posterior import PRIORS
+from hilbo.population.recipes import WIDTHS
 
 __all__ = ["class_probabilities", "log_highest"]
 
@@ -21,7 +21,7 @@ def class_probabilities(
 ) -> Float[Array, "m C"]:
     """Probabilities (m, C) of a new person's answers, from the mean and variance (m,) of that person's function.
 
-    **Arguments:** `widths`: whether people's distances between thresholds differ, as learnt-1's prior says; they are
+    **Arguments:** `widths`: whether people's distances between thresholds differ, as the recipes' prior says; they are
     then integrated out by Gauss and Hermite, with 7 nodes.
     """
     if not widths:
@@ -47,8 +47,7 @@ def log_highest(
 
 
 def _log_widths(like: Array) -> Float[Array, " nodes"]:
-    prior = PRIORS["widths"]
-    return prior.mean + prior.sd * jnp.asarray(_NODES, like.dtype)
+    return WIDTHS.mean + WIDTHS.sd * jnp.asarray(_NODES, like.dtype)
 
 
 def _widened(likelihood: OrdinalProbit, log_width: Float[Array, ""]) -> Float[Array, " edges"]:

@@ -1,7 +1,8 @@
 """Features of a smooth function that many people share: from few of the answered points the rest follows.
 
 With Z the pivots of an incomplete Cholesky factorisation of k at all answered points, L L' = k(Z, Z) and the features
-phi(x) = L^-1 k(Z, x), k(x, y) = phi(x)'phi(y) to an error that the factorisation states. Reference: Harbrecht, Peters &
+phi(x) = L^-1 k(Z, x), k(x, y) = phi(x)'phi(y) to an error that the factorisation states. The kernels have the variance
+1 here. Reference: Harbrecht, Peters &
 Schneider (2012), Applied Numerical Mathematics 62:428.
 """
 
@@ -14,7 +15,7 @@ from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from hilbo.kernels import RBF, gram
+from hilbo.kernels import Stationary, gram
 from hilbo.numerics.tracing import program
 from hilbo.population.tallies import Tallies
 
@@ -34,10 +35,9 @@ class Pivots(NamedTuple):
     """Largest part of the prior variance of g, at an answered point, that they do not explain."""
 
 
-def pivots_of(theta: Float[Array, " d"], answers: Tallies, rank: int, tolerance: ArrayLike) -> Pivots:
+def pivots_of(kernel: Stationary, answers: Tallies, rank: int, tolerance: ArrayLike) -> Pivots:
     """At most `rank` of the points that people were asked at, each where the ones before explain least."""
     x = answers.x.reshape(-1, answers.x.shape[-1])
-    kernel = RBF(theta, jnp.ones_like(theta[0]))
     start = answers.asked.reshape(-1).astype(x.dtype)
 
     def going(state):
@@ -57,29 +57,29 @@ def pivots_of(theta: Float[Array, " d"], answers: Tallies, rank: int, tolerance:
 
 
 @program
-def _unexplained(theta: Float[Array, " d"], answers: Tallies, rank: int, tolerance: ArrayLike) -> Float[Array, ""]:
-    return pivots_of(theta, answers, rank, tolerance).left
+def _unexplained(kernel: Stationary, answers: Tallies, rank: int, tolerance: ArrayLike) -> Float[Array, ""]:
+    return pivots_of(kernel, answers, rank, tolerance).left
 
 
-def rank_for(theta: Float[Array, " d"], answers: Tallies, tolerance: float = TOLERANCE) -> int:
-    """The number of features, from a short list, that g takes at these lengths; all points, or the largest, at most."""
+def rank_for(kernel: Stationary, answers: Tallies, tolerance: float = TOLERANCE) -> int:
+    """The number of features, from a short list, that g takes by this kernel; all points, or the largest, at most."""
     points = int(np.asarray(answers.asked).sum())
     for rank in _RANKS:
-        if rank >= points or float(_unexplained(theta, answers, rank, tolerance)) <= tolerance:
+        if rank >= points or float(_unexplained(kernel, answers, rank, tolerance)) <= tolerance:
             return rank
     return _RANKS[-1]
 
 
-def root_of_pivots(theta: Float[Array, " d"], pivots: Pivots) -> Float[Array, "r r"]:
+def root_of_pivots(kernel: Stationary, pivots: Pivots) -> Float[Array, "r r"]:
     """L, with ones on the diagonal in place of pivots that are not used."""
     both = pivots.used[:, None] & pivots.used[None, :]
-    covariance = gram(RBF(theta, jnp.ones_like(theta[0])), pivots.points, pivots.points)
+    covariance = gram(kernel, pivots.points, pivots.points)
     return jnp.linalg.cholesky(jnp.where(both, covariance, jnp.eye(len(pivots.used), dtype=covariance.dtype)))
 
 
-def features_of(theta: Float[Array, " d"], pivots: Pivots, x: Float[Array, "M n d"]) -> Float[Array, "M n r"]:
+def features_of(kernel: Stationary, pivots: Pivots, x: Float[Array, "M n d"]) -> Float[Array, "M n r"]:
     """phi(x)' of everybody's points."""
-    cross = gram(RBF(theta, jnp.ones_like(theta[0])), pivots.points, x.reshape(-1, x.shape[-1]))
+    cross = gram(kernel, pivots.points, x.reshape(-1, x.shape[-1]))
     cross = jnp.where(pivots.used[:, None], cross, 0.0)
-    solved = solve_triangular(root_of_pivots(theta, pivots), cross, lower=True)
+    solved = solve_triangular(root_of_pivots(kernel, pivots), cross, lower=True)
     return solved.T.reshape(*x.shape[:2], -1)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 
-from hilbo.population.learnt import RECIPE
+from hilbo.population.recipes import RECIPES
 from hilbo.report import validation
 from hilbo.report.checklist import checklist
 from hilbo.report.comparison import comparison_section, comparison_table
@@ -115,7 +115,7 @@ def _compared(analysis: Analysis, seed, say) -> dict[str, Any] | None:
     if np.sum(analysis.cohort.counts() > 0) < _FEWEST:
         return None
     say("comparing the rules of aggregation")
-    return compare(analysis.study, analysis.aggregate, seed, learns=analysis.study.rule == RECIPE)
+    return compare(analysis.study, analysis.aggregate, seed, learns=analysis.study.rule in RECIPES)
 
 
 def _write_material(material, analysis: Analysis, validated, compared, folder: Path, seed):

@@ -28,9 +28,9 @@ from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
-from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map, share_of
 from hilbo.population.newcomer import class_probabilities, log_highest
+from hilbo.population.recipes import RECIPES
 from hilbo.search.candidates import search_points
 from hilbo.search.space import SearchSpace
 from hilbo.study.cohort import Cohort
@@ -204,8 +204,9 @@ def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidate
 
 
 def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
-    """Where a rule's map has its largest mean in the feasible set; by learnt-1 where a new person answers with the
-    highest category most often, among points of which the answers tell as much as of some that were asked.
+    """Where a rule's map has its largest mean in the feasible set; by a recipe that learns where a new person answers
+    with the highest category most often, or where the mean less so many standard deviations as the recipe's caution is
+    largest, among points of which the answers tell as much as of some that were asked.
     `candidates` (m, d): feasible points of the unit cube, where the search begins.
     """
     return _map_optimum(study.gp.likelihood, study.space, _nameless(map_), candidates)
@@ -214,7 +215,7 @@ def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) ->
 def _nameless(map_: RuleMap) -> RuleMap:
     """The map without the name of its rule where it predicts alike by all: from one function's posterior. One program
     then serves them."""
-    exact = map_.method == "exact" and map_.rule != RECIPE
+    exact = map_.method == "exact" and map_.rule not in RECIPES
     return dataclasses.replace(map_, rule="hierarchical") if exact else map_
 
 
@@ -222,12 +223,14 @@ def _nameless(map_: RuleMap) -> RuleMap:
 def _map_optimum(
     likelihood: OrdinalProbit, space: SearchSpace, map_: RuleMap, candidates: Float[Array, "m d"]
 ) -> Optimum:
-    if map_.rule != RECIPE:
+    if map_.rule not in RECIPES:
         single = jnp.float32  # which ranks the candidates; the best are scored again
         values = predict_map(map_.astype(single), candidates.astype(single))[0]
         return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, values, map_.apart)
 
     def chance(mean, variance):
+        if map_.caution:
+            return mean - map_.caution * jnp.sqrt(variance)
         return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
 
     assert map_.reach is not None
@@ -320,7 +323,7 @@ def aggregate_cohort(
     map_ = _rule_map(study, cohort, study.rule, posteriors, share)
     optimum = map_optimum(study, map_, candidates)
     first(optimum, map_)
-    beside = alternatives and study.rule != RECIPE
+    beside = alternatives and study.rule not in RECIPES
     with ThreadPoolExecutor(1) as other_core:  # for what does not wait for the share
         individuals = other_core.submit(individual_optima, study, posteriors, candidates)
         by_other = other_core.submit(_by_other_inference, study, cohort, candidates, share) if beside else None
@@ -364,7 +367,7 @@ def _rule_map(
     study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: Share | None, inference: str | None = None
 ) -> RuleMap:
     """The map by a rule from everybody's posteriors, or from all answers where the rule takes them at once."""
-    if rule == RECIPE:
+    if rule in RECIPES:
         assert study.learnt is not None
         return learnt_map(study.learnt, cohort.trials)
     return rule_map(

@@ -17,8 +17,8 @@ import pandas as pd
 from hilbo.errors import InputError
 from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maximise_judged
 from hilbo.hyperparameters.maximum_evidence import Learned
-from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import RuleMap, learnt_map, point_rule
+from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, aggregate_cohort, map_optimum, nrmse
@@ -147,11 +147,11 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
 
 
 def _with_learnt(population: Population, seed: int, say: Say) -> Population:
-    """With the optimum by learnt-1 among the alternatives, where the study's rule is another."""
+    """With the optimum by the recommended recipe among the alternatives, where the study's rule learns nothing."""
     study, aggregate = population.study, population.aggregate
-    if study.rule == RECIPE:
+    if study.rule in RECIPES:
         return population
-    say(f"the same by {RECIPE}")
+    say(f"the same by {RECOMMENDED}")
     learns = resolved(that_learns(study), aggregate.cohort)
     assert learns.learnt is not None
     map_ = learnt_map(learns.learnt, aggregate.cohort.trials)
@@ -159,7 +159,7 @@ def _with_learnt(population: Population, seed: int, say: Say) -> Population:
     beside = eqx.tree_at(
         lambda a: (a.alternatives, a.maps),
         aggregate,
-        (aggregate.alternatives | {RECIPE: optimum}, aggregate.maps | {RECIPE: map_}),
+        (aggregate.alternatives | {RECOMMENDED: optimum}, aggregate.maps | {RECOMMENDED: map_}),
     )
     return population._replace(aggregate=beside)
 
@@ -168,7 +168,7 @@ def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, 
     """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
     judged = maximise_judged(study.gp, cohort.trials, _LEARN, inference=study.inference)
     learned = judged.learned
-    rule = "hierarchical" if study.rule == RECIPE else study.rule
+    rule = "hierarchical" if study.rule in RECIPES else study.rule
     learned_study = dataclasses.replace(study, gp=learned.gp, rule=rule, learnt=None)
     return judged, learned_study, aggregate_cohort(learned_study, cohort, seed, alternatives=False)
 

@@ -8,9 +8,10 @@ import equinox as eqx
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
-from hilbo.population.learnt import RECIPE, Learnt
+from hilbo.population.learnt import Learnt
 from hilbo.population.learnt_posterior import NOTHING, Stated, prior_model
 from hilbo.population.maps import AnyRule
+from hilbo.population.recipes import RECIPES
 from hilbo.search.space import SearchSpace
 from hilbo.study.protocols import SessionTable
 from hilbo.study.simulation_table import SimulationTable
@@ -120,7 +121,7 @@ def _gp(file: StudyFile) -> tuple[OrdinalGP, Stated]:
     """The model of [gp], and what the file states of it; a rule that learns takes the priors' medians for the rest."""
     table, dim = file.tables.gp, file.space.dim
     theta, variance, thresholds, noise = table.theta, table.variance, table.thresholds, table.noise
-    if file.tables.aggregation.rule == RECIPE:
+    if file.tables.aggregation.rule in RECIPES:
         lengths = theta if theta is None or isinstance(theta, tuple) else (theta,) * dim
         stated = Stated(lengths, variance, thresholds, noise)
         return prior_model(dim, len(file.responses), stated), stated

@@ -7,9 +7,9 @@ import numpy as np
 
 from hilbo.numerics.host import placed
 from hilbo.population.hierarchical import Share
-from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import RuleMap
 from hilbo.population.pointwise import RULES
+from hilbo.population.recipes import RECIPES
 from hilbo.study.aggregate import predict_map
 from hilbo.study.config import Study
 
@@ -17,7 +17,7 @@ __all__ = ["ALIKE", "SURE", "heterogeneity", "in_place", "rule_warnings", "share
 
 ALIKE = ("bcm", "rbcm", "pooled")  # rules that take people to share one function
 SURE = 3.0  # log Bayes factor, about 20 to 1
-_TOOSURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
+_TOO_SURE = 1.5  # times as large as the map says: a standard deviation worth a sentence
 
 
 def heterogeneity(aggregate: Any) -> dict[str, Any] | None:
@@ -38,7 +38,7 @@ def share_content(share: Share) -> dict[str, Any]:
 
 def in_place(map_: RuleMap) -> str:
     """How maps of fewer trials, and of bootstrap resamples, are aggregated where that differs; else nothing."""
-    if map_.rule == RECIPE:
+    if map_.rule in RECIPES:
         return "by the rule hierarchical point by point, with the learnt hyperparameters"
     if map_.rule not in RULES:
         return "by bcm"
@@ -56,7 +56,7 @@ def rule_warnings(study: Study, aggregate: Any) -> list[str]:
         f' and the rule "{study.rule}" takes that to be 1'
     )
     ratio = _sd_ratio(aggregate)
-    if ratio is not None and ratio >= _TOOSURE:
+    if ratio is not None and ratio >= _TOO_SURE:
         words += (
             f"; at its optimum the map says a standard deviation of {float(aggregate.optimum.sd):.2f}, the hierarchical"
             f" one {ratio:.1f} times as much"

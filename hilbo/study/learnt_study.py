@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from hilbo.population.learnt import RECIPE, Learnt, learn
-from hilbo.population.learnt_posterior import NOTHING, PRIORS, prior_model
+from hilbo.population.learnt import Learnt, learn
+from hilbo.population.learnt_posterior import NOTHING, prior_model
+from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
@@ -17,17 +18,17 @@ __all__ = ["learnt_content", "learnt_sentences", "resolved", "that_learns"]
 _UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
 
 
-def that_learns(study: Study) -> Study:
-    """The same study by the rule that learns: nothing of its [gp] is kept."""
+def that_learns(study: Study, recipe: str = RECOMMENDED) -> Study:
+    """The same study by a recipe that learns: nothing of its [gp] is kept."""
     gp = prior_model(study.space.dim, len(study.responses))
-    return dataclasses.replace(study, rule=RECIPE, gp=gp, inference="laplace", stated=NOTHING, learnt=None)
+    return dataclasses.replace(study, rule=recipe, gp=gp, inference="laplace", stated=NOTHING, learnt=None)
 
 
 def resolved(study: Study, cohort: Cohort) -> Study:
     """The study with the model that its answers say, where its rule learns; else the study itself."""
-    if study.rule != RECIPE or study.learnt is not None:
+    if study.rule not in RECIPES or study.learnt is not None:
         return study
-    learnt = learn(cohort.trials, len(study.responses), study.stated)
+    learnt = learn(cohort.trials, len(study.responses), study.stated, RECIPES[study.rule])
     return dataclasses.replace(study, gp=learnt.model.gp, learnt=learnt)
 
 
@@ -39,7 +40,7 @@ def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
         return None
     model = learnt.model
     content: dict[str, Any] = {
-        "recipe": RECIPE,
+        "recipe": learnt.recipe,
         "stated": {name: value for name, value in study.stated._asdict().items() if value is not None},
         "noise": float(model.noise),
         "theta": dict(zip(study.space.names, np.asarray(model.theta).tolist(), strict=True)),
@@ -76,7 +77,7 @@ def _coordinates(study: Study, learnt: Learnt) -> list[tuple[str, tuple[float, f
         for label, mean, sd in zip(labels, means.tolist(), sds.tolist(), strict=True):
             ends = mean - 1.96 * sd, mean + 1.96 * sd
             ends = ends if name == "middle" else (math.exp(ends[0]), math.exp(ends[1]))
-            known = math.isfinite(sd) and sd < _UNKNOWN * PRIORS[name].sd
+            known = math.isfinite(sd) and sd < _UNKNOWN * RECIPES[learnt.recipe].priors[name].sd
             rows.append((label, ends, known))
     return rows
 
@@ -90,7 +91,7 @@ def learnt_sentences(study: Study) -> list[str]:
     unknown = [name for name, _, known in _coordinates(study, learnt) if not known]
     if unknown:
         sentences.append(
-            f"Not identified by these answers, so that the prior decides: {', '.join(unknown)} (rule {RECIPE})."
+            f"Not identified by these answers, so that the prior decides: {', '.join(unknown)} (rule {learnt.recipe})."
         )
     if study.stated.thresholds is not None and study.stated.theta is None:
         sentences.append(

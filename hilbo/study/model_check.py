@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hilbo.population.baselines import constant, quadratic
-from hilbo.population.learnt import RECIPE
 from hilbo.population.leave_one_out import LeftOut, clustered, leave_one_out, leave_one_out_learnt
+from hilbo.population.recipes import RECIPES
 from hilbo.study.aggregate import Aggregate
 from hilbo.study.config import Study
 
@@ -88,7 +88,7 @@ def _percent(share: float) -> str:
 def _left_out(study: Study, aggregate: Aggregate, answered: np.ndarray) -> LeftOut:
     """Alone, or in groups of people from all over the table where they would be too many folds."""
     trials = aggregate.cohort.trials
-    cheap = study.rule == RECIPE or aggregate.map.method == "by points"
+    cheap = study.rule in RECIPES or aggregate.map.method == "by points"
     folds = min(_FOLDS if cheap else _DEAR_FOLDS, len(answered))
     groups = [answered[k::folds] for k in range(folds)]
     if study.learnt is not None:

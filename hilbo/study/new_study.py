@@ -104,7 +104,7 @@ def study_text(new: NewStudy) -> str:
             _line(f"attribute = {_quoted(_ATTRIBUTE)}", "what is judged: labels of axes and captions"),
             *(line for p in parameters for line in _table(p)),
             _presenting(new, parameters),
-            _line("[gp]", "what is believed of people before any answer; rule learnt-1 learns it"),
+            _line("[gp]", "what is believed of people before any answer; rule learnt-2 learns it"),
             _line(f"length = {0.13 if new.device else 0.22}", "over what part of a range answers change"),
             "variance = 1.0",
             _line(f"thresholds = {_thresholds(len(new.responses))}", "between one answer and the next"),

@@ -6,7 +6,7 @@ What `hilbo aggregate` writes. `hilbo.study.analysis` adds what a report says be
 from collections.abc import Callable
 from typing import NamedTuple
 
-from hilbo.population.learnt import RECIPE
+from hilbo.population.recipes import RECIPES
 from hilbo.study.aggregate import Aggregate, aggregate_cohort, asked_variance
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -42,7 +42,7 @@ def analyse_population(
 ) -> Population:
     """The aggregate of a cohort, and its optima after fewer trials; everything is fitted once. `tell` is given the
     optimum in sentences as soon as it is known."""
-    if study.rule == RECIPE:
+    if study.rule in RECIPES:
         say("learning the hyperparameters from all answers")
     study = resolved(study, cohort)
     say(f"fitting {len(cohort.names)} participants ({study.name})")

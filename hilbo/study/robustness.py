@@ -21,9 +21,9 @@ from hilbo.hyperparameters.judged_evidence import Judged, maximise_judged
 from hilbo.hyperparameters.maximum_evidence import Learned, optimum_sensitivity
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
-from hilbo.population.learnt import RECIPE
 from hilbo.population.maps import point_rule, share_of
 from hilbo.population.pointwise import Rule
+from hilbo.population.recipes import RECIPES
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
 from hilbo.study.cohort import Cohort
@@ -101,10 +101,10 @@ def robustness(
     """
     if "variance" in learn:
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
-    if study.rule == RECIPE:
+    if study.rule in RECIPES:
         raise InputError(
-            f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{RECIPE}" has no fixed ones;'
-            " its result.json has their intervals."
+            f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{study.rule}" has no fixed'
+            " ones; its result.json has their intervals."
         )
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)

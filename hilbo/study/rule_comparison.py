@@ -21,7 +21,6 @@ from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.hierarchical import Share
 from hilbo.population.joint import joint_map, posterior_map
-from hilbo.population.learnt import RECIPE
 from hilbo.population.leave_one_out import (
     LeftOut,
     calibration,
@@ -33,6 +32,7 @@ from hilbo.population.leave_one_out import (
 )
 from hilbo.population.maps import GIVEN_RULES, RuleMap, learnt_map, rule_map, share_of
 from hilbo.population.pointwise import RULES
+from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, map_optimum, nrmse
 from hilbo.study.cohort import Cohort
@@ -51,8 +51,9 @@ _DRAWS = 2000
 
 
 def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool = True) -> dict[str, Any]:
-    """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say, but learnt-1
-    by what it learns in each fold, if it `learns` (a search in each). What a rule cannot do stands there as its reason.
+    """All rules side by side; by the study's hyperparameters, and the share that everybody's answers say, but a recipe
+    (the study's, else the recommended one) by what it learns in each fold, if it `learns`. What a rule cannot do stands
+    there as its reason.
 
     Raises InputError for fewer than three people with answers: two must be left when one is left out.
     """
@@ -83,7 +84,8 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
         rules[rule] |= _map_content(study, cohort, posteriors, map_, folds, pooled, candidates, x, seed)
         rules[rule]["hyperparameters"] = "given" if study.learnt is None else "learnt from all answers"
     if learns:
-        left[RECIPE], rules[RECIPE] = _learnt_entry(study, cohort, everybody, posteriors, pooled, candidates, x, seed)
+        recipe, given = study.rule if study.rule in RECIPES else RECOMMENDED, (cohort, everybody, posteriors, pooled)
+        left[recipe], rules[recipe] = _learnt_entry(study, recipe, *given, candidates, x, seed)
     for rule, (difference, error) in differences(left).items():
         rules[rule] |= {"difference": difference, "difference_error": error}
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
@@ -92,6 +94,7 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
 
 def _learnt_entry(
     study: Study,
+    recipe: str,
     cohort: Cohort,
     everybody: bool,
     posteriors: Posterior,
@@ -100,8 +103,8 @@ def _learnt_entry(
     x: Float[Array, "p d"],
     seed: int,
 ) -> tuple[LeftOut, dict[str, Any]]:
-    """learnt-1, whose hyperparameters are learnt again without each person; beside it, with those of all answers."""
-    learns = study if study.rule == RECIPE else that_learns(study)
+    """A recipe, whose hyperparameters are learnt again without each person; beside it, with those of all answers."""
+    learns = study if study.rule == recipe else that_learns(study, recipe)
     learns = resolved(learns if everybody else dataclasses.replace(learns, learnt=None), cohort)
     assert learns.learnt is not None
     left, folds = leave_one_out_learnt(learns.learnt, cohort.trials, learns.stated)

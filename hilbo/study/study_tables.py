@@ -36,9 +36,9 @@ __all__ = [
 ]
 
 Inference = Literal["laplace", "ep", "ep_corrected", "exact"]
-Rule = Literal["bcm", "hierarchical", "rbcm", "average", "pooled", "learnt-1"]
+Rule = Literal["bcm", "hierarchical", "rbcm", "average", "pooled", "learnt-1", "learnt-2"]
 """How people are aggregated; `hilbo.population.maps` has the rules."""
-_LEARNS: Rule = "learnt-1"
+_LEARN: tuple[Rule, ...] = ("learnt-1", "learnt-2")
 Acquisition = Literal["ucb", "log_ei", "thompson", "top_category", "mean"]
 
 
@@ -203,9 +203,9 @@ def _check_complete(raw: Mapping[str, Any]) -> None:
         missing += missing_keys(_ParameterTable, table, f"parameters.{name}")
     rule = raw.get("aggregation", {}).get("rule", "bcm")  # one that is none is refused with its value
     stated = {"theta" if key == "length" else key for key in raw.get("gp", {})}
-    fixed = rule != _LEARNS and rule in get_args(Rule)
+    fixed = rule not in _LEARN and rule in get_args(Rule)
     unstated = [f"gp.{key}" for key in _LEARNT if fixed and key not in stated]
-    hint = f'; rule = "{_LEARNS}" in [aggregation] learns what [gp] does not state' if unstated else ""
+    hint = f'; rule = "{_LEARN[-1]}" in [aggregation] learns what [gp] does not state' if unstated else ""
     check_present([*missing, *unstated], hint)
 
 
@@ -270,9 +270,9 @@ def _check_gp(table: GPTable, rule: Rule, count: int) -> None:
             )
         if any(low >= high for low, high in itertools.pairwise(thresholds)):
             raise InputError(f"gp.thresholds is {shown(thresholds)}, it must rise from each number to the next.")
-    if rule == _LEARNS:
+    if rule in _LEARN:
         if table.inference != "laplace":
-            raise InputError(f'gp.inference is {shown(table.inference)}, it must be "laplace" with rule = "{_LEARNS}".')
+            raise InputError(f'gp.inference is {shown(table.inference)}, it must be "laplace" with rule = "{rule}".')
         return
 
 

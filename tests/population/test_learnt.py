@@ -9,7 +9,8 @@ from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
 from hilbo.population.learnt import learn, learnt_function
-from hilbo.population.learnt_posterior import PRIORS, Stated, prior_model
+from hilbo.population.learnt_posterior import Stated, prior_model
+from hilbo.population.recipes import LEARNT_1
 
 PEOPLE, ANSWERS = 4, 12
 
@@ -134,7 +135,7 @@ def test_hostile_answers_are_learnt_or_said_not_to_be(name, rule, categories):
     assert bool(end.converged), name
     assert all(np.isfinite(np.asarray(sd)).all() for sd in end.sd.values())
     if name == "one category only":
-        assert np.all(np.asarray(end.sd["theta"]) > 0.9 * PRIORS["theta"].sd)
+        assert np.all(np.asarray(end.sd["theta"]) > 0.9 * LEARNT_1.priors["theta"].sd)
 
 
 @pytest.mark.deep

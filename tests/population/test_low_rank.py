@@ -106,7 +106,7 @@ def test_gradients_are_differences_of_the_dense_evidence():
 def test_what_features_leave_is_said_and_bounds_the_covariances():
     trials = stacked(people=4, answers=30)
     theta, answers = jnp.array([3.0, 5.0]), apart(trials)
-    rank = rank_for(theta, answers)
+    rank = rank_for(RBF(theta), answers)
     held = eqx.tree_at(lambda m: m.log_widths, model(), jnp.zeros(4))
     end = shared_evidence(held, answers, answers.blank, rank)
     dense = fit_people(held.gp, of_people(trials), held.share)

@@ -66,7 +66,7 @@ def test_what_the_file_states_is_kept():
         ),
         (SOUND + '[gp]\ninference = "ep"\n', 'gp.inference is "ep", it must be "laplace" with rule = "learnt-1"'),
         (SOUND + "[gp]\nthresholds = [0.0]\n", "gp.thresholds is [0.0], it must have one number fewer than the 3"),
-        (SOUND.replace("learnt-1", "learnt-2"), 'aggregation.rule is "learnt-2", it must be one of'),
+        (SOUND.replace("learnt-1", "learnt-0"), 'aggregation.rule is "learnt-0", it must be one of'),
     ],
 )
 def test_bad_files_get_one_sentence(text, sentence):

@@ -1,0 +1,80 @@
+"""Recipes that learn the hyperparameters from all people's answers.
+
+Each has a name, and never changes: a study that names one gets the same numbers from a later hilbo. A better recipe
+gets another name.
+
+In units of the classification noise, with d parameters and C categories, people's functions and answers are those of
+`low_rank.PeopleModel`. The priors of the hyperparameters:
+
+    coordinate                                   learnt-1            learnt-2
+    kernel                                       RBF                 Matern 3/2
+    log theta_i                                  log(24 / d), 1.2    the same
+    log shared variance                          log 3, 1            log 3, 2
+    log own variance                             0, 1                0, 2
+    middle of the thresholds                     0, 1.5              0, 4
+    log distance of neighbouring thresholds      log 0.8, 0.7        log 0.8, 2
+    log width_j of a person, if C > 2            0, 0.4              the same
+    largest at the optimum                       P(highest answer)   map's mean less its standard deviation
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from hilbo.kernels import RBF, Matern32, Stationary
+
+__all__ = ["LEARNT_1", "LEARNT_2", "RECIPES", "RECOMMENDED", "WIDTHS", "Prior", "Recipe"]
+
+
+class Prior(NamedTuple):
+    """Normal, of one coordinate."""
+
+    mean: float
+    sd: float
+
+
+class Recipe(NamedTuple):
+    """What is learnt from answers, and how."""
+
+    name: str
+    kernel: type[Stationary]
+    """Of the function that people share, and of everybody's own part."""
+    priors: Mapping[str, Prior]
+    """By the names of `learnt_posterior.Coordinates`; that of theta less log d."""
+    caution: float
+    """Standard deviations by which the map's mean is lowered where the optimum is sought. 0: sought is the place where
+    a new person most probably gives the highest answer."""
+
+
+WIDTHS: Final = Prior(0.0, 0.4)
+"""Of the logarithm of a person's distances between thresholds, about their middle."""
+
+LEARNT_1: Final = Recipe(
+    "learnt-1",
+    RBF,
+    {
+        "theta": Prior(math.log(24.0), 1.2),
+        "shared": Prior(math.log(3.0), 1.0),
+        "own": Prior(0.0, 1.0),
+        "middle": Prior(0.0, 1.5),
+        "gaps": Prior(math.log(0.8), 0.7),
+        "widths": WIDTHS,
+    },
+    caution=0.0,
+)
+LEARNT_2: Final = Recipe(
+    "learnt-2",
+    Matern32,
+    {
+        "theta": Prior(math.log(24.0), 1.2),
+        "shared": Prior(math.log(3.0), 2.0),
+        "own": Prior(0.0, 2.0),
+        "middle": Prior(0.0, 4.0),
+        "gaps": Prior(math.log(0.8), 2.0),
+        "widths": WIDTHS,
+    },
+    caution=1.0,
+)
+RECIPES: Final = {recipe.name: recipe for recipe in (LEARNT_1, LEARNT_2)}
+RECOMMENDED: Final = LEARNT_2.name
+"""What is shown beside a study's own rule."""
