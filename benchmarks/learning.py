@@ -1,4 +1,4 @@
-"""What learnt-1 costs, and how much it depends on its priors.
+"""What a recipe costs, and how much it depends on its priors.
 
     python benchmarks/learning.py [--write]           times on one core, warm, and the error of the low rank
     python benchmarks/learning.py --priors [--seeds 10] [--write]
@@ -34,6 +34,7 @@ from populations_people import POPULATIONS  # noqa: E402
 from hilbo.population.learnt import learn  # noqa: E402
 from hilbo.population.low_rank import shared_evidence  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
+from hilbo.population.recipes import LEARNT_1, RECIPES  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
 from hilbo.study.aggregate import map_optimum  # noqa: E402
@@ -50,9 +51,11 @@ def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--priors", action="store_true")
     options.add_argument("--seeds", type=int, default=10)
+    options.add_argument("--recipe", choices=RECIPES, default=LEARNT_1.name)
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    name, lines = ("priors", sensitivity(chosen.seeds)) if chosen.priors else ("times", times())
+    recipe = RECIPES[chosen.recipe]
+    name, lines = ("priors", sensitivity(recipe, chosen.seeds)) if chosen.priors else ("times", times(recipe))
     print("\n".join(lines))
     if chosen.write:
         before, _, rest = PAGE.read_text().partition(f"<!-- {name} -->")
@@ -67,16 +70,16 @@ def answers(people, seed):
     return simulate_study(study, scene.persons, seed), scene.chance
 
 
-def times():
+def times(recipe):
     lines = [
         "| people × trials | seconds (asked) | L-BFGS steps | features | error of the log evidence by the low rank |",
         "|---|---:|---:|---:|---:|",
     ]
     for people, asked in SIZES:
         trials, _ = answers(people, 1)
-        learn(trials, 3)  # compiles what it needs
+        learn(trials, 3, recipe=recipe)  # compiles what it needs
         begun = time.perf_counter()
-        learnt = jax.block_until_ready(learn(trials, 3))
+        learnt = jax.block_until_ready(learn(trials, 3, recipe=recipe))
         seconds = time.perf_counter() - begun
         given = learnt.model, trials, learnt.weights
         error = abs(evidence(*given, int(learnt.rank), 1e-4) - evidence(*given, min(EXACT, 25 * people), 1e-12))
@@ -92,22 +95,22 @@ def evidence(model, trials, weights, rank, tolerance):
     return float(eqx.filter_jit(shared_evidence)(model, trials, weights, rank, tolerance).value)
 
 
-def sensitivity(seeds):
-    study = that_learns(POPULATION.study, RECIPE.name)
-    moved = {(name, factor): [] for name in RECIPE.priors for factor in (0.5, 2.0)}
+def sensitivity(recipe, seeds):
+    study = that_learns(POPULATION.study, recipe.name)
+    moved = {(name, factor): [] for name in recipe.priors for factor in (0.5, 2.0)}
     for seed in range(seeds):
         trials, chance = answers(24, seed)
         candidates = search_points(study.space, seed)
 
         def best(priors, near=None, trials=trials, candidates=candidates, chance=chance):
             traced = jax.tree.map(jnp.asarray, priors)  # numbers, not constants: one compilation for all
-            learnt = learn(trials, 3, recipe=RECIPE._replace(priors=traced), near=near)
+            learnt = learn(trials, 3, recipe=recipe._replace(priors=traced), near=near)
             x = _optimum(study, learnt, trials, candidates)
             return learnt, np.asarray(x), float(chance_at(chance, x[None, :])[0])
 
-        learnt, x, value = best(RECIPE.priors)
+        learnt, x, value = best(recipe.priors)
         for name, factor in moved:
-            changed = RECIPE.priors | {name: RECIPE.priors[name]._replace(sd=factor * RECIPE.priors[name].sd)}
+            changed = recipe.priors | {name: recipe.priors[name]._replace(sd=factor * recipe.priors[name].sd)}
             _, other, its_value = best(changed, learnt)
             moved[name, factor].append((100 * np.sqrt(np.mean((other - x) ** 2)), its_value - value))
         print(seed, flush=True)

@@ -1,4 +1,4 @@
-"""The RBF covariance against its formula in mpmath; its gram matrix, dtypes and derivatives."""
+"""The covariances against their formulas in mpmath; gram matrices, dtypes and derivatives."""
 
 import jax
 import jax.numpy as jnp
@@ -8,29 +8,55 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpmath import mp
 
-from hilbo.kernels import RBF, gram
+from hilbo.kernels import RBF, Matern32, gram
 
 rng = np.random.default_rng(3)
 X, Y = rng.random((7, 3)), rng.random((5, 3))
 THETAS = [30.0, 1e-2, (4.0, 9.0, 2.5)]
 
 
-def exact(x, y, theta, variance):
+def matern32(squared):
+    root = mp.sqrt(6 * squared)
+    return (1 + root) * mp.exp(-root)
+
+
+CORRELATION = {RBF: lambda squared: mp.exp(-squared), Matern32: matern32}
+
+
+def exact(kernel, x, y, theta, variance):
     thetas = np.broadcast_to(theta, x.shape)
     with mp.workdps(40):
         triples = (map(mp.mpf, map(float, triple)) for triple in zip(thetas, x, y, strict=True))
         squares = [t * (a - b) ** 2 for t, a, b in triples]
-        return float(mp.mpf(float(variance)) * mp.exp(-mp.fsum(squares)))
+        return float(mp.mpf(float(variance)) * CORRELATION[kernel](mp.fsum(squares)))
 
 
 @pytest.mark.parametrize("theta", THETAS)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_gram_against_mpmath(theta, dtype):
+@pytest.mark.parametrize("kernel", CORRELATION)
+def test_gram_against_mpmath(kernel, theta, dtype):
     x, y, scale = X.astype(dtype), Y.astype(dtype), np.asarray(theta, dtype)
-    found = gram(RBF(scale, dtype(1.7)), jnp.asarray(x), jnp.asarray(y))
-    expected = [[exact(p, r, scale, dtype(1.7)) for r in y] for p in x]
-    assert found.dtype == dtype
-    np.testing.assert_allclose(found, expected, rtol=60 * np.finfo(dtype).eps)
+    matrix = gram(kernel(scale, dtype(1.7)), jnp.asarray(x), jnp.asarray(y))
+    expected = [[exact(kernel, p, r, scale, dtype(1.7)) for r in y] for p in x]
+    assert matrix.dtype == dtype
+    np.testing.assert_allclose(matrix, expected, rtol=60 * np.finfo(dtype).eps)
+
+
+@pytest.mark.parametrize("step", [0.0, 0.3])
+def test_second_derivatives_of_the_matern_kernel_also_where_points_meet(step):
+    """Against central differences of the gradient in closed form, -6 theta (x - y) exp(-s) times the variance; at one
+    point they are -6 theta times the variance."""
+    theta, x = jnp.array([4.0, 9.0]), jnp.array([0.2, 0.7])
+    y, kernel = x + step, Matern32((4.0, 9.0), 1.7)
+
+    def slope(x):
+        s = np.sqrt(6.0 * np.sum(np.asarray(theta) * (x - np.asarray(y)) ** 2))
+        return -6.0 * 1.7 * np.asarray(theta) * (x - np.asarray(y)) * np.exp(-s)
+
+    h = 1e-6
+    moved = [(slope(np.asarray(x) + h * unit) - slope(np.asarray(x) - h * unit)) / (2 * h) for unit in np.eye(2)]
+    np.testing.assert_allclose(jax.grad(kernel)(x, y), slope(np.asarray(x)), atol=1e-13)
+    np.testing.assert_allclose(jax.hessian(kernel)(x, y), moved, rtol=1e-4, atol=1e-4)
 
 
 def test_near_points_keep_their_difference():

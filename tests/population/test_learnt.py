@@ -7,10 +7,11 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
+from hilbo.kernels import Matern32
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
 from hilbo.population.learnt import learn, learnt_function
 from hilbo.population.learnt_posterior import Stated, prior_model
-from hilbo.population.recipes import LEARNT_1
+from hilbo.population.recipes import LEARNT_1, LEARNT_2
 
 PEOPLE, ANSWERS = 4, 12
 
@@ -47,6 +48,23 @@ def dense_objective(z, trials):
 def at(learnt):
     c = learnt.coordinates
     return np.concatenate([np.atleast_1d(np.asarray(c[k])) for k in ("theta", "shared", "own", "middle", "gaps")])
+
+
+def test_learnt_2_is_a_maximum_of_the_dense_posterior_of_its_kernel_and_priors():  # one search: 3 s
+    trials = answers()
+    learnt = learn(trials, 3, recipe=LEARNT_2)
+    assert bool(learnt.converged) and isinstance(learnt.model.gp.kernel, Matern32)
+
+    def height(z):
+        theta, shared, own = np.exp(z[:2]), np.exp(z[2]), np.exp(z[3])
+        half = 0.5 * np.exp(z[5])
+        gp = OrdinalGP(Matern32(tuple(theta), shared + own), OrdinalProbit((z[4] - half, z[4] + half), 1.0))
+        evidence = fit_people(gp, of_people(trials), shared / (shared + own)).log_evidence
+        mean = np.array([np.log(12.0), np.log(12.0), np.log(3.0), 0.0, 0.0, np.log(0.8)])
+        return float(evidence) - 0.5 * float(np.sum(((z - mean) / np.array([1.2, 1.2, 2.0, 2.0, 4.0, 2.0])) ** 2))
+
+    best = height(at(learnt))
+    assert all(height(at(learnt) + step) < best for step in np.concatenate([np.eye(6), -np.eye(6)]) * 0.1)
 
 
 def test_the_end_is_a_maximum_of_the_dense_posterior(learnt):

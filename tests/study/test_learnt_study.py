@@ -13,8 +13,11 @@ from studies import SOUND
 from hilbo import Session
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials
+from hilbo.population.maps import learnt_map
+from hilbo.population.recipes import RECOMMENDED
+from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import to_table
-from hilbo.study.aggregate import aggregate_cohort
+from hilbo.study.aggregate import aggregate_cohort, map_optimum
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.learnt_study import learnt_content, learnt_sentences, resolved, that_learns
@@ -48,6 +51,19 @@ def test_a_session_starts_from_the_medians():
     np.testing.assert_allclose(study.gp.likelihood.thresholds, (-0.4, 0.4))
     session = Session.start(study, seed=0)
     assert set(session.ask()) == {"level", "tone"}
+
+
+def test_learnt_2_seeks_its_optimum_where_the_mean_less_the_standard_deviation_is_largest(table):  # one search: 4 s
+    study = study_of(SOUND.replace("learnt-1", "learnt-2"))
+    cohort = cohort_of(read_trials(table, study), study)
+    study = resolved(study, cohort)
+    map_, x = learnt_map(study.learnt, cohort.trials), search_points(study.space, 0)
+    optimum = map_optimum(study, map_, x)
+    mean, variance = map_.predict(x)
+    known = variance <= map_.reach
+    assert learnt_content(study, cohort.names)["recipe"] == "learnt-2"
+    assert float(optimum.mean - optimum.sd) >= float(jnp.max(jnp.where(known, mean - jnp.sqrt(variance), -jnp.inf)))
+    assert float(optimum.sd**2) <= float(map_.reach) * (1 + 1e-6)
 
 
 def test_what_the_file_states_is_kept():
@@ -130,7 +146,7 @@ def test_another_rule_has_no_model_to_go_by(tmp_path, table, capsys, monkeypatch
 def test_by_the_command_line_nothing_stated_is_kept():
     study = that_learns(Study.load("hilbo/data/paper.toml"))
     np.testing.assert_allclose(study.gp.kernel.theta, 8.0)
-    assert study.rule == "learnt-1"
+    assert study.rule == RECOMMENDED
     assert not any(study.stated)
 
 
