@@ -64,12 +64,15 @@ def test_a_live_trial_fits_each_data_set_once():
             look(state)
             return state
 
+        given = []
+
         def look(state):
-            assert maps.slices(state)["slices"]
-            assert maps.trust(state)
+            assert bool(maps.slices(state)["slices"]) == bool(given)  # nothing is shown before there is an answer
+            assert bool(maps.trust(state)) == bool(given)
 
         def answered(state, response):
             values = {"class_a": response}
+            given.append(response)
             state = state.after(live.answer(state, state.pending.id, f"c{state.seq}", values, 0.0))
             look(state)
             return state

@@ -254,7 +254,7 @@ def test_all_that_is_missing_stands_in_one_sentence():
         Study.from_dict({"schema": 1, "study": {"name": "a"}, "parameters": {"u": {"low": 0}}, "gp": {"theta": 1.0}})
     assert str(caught.value) == (
         "study.responses is missing and so are parameters.u.high, gp.variance, gp.thresholds, gp.noise, add them;"
-        ' rule = "learnt-1" in [aggregation] learns what [gp] does not state.'
+        ' rule = "learnt-2" in [aggregation] learns what [gp] does not state.'
     )
 
 

@@ -11,7 +11,8 @@ from studies import answered, plain_study
 from hilbo.errors import InputError
 from hilbo.population.hierarchical import Share
 from hilbo.population.leave_one_out import LeftOut, calibration
-from hilbo.population.maps import ALL_RULES
+from hilbo.population.maps import GIVEN_RULES
+from hilbo.population.recipes import RECOMMENDED
 from hilbo.report.comparison import write_comparison
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.rule_comparison import compare, recommendation
@@ -20,10 +21,10 @@ from hilbo.study.rule_comparison import compare, recommendation
 @pytest.mark.deep
 def test_everything_is_compared_and_written(tmp_path):
     study = dataclasses.replace(plain_study(2), rule="rbcm")
-    content = write_comparison(study, aggregate_cohort(study, answered(study, people=4)), tmp_path)
+    content = write_comparison(study, aggregate_cohort(study, answered(study, people=4)), tmp_path).content
     assert json.loads((tmp_path / "comparison.json").read_text()) == content
-    assert set(content["rules"]) == set(ALL_RULES)
-    assert content["rules"]["learnt-1"]["hyperparameters"] == "learnt in each fold"
+    assert set(content["rules"]) == {*GIVEN_RULES, RECOMMENDED}
+    assert content["rules"][RECOMMENDED]["hyperparameters"] == "learnt in each fold"
     for found in content["rules"].values():
         assert found["negative_log_density"] > 0 and 0 <= found["central_95"] <= 1 and 0 <= found["covered"] <= 1
         assert set(found["influence"]) == {"P0", "P1", "P2", "P3"}
