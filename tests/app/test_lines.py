@@ -1,5 +1,6 @@
 """The stimulus's messages as a form and as lines: the same session, for programs without a JSON parser."""
 
+import asyncio
 import urllib.error
 import urllib.parse
 import urllib.request
@@ -7,7 +8,9 @@ import urllib.request
 import pytest
 from live_server import PATIENCE
 from live_stimulus import SETS, LiveStimulus
+from starlette.requests import Request
 
+from hilbo.app import messages, server
 from hilbo.app.lines import fields_of, lines_of
 from hilbo.errors import InputError
 from hilbo.session.records import Block, Planned
@@ -47,6 +50,22 @@ def test_an_answer_has_a_line_for_each_fact():
         "",
     ]
     assert lines_of(409, {"force": True}) == "status\t409\nforce\ttrue\n"
+
+
+def request_of(body: bytes) -> Request:
+    """As curl and Python's urllib send a body whose kind nobody states: with the header of a form."""
+
+    async def receive():
+        return {"type": "http.request", "body": body}
+
+    return Request({"type": "http", "headers": [(b"content-type", b"application/x-www-form-urlencoded")]}, receive)
+
+
+def test_an_object_of_json_is_no_form_whatever_its_header_says():
+    for body, form in ((b' {"token": "abc"}', False), (b"token=abc", True)):
+        request = request_of(body)
+        assert asyncio.run(server._message(messages.Join, request)).token == "abc"
+        assert request.state.form == form
 
 
 class Form:
