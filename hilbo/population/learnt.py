@@ -185,7 +185,8 @@ def _descended(search: _Search, problem: Problem, free: Set[str]) -> _Search:
 
 
 def _gain_of_widths(alike: _Search, different: _Search, problem: Problem) -> float:
-    """What widths of people's own add to the log evidence, by Laplace's method in each width alone."""
+    """What widths of people's own add to the log evidence, by Laplace's method in each width alone. -inf where the search
+    ended at no maximum of some width: the method then says nothing, and nobody has a width."""
     costs = [float(cost_at(s.coordinates, s.weights, problem, s.coordinates).value) for s in (alike, different)]
     widths = different.coordinates["widths"]
 
@@ -194,6 +195,8 @@ def _gain_of_widths(alike: _Search, different: _Search, problem: Problem) -> flo
         return np.asarray(cost_at(moved, different.weights, problem, moved).gradient["widths"])
 
     curvature = (slope(_FINE) - slope(-_FINE)) / (2 * _FINE)
+    if not np.all(curvature > 0):
+        return -np.inf
     return costs[0] - costs[1] - float(np.sum(np.log(problem.priors["widths"].sd * np.sqrt(curvature))))
 
 
