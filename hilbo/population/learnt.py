@@ -185,8 +185,8 @@ def _descended(search: _Search, problem: Problem, free: Set[str]) -> _Search:
 
 
 def _gain_of_widths(alike: _Search, different: _Search, problem: Problem) -> float:
-    """What widths of people's own add to the log evidence, by Laplace's method in each width alone. -inf where the search
-    ended at no maximum of some width: the method then says nothing, and nobody has a width."""
+    """What widths of people's own add to the log evidence, by Laplace's method in each width alone. -inf where the
+    search ended at no maximum of some width: the method then says nothing, and nobody has a width."""
     costs = [float(cost_at(s.coordinates, s.weights, problem, s.coordinates).value) for s in (alike, different)]
     widths = different.coordinates["widths"]
 
