@@ -155,7 +155,7 @@ def _resampled(
     """How far the optimum of resampled people is from x, sought among x and some of the candidates."""
     points = jnp.concatenate([x[None, :], candidates[:_POINTS]])
     tops = resampled_tops(posteriors, points, rule, share, study.gp.kernel.variance, seed)
-    return jnp.sqrt(jnp.mean((points[tops] - x) ** 2, axis=1))
+    return jnp.sqrt(jnp.mean((points[tops] - x[None, :]) ** 2, axis=1))
 
 
 def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:
