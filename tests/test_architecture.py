@@ -71,6 +71,7 @@ WITHOUT_JAX = {
 LATER = {"device.parameter_sets", "search.box"}
 OUTSIDE_WORLD = {"os", "io", "sys", "time", "datetime", "pathlib", "logging", "random", "socket", "subprocess"}
 MAY_ENABLE_X64 = {"cli.console", "app"}
+SAYS_NOTHING = {"found", "told", "told_of", "gone"}  # as names: what is it that was found?
 LONGEST = 400  # lines
 
 
@@ -143,9 +144,28 @@ def faults(module: str, source: str) -> list[str]:
         listed += [f"calls {f.id}" for f in calls if isinstance(f, ast.Name) and f.id in {"print", "open", "input"}]
     if "enable_x64" in source and not among(module, MAY_ENABLE_X64):
         listed.append("switches 64-bit numbers on, or talks of it")
+    listed += [f"binds {name}, which does not say what it holds" for name in sorted(bound(tree) & SAYS_NOTHING)]
     if source.count("\n") > LONGEST:
         listed.append(f"has more than {LONGEST} lines")
     return listed + public_faults(module, tree)
+
+
+def bound(tree: ast.AST) -> set[str]:
+    """Every name that a module gives: variables, attributes, parameters, functions, classes, aliases, captures."""
+    named = ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef | ast.ExceptHandler | ast.MatchAs | ast.MatchStar
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            names.add(node.id)
+        elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            names.add(node.attr)
+        elif isinstance(node, ast.arg):
+            names.add(node.arg)
+        elif isinstance(node, ast.alias):
+            names.add(node.asname)
+        elif isinstance(node, named):
+            names.add(node.name)
+    return names
 
 
 def public_faults(module: str, tree: ast.Module) -> list[str]:
@@ -218,6 +238,24 @@ HEAD = '"""Doc."""\n__all__ = []\n'
         ("search.space", HEAD + "print(1)\n", "calls print"),
         ("bcm", HEAD + "jax.config.update('jax_enable_x64', True)\n", "switches 64-bit numbers on, or talks of it"),
         ("bcm", HEAD + "\n" * LONGEST, "has more than 400 lines"),
+        *(
+            ("bcm", HEAD + given, "binds found, which does not say what it holds")
+            for given in (
+                "found = 1\n",
+                "found: int\n",
+                "a.found = 1\n",
+                "for a, found in b:\n    pass\n",
+                "a = [found for found in b]\n",
+                "if found := 1:\n    pass\n",
+                "with a as found:\n    pass\n",
+                "def f(*, found):\n    pass\n",
+                "a = lambda found: 1\n",
+                "async def found():\n    pass\n",
+                "import ast as found\n",
+                "try:\n    pass\nexcept OSError as found:\n    pass\n",
+                "match a:\n    case found:\n        pass\n",
+            )
+        ),
         ("bcm", "__all__ = []\n", "has no docstring"),
         ("bcm", '"""Doc."""\n', "has no __all__"),
         ("bcm", '"""Doc."""\n__all__ = ["combine"]\n', "exports combine, which it does not define"),

@@ -51,12 +51,12 @@ def _labels(hub: Any, trial: Trial | None) -> dict[str, str]:
 
 def _table(hub: Any, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """The trials, the newest first, with labels in the place of values and of names of sets."""
-    found = []
+    labelled = []
     for trial, row in zip(reversed(hub.state.trials), rows, strict=True):
         place, answer, remark = row["cells"][:3]
         remark = _first_words(remark) if trial.voided and trial.voided.get("by") == "rule" else remark
-        found.append(row | {"cells": [place, answer, remark, " / ".join(_labels(hub, trial).values())]})
-    return {"head": ["trial", "answer", "remark", "label"], "rows": found}
+        labelled.append(row | {"cells": [place, answer, remark, " / ".join(_labels(hub, trial).values())]})
+    return {"head": ["trial", "answer", "remark", "label"], "rows": labelled}
 
 
 def _unvalued(event: Event) -> Event:

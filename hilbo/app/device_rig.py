@@ -58,9 +58,9 @@ class DeviceRig:
 
     def do(self, job: Callable[[Renderer], Any]) -> Future:
         """Has `job(device)` done after those before it."""
-        found: Future = Future()
-        self._jobs.put((lambda: job(self._ready()), found))
-        return found
+        result: Future = Future()
+        self._jobs.put((lambda: job(self._ready()), result))
+        return result
 
     @property
     def words(self) -> str:
@@ -73,10 +73,10 @@ class DeviceRig:
         While `may_push()`, a handle that was left pressed is pushed back by the set that is in force.
         """
         wanted = self._wanted(showing)
-        found = await asyncio.wrap_future(self.do(lambda device: self._load(device, wanted, stop, may_push)))
-        if found is None:
+        loaded = await asyncio.wrap_future(self.do(lambda device: self._load(device, wanted, stop, may_push)))
+        if loaded is None:
             raise asyncio.CancelledError
-        return found
+        return loaded
 
     async def show(self, showing: Showing) -> None:
         """The set in force, from now on; nothing where it is rendered already. The reference is no business of ours."""
@@ -88,9 +88,9 @@ class DeviceRig:
 
     async def rest(self) -> None:
         """The renderer rests; told even if this is left."""
-        told = asyncio.wrap_future(self.do(lambda device: device.stop()))
-        told.add_done_callback(_looked_at)
-        await asyncio.shield(told)
+        stopped = asyncio.wrap_future(self.do(lambda device: device.stop()))
+        stopped.add_done_callback(_looked_at)
+        await asyncio.shield(stopped)
 
     async def estop(self) -> None:
         """Force to zero at once: overtakes everything that waits."""
@@ -142,20 +142,20 @@ class DeviceRig:
             if resting and may_push() and device.in_force() is not None:
                 device.start()  # nothing but the last set's force brings a handle back that was left pressed
         begun = time.perf_counter()
-        found = device.send(**wanted)
+        in_force = device.send(**wanted)
         took = time.perf_counter() - begun
-        return Loaded({"in_force": found._asdict(), "serial_s": took}, took)
+        return Loaded({"in_force": in_force._asdict(), "serial_s": took}, took)
 
     def _work(self) -> None:
         looked = time.monotonic()
         while not self._ending.is_set():
-            job, found = self._next()
-            if found is not None and found.set_running_or_notify_cancel():
+            job, result = self._next()
+            if result is not None and result.set_running_or_notify_cancel():
                 try:
-                    found.set_result(job())
+                    result.set_result(job())
                 except BaseException as error:  # the waiting side's to judge
-                    found.set_exception(error)
-            if found is None or time.monotonic() - looked > self._pause:  # jobs may leave no pause between them
+                    result.set_exception(error)
+            if result is None or time.monotonic() - looked > self._pause:  # jobs may leave no pause between them
                 self._regularly()
                 looked = time.monotonic()
 
@@ -196,22 +196,22 @@ class DeviceRig:
             self._see(self.snapshot._replace(lost=str(error)))
 
     def _look(self) -> Snapshot:
-        found = self.device.status()
+        status = self.device.status()
         if self.device.link.restarted or self.device.link.faint:  # which answer this question all the same
             self.device.limits()  # and no other: `DeviceError` with what has happened
-        state = State(found.state).name if found.state in State._value2member_map_ else f"state {found.state}"
-        counters = {name: getattr(found, name) for name in COUNTERS}
-        force, position = (v if math.isfinite(v) else 0.0 for v in (found.force_N, found.position_mm))
-        rows = [("Contact", "yes" if found.contact else "no"), ("Position", f"{position:.2f} mm")]
+        state = State(status.state).name if status.state in State._value2member_map_ else f"state {status.state}"
+        counters = {name: getattr(status, name) for name in COUNTERS}
+        force, position = (v if math.isfinite(v) else 0.0 for v in (status.force_N, status.position_mm))
+        rows = [("Contact", "yes" if status.contact else "no"), ("Position", f"{position:.2f} mm")]
         rows += [("Force", f"{force:.2f} N"), *((n.replace("_", " "), str(v)) for n, v in counters.items() if v)]
         return Snapshot(
             state,
-            bool(found.contact),
+            bool(status.contact),
             None,
-            reason=held_because(found.hold_reason) if state in ("HOLD", "ESTOP") else "",
+            reason=held_because(status.hold_reason) if state in ("HOLD", "ESTOP") else "",
             facts={"counters": counters},
             rows=tuple(rows),
-            excused=state == "HOLD" and found.hold_reason == HoldReason.WATCHDOG,
+            excused=state == "HOLD" and status.hold_reason == HoldReason.WATCHDOG,
         )
 
     def _see(self, seen: Snapshot) -> None:

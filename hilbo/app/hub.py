@@ -185,8 +185,8 @@ class Hub:
         browser |= {} if clicked is None else {"clicked": clicked}
 
         def make(state, at):
-            found = state.trial(trial)
-            if found.values is None and found.presentation != presentation:
+            asked = state.trial(trial)
+            if asked.values is None and asked.presentation != presentation:
                 raise RefusedError("old-trial", "This trial has been begun again since.")
             self._came = came
             return actions.answer(state, trial, message.client, message.answers, at, browser=browser)

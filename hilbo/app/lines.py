@@ -28,15 +28,15 @@ def fields_of(body: bytes) -> dict[str, Any]:
         )
     except ValueError as error:
         raise InputError(f"The form is not understood: {error}.") from None
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     values: dict[str, str] = {}
     for key, text in pairs:
         name = key.removeprefix(_VALUE)
-        place = found if name == key else values
+        place = fields if name == key else values
         if name in place:
             raise InputError(f"The form has {key} twice.")
         place[name] = text
-    return found | ({"values": values} if values else {})
+    return fields | ({"values": values} if values else {})
 
 
 def lines_of(status: int, content: Mapping[str, Any]) -> str:

@@ -78,12 +78,12 @@ def _repeated(trial, name, seq):
 def _device(state, name, data):
     stimulus = state.study.stimulus
     who = "The device" if stimulus is None else _WHO[stimulus.role]
-    told = data["condition"]
+    condition = data["condition"]
     reason = str(data.get("reason", ""))
-    if told == "lost":
+    if condition == "lost":
         return f"{who} is lost{_because(data)}"
-    words = f"{who} {_DEVICE[told]}{_because({'reason': reason})}"
-    voided = state.trial(data["trial"]).voided if told in ("hold", "estop") and name else None
+    words = f"{who} {_DEVICE[condition]}{_because({'reason': reason})}"
+    voided = state.trial(data["trial"]).voided if condition in ("hold", "estop") and name else None
     return f"{words} {name} is void." if voided and voided["by"] == "rule" else words
 
 
@@ -125,8 +125,8 @@ def _row(state: LiveSession, trial: Trial, width: int) -> dict[str, Any]:
     else:
         shown = [trial.presented["a"][name] for name in state.study.space.names]
     answer, remark = " ".join((trial.values or {}).values()), _remark(state, trial)
-    gone = trial.status not in ("pending", "answered")
-    kind = "voided" if gone else "now" if trial.status == "pending" else "repeated" if remark else ""
+    discarded = trial.status not in ("pending", "answered")
+    kind = "voided" if discarded else "now" if trial.status == "pending" else "repeated" if remark else ""
     row = {"kind": kind, "cells": [place_of(trial), answer, remark, *shown]}
     voided = trial.status == "void" and trial.values is not None
     return row | ({"restore": meant(trial)} if voided and restorable(state, trial.id) else {})
@@ -135,14 +135,14 @@ def _row(state: LiveSession, trial: Trial, width: int) -> dict[str, Any]:
 def _remark(state: LiveSession, trial: Trial) -> str:
     """Whether it does not count, and why; and how often it was presented."""
     reason = str((trial.voided or {}).get("reason", ""))
-    gone = {
+    status = {
         "void": "void",
         "left out": "left out",
         "undone": "answer taken back",
         "dropped": "not asked: an earlier answer changed",
         "pending": "now",
     }.get(trial.status)
-    words = [f"{gone}: {reason}" if gone and reason else gone] if gone else []
+    words = [f"{status}: {reason}" if status and reason else status] if status else []
     words += [f"repeats {place_of(state.trial(trial.repeats))}"] if trial.repeats is not None else []
     words += [f"presented {trial.presentation} times"] if trial.presentation > 1 else []
     words += ["to be repeated"] if trial.id in state.wanted else []

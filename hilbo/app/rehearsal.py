@@ -173,13 +173,13 @@ def rehearse(
     try:
         with server(*arguments, "--device", finger.port) as (_, links), browser() as program:
             say("in session")
-            found = _session(program, links, Decider(study, population, seed), finger, out, say)
-        found["log"] = links["log"]
-        found["events"] = len(read_log(links["log"], study)[1])
+            summary = _session(program, links, Decider(study, population, seed), finger, out, say)
+        summary["log"] = links["log"]
+        summary["events"] = len(read_log(links["log"], study)[1])
     finally:
         finger.close()
-    (out / "result.json").write_text(json.dumps(found, indent=2), encoding="utf-8")
-    return found
+    (out / "result.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
+    return summary
 
 
 def _plan(study, population, out, phase, seed) -> Path:

@@ -92,7 +92,7 @@ class Gate:
         """The role whose key is in some bytes of a connection, before anything has read them as HTTP; of two the
         experimenter's."""
         shown = (itertools.islice(pattern.finditer(data), _KEYS) for pattern in self._shown)
-        keys = [found[1].decode() for found in itertools.chain.from_iterable(shown)]
+        keys = [match[1].decode() for match in itertools.chain.from_iterable(shown)]
         return next((role for role in reversed(get_args(Role)) for key in keys if self.admits(role, key)), None)
 
     def refuses(self, headers: Mapping[str, str], *, changes: bool, cookie: bool) -> str | None:
@@ -127,20 +127,20 @@ def _digest(text: str) -> str:
 def _kept(file: Path | None) -> dict[Role, str]:
     """The digests in a file of keys; none where it is missing or damaged, and everybody is invited again."""
     try:
-        found = json.loads(file.read_text(encoding="utf-8")) if file else {}
+        digests = json.loads(file.read_text(encoding="utf-8")) if file else {}
     except (OSError, ValueError):
         return {}
-    if not isinstance(found, dict):
+    if not isinstance(digests, dict):
         return {}
-    return {role: found[role] for role in get_args(Role) if isinstance(found.get(role), str)}
+    return {role: digests[role] for role in get_args(Role) if isinstance(digests.get(role), str)}
 
 
 def lan_addresses() -> list[str]:
     """Addresses of this computer in its networks, the one towards other networks first; no packet is sent."""
-    found = []
+    addresses = []
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe, contextlib.suppress(OSError):
         probe.connect(("192.0.2.1", 9))  # reserved for documentation
-        found.append(probe.getsockname()[0])
+        addresses.append(probe.getsockname()[0])
     with contextlib.suppress(OSError):
-        found += [info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
-    return [str(address) for address in dict.fromkeys(found) if not str(address).startswith("127.")]
+        addresses += [info[4][0] for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)]
+    return [str(address) for address in dict.fromkeys(addresses) if not str(address).startswith("127.")]

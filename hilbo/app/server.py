@@ -161,12 +161,12 @@ def _join(hub, gate):
         if gate.asked_for(message.token) == "stimulus" and not message.bearer:
             return _error(400, "This link is for a program that presents, not for a browser; give it to the program.")
         try:
-            found = gate.redeem(message.token)
+            granted = gate.redeem(message.token)
         except InputError as error:
             return _error(503, str(error))
-        if found is None:
+        if granted is None:
             return _error(401, "This link has been used, or is not of this session; ask for a new one.")
-        role, key = found
+        role, key = granted
         hub.watchers.end(role)
         if message.bearer:
             return JSONResponse({"role": role, "key": key})
@@ -193,7 +193,7 @@ def _for(hub, gate):
             except LogError as error:
                 return _json({"error": str(error)}, 503)
             except OverError as error:
-                return _json({"error": str(error), **error.told}, 409)
+                return _json({"error": str(error), **error.standing}, 409)
             except NotNowError as error:
                 return _json({"error": str(error), "view": hub.view(role)}, 409)
             except InputError as error:
@@ -209,23 +209,23 @@ async def _view(hub, role, _request) -> Response:
 
 
 async def _map(hub, _role, _request) -> Response:
-    found = await hub.map()
-    return _error(404, "This session has no map.") if found is None else _json(found)
+    slices = await hub.map()
+    return _error(404, "This session has no map.") if slices is None else _json(slices)
 
 
-def _json_of(found):
+def _json_of(content):
     """A handler of what is found in a hub."""
 
     async def handle(hub, _role, _request) -> Response:
-        return _json(await found(hub))
+        return _json(await content(hub))
 
     return handle
 
 
 async def _answer(hub, role, request) -> Response:
     message = messages.read(messages.Answer, await _body(request))
-    found = await hub.answer(message, _page_of(request))
-    return _json(found | {"view": hub.view(role)})
+    accepted = await hub.answer(message, _page_of(request))
+    return _json(accepted | {"view": hub.view(role)})
 
 
 async def _press(hub, role, request) -> Response:
@@ -282,12 +282,12 @@ async def _stream(hub, role, page) -> AsyncIterator[bytes]:
 
 async def _body(request) -> bytes:
     """The body, or as much of it as shows that it is too large."""
-    found = b""
+    body = b""
     async for part in request.stream():
-        found += part
-        if len(found) > messages.LARGEST:
+        body += part
+        if len(body) > messages.LARGEST:
             break
-    return found
+    return body
 
 
 def _bearer(request) -> str | None:

@@ -35,7 +35,7 @@ class StimulusCheck:
     def __init__(self, study: AnyStudy, patience: float):
         self.rig = StimulusRig(study, "check")
         self.watchers = Watchers(lambda: "")
-        self.found: Measured | None = None
+        self.measured: Measured | None = None
         self._study, self._patience = study, patience
         self._done: Callable[[], Any] = lambda: None
         self._task: asyncio.Task | None = None
@@ -69,7 +69,7 @@ class StimulusCheck:
                 await self.rig.clear()
         except (RuntimeError, InputError) as error:
             why = str(error)
-        self.found = Measured(self.rig.words, tuple(presented), tuple(stopped), why)
+        self.measured = Measured(self.rig.words, tuple(presented), tuple(stopped), why)
         await asyncio.sleep(0.1)  # so that the program hears the last order
         self._done()
 

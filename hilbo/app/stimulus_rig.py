@@ -36,10 +36,10 @@ _PART = 3  # a question is held for so small a part of the silence that is borne
 class OverError(InputError):
     """A report that is not taken, and not because it was not understood: it came late, twice, or from another run.
 
-    `told`: the order that stands, where the run is the right one.
+    `standing`: the order that stands, where the run is the right one.
     """
 
-    told: Mapping[str, Any] = {}
+    standing: Mapping[str, Any] = {}
 
 
 class Order(NamedTuple):
@@ -105,7 +105,7 @@ class StimulusRig:
         self._give("stop")
         self._heard()
         return {"run": self._run, "silence_s": self._table.silence, "within_s": self._table.within,
-                "study": self._study.name, "parameters": self._parameters(), **self._told()}  # fmt: skip
+                "study": self._study.name, "parameters": self._parameters(), **self._order_message()}  # fmt: skip
 
     async def report(self, report: Report) -> dict[str, Any]:
         """What the program says; the newest order, as soon as there is one that it does not know, or it has waited.
@@ -118,14 +118,14 @@ class StimulusRig:
         try:
             self._take(report)
         except OverError as error:
-            self._refused, error.told = str(error), self._told()
+            self._refused, error.standing = str(error), self._order_message()
             self._see(self.snapshot)
             raise
         wait = min(report.wait_s, self._table.silence / _PART)
         if report.order == self.order.number and wait and not self._ended:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._news.wait(), wait)
-        return self._told()
+        return self._order_message()
 
     def _take(self, report: Report) -> None:
         """What a report says of the present order, and of contact."""
@@ -208,7 +208,7 @@ class StimulusRig:
         self._give("present", showing, name)
         self._see(self.snapshot._replace(state="RUNNING"))
         try:
-            found = await asyncio.wait_for(self._asked, self._table.within)
+            confirmed = await asyncio.wait_for(self._asked, self._table.within)
         except TimeoutError:
             self._give("neutral")
             raise MissedError(f"late: nothing was confirmed within {self._table.within:g} s") from None
@@ -217,7 +217,7 @@ class StimulusRig:
             raise
         finally:
             self._asked = None
-        return None if showing.values is None else found
+        return None if showing.values is None else confirmed
 
     async def blank(self) -> None:
         """Nothing is shown while somebody answers."""
@@ -342,14 +342,14 @@ class StimulusRig:
             for p in self._study.space.parameters
         ]
 
-    def _told(self) -> dict[str, Any]:
+    def _order_message(self) -> dict[str, Any]:
         """The order, as it is sent."""
         order, showing = self.order, self.order.showing
-        found: dict[str, Any] = {"order": order.number, "do": order.do}
+        message: dict[str, Any] = {"order": order.number, "do": order.do}
         if showing is None:
-            return found
+            return message
         rendering = showing.values is not None
-        return found | {
+        return message | {
             "trial": order.trial,
             "step": showing.step,
             "show": "test" if rendering else showing.show,

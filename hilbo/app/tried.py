@@ -42,20 +42,20 @@ class Tried:
         study's unit and on [0, 1]. Without slices while they are being prepared, or before the last answer."""
         if hub.state.screen not in ("done", "ended"):
             raise InputError("The map is shown after the last answer.")
-        found = await hub.map()
-        if not found:
+        slices = await hub.map()
+        if not slices:
             return {}
-        best = {s[axis]: s["best"][i] for s in found["slices"] for i, axis in enumerate(("across", "up"))}
-        return found | {"parameters": [self._compared(i, best) for i in range(self._study.space.dim)]}
+        best = {s[axis]: s["best"][i] for s in slices["slices"] for i, axis in enumerate(("across", "up"))}
+        return slices | {"parameters": [self._compared(i, best) for i in range(self._study.space.dim)]}
 
     def _compared(self, i: int, best: Mapping[str, float]) -> dict[str, Any]:
         parameter = self._study.space.parameters[i]
-        hidden, found = self._reference[parameter.name], best[parameter.name]
+        hidden, optimum = self._reference[parameter.name], best[parameter.name]
         return {
             "name": parameter.name, "unit": parameter.unit, "scale": parameter.scale,
             "low": parameter.low, "high": parameter.high,
             "hidden": hidden, "hidden_unit": float(parameter.to_unit(np.asarray(hidden))),
-            "found": float(parameter.to_physical(np.asarray(found))), "found_unit": found,
+            "optimum": float(parameter.to_physical(np.asarray(optimum))), "optimum_unit": optimum,
         }  # fmt: skip
 
 

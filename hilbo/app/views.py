@@ -105,9 +105,9 @@ def _question(ask):
     return {"name": ask["name"], "text": ask["question"], "options": options}
 
 
-def _progress(found, text):
-    words = f"{text('warm_up')}: {found['text']}" if found["warm_up"] else found["text"]
-    return {"done": found["done"], "of": found["of"], "text": words}
+def _progress(progress, text):
+    words = f"{text('warm_up')}: {progress['text']}" if progress["warm_up"] else progress["text"]
+    return {"done": progress["done"], "of": progress["of"], "text": words}
 
 
 def experimenter(hub: Any) -> dict[str, Any]:
@@ -145,14 +145,14 @@ def experimenter(hub: Any) -> dict[str, Any]:
 
 def _banners(hub) -> list[str]:
     """What this session is not: nobody shall take a rehearsal for one that counts."""
-    header, found = hub.state.header, []
+    header, banners = hub.state.header, []
     if header.dry_run:
-        found.append("Dry run: nobody takes part, and no table has these answers")
+        banners.append("Dry run: nobody takes part, and no table has these answers")
     if hub.rig.simulated:
-        found.append("Simulated device: nothing moves")
+        banners.append("Simulated device: nothing moves")
     if header.unblinded:
-        found.append("Unblinded: the participant was shown the parameters")
-    return found
+        banners.append("Unblinded: the participant was shown the parameters")
+    return banners
 
 
 def _phase_words(hub, trial):
@@ -231,19 +231,22 @@ def _device(hub):
 
 def _may(hub):
     state, seen = hub.state, hub.rig.snapshot
-    found = ["note", "invite"] + ([] if seen.lost else ["estop"])
+    actions = ["note", "invite"] + ([] if seen.lost else ["estop"])
     if seen.state in ("HOLD", "ESTOP") and not seen.lost:
-        found.append("clear")
+        actions.append("clear")
     if state.screen in ("ended",):
-        return found
-    found += ["resume"] if state.screen in ("paused", "ready", "rest") else ["pause"] if state.screen != "done" else []
+        return actions
+    if state.screen in ("paused", "ready", "rest"):
+        actions.append("resume")
+    elif state.screen != "done":
+        actions.append("pause")
     answered = any(t.status == "answered" for t in state.trials)
     begun = state.pending is not None and state.pending.step is not None
-    found += ["repeat"] if begun else []
-    found += ["undo"] if answered else []
-    found += ["void"] if answered or begun else []
-    found += ["skip"] if skippable(state) else []
-    return [*found, "abort"]
+    actions += ["repeat"] if begun else []
+    actions += ["undo"] if answered else []
+    actions += ["void"] if answered or begun else []
+    actions += ["skip"] if skippable(state) else []
+    return [*actions, "abort"]
 
 
 def map_version(state: LiveSession) -> str:
@@ -256,7 +259,7 @@ def map_version(state: LiveSession) -> str:
 def seconds_of(text: str) -> float | None:
     """A browser's time in s since the epoch; None if it is not one."""
     try:
-        found = datetime.fromisoformat(text).timestamp()
+        seconds = datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError):
         return None
-    return found if math.isfinite(found) else None
+    return seconds if math.isfinite(seconds) else None

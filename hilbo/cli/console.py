@@ -150,7 +150,7 @@ class Say:
 
     def __init__(self, console: Any, status: Any):
         self._console, self._status, self._pace = console, status, _Pace()
-        self.told: list[str] = []
+        self.printed: list[str] = []
 
     def __call__(self, text: str, done: int | None = None, people: int | None = None) -> None:
         line, new = self._pace.line(text, done, people, time.perf_counter())
@@ -161,7 +161,7 @@ class Say:
 
     def tell(self, sentences: list[str]) -> None:
         """Results that are known before the others; they stay on a terminal too."""
-        self.told += sentences
+        self.printed += sentences
         for sentence in sentences:
             self._console.print(sentence)
 
@@ -183,7 +183,7 @@ class _Pace:
     """The words for work that goes by participants: how many are done, and how long the others will take."""
 
     def __init__(self) -> None:
-        self.text, self.done, self.first, self.told = "", 0, (0, 0.0), -math.inf
+        self.text, self.done, self.first, self.last_shown = "", 0, (0, 0.0), -math.inf
 
     def line(self, text: str, done: int | None, people: int | None, now: float) -> tuple[str, bool]:
         """The line, and whether it is news where there is no line that changes."""
@@ -192,23 +192,23 @@ class _Pace:
             return text, True
         if text != self.text or done < self.done:  # the first report has the compilation in it, and tells no pace
             again = text == self.text
-            self.text, self.first, self.told = text, (done, now), self.told if again else -math.inf
+            self.text, self.first, self.last_shown = text, (done, now), self.last_shown if again else -math.inf
         self.done = done
         done_before, time_before = self.first
         line = f"{done:,} {text}" if people is None else f"{done:,} of {people:,} {text}"
         if people is not None and done_before < done < people:
             left = round((now - time_before) / (done - done_before) * (people - done))
             line += f", {left // 60}:{left % 60:02d} left"
-        if now - self.told < _EVERY:
+        if now - self.last_shown < _EVERY:
             return line, False
-        self.told = now
+        self.last_shown = now
         return line, True
 
 
-def finish(content: dict[str, Any], out: Path, as_json: bool, told: Collection[str] = ()) -> None:
+def finish(content: dict[str, Any], out: Path, as_json: bool, printed: Collection[str] = ()) -> None:
     """The last words of a command: warnings that were not told before, then result.json or the way to the report."""
     for warning in content.get("warnings", []):
-        if warning not in told:
+        if warning not in printed:
             remark(warning)
     if as_json:
         with (out / "result.json").open(encoding="utf-8") as file:

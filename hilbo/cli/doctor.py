@@ -274,14 +274,14 @@ def stimulus_checks(path: Path, port: int, patience: float = _JOINS) -> Iterator
         check.begin(stop)
 
     serve.serve(place, check, started)
-    found = check.found
-    if found is None or found.why:
-        why = "nothing was measured" if found is None else found.why
+    measured = check.measured
+    if measured is None or measured.why:
+        why = "nothing was measured" if measured is None else measured.why
         yield Check("the program's stop", "bad", why, "fix the program; docs/guides/stimulus.md has what it has to say")
         return
-    for name, times in (("renderings", found.presented), ("the program's stop", found.stopped)):
+    for name, times in (("renderings", measured.presented), ("the program's stop", measured.stopped)):
         slowest = f"{len(times)} times, the slowest after {1000 * max(times):.0f} ms"
-        yield Check(name, "good", f"{found.words.rpartition(', stopped')[0]}: {slowest}")
+        yield Check(name, "good", f"{measured.words.rpartition(', stopped')[0]}: {slowest}")
 
 
 def _loopback(device: Any) -> Check:

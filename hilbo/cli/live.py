@@ -174,12 +174,12 @@ def doctor(
         raise InputError("--stimulus: name the study whose renderings the program presents.")
     results = []
     marks = {"good": "ok  ", "note": "note", "bad": "BAD "}
-    found = checks(study, line.open, logs, port, start)
+    to_check = checks(study, line.open, logs, port, start)
     if stimulus:
         need_extra()
         assert study is not None  # looked at above
-        found = itertools.chain(found, stimulus_checks(study, port))
-    for check in found:
+        to_check = itertools.chain(to_check, stimulus_checks(study, port))
+    for check in to_check:
         results.append(check)
         fix = f"\n       -> {check.fix}" if check.fix else ""
         print(f"{marks[check.level]}  {check.name}: {check.words}{fix}", file=sys.stderr, flush=True)

@@ -148,7 +148,7 @@ def aggregate(
         else:
             content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say)
     if team.writes:
-        finish(content, out, as_json, say.told)
+        finish(content, out, as_json, say.printed)
 
 
 @app.command()
@@ -176,7 +176,7 @@ def simulate(
         return
     with results(out, force) as folder, progress() as say:
         content = _simulate(preset, study, participants, seed, folder, say)
-    finish(content, out, as_json, say.told)
+    finish(content, out, as_json, say.printed)
 
 
 @app.command()
@@ -283,11 +283,11 @@ def _aggregate(study, cohort, folder, seed, say, truth=None, compare=False, sele
 
     with ThreadPoolExecutor(1) as other_core:
 
-        def told(sentences):
+        def report_early(sentences):
             say.tell(sentences)
             other_core.submit(list, map(importlib.import_module, _DRAW_AND_WRITE))
 
-        population = analyse_population(study, cohort, seed, say, told)
+        population = analyse_population(study, cohort, seed, say, report_early)
     from hilbo.report.results import write_results
 
     beside: dict[str, Any] = {}

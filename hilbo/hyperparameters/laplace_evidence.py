@@ -76,12 +76,12 @@ def conditioned(matrix: Float[Array, "n n"], curvature: Float[Array, " n"]) -> C
 def certified(
     value: Float[Array, ""],
     matrix: Float[Array, "n n"],
-    found: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]],
+    at_mode: tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]],
     post: Conditioned,
     curvature_at: Callable[[Float[Array, " n"]], Float[Array, " n"]],
 ) -> Bool[Array, ""]:
-    """Whether the evidence is known and no variance is below its rounding; `found`: mode, weights and curvatures."""
-    eta, weights, curvature = found
+    """Whether the evidence is known and no variance is below its rounding; `at_mode`: mode, weights and curvatures."""
+    eta, weights, curvature = at_mode
     largest = jnp.max(jnp.diagonal(matrix))
     smallest = jnp.min(jnp.where(curvature > 0, post.variance, largest))
     resolved = smallest >= jnp.finfo(value.dtype).eps * largest * eta.size**0.5

@@ -98,7 +98,7 @@ def _estimates(best_fit: Fit, sides: intervals.Intervals, sampling: intervals.Sp
     """Every parameter and coordinate by name: coordinates from their profiles, the others by `_quantiles`."""
     model, labels, held = best_fit.model, best_fit.model.labels, np.asarray(best_fit.held())
     open_lower, open_upper = np.asarray(sides.open_lower), np.asarray(sides.open_upper)
-    ok = np.asarray(sides.found) & np.isfinite(np.asarray(sides.lower)) & np.isfinite(np.asarray(sides.upper))
+    ok = np.asarray(sides.bracketed) & np.isfinite(np.asarray(sides.lower)) & np.isfinite(np.asarray(sides.upper))
     value, lower, upper = (np.asarray(model.natural(q)) for q in (best_fit.q, sides.lower, sides.upper))
     estimates = {}
     for j, name in enumerate(labels):

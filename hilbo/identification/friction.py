@@ -98,10 +98,10 @@ def _sweep(x: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], tick: flo
     return Sweep(float(mean_force), float(velocity), float(acceleration), period)
 
 
-def friction(found: Sequence[Sweep], seed: int = 0) -> Friction:
+def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
     """Least squares over the sweeps, with intervals by a bootstrap over periods. Raises `InputError` for too few."""
-    values = np.array([[s.force, s.velocity, s.acceleration] for s in found])
-    periods, period = np.unique([s.period for s in found], return_inverse=True)
+    values = np.array([[s.force, s.velocity, s.acceleration] for s in sweeps])
+    periods, period = np.unique([s.period for s in sweeps], return_inverse=True)
     if periods.size < _FEWEST or np.unique(np.abs(values[:, 1]).round(0)).size < 2:
         raise InputError(
             f"There are {periods.size} periods of sweeps; at least {_FEWEST}, at two speeds or more, tell damping from"
@@ -123,4 +123,4 @@ def friction(found: Sequence[Sweep], seed: int = 0) -> Friction:
     lower, upper = best - wide * (np.quantile(estimates, [0.975, 0.025], axis=0) - best)
     mass, damping, coulomb, constant = (Interval(*map(float, row)) for row in zip(best, lower, upper, strict=True))
     left = values[:, 0] - ways @ best
-    return Friction(damping, coulomb, mass, constant, float(left.std(ddof=4)), len(found), int(periods.size))
+    return Friction(damping, coulomb, mass, constant, float(left.std(ddof=4)), len(sweeps), int(periods.size))

@@ -69,14 +69,15 @@ class Intervals(eqx.Module):
     """An interval for each coordinate.
 
     `open_*` says that the data set no end on that side before the box does (the number there is the box's bound).
-    `found` is False where the search failed; `lowest` is the lowest cost met: below the fit's, the fit was no minimum.
+    `bracketed` is False where the search failed; `lowest` is the lowest cost met: below the fit's, the fit was no
+    minimum.
     """
 
     lower: Float[Array, " p"]
     upper: Float[Array, " p"]
     open_lower: Bool[Array, " p"]
     open_upper: Bool[Array, " p"]
-    found: Bool[Array, " p"]
+    bracketed: Bool[Array, " p"]
     lowest: Float[Array, ""]
     lowest_q: Float[Array, " p"]
 
@@ -154,10 +155,10 @@ def _profile(fit: Fit, sampling: Spread) -> Intervals:
     # One after the other: together, all would wait for the slowest.
     ends = jax.lax.map(lambda j_and_sign: _end(fit, sampling, *j_and_sign), (which, side))
     place, open_, done = (leaf.reshape(size, 2) for leaf in (ends.place, ends.open, ends.done))
-    found_both = jnp.all(done & jnp.isfinite(place), axis=1)
+    both_bracketed = jnp.all(done & jnp.isfinite(place), axis=1)
     lower, upper = fit.q - place[:, 0], fit.q + place[:, 1]
     best = jnp.argmin(ends.lowest)
-    return Intervals(lower, upper, open_[:, 0], open_[:, 1], found_both, ends.lowest[best], ends.lowest_q[best])
+    return Intervals(lower, upper, open_[:, 0], open_[:, 1], both_bracketed, ends.lowest[best], ends.lowest_q[best])
 
 
 def _end(fit: Fit, sampling: Spread, j: Int[Array, ""], sign: Float[Array, ""]) -> _Search:

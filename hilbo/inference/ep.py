@@ -71,7 +71,7 @@ def gaussian(
     covariance: Float[Array, "n n"],
     mean: Float[Array, " n"],
     variance: Float[Array, " n"],
-    found: Found,
+    cavities: Found,
 ) -> GaussianPosterior:
     """The posterior that belongs to the cavities `fixed_point` ended at."""
     _, slope, precision = terms(mean, variance)
@@ -88,10 +88,10 @@ def gaussian(
         root,
         lambda eta: terms(eta - cavity * weights, cavity)[2],
         jax.lax.stop_gradient(log_evidence),
-        residual=found.residual,
-        tolerance=found.tolerance,
-        iterations=found.iterations,
-        jitter=found.changed / jnp.max(jnp.diagonal(fixed[0])),
+        residual=cavities.residual,
+        tolerance=cavities.tolerance,
+        iterations=cavities.iterations,
+        jitter=cavities.changed / jnp.max(jnp.diagonal(fixed[0])),
         condition=condition,
     )
     return GaussianPosterior(covariance @ slope, slope, root, inverse, log_evidence, jax.lax.stop_gradient(certificate))

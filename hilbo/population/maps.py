@@ -200,8 +200,8 @@ def share_of(gp: OrdinalGP, trials: Trials, inference: str = "laplace", largest:
 
     def evidence(share):
         fitted = fit_counts(gp, share, counts)
-        found = fitted.certificate
-        return float(fitted.log_evidence), float(found.residual) <= float(found.tolerance)
+        certificate = fitted.certificate
+        return float(fitted.log_evidence), float(certificate.residual) <= float(certificate.tolerance)
 
     return share_from(evidence, trials.x.dtype)
 

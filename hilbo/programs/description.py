@@ -33,10 +33,10 @@ def describe(function: Callable, args: tuple, kwargs: dict[str, Any]) -> str:
 def name_of(what: Any) -> str:
     """Where a function or a class is found again. Raises `NotKeptError` where nothing, or another, is found there."""
     module, path = getattr(what, "__module__", None), getattr(what, "__qualname__", "")
-    found: Any = sys.modules.get(str(module))
+    named: Any = sys.modules.get(str(module))
     for part in path.split("."):
-        found = getattr(found, part, None)
-    if found is None or inspect.unwrap(found) is not inspect.unwrap(what):
+        named = getattr(named, part, None)
+    if named is None or inspect.unwrap(named) is not inspect.unwrap(what):
         raise NotKeptError(f"{module}.{path} is not found by its name")
     return f"{module}.{path}"
 

@@ -71,11 +71,11 @@ class Entries:
 
     def sizes(self) -> dict[Path, int]:
         """Bytes of each entry, that which was used longest ago first."""
-        found = []
+        entries = []
         for path in self.folder.glob(f"*{_SUFFIX}"):
             with contextlib.suppress(FileNotFoundError):  # another process drops it
-                found.append((path.stat().st_mtime_ns, path, path.stat().st_size))
-        return {path: size for _, path, size in sorted(found)}
+                entries.append((path.stat().st_mtime_ns, path, path.stat().st_size))
+        return {path: size for _, path, size in sorted(entries)}
 
     def clear(self) -> None:
         """Drop every entry."""
@@ -98,7 +98,7 @@ class Entries:
 def _private(path: Path) -> bool:
     """Whether it is this user's and nobody else may write to it; on Windows, whose rights are others, it is taken to be
     so in a user's own folder."""
-    found = path.lstat()
+    status = path.lstat()
     if os.name == "nt":
-        return not stat.S_ISLNK(found.st_mode)
-    return found.st_uid == os.geteuid() and not found.st_mode & 0o022 and not stat.S_ISLNK(found.st_mode)
+        return not stat.S_ISLNK(status.st_mode)
+    return status.st_uid == os.geteuid() and not status.st_mode & 0o022 and not stat.S_ISLNK(status.st_mode)

@@ -217,8 +217,8 @@ def write_results(
     write_map(data, folder / "map.nc")
     say("figures and report")
     pictures = save_figures(_figures(population, truth), folder) | (pictures or {})
-    told = {"how": in_place(aggregate.map), "halves": population.progress.splits}
-    page = results_page(study, content, pictures, people, selection=selection, comparison=comparison, **told)
+    shown = {"how": in_place(aggregate.map), "halves": population.progress.splits}
+    page = results_page(study, content, pictures, people, selection=selection, comparison=comparison, **shown)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content
 

@@ -82,8 +82,8 @@ def _radius(walls: Walls) -> tuple[float, Float[np.ndarray, " d"]]:
     normals, offsets = _with_cube(walls)
     goal = np.append(np.zeros(normals.shape[1]), -1.0)
     rows = np.column_stack([normals, np.linalg.norm(normals, axis=1)])
-    found = linprog(goal, A_ub=rows, b_ub=offsets, bounds=[(0, 1)] * normals.shape[1] + [(None, None)])
-    return (float(found.x[-1]), found.x[:-1]) if found.success else (-1.0, goal[:-1])
+    solution = linprog(goal, A_ub=rows, b_ub=offsets, bounds=[(0, 1)] * normals.shape[1] + [(None, None)])
+    return (float(solution.x[-1]), solution.x[:-1]) if solution.success else (-1.0, goal[:-1])
 
 
 def _with_cube(walls: Walls) -> tuple[Float[np.ndarray, "r d"], Float[np.ndarray, " r"]]:

@@ -259,8 +259,8 @@ class SearchSpace(eqx.Module):
     @property
     def _bounds_K1(self) -> tuple[Constraint, ...]:
         """The constraints on K1, with mechanics."""
-        found = [c for c in self.constraints if any(name == "K1" and weight for name, weight in c.terms)]
-        return () if self.mechanics is None else tuple(found)
+        bounds = [c for c in self.constraints if any(name == "K1" and weight for name, weight in c.terms)]
+        return () if self.mechanics is None else tuple(bounds)
 
     def _index(self, name: str) -> int:
         return self.names.index(name)
@@ -388,11 +388,11 @@ def _take_feasible(
 
 
 def _enough(
-    space: SearchSpace, count: int, kept: list[Float[np.ndarray, "_ d"]], found: int, tried: int
+    space: SearchSpace, count: int, kept: list[Float[np.ndarray, "_ d"]], taken: int, tried: int
 ) -> Float[np.ndarray, "count d"]:
     """The points that were taken. Raises `InputError` for fewer than `count`."""
-    if found < count:
-        left = f"{found} of {tried} {'points' if space.mechanics is None else 'passive points'}, too few to search"
+    if taken < count:
+        left = f"{taken} of {tried} {'points' if space.mechanics is None else 'passive points'}, too few to search"
         if space.constraints:
             raise InputError(f"constraints leave {left}; widen them.")
         raise InputError(f"renderer.effective_damping leaves {left}; widen it.")

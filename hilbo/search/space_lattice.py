@@ -48,11 +48,11 @@ def _steep_wall(space, levels):
         (high.T, COLUMNS, ROWS, ("alpha", "B1")),
         (high, ROWS, COLUMNS, ("B1", "alpha")),
     ):
-        at = np.abs(lines[:, None] - levels[None, :]).argmin(axis=0)
-        line, place = crossings(table[at], positions, rises)
-        found = np.ones((len(line), 3))
-        found[:, [space.names.index(name) for name in names]] = np.stack([lines[at][line], place], axis=1)
-        points = np.concatenate([points, found])
+        rows = np.abs(lines[:, None] - levels[None, :]).argmin(axis=0)
+        line, place = crossings(table[rows], positions, rises)
+        wall = np.ones((len(line), 3))
+        wall[:, [space.names.index(name) for name in names]] = np.stack([lines[rows][line], place], axis=1)
+        points = np.concatenate([points, wall])
     low, high = _ends_of(space, points)
     points[:, space.names.index("K1")] = high
     return points[high > low]

@@ -81,22 +81,22 @@ def propose(state: LiveSession, chooser: Chooser, at: float) -> Event:
         "planned": need.planned,
         "repeats": need.repeats,
     }
-    found = chooser.choose(state, need)
-    for name, value in ((n, v) for values in found["renderings"].values() for n, v in values.items()):
+    choice = chooser.choose(state, need)
+    for name, value in ((n, v) for values in choice["renderings"].values() for n, v in values.items()):
         if not math.isfinite(value):
             raise InputError(f"the next rendering is no number ({name} is {value}); undo or void the last answer.")
-    return _event(state, "propose", at, **data, **found)
+    return _event(state, "propose", at, **data, **choice)
 
 
 def sent(state: LiveSession, trial: int, side: str, at: float, **facts) -> Event:
     """A rendering is in force, as a device says (`facts`: its CRC, what it read back, times), or as the program that
     presents it does (`values`: parameter -> physical unit). Raises RefusedError for values that are too far off."""
-    found = _live(state, trial)
-    if side not in found.renderings:
+    pending = _live(state, trial)
+    if side not in pending.renderings:
         raise RefusedError("bad-answer", f'trial {trial} has no side "{side}".')
     if state.study.stimulus is not None:
-        here = study_of(state.study, state.header.blocks[found.block].material)
-        check_confirmed(here, found.renderings[side], facts.get("values"))
+        here = study_of(state.study, state.header.blocks[pending.block].material)
+        check_confirmed(here, pending.renderings[side], facts.get("values"))
     return _event(state, "sent", at, id=trial, side=side, **facts)
 
 
@@ -105,14 +105,14 @@ def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> E
     program has not confirmed.
     Raises `RefusedError` for these, and for a step that the trial does not have. `at`: time in s.
     """
-    found = _live(state, trial)
+    pending = _live(state, trial)
     if on and state.screen != "trial":
         raise RefusedError("paused", f"no step of trial {trial} begins now: the screen shows {state.screen}.")
-    steps = steps_of(state, found)
+    steps = steps_of(state, pending)
     if not 0 <= step < len(steps):
         raise RefusedError("bad-answer", f"trial {trial} has {len(steps)} steps, none with the number {step}.")
     show = steps[step][0]
-    if on and state.study.stimulus is not None and show in found.renderings and show not in found.confirmed:
+    if on and state.study.stimulus is not None and show in pending.renderings and show not in pending.confirmed:
         raise RefusedError("unconfirmed", f'nobody has confirmed that side "{show}" of trial {trial} is presented.')
     return _event(state, "stimulus", at, id=trial, step=step, show=show, on=bool(on))
 
@@ -140,21 +140,21 @@ def answer(
     """
     if not isinstance(trial, int) or isinstance(trial, bool) or not isinstance(client, str) or not client:
         raise RefusedError("bad-answer", "an answer needs the number of its trial and the id of its client.")
-    found = state.trial(trial)
-    if found.values is not None:
-        if found.client == client and found.values == values:
+    asked = state.trial(trial)
+    if asked.values is not None:
+        if asked.client == client and asked.values == values:
             return None
-        if found.client == client:
+        if asked.client == client:
             raise RefusedError("answered", f"trial {trial} is answered otherwise already; the first answer counts.")
         raise RefusedError("answered", f"trial {trial} is answered already, from another page.")
-    if found.status != "pending":
-        code = "voided" if found.status == "void" else "old-trial"
-        raise RefusedError(code, f"trial {trial} is over ({found.status}); the next one will be shown.")
+    if asked.status != "pending":
+        code = "voided" if asked.status == "void" else "old-trial"
+        raise RefusedError(code, f"trial {trial} is over ({asked.status}); the next one will be shown.")
     if state.aborted is not None:
         raise RefusedError("over", "the session has ended.")
-    if felt and found.felt != frozenset(found.renderings):
+    if felt and asked.felt != frozenset(asked.renderings):
         raise RefusedError("unfelt", f"trial {trial} has not been felt yet.")
-    _check_values(state, found, values)
+    _check_values(state, asked, values)
     return _event(state, "answer", at, id=trial, client=client, values=dict(values), browser=_times(browser))
 
 
@@ -174,12 +174,12 @@ def repeat(state: LiveSession, at: float, trial: int | None = None) -> Event:
     Raises `RefusedError` if there is none, or if it is a repetition itself.
     """
     _running(state)
-    found = state.pending if trial is None else state.trial(trial)
-    if found is None or found.status not in ("pending", "answered"):
+    repeated = state.pending if trial is None else state.trial(trial)
+    if repeated is None or repeated.status not in ("pending", "answered"):
         raise RefusedError("nothing", "there is no trial to repeat.")
-    if found.repeats is not None and found.status == "answered":
-        raise RefusedError("nothing", f"trial {found.id} is a repetition itself; repeat trial {found.repeats}.")
-    return _event(state, "repeat", at, id=found.id)
+    if repeated.repeats is not None and repeated.status == "answered":
+        raise RefusedError("nothing", f"trial {repeated.id} is a repetition itself; repeat trial {repeated.repeats}.")
+    return _event(state, "repeat", at, id=repeated.id)
 
 
 def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
@@ -188,19 +188,19 @@ def void(state: LiveSession, trial: int, reason: str, at: float) -> Event:
     Raises `RefusedError` if it does not count already.
     """
     _running(state)
-    found = state.trial(trial)
-    if found.status not in ("pending", "answered"):
-        raise RefusedError("nothing", f"trial {trial} is {found.status} already.")
+    voided = state.trial(trial)
+    if voided.status not in ("pending", "answered"):
+        raise RefusedError("nothing", f"trial {trial} is {voided.status} already.")
     return _event(state, "void", at, id=trial, reason=_text(reason))
 
 
 def restore(state: LiveSession, trial: int, at: float) -> Event:
     """A voided answer shall count after all. Raises RefusedError if its place has been filled."""
     _running(state)
-    found = state.trial(trial)
-    if found.status != "void" or found.values is None:
+    voided = state.trial(trial)
+    if voided.status != "void" or voided.values is None:
         raise RefusedError("nothing", f"trial {trial} has no voided answer.")
-    if _filled(state, found):
+    if _filled(state, voided):
         raise RefusedError("nothing", f"the place of trial {trial} has been filled by another one.")
     return _event(state, "restore", at, id=trial)
 
@@ -208,10 +208,10 @@ def restore(state: LiveSession, trial: int, at: float) -> Event:
 def skip(state: LiveSession, reason: str, at: float, trial: int | None = None) -> Event:
     """The pending planned trial is left out for good: one that the device has stopped twice. Raises RefusedError."""
     _running(state)
-    found = skippable(state)
-    if found is None or trial not in (None, found.id):
+    skipped = skippable(state)
+    if skipped is None or trial not in (None, skipped.id):
         raise RefusedError("nothing", "only a planned trial that the device has stopped twice can be left out.")
-    return _event(state, "skip", at, id=found.id, reason=_text(reason))
+    return _event(state, "skip", at, id=skipped.id, reason=_text(reason))
 
 
 def skippable(state: LiveSession) -> Trial | None:
@@ -221,16 +221,16 @@ def skippable(state: LiveSession) -> Trial | None:
     return trial if good else None
 
 
-def _filled(state: LiveSession, found: Trial) -> bool:
+def _filled(state: LiveSession, trial: Trial) -> bool:
     """Whether another answer counts in the place of a voided one."""
-    if found.repeats is not None:
+    if trial.repeats is not None:
         pending = state.pending
-        waits = found.repeats in state.wanted or (pending is not None and pending.repeats == found.repeats)
-        return bool(found.voided and found.voided.get("asked_again")) and not waits
-    others = state.answers(found.block)
-    if found.planned is not None:
-        return len(others) >= state.quota(found.block) or any(t.planned == found.planned for t in others)
-    return len(others) >= state.quota(found.block) or any(t.renderings == found.renderings for t in others)
+        waits = trial.repeats in state.wanted or (pending is not None and pending.repeats == trial.repeats)
+        return bool(trial.voided and trial.voided.get("asked_again")) and not waits
+    others = state.answers(trial.block)
+    if trial.planned is not None:
+        return len(others) >= state.quota(trial.block) or any(t.planned == trial.planned for t in others)
+    return len(others) >= state.quota(trial.block) or any(t.renderings == trial.renderings for t in others)
 
 
 def restorable(state: LiveSession, trial: int) -> bool:
@@ -343,10 +343,10 @@ def _running(state):
 
 
 def _live(state, id):
-    found = state.trial(id)
-    if found.status != "pending":
-        raise RefusedError("old-trial", f"trial {id} is {found.status}.")
-    return found
+    trial = state.trial(id)
+    if trial.status != "pending":
+        raise RefusedError("old-trial", f"trial {id} is {trial.status}.")
+    return trial
 
 
 def _times(browser):

@@ -63,7 +63,7 @@ def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> li
     """
     rng = np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 2]))
     ways = [_ways(repeats, offset, rng) for offset in rng.permutation(len(pairs))]
-    found: list[Comparison] = []
+    planned: list[Comparison] = []
     last = -1
     for turn in range(repeats):
         order = rng.permutation(len(pairs))
@@ -73,8 +73,8 @@ def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> li
         for k in order:
             swapped, first = ways[k][turn]
             a, b = pairs[k][::-1] if swapped else pairs[k]
-            found.append((a, b, first))
-    return found
+            planned.append((a, b, first))
+    return planned
 
 
 def _ways(repeats, start, rng):

@@ -227,8 +227,8 @@ def _parsed(content, path):
 
 
 def _checked(line, number, previous, path):
-    found = _CRC.search(line)
-    if found is None or int(found[1], 16) != zlib.crc32(line[: found.start()]):
+    checksum = _CRC.search(line)
+    if checksum is None or int(checksum[1], 16) != zlib.crc32(line[: checksum.start()]):
         raise InputError(f"{path}:{number}: is damaged; restore the file from a copy, nothing after it can be trusted.")
     raw = decoded(line, _Line, f"{path}:{number}", _WHAT)
     if raw.seq != number - 1 or raw.previous != _hash(previous):

@@ -42,21 +42,21 @@ class _Explanation(NamedTuple):
 
 def explained(study: Study, posterior: Posterior, choice: Choice) -> dict[str, Any]:
     """`renderings` and `choice` of a proposal's data."""
-    found: _Explanation = jax.device_get(_explanation(study, posterior, np.asarray(choice.point)))
+    predicted: _Explanation = jax.device_get(_explanation(study, posterior, np.asarray(choice.point)))
     parameters = dict(zip(study.space.names, np.asarray(choice.point).tolist(), strict=True))
-    mean, sd = float(found.mean), math.sqrt(found.variance) if found.variance >= 0 else math.nan
-    figures = {f.name: getattr(found.certificate, f.name).item() for f in dataclasses.fields(found.certificate)}
+    mean, sd = float(predicted.mean), math.sqrt(predicted.variance) if predicted.variance >= 0 else math.nan
+    figures = {f.name: getattr(predicted.certificate, f.name).item() for f in dataclasses.fields(predicted.certificate)}
     words = {
         "by": choice.by,
-        "unit": found.unit.tolist(),
+        "unit": predicted.unit.tolist(),
         "mean": mean,
         "sd": sd,
         "score": mean + study.selection.weight * sd if choice.by.startswith("ucb") else None,
-        "probabilities": dict(zip(study.responses, found.probabilities.tolist(), strict=True)),
-        "margin": None if found.margin is None else float(found.margin),
+        "probabilities": dict(zip(study.responses, predicted.probabilities.tolist(), strict=True)),
+        "margin": None if predicted.margin is None else float(predicted.margin),
         "certificate": figures,
     }
-    derived = {name: float(value) for name, value in found.derived.items()}
+    derived = {name: float(value) for name, value in predicted.derived.items()}
     return {"renderings": {"a": parameters | derived}, "choice": _numbers(words)}
 
 

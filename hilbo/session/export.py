@@ -77,17 +77,17 @@ def read_sessions(
     paths = log_paths(folder)
     if not paths:
         raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
-    found, dry = [], 0
+    sessions, dry = [], 0
     for path in paths:
         state = read_session(path, study)
         dry += state.header.dry_run
         if not state.header.dry_run:
-            found.append(state)
-    if not found:
+            sessions.append(state)
+    if not sessions:
         raise InputError(f"{folder}: holds nothing but dry runs, in which nobody took part.")
     if dry:
         note(f"{folder}: {'1 dry run is' if dry == 1 else f'{dry} dry runs are'} left out.")
-    return found
+    return sessions
 
 
 def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:

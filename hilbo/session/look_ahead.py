@@ -187,8 +187,8 @@ class LiveChooser:
         excluded = _rows(situation.excluded, study)
         if warm is not None:
             return Choice(apart.point_from_map(study, warm, fitted.posterior, excluded), "map")
-        initial, gone = session.step.initial, {*answers.proposed, *situation.excluded}
-        missing = [point for point in initial if tuple(point.tolist()) not in gone]
+        initial, shown = session.step.initial, {*answers.proposed, *situation.excluded}
+        missing = [point for point in initial if tuple(point.tolist()) not in shown]
         if missing:  # in their order; one whose answer was voided comes again
             return Choice(missing[0], "latin hypercube")
         if len(answers.points) < len(initial):

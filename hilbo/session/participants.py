@@ -43,25 +43,25 @@ def read_people(path: str | os.PathLike) -> People:
     for line, row in rows:
         if len(row) > len(columns):
             raise InputError(f"{path}:{line}: has {len(row)} cells, the header has {len(columns)}; fix that line.")
-        found = {key: value.strip() for key, value in zip_longest(columns, row, fillvalue="")}
-        _check(found, f"{path}:{line}")
-        if not found["participant"]:
+        person = {key: value.strip() for key, value in zip_longest(columns, row, fillvalue="")}
+        _check(person, f"{path}:{line}")
+        if not person["participant"]:
             raise InputError(f"{path}:{line}: participant is empty; give each row a participant.")
-        if found["participant"] in people:
-            raise InputError(f"{path}:{line}: participant {found['participant']} stands there twice; keep one row.")
-        people[found["participant"]] = found
+        if person["participant"] in people:
+            raise InputError(f"{path}:{line}: participant {person['participant']} stands there twice; keep one row.")
+        people[person["participant"]] = person
     return people
 
 
 def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
     """Add a row, and write the table anew, whole or not at all; with its folder. Raises InputError."""
     people = read_people(path) if Path(path).exists() else {}
-    found = {key: str(value).strip() for key, value in row.items()}
-    _check_words(found, str(path))
-    _check(found, str(path))
-    if found["participant"] in people:
-        raise InputError(f"{path}: participant {found['participant']} stands there already; choose another id.")
-    people[found["participant"]] = found
+    person = {key: str(value).strip() for key, value in row.items()}
+    _check_words(person, str(path))
+    _check(person, str(path))
+    if person["participant"] in people:
+        raise InputError(f"{path}: participant {person['participant']} stands there already; choose another id.")
+    people[person["participant"]] = person
     try:
         _write(Path(path), people, _delimiter(path))
     except OSError as error:

@@ -186,14 +186,14 @@ def plan_hash(plan: Mapping[str, Any]) -> str:
 
 def planned_header(plan: Mapping[str, Any], study: AnyStudy, participant: str, **others: Any) -> Header:
     """The header of a planned session. Raises InputError if plan, study and participant do not belong together."""
-    found = check_plan(plan, study)
-    rows = {row.participant: row.header for row in found.participants}
+    checked = check_plan(plan, study)
+    rows = {row.participant: row.header for row in checked.participants}
     if participant not in rows:
         raise InputError(
             f'participant "{participant}" is not in the plan, which has {len(rows)}, {min(rows)} to {max(rows)}; add'
             " them by a new plan, or reissue the row of somebody who dropped out."
         )
-    return msgspec.structs.replace(rows[participant], plan=found.hash, **others)
+    return msgspec.structs.replace(rows[participant], plan=checked.hash, **others)
 
 
 def read_plan(path: str | os.PathLike) -> dict[str, Any]:
@@ -206,21 +206,22 @@ def check_plan(plan: Mapping[str, Any], study: AnyStudy) -> _Plan:
 
     Raises `InputError`, with what to do.
     """
-    found = converted(plan, _Plan, "the plan", _WHAT)
-    if found.hash != plan_hash(plan):
+    checked = converted(plan, _Plan, "the plan", _WHAT)
+    if checked.hash != plan_hash(plan):
         raise InputError("the plan was changed after it was made (its hash does not fit); make a new one.")
-    if found.study != study.hash:
+    if checked.study != study.hash:
         raise InputError(
-            f"the plan belongs to another study ({found.study}, not {study.hash}); use the study file it was made from."
+            f"the plan belongs to another study ({checked.study}, not {study.hash}); use the study file it was made"
+            " from."
         )
-    names = [row.participant for row in found.participants]
+    names = [row.participant for row in checked.participants]
     if len(set(names)) < len(names):
         raise InputError("the plan names a participant twice; make a new one.")
-    for row in found.participants:
+    for row in checked.participants:
         check_header(study, row.header)
-        if row.header.participant != row.participant or row.header.study != found.study:
+        if row.header.participant != row.participant or row.header.study != checked.study:
             raise InputError(f"the plan's row of {row.participant} has somebody else's session; make a new one.")
-    return found
+    return checked
 
 
 def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
@@ -260,8 +261,8 @@ def _header(study, person, session, seed, phase, materials, sets, source, codes)
         return header_for(study, person, session, seed, materials=materials)
     if phase == "warm-up" or sets is None:
         raise InputError(f"plan: a session of {phase} needs sets to compare; give --from result.json.")
-    begin, found = warm_up(study, seed, materials[0])
-    blocks = [begin]
+    first_block, compared = warm_up(study, seed, materials[0])
+    blocks = [first_block]
     for i, material in enumerate(materials):
         here = sets.get(material or "", {})
         trials, used = _compared(study, person, phase, here, source, codes, seed_of(seed, i, 7))
@@ -271,8 +272,8 @@ def _header(study, person, session, seed, phase, materials, sets, source, codes)
         planned = tuple(Planned(named[a], named[b], first) for a, b, first in trials)
         rest = protocol(study.session, phase).rest if i else 0.0
         blocks.append(Block(phase, len(planned), planned, material, rest))
-        found |= renamed
-    return _made(study, person, session, seed, blocks, found)
+        compared |= renamed
+    return _made(study, person, session, seed, blocks, compared)
 
 
 def _compared(study, person, phase, sets, source, codes, seed):

@@ -47,16 +47,16 @@ def validation_sets(
     study: Study, result: Result, cohort: Cohort, source: Source, participants: Sequence[str]
 ) -> NamedSets:
     """Best, mid and worst of the map, or of each participant's own (`PARTICIPANT best`): name -> parameters."""
-    found = aggregate_cohort(study, cohort, result.seed, alternatives=False)
-    _check_same(study, result, np.asarray(found.optimum.x))
+    aggregated = aggregate_cohort(study, cohort, result.seed, alternatives=False)
+    _check_same(study, result, np.asarray(aggregated.optimum.x))
     points = search_points(study.space, result.seed)
     if source == "aggregate":
-        return _named(study, best_mid_worst(study, found.surface, points, prior=found.map.map_prior).x, "")
+        return _named(study, best_mid_worst(study, aggregated.surface, points, prior=aggregated.map.map_prior).x, "")
     sets: NamedSets = {}
     for person in participants:
         row = cohort.names.index(person)
-        own = jax.tree.map(lambda leaf, row=row: leaf[row], found.posteriors)
-        sets |= _named(study, best_mid_worst(study, _Predict(own), points).x, f"{person} ")
+        posterior = jax.tree.map(lambda leaf, row=row: leaf[row], aggregated.posteriors)
+        sets |= _named(study, best_mid_worst(study, _Predict(posterior), points).x, f"{person} ")
     return sets
 
 

@@ -88,12 +88,12 @@ class _Device(msgspec.Struct):
 class _Given:
     """A chooser that chooses what a log says was chosen."""
 
-    def __init__(self, found: Mapping[str, Any]) -> None:
-        self.found = found
+    def __init__(self, proposal: Mapping[str, Any]) -> None:
+        self.proposal = proposal
 
     def choose(self, state: LiveSession, need: Need) -> dict[str, Any]:
-        _check_proposal(state, need, self.found)
-        return dict(self.found)
+        _check_proposal(state, need, self.proposal)
+        return dict(self.proposal)
 
 
 def _worded(event: Event, **words: str) -> Event:
@@ -160,21 +160,21 @@ def _without(raw: Mapping[str, Any], *names: str) -> dict[str, Any]:
     return {key: value for key, value in raw.items() if key not in names}
 
 
-def _check_proposal(state: LiveSession, need: Need, found: Mapping[str, Any]) -> None:
+def _check_proposal(state: LiveSession, need: Need, proposal: Mapping[str, Any]) -> None:
     """Refuse renderings other than the plan's or the repeated trial's, and chosen ones outside the study's ranges."""
-    block, sets = state.header.blocks[need.block], found.get("sets")
-    renderings: Mapping[str, Mapping[str, float]] = found["renderings"]
+    block, sets = state.header.blocks[need.block], proposal.get("sets")
+    renderings: Mapping[str, Mapping[str, float]] = proposal["renderings"]
     study = study_of(state.study, block.material)
     for side, values in renderings.items():
         check_values(values, study.space.parameters, f"side {side}", "the rendering")
     if need.repeats is not None:
         data = state.trial(need.repeats).data
-        if any(found.get(key) != data.get(key) for key in ("renderings", "sets", "first")):
+        if any(proposal.get(key) != data.get(key) for key in ("renderings", "sets", "first")):
             raise InputError("the repetition is not of the trial that it repeats.")
     elif need.planned is not None:
         planned = block.trials[need.planned]
         wanted = {"a": planned.a} | ({} if planned.b is None else {"b": planned.b})
-        same = sets == wanted and set(renderings) == set(wanted) and found.get("first", "a") == planned.first
+        same = sets == wanted and set(renderings) == set(wanted) and proposal.get("first", "a") == planned.first
         places = [(side, name) for side in wanted for name in study.space.names]
         if not same or any(renderings[side][name] != state.header.sets[wanted[side]][name] for side, name in places):
             raise InputError("the renderings are not those of the plan.")

@@ -123,18 +123,18 @@ def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
     if study.selection.acquisition in _IN_UNITS_OF_F:
         space["gain"] = _GAIN * jnp.sqrt(study.gp.kernel.variance)
     short = posterior.astype(jnp.float32)
-    known = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
+    fitted = short.gp.kernel, short.trials.x, short.latent.weights, short.latent.factor
     if plan.lattice is None:
         points = plan.candidates
         if allowed is None:
-            values = screen_points(*known, points.astype(jnp.float32), score)
+            values = screen_points(*fitted, points.astype(jnp.float32), score)
         else:  # which may rule out all points that were not skipped
             values = score(*short.predict(points.astype(jnp.float32)))
         return acquisition.maximise(values, points, score_at, **space, allowed=allowed)
-    found = screen(*known, plan.lattice, score, allowed)
-    rows = acquisition.spread(found.hopes, found.points, _STARTS)
-    usable = found.hopes[rows] > -jnp.inf
-    return acquisition.climb(found.points[rows], usable, score_at, **space, allowed=allowed)
+    screened = screen(*fitted, plan.lattice, score, allowed)
+    rows = acquisition.spread(screened.hopes, screened.points, _STARTS)
+    usable = screened.hopes[rows] > -jnp.inf
+    return acquisition.climb(screened.points[rows], usable, score_at, **space, allowed=allowed)
 
 
 def _score(study, posterior, weight):

@@ -47,8 +47,8 @@ def set_codes(sets: Mapping[str, Sets]) -> dict[str, str]:
                 what = name.removesuffix(person).removeprefix(person)
                 values.setdefault(person, []).append([material, what, sorted(parameters.items())])
     codes: dict[str, str] = {}
-    for person, found in values.items():
-        codes[person] = code_of(sorted(found), codes.values())
+    for person, described in values.items():
+        codes[person] = code_of(sorted(described), codes.values())
     return codes
 
 

@@ -79,9 +79,9 @@ class LiveSession:
         apply = _APPLY.get(event.kind)
         if apply is None:
             raise InputError(f'event {event.seq} is of the kind "{event.kind}", which this hilbo does not know.')
-        found = apply(self, event)
+        following = apply(self, event)
         began = event.time if self.began is None else self.began
-        return replace(found, seq=event.seq, began=began, last=event.time)
+        return replace(following, seq=event.seq, began=began, last=event.time)
 
     # What follows from the state.
 

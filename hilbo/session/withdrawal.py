@@ -110,9 +110,9 @@ def _logs(root: Path) -> tuple[dict[Path, str], list[Path]]:
 def _keys(root: Path, participant: str, people: set[str]) -> list[Path]:
     """The files of keys of one participant's sessions, .ID-SESSION.keys; not those of somebody whose id begins so."""
     longer = tuple(f".{person}-" for person in people if person.startswith(f"{participant}-"))
-    found = (path for end in ("*.keys", "*.keys.part") for path in root.rglob(end))
+    paths = (path for end in ("*.keys", "*.keys.part") for path in root.rglob(end))
     return sorted(
-        path for path in found if path.name.startswith(f".{participant}-") and not path.name.startswith(longer)
+        path for path in paths if path.name.startswith(f".{participant}-") and not path.name.startswith(longer)
     )
 
 
@@ -124,21 +124,21 @@ def _tables(root: Path, done: Withdrawal) -> None:
     names, gone_sets = _sets(tables.values(), done.participant, done.label)
     for path, table in tables.items():
         edited = without_person(table, done.participant, done.label, names, gone_sets)
-        gone = len(table.rows) - len(edited.kept)
-        if not (gone or edited.renamed):
+        rows_removed = len(table.rows) - len(edited.kept)
+        if not (rows_removed or edited.renamed):
             continue
         if edited.table.rows or path.stem.partition("-")[0] not in _OPTIONAL:
             write_table(path, edited)
         else:
             path.unlink()
-        done.removed |= {str(path): gone} if gone else {}
+        done.removed |= {str(path): rows_removed} if rows_removed else {}
         done.renamed |= {str(path): edited.renamed} if edited.renamed else {}
     for path in sorted(root.rglob("*.nc")):
-        gone = netcdf_without(path, done.participant)
-        if gone is None:
+        rows_removed = netcdf_without(path, done.participant)
+        if rows_removed is None:
             done.left[str(path)] = _UNREADABLE
-        elif gone:
-            done.removed[str(path)] = gone
+        elif rows_removed:
+            done.removed[str(path)] = rows_removed
 
 
 def _sets(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[str, str], set[str]]:
@@ -161,15 +161,15 @@ def _plans(root: Path, done: Withdrawal) -> None:
 
 def _coded(root: Path) -> list[Path]:
     """The files with renderings of individuals' maps that others compare under codes."""
-    found = []
+    coded = []
     for path in sorted(path for end in ("*.csv", "*.parquet", "*.json", "*.jsonl") for path in root.rglob(end)):
         if path.suffix in (".csv", ".parquet"):
             table = read_table(path)
             holds = table is not None and any(CODED_JUDGED.search(name) for name in named_sets(table))
         else:
             holds = CODED_JUDGED.search(path.read_text(encoding="utf-8", errors="replace")) is not None
-        found += [path] if holds else []
-    return found
+        coded += [path] if holds else []
+    return coded
 
 
 def _left(root: Path, participant: str, whose: dict[Path, str], damaged: Iterable[Path]) -> dict[str, str]:

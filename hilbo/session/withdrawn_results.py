@@ -45,53 +45,53 @@ def results_folders(root: Path) -> list[Path]:
 
 def clear_results(folder: Path, participant: str) -> Cleared:
     """Take away, or mark, what was computed from somebody's answers; the folder's list and command say so."""
-    found = listed(folder)
+    results = listed(folder)
     parts = {
-        part: [path for name in names if not _is_kept(found, name) and (path := folder / name).is_file()]
-        for part, names in _parts(found).items()
+        part: [path for name in names if not _is_kept(results, name) and (path := folder / name).is_file()]
+        for part, names in _parts(results).items()
     }
     named = [part for part, paths in parts.items() if any(_names(path, participant) for path in paths)]
-    if named and "" in parts and "result.json" not in found.files:
+    if named and "" in parts and "result.json" not in results.files:
         named = list(dict.fromkeys([*named, ""]))  # what lies above several results was made of all of them
     removed = [path for part in named for path in parts[part]]
-    marked = [part for part, paths in parts.items() if paths and part not in named and _may_hold(found)]
+    marked = [part for part, paths in parts.items() if paths and part not in named and _may_hold(results)]
     for path in removed:
         path.unlink()
-    again = command_without(found.command, participant)
+    again = command_without(results.command, participant)
     stays = any(path.name != LIST for path in folder.rglob("*") if path.is_file())
     forced = f"{again} --force" if again and stays and "--force" not in again.split() else again
-    commands = {part: _command(folder / part, found, forced) for part in [*named, *marked] if parts[part]}
+    commands = {part: _command(folder / part, results, forced) for part in [*named, *marked] if parts[part]}
     for part in marked:
         (folder / part / MARK).write_text(_marked(commands[part]), encoding="utf-8")
-    if removed or marked or again != found.command:
-        _list_again(folder, found, {folder / part / MARK for part in marked}, again)
+    if removed or marked or again != results.command:
+        _list_again(folder, results, {folder / part / MARK for part in marked}, again)
         _remove_empty(folder)
-    made = [command for command in dict.fromkeys(commands.values()) if command]
-    return Cleared(removed, [folder / part / MARK for part in marked], made)
+    given = [command for command in dict.fromkeys(commands.values()) if command]
+    return Cleared(removed, [folder / part / MARK for part in marked], given)
 
 
-def _list_again(folder: Path, found: Listed, marks: set[Path], command: str) -> None:
+def _list_again(folder: Path, results: Listed, marks: set[Path], command: str) -> None:
     """The list without what went, with the marks, so that --force replaces them too, and with the command of today."""
-    files = {name: was for name, was in found.files.items() if (folder / name).is_file()}
+    files = {name: was for name, was in results.files.items() if (folder / name).is_file()}
     files |= {path.relative_to(folder).as_posix(): digest(path) for path in marks}
-    write_list(folder, found._replace(files=files, command=command))
+    write_list(folder, results._replace(files=files, command=command))
 
 
-def _parts(found: Listed) -> dict[str, list[str]]:
+def _parts(results: Listed) -> dict[str, list[str]]:
     """The files of each result in a folder, by the nearest folder above them that has a result.json."""
-    results = {name.rpartition("/")[0] for name in found.files if name.rpartition("/")[2] == "result.json"}
+    with_result = {name.rpartition("/")[0] for name in results.files if name.rpartition("/")[2] == "result.json"}
     parts: dict[str, list[str]] = {}
-    for name in found.files:
+    for name in results.files:
         above = name.rpartition("/")[0]
-        while above and above not in results:
+        while above and above not in with_result:
             above = above.rpartition("/")[0]
         parts.setdefault(above, []).append(name)
     return parts
 
 
-def _may_hold(found: Listed) -> bool:
+def _may_hold(results: Listed) -> bool:
     """Whether results that name nobody may hold anybody's answers: also where no list says what made them."""
-    words = _words(found.command)
+    words = _words(results.command)
     return not words or words[1:2] == ["validate"]
 
 
@@ -100,9 +100,9 @@ def _marked(command: str) -> str:
     return f"These results were made before a participant withdrew, and may hold their answers. {again}"
 
 
-def _is_kept(found: Listed, name: str) -> bool:
+def _is_kept(results: Listed, name: str) -> bool:
     """Whether a listed file is a table, log or study file, and no result: an export holds nothing else."""
-    return "dataset_description.json" in found.files or _KEPT.fullmatch(name.rpartition("/")[2]) is not None
+    return "dataset_description.json" in results.files or _KEPT.fullmatch(name.rpartition("/")[2]) is not None
 
 
 def _names(path: Path, participant: str) -> bool:
@@ -120,15 +120,15 @@ def _remove_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _command(folder: Path, found: Listed, again: str) -> str:
+def _command(folder: Path, results: Listed, again: str) -> str:
     """What makes the results again: the report of a folder that holds its own tables, else the command that was given,
     without the participant; empty where it was about nobody else."""
     if (folder / "trials.csv").exists() and (folder / "study.toml").exists():
         out = Path(f"{folder}-report")
         return shlex.join(["hilbo", "report", str(folder), "--out", str(out), *["--force"] * out.exists()])
-    if not found.command:
+    if not results.command:
         return f"{folder}: by the hilbo command that made it"
-    return f"cd {shlex.quote(found.where)} && {again}" if again else ""
+    return f"cd {shlex.quote(results.where)} && {again}" if again else ""
 
 
 def command_without(command: str, participant: str) -> str:
@@ -199,12 +199,14 @@ def _row_without(row: dict[str, Any], participant: str, label: str, materials: I
 
     def trial(planned: Any) -> Any:
         sides = {side: planned[side] for side in ("a", "b") if isinstance(planned, dict) and side in planned}
-        made = {side: renamed_set(str(name), participant, label, materials) for side, name in sides.items() if name}
-        return planned | made if made else planned
+        new_names = {
+            side: renamed_set(str(name), participant, label, materials) for side, name in sides.items() if name
+        }
+        return planned | new_names if new_names else planned
 
-    def block(found: Any) -> Any:
-        known = isinstance(found, dict) and isinstance(found.get("trials"), list)
-        return found | {"trials": [trial(planned) for planned in found["trials"]]} if known else found
+    def block(entry: Any) -> Any:
+        has_trials = isinstance(entry, dict) and isinstance(entry.get("trials"), list)
+        return entry | {"trials": [trial(planned) for planned in entry["trials"]]} if has_trials else entry
 
     row, header = person(row, "participant", "reissued_from"), row.get("header")
     if not isinstance(header, dict):
@@ -213,5 +215,5 @@ def _row_without(row: dict[str, Any], participant: str, label: str, materials: I
     if isinstance(sets := header.get("sets"), dict):
         header["sets"] = {renamed_set(name, participant, label, materials): values for name, values in sets.items()}
     if isinstance(blocks := header.get("blocks"), list):
-        header["blocks"] = [block(found) for found in blocks]
+        header["blocks"] = [block(entry) for entry in blocks]
     return row | {"header": header}

@@ -75,14 +75,14 @@ class Edited(NamedTuple):
 
 def set_names(table: Cells, participant: str, label: str) -> dict[str, str]:
     """The sets in a table that are named after a participant, and what they are called afterwards."""
-    found = {}
+    renamed = {}
     for cells in _rows(table):
         for name in filter(None, (cells.get(column) for column in ("set_a", "set_b", "set_id"))):
-            made = renamed_set(name, participant, label, (cells.get("material"),))
-            if made == name and name == cells.get("set_id") and cells.get("source") == OWN + participant:
-                made = replaced(name, participant, label)
-            found |= {name: made} if made != name else {}
-    return found
+            new_name = renamed_set(name, participant, label, (cells.get("material"),))
+            if new_name == name and name == cells.get("set_id") and cells.get("source") == OWN + participant:
+                new_name = replaced(name, participant, label)
+            renamed |= {name: new_name} if new_name != name else {}
+    return renamed
 
 
 def coded_own(table: Cells, participant: str) -> set[str]:
@@ -114,22 +114,22 @@ def _rows(table: Cells) -> Iterator[dict[str, str]]:
 
 
 def without_person(
-    table: Cells, participant: str, label: str, names: Mapping[str, str], gone: Collection[str] = ()
+    table: Cells, participant: str, label: str, names: Mapping[str, str], sets_removed: Collection[str] = ()
 ) -> Edited:
-    """A table without a participant. `names`: sets that are called otherwise now. `gone`: sets whose rows go too."""
+    """A table without a participant. `names`: sets that are called otherwise now. `sets_removed`: their rows go."""
     head = [name.strip() for name in table.head]
     kept, rows, renamed = [], [], 0
     for number, (row, cells) in enumerate(zip(table.rows, _rows(table), strict=True)):
         own = cells.get("source") == OWN + participant and "set_id" not in cells
-        if own or cells.get("participant") == participant or cells.get("set_id") in gone:
+        if own or cells.get("participant") == participant or cells.get("set_id") in sets_removed:
             continue
-        made = [
+        new_row = [
             _renamed(cell, column, {**names, OWN + participant: OWN + label})
             for column, cell in zip([*head, *[""] * (len(row) - len(head))], row, strict=False)
         ]
-        renamed += made != row
+        renamed += new_row != row
         kept.append(number)
-        rows.append(made)
+        rows.append(new_row)
     return Edited(kept, table._replace(rows=rows), renamed)
 
 

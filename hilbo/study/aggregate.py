@@ -234,13 +234,13 @@ def _map_optimum(
         return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
 
     assert map_.reach is not None
-    known = jnp.maximum(map_.reach, jnp.min(map_.predict(candidates)[1]))  # of which there is one at least
+    largest_variance = jnp.maximum(map_.reach, jnp.min(map_.predict(candidates)[1]))  # of which there is one at least
 
-    def told(x):
-        return map_.predict(x[None, :])[1][0] <= known
+    def within_reach(x):
+        return map_.predict(x[None, :])[1][0] <= largest_variance
 
     values = chance(*map_.predict(candidates))
-    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, chance, told, map_.widths)
+    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, chance, within_reach, map_.widths)
 
 
 def _optimum(

@@ -40,9 +40,9 @@ def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFram
         chances = model.class_probabilities(study.gp.likelihood, x)
     else:
         raise InputError(f"predict_table: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
-    found = {"mean": np.asarray(mean), "sd": np.sqrt(np.asarray(variance))}
-    found |= {f"P({label})": column for label, column in zip(study.responses, np.asarray(chances).T, strict=True)}
-    return table.assign(**found)
+    predicted = {"mean": np.asarray(mean), "sd": np.sqrt(np.asarray(variance))}
+    predicted |= {f"P({label})": column for label, column in zip(study.responses, np.asarray(chances).T, strict=True)}
+    return table.assign(**predicted)
 
 
 def _points(study: Study, table: pd.DataFrame) -> jnp.ndarray:

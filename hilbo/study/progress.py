@@ -101,10 +101,10 @@ def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[
         halves = np.asarray(points)[_tops(map_, points, split)]
         return population, np.asarray(optima.x), halves, map_ if last or count in _MOMENTS else None
 
-    found = [after(count) for count in asked[:1].tolist()]  # whose programs serve the others
+    optima_after = [after(count) for count in asked[:1].tolist()]  # whose programs serve the others
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
-        found += pool.map(after, asked[1:].tolist())
-    population, individual, halves, maps = zip(*found, strict=True)
+        optima_after += pool.map(after, asked[1:].tolist())
+    population, individual, halves, maps = zip(*optima_after, strict=True)
     kept = {count: map_ for count, map_ in zip(asked.tolist(), maps, strict=True) if map_ is not None}
     own, tops = np.stack(individual), np.stack(halves)
     return Progress(asked, np.stack(population), own, ends, *_to_other_half(tops, own, split), kept)

@@ -84,7 +84,7 @@ def check_values(
     values: Mapping[str, float | None], parameters: Iterable[Parameter], source: str, what: str
 ) -> dict[str, float]:
     """A rendering's parameters in physical units, each a finite number in the study's range. Raises InputError."""
-    found = {}
+    checked = {}
     for parameter in parameters:
         value = values.get(parameter.name)
         slack = _SLACK * (parameter.high - parameter.low)
@@ -96,5 +96,5 @@ def check_values(
                 f" {parameter.high:g} {parameter.unit}".rstrip()
                 + ", the study's range; make the file again."
             )
-        found[parameter.name] = float(value)
-    return found
+        checked[parameter.name] = float(value)
+    return checked

@@ -133,7 +133,7 @@ def test_a_whole_session_its_log_and_its_map(session):
         found = program.get("/api/try/map")
     assert [len(s["trials"]) for s in found["slices"]] == [15] * 3
     assert {p["name"]: p["hidden"] for p in found["parameters"]} == reference
-    best = {p["name"]: p["found"] for p in found["parameters"]}
+    best = {p["name"]: p["optimum"] for p in found["parameters"]}
     assert person.distance(best) < 0.5
     header, events, _ = read_log(log.path, study)
     assert header.unblinded == "try" and header.consent is None and header.sets == {"reference": reference}

@@ -62,7 +62,7 @@ def test_the_quantile_is_students(freedom):
 @pytest.mark.deep
 def test_ends_of_a_profile_are_where_scipy_finds_them(found):
     around, sides = intervals.spread(found), intervals.profile_intervals(found)
-    assert np.all(sides.found)
+    assert np.all(sides.bracketed)
     assert not np.any(sides.open_lower) and not np.any(sides.open_upper)
     misfit = jax.jit(lambda q: residuals(found.model, found.curves, found.weights, q))
     slopes = jax.jit(jax.jacfwd(misfit))
@@ -133,7 +133,7 @@ def test_what_the_data_do_not_tell_has_an_open_end():
     """Half a second of one slow test: κ and α cannot be told apart from a slower, weaker branch."""
     found = fit(foam_tests(noise=0.3, hold=0.1, seed=5), Sampled())
     sides = intervals.profile_intervals(found)
-    assert np.any(sides.open_lower | sides.open_upper | ~sides.found)
+    assert np.any(sides.open_lower | sides.open_upper | ~sides.bracketed)
 
 
 def test_too_few_repeats_have_no_bootstrap():

@@ -262,10 +262,10 @@ async function results() {               // the end: one's own map
   at("stage").hidden = true; at("results").hidden = false;
   put("progress", `${slices[0].trials.length} answers`);
   at("bar").style.width = "100%";
-  const off = Math.hypot(...parameters.map((p) => p.found_unit - p.hidden_unit)) / Math.sqrt(parameters.length);
+  const off = Math.hypot(...parameters.map((p) => p.optimum_unit - p.hidden_unit)) / Math.sqrt(parameters.length);
   put("verdict", `The optimum of your map is ${Math.round(100 * off)} % of the ranges away from the hidden reference (root mean square).`);
   at("values").replaceChildren(...parameters.map((p) => {
-    const cells = [p.name + (p.unit ? ` (${p.unit})` : ""), shown(p.hidden), shown(p.found), `${p.low} to ${p.high}`];
+    const cells = [p.name + (p.unit ? ` (${p.unit})` : ""), shown(p.hidden), shown(p.optimum), `${p.low} to ${p.high}`];
     const row = document.createElement("tr");
     row.append(...cells.map((text) => Object.assign(document.createElement("td"), { textContent: text })));
     return row;
