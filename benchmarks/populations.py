@@ -94,7 +94,7 @@ def one_study(name, design, seed):
     individual = jnp.mean(individual_optima(study, posteriors, candidates).x, axis=0)
     learnt = {recipe: by_recipe(study, cohort, recipe, candidates, seed) for recipe in RECIPES}
     resolved_study, optimum, region = learnt[RECOMMENDED]
-    held = region.holds(np.asarray(best), np.asarray(resolved_study.gp.kernel.theta))
+    held = region.holds(np.asarray(best), resolved_study.gp.kernel)
     _, of_learnt_1, hills = learnt[LEARNT_1.name]
     places = {recipe: optimum.x for recipe, (_, optimum, _) in learnt.items()} | {
         "centre of its hill": centre_of_hill(study.space, hills, of_learnt_1.x),

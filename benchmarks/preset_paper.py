@@ -16,9 +16,10 @@ ROOT = Path(__file__).parents[1]
 
 def one_study(study, seed, candidates):
     """Answers and errors of one simulated study (NRMSE over K1, B1, alpha by search range)."""
+    from hilbo.search.apart import nrmse
     from hilbo.simulation import simulate
     from hilbo.simulation.presets import PRESETS
-    from hilbo.study.aggregate import aggregate_cohort, nrmse, population_optimum
+    from hilbo.study.aggregate import aggregate_cohort, population_optimum
     from hilbo.study.cohort import Cohort
     from hilbo.study.progress import follow
 

@@ -4,23 +4,30 @@
     Matern 3/2:   k(x, x') = variance * (1 + s) exp(-s),  s^2 = 6 theta |x - x'|^2
 
 `theta` is one number, or one per dimension (automatic relevance determination). In terms of a length scale l,
-theta = 1 / (2 l^2) for both. Functions of the RBF are smooth everywhere; those of the Matern kernel have a slope
-everywhere and may bend sharply, as a dissimilarity that grows with the distance does where it is smallest.
+theta = 1 / (2 l^2) for both. A coordinate may be one of k unordered levels, at 0, 1/(k-1), ..., 1: its part of
+theta |x - x'|^2 is theta where the levels differ, whichever they are, and 0 where they are the same. That is the
+squared distance of corners of a simplex, so that the covariance stays positive definite.
+
+Functions of the RBF are smooth everywhere; those of the Matern kernel have a slope everywhere and may bend sharply, as
+a dissimilarity that grows with the distance does where it is smallest.
 Reference: Rasmussen & Williams (2006), section 4.2.1.
 """
 
+import math
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+from scipy.special import lambertw
 
 from hilbo.numerics.shown import check_positive, numbers, shown
 
-__all__ = ["RBF", "Kernel", "Matern32", "Stationary", "gram"]
+__all__ = ["RBF", "Kernel", "Levels", "Matern32", "Stationary", "embedded", "gram", "theta_of"]
 
 
 def __dir__() -> list[str]:
@@ -50,27 +57,37 @@ class RBF(eqx.Module):
 
     - `theta`: inverse squared length, > 0, scalar or (d,), per squared unit of x.
     - `variance`: prior variance of the latent function, > 0.
+    - `levels`: for each coordinate its number of unordered levels, 0 for numbers; left out, all are numbers.
 
     Raises `InputError` for numbers that are not above 0; what is traced is not checked.
     """
 
     theta: Float[Array, "*d"]
     variance: Float[Array, ""]
+    levels: tuple[int, ...] = eqx.field(static=True, default=())
 
-    def __init__(self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0):
+    def __init__(
+        self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0, levels: tuple[int, ...] = ()
+    ):
         self.theta = numbers("RBF", "theta", theta, _float_dtype(theta))
         self.variance = numbers("RBF", "variance", variance, _float_dtype(variance))
+        self.levels = levels
         check_positive("RBF", theta=self.theta, variance=self.variance)
 
     def __repr__(self) -> str:
-        return f"RBF(theta={shown(self.theta)}, variance={shown(self.variance)})"
+        return f"RBF({_numbers_shown(self)})"
+
+    def with_numbers(self, theta: ArrayLike, variance: ArrayLike) -> "RBF":
+        """The same kind of kernel, of the same levels, with other numbers."""
+        return RBF(theta, variance, self.levels)
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
         """Covariance of the latent function at `x` and at `y`, both (d,)."""
-        return self.variance.astype(x.dtype) * jnp.exp(-_squared(self.theta, x, y))
+        return self.variance.astype(x.dtype) * jnp.exp(-_squared(self, x, y))
 
     def along(self, axis: int, x: Float[Array, " n"], y: Float[Array, " m"]) -> Float[Array, "n m"]:
-        """The factor (n, m) that one coordinate contributes: the kernel is the product of these and the variance."""
+        """The factor (n, m) that one coordinate of numbers contributes: the kernel is the product of these and the
+        variance."""
         theta = self.theta[axis] if self.theta.ndim else self.theta
         return jnp.exp(-theta.astype(x.dtype) * (x[:, None] - y[None, :]) ** 2)
 
@@ -87,18 +104,26 @@ class Matern32(eqx.Module):
 
     theta: Float[Array, "*d"]
     variance: Float[Array, ""]
+    levels: tuple[int, ...] = eqx.field(static=True, default=())
 
-    def __init__(self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0):
+    def __init__(
+        self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0, levels: tuple[int, ...] = ()
+    ):
         self.theta = jnp.asarray(theta, dtype=_float_dtype(theta))
         self.variance = jnp.asarray(variance, dtype=_float_dtype(variance))
+        self.levels = levels
         check_positive("Matern32", theta=self.theta, variance=self.variance)
 
     def __repr__(self) -> str:
-        return f"Matern32(theta={shown(self.theta)}, variance={shown(self.variance)})"
+        return f"Matern32({_numbers_shown(self)})"
+
+    def with_numbers(self, theta: ArrayLike, variance: ArrayLike) -> "Matern32":
+        """The same kind of kernel, of the same levels, with other numbers."""
+        return Matern32(theta, variance, self.levels)
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
         """Covariance of the latent function at `x` and at `y`, both (d,)."""
-        return self.variance.astype(x.dtype) * _matern32(6.0 * _squared(self.theta, x, y))
+        return self.variance.astype(x.dtype) * _matern32(6.0 * _squared(self, x, y))
 
     def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
         """The prior variance, the same everywhere. `x` (d,) -> a scalar."""
@@ -109,12 +134,56 @@ Stationary = RBF | Matern32
 """Kernels of the distance theta |x - x'|^2 alone."""
 
 
-def _squared(theta: Float[Array, "*d"], x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
+class Levels(NamedTuple):
+    """A coordinate of unordered levels: how many, and the correlation of the latent function at two of them."""
+
+    count: int
+    correlation: float
+
+
+def theta_of(kernel: type[Stationary], correlation: float) -> float:
+    """The theta of a coordinate of levels at which two of them have this correlation, all else being equal.
+
+    `correlation`: above 0 and below 1.
+    """
+    if kernel is RBF:
+        return -math.log(correlation)
+    # (1 + s) exp(-s) = c has s = -1 - W(-c/e) on the lower branch of Lambert's function.
+    return (-1.0 - float(lambertw(-correlation / math.e, -1).real)) ** 2 / 6.0
+
+
+def embedded(kernel: Stationary, x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n e"]:
+    """Points (n, d) in coordinates (n, e) in which the kernel's squared distance is the Euclidean one: numbers times
+    the root of theta, and of k levels k coordinates, one of which is not 0."""
+    theta = np.broadcast_to(np.asarray(kernel.theta), x.shape[1])
+    columns = []
+    for i, count in enumerate(kernel.levels or (0,) * x.shape[1]):
+        if count:
+            columns.append(np.sqrt(theta[i] / 2) * np.eye(count)[np.rint(x[:, i] * (count - 1)).astype(int)])
+        else:
+            columns.append(x[:, i : i + 1] * np.sqrt(theta[i]))
+    return np.concatenate(columns, axis=1)
+
+
+def _numbers_shown(kernel: Stationary) -> str:
+    levels = f", levels={kernel.levels}" if kernel.levels else ""
+    return f"theta={shown(kernel.theta)}, variance={shown(kernel.variance)}{levels}"
+
+
+def _squared(kernel: Stationary, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
     """theta |x - y|^2, summed coordinate by coordinate: under vmap this becomes one fused loop over pairs, about three
     times faster than a reduction over an axis of length d, and it keeps the digits that |x|^2 + |y|^2 - 2xy would lose.
     """
-    theta = jnp.broadcast_to(theta, x.shape).astype(x.dtype)
-    return sum((theta[i] * (x[i] - y[i]) ** 2 for i in range(1, x.shape[0])), theta[0] * (x[0] - y[0]) ** 2)
+    theta = jnp.broadcast_to(kernel.theta, x.shape).astype(x.dtype)
+    counts = kernel.levels or (0,) * x.shape[0]
+
+    def part(i):
+        if counts[i] == 0:
+            return theta[i] * (x[i] - y[i]) ** 2
+        steps = counts[i] - 1
+        return jnp.where(jnp.round(steps * x[i]) == jnp.round(steps * y[i]), jnp.zeros_like(theta[i]), theta[i])
+
+    return sum((part(i) for i in range(1, x.shape[0])), part(0))
 
 
 # With r = s^2 the correlation has the slope -exp(-s) / 2, and that has exp(-s) / (4 s): infinite where both points are

@@ -187,6 +187,7 @@ def schemas():
     """The tables of a study file by the heading of the page that describes them."""
     tables = {f"[{name}]": kind for name, kind in study_tables._TABLES.items()}
     own = {"[renderer]": study_tables._RendererTable, "[parameters.NAME]": study_tables._ParameterTable}
+    own["[parameters.NAME] of levels"] = study_tables._LevelsTable
     return tables | own | {"[session.PHASE]": PhaseTable}
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
+from hilbo.ordinal_gp import OrdinalGP, OrdinalProbit
 
 __all__ = ["OF_THE_LIKELIHOOD", "Coordinates", "Learnable", "coordinates_of", "log_prior", "model_at"]
 
@@ -42,7 +42,8 @@ def model_at(coordinates: Coordinates, gp: OrdinalGP) -> OrdinalGP:
     if "first" in coordinates:
         steps = jnp.concatenate([coordinates["first"][None], jnp.exp(coordinates["gaps"])])
         thresholds = jnp.cumsum(steps)
-    return OrdinalGP(RBF(positive["theta"], positive["variance"]), OrdinalProbit(thresholds, positive["noise"]))
+    kernel = gp.kernel.with_numbers(positive["theta"], positive["variance"])
+    return OrdinalGP(kernel, OrdinalProbit(thresholds, positive["noise"]))
 
 
 def log_prior(gp: OrdinalGP, centre: OrdinalGP, learn: Sequence[str]) -> Float[Array, ""]:

@@ -120,7 +120,7 @@ def fit_counts(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> Poste
     size = answers.x.shape[0]
     held = Trials(answers.x, jnp.zeros(size, jnp.int32), jnp.ones(size, bool))
     kernel = gp.kernel
-    return Posterior(OrdinalGP(type(kernel)(kernel.theta, share * kernel.variance), gp.likelihood), held, latent)
+    return Posterior(OrdinalGP(kernel.with_numbers(kernel.theta, share * kernel.variance), gp.likelihood), held, latent)
 
 
 def evidence(gp: OrdinalGP, share: Float[Array, ""], answers: Counts) -> tuple[Float[Array, ""], Bool[Array, ""]]:

@@ -134,7 +134,7 @@ def shared_posterior(posterior: Posterior) -> Posterior:
     """
     kernel, trials, latent = posterior.gp.kernel, posterior.trials, posterior.latent
     person = kernel.kernel
-    of_shared = type(person)(person.theta, kernel.share.astype(person.variance.dtype) * person.variance)
+    of_shared = person.with_numbers(person.theta, kernel.share.astype(person.variance.dtype) * person.variance)
     return Posterior(
         OrdinalGP(of_shared, posterior.gp.likelihood), Trials(trials.x[:, :-1], trials.q, trials.mask), latent
     )

@@ -17,7 +17,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.optimize import minimize
 
-from hilbo.kernels import RBF
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP
@@ -124,5 +123,6 @@ def _model(
     if "first" in z:
         thresholds = jnp.cumsum(jnp.concatenate([z["first"][None], jnp.exp(z["gaps"])]))
     learnt_share = jax.nn.sigmoid(z["share"]) if "share" in z else jnp.asarray(share, thresholds.dtype)
-    model = OrdinalGP(RBF(positive["theta"], positive["variance"]), OrdinalProbit(thresholds, positive["noise"]))
+    kernel = gp.kernel.with_numbers(positive["theta"], positive["variance"])
+    model = OrdinalGP(kernel, OrdinalProbit(thresholds, positive["noise"]))
     return model, learnt_share

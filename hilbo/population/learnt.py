@@ -104,7 +104,7 @@ def learn(
     if not np.asarray(trials.mask).any():
         raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
     answers = tallied(trials, categories)
-    start = medians(answers, stated, recipe.priors)
+    start = medians(answers, stated, recipe.priors, recipe.kernel)
     common = frozenset(start) - {"widths"}
     if near is not None:
         start |= {name: near.coordinates[name] for name in common}

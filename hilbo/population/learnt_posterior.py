@@ -1,7 +1,7 @@
 """What a recipe maximises: the log posterior of the hyperparameters with its gradient, in their coordinates."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,7 +10,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from hilbo.kernels import RBF, Stationary
+from hilbo.kernels import RBF, Levels, Stationary, theta_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP
 from hilbo.population.low_rank import PeopleModel, shared_evidence
@@ -25,6 +25,7 @@ __all__ = [
     "Problem",
     "Stated",
     "cost_at",
+    "every_theta",
     "medians",
     "model_at",
     "prior_model",
@@ -36,12 +37,27 @@ LEFT = 1e-4
 
 
 class Stated(NamedTuple):
-    """What a study file states of the model; None is learnt."""
+    """What a study file states of the model; None is learnt.
+
+    `theta`: of the coordinates that are numbers. `levels`: for each coordinate, None for numbers; nothing where all are
+    numbers. Their correlation stays where theta is stated, and else is the middle of what is believed before answers.
+    """
 
     theta: tuple[float, ...] | None = None
     variance: float | None = None
     thresholds: tuple[float, ...] | None = None
     noise: float | None = None
+    levels: tuple[Levels | None, ...] = ()
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """What is stated, by its names in [gp]."""
+        return {name: value for name, value in self._asdict().items() if name != "levels" and value is not None}
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """For each coordinate its number of levels, 0 for numbers, as kernels take it."""
+        return tuple(0 if each is None else each.count for each in self.levels)
 
 
 NOTHING = Stated()
@@ -68,11 +84,19 @@ class Cost(NamedTuple):
     left: Float[Array, ""]
 
 
+def every_theta(
+    kernel: type[Stationary], theta: tuple[float, ...], levels: tuple[Levels | None, ...]
+) -> tuple[float, ...]:
+    """One theta for each coordinate, from those of the numbers and from the correlations of levels."""
+    given = iter(theta)
+    return tuple(next(given) if each is None else theta_of(kernel, each.correlation) for each in levels) or theta
+
+
 def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalGP:
     """One person's model before any answer, by which sessions choose: what is stated, and the medians of the priors,
     which all recipes have in common, with the RBF."""
     nobody = Tallies(jnp.zeros((1, 1, dim)), jnp.zeros((1, 1, categories)))
-    return model_at(medians(nobody, stated, LEARNT_1.priors), nobody, stated, RBF).gp
+    return model_at(medians(nobody, stated, LEARNT_1.priors, RBF), nobody, stated, RBF).gp
 
 
 @program
@@ -91,11 +115,11 @@ def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Probl
     return Cost(cost, gradient, evidence.value, evidence.weights, evidence.arrived & finite, evidence.left)
 
 
-def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior]) -> Coordinates:
+def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior], kernel: type[Stationary]) -> Coordinates:
     """Where the search begins: the medians of what is learnt."""
     (people, _, d), categories, dtype = answers.x.shape, answers.counts.shape[-1], answers.x.dtype
     every = {
-        "theta": jnp.full(d, priors["theta"].mean - np.log(d), dtype),
+        "theta": jnp.full(d, priors["theta"].mean, dtype) - _lowered(stated, priors["theta"], kernel, d),
         "shared": jnp.asarray(priors["shared"].mean, dtype),
         "own": jnp.asarray(priors["own"].mean, dtype),
         "middle": jnp.asarray(priors["middle"].mean, dtype),
@@ -122,7 +146,7 @@ def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel:
     if stated.theta is None:
         theta = jnp.exp(coordinates["theta"])
     else:
-        theta = jnp.broadcast_to(jnp.asarray(stated.theta, dtype), (d,))
+        theta = jnp.broadcast_to(jnp.asarray(every_theta(kernel, stated.theta, stated.levels), dtype), (d,))
     if stated.thresholds is None:
         gaps = jnp.exp(coordinates["gaps"]) if "gaps" in coordinates else jnp.zeros(0, dtype)
         edges = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(gaps)])
@@ -130,7 +154,7 @@ def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel:
     else:
         thresholds = jnp.asarray(stated.thresholds, dtype)
     widths = coordinates.get("widths", jnp.zeros(people, dtype))
-    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel)
+    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel, stated.counts)
 
 
 def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:
@@ -139,5 +163,16 @@ def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:
     total = jnp.zeros((), problem.answers.x.dtype)
     for name, value in coordinates.items():
         mean, sd = problem.priors[name]
-        total -= 0.5 * jnp.sum(((value - mean + (jnp.log(d) if name == "theta" else 0.0)) / sd) ** 2)
+        lowered = _lowered(problem.stated, problem.priors[name], problem.kernel, d) if name == "theta" else 0.0
+        total -= 0.5 * jnp.sum(((value - mean + lowered) / sd) ** 2)
     return total
+
+
+def _lowered(stated: Stated, prior: Prior, kernel: type[Stationary], d: int) -> Float[Array, "*d"]:
+    """By what the prior's mean of log theta is lowered: the logarithm of how many coordinates are numbers; of levels so
+    that its middle is their correlation."""
+    if not stated.levels:
+        return jnp.log(d)
+    numbers = sum(each is None for each in stated.levels)
+    by = (np.log(numbers) if e is None else prior.mean - np.log(theta_of(kernel, e.correlation)) for e in stated.levels)
+    return jnp.asarray(list(by))

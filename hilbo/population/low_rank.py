@@ -63,6 +63,8 @@ class PeopleModel(eqx.Module):
     """Logarithm of each person's distances between thresholds, about their middle, in units of those above."""
     kernel: type[Stationary] = eqx.field(static=True, default=RBF)
     """Of g and of each h_j."""
+    levels: tuple[int, ...] = eqx.field(static=True, default=())
+    """For each coordinate its number of unordered levels, as kernels take it."""
 
     @property
     def share(self) -> Float[Array, ""]:
@@ -72,12 +74,16 @@ class PeopleModel(eqx.Module):
     @property
     def gp(self) -> OrdinalGP:
         """One person's model, with the median widths."""
-        return OrdinalGP(self.kernel(self.theta, self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
+        return OrdinalGP(self.of_variance(self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
 
     @property
     def unit(self) -> Stationary:
         """The kernel with a variance of 1."""
-        return self.kernel(self.theta, jnp.ones_like(self.shared))
+        return self.of_variance(jnp.ones_like(self.shared))
+
+    def of_variance(self, variance: Float[Array, ""]) -> Stationary:
+        """The kernel with this variance."""
+        return self.kernel(self.theta, variance, self.levels)
 
     @property
     def person_thresholds(self) -> Float[Array, "M edges"]:
@@ -246,7 +252,7 @@ def shared_evidence(
     if it is not given. With other points the value changes in a small step, so that differences of it want the same.
     """
     still = jax.lax.stop_gradient
-    unit = model.unit if lengths is None else model.kernel(lengths, jnp.ones_like(model.shared))
+    unit = model.unit if lengths is None else model.unit.with_numbers(lengths, jnp.ones_like(model.shared))
     pivots = pivots_of(still(unit), answers, rank, tolerance)
     prior = _prior(model, answers, pivots)
     mode = still(_mode(still(model), answers, still(prior), start))
@@ -282,7 +288,7 @@ def shared_function(
     factor = known[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
     factor = jnp.where(pivots.used[None, :], factor, 0.0)
 
-    kernel = model.kernel(model.theta, model.shared)
+    kernel = model.of_variance(model.shared)
     covariance = gram(kernel, pivots.points, pivots.points)
     smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
     resolution = jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5
@@ -324,6 +330,6 @@ def _rounding(
     of_pivots: Float[Array, " r"],
 ) -> Float[Array, ""]:
     """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
-    kernel = model.kernel(model.theta, model.own)
+    kernel = model.of_variance(model.own)
     each = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (answers.x, weights))
     return jnp.linalg.norm(each) + evidence_rounding(covariance, of_pivots[None, :])

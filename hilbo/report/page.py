@@ -88,8 +88,10 @@ def _unit(unit: str) -> str:
     return unit.replace("^alpha", "^α").replace("s^α", "sᵅ").replace(".", "·")
 
 
-def number(value: float) -> str:
-    """Four significant digits, never with an exponent."""
+def number(value: float | str) -> str:
+    """Four significant digits, never with an exponent; the name of a level as it is."""
+    if isinstance(value, str):
+        return value
     return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
 
 

@@ -46,7 +46,7 @@ class People(NamedTuple):
             return None
         chances = self.optima["class_probabilities"][j].tolist()
         return {
-            "parameters": {name: float(values[j]) for name, values in self.sets.items()},
+            "parameters": {name: values[j].item() for name, values in self.sets.items()},
             "unit": self.optima["x"][j].tolist(),
             "mean": float(self.optima["mean"][j]),
             "sd": float(self.optima["sd"][j]),
@@ -84,7 +84,8 @@ def parameter_sets(study: Study, x: Float[np.ndarray, "M d"]) -> tuple[dict[str,
         block_margins = [margin for _, margin in parts if margin is not None]
         return sets, np.concatenate(block_margins)[: len(x)] if block_margins else None
     physical, derived, margins = _mechanics(study.space, x)
-    named = {name: np.asarray(physical)[:, i] for i, name in enumerate(study.space.names)}
+    values = np.asarray(physical)
+    named = {p.name: np.asarray(p.column(values[:, i])) for i, p in enumerate(study.space.parameters)}
     return {name: np.asarray(v) for name, v in derived.items()} | named, None if margins is None else np.asarray(
         margins
     )

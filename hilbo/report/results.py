@@ -21,8 +21,9 @@ from jaxtyping import Array, Float
 
 from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, as_json, json_lines, people_of
+from hilbo.search.apart import differences, nrmse
 from hilbo.search.rendering import K0_range, margin_of, set_of
-from hilbo.study.aggregate import Aggregate, Optimum, asked_variance, nrmse, other_inference
+from hilbo.study.aggregate import Aggregate, Optimum, asked_variance, other_inference
 from hilbo.study.batch_optimum import LargeAggregate
 from hilbo.study.config import Study
 from hilbo.study.effects import effects_of
@@ -60,7 +61,7 @@ def misses(
 ) -> tuple[np.ndarray, np.ndarray | None]:
     """NRMSE of points to the truth by search range: over the searched parameters, and with the derived K0."""
     x = np.asarray(x)
-    errors = np.asarray(np.sqrt(np.mean((x - truth) ** 2, axis=-1)))
+    errors = np.asarray(nrmse(x, truth, study.gp.kernel.levels))
     if study.space.mechanics is None:
         return errors, None
     K0 = np.array([set_of(study.space, row)["K0"] for row in x.reshape(-1, x.shape[-1])]).reshape(errors.shape)
@@ -133,14 +134,23 @@ def _location(study: Study, aggregate: Aggregate | LargeAggregate, name: str, op
 
 
 def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> dict[str, Any]:
-    """How far one optimum is from another: NRMSE, and each parameter's way in its unit and in % of its range."""
+    """How far one optimum is from another: NRMSE, and each parameter's way in its unit and in % of its range; from one
+    level to another it is 100 %, and the way in words."""
     there, here = set_of(study.space, x), set_of(study.space, start)
-    percent = 100 * (np.asarray(x) - np.asarray(start))
+    levels = study.gp.kernel.levels
+    percent = 100 * differences(levels, np.asarray(x), np.asarray(start))
     share = dict(zip(study.space.names, percent.tolist(), strict=True))
     if "K0" in there:
         share = {"K0": 100 * (there["K0"] - here["K0"]) / K0_range(study.space)} | share
-    ways = {name: {"by": there[name] - here[name], "percent": share[name]} for name in there}
-    return {"nrmse": float(nrmse(x, start)), "moved": ways}
+    ways = {name: {"by": _way(here[name], there[name]), "percent": share[name]} for name in there}
+    return {"nrmse": float(nrmse(x, start, levels)), "moved": ways}
+
+
+def _way(start: float | str, end: float | str) -> float | str:
+    """From one value to another: the difference, or of levels which they are."""
+    if isinstance(start, str) or isinstance(end, str):
+        return "the same" if start == end else f"{start} to {end}"
+    return end - start
 
 
 def _not_converged(names):

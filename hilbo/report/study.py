@@ -176,7 +176,8 @@ def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
     table = pd.DataFrame(
         {"parameter": list(ours), "aggregate": list(ours.values()), "mean_of_optima": list(theirs.values())}
     )
-    table["sd_of_optima"] = [individual_sets[name].std(ddof=1) if len(individual_sets) > 1 else np.nan for name in ours]
+    spread = individual_sets.std(ddof=1, numeric_only=True)  # NaN of one; levels have none
+    table["sd_of_optima"] = [spread.get(name, np.nan) for name in ours]
     if reference is not None:
         table.insert(1, "reference", list(set_of(study.space, reference).values()))
         for name, x in (("error_percent", best), ("mean_error_percent", mean)):

@@ -22,6 +22,14 @@ __all__ = ["MOST_PARAMETERS", "Box", "Constraint", "Mechanics", "Parameter"]
 MOST_PARAMETERS = 8
 
 
+def _reads_as_a_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One named parameter, `low` to `high` in `unit`; `scale` says how it lies on [0, 1].
@@ -64,6 +72,15 @@ class Parameter:
         twice = next((level for level in self.levels if self.levels.count(level) > 1), None)
         if twice is not None:
             raise InputError(f'{path}.levels has "{twice}" twice, give each level once.')
+        unseen = next((level for level in self.levels if level != level.strip() or not level.isprintable()), None)
+        if unseen is not None:
+            raise InputError(f"{path}.levels has {unseen!r}, a level is a text without blanks around it, on one line.")
+        numeral = next((level for level in self.levels if _reads_as_a_number(level)), None)
+        if numeral is not None:
+            raise InputError(
+                f'{path}.levels has "{numeral}", which reads as a number; name it otherwise, or give low, high and'
+                " integer = true."
+            )
         if not 0 < self.correlation < 1:
             raise InputError(f"{path}.correlation is {self.correlation}, it must be between 0 and 1.")
 
@@ -82,6 +99,10 @@ class Parameter:
         if self.levels:
             return self.levels[round(value)]
         return round(value) if self.integer else float(value)
+
+    def column(self, values: Float[Any, " n"]) -> Any:
+        """Physical numbers as a column of a table: of levels their names, else the numbers."""
+        return [self.shown(value) for value in values] if self.levels else values
 
     def words(self, value: float) -> str:
         """A physical number in a sentence, without its unit."""

@@ -13,7 +13,7 @@ log, of a table, on another day) gives the same points bit for bit.
 import threading
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import SupportsFloat
+from typing import Any, SupportsFloat
 
 import jax.numpy as jnp
 import numpy as np
@@ -62,9 +62,8 @@ class Session:
     def __repr__(self) -> str:
         of, asked = self.study.selection.trials, ""
         if self.proposal is not None:
-            units = [p.unit for p in self.study.space.parameters]
-            values = zip(self.ask().items(), units, strict=True)
-            asked = ", asks " + ", ".join(f"{name} {value:.4g} {unit}".rstrip() for (name, value), unit in values)
+            values = zip(self.study.space.parameters, self.proposal.tolist(), strict=True)
+            asked = ", asks " + ", ".join(f"{p.name} {p.words(value)} {p.unit}".rstrip() for p, value in values)
         return f'Session("{self.study.name}": {len(self.answers)} of {of} answers{asked})'
 
     @classmethod
@@ -106,11 +105,11 @@ class Session:
         thread.start()
         return thread
 
-    def ask(self) -> dict[str, float]:
-        """The rendering to present next: parameter -> value in physical units."""
-        return dict(zip(self.step.names, _asked(self).tolist(), strict=True))
+    def ask(self) -> dict[str, Any]:
+        """The rendering to present next: parameter -> value in physical units, of levels the name of one."""
+        return self._named(_asked(self))
 
-    def tell(self, response: str, at: Mapping[str, float] | None = None) -> "Session":
+    def tell(self, response: str, at: Mapping[str, Any] | None = None) -> "Session":
         """The next state, after the participant's answer (one of the study's responses) to the asked point.
 
         `at`: the point that was really presented, if it was not the asked one.
@@ -126,27 +125,33 @@ class Session:
         answers = np.append(self.answers, step.responses.index(response))
         return replace(self, points=points, answers=answers, proposal=step(points, answers))
 
-    def _point(self, at: Mapping[str, float]) -> np.ndarray:
+    def _named(self, point: np.ndarray) -> dict[str, Any]:
+        """Physical numbers (d,) by the parameters' names, and levels by their own."""
+        values = zip(self.study.space.parameters, point.tolist(), strict=True)
+        return {p.name: p.shown(value) if p.levels else value for p, value in values}
+
+    def _point(self, at: Mapping[str, Any]) -> np.ndarray:
         """A rendering (d,) that was presented. Raises `InputError` for one that is none of this study's."""
         if set(at) != set(self.step.names):
             raise InputError(f"Session: at has {', '.join(at)}; give {', '.join(self.step.names)}.")
         for p in self.study.space.parameters:
-            if not isinstance(at[p.name], SupportsFloat):
-                raise InputError(f"Session: {p.name} is {at[p.name]!r}; give a number.")
-            if not p.holds(at[p.name]):
-                raise InputError(f"Session: {p.name} is {at[p.name]}; it must be {p.range_words}.")
-        return np.array([at[name] for name in self.step.names], float)
+            value = at[p.name]
+            if not p.levels and not isinstance(value, SupportsFloat):
+                raise InputError(f"Session: {p.name} is {value!r}; give a number.")
+            if not p.holds(p.number(str(value)) if p.levels else float(value)):
+                raise InputError(f"Session: {p.name} is {value}; it must be {p.range_words}.")
+        return np.array([p.number(at[p.name]) if p.levels else at[p.name] for p in self.study.space.parameters], float)
 
     def posterior(self) -> Posterior:
         """The participant's posterior after the answers so far."""
         return fit(self.study.gp, self.trials, inference=self.study.inference)
 
-    def best(self) -> dict[str, float]:
-        """The rendering with the largest posterior mean: parameter -> value in physical units. Raises `InputError`
+    def best(self) -> dict[str, Any]:
+        """The rendering with the largest posterior mean, as `ask` has one. Raises `InputError`
         before the first answer: the prior mean is the same everywhere."""
         if not len(self.answers):
             raise InputError("Session: there are no answers yet, and so no best rendering; tell one first.")
-        return dict(zip(self.step.names, self.step.best(self.posterior()).tolist(), strict=True))
+        return self._named(self.step.best(self.posterior()))
 
 
 def _asked(session) -> np.ndarray:

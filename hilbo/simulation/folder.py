@@ -41,6 +41,5 @@ def simulate_folder(folder: Path, preset: str | None, count: int, seed: int, sou
     write_trials(table, folder / "trials.csv")
     write_trials(simulate.truth_table(study, population, people), folder / "truth.csv")
     shutil.copyfile(path, folder / "study.toml")
-    table["category"] = table["response"].map({label: i for i, label in enumerate(study.responses)})
     truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
     return Simulated(study, population, cohort_of(table, study), truth)

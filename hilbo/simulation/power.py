@@ -31,9 +31,10 @@ from scipy.stats import binomtest
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map
+from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
 from hilbo.simulation.presets import placed
-from hilbo.simulation.simulate import Person, Population, people, simulate_study
+from hilbo.simulation.simulate import Person, Population, felt_apart, people, simulate_study
 from hilbo.study.aggregate import fit_cohort, map_optimum
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -161,7 +162,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
                 map_ = learnt_map(judged.learnt, given)
             x = np.asarray(map_optimum(judged, map_, candidates).x)
             probabilities = np.asarray(_map_top_probability(judged, map_, points))
-            rows.append((index, m, count, _rms(x - truth), _rms(probabilities - target)))
+            rows.append((index, m, count, _rms(differences(persons.levels, x, truth)), _rms(probabilities - target)))
     return pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
 
 
@@ -190,7 +191,8 @@ def top_probability(persons: Person, categories: int, x: Float[np.ndarray, "m d"
     P = (1 - lapse) Phi((lowest criterion - distance - drift / 2) / noise) + lapse / C, its mean over the persons.
     """
     optimum, tolerance = np.asarray(persons.optimum), np.asarray(persons.tolerance)
-    distance = np.sqrt(np.sum(((x[:, None, :] - optimum[None]) / tolerance[None]) ** 2, axis=2))
+    away = felt_apart(persons.levels, x[:, None, :], optimum[None])
+    distance = np.sqrt(np.sum((away / tolerance[None]) ** 2, axis=2))
     strict = np.asarray(persons.criteria).min(axis=1)[None, :]
     felt = (strict - distance - np.asarray(persons.drift)[None, :] / 2) / np.asarray(persons.noise)[None, :]
     lapses = np.asarray(persons.lapse)[None, :]

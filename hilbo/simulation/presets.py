@@ -58,7 +58,10 @@ def population_of(study: Study, preset: str | None = None) -> tuple[str, Populat
     population = preset_of(name)
     if not _of_these_ranges(study, population):
         truth = ", ".join(f"{key} = {value:g}" for key, value in population.truth.items())
-        ranges = ", ".join(f"{p.name} from {p.low:g} to {p.high:g}" for p in study.space.parameters)
+        ranges = ", ".join(
+            f"{p.name} of levels" if p.levels else f"{p.name} from {p.low:g} to {p.high:g}"
+            for p in study.space.parameters
+        )
         raise InputError(
             f'--preset is "{name}", whose people like {truth}, and the study has {ranges}; leave --preset out, and'
             " state [simulation] in the study file."
@@ -75,7 +78,7 @@ def _of_these_ranges(study: Study, population: Population) -> bool:
 def _stated(study: Study, table: SimulationTable) -> Population:
     dim, steps = study.space.dim, len(study.responses) - 1
     return Population(
-        truth=table.truth,
+        truth={p.name: p.number(table.truth[p.name]) for p in study.space.parameters} if table.truth else {},
         spread=each(table.spread, dim),
         tolerance=each(table.tolerance, dim),
         tolerance_sd=table.tolerance_sd,

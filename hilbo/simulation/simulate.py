@@ -5,11 +5,13 @@ A simulated person prefers one rendering and perceives every other at a dissimil
     s = sqrt( sum_i ((x_i - optimum_i) / tolerance_i)^2 ) + drift * (trial / trials) + noise * e,    e ~ N(0, 1),
 
 and answers with the highest category whose criterion s stays below; with probability `lapse` the answer is any
-category. This is deliberately not the model that is fitted: its tails are linear where the GP's are bounded.
+category. Two different levels of a parameter count as half a range apart, whichever they are. This is deliberately not
+the model that is fitted: its tails are linear where the GP's are bounded.
 A whole study (everybody's space-filling and acquisition trials) runs in one compiled call.
 """
 
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -21,12 +23,14 @@ from jaxtyping import Array, Float, Int, Key, PRNGKeyArray
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
+from hilbo.search.apart import differences, levels_of
 from hilbo.session.selection import Design, design, next_point
 from hilbo.study.config import Study
 
-__all__ = ["Person", "Population", "people", "simulate_study", "to_table", "truth_table"]
+__all__ = ["Person", "Population", "felt_apart", "people", "simulate_study", "to_table", "truth_table"]
 
 _MOST_DRAWS = 2000  # of 64 people each
+_LEVELS_APART = 0.5  # of a range
 
 
 class Person(eqx.Module):
@@ -40,6 +44,8 @@ class Person(eqx.Module):
     noise: Float[Array, "*M"]
     lapse: Float[Array, "*M"]
     drift: Float[Array, "*M"]
+    levels: tuple[int, ...] = eqx.field(static=True, default=())
+    """For each parameter its number of unordered levels, 0 for numbers; empty where all are numbers."""
 
     def answer(self, key: PRNGKeyArray, x: Float[Array, " d"], progress: Float[Array, ""]) -> Int[Array, ""]:
         """Category of the answer to the rendering `x` after the share `progress` of the session.
@@ -47,18 +53,24 @@ class Person(eqx.Module):
         `x` (d,) in the unit cube, `progress` from 0 to 1 -> a scalar in 0..C-1.
         """
         perceive, lapse, guess = jax.random.split(key, 3)
-        distance = jnp.sqrt(jnp.sum(((x - self.optimum) / self.tolerance) ** 2))
+        distance = jnp.sqrt(jnp.sum((felt_apart(self.levels, x, self.optimum) / self.tolerance) ** 2))
         felt = distance + self.drift * progress + self.noise * jax.random.normal(perceive, (), x.dtype)
         judged = jnp.sum(felt < self.criteria)
         guessed = jax.random.randint(guess, (), 0, self.criteria.shape[-1] + 1, judged.dtype)
         return jnp.where(jax.random.uniform(lapse, (), x.dtype) < self.lapse, guessed, judged)
 
 
+def felt_apart(levels: tuple[int, ...], x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"]) -> Float[Any, "... d"]:
+    """Differences (..., d) of points as simulated people feel them, before they are divided by their tolerances."""
+    return differences(levels, x, y, _LEVELS_APART)
+
+
 class Population(eqx.Module):
     """From which people are drawn.
 
     `truth` is the rendering, in physical units, around which their optima lie with the standard deviations `spread`
-    (unit cube; redrawn until inside the box and feasible); tolerances are log-normal around `tolerance` with the
+    (unit cube; redrawn until inside the box and feasible), of levels the share of people who prefer another one;
+    tolerances are log-normal around `tolerance` with the
     log standard deviation `tolerance_sd`, one factor per person; `drift` has mean 0 and standard deviation `drift_sd`.
     """
 
@@ -86,11 +98,12 @@ def people(study: Study, population: Population, count: int, seed: int) -> Perso
         )
     rng = np.random.default_rng(seed)
     truth = np.asarray(study.space.to_unit(np.array([population.truth[name] for name in study.space.names])))
-    optima = np.empty((0, study.space.dim))
+    optima, levels = np.empty((0, study.space.dim)), levels_of(study.space.parameters)
     for _ in range(_MOST_DRAWS):
         if len(optima) >= count:
             break
         drawn = truth + np.array(population.spread) * rng.standard_normal((64, study.space.dim))
+        drawn = _with_levels(drawn, levels, truth, population.spread, rng) if levels else drawn
         inside = np.all((drawn >= 0) & (drawn <= 1), axis=1)
         drawn = drawn[inside]
         optima = np.concatenate([optima, drawn[np.asarray(study.space.feasible(drawn))]])
@@ -107,7 +120,22 @@ def people(study: Study, population: Population, count: int, seed: int) -> Perso
         noise=jnp.full(count, population.noise),
         lapse=jnp.full(count, population.lapse),
         drift=jnp.asarray(population.drift_sd * rng.standard_normal(count)),
+        levels=levels,
     )
+
+
+def _with_levels(
+    drawn: Float[np.ndarray, "n d"],
+    levels: tuple[int, ...],
+    truth: Float[np.ndarray, " d"],
+    spread: tuple[float, ...],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "n d"]:
+    """Drawn optima with the truth's levels, and for the share `spread` of people one of the others, evenly."""
+    for i, count in ((i, count) for i, count in enumerate(levels) if count):
+        moved = np.where(rng.random(len(drawn)) < spread[i], rng.integers(1, count, len(drawn)), 0)
+        drawn[:, i] = (np.rint(truth[i] * (count - 1)) + moved) % count / (count - 1)
+    return drawn
 
 
 def simulate_study(study: Study, persons: Person, seed: int) -> Trials:
@@ -170,8 +198,8 @@ def to_table(study: Study, trials: Trials) -> pd.DataFrame:
             "response": np.array(study.responses)[np.asarray(trials.q)[tuple(rows.T)]],
         }
     )
-    for i, name in enumerate(study.space.names):
-        table[name] = physical[..., i][tuple(rows.T)]
+    for i, p in enumerate(study.space.parameters):
+        table[p.name] = p.column(physical[..., i][tuple(rows.T)])
     del capacity
     return table
 
@@ -181,6 +209,7 @@ def truth_table(study: Study, population: Population, persons: Person) -> pd.Dat
     individual_sets = np.asarray(study.space.to_physical(persons.optimum))
     width = max(2, len(str(len(individual_sets))))
     centre = [population.truth[name] for name in study.space.names]
-    table = pd.DataFrame(np.vstack([centre, individual_sets]), columns=list(study.space.names))
+    values = np.vstack([centre, individual_sets])
+    table = pd.DataFrame({p.name: p.column(values[:, i]) for i, p in enumerate(study.space.parameters)})
     table.insert(0, "source", ["population", *(f"individual:P{i + 1:0{width}d}" for i in range(len(individual_sets)))])
     return table

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from hilbo.search.rendering import set_of
 from hilbo.session.set_codes import OWN, code_of
-from hilbo.simulation.simulate import Person, Population, people
+from hilbo.simulation.simulate import Person, Population, felt_apart, people
 from hilbo.study.config import Study
 from hilbo.study.map_summary import Sets
 
@@ -71,7 +71,7 @@ def validation_table(
 
 def _unit(study: Study, row: pd.Series) -> Float[np.ndarray, " d"]:
     """A row of a sets table in the unit cube."""
-    return np.asarray(study.space.to_unit(np.array([float(row[name]) for name in study.space.names])))
+    return np.asarray(study.space.to_unit(np.array([p.number(row[p.name]) for p in study.space.parameters])))
 
 
 def _answer(
@@ -85,7 +85,8 @@ def _answer(
 ) -> tuple[list[str], int]:
     """Classes of two renderings, and which of them is preferred."""
     optimum, tolerance = np.asarray(crowd.optimum[person]), np.asarray(crowd.tolerance[person])
-    felt = np.array([np.sqrt(np.sum(((point - optimum) / tolerance) ** 2)) for point in (x, y)])
+    away = (felt_apart(crowd.levels, point, optimum) / tolerance for point in (x, y))
+    felt = np.array([np.sqrt(np.sum(each**2)) for each in away])
     felt = felt + float(crowd.noise[person]) * rng.standard_normal(2)
     shown = felt + contrast * (felt - felt[::-1])
     judged = [int((value < np.asarray(crowd.criteria[person])).sum()) for value in shown]

@@ -31,6 +31,7 @@ from hilbo.population.hierarchical import Share
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map, share_of
 from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.population.recipes import RECIPES
+from hilbo.search.apart import middle_of
 from hilbo.search.candidates import search_points
 from hilbo.search.space import SearchSpace
 from hilbo.study.cohort import Cohort
@@ -47,7 +48,6 @@ __all__ = [
     "fit_cohort",
     "individual_optima",
     "map_optimum",
-    "nrmse",
     "other_inference",
     "population",
     "population_optimum",
@@ -132,8 +132,9 @@ class Aggregate(eqx.Module):
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"]:
-        """Plain average of the individuals' optima in the unit cube: what the paper compares the map with. (d,)."""
-        return placed(np.asarray(self.individuals.x).mean(axis=0))
+        """Plain average of the individuals' optima in the unit cube, of levels the commonest: what the paper compares
+        the map with. (d,)."""
+        return placed(middle_of(self.posteriors.gp.kernel.levels, np.asarray(self.individuals.x)))
 
 
 def fit_cohort(
@@ -387,12 +388,3 @@ def asked_variance(map_: RuleMap, cohort: Cohort) -> Float[Array, ""]:
         return map_.reach
     points = np.unique(np.asarray(cohort.trials.x)[np.asarray(cohort.trials.mask)], axis=0)
     return placed(np.asarray(predict_map(map_, placed(points))[1]).max())
-
-
-def nrmse(x: Float[Array, "*s d"], reference: Float[Array, " d"]) -> Float[Array, "*s"]:
-    """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube.
-
-    `x` (..., d), `reference` (d,) -> (...,), shares of the ranges.
-    """
-    away = np.asarray(x) - np.asarray(reference)
-    return placed(np.sqrt(np.mean(away**2, axis=-1)))

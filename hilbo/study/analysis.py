@@ -20,8 +20,9 @@ from hilbo.hyperparameters.maximum_evidence import Learned
 from hilbo.population.maps import RuleMap, learnt_map, point_rule
 from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.population.response_quality import excluded, measure_people
+from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, aggregate_cohort, map_optimum, nrmse
+from hilbo.study.aggregate import Aggregate, aggregate_cohort, map_optimum
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import in_place
@@ -174,7 +175,7 @@ def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, 
 
 
 def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
-    """Tolerance intervals through the map's optimum, along every parameter."""
+    """Tolerance intervals through the map's optimum, along every parameter that is no choice of levels."""
     x = aggregate.optimum.x
     rule, share = point_rule(study.rule, aggregate.map.share)
     return Reading(
@@ -185,7 +186,7 @@ def _reading(study: Study, aggregate: Any, seed: int) -> Reading:
                 tolerance(study, aggregate.newcomer, x, name),
                 tolerance_ends(study, aggregate.posteriors, x, name, seed, rule=rule, share=share),
             )
-            for name in study.space.names
+            for name in (p.name for p in study.space.parameters if not p.levels)
         },
     )
 
@@ -212,4 +213,6 @@ def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
 
 def moved_by_evidence(analysis: Analysis) -> float:
     """NRMSE between the optima under fixed and under optimised hyperparameters."""
-    return float(nrmse(analysis.optimised.aggregate.optimum.x, analysis.aggregate.optimum.x))
+    return float(
+        nrmse(analysis.optimised.aggregate.optimum.x, analysis.aggregate.optimum.x, analysis.study.gp.kernel.levels)
+    )

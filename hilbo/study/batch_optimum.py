@@ -19,11 +19,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.errors import InputError
+from hilbo.numerics.host import placed
 from hilbo.numerics.newton import TrustRegionNewton
 from hilbo.numerics.tracing import program
 from hilbo.population.hierarchical import Share
 from hilbo.population.maps import share_of
 from hilbo.population.pointwise import RULES, Rule, Sums
+from hilbo.search.apart import middle_of
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Optimum, other_inference
 from hilbo.study.batch import Jets, Population, Say, jets, population_of, refit, sums
@@ -65,8 +67,11 @@ class LargeAggregate(eqx.Module):
 
     @property
     def mean_of_optima(self) -> Float[Array, " d"] | None:
-        """Plain average of the individuals' optima in the unit cube, if they are known."""
-        return None if self.individuals is None else jnp.mean(self.individuals.x, axis=0)
+        """Plain average of the individuals' optima in the unit cube, of levels the commonest, if they are known."""
+        if self.individuals is None:
+            return None
+        levels = self.population.study.gp.kernel.levels
+        return placed(middle_of(levels, np.asarray(self.individuals.x)))
 
 
 def aggregate_population(

@@ -14,9 +14,10 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
+from hilbo.search.box import Parameter
 from hilbo.study.text_cells import csv_rows, is_decimal, say_delimiter, without_decimal_comma
 
-__all__ = ["FRAME", "cell_pieces", "cells_of", "numbers", "place", "read_cells", "refuse"]
+__all__ = ["FRAME", "cell_pieces", "cells_of", "numbers", "parameter_values", "place", "read_cells", "refuse"]
 
 FRAME = "DataFrame"
 """What a table that is in memory is called in sentences."""
@@ -163,6 +164,27 @@ def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> 
 
     refuse(wrong, source, sentence)
     return values
+
+
+def parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> pd.Series:
+    """A parameter's column in physical numbers, of levels, which stand there by their names, the places in the list.
+
+    Raises `InputError` for what is no number of the range, or none of the levels.
+    """
+    if parameter.levels:
+        cells = text[parameter.name].str.strip()
+        values = cells.map({level: float(place) for place, level in enumerate(parameter.levels)})
+        refuse(
+            values.isna(),
+            source,
+            lambda row: f'{parameter.name} is "{cells.at[row]}"; it must be {parameter.range_words}.',
+        )
+        return values.astype(float)
+
+    def valid(values):
+        return (values >= parameter.low) & (values <= parameter.high) & ((values % 1 == 0) | (not parameter.integer))
+
+    return numbers(text, parameter.name, source, f"{parameter.range_words}, the study's range", valid)
 
 
 def _with_points(text: pd.DataFrame, column: str, source: str) -> list[str]:

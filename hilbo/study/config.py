@@ -7,9 +7,10 @@ from typing import Any
 import equinox as eqx
 
 from hilbo.errors import InputError
+from hilbo.kernels import Levels
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit
 from hilbo.population.learnt import Learnt
-from hilbo.population.learnt_posterior import NOTHING, Stated, prior_model
+from hilbo.population.learnt_posterior import NOTHING, Stated, every_theta, prior_model
 from hilbo.population.maps import AnyRule
 from hilbo.population.recipes import RECIPES
 from hilbo.search.space import SearchSpace
@@ -49,7 +50,7 @@ class Study(eqx.Module):
     simulation: SimulationTable | None = eqx.field(static=True, repr=False, default=None)
     """Of whom `hilbo simulate` and `hilbo power` draw people, if the file states it."""
     stated: Stated = eqx.field(static=True, repr=False, default=NOTHING)
-    """What the file states of the model, where the rule learns the rest."""
+    """What the file states of the model, where the rule learns the rest; and of levels, whatever the rule."""
     learnt: Learnt | None = eqx.field(repr=False, default=None)
     """What was learnt from the answers, by a rule that learns; `gp` is then the learnt model, and before that the
     priors' medians."""
@@ -90,7 +91,10 @@ class Study(eqx.Module):
         )
 
     def __repr__(self) -> str:
-        ranges = ", ".join(f"{p.name} {p.low:g} to {p.high:g} {p.unit}".rstrip() for p in self.space.parameters)
+        ranges = ", ".join(
+            f"{p.name} {p.range_words}" if p.levels else f"{p.name} {p.low:g} to {p.high:g} {p.unit}".rstrip()
+            for p in self.space.parameters
+        )
         return f'Study("{self.name}": {ranges}; {", ".join(self.responses)}; rule {self.rule}; hash {self.hash})'
 
     @property
@@ -119,11 +123,18 @@ def _plain(raw: Any) -> Any:
 
 def _gp(file: StudyFile) -> tuple[OrdinalGP, Stated]:
     """The model of [gp], and what the file states of it; a rule that learns takes the priors' medians for the rest."""
-    table, dim = file.tables.gp, file.space.dim
+    table, parameters = file.tables.gp, file.space.parameters
+    numbers = sum(not p.levels for p in parameters)
+    levels = tuple(Levels(p.steps, p.correlation) if p.levels else None for p in parameters)
+    levels = levels if numbers < len(parameters) else ()
     theta, variance, thresholds, noise = table.theta, table.variance, table.thresholds, table.noise
     if file.tables.aggregation.rule in RECIPES:
-        lengths = theta if theta is None or isinstance(theta, tuple) else (theta,) * dim
-        stated = Stated(lengths, variance, thresholds, noise)
-        return prior_model(dim, len(file.responses), stated), stated
+        lengths = theta if theta is None or isinstance(theta, tuple) else (theta,) * numbers
+        stated = Stated(lengths, variance, thresholds, noise, levels)
+        return prior_model(len(parameters), len(file.responses), stated), stated
     assert theta is not None and variance is not None and thresholds is not None and noise is not None
-    return OrdinalGP(RBF(theta, variance), OrdinalProbit(thresholds, noise)), NOTHING
+    likelihood = OrdinalProbit(thresholds, noise)
+    if not levels:
+        return OrdinalGP(RBF(theta, variance), likelihood), NOTHING
+    stated, lengths = Stated(levels=levels), theta if isinstance(theta, tuple) else (theta,) * numbers
+    return OrdinalGP(RBF(every_theta(RBF, lengths, levels), variance, stated.counts), likelihood), stated

@@ -20,7 +20,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from hilbo.errors import InputError
-from hilbo.study.cells import numbers, read_cells
+from hilbo.study.cells import numbers, parameter_values, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.departures import departures
@@ -185,7 +185,12 @@ def _read_truth(path: Path, study: Study) -> pd.DataFrame:
     missing = [name for name in ("source", *study.space.names) if name not in cells]
     if missing:
         raise InputError(f'{path}:1: column "{missing[0]}" is missing.')
-    values = {name: numbers(cells, name, str(path), "a finite number", np.isfinite) for name in study.space.names}
+    values = {
+        p.name: parameter_values(cells, p, str(path))
+        if p.levels
+        else numbers(cells, p.name, str(path), "a finite number", np.isfinite)
+        for p in study.space.parameters
+    }
     return pd.DataFrame(values).assign(
         source=cells["source"], **({"material": cells["material"]} if "material" in cells else {})
     )

@@ -3,7 +3,8 @@
 Even points of the map are added from the highest down. A point joins the hill of its higher neighbours; one that has
 none begins a hill; where two hills meet, the lower one is part of the other if its top is above the meeting place by
 less than the map's standard deviation at that top: a dip that the answers do not show. Joint draws of the map then say
-how often the largest value of all is on each hill. Its *centre* is the mean of the places where it was.
+how often the largest value of all is on each hill. Its *centre* is the mean of the places where it was, of unordered
+levels the likeliest.
 
 Reference: Edelsbrunner & Harer (2010), Computational Topology, chapter VII, for tops and the places where they merge.
 """
@@ -13,6 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
+
+from hilbo.kernels import Stationary, embedded
 
 __all__ = ["Hill", "hills_of"]
 
@@ -34,17 +37,21 @@ def hills_of(
     height: Float[np.ndarray, " m"],
     sd: Float[np.ndarray, " m"],
     weight: Float[np.ndarray, " m"],
-    theta: Float[np.ndarray, " d"],
+    kernel: Stationary,
 ) -> tuple[Hill, ...]:
     """Hills by falling probability, from even points of the box, the map's mean and standard deviation, and the share
-    of draws that are largest there; `theta`: inverse squared lengths, by which points are near."""
-    tops = _tops(points * np.sqrt(theta), height, sd)
+    of draws that are largest there; `kernel`: by whose distance points are near."""
+    tops = _tops(embedded(kernel, points), height, sd)
     hills = []
     for top in np.unique(tops):
         on = tops == top
         probability = float(weight[on].sum())
         if probability >= _LEAST:
-            hills.append(Hill(points[top], weight[on] @ points[on] / probability, probability))
+            centre = weight[on] @ points[on] / probability
+            for i in (i for i, count in enumerate(kernel.levels) if count):  # a level that is likeliest, and no mean
+                values, which = np.unique(points[on, i], return_inverse=True)
+                centre[i] = values[np.bincount(which, weight[on]).argmax()]
+            hills.append(Hill(points[top], centre, probability))
     return tuple(sorted(hills, key=lambda hill: -hill.probability))
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hilbo.population.learnt import Learnt, learn
-from hilbo.population.learnt_posterior import NOTHING, prior_model
+from hilbo.population.learnt_posterior import Stated, prior_model
 from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -20,8 +20,9 @@ _UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
 
 def that_learns(study: Study, recipe: str = RECOMMENDED) -> Study:
     """The same study by a recipe that learns: nothing of its [gp] is kept."""
-    gp = prior_model(study.space.dim, len(study.responses))
-    return dataclasses.replace(study, rule=recipe, gp=gp, inference="laplace", stated=NOTHING, learnt=None)
+    stated = Stated(levels=study.stated.levels)
+    gp = prior_model(study.space.dim, len(study.responses), stated)
+    return dataclasses.replace(study, rule=recipe, gp=gp, inference="laplace", stated=stated, learnt=None)
 
 
 def resolved(study: Study, cohort: Cohort) -> Study:
@@ -41,7 +42,7 @@ def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
     model = learnt.model
     content: dict[str, Any] = {
         "recipe": learnt.recipe,
-        "stated": {name: value for name, value in study.stated._asdict().items() if value is not None},
+        "stated": study.stated.numbers,
         "noise": float(model.noise),
         "theta": dict(zip(study.space.names, np.asarray(model.theta).tolist(), strict=True)),
         "shared_variance": float(model.shared),

@@ -24,7 +24,7 @@ def optimum_sentence(study: Study, x: Float[Array, " d"]) -> str:
     """The optimum x (d,) of the unit cube in the study's units."""
     values = np.asarray(study.space.to_physical(np.asarray(x)))
     sets = (
-        f"{parameter.name} = {value:.4g}{f' {parameter.unit}' if parameter.unit else ''}"
+        f"{parameter.name} = {parameter.words(value)}{f' {parameter.unit}' if parameter.unit else ''}"
         for parameter, value in zip(study.space.parameters, values, strict=True)
     )
     return f"The population optimum is {', '.join(sets)}."
@@ -74,6 +74,8 @@ def _extrapolates(sd: Float[Array, ""], asked: Float[Array, ""]) -> bool:
 def _edges(study: Study, x: Float[np.ndarray, " d"]) -> _Edges:
     inner, edges = np.asarray(study.space.to_box(x)), _Edges([], [])
     for i, parameter in enumerate(study.space.parameters):
+        if parameter.levels:
+            continue
         unit = f" {parameter.unit}" if parameter.unit else ""
         for place, end, word in ((0.0, parameter.low, "lowest"), (1.0, parameter.high, "highest")):
             if abs(x[i] - place) < _AT:

@@ -11,8 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from hilbo.kernels import Stationary, embedded
 from hilbo.population.joint import posterior_map
 from hilbo.population.maps import RuleMap
+from hilbo.search.box import Parameter
 from hilbo.search.candidates import search_points
 from hilbo.search.rendering import set_of
 from hilbo.study.config import Study
@@ -42,9 +44,11 @@ class Region(NamedTuple):
         """Whether it is small enough to say where the best rendering is."""
         return self.volume <= _LOCATED
 
-    def holds(self, x: Float[np.ndarray, " d"], theta: Float[np.ndarray, " d"]) -> bool:
-        """Whether the nearest of all points, in units of the lengths, is in the region."""
-        near, far = (np.min(((p - x) ** 2) @ theta) if len(p) else np.inf for p in (self.points, self.others))
+    def holds(self, x: Float[np.ndarray, " d"], kernel: Stationary) -> bool:
+        """Whether the nearest of all points, by the kernel's distance, is in the region."""
+        places = embedded(kernel, np.concatenate([self.points, self.others, x[None]]))
+        away, count = np.sum((places[:-1] - places[-1]) ** 2, axis=1), len(self.points)
+        near, far = np.min(away[:count], initial=np.inf), np.min(away[count:], initial=np.inf)
         return bool(near <= far)
 
 
@@ -61,7 +65,7 @@ def optimum_region(study: Study, map_: RuleMap, seed: int = 0) -> Region | None:
     inside[order[:count]] = True
     points, box = np.asarray(x), np.asarray(study.space.to_box(x))
     mean, sd = np.asarray(joint.mean), np.sqrt(np.asarray(joint.variance))
-    hills = hills_of(box, mean, sd, weight, np.broadcast_to(np.asarray(study.gp.kernel.theta), box.shape[1]))
+    hills = hills_of(box, mean, sd, weight, study.gp.kernel)
     return Region(points[inside], points[~inside], float(inside[:_POINTS].mean()), hills)
 
 
@@ -74,17 +78,25 @@ def region_content(study: Study, region: Region | None) -> dict[str, Any] | None
     def of_box(x: Float[np.ndarray, " d"]) -> dict[str, float]:
         return set_of(study.space, study.space.from_box(jnp.asarray(x)))
 
-    ends = zip(study.space.names, physical.min(axis=0).tolist(), physical.max(axis=0).tolist(), strict=True)
     return {
         "probability": PROBABILITY,
         "volume": region.volume,
         "located": region.located,
-        "parameters": {name: [low, high] for name, low, high in ends},
+        "parameters": {
+            p.name: _extent(p, column) for p, column in zip(study.space.parameters, physical.T, strict=True)
+        },
         "hills": [
             {"probability": hill.probability, "top": of_box(hill.top), "centre": of_box(hill.centre)}
             for hill in region.hills
         ],
     }
+
+
+def _extent(parameter: Parameter, values: Float[np.ndarray, " k"]) -> list[float | str]:
+    """Both ends of a parameter's values; of levels all that are among them."""
+    if parameter.levels:
+        return [parameter.shown(value) for value in np.unique(values).tolist()]
+    return [values.min().item(), values.max().item()]
 
 
 def region_sentences(region: Region | None) -> list[str]:

@@ -11,7 +11,7 @@ from hilbo.errors import InputError
 from hilbo.numerics.shown import known
 from hilbo.ordinal_gp import Posterior
 from hilbo.study.aggregate import Aggregate
-from hilbo.study.cells import FRAME, cells_of, numbers, place
+from hilbo.study.cells import FRAME, cells_of, parameter_values, place
 from hilbo.study.config import Study
 
 __all__ = ["predict_table"]
@@ -54,6 +54,5 @@ def _points(study: Study, table: pd.DataFrame) -> jnp.ndarray:
         raise InputError(f'{place(FRAME)}column "{missing[0]}" is missing; a rendering of this study has {wanted}.')
     columns = []
     for p in study.space.parameters:
-        words = f"a number from {p.low:g} to {p.high:g} {p.unit}".rstrip() + ", the study's range"
-        columns.append(numbers(text, p.name, FRAME, words, lambda v, p=p: (v >= p.low) & (v <= p.high)))
+        columns.append(parameter_values(text, p, FRAME))
     return jnp.asarray(study.space.to_unit(jnp.asarray(np.stack(columns, axis=1))))

@@ -22,6 +22,7 @@ from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.pointwise import Rule, aggregate
+from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, fit_cohort, individual_optima, map_optimum
 from hilbo.study.config import Study
@@ -50,6 +51,8 @@ class Progress(NamedTuple):
     """The same of each person's own optimum, to the half without that person; median over the splits."""
     maps: dict[int, RuleMap]
     """The population's map, with everybody's posteriors in it, after some of `counts`: those that are drawn."""
+    levels: tuple[int, ...] = ()
+    """As the kernel has them."""
 
     @property
     def splits(self) -> int:
@@ -72,8 +75,8 @@ class Progress(NamedTuple):
     def to_end(self) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p M"]]:
         """NRMSE of the population's and of everybody's running optimum to the final one; a person's is NaN beyond their
         last answer, where it cannot move."""
-        population = np.sqrt(np.mean((self.population - self.population[-1]) ** 2, axis=1))
-        individual = np.sqrt(np.mean((self.own - self.own[-1]) ** 2, axis=2))
+        population = np.asarray(nrmse(self.population, self.population[-1], self.levels))
+        individual = np.asarray(nrmse(self.own, self.own[-1], self.levels))
         return population, np.where(self.counts[:, None] <= self.ends[None, :], individual, np.nan)
 
 
@@ -106,8 +109,9 @@ def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[
         optima_after += pool.map(after, asked[1:].tolist())
     population, individual, halves, maps = zip(*optima_after, strict=True)
     kept = {count: map_ for count, map_ in zip(asked.tolist(), maps, strict=True) if map_ is not None}
+    levels = study.gp.kernel.levels
     own, tops = np.stack(individual), np.stack(halves)
-    return Progress(asked, np.stack(population), own, ends, *_to_other_half(tops, own, split), kept)
+    return Progress(asked, np.stack(population), own, ends, *_to_other_half(levels, tops, own, split), kept, levels)
 
 
 def _splits(people: int, seed: int) -> Bool[np.ndarray, "s M"]:
@@ -142,15 +146,18 @@ def _highest(map_: RuleMap, points: Float[Array, "m d"], sides: Bool[Array, "k M
 
 
 def _to_other_half(
-    tops: Float[np.ndarray, "p s 2 d"], own: Float[np.ndarray, "p M d"], split: Bool[np.ndarray, "s M"]
+    levels: tuple[int, ...],
+    tops: Float[np.ndarray, "p s 2 d"],
+    own: Float[np.ndarray, "p M d"],
+    split: Bool[np.ndarray, "s M"],
 ) -> tuple[Float[np.ndarray, "p s2"], Float[np.ndarray, "p M"]]:
     """NRMSE to where the other half's optimum is after all trials: of each half's optimum, and of each person's own."""
     if not len(split):
         return np.zeros((len(tops), 0)), np.full(own.shape[:2], np.nan)
     last = tops[-1, :, ::-1]  # of a half, the other half's
-    halves = np.sqrt(np.mean((tops - last) ** 2, axis=-1)).reshape(len(tops), -1)
+    halves = np.asarray(nrmse(tops, last, levels)).reshape(len(tops), -1)
     others = np.where(split[:, :, None], last[:, :1], last[:, 1:])  # of each person, the half without that person
-    person = np.sqrt(np.mean((own[:, None] - others) ** 2, axis=-1))
+    person = np.asarray(nrmse(own[:, None], others, levels))
     return halves, np.median(person, axis=1)
 
 

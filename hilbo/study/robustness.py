@@ -24,8 +24,9 @@ from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.maps import point_rule, share_of
 from hilbo.population.pointwise import Rule
 from hilbo.population.recipes import RECIPES
+from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Optimum, fit_cohort, individual_optima, nrmse, population, population_optimum
+from hilbo.study.aggregate import Optimum, fit_cohort, individual_optima, population, population_optimum
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.resampled_optimum import resampled_tops
@@ -124,6 +125,7 @@ def robustness(
         population_optimum(s, p, candidates, rule, share)
         for s, p, share in zip((study, study_learnt), (posteriors, again), shares, strict=True)
     )
+    levels = study.gp.kernel.levels
     before, after = (individual_optima(s, p, candidates) for s, p in ((study, posteriors), (study_learnt, again)))
     return Robustness(
         judged=judged,
@@ -133,8 +135,8 @@ def robustness(
         optimised_individuals=after,
         posteriors=posteriors,
         posteriors_learnt=again,
-        nrmse=nrmse(optimised.x, fixed.x),
-        individual_nrmse=jnp.sqrt(jnp.mean((after.x - before.x) ** 2, axis=1)),
+        nrmse=nrmse(optimised.x, fixed.x, levels),
+        individual_nrmse=nrmse(after.x, before.x, levels),
         resampled=_resampled(study, posteriors, candidates, fixed.x, rule, share, seed),
         sensitivity=_sensitivity(study, cohort.trials, fixed.x, tuple(learn), rule, share),
         shared=shared,
@@ -155,7 +157,7 @@ def _resampled(
     """How far the optimum of resampled people is from x, sought among x and some of the candidates."""
     points = jnp.concatenate([x[None, :], candidates[:_POINTS]])
     tops = resampled_tops(posteriors, points, rule, share, study.gp.kernel.variance, seed)
-    return jnp.sqrt(jnp.mean((points[tops] - x[None, :]) ** 2, axis=1))
+    return nrmse(points[tops], x[None, :], study.gp.kernel.levels)
 
 
 def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:

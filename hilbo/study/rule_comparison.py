@@ -33,8 +33,9 @@ from hilbo.population.leave_one_out import (
 from hilbo.population.maps import GIVEN_RULES, RuleMap, learnt_map, rule_map, share_of
 from hilbo.population.pointwise import RULES
 from hilbo.population.recipes import RECIPES, RECOMMENDED
+from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, map_optimum, nrmse
+from hilbo.study.aggregate import Aggregate, map_optimum
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import ALIKE, SURE, share_content
@@ -151,7 +152,7 @@ def _map_content(
         "agreement_with_pooled": None if isinstance(pooled, str) else _agreement(mean, pooled.predict(x)[0]),
         "from_pooled": None
         if isinstance(pooled, str)
-        else float(nrmse(best.x, map_optimum(study, pooled, candidates).x)),
+        else float(nrmse(best.x, map_optimum(study, pooled, candidates).x, study.gp.kernel.levels)),
         "optimum_by_draws": _by_draws(study, map_, posteriors, x, seed),
         "optimum_by_bootstrap": _by_bootstrap(study, map_, posteriors, x, seed),
     }
@@ -187,19 +188,23 @@ def _by_bootstrap(
 
 
 def _quantiles(study: Study, x: Float[Array, "p d"], weight: Float[np.ndarray, " p"]) -> dict[str, list[float]]:
-    """5, 50 and 95 % of each parameter, in its unit, over weighted points."""
+    """5, 50 and 95 % of each parameter, in its unit, over weighted points; of levels that of the largest weight."""
     physical = np.asarray(study.space.to_physical(np.asarray(x)))
     quantiles = {}
-    for i, name in enumerate(study.space.names):
+    for i, p in enumerate(study.space.parameters):
+        if p.levels:
+            quantiles[p.name] = [p.shown(np.bincount(physical[:, i].astype(int), weight).argmax().item())]
+            continue
         order = np.argsort(physical[:, i])
         total = np.cumsum(weight[order])
         places = np.searchsorted(total, np.array([0.05, 0.5, 0.95]) * total[-1])
-        quantiles[name] = physical[order[np.minimum(places, len(order) - 1)], i].tolist()
+        quantiles[p.name] = physical[order[np.minimum(places, len(order) - 1)], i].tolist()
     return quantiles
 
 
-def _parameters(study: Study, x: Float[Array, " d"]) -> dict[str, float]:
-    return dict(zip(study.space.names, np.asarray(study.space.to_physical(np.asarray(x))).tolist(), strict=True))
+def _parameters(study: Study, x: Float[Array, " d"]) -> dict[str, Any]:
+    values = np.asarray(study.space.to_physical(np.asarray(x))).tolist()
+    return {p.name: p.shown(v) if p.levels else v for p, v in zip(study.space.parameters, values, strict=True)}
 
 
 def recommendation(left: Mapping[str, LeftOut], rules: dict[str, Any], share: Share, people: int) -> str:

@@ -23,12 +23,13 @@ class SimulationTable(Table, frozen=True):
     """People of whom each prefers one rendering; `hilbo.simulation.simulate` has the model.
 
     `truth`: parameter -> where their optima lie, physical units; drawn from what may be rendered where it is not
-    stated. `spread`: sd of optima between people, and `tolerance`: the distance at which the highest answer is left,
-    both in parts of the ranges. `criteria`: C - 1 falling distances in tolerances, below the last of which the answer
-    is the highest. `noise`: sd of what is felt, in tolerances. `lapse`: share of answers that are guesses.
+    stated. `spread`: sd of optima between people, of levels the share who prefer another one, and `tolerance`: the
+    distance at which the highest answer is left, both in parts of the ranges. `criteria`: C - 1 falling distances in
+    tolerances, below the last of which the answer is the highest. `noise`: sd of what is felt, in tolerances. `lapse`:
+    share of answers that are guesses.
     """
 
-    truth: Annotated[dict[str, float], words("a table of numbers", "{hue = 120, light = 50}")] = msgspec.field(
+    truth: Annotated[dict[str, float | str], words("a table of numbers or levels", "{hue = 120}")] = msgspec.field(
         default_factory=dict
     )
     spread: _Parts = 0.12
@@ -45,9 +46,9 @@ class SimulationTable(Table, frozen=True):
         if self.truth and set(self.truth) != set(names):
             raise InputError(f"simulation.truth names {', '.join(self.truth)}, it must name {', '.join(names)}.")
         for p in parameters if self.truth else ():
-            if not p.low <= self.truth[p.name] <= p.high:
+            if not p.low <= p.number(self.truth[p.name]) <= p.high:
                 value = shown(self.truth[p.name])
-                raise InputError(f"simulation.truth.{p.name} is {value}, it must be from {p.low:g} to {p.high:g}.")
+                raise InputError(f"simulation.truth.{p.name} is {value}, it must be {p.range_words}.")
         for name, values in (("spread", self.spread), ("tolerance", self.tolerance)):
             if isinstance(values, tuple) and len(values) != len(names):
                 raise InputError(

@@ -35,12 +35,15 @@ class StimulusTable(Table, frozen=True):
     by: Annotated[Literal["program", "person"], words('"program" or "person"', '"program"')] = "program"
     experimenter_sees: Annotated[bool | None, words("true or false", "true")] = None
 
-    def check(self, names: Sequence[str]) -> None:
+    def check(self, parameters: Sequence[Parameter]) -> None:
         """Refuse tolerances of what is no parameter, and those that are none. Raises `InputError`."""
+        names, levels = [p.name for p in parameters], [p.name for p in parameters if p.levels]
         for name, value in self.tolerance.items():
             path = f"stimulus.tolerance.{name}"
             if name not in names:
                 raise InputError(f"{path} is of no parameter of the study, those are {', '.join(names)}.")
+            if name in levels:
+                raise InputError(f"{path} is of levels, and another level is none that was asked for; leave it out.")
             if not 0 <= value < math.inf:
                 raise InputError(f"{path} is {shown(value)}, it must be a number, 0 or above.")
         for key, least in _PATIENCE.items() if self.by == "person" else ():
@@ -62,4 +65,6 @@ class StimulusTable(Table, frozen=True):
 
     def off_by(self, parameter: Parameter) -> float:
         """How far a confirmed value may be off, in the parameter's unit."""
-        return self.tolerance.get(parameter.name, _EXACT * (parameter.high - parameter.low))
+        return self.tolerance.get(
+            parameter.name, 0.0 if parameter.levels else _EXACT * (parameter.high - parameter.low)
+        )

@@ -4,7 +4,7 @@ Each table is a schema, whose annotations carry the type, the range and the word
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, Literal, get_args
 
 import msgspec
@@ -59,6 +59,17 @@ class _ParameterTable(_Table, frozen=True):
     unit: Annotated[str, _text("a text", '"N/mm"')] = ""
     scale: Annotated[Literal["linear", "log"], _text('"linear" or "log"', '"linear"')] = "linear"
     integer: Annotated[bool, _text("true or false", "true")] = False
+
+
+class _LevelsTable(_Table, frozen=True):
+    """A parameter of unordered levels. `correlation`: of the latent score at two of them, before any answer."""
+
+    levels: Annotated[
+        tuple[Annotated[str, msgspec.Meta(min_length=1)], ...],
+        msgspec.Meta(min_length=2),
+        _text("a list of two or more texts", '["silk", "wood", "stone"]'),
+    ]
+    correlation: Annotated[float, msgspec.Meta(gt=0, lt=1), _text("a number above 0 and below 1", "0.5")] = 0.5
 
 
 class _ConstraintTable(_Table, frozen=True):
@@ -135,7 +146,7 @@ class Tables(_Table, frozen=True):
     """The whole file: what the hash is taken of."""
 
     study: _StudyTable
-    parameters: dict[str, _ParameterTable]
+    parameters: dict[str, _ParameterTable | _LevelsTable]
     gp: GPTable = GPTable()
     renderer: _RendererTable | None = None
     selection: Selection = Selection()
@@ -162,6 +173,7 @@ _REQUIRED = ("schema", "study", "parameters")
 _KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "constraints", "materials")
 _LEARNT = ("theta", "variance", "thresholds", "noise")
 _OVERRIDES = ("renderer", "parameters")
+_NUMBERS_KEYS = ("low", "high", "unit", "scale", "integer")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
 
 
@@ -172,13 +184,13 @@ def read(raw: Mapping[str, Any]) -> Tables:
     if raw["schema"] is True or raw["schema"] != 1:
         raise InputError(f"schema is {shown(raw['schema'])}, it must be 1: this hilbo reads no other.")
     tables = {key: read_table(kind, raw[key], key) for key, kind in _TABLES.items() if key in raw}
+    parameters = {
+        name: read_table(_kind_of(table), table, f"parameters.{name}") for name, table in raw["parameters"].items()
+    }
     if "gp" in tables:
-        tables["gp"] = _with_theta(tables["gp"], len(raw["parameters"]))
+        tables["gp"] = _with_theta(tables["gp"], parameters.values())
     if "renderer" in raw:
         tables["renderer"] = read_table(_RendererTable, raw["renderer"], "renderer")
-    parameters = {
-        name: read_table(_ParameterTable, table, f"parameters.{name}") for name, table in raw["parameters"].items()
-    }
     if "constraints" in raw:
         tables["constraints"] = _constraints(raw["constraints"])
     materials = check_table(raw.get("materials", {}), "materials")
@@ -200,7 +212,7 @@ def _check_complete(raw: Mapping[str, Any]) -> None:
     kinds = _TABLES | {"renderer": _RendererTable}
     missing += (key for name, kind in kinds.items() if name in raw for key in missing_keys(kind, raw[name], name))
     for name, table in check_table(raw.get("parameters", {}), "parameters").items():
-        missing += missing_keys(_ParameterTable, table, f"parameters.{name}")
+        missing += missing_keys(_kind_of(table), _of_one_kind(table, f"parameters.{name}"), f"parameters.{name}")
     rule = raw.get("aggregation", {}).get("rule", "bcm")  # one that is none is refused with its value
     stated = {"theta" if key == "length" else key for key in raw.get("gp", {})}
     fixed = rule not in _LEARN and rule in get_args(Rule)
@@ -209,12 +221,32 @@ def _check_complete(raw: Mapping[str, Any]) -> None:
     check_present([*missing, *unstated], hint)
 
 
-def _with_theta(table: GPTable, dim: int) -> GPTable:
-    """The same model with its lengths as theta: how they are written is not part of a study's hash."""
+def _kind_of(table: Any) -> type[_ParameterTable | _LevelsTable]:
+    """The schema of a parameter: of numbers, or of levels."""
+    return _LevelsTable if isinstance(table, Mapping) and "levels" in table else _ParameterTable
+
+
+def _of_one_kind(table: Any, path: str) -> Any:
+    """The parsed table of a parameter. Raises `InputError` for levels beside what only numbers have."""
+    if _kind_of(table) is _LevelsTable:
+        beside = next((key for key in table if key in _NUMBERS_KEYS), None)
+        if beside is not None:
+            raise InputError(f"{path}.{beside} stands beside levels, which have no order and no unit; leave it out.")
+    elif isinstance(table, Mapping) and "correlation" in table:
+        raise InputError(f"{path}.correlation is of levels, and there are none; leave it out, or give levels.")
+    return table
+
+
+def _with_theta(table: GPTable, parameters: Collection[_ParameterTable | _LevelsTable]) -> GPTable:
+    """The same model with its lengths as theta: how they are written is not part of a study's hash. Levels have none,
+    but a correlation."""
+    dim = sum(isinstance(p, _ParameterTable) for p in parameters)
     for name, values in (("theta", table.theta), ("length", table.length)):
         if isinstance(values, tuple) and len(values) != dim:
-            count = len(values)
-            raise InputError(f"gp.{name} has {count} numbers, it must be one number or {dim}, one per parameter.")
+            count, which = len(values), "" if dim == len(parameters) else " without levels"
+            raise InputError(
+                f"gp.{name} has {count} numbers, it must be one number or {dim}, one per parameter{which}."
+            )
     if table.length is None:
         return table
     if table.theta is not None:
@@ -226,7 +258,7 @@ def _with_theta(table: GPTable, dim: int) -> GPTable:
 
 def box_of(tables: Tables) -> Box:
     """[parameters] and [renderer]. Raises `InputError`."""
-    parameters = tuple(Parameter(name, **msgspec.structs.asdict(p)) for name, p in tables.parameters.items())
+    parameters = tuple(_parameter(name, table) for name, table in tables.parameters.items())
     constraints = tuple(Constraint(tuple(c.terms.items()), c.least, c.most) for c in tables.constraints)
     if tables.renderer is None:
         return Box(parameters, None, constraints)
@@ -241,6 +273,12 @@ def box_of(tables: Tables) -> Box:
     return Box(parameters, Mechanics(**renderer), constraints)
 
 
+def _parameter(name: str, table: _ParameterTable | _LevelsTable) -> Parameter:
+    if isinstance(table, _LevelsTable):
+        return Parameter.of_levels(name, table.levels, table.correlation)
+    return Parameter(name, **msgspec.structs.asdict(table))
+
+
 def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     """Refuse tables that do not fit each other, or the parameters. Raises `InputError`."""
     labels, selection = tables.study.responses, tables.selection
@@ -252,7 +290,7 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
         )
     tables.session.check(labels)
     if tables.stimulus is not None:
-        tables.stimulus.check(tuple(tables.parameters))
+        tables.stimulus.check(parameters)
         if tables.renderer is not None:
             raise InputError("stimulus stands beside renderer, a study has one: a program presents, or a device.")
     if tables.simulation is not None:

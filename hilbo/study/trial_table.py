@@ -15,8 +15,7 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.search.box import Parameter
-from hilbo.study.cells import FRAME, cell_pieces, cells_of, numbers, place, refuse
+from hilbo.study.cells import FRAME, cell_pieces, cells_of, numbers, parameter_values, place, refuse
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, check_text, formulas, no_ids
 
@@ -100,7 +99,7 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
     check_people(text, source)
     check_texts(text, source, numeric | {"response"})
     for parameter in study.space.parameters:
-        table[parameter.name] = _parameter_values(text, parameter, source)
+        table[parameter.name] = parameter_values(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
     table["_blinded"] = text["unblinded"].str.strip().str.lower().isin(_FALSE) if "unblinded" in text else True
     table["_fitted"] = ~_flags(text, "voided", source) & (~text["phase"].isin(NOT_FITTED) if "phase" in text else True)
@@ -131,13 +130,6 @@ def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
         raise InputError(
             f'{place(source)}column "{missing[0]}" is missing{hint}; a trial table of this study has {wants}.'
         )
-
-
-def _parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> pd.Series:
-    def valid(values):
-        return (values >= parameter.low) & (values <= parameter.high) & ((values % 1 == 0) | (not parameter.integer))
-
-    return numbers(text, parameter.name, source, f"{parameter.range_words}, the study's range", valid)
 
 
 def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.Series:

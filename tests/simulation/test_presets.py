@@ -76,7 +76,7 @@ def test_a_study_may_state_its_people():
     ("old", "new", "sentence"),
     [
         ("light = 65}", "lightness = 65}", "simulation.truth names hue, lightness, it must name hue, light."),
-        ("hue = 90", "hue = 400", "simulation.truth.hue is 400.0, it must be from 0 to 360."),
+        ("hue = 90", "hue = 400", "simulation.truth.hue is 400.0, it must be a number from 0 to 360."),
         ("[0.02, 0.03]", "[0.02]", "simulation.spread has 1 numbers, it must be one number or 2, one per parameter."),
         (
             "[4, 2, 1]",

@@ -13,8 +13,9 @@ import pytest
 from hilbo import bcm
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials, fit
+from hilbo.search.apart import nrmse
 from hilbo.session.ask_tell import physical_trials
-from hilbo.study.aggregate import aggregate_cohort, fit_cohort, nrmse, population
+from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
 from hilbo.study.progress import follow

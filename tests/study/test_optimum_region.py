@@ -33,8 +33,8 @@ def test_more_answers_leave_less_and_hold_the_best(monkeypatch):
     assert few is not None and many is not None
     assert 0 < many.volume < 0.5 * few.volume
     assert len(many.points) + len(many.others) == 250
-    assert many.holds(np.array([0.3, 0.6]), THETA)
-    assert not many.holds(np.array([0.95, 0.05]), THETA)
+    assert many.holds(np.array([0.3, 0.6]), RBF(THETA))
+    assert not many.holds(np.array([0.95, 0.05]), RBF(THETA))
 
 
 def test_an_unlocated_optimum_says_so():
@@ -88,5 +88,5 @@ def test_the_best_is_in_it_as_often_as_it_says():
         one = jnp.ones(())
         region = optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), seed)
         assert region is not None
-        held += region.holds(grid[np.argmax(f[40:])], THETA)
+        held += region.holds(grid[np.argmax(f[40:])], RBF(THETA))
     assert held >= 0.95 * 25 - 3 * np.sqrt(25 * 0.95 * 0.05)

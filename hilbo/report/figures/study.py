@@ -38,6 +38,7 @@ from hilbo.report.figures.style import (
     star,
     title,
 )
+from hilbo.search.apart import nrmse
 from hilbo.study.analysis import Analysis, Reading
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
@@ -64,7 +65,7 @@ _CELLS = 101
 def typical_person(analysis: Analysis) -> int:
     """Whose own optimum is nearest to the median distance from the population's: shown as the example."""
     x, best = np.asarray(analysis.aggregate.individuals.x), np.asarray(analysis.aggregate.optimum.x)
-    miss = np.sqrt(np.mean((x - best) ** 2, axis=1))
+    miss = np.asarray(nrmse(x, best, analysis.study.gp.kernel.levels))
     return int(np.argsort(miss, kind="stable")[(len(miss) - 1) // 2])
 
 
@@ -125,7 +126,7 @@ def population_convergence(progress: Progress, references: Mapping[str, Float[np
         figure = Figure(figsize=(ONE_COLUMN, 2.7), layout="constrained")
         axes = figure.subplots()
         for (name, x), (colour, marker, dashes) in zip(targets.items(), looks, strict=False):
-            miss = 100 * np.sqrt(np.mean((progress.population - x) ** 2, axis=1))
+            miss = 100 * np.asarray(nrmse(progress.population, x, progress.levels))
             axes.plot(
                 progress.counts, miss, color=colour, marker=marker, linestyle=dashes, markersize=3.5, label=f"to {name}"
             )
@@ -261,7 +262,7 @@ def _interval(axes, reading, index, i, j):
     """The tolerance interval of a parameter as a line along the slice it was read on, with a bar at each end."""
     study = reading.study
     parameter = study.space.parameters[index]
-    interval, _ = reading.tolerances[parameter.name]
+    interval, _ = reading.tolerances.get(parameter.name, (None, None))  # levels have none
     if interval is None:
         return
     ends = np.asarray(parameter.to_unit(jnp.asarray([interval.low, interval.high])))
@@ -278,7 +279,7 @@ def _class_curves(axes, reading, shades):
     chances = np.asarray(_probabilities(reading, side[:, None])).T
     label_axes(axes, study, 0, 0)
     axes.stackplot(physical_side, chances, colors=[shades(k) for k in range(len(chances))])
-    interval, _ = reading.tolerances[study.space.parameters[0].name]
+    interval, _ = reading.tolerances.get(study.space.parameters[0].name, (None, None))
     if interval is not None:
         axes.hlines(0.5, interval.low, interval.high, color=RED, linewidth=2)
     axes.set(yscale="linear", ylabel="probability of each answer", ylim=(0, 1))

@@ -1,0 +1,54 @@
+"""How far apart points of the unit cube are, where some coordinates are unordered levels."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.numerics.host import namespace_of, placed
+from hilbo.search.box import Parameter
+
+__all__ = ["differences", "levels_of", "middle_of", "nrmse"]
+
+
+def levels_of(parameters: Sequence[Parameter]) -> tuple[int, ...]:
+    """For each coordinate its number of unordered levels, 0 for numbers; empty where all are numbers."""
+    counts = tuple(p.steps if p.levels else 0 for p in parameters)
+    return counts if any(counts) else ()
+
+
+def differences(
+    levels: tuple[int, ...], x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"], apart: float = 1.0
+) -> Float[Any, "... d"]:
+    """x - y, coordinate by coordinate: (..., d); of unordered levels `apart` where they differ, whichever they are.
+
+    `levels`: as `levels_of` has them.
+    """
+    if not levels:
+        return x - y
+    xp = namespace_of(x, y)
+
+    def part(i: int, count: int) -> Float[Any, "..."]:
+        here, there = x[..., i], y[..., i]
+        if not count:
+            return here - there
+        return xp.where(xp.round(here * (count - 1)) == xp.round(there * (count - 1)), 0.0, apart).astype(x.dtype)
+
+    return xp.stack([part(i, count) for i, count in enumerate(levels)], axis=-1)
+
+
+def nrmse(x: Float[Any, "*#batch d"], y: Float[Any, "*#batch d"], levels: tuple[int, ...] = ()) -> Float[Array, "..."]:
+    """Root-mean-square difference of parameter sets in units of their search ranges: of points of the unit cube, by
+    `differences`. `x`, `y` (..., d) -> (...,)."""
+    away = differences(levels, np.asarray(x), np.asarray(y))
+    return placed(np.sqrt(np.mean(away**2, axis=-1)))
+
+
+def middle_of(levels: tuple[int, ...], x: Float[np.ndarray, "n d"]) -> Float[np.ndarray, " d"]:
+    """The mean of points, coordinate by coordinate: (d,); of unordered levels the commonest."""
+    middle = x.mean(axis=0)
+    for i in (i for i, count in enumerate(levels) if count):
+        values, counts = np.unique(x[:, i], return_counts=True)
+        middle[i] = values[counts.argmax()]
+    return middle
