@@ -29,7 +29,7 @@ def one_study(study, seed, candidates):
     cohort = Cohort(trials, np.zeros((24, 25, 3)), tuple(f"P{j:02d}" for j in range(24)))
     aggregate = aggregate_cohort(study, cohort, 0, alternatives=False)
     progress = follow(study, aggregate, 0)
-    merged, own = progress.population, progress.own
+    merged, own = progress.population, progress.individual
     average = np.asarray(population_optimum(study, aggregate.posteriors, candidates, "average").x)
     close = np.asarray((trials.q == 2).sum(axis=1))
     return {

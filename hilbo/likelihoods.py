@@ -50,8 +50,8 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
 def _rising(thresholds: np.ndarray) -> bool:
     """Whether there is one threshold at least, all are finite, and each is above the one before; for several people."""
-    some = thresholds.ndim > 0 and thresholds.shape[-1] > 0
-    return bool(some and np.all(np.isfinite(thresholds)) and np.all(np.diff(thresholds) > 0))
+    not_empty = thresholds.ndim > 0 and thresholds.shape[-1] > 0
+    return bool(not_empty and np.all(np.isfinite(thresholds)) and np.all(np.diff(thresholds) > 0))
 
 
 class OrdinalProbit(eqx.Module):

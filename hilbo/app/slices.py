@@ -73,12 +73,12 @@ class Maps:
         study, fitted = self._chooser.study(answers.block), self._chooser.fitted(answers)
         names = study.space.names
         best = self._chooser.best(answers.block, fitted)
-        made: _Slices = jax.device_get(_slices(study, fitted.posterior, best))
+        maps: _Slices = jax.device_get(_slices(study, fitted.posterior, best))
         marks = np.asarray(fitted.posterior.trials.x)[: len(answers.categories)]
         levels = np.array(answers.categories, int) / (len(study.responses) - 1)
-        now = None if asked is None else np.asarray(study.space.to_unit(np.array([asked[name] for name in names])))
+        felt = None if asked is None else np.asarray(study.space.to_unit(np.array([asked[name] for name in names])))
         pairs = itertools.combinations(range(len(names)), 2)
-        return [_slice(study, made, k, pair, marks, levels, now) for k, pair in enumerate(pairs)]
+        return [_slice(study, maps, k, pair, marks, levels, felt) for k, pair in enumerate(pairs)]
 
 
 class _Slices(NamedTuple):
@@ -89,9 +89,9 @@ class _Slices(NamedTuple):
     feasible: Bool[Array, "pairs side side"]
 
 
-def _slice(study, made: _Slices, k: int, pair: tuple[int, int], marks, levels, now) -> dict[str, Any]:
-    """One grid, for the page; `marks` (n, d) and `levels` (n,) are the answers, `now` (d,) what is being felt."""
-    best, names = made.best, study.space.names
+def _slice(study, maps: _Slices, k: int, pair: tuple[int, int], marks, levels, felt) -> dict[str, Any]:
+    """One grid, for the page; `marks` (n, d) and `levels` (n,) are the answers, `felt` (d,) what is being felt."""
+    best, names = maps.best, study.space.names
     others = [i for i in range(len(names)) if i not in pair]
     held = [f"{names[i]} = {float(study.space.parameters[i].to_physical(jnp.asarray(best[i]))):.3g}" for i in others]
     across, up = pair
@@ -100,11 +100,11 @@ def _slice(study, made: _Slices, k: int, pair: tuple[int, int], marks, levels, n
          "away": float(np.linalg.norm((x - best)[others]) / 0.35)}
         for x, level in zip(marks, levels, strict=True)
     ]  # fmt: skip
-    if now is not None:
-        trials.append({"x": float(now[across]), "y": float(now[up]), "level": 0.0, "now": True, "away": 0.0})
+    if felt is not None:
+        trials.append({"x": float(felt[across]), "y": float(felt[up]), "level": 0.0, "now": True, "away": 0.0})
     shown = [
         [round(float(v), 4) if ok else None for v, ok in zip(row, oks, strict=True)]
-        for row, oks in zip(made.mean[k], made.feasible[k], strict=True)
+        for row, oks in zip(maps.mean[k], maps.feasible[k], strict=True)
     ]
     return {
         "across": names[across],

@@ -268,10 +268,10 @@ class StimulusRig:
         if self.order.do != "present" or do != "present":
             self._off("neutral")
         self._set(Order(self.order.number + 1, do, showing, trial))
-        said = self._hello
-        if said is not None and do != "present" and (said.force or do == "stop"):
-            words = f"{said.name} has not said that it is neutral, {said.neutral_within_s:g} s after it was told."
-            self._on("neutral", said.neutral_within_s + _TRAVEL, words)
+        program = self._hello
+        if program is not None and do != "present" and (program.force or do == "stop"):
+            words = f"{program.name} has not said that it is neutral, {program.neutral_within_s:g} s after it was told."
+            self._on("neutral", program.neutral_within_s + _TRAVEL, words)
 
     def _heard(self) -> None:
         said = self._hello
@@ -333,8 +333,8 @@ class StimulusRig:
     # In words.
 
     def _who(self) -> dict[str, Any]:
-        said = self._hello
-        return {} if said is None else {"program": said.name, "version": said.version, "force": said.force}
+        program = self._hello
+        return {} if program is None else {"program": program.name, "version": program.version, "force": program.force}
 
     def _parameters(self) -> list[dict[str, Any]]:
         return [

@@ -72,7 +72,7 @@ def plan(
             chosen = _whole(study)
             sets = _sets(chosen, kind, paths, trials, source, people, say)
         label = session or {"optimisation": "1", "validation": "2", "aggregate-best": "3"}[kind]
-        made = make_plan(
+        content = make_plan(
             chosen,
             people,
             seed,
@@ -83,9 +83,9 @@ def plan(
             source=source if kind == "validation" else None,
         )
     check_free(out, force)  # it may have been made in the meantime
-    _write_plan(made, out, as_json)
+    _write_plan(content, out, as_json)
     if register is not None:
-        _write_registration(file, made, register)
+        _write_registration(file, content, register)
 
 
 def export(
@@ -166,11 +166,11 @@ def _searchable(path) -> Any:
     from hilbo.search.space import SearchSpace
     from hilbo.study.study_file import StudyFile, read_study
 
-    def made(file: StudyFile) -> StudyFile:
+    def search_space_of(file: StudyFile) -> StudyFile:
         SearchSpace(file.space.parameters, file.space.mechanics)  # refuses a space without a passive set
         return file
 
-    return read_study(path, made)
+    return read_study(path, search_space_of)
 
 
 def _whole(path) -> Any:

@@ -95,13 +95,13 @@ def report(
     """The whole results section from a folder of sessions: one page, figures and tables, in the paper's order."""
     if out.resolve() in (folder.resolve(), *folder.resolve().parents):
         raise InputError(f"{out}: holds the folder that is read; choose another --out.")
-    with results(out, force) as made, progress() as say:
+    with results(out, force) as destination, progress() as say:
         start()
         say("reading")
         from hilbo.report.study import write_study
         from hilbo.study.folder import read_folder
 
-        content = write_study(read_folder(folder, exclude), made, seed, say, comparison=compare)
+        content = write_study(read_folder(folder, exclude), destination, seed, say, comparison=compare)
     finish(content, out, as_json)
 
 

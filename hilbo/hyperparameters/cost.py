@@ -28,7 +28,7 @@ class Seen(NamedTuple):
 
     log_evidence: Float[Array, ""]
     certified: Bool[Array, ""]
-    at: Float[Array, " p"]
+    coordinates: Float[Array, " p"]
     place: PyTree[Float[Array, "M n"]]
     moved: PyTree[Float[Array, "M n p"]]
 
@@ -100,7 +100,7 @@ def _closed(gp: OrdinalGP, trials: Trials, inference: str, coordinates: Coordina
     """The same by closed derivatives; the posteriors are sought from where the last ones point."""
     expansion = {"laplace": person_evidence, "ep": person_ep_evidence}[inference]
     flat, _ = ravel_pytree(coordinates)
-    step = flat - last.at
+    step = flat - last.coordinates
     starts = jax.tree.map(lambda place, moved: place + moved @ step, last.place, last.moved)
     if trials.q.shape[0] > 1:
         evidence = jax.vmap(expansion, in_axes=(None, None, 0, 0))(gp, coordinates, trials, starts)
@@ -121,7 +121,7 @@ def person_evidence(gp: OrdinalGP, coordinates: Coordinates, trials: Trials, sta
     split = _split(gp, coordinates, trials, start.dtype)
     return laplace_evidence(
         split.covariance,
-        lambda own: OrdinalTerms(split.likelihood(own), trials.q, trials.mask),
+        lambda of_terms: OrdinalTerms(split.likelihood(of_terms), trials.q, trials.mask),
         split.of_likelihood,
         split.of_kernel,
         start,
@@ -136,7 +136,7 @@ def person_ep_evidence(
     split = _split(gp, coordinates, trials, start[0].dtype)
     return ep_evidence(
         split.covariance,
-        lambda own: TiltedTerms(split.likelihood(own), trials.q, trials.mask),
+        lambda of_terms: TiltedTerms(split.likelihood(of_terms), trials.q, trials.mask),
         split.of_likelihood,
         split.of_kernel,
         start,

@@ -39,25 +39,25 @@ _STEPS = 200
 def ep_evidence(
     covariance: Callable[[Float[Array, " k"]], Float[Array, "n n"]],
     terms: Callable[[Float[Array, " l"]], Tilted],
-    own: Float[Array, " l"],
+    of_terms: Float[Array, " l"],
     shape: Float[Array, " k"],
     start: tuple[Float[Array, " n"], Float[Array, " n"]],
 ) -> Evidence:
-    """The expansion in x = (own, shape): the terms depend on `own`, the covariance on `shape`.
+    """The expansion in x = (of_terms, shape): the terms depend on `of_terms`, the covariance on `shape`.
 
     `start`: means and log variances of cavities near which the fixed point is sought, as is the result's `place`; where
     that fails, or where a variance is none, it is sought anew. Logarithms, because moved along their derivatives they
     save a quarter of the steps that variances take.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
-    tilted = terms(own)
+    tilted = terms(of_terms)
     settled = _settled(tilted, matrix, Cavities(start[0], jnp.exp(start[1])))
     (mean, variance), post = settled.cavities, settled.post
     values, weights, precision = tilted(mean, variance)
-    moves = _moves(terms, own, settled.cavities, post, slopes)
+    moves = _moves(terms, of_terms, settled.cavities, post, slopes)
 
-    def explicit(own):
-        return jnp.sum(terms(own)(mean, variance)[0])
+    def explicit(of_terms):
+        return jnp.sum(terms(of_terms)(mean, variance)[0])
 
     def curvature_at(eta):
         return tilted(eta - variance * weights, variance)[2]
@@ -66,10 +66,12 @@ def ep_evidence(
         return jnp.sum(covariance(shape) * pairing)
 
     pairing = 0.5 * (weights[:, None] * weights[None, :] - post.inverse)
-    gradient = jnp.concatenate([jax.jacfwd(explicit)(own), jnp.einsum("ij,ijk->k", pairing, slopes)])
+    gradient = jnp.concatenate([jax.jacfwd(explicit)(of_terms), jnp.einsum("ij,ijk->k", pairing, slopes)])
     hessian = _bilinear(weights, precision, variance, moves)
-    hessian = hessian.at[: own.size, : own.size].add(jax.jacfwd(jax.jacfwd(explicit))(own))
-    hessian = hessian.at[own.size :, own.size :].add(jax.jacfwd(jax.jacfwd(paired))(shape) + _twice(post, slopes))
+    hessian = hessian.at[: of_terms.size, : of_terms.size].add(jax.jacfwd(jax.jacfwd(explicit))(of_terms))
+    hessian = hessian.at[of_terms.size :, of_terms.size :].add(
+        jax.jacfwd(jax.jacfwd(paired))(shape) + _twice(post, slopes)
+    )
 
     joined = jnp.sum(values + 0.5 * jnp.log1p(variance * precision))
     value = joined - 0.5 * weights @ mean - 0.5 * post.log_determinant
@@ -123,14 +125,14 @@ class _Moves(NamedTuple):
 
 def _moves(
     terms: Callable[[Float[Array, " l"]], Tilted],
-    own: Float[Array, " l"],
+    of_terms: Float[Array, " l"],
     cavities: Cavities,
     post: Conditioned,
     slopes: Float[Array, "n n k"],
 ) -> _Moves:
-    """`slopes`: dK/dx of the covariance's hyperparameters, which come after the terms' `own`."""
+    """`slopes`: dK/dx of the covariance's hyperparameters, which come after the terms' `of_terms`."""
     mean, variance = cavities
-    sites = sites_of(terms(own), mean, variance)
+    sites = sites_of(terms(of_terms), mean, variance)
     ratio = (1.0 + variance * sites.precision)[:, None]
     joint = Joint(post.covariance, post.variance, 1.0 / ratio[:, 0])
     follow, spread, matrix = coupling(sites, joint, variance)
@@ -138,9 +140,9 @@ def _moves(
     without = jnp.zeros((mean.size, slopes.shape[2]), mean.dtype)
     slope_x, precision_x = (
         jnp.concatenate([by_own, without], axis=1)
-        for by_own in jax.jacfwd(lambda own: terms(own)(mean, variance)[1:])(own)
+        for by_own in jax.jacfwd(lambda of_terms: terms(of_terms)(mean, variance)[1:])(of_terms)
     )
-    fixed = jnp.zeros((mean.size, own.size), mean.dtype)
+    fixed = jnp.zeros((mean.size, of_terms.size), mean.dtype)
     pulled = jnp.concatenate([fixed, jnp.einsum("ijk,j->ik", slopes, sites.slope)], axis=1)
     widened = [jnp.sum(post.transfer * (slopes[:, :, k] @ post.transfer), axis=0) for k in range(slopes.shape[2])]
     widened = jnp.concatenate([fixed, jnp.stack(widened, axis=1)], axis=1) if widened else fixed

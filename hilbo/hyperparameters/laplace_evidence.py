@@ -93,38 +93,38 @@ def certified(
 def laplace_evidence(
     covariance: Callable[[Float[Array, " k"]], Float[Array, "n n"]],
     terms: Callable[[Float[Array, " l"]], Terms],
-    own: Float[Array, " l"],
+    of_terms: Float[Array, " l"],
     shape: Float[Array, " k"],
     start: Float[Array, " n"],
 ) -> Evidence:
-    """The expansion in x = (own, shape): the terms depend on `own`, the covariance on `shape`.
+    """The expansion in x = (of_terms, shape): the terms depend on `of_terms`, the covariance on `shape`.
 
     `start`: weights near which the mode is sought; where that fails it is sought anew.
     """
     matrix, slopes = covariance(shape), jax.jacfwd(covariance)(shape)
-    pointwise = terms(own)
+    pointwise = terms(of_terms)
     mode = find_mode(pointwise, matrix, start, _STEPS)
     values, weights, curvature = pointwise(mode.eta)
     post = conditioned(matrix, curvature)
-    paths = _paths(terms, own, mode.eta, post, slopes, (matrix, weights, curvature))
+    paths = _paths(terms, of_terms, mode.eta, post, slopes, (matrix, weights, curvature))
 
     bent = matrix @ paths.adjoint
 
     def along(step):
-        value, slope, curved = terms(own + step[: own.size])(mode.eta + paths.mean @ step)
+        value, slope, curved = terms(of_terms + step[: of_terms.size])(mode.eta + paths.mean @ step)
         return jnp.sum(value - 0.5 * post.variance * curved + bent * slope)
 
     def paired(shape):
         return jnp.sum(covariance(shape) * pairing)
 
     pairing = 0.5 * (weights + 2.0 * paths.adjoint)[:, None] * weights[None, :] - 0.5 * post.inverse
-    no_step = jnp.zeros(own.size + shape.size, mode.eta.dtype)
+    no_step = jnp.zeros(of_terms.size + shape.size, mode.eta.dtype)
     first, second = jax.jacfwd(along)(no_step), jax.jacfwd(jax.jacfwd(along))(no_step)
     # `along` moves eta too: what that adds, its slope a + lambda there times m, is no part of the gradient.
     gradient = first - (weights + paths.adjoint) @ paths.mean
-    gradient = gradient.at[own.size :].add(jnp.einsum("ij,ijk->k", pairing, slopes))
+    gradient = gradient.at[of_terms.size :].add(jnp.einsum("ij,ijk->k", pairing, slopes))
     hessian = second + _bilinear(matrix, post, slopes, paths)
-    hessian = hessian.at[own.size :, own.size :].add(jax.jacfwd(jax.jacfwd(paired))(shape))
+    hessian = hessian.at[of_terms.size :, of_terms.size :].add(jax.jacfwd(jax.jacfwd(paired))(shape))
     value = jnp.sum(values) - 0.5 * weights @ mode.eta - 0.5 * post.log_determinant
     sure = certified(value, matrix, (mode.eta, weights, curvature), post, lambda eta: pointwise(eta)[2])
     return Evidence(value, gradient, hessian, weights, paths.weights, (mode.residual <= mode.tolerance) & sure)
@@ -141,7 +141,7 @@ class _Paths(NamedTuple):
 
 def _paths(
     terms: Callable[[Float[Array, " l"]], Terms],
-    own: Float[Array, " l"],
+    of_terms: Float[Array, " l"],
     eta: Float[Array, " n"],
     post: Conditioned,
     slopes: Float[Array, "n n k"],
@@ -150,11 +150,11 @@ def _paths(
     """`slopes`: dK/dx of the covariance's hyperparameters; `posterior`: K, weights and curvatures at the mode."""
     matrix, weights, curvature = posterior
 
-    def nearby(own, shift):
-        return terms(own)(eta + shift)[1:]
+    def nearby(of_terms, shift):
+        return terms(of_terms)(eta + shift)[1:]
 
     (slope_own, curvature_own), (_, bend) = (
-        jax.jacfwd(nearby, argnums=side)(own, jnp.zeros_like(weights[0])) for side in (0, 1)
+        jax.jacfwd(nearby, argnums=side)(of_terms, jnp.zeros_like(weights[0])) for side in (0, 1)
     )
     unmoved = jnp.zeros((eta.size, slopes.shape[2]), eta.dtype)
     slope_x, curvature_x = (jnp.concatenate([by_own, unmoved], axis=1) for by_own in (slope_own, curvature_own))

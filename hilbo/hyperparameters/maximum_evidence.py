@@ -158,7 +158,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> Learned:
         certified = end.aux.certified
         value = jnp.where(certified & jnp.isfinite(end.value) & ~joined, end.value, jnp.inf)
         done = (solution.result == optx.RESULTS.successful) & certified
-        own_end = jnp.where(done & ~joined, end.aux.at, jnp.nan)
+        own_end = jnp.where(done & ~joined, end.aux.coordinates, jnp.nan)
         ends = jnp.concatenate([earlier_ends[1:], own_end[None, :]])
         steps = jnp.asarray(solution.stats["num_steps"]) + 1
         flat = _flat(end, trials)
@@ -167,7 +167,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> Learned:
     initial = coordinates_of(gp, options.learn)
     # One search after the other: each stops when it is done, or on its way to where an earlier one ended; and its first
     # evidence is sought from the one before's.
-    no_ends = jnp.full((options.starts, nothing.at.size), jnp.nan, nothing.at.dtype)
+    no_ends = jnp.full((options.starts, nothing.coordinates.size), jnp.nan, nothing.coordinates.dtype)
     _, ends = jax.lax.scan(ended, (no_ends, nothing), _spread(initial, options.starts))
     # The search from the model itself wins a tie: where there are no answers, and where no search ended well.
     model_first = (jnp.arange(options.starts) + _row_of_model(options.starts)) % options.starts
@@ -175,14 +175,14 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> Learned:
     end = jax.tree.map(lambda leaf: leaf[best], ends)
     runaway = end.flat
     for name in initial.keys() - {"first"}:
-        runaway |= jnp.any(jnp.abs(end.at[name] - initial[name]) > _RUNAWAY)
-    return Learned(model_at(end.at, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
+        runaway |= jnp.any(jnp.abs(end.coordinates[name] - initial[name]) > _RUNAWAY)
+    return Learned(model_at(end.coordinates, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
 
 
 class _End(NamedTuple):
     """Where a search ended; `value` is infinite where it does not count."""
 
-    at: Coordinates
+    coordinates: Coordinates
     value: Float[Array, ""]
     log_evidence: Float[Array, ""]
     steps: Int[Array, ""]

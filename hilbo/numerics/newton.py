@@ -138,10 +138,10 @@ class TrustRegionNewton(optx.AbstractMinimiser):
         return y, aux, {}
 
 
-def arrives(y: PyTree, move: Float[Array, " p"], known: Float[Array, "k p"]) -> Bool[Array, ""]:
+def arrives(y: PyTree, move: Float[Array, " p"], ends: Float[Array, "k p"]) -> Bool[Array, ""]:
     """Whether this step from `y` goes to one of the known ends."""
     target = ravel_pytree(y)[0] + move
-    return jnp.any(jnp.max(jnp.abs(known - target[None, :]), axis=1) < _SAME)
+    return jnp.any(jnp.max(jnp.abs(ends - target[None, :]), axis=1) < _SAME)
 
 
 def _bounds(options: dict[str, Any]) -> tuple[Float[Array, " p"] | None, Float[Array, " p"] | None]:

@@ -36,14 +36,14 @@ class Nearest(NamedTuple):
     multipliers: Float[Array, " k"]
 
 
-def walls_of_cube(walls: Polytope, held: Bool[Array, " d"], at: Float[Array, " d"]) -> Polytope:
-    """The walls and those of the unit cube as seen from a point `at` of the polytope: normals v <= offsets for a step v
+def walls_of_cube(walls: Polytope, held: Bool[Array, " d"], point: Float[Array, " d"]) -> Polytope:
+    """The walls and those of the unit cube as seen from a `point` of the polytope: normals v <= offsets for a step v
     whose `held` coordinates stay 0. Offsets are never below 0."""
-    unit = jnp.eye(at.size, dtype=at.dtype)
-    free = jnp.where(held, 0.0, 1.0).astype(at.dtype)
-    normals = jnp.concatenate([walls.normals.astype(at.dtype), unit, -unit]) * free[None, :]
-    left = walls.offsets.astype(at.dtype) - walls.normals.astype(at.dtype) @ at
-    return Polytope(normals, jnp.maximum(jnp.concatenate([left, 1.0 - at, at]), 0.0))
+    unit = jnp.eye(point.size, dtype=point.dtype)
+    free = jnp.where(held, 0.0, 1.0).astype(point.dtype)
+    normals = jnp.concatenate([walls.normals.astype(point.dtype), unit, -unit]) * free[None, :]
+    left = walls.offsets.astype(point.dtype) - walls.normals.astype(point.dtype) @ point
+    return Polytope(normals, jnp.maximum(jnp.concatenate([left, 1.0 - point, point]), 0.0))
 
 
 def projector(normals: Float[Array, "k d"], active: Bool[Array, " k"]) -> Float[Array, "d d"]:

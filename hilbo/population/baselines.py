@@ -14,40 +14,40 @@ __all__ = ["constant", "quadratic"]
 _SLOPE_SD, _GAP_SD = 3.0, 1.5
 
 
-def constant(q: Int[np.ndarray, " n"], categories: int, known: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n C"]:
-    """Class probabilities (n, C) from the answers q (n,) that are `known` (n,)."""
-    counts = np.bincount(q[known], minlength=categories) + 0.5
+def constant(q: Int[np.ndarray, " n"], categories: int, observed: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "n C"]:
+    """Class probabilities (n, C) from the answers q (n,) that are `observed` (n,)."""
+    counts = np.bincount(q[observed], minlength=categories) + 0.5
     return np.tile(counts / counts.sum(), (len(q), 1))
 
 
 def quadratic(
-    x: Float[np.ndarray, "n d"], q: Int[np.ndarray, " n"], categories: int, known: Bool[np.ndarray, " n"]
+    x: Float[np.ndarray, "n d"], q: Int[np.ndarray, " n"], categories: int, observed: Bool[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n C"]:
-    """Class probabilities (n, C) at points x (n, d), from the answers that are `known` (n,)."""
+    """Class probabilities (n, C) at points x (n, d), from the answers that are `observed` (n,)."""
     from scipy.optimize import minimize
 
-    spread = x[known].std(axis=0)
-    z = (x - x[known].mean(axis=0)) / np.where(spread > 0, spread, 1.0)  # a parameter that nobody varied is 0
+    spread = x[observed].std(axis=0)
+    z = (x - x[observed].mean(axis=0)) / np.where(spread > 0, spread, 1.0)  # a parameter that nobody varied is 0
     first, second = np.triu_indices(x.shape[1])
     features = np.concatenate([z, z[:, first] * z[:, second]], axis=1)
     count = features.shape[1]
-    edges = ndtri(np.cumsum(constant(q, categories, known)[0])[:-1])
-    begin = np.concatenate([np.zeros(count), edges[:1], np.log(np.diff(edges))])
+    edges = ndtri(np.cumsum(constant(q, categories, observed)[0])[:-1])
+    start = np.concatenate([np.zeros(count), edges[:1], np.log(np.diff(edges))])
     scale = np.concatenate([np.full(count, _SLOPE_SD), [np.inf], np.full(categories - 2, _GAP_SD)])
 
     def cost(w: Float[np.ndarray, " p"]) -> tuple[float, Float[np.ndarray, " p"]]:
-        logs, by_low, by_high = _log_masses(features[known] @ w[:count], _edges(w[count:]), q[known])
+        logs, by_low, by_high = _log_masses(features[observed] @ w[:count], _edges(w[count:]), q[observed])
         by_edge = np.zeros(categories + 1)
-        np.add.at(by_edge, q[known], by_low)
-        np.add.at(by_edge, q[known] + 1, by_high)
+        np.add.at(by_edge, q[observed], by_low)
+        np.add.at(by_edge, q[observed] + 1, by_high)
         by_edge = by_edge[1:-1]
         later = np.cumsum(by_edge[::-1])[::-1]  # a gap moves all thresholds above it
         of_edges = np.concatenate([later[:1], np.exp(w[count + 1 :]) * later[1:]])
-        slope = np.concatenate([-(by_low + by_high) @ features[known], of_edges])
-        away = (w - begin) / scale
+        slope = np.concatenate([-(by_low + by_high) @ features[observed], of_edges])
+        away = (w - start) / scale
         return 0.5 * away @ away - logs.sum(), away / scale - slope
 
-    w = minimize(cost, begin, jac=True, method="L-BFGS-B").x
+    w = minimize(cost, start, jac=True, method="L-BFGS-B").x
     level, edges = features @ w[:count], _edges(w[count:])
     masses = [_log_masses(level, edges, np.full(len(q), c))[0] for c in range(categories)]
     return np.exp(np.stack(masses, axis=1))

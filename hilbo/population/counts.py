@@ -148,10 +148,10 @@ class _State(NamedTuple):
 class _System(NamedTuple):
     """What the curvatures make of the prior."""
 
-    own: Float[Array, "M m m"]  # triangular factors of I + (1 - p) W^(1/2) K W^(1/2)
+    person_factors: Float[Array, "M m m"]  # triangular factors of I + (1 - p) W^(1/2) K W^(1/2)
     root: Float[Array, "M m"]  # W^(1/2)
     sum_root: Float[Array, "m m"]  # L, with L L' = S
-    asked: Bool[Array, " m"]
+    answered: Bool[Array, " m"]
     lower: Float[Array, "m m"]  # the triangular factor of I + p L'K L
     factor: Float[Array, "m m"]  # V
     log_determinant: Float[Array, ""]
@@ -192,7 +192,7 @@ def _mode(
 ) -> tuple[_State, Float[Array, ""], Int[Array, ""]]:
     """Full Newton steps on the weights from 0; the mode, its distance from stationarity, and the steps taken."""
 
-    def at(state):
+    def evaluated(state):
         terms = _expand(likelihood, counts, state.eta)
         value, off = jnp.sum(terms.value), terms.slope - state.weights
         residual = jnp.sqrt(jnp.linalg.norm(off) * jnp.linalg.norm(_latent(share, covariance, off)))
@@ -200,17 +200,17 @@ def _mode(
         return _Place(state, value - 0.5 * jnp.sum(state.weights * state.eta), jnp.abs(value), residual, tolerance)
 
     def forward(carry):
-        here, steps = carry
-        full = _newton_step(likelihood, share, covariance, counts, here.state)
-        return _damped(at, here, full), steps + 1
+        current, steps = carry
+        full = _newton_step(likelihood, share, covariance, counts, current.state)
+        return _damped(evaluated, current, full), steps + 1
 
     def going(carry):
-        here, steps = carry
-        return (here.residual > here.tolerance) & (steps < _STEPS)
+        current, steps = carry
+        return (current.residual > current.tolerance) & (steps < _STEPS)
 
     start = jnp.zeros(counts.shape[:2], covariance.dtype)
-    here, steps = jax.lax.while_loop(going, forward, (at(_State(start, start)), jnp.asarray(0)))
-    return here.state, here.residual, steps
+    current, steps = jax.lax.while_loop(going, forward, (evaluated(_State(start, start)), jnp.asarray(0)))
+    return current.state, current.residual, steps
 
 
 def _newton_step(
@@ -229,7 +229,7 @@ def _newton_step(
     # (S + (p K)^-1)^-1 s = p K L (I + p L'K L)^-1 L^-1 s: nothing is subtracted
     solve = jax.scipy.linalg.solve_triangular
     shared_term = solve(
-        system.sum_root + jnp.diag(jnp.where(system.asked, 0.0, 1.0)), jnp.sum(person_terms, axis=0), lower=True
+        system.sum_root + jnp.diag(jnp.where(system.answered, 0.0, 1.0)), jnp.sum(person_terms, axis=0), lower=True
     )
     moved = share * covariance @ (system.factor.T @ solve(system.lower, shared_term, lower=True))
     weights = (
@@ -238,23 +238,23 @@ def _newton_step(
     return _State(weights, _latent(share, covariance, weights))
 
 
-def _damped(at: Callable[[_State], _Place], here: _Place, full: _State) -> _Place:
+def _damped(evaluated: Callable[[_State], _Place], current: _Place, full: _State) -> _Place:
     """The largest of a few shares of a step at which the log posterior has not fallen, beyond its rounding."""
 
     def between(scale):
-        return jax.tree.map(lambda a, b: jnp.where(scale == 1.0, b, a + scale * (b - a)), here.state, full)
+        return jax.tree.map(lambda a, b: jnp.where(scale == 1.0, b, a + scale * (b - a)), current.state, full)
 
     def fallen(carry):
-        there, scale = carry
-        slack = 8.0 * jnp.finfo(there.size.dtype).eps * (here.size + there.size)
-        return (there.height < here.height - slack) & (scale > 0.5 ** (_HALVINGS - 1))
+        candidate, scale = carry
+        slack = 8.0 * jnp.finfo(candidate.size.dtype).eps * (current.size + candidate.size)
+        return (candidate.height < current.height - slack) & (scale > 0.5 ** (_HALVINGS - 1))
 
     def halved(carry):
         scale = 0.5 * carry[1]
-        return at(between(scale)), scale
+        return evaluated(between(scale)), scale
 
     # The whole step is tried first and is nearly always taken; the others wait until it is not.
-    return jax.lax.while_loop(fallen, halved, (at(full), jnp.ones_like(here.height)))[0]
+    return jax.lax.while_loop(fallen, halved, (evaluated(full), jnp.ones_like(current.height)))[0]
 
 
 def _solve_people(system: _System, right: Float[Array, "M m"]) -> Float[Array, "M m"]:
@@ -267,7 +267,7 @@ def _solve_people(system: _System, right: Float[Array, "M m"]) -> Float[Array, "
     def one(person):
         return jax.lax.cond(jnp.any(person[1] > 0), solved, lambda lower, root, r: jnp.zeros_like(r), *person)
 
-    return jax.lax.map(one, (system.own, system.root, right))
+    return jax.lax.map(one, (system.person_factors, system.root, right))
 
 
 def _system(share: Float[Array, ""], covariance: Float[Array, "m m"], curvature: Float[Array, "M m"]) -> _System:
@@ -286,15 +286,15 @@ def _system(share: Float[Array, ""], covariance: Float[Array, "m m"], curvature:
         return jax.lax.cond(jnp.any(root > 0), added, lambda total, root: (total, unit), total, root)
 
     total, person_factors = jax.lax.scan(add, jnp.zeros_like(covariance), root)
-    asked = jnp.any(held, axis=0)  # a point at which nobody answered stands apart from the rest
-    sum_root = jnp.linalg.cholesky(total + jnp.diag(jnp.where(asked, 0.0, 1.0)))
-    sum_root = jnp.where(asked[:, None], sum_root, 0.0)
+    answered = jnp.any(held, axis=0)  # a point at which nobody answered stands apart from the rest
+    sum_root = jnp.linalg.cholesky(total + jnp.diag(jnp.where(answered, 0.0, 1.0)))
+    sum_root = jnp.where(answered[:, None], sum_root, 0.0)
     matrix = unit + share * sum_root.T @ covariance @ sum_root
     lower = jnp.linalg.cholesky(matrix)
     factor = jax.scipy.linalg.solve_triangular(lower, sum_root.T, lower=True)
-    each = jnp.sum(jnp.log(jnp.diagonal(person_factors, axis1=1, axis2=2)))
-    log_determinant = 2.0 * (each + jnp.sum(jnp.log(jnp.diagonal(lower))))
-    return _System(person_factors, root, sum_root, asked, lower, factor, log_determinant, jnp.linalg.norm(matrix))
+    of_people = jnp.sum(jnp.log(jnp.diagonal(person_factors, axis1=1, axis2=2)))
+    log_determinant = 2.0 * (of_people + jnp.sum(jnp.log(jnp.diagonal(lower))))
+    return _System(person_factors, root, sum_root, answered, lower, factor, log_determinant, jnp.linalg.norm(matrix))
 
 
 def _expand(likelihood: OrdinalProbit, counts: Float[Array, "M m C"], eta: Float[Array, "M m"]) -> Expansion:

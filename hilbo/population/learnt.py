@@ -231,11 +231,13 @@ def _standard_deviations(
     mixed = np.stack([np.asarray(column["widths"]) for column in columns])
     widths = coordinates["widths"]
     if widths.size <= _WHOLE:
-        each = [difference({"widths": unit})["widths"] for unit in jnp.eye(widths.size, dtype=widths.dtype)]
-        own = np.stack([np.asarray(row) for row in each])
+        columns_of_widths = [
+            difference({"widths": unit})["widths"] for unit in jnp.eye(widths.size, dtype=widths.dtype)
+        ]
+        curvature = np.stack([np.asarray(row) for row in columns_of_widths])
     else:
-        own = np.diag(np.asarray(difference({"widths": jnp.ones_like(widths)})["widths"]))
-    sd = _root_of_diagonal(np.linalg.inv(np.block([[hessian, mixed], [mixed.T, own]])))
+        curvature = np.diag(np.asarray(difference({"widths": jnp.ones_like(widths)})["widths"]))
+    sd = _root_of_diagonal(np.linalg.inv(np.block([[hessian, mixed], [mixed.T, curvature]])))
     return restore(jnp.asarray(sd[: flat.size])) | {"widths": jnp.asarray(sd[flat.size :])}
 
 

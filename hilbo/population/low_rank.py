@@ -284,8 +284,8 @@ def shared_function(
     together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
     weights = jnp.where(pivots.used, solve_triangular(root, together, lower=True, trans=1), 0.0)
     excess, vectors = eigh(system.precision - jnp.eye(root.shape[0], dtype=root.dtype))
-    known = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
-    factor = known[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
+    explained = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
+    factor = explained[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
     factor = jnp.where(pivots.used[None, :], factor, 0.0)
 
     kernel = model.of_variance(model.shared)
@@ -331,5 +331,5 @@ def _rounding(
 ) -> Float[Array, ""]:
     """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
     kernel = model.of_variance(model.own)
-    each = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (answers.x, weights))
-    return jnp.linalg.norm(each) + evidence_rounding(covariance, of_pivots[None, :])
+    of_people = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (answers.x, weights))
+    return jnp.linalg.norm(of_people) + evidence_rounding(covariance, of_pivots[None, :])

@@ -51,8 +51,8 @@ def pivots_of(kernel: Stationary, answers: Tallies, rank: int, tolerance: ArrayL
         row = (column - rows[:, place] @ rows) / jnp.sqrt(left[place])
         return count + 1, rows.at[count].set(row), (left - row**2).at[place].set(0.0), chosen.at[count].set(place)
 
-    begin = (jnp.asarray(0), jnp.zeros((rank, x.shape[0]), x.dtype), start, jnp.zeros(rank, int))
-    count, _, left, chosen = jax.lax.while_loop(going, choose, begin)
+    initial = (jnp.asarray(0), jnp.zeros((rank, x.shape[0]), x.dtype), start, jnp.zeros(rank, int))
+    count, _, left, chosen = jax.lax.while_loop(going, choose, initial)
     return Pivots(x[chosen], jnp.arange(rank) < count, jnp.max(left))
 
 

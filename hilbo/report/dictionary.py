@@ -142,12 +142,12 @@ _TABLES: dict[str, dict[str, tuple[str, str]]] = {
 def dictionary(tables: Mapping[str, pd.DataFrame], study: Study) -> pd.DataFrame:
     """A row for each column of the tables: `table`, `column`, `unit`, `meaning`. Raises KeyError for one without."""
     units = {p.name: (p.unit, "value of the parameter") for p in study.space.parameters}
-    own = units | {"K0": ("N/mm", "stiffness of the spring, derived from the effective stiffness")}
-    own |= {label: ("comparisons", f'in which the answer was "{label}"') for label in study.responses}
+    meanings = units | {"K0": ("N/mm", "stiffness of the spring, derived from the effective stiffness")}
+    meanings |= {label: ("comparisons", f'in which the answer was "{label}"') for label in study.responses}
     rows = [
         {"table": f"{name}.csv", "column": column, "unit": unit, "meaning": meaning}
         for name, table in tables.items()
         for column in map(str, table.columns)
-        for unit, meaning in [(own | _TABLES[name])[column]]
+        for unit, meaning in [(meanings | _TABLES[name])[column]]
     ]
     return pd.DataFrame(rows)

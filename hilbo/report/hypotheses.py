@@ -99,7 +99,7 @@ def _individuals(results):
 def _nearer_to_others(progress):
     """Whether individual optima come nearer to those of people who are not among them."""
     row = _early(progress.counts)
-    early, late = (100 * progress.own_to_half[k] for k in (row, -1))
+    early, late = (100 * progress.individual_to_half[k] for k in (row, -1))
     nearer = early - late
     error = nearer.std(ddof=1) / np.sqrt(len(nearer))
     side: Side = (
@@ -185,14 +185,14 @@ def _convergence(results):
     how = in_place(analysis.aggregate.map)
     how = f" (aggregated {how})" if how else ""
     row = _early(progress.counts)
-    half, end, own = (
-        100 * float(np.median(v)) for v in (progress.halves[row], progress.halves[-1], progress.own_to_half[row])
+    half, end, individual = (
+        100 * float(np.median(v)) for v in (progress.halves[row], progress.halves[-1], progress.individual_to_half[row])
     )
     yield Evidence(
-        _side(half < own),
+        _side(half < individual),
         f"After {progress.counts[row]} trials the optimum of one half of the people{how} is {half:.0f} % (NRMSE,"
         f" median of {progress.splits} random halves) from that of the other half after all trials, and individual"
-        f" optima are {own:.0f} % from it (supports: the half nearer than the individuals); after all trials the"
+        f" optima are {individual:.0f} % from it (supports: the half nearer than the individuals); after all trials the"
         f" halves are {end:.0f} % apart.",
     )
     if results.reference is not None:

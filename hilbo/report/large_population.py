@@ -59,9 +59,9 @@ def _figures(study, aggregate, grid):
 
     figures, best, drawn = {}, np.asarray(aggregate.optimum.x), {}
     if on_grid(study.space):
-        some = _some(aggregate.cohort)
-        figures["map"] = maps.map_slices(study, _from(grid), best, some)
-        drawn["participants"] = len(some.names)
+        subset = _some(aggregate.cohort)
+        figures["map"] = maps.map_slices(study, _from(grid), best, subset)
+        drawn["participants"] = len(subset.names)
     if aggregate.individuals is not None and study.space.dim > 1:
         x = np.asarray(aggregate.individuals.x)
         rows = np.unique(np.linspace(0, len(x) - 1, min(len(x), _DOTS)).round().astype(int))

@@ -136,13 +136,13 @@ def _location(study: Study, aggregate: Aggregate | LargeAggregate, name: str, op
 def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> dict[str, Any]:
     """How far one optimum is from another: NRMSE, and each parameter's way in its unit and in % of its range; from one
     level to another it is 100 %, and the way in words."""
-    there, here = set_of(study.space, x), set_of(study.space, start)
+    target, origin = set_of(study.space, x), set_of(study.space, start)
     levels = study.gp.kernel.levels
     percent = 100 * differences(levels, np.asarray(x), np.asarray(start))
     share = dict(zip(study.space.names, percent.tolist(), strict=True))
-    if "K0" in there:
-        share = {"K0": 100 * (there["K0"] - here["K0"]) / K0_range(study.space)} | share
-    ways = {name: {"by": _way(here[name], there[name]), "percent": share[name]} for name in there}
+    if "K0" in target:
+        share = {"K0": 100 * (target["K0"] - origin["K0"]) / K0_range(study.space)} | share
+    ways = {name: {"by": _way(origin[name], target[name]), "percent": share[name]} for name in target}
     return {"nrmse": float(nrmse(x, start, levels)), "moved": ways}
 
 

@@ -198,7 +198,7 @@ def convergence_table(analysis: Analysis) -> pd.DataFrame:
     if analysis.progress.splits:
         table["halves"] = np.median(analysis.progress.halves, axis=1)
         table["individuals_to_half"] = np.nanmedian(
-            np.where(np.isnan(individual_errors), np.nan, analysis.progress.own_to_half), axis=1
+            np.where(np.isnan(individual_errors), np.nan, analysis.progress.individual_to_half), axis=1
         )
     for name, values in (("individuals", individual_errors.T), ("top_answers", so_far)):
         table[[f"{name}_low", f"{name}_median", f"{name}_high"]] = np.nanpercentile(values, [25, 50, 75], axis=0).T

@@ -78,8 +78,8 @@ class Lattice(eqx.Module):
     def everywhere(self) -> tuple[Float[Array, "m d"], Bool[Array, " m"]]:
         """All points (m, d), and which of them are feasible."""
         usable = jnp.concatenate([self.inside, self.present])
-        own = self.points(*jnp.indices(usable.shape)).reshape(-1, self.dim)
-        points = jnp.concatenate([own, self.extra.astype(own.dtype)])
+        of_lattice = self.points(*jnp.indices(usable.shape)).reshape(-1, self.dim)
+        points = jnp.concatenate([of_lattice, self.extra.astype(of_lattice.dtype)])
         return points, jnp.concatenate([usable.reshape(-1), jnp.ones(len(self.extra), bool)])
 
 

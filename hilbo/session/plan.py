@@ -158,8 +158,8 @@ def make_plan(
     sequence = orders(len(names), len(participants), seed)
     people = []
     for i, person in enumerate(participants):
-        own = [names[k] for k in sequence[i]]
-        header = _header(study, person, session, seed_of(seed, i), phase, own, sets, source, codes)
+        in_order = [names[k] for k in sequence[i]]
+        header = _header(study, person, session, seed_of(seed, i), phase, in_order, sets, source, codes)
         people.append({"participant": person, "order": i, "header": _for_plan(header)})
     size = block_size(len(names))
     plan = {
@@ -285,8 +285,8 @@ def _compared(study, person, phase, sets, source, codes, seed):
             raise InputError("plan: aggregate-best needs the population's optimum and individuals' own.")
         pairs = [("aggregate", name) for name in others]
     else:
-        own = f"{person} " if source == "individual" else ""
-        pairs = [(own + a, own + b) for a, b in _PAIRS]
+        prefix = f"{person} " if source == "individual" else ""
+        pairs = [(prefix + a, prefix + b) for a, b in _PAIRS]
         missing = [name for pair in pairs for name in pair if name not in sets]
         if missing:
             raise InputError(

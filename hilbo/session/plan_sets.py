@@ -31,13 +31,13 @@ NamedSets = dict[str, dict[str, float]]
 
 def check_participants(result: Result, participants: Sequence[str], source: Source) -> None:
     """Validation of the aggregate needs people who are not in it, of individuals' own maps these very people."""
-    known = {person.participant for person in result.participants}
+    in_map = {person.participant for person in result.participants}
     for person in participants:
-        if source == "aggregate" and person in known:
+        if source == "aggregate" and person in in_map:
             raise InputError(
                 f'plan: participant "{person}" is in the map that is to be validated; invite people who are not.'
             )
-        if source == "individual" and person not in known:
+        if source == "individual" and person not in in_map:
             raise InputError(
                 f'plan: participant "{person}" has no map of their own in the results; plan for those who do.'
             )

@@ -28,7 +28,7 @@ from hilbo.study.config import Study
 
 __all__ = ["Fitted", "Step", "padding"]
 
-_COUNT, _WEIGHT, _KNOWN, _FACTS = 0, 1, 2, 3  # places in a query, which goes on with categories and points
+_COUNT, _WEIGHT, _GIVEN, _FACTS = 0, 1, 2, 3  # places in a query, which goes on with categories and points
 _FROM_THE_SEARCH = ("residual", "tolerance", "iterations", "jitter", "condition")  # of a certificate
 _MADE_LATER = ("smallest_variance", "evidence_error", "evidence_rounding", "converged")
 
@@ -84,9 +84,9 @@ class Step:
     def best(self, posterior: Posterior) -> Float[np.ndarray, " d"]:
         """Where the mean of a posterior of this study is largest, in physical units; nothing is fitted."""
         query = self._blank.copy()
-        query[_KNOWN] = 1.0
-        known = jax.device_put(self._layout.vector(posterior))
-        return np.asarray(self._bound_to_the_mean(query, known))[: len(self.names)]
+        query[_GIVEN] = 1.0
+        packed = jax.device_put(self._layout.vector(posterior))
+        return np.asarray(self._bound_to_the_mean(query, packed))[: len(self.names)]
 
     def warm(self) -> None:
         """Compile what chooses."""
@@ -96,9 +96,9 @@ class Step:
         query, count = self._blank.copy(), len(answers)
         query[_COUNT], query[_WEIGHT] = count, self.weight
         query[_FACTS : _FACTS + count] = answers
-        begin = _FACTS + self.capacity
-        query[begin : begin + count * len(self.names)] = np.ravel(points)
-        return np.asarray(self._bound(query, self._unknown))
+        first = _FACTS + self.capacity
+        query[first : first + count * len(self.names)] = np.ravel(points)
+        return np.asarray(self._bound(query, self._none_given))
 
     @functools.cached_property
     def _layout(self) -> "_Layout":
@@ -106,7 +106,7 @@ class Step:
         return _Layout(structure, tuple(leaves))
 
     @functools.cached_property
-    def _unknown(self) -> Float[Array, " p"]:
+    def _none_given(self) -> Float[Array, " p"]:
         return jax.device_put(np.zeros(self._layout.size))
 
     @functools.cached_property
@@ -121,7 +121,7 @@ class Step:
 
     def _bound_by(self, choosing: Choosing) -> "_Bound":
         arrays = arrays_in((choosing, self._plan))
-        return _Bound(prepared(_step, choosing, self._plan, self._blank, self._unknown), arrays)
+        return _Bound(prepared(_step, choosing, self._plan, self._blank, self._none_given), arrays)
 
 
 class _Bound(NamedTuple):
@@ -130,8 +130,8 @@ class _Bound(NamedTuple):
     program: OfArrays
     arrays: tuple[Array, ...]
 
-    def __call__(self, query: Float[np.ndarray, " k"], known: Float[Array, " p"]) -> Float[Array, " r"]:
-        return self.program((*self.arrays, query, known))
+    def __call__(self, query: Float[np.ndarray, " k"], packed: Float[Array, " p"]) -> Float[Array, " r"]:
+        return self.program((*self.arrays, query, packed))
 
 
 class _Query(NamedTuple):
@@ -139,19 +139,19 @@ class _Query(NamedTuple):
 
     count: Int[Array, ""]
     weight: Float[Array, ""]
-    known: Bool[Array, ""]
+    given: Bool[Array, ""]
     categories: Int[Array, " n"]
     points: Float[Array, "n d"]
 
     @classmethod
     def of(cls, numbers: Float[Array, " k"], capacity: int) -> "_Query":
-        begin = _FACTS + capacity
+        first = _FACTS + capacity
         return cls(
             numbers[_COUNT].astype(jnp.int32),
             numbers[_WEIGHT],
-            numbers[_KNOWN] > 0,
-            numbers[_FACTS:begin].astype(jnp.int32),
-            numbers[begin:].reshape(capacity, -1),
+            numbers[_GIVEN] > 0,
+            numbers[_FACTS:first].astype(jnp.int32),
+            numbers[first:].reshape(capacity, -1),
         )
 
 
@@ -180,13 +180,13 @@ class _Layout(NamedTuple):
 
 
 def _step(
-    choosing: Choosing, plan: Design, numbers: Float[Array, " k"], known: Float[Array, " p"]
+    choosing: Choosing, plan: Design, numbers: Float[Array, " k"], packed: Float[Array, " p"]
 ) -> Float[Array, " r"]:
     """The next point in physical units and, behind it, the posterior's numbers."""
     query = _Query.of(numbers, choosing.selection.trials)
     leaves, structure = jax.tree.flatten(_shapes(choosing))
     layout = _Layout(structure, tuple(leaves))
-    trials, latent = jax.lax.cond(query.known, lambda: layout.tree(known), lambda: _fitted(choosing, query))
+    trials, latent = jax.lax.cond(query.given, lambda: layout.tree(packed), lambda: _fitted(choosing, query))
     point = point_after(choosing, plan, Posterior(choosing.gp, trials, latent), query.count, query.weight)
     parts = [choosing.space.to_physical(point), *jax.tree.leaves((trials, latent))]
     return jnp.concatenate([part.astype(numbers.dtype).ravel() for part in parts])

@@ -146,11 +146,13 @@ def _sets(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[s
     tables = list(tables)
     compared = {name for table in tables for name in sets_compared(table, participant)}
     names = {old: new for table in tables for old, new in set_names(table, participant, label).items()}
-    own = {name for table in tables for name in sets_from(table, participant)}
+    theirs = {name for table in tables for name in sets_from(table, participant)}
     coded = {name for table in tables for name in coded_own(table, participant)} - compared
     same = {name.rpartition(" ")[0] for name in coded}  # the roles of their map that they have not yet compared
-    own |= {n for table in tables for n in named_sets(table) if CODED_OWN.fullmatch(n) and n.rpartition(" ")[0] in same}
-    return names, (own | set(names)) - compared
+    theirs |= {
+        n for table in tables for n in named_sets(table) if CODED_OWN.fullmatch(n) and n.rpartition(" ")[0] in same
+    }
+    return names, (theirs | set(names)) - compared
 
 
 def _plans(root: Path, done: Withdrawal) -> None:

@@ -40,13 +40,13 @@ def _pattern(participant: str) -> re.Pattern[str]:
 
 def renamed_set(name: str, participant: str, label: str, materials: Iterable[str | None] = ()) -> str:
     """The name of a set with a label in the place of the id; as it is, where it is not named after the participant."""
-    known = [material for material in materials if material]
-    for prefix in ("", *(f"{material} " for material in known)):
-        own = name[len(prefix) :] if name.startswith(prefix) else ""
-        if own in (OWN + participant, f"own-{participant}"):
-            return prefix + own.removesuffix(participant) + label
-        if participant not in known and own in [f"{participant} {role}" for role in ROLES]:
-            return prefix + label + own.removeprefix(participant)
+    stated = [material for material in materials if material]
+    for prefix in ("", *(f"{material} " for material in stated)):
+        rest = name[len(prefix) :] if name.startswith(prefix) else ""
+        if rest in (OWN + participant, f"own-{participant}"):
+            return prefix + rest.removesuffix(participant) + label
+        if participant not in stated and rest in [f"{participant} {role}" for role in ROLES]:
+            return prefix + label + rest.removeprefix(participant)
     return name
 
 

@@ -133,7 +133,7 @@ def _command(folder: Path, results: Listed, again: str) -> str:
 
 def command_without(command: str, participant: str) -> str:
     """A command without a participant among those whom it names; empty if it names nobody else."""
-    words, made = _words(command), []
+    words, kept = _words(command), []
     names = {"--names"} if words[1:2] and words[1] in _COUNT_PEOPLE else {"--names", "--participants"}
     for before, word in zip(["", *words], words, strict=False):
         option, equals, value = word.partition("=") if word.startswith("--") else (before, "", word)
@@ -143,8 +143,8 @@ def command_without(command: str, participant: str) -> str:
             if not left:
                 return ""
             word = f"{option}={left}" if equals else left
-        made.append(word)
-    return shlex.join(made) if made != words else command
+        kept.append(word)
+    return shlex.join(kept) if kept != words else command
 
 
 def _words(command: str) -> list[str]:
@@ -170,11 +170,11 @@ def plan_without(path: Path, participant: str, label: str) -> bool:
     have. A session of their own sets goes. Whether there was anything to do."""
     try:
         content = path.read_bytes()
-        known = msgspec.json.decode(content, type=_PlanLike)
+        typed = msgspec.json.decode(content, type=_PlanLike)
         plan: dict[str, Any] = msgspec.json.decode(content)
     except (OSError, msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return False
-    people = {name for row in known.participants for name in (row.participant, row.reissued_from)}
+    people = {name for row in typed.participants for name in (row.participant, row.reissued_from)}
     if participant not in people:
         return False
     whole = plan["hash"] == plan_hash(plan)
@@ -185,9 +185,9 @@ def plan_without(path: Path, participant: str, label: str) -> bool:
     ]
     plan["replaces"] = [*plan.get("replaces", []), plan["hash"]]
     plan["hash"] = plan_hash(plan) if whole else plan["hash"]
-    made = path.with_name(f".{path.name}-new")
-    made.write_text(json.dumps(plan, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    replace_file(path, made)
+    new_file = path.with_name(f".{path.name}-new")
+    new_file.write_text(json.dumps(plan, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    replace_file(path, new_file)
     return True
 
 

@@ -141,7 +141,7 @@ def _renamed(cell: str, column: str, names: Mapping[str, str]) -> str:
 
 def write_table(path: Path, edited: Edited) -> None:
     """Write a table anew, whole or not at all."""
-    handle, made = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    handle, new_file = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     with open(handle, "w", newline="", encoding="utf-8") as file:
         if path.suffix != ".parquet":
             writer = csv.writer(file, delimiter=edited.table.delimiter, lineterminator="\n")
@@ -149,8 +149,8 @@ def write_table(path: Path, edited: Edited) -> None:
         file.flush()
         os.fsync(file.fileno())
     if path.suffix == ".parquet":
-        _parquet(path, edited).to_parquet(made, index=False)
-    replace_file(path, Path(made))
+        _parquet(path, edited).to_parquet(new_file, index=False)
+    replace_file(path, Path(new_file))
 
 
 def _parquet(path: Path, edited: Edited):
@@ -182,22 +182,24 @@ def netcdf_without(path: Path, participant: str) -> int | None:
             keep[group["participant"].dims[0]] = group["participant"].values != participant
     removed = max((int((~kept).sum()) for kept in keep.values()), default=0)
     if removed:
-        here = {name: {dim: kept for dim, kept in keep.items() if dim in g.dims} for name, g in groups.items()}
-        tree = xr.DataTree.from_dict({name: group.isel(here[name]).drop_encoding() for name, group in groups.items()})
-        made = path.with_name(f".{path.name}-new")
+        kept_in = {name: {dim: kept for dim, kept in keep.items() if dim in g.dims} for name, g in groups.items()}
+        tree = xr.DataTree.from_dict(
+            {name: group.isel(kept_in[name]).drop_encoding() for name, group in groups.items()}
+        )
+        new_file = path.with_name(f".{path.name}-new")
         try:
-            tree.to_netcdf(made, engine="h5netcdf")
-            replace_file(path, made)
+            tree.to_netcdf(new_file, engine="h5netcdf")
+            replace_file(path, new_file)
         finally:
-            made.unlink(missing_ok=True)
+            new_file.unlink(missing_ok=True)
     return removed
 
 
-def replace_file(path: Path, made: Path) -> None:
+def replace_file(path: Path, new_file: Path) -> None:
     """Put a file that is complete in the place of another, with that one's rights; or leave both as before."""
     try:
-        os.chmod(made, path.stat().st_mode if path.exists() else 0o600)
-        os.replace(made, path)
+        os.chmod(new_file, path.stat().st_mode if path.exists() else 0o600)
+        os.replace(new_file, path)
     except BaseException:
-        made.unlink(missing_ok=True)
+        new_file.unlink(missing_ok=True)
         raise

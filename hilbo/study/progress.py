@@ -42,12 +42,12 @@ class Progress(NamedTuple):
 
     counts: Int[np.ndarray, " p"]
     population: Float[np.ndarray, "p d"]
-    own: Float[np.ndarray, "p M d"]
+    individual: Float[np.ndarray, "p M d"]
     ends: Int[np.ndarray, " M"]
     """How many answers each person gave."""
     halves: Float[np.ndarray, "p s"]
     """NRMSE of the optimum of one half of the people to the other half's after all trials, for every split and side."""
-    own_to_half: Float[np.ndarray, "p M"]
+    individual_to_half: Float[np.ndarray, "p M"]
     """The same of each person's own optimum, to the half without that person; median over the splits."""
     maps: dict[int, RuleMap]
     """The population's map, with everybody's posteriors in it, after some of `counts`: those that are drawn."""
@@ -76,7 +76,7 @@ class Progress(NamedTuple):
         """NRMSE of the population's and of everybody's running optimum to the final one; a person's is NaN beyond their
         last answer, where it cannot move."""
         population = np.asarray(nrmse(self.population, self.population[-1], self.levels))
-        individual = np.asarray(nrmse(self.own, self.own[-1], self.levels))
+        individual = np.asarray(nrmse(self.individual, self.individual[-1], self.levels))
         return population, np.where(self.counts[:, None] <= self.ends[None, :], individual, np.nan)
 
 
@@ -110,8 +110,10 @@ def follow(study: Study, aggregated: Aggregate, seed: int = 0, counts: Sequence[
     population, individual, halves, maps = zip(*optima_after, strict=True)
     kept = {count: map_ for count, map_ in zip(asked.tolist(), maps, strict=True) if map_ is not None}
     levels = study.gp.kernel.levels
-    own, tops = np.stack(individual), np.stack(halves)
-    return Progress(asked, np.stack(population), own, ends, *_to_other_half(levels, tops, own, split), kept, levels)
+    optima, tops = np.stack(individual), np.stack(halves)
+    return Progress(
+        asked, np.stack(population), optima, ends, *_to_other_half(levels, tops, optima, split), kept, levels
+    )
 
 
 def _splits(people: int, seed: int) -> Bool[np.ndarray, "s M"]:
@@ -148,16 +150,16 @@ def _highest(map_: RuleMap, points: Float[Array, "m d"], sides: Bool[Array, "k M
 def _to_other_half(
     levels: tuple[int, ...],
     tops: Float[np.ndarray, "p s 2 d"],
-    own: Float[np.ndarray, "p M d"],
+    individual: Float[np.ndarray, "p M d"],
     split: Bool[np.ndarray, "s M"],
 ) -> tuple[Float[np.ndarray, "p s2"], Float[np.ndarray, "p M"]]:
     """NRMSE to where the other half's optimum is after all trials: of each half's optimum, and of each person's own."""
     if not len(split):
-        return np.zeros((len(tops), 0)), np.full(own.shape[:2], np.nan)
+        return np.zeros((len(tops), 0)), np.full(individual.shape[:2], np.nan)
     last = tops[-1, :, ::-1]  # of a half, the other half's
     halves = np.asarray(nrmse(tops, last, levels)).reshape(len(tops), -1)
     others = np.where(split[:, :, None], last[:, :1], last[:, 1:])  # of each person, the half without that person
-    person = np.asarray(nrmse(own[:, None], others, levels))
+    person = np.asarray(nrmse(individual[:, None], others, levels))
     return halves, np.median(person, axis=1)
 
 

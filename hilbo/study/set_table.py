@@ -82,8 +82,8 @@ def role_of(name: str) -> str:
 def source_of(name: str, material: str | None = None) -> str:
     """The source in a set's name as plans give it: with a role its participant's or the population's map, else
     `[MATERIAL ]aggregate` or `[MATERIAL ]individual:PARTICIPANT`. The population's where the name says none."""
-    own = name.removeprefix(f"{material} ") if material else name
-    before, _, last = own.rpartition(" ")
+    rest = name.removeprefix(f"{material} ") if material else name
+    before, _, last = rest.rpartition(" ")
     if last in ROLES:
         return _INDIVIDUAL + before if before else "aggregate"
     return last if source_kind(last) else "aggregate"

@@ -136,9 +136,9 @@ class AnyStudy(Protocol):
     def material(self, name: str) -> "AnyStudy": ...
 
 
-def read_study(path: str | os.PathLike, made: Callable[[StudyFile], _T]) -> _T:
-    """What `made` makes of a study file, of that of each material too, to find mistakes now. InputError says in one
-    sentence what is wrong, with the file or for `made`, and where."""
+def read_study(path: str | os.PathLike, make: Callable[[StudyFile], _T]) -> _T:
+    """What `make` makes of a study file, of that of each material too, to find mistakes now. InputError says in one
+    sentence what is wrong, with the file or for `make`, and where."""
     source = str(path)
     if Path(path).suffix.lower() in (".csv", ".parquet", ".tsv"):
         raise InputError(f"{source}: is a table by its name, and no study file; give a file such as study.toml.")
@@ -155,18 +155,18 @@ def read_study(path: str | os.PathLike, made: Callable[[StudyFile], _T]) -> _T:
         line = rest.partition(",")[0]
         place = f"{source}:{line or len(text.splitlines())}"
         raise InputError(f"{place}: is not valid TOML ({reason}), fix that line.") from error
-    return checked(raw, source, made, text)
+    return checked(raw, source, make, text)
 
 
-def checked(raw: Mapping[str, Any], source: str, made: Callable[[StudyFile], _T], text: str = "") -> _T:
+def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T], text: str = "") -> _T:
     """As `read_study`, from the parsed tables; `text`: the file's, in which the line of a mistake is looked for."""
     place = ""
     try:
         file = _file(raw, source)
-        whole = made(file)
+        whole = make(file)
         for name in file.materials:
             place = f"materials.{name}."
-            made(_file(of_material(raw, name), source))
+            make(_file(of_material(raw, name), source))
     except InputError as error:
         lines = lines_of(text)
         where = next((lines[key] for key in enclosing(place + str(error).split()[0], place) if key in lines), None)
@@ -190,12 +190,12 @@ def materials_in(content: str) -> tuple[str, ...]:
 
 
 @lru_cache(maxsize=32)  # every event of a log may ask for its block's
-def made_of_material(content: str, source: str, name: str, made: Callable[[StudyFile], _T]) -> _T:
-    """What `made` makes of the study of one material, from the content of the whole one. Raises InputError."""
+def made_of_material(content: str, source: str, name: str, make: Callable[[StudyFile], _T]) -> _T:
+    """What `make` makes of the study of one material, from the content of the whole one. Raises InputError."""
     if name not in materials_in(content):
         listed = ", ".join(materials_in(content)) or "there are none"
         raise InputError(f"{prefix(source)}materials.{name} is not in the study, its materials: {listed}.")
-    return checked(of_material({"schema": 1} | json.loads(content), name), source, made)
+    return checked(of_material({"schema": 1} | json.loads(content), name), source, make)
 
 
 def _file(raw: Mapping[str, Any], source: str) -> StudyFile:

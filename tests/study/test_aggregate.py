@@ -147,10 +147,10 @@ def test_the_optimum_is_where_the_map_is_highest(cohort):
     assert found.share is not None and 0 < float(found.share.mean) < 1
     progress = follow(STUDY, found, 0, [5, 9])
     np.testing.assert_array_equal(progress.population[-1], found.optimum.x)
-    np.testing.assert_array_equal(progress.own[-1], found.individuals.x)
+    np.testing.assert_array_equal(progress.individual[-1], found.individuals.x)
     after = aggregate_cohort(STUDY, cohort.first(5), alternatives=False)
     np.testing.assert_array_equal(progress.population[0], after.optimum.x)
-    np.testing.assert_array_equal(progress.own[0], after.individuals.x)
+    np.testing.assert_array_equal(progress.individual[0], after.individuals.x)
     assert progress.moments == [5, 9]
 
 

@@ -143,7 +143,7 @@ def progress_figure(study: Study, population: Population, truth: Float[np.ndarra
     from_goal = to_end
     if truth is not None:
         from_goal = np.sqrt(np.mean((progress.population - truth) ** 2, axis=1))
-        individual_errors = np.sqrt(np.mean((progress.own - truth) ** 2, axis=2))
+        individual_errors = np.sqrt(np.mean((progress.individual - truth) ** 2, axis=2))
     top = (np.asarray(cohort.trials.q) == len(study.responses) - 1) & np.asarray(cohort.trials.mask)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(TWO_COLUMNS, 2.7), layout="constrained")

@@ -64,10 +64,10 @@ def reliability_figure(content: dict[str, Any], rules: tuple[str, ...] = ("bcm",
 
 
 def coverage_figure(
-    study: Study, predict: Callable[..., Any], at: Float[np.ndarray, " d"], prior: float, known: float = 0.8
+    study: Study, predict: Callable[..., Any], point: Float[np.ndarray, " d"], prior: float, limit: float = 0.8
 ) -> Figure:
     """The map's standard deviation over what it is without answers (of variance `prior`), on the slice of the first two
-    parameters through `at`; hatched where it is above `known`: nobody's answers say much there."""
+    parameters through `point`; hatched where it is above `limit`: nobody's answers say much there."""
     parameters = study.space.parameters
     side = np.linspace(0.0, 1.0, _CELLS)
     with mpl.rc_context(STYLE):
@@ -77,11 +77,11 @@ def coverage_figure(
             ratio = np.sqrt(np.asarray(predict(jnp.asarray(side[:, None]))[1]) / prior)
             along = np.asarray(parameters[0].to_physical(jnp.asarray(side)))
             axes.plot(along, ratio, color=BLUE)
-            axes.fill_between(along, 0, 1, where=ratio > known, hatch="///", facecolor="none", edgecolor=GREY)
+            axes.fill_between(along, 0, 1, where=ratio > limit, hatch="///", facecolor="none", edgecolor=GREY)
             label_axes(axes, study, 0, 0)
             axes.set(ylabel="sd of the map, over that without answers", yscale="linear", ylim=(0, 1.05))
         else:
-            grid = np.tile(np.asarray(at), (_CELLS, _CELLS, 1))
+            grid = np.tile(np.asarray(point), (_CELLS, _CELLS, 1))
             grid[..., 0], grid[..., 1] = np.meshgrid(side, side, indexing="ij")
             flat = grid.reshape(-1, len(parameters))
             ratio = np.sqrt(np.asarray(predict(jnp.asarray(flat))[1]) / prior).reshape(_CELLS, _CELLS)
@@ -89,7 +89,7 @@ def coverage_figure(
             ratio = np.where(feasible, ratio, np.nan)
             sides = [np.asarray(p.to_physical(jnp.asarray(side))) for p in parameters[:2]]
             shown = axes.pcolormesh(*sides, ratio.T, cmap="cividis", vmin=0, vmax=1, shading="gouraud", rasterized=True)
-            axes.contourf(*sides, ratio.T, levels=[known, 10.0], hatches=["///"], colors="none")
+            axes.contourf(*sides, ratio.T, levels=[limit, 10.0], hatches=["///"], colors="none")
             figure.colorbar(shown, ax=axes, label="sd of the map, over that without answers")
             label_axes(axes, study, 0, 1)
     return figure

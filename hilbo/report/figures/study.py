@@ -74,7 +74,7 @@ def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: in
 
     Paper, figure 4.
     """
-    person, optima = cohort.rows(np.array([row])), progress.own[progress.at(progress.moments), row]
+    person, optima = cohort.rows(np.array([row])), progress.individual[progress.at(progress.moments), row]
     maps = {f"{count} trials": posterior.predict for count, posterior in progress.person(row).items()}
     if study.space.dim == 1:
         return maps_beside(study, maps, optima)
@@ -104,7 +104,7 @@ def individual_convergence(study: Study, cohort: Cohort, progress: Progress) -> 
         left, right = figure.subplots(1, 2)
         band(left, trials, 100 * errors.T, BLUE, "to their own final optimum")
         if progress.splits:
-            others = 100 * np.nanmedian(np.where(np.isnan(errors), np.nan, progress.own_to_half), axis=1)
+            others = 100 * np.nanmedian(np.where(np.isnan(errors), np.nan, progress.individual_to_half), axis=1)
             left.plot(trials, others, color=GREY, linestyle="--", label="to that of half of the others")
         left.set(xlabel="trials", ylabel="NRMSE of individual optima (%)", ylim=(0, None))
         left.legend(frameon=False)
