@@ -37,9 +37,9 @@ from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.population.recipes import LEARNT_1, RECIPES  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.aggregate import map_optimum  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 from hilbo.study.learnt_study import that_learns  # noqa: E402
+from hilbo.study.optima import map_optimum  # noqa: E402
 
 PAGE = Path(__file__).parents[1] / "docs" / "methods" / "which_method.md"
 POPULATION = POPULATIONS["paper-individuals"]

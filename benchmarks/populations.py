@@ -32,10 +32,11 @@ from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
 from hilbo.population.recipes import LEARNT_1, RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.aggregate import fit_cohort, individual_optima, map_optimum  # noqa: E402
+from hilbo.study.aggregate import fit_cohort  # noqa: E402
 from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
 from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
+from hilbo.study.optima import individual_optima, map_optimum  # noqa: E402
 from hilbo.study.optimum_region import optimum_region  # noqa: E402
 
 ROOT = Path(__file__).parents[1]

@@ -19,8 +19,9 @@ def one_study(study, seed, candidates):
     from hilbo.search.apart import nrmse
     from hilbo.simulation import simulate
     from hilbo.simulation.presets import PRESETS
-    from hilbo.study.aggregate import aggregate_cohort, population_optimum
+    from hilbo.study.aggregate import aggregate_cohort
     from hilbo.study.cohort import Cohort
+    from hilbo.study.optima import population_optimum
     from hilbo.study.progress import follow
 
     population = PRESETS["paper-individuals"]

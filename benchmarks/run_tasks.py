@@ -18,8 +18,9 @@ from hilbo.hyperparameters.maximum_evidence import maximise_evidence
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.lattice import screen_points
 from hilbo.session.ask_tell import Session
-from hilbo.study.aggregate import fit_cohort, population
+from hilbo.study.aggregate import fit_cohort
 from hilbo.study.config import Study
+from hilbo.study.optima import population
 
 PAPER = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 

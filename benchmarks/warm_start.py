@@ -26,7 +26,7 @@ from hilbo.session.selection import design, point_after
 from hilbo.session.warm_start import warm_point, warm_start
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import Person, people, simulate_study
-from hilbo.study.aggregate import population
+from hilbo.study.optima import population
 
 TRIALS = 25
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import hilbo
 from hilbo.app.rehearsal import Decider
 from hilbo.hardware_bridge import Renderer
-from hilbo.session.actions import answer, go_on, present, propose, sent, steps_of
+from hilbo.session.actions import answer, go_on, present, propose, sent
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.plan import header_for
@@ -60,7 +60,7 @@ while log.state.screen not in ("done", "ended"):
     numbers = {name: trial.renderings["a"][name] for name in ("K0", "K1", "B1", "alpha")}
     found = device.send(**numbers, N=mechanics.N, T=mechanics.T)
     log.append(sent(log.state, trial.id, "a", time.time(), in_force=found._asdict()))
-    for step, _ in enumerate(steps_of(log.state, trial)):
+    for step, _ in enumerate(log.state.steps_of(trial)):
         log.append(present(log.state, trial.id, step, True, time.time()))
         chooser.lookahead(log.state)  # while somebody feels
         log.append(present(log.state, trial.id, step, False, time.time()))

@@ -18,8 +18,9 @@ import numpy as np
 import hilbo
 from hilbo import Study
 from hilbo.report.figures.maps import map_slices
-from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population, population_optimum
+from hilbo.study.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.cohort import cohort_of
+from hilbo.study.optima import population, population_optimum
 from hilbo.study.trial_table import read_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped

@@ -21,7 +21,8 @@ import hilbo
 from hilbo import Study
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.report.figures.study import people_figure
-from hilbo.study.aggregate import aggregate_cohort, nrmse
+from hilbo.search.apart import nrmse
+from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import cohort_of
 from hilbo.study.trial_table import read_trials, write_trials
 

@@ -49,7 +49,10 @@ MATHS = {
     *("kernels", "bcm", "numerics", "acquisition", "likelihoods", "gaussian", "laplace", "inference", "ordinal_gp"),
     *("hyperparameters", "population", "mechanics", "viscoelastic", "passivity", "search"),
     *(f"statistics.{name}" for name in ("ordered_logit", "separation", "cluster_robust", "regression")),
-    *(f"identification.{name}" for name in ("fitting", "sampled", "moduli", "intervals", "characterise")),
+    *(
+        f"identification.{name}"
+        for name in ("fitting", "sampled", "moduli", "intervals", "residual_noise", "characterise")
+    ),
     *("study.map_summary", "study.tolerance_intervals", "session.selection", "session.ask_tell", "simulation.simulate"),
 }
 ASKS_THE_PROCESS = {"numerics.compiling"}  # which flags XLA was given
@@ -64,7 +67,10 @@ WITHOUT_JAX = {
         f"session.{name}"
         for name in ("actions", "confirmed", "event_log", "export", "header_check", "netcdf", "participants")
     ),
-    *(f"session.{name}" for name in ("plan", "records", "replay", "state", "views", "withdrawal", "withdrawn_results")),
+    *(
+        f"session.{name}"
+        for name in ("plan", "records", "replay", "state", "transitions", "views", "withdrawal", "withdrawn_results")
+    ),
     "session.pace",
 }
 # These import JAX for a set with full memory, and to convert a value, and not before.

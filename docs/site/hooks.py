@@ -20,7 +20,7 @@ API = {
     "inference": ("Inference and hyperparameters", "laplace gaussian inference.exact hyperparameters.maximum_evidence"),
     "aggregation": (
         "Aggregation",
-        "bcm study.cohort study.aggregate study.map_summary study.rule_comparison population.pointwise"
+        "bcm study.cohort study.aggregate study.optima study.map_summary study.rule_comparison population.pointwise"
         " population.hierarchical population.learnt population.response_quality",
     ),
     "mechanics": (
@@ -31,12 +31,12 @@ API = {
     "identification": (
         "Identification",
         "identification.material_tables identification.sampled identification.fitting identification.intervals"
-        " identification.moduli identification.characterise report.material",
+        " identification.residual_noise identification.moduli identification.characterise report.material",
     ),
     "sessions": (
         "Studies and sessions",
-        "study.config session.ask_tell session.logged_session session.plan session.actions session.event_log"
-        " session.look_ahead session.views session.warm_start",
+        "study.config session.ask_tell session.logged_session session.plan session.actions session.state"
+        " session.event_log session.look_ahead session.views session.warm_start",
     ),
     "simulation": (
         "Simulation",
@@ -45,7 +45,7 @@ API = {
     "reports": (
         "Tables, statistics, reports",
         "study.trial_table study.folder study.validation_table statistics.paper_tables statistics.logits"
-        " statistics.preferences report.comparison report.study",
+        " statistics.preferences report.comparison report.study report.result_tables",
     ),
     "device": ("Device", "hardware_bridge device.protocol device.ports device.simulator"),
 }

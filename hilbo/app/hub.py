@@ -24,8 +24,9 @@ from hilbo.app.security import Role
 from hilbo.app.watchers import Watchers
 from hilbo.errors import InputError
 from hilbo.session import actions
-from hilbo.session.actions import LiveSession, RefusedError
 from hilbo.session.event_log import LogError
+from hilbo.session.records import RefusedError
+from hilbo.session.state import LiveSession
 
 __all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError", "others_present"]
 
@@ -324,7 +325,7 @@ class Hub:
 
 def _taken(state, what, message, at):
     """A trial made void, or an answer taken back: that of the trial which the sender saw, or none."""
-    trial = actions.voidable(state) if what == "void" else actions.last_answered(state)
+    trial = state.voidable if what == "void" else state.last_answered
     if trial is None:
         raise RefusedError("nothing", f"There is no trial to {what} yet.")
     if message.trial not in (None, trial.id):

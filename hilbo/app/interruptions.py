@@ -16,8 +16,8 @@ from typing import Any
 from hilbo.app.rig import Snapshot
 from hilbo.errors import InputError
 from hilbo.session import actions
-from hilbo.session.actions import LiveSession
 from hilbo.session.event_log import LogError
+from hilbo.session.state import LiveSession
 
 __all__ = ["Interruptions"]
 

@@ -4,8 +4,9 @@ from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any
 
-from hilbo.session.actions import LiveSession, Trial, restorable
-from hilbo.session.records import Event
+from hilbo.session.actions import restorable
+from hilbo.session.records import Event, Trial
+from hilbo.session.state import LiveSession
 
 __all__ = ["line", "meant", "place_of", "sentence", "table"]
 

@@ -14,11 +14,12 @@ from hilbo.app.hub import Hub
 from hilbo.app.slices import Maps
 from hilbo.app.stimulus_rig import StimulusRig
 from hilbo.errors import InputError
-from hilbo.session.actions import Header, LiveSession
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.participants import check_consent, read_people
 from hilbo.session.plan import header_for, planned_header, read_plan
+from hilbo.session.records import Header
+from hilbo.session.state import LiveSession
 from hilbo.session.warm_start import read_warm_start
 from hilbo.study.config import Study
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from hilbo.app.rig import Loaded, MissedError, Showing
 from hilbo.session import actions
-from hilbo.session.actions import RefusedError, Trial
+from hilbo.session.records import Event, RefusedError, Trial
 
 __all__ = ["Runner"]
 
@@ -126,7 +126,7 @@ class Runner:
                 return event
             if newest.need != state.need or newest.trials != state.trials:
                 raise RefusedError("nothing", "what is to be proposed has changed.")
-            return actions.Event(seq=newest.seq + 1, kind=event.kind, time=at, data=event.data)
+            return Event(seq=newest.seq + 1, kind=event.kind, time=at, data=event.data)
 
         self.clock["chosen"] = time.perf_counter() - begun
         await hub.commit(make, mine=True)
@@ -140,7 +140,7 @@ class Runner:
             self._look_ahead()
             self._at("answer")
             return
-        steps = actions.steps_of(hub.state, trial)
+        steps = hub.state.steps_of(trial)
         await hub.rig.blank()
         await self._rig_ready()
         loading = self._loading(trial, _next_side(steps, 0), stop)

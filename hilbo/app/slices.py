@@ -12,8 +12,8 @@ from jaxtyping import Array, Bool, Float
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.session import progress
-from hilbo.session.actions import LiveSession
 from hilbo.session.look_ahead import Answers, LiveChooser
+from hilbo.session.state import LiveSession
 from hilbo.study.config import Study
 
 __all__ = ["Maps"]

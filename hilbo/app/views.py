@@ -10,8 +10,8 @@ from datetime import datetime
 from typing import Any
 
 from hilbo.app.log_words import line, meant, place_of, table
-from hilbo.session.actions import LiveSession, last_answered, skippable, voidable
 from hilbo.session.pace import minutes_left
+from hilbo.session.state import LiveSession
 from hilbo.session.views import experimenter_view, participant_view
 
 __all__ = ["choice_rows", "experimenter", "map_version", "participant", "place_of", "seconds_of", "trial_name"]
@@ -131,9 +131,9 @@ def experimenter(hub: Any) -> dict[str, Any]:
         "alert": hub.alert or hub.fault or (runner.trouble if runner.stage == "trouble" else None),
         "may": _may(hub),
         "means": {
-            "void": meant(voidable(state)),
-            "undo": meant(last_answered(state)),
-            "skip": meant(skippable(state)),
+            "void": meant(state.voidable),
+            "undo": meant(state.last_answered),
+            "skip": meant(state.skippable),
         },
         "map_version": map_version(state) + ("" if hub.draws else " later"),
         "participant_here": hub.watchers.participant_here,
@@ -245,7 +245,7 @@ def _may(hub):
     actions += ["repeat"] if begun else []
     actions += ["undo"] if answered else []
     actions += ["void"] if answered or begun else []
-    actions += ["skip"] if skippable(state) else []
+    actions += ["skip"] if state.skippable else []
     return [*actions, "abort"]
 
 

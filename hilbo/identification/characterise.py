@@ -17,6 +17,7 @@ from hilbo import passivity
 from hilbo.identification import intervals
 from hilbo.identification.fitting import Fit, Test, fit, nrmse, polish
 from hilbo.identification.memory_selection import Row, select_memory
+from hilbo.identification.residual_noise import noise
 from hilbo.identification.sampled import Sampled
 
 __all__ = ["Characterisation", "Estimate", "characterise"]
@@ -141,7 +142,7 @@ def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str
 
 def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
     """What the residuals of each test look like, and how they compare with the noise of the repeats."""
-    for test, autoregression in zip(tests, intervals.noise(best_fit), strict=True):
+    for test, autoregression in zip(tests, noise(best_fit), strict=True):
         row = {
             "autocorrelation": float(autoregression.lag_one),
             "order": int(autoregression.order),

@@ -1,7 +1,7 @@
-"""How well tests determine the parameters of a fit: residuals, profile-likelihood intervals, block bootstrap.
+"""How well tests determine the parameters of a fit: profile-likelihood intervals, block bootstrap.
 
-Residuals of a curve are autocorrelated, by drift and by what the model cannot make. Each curve's are described by an
-autoregression of order 0 to 8 (Yule-Walker, BIC). With its spectrum the variance of an estimate is the sandwich
+With the spectrum of each curve's residuals (`hilbo.identification.residual_noise`) the variance of an estimate is the
+sandwich
 
     V = A⁻¹ (Σ_c J_cᵀ Γ_c J_c) A⁻¹,   A = JᵀJ,
 
@@ -27,33 +27,18 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Fit, curve_residuals, residuals
+from hilbo.identification.residual_noise import autoregression, filtered, fitted_residuals
 from hilbo.numerics.least_squares import Solution, least_squares, solve_symmetric
 from hilbo.numerics.tracing import program
 
-__all__ = ["Intervals", "Noise", "Spread", "block_bootstrap", "noise", "profile_intervals", "refits", "spread"]
+__all__ = ["Intervals", "Spread", "block_bootstrap", "profile_intervals", "refits", "spread"]
 
-LONGEST_MEMORY = 8  # largest order of the autoregression
 FEWEST_REPEATS = 5  # of a test, below which resampling them says nothing
 _CLOSE = 1e-3  # of the half-width, to which an end of an interval is found
 _FARTHEST = 4.0  # growth of a step away from the estimate
 _IMPATIENCE = 0.05  # least growth, times the steps taken: profiles may be flat beyond some distance
 _SEARCH_STEPS = 25
 _ENOUGH = 1e-8  # of the cost: cuts are 1e-4 of it and more
-
-
-class Noise(eqx.Module):
-    """The residuals of one curve as an autoregression.
-
-    `order` and `coefficients` (zero beyond the order), `lag_one`: their autocorrelation after one sample, `effective`:
-    how many independent samples would tell a mean as well, `rms`: in units of the curve's range.
-    """
-
-    order: Int[Array, ""]
-    coefficients: Float[Array, " 8"]
-    lag_one: Float[Array, ""]
-    effective: Float[Array, ""]
-    rms: Float[Array, ""]
-    innovation: Float[Array, ""]  # share of the variance that is new in each sample
 
 
 class Spread(eqx.Module):
@@ -82,12 +67,6 @@ class Intervals(eqx.Module):
     lowest_q: Float[Array, " p"]
 
 
-@program
-def noise(fitted: Fit) -> tuple[Noise, ...]:
-    """The autoregressions of the residuals, curve by curve."""
-    return tuple(_autoregression(r) for r in _residuals(fitted, fitted.q))
-
-
 def spread(fitted: Fit, quantile: float = 1.959964) -> Spread:
     """Sandwich variance of the coordinates, with those at a bound held there unless it is their own turn."""
     return _spread(fitted, quantile)
@@ -96,12 +75,12 @@ def spread(fitted: Fit, quantile: float = 1.959964) -> Spread:
 @program
 def _spread(fit: Fit, quantile: float) -> Spread:
     q = fit.q
-    slopes = jax.jacfwd(lambda x: _residuals(fit, x))(q)
+    slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(q)
     meat, effective = jnp.zeros_like(fit.solution.normal), jnp.zeros_like(q[0])
     unscaled = _inverse(fit.solution.normal, _free(fit))
-    for r, J in zip(_residuals(fit, q), slopes, strict=True):
-        model = _autoregression(r)
-        shape = _filtered(J, model)  # Jᵀ Γ J / γ_0
+    for r, J in zip(fitted_residuals(fit, q), slopes, strict=True):
+        model = autoregression(r)
+        shape = filtered(J, model)  # Jᵀ Γ J / γ_0
         lost = jnp.sum(unscaled * shape)
         variance = r @ r / (r.size - lost)
         meat, effective = meat + variance * shape, effective + model.effective
@@ -261,7 +240,7 @@ def _bootstrap(
 ) -> tuple[Float[Array, " p"], Float[Array, " p"]]:
     keys = jax.random.split(key, len(fit.weights))
     draws = tuple(jax.random.randint(k, (resamples, w.size), 0, w.size) for k, w in zip(keys, fit.weights, strict=True))
-    influences = _influences(fit, jax.jacfwd(lambda x: _residuals(fit, x))(fit.q))
+    influences = _influences(fit, jax.jacfwd(lambda x: fitted_residuals(fit, x))(fit.q))
     moved = sum(jnp.mean(u[d], axis=1) - jnp.mean(u, axis=0)[None, :] for u, d in zip(influences, draws, strict=True))
     errors = jnp.sqrt(sum(_variance_of_mean(u[d], 1) for u, d in zip(influences, draws, strict=True)))
     standard_error = jnp.sqrt(sum(_variance_of_mean(u, 0) for u in influences))
@@ -292,11 +271,6 @@ def _influences(fit: Fit, slopes: tuple[Float[Array, "_ p"], ...]) -> tuple[Floa
     return tuple(pulls)
 
 
-def _residuals(fit: Fit, q: Float[Array, " p"]) -> tuple[Float[Array, " _"], ...]:
-    """Those of each curve, under the weights of the fit."""
-    return tuple(curve_residuals(fit.model, c, w, q) for c, w in zip(fit.curves, fit.weights, strict=True))
-
-
 def _free(fit: Fit) -> Bool[Array, " p"]:
     """Coordinates that are not held at a bound."""
     return ~fit.held()
@@ -310,37 +284,6 @@ def _inverse(normal: Float[Array, "p p"], free: Bool[Array, " p"]) -> Float[Arra
     matrix = jnp.where(both, normal / outer, jnp.eye(free.size, dtype=normal.dtype))
     columns = jax.vmap(solve_symmetric, (None, 0))(matrix, jnp.eye(free.size, dtype=normal.dtype))
     return jnp.where(both, columns / outer, 0)
-
-
-def _autoregression(r: Float[Array, " m"]) -> Noise:
-    """Of one curve's residuals: Yule-Walker by Levinson's recursion, the order by BIC."""
-    m = r.size
-    lags = jnp.stack([r[: m - k] @ r[k:] for k in range(LONGEST_MEMORY + 1)])
-    rho = lags / lags[0]
-    a, error = jnp.zeros(LONGEST_MEMORY, r.dtype), jnp.ones_like(rho[0])
-    models, scores = [a], [jnp.zeros_like(error)]
-    for p in range(1, LONGEST_MEMORY + 1):
-        back = a[: p - 1][::-1]
-        reflection = (rho[p] - a[: p - 1] @ rho[1:p][::-1]) / error
-        a = a.at[: p - 1].add(-reflection * back).at[p - 1].set(reflection)
-        error = error * (1 - reflection**2)
-        models.append(a)
-        scores.append(m * jnp.log(error) + p * jnp.log(float(m)))
-    order = jnp.argmin(jnp.stack(scores))
-    a = jnp.stack(models)[order]
-    innovation = 1 - a @ rho[1:]
-    return Noise(order, a, rho[1], m * (1 - jnp.sum(a)) ** 2 / innovation, jnp.sqrt(lags[0]), innovation)
-
-
-def _filtered(slopes: Float[Array, "m p"], model: Noise) -> Float[Array, "p p"]:
-    """Jᵀ Γ J for the autocovariance Γ of variance 1, by its spectrum."""
-    length = 2 * slopes.shape[0]
-    response = jnp.fft.rfft(jnp.concatenate([jnp.ones(1, slopes.dtype), -model.coefficients]), length)
-    density = model.innovation / jnp.abs(response) ** 2
-    twice = jnp.full(density.size, 2.0, density.dtype).at[0].set(1).at[-1].set(1)
-    waves = jnp.fft.rfft(slopes, length, axis=0)
-    weight = (density * twice / length)[:, None]
-    return waves.real.T @ (weight * waves.real) + waves.imag.T @ (weight * waves.imag)
 
 
 def _student(quantile: float, freedom: Float[Array, "*p"]) -> Float[Array, "*p"]:

@@ -23,7 +23,7 @@ from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, as_json, json_lines, people_of
 from hilbo.search.apart import differences, nrmse
 from hilbo.search.rendering import K0_range, margin_of, set_of
-from hilbo.study.aggregate import Aggregate, Optimum, asked_variance, other_inference
+from hilbo.study.aggregate import Aggregate, asked_variance, other_inference
 from hilbo.study.batch_optimum import LargeAggregate
 from hilbo.study.config import Study
 from hilbo.study.effects import effects_of
@@ -31,6 +31,7 @@ from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
 from hilbo.study.learnt_study import learnt_content, learnt_sentences
 from hilbo.study.map_file import map_at_points, on_grid, write_map
 from hilbo.study.model_check import check_sentences, model_check
+from hilbo.study.optima import Optimum
 from hilbo.study.optimum_location import location_notes, location_sentences
 from hilbo.study.optimum_region import optimum_region, region_content, region_sentences
 from hilbo.study.population_results import Population

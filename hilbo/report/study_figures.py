@@ -21,6 +21,7 @@ def study_figures(
     hatched. `shares`: of `inference_data.predictive_shares`."""
     from hilbo.report.figures import maps, study
     from hilbo.report.figures.effects import effects_figure
+    from hilbo.report.figures.regions import class_regions
 
     chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
@@ -33,7 +34,7 @@ def study_figures(
         "map": map_,
         "maps-after": maps.slices_after(chosen, progress),
         "population-convergence": study.population_convergence(progress, references),
-        "classes": study.class_regions(regions),
+        "classes": class_regions(regions),
         "people": study.people_figure(analysis.people, analysis.left_out),
         "predictive": study.predictive_check(chosen.responses, *shares),
     }

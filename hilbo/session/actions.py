@@ -14,26 +14,16 @@ from typing import Any, Protocol, runtime_checkable
 from hilbo.errors import InputError
 from hilbo.session.confirmed import check_confirmed
 from hilbo.session.header_check import study_of
-from hilbo.session.records import Block, Event, Header, Need, Planned, RefusedError, Trial
-from hilbo.session.state import LiveSession, Screen
+from hilbo.session.records import Event, Need, RefusedError, Trial
+from hilbo.session.state import LiveSession
 from hilbo.study.protocols import protocol
 from hilbo.study.text_cells import runs_in_a_spreadsheet
 
 __all__ = [
-    "Block",
-    "Event",
-    "Header",
-    "LiveSession",
-    "Need",
-    "Planned",
-    "RefusedError",
-    "Screen",
-    "Trial",
     "abort",
     "answer",
     "device",
     "go_on",
-    "last_answered",
     "missed",
     "more",
     "note",
@@ -46,10 +36,8 @@ __all__ = [
     "resume",
     "sent",
     "skip",
-    "skippable",
     "undo",
     "void",
-    "voidable",
 ]
 
 
@@ -108,7 +96,7 @@ def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> E
     pending = _live(state, trial)
     if on and state.screen != "trial":
         raise RefusedError("paused", f"no step of trial {trial} begins now: the screen shows {state.screen}.")
-    steps = steps_of(state, pending)
+    steps = state.steps_of(pending)
     if not 0 <= step < len(steps):
         raise RefusedError("bad-answer", f"trial {trial} has {len(steps)} steps, none with the number {step}.")
     show = steps[step][0]
@@ -161,7 +149,7 @@ def answer(
 def undo(state: LiveSession, at: float, reason: str = "") -> Event:
     """Take the last answer back; its rendering is asked again. Raises `RefusedError` if there is none."""
     _running(state)
-    last = last_answered(state)
+    last = state.last_answered
     if last is None:
         raise RefusedError("nothing", "there is no answer to undo.")
     return _event(state, "undo", at, id=last.id, reason=_text(reason))
@@ -208,17 +196,10 @@ def restore(state: LiveSession, trial: int, at: float) -> Event:
 def skip(state: LiveSession, reason: str, at: float, trial: int | None = None) -> Event:
     """The pending planned trial is left out for good: one that the device has stopped twice. Raises RefusedError."""
     _running(state)
-    skipped = skippable(state)
+    skipped = state.skippable
     if skipped is None or trial not in (None, skipped.id):
         raise RefusedError("nothing", "only a planned trial that the device has stopped twice can be left out.")
     return _event(state, "skip", at, id=skipped.id, reason=_text(reason))
-
-
-def skippable(state: LiveSession) -> Trial | None:
-    """The trial that may be left out now."""
-    trial = state.pending
-    good = trial is not None and trial.repeats is None and trial.planned in state.put_off(trial.block)
-    return trial if good else None
 
 
 def _filled(state: LiveSession, trial: Trial) -> bool:
@@ -297,26 +278,6 @@ def device(state: LiveSession, condition: str, at: float, *, trial: int | None =
     if trial is not None:
         state.trial(trial)
     return _event(state, "device", at, condition=condition, trial=trial, **facts)
-
-
-def steps_of(state: LiveSession, trial: Trial) -> list[tuple[str, float]]:
-    """What is felt and for how many seconds; a and b in the order of this trial."""
-    steps = protocol(state.study.session, state.header.blocks[trial.block].phase).steps
-    other = {"a": "b", "b": "a"} if trial.first == "b" else {}
-    return [(other.get(step.show, step.show), step.seconds) for step in steps]
-
-
-def last_answered(state: LiveSession) -> Trial | None:
-    """The trial whose answer came last, of those that count: what `undo` takes back."""
-    given = [t for t in state.trials if t.status == "answered"]
-    return max(given, key=lambda t: t.answered["seq"] if t.answered else 0, default=None)
-
-
-def voidable(state: LiveSession) -> Trial | None:
-    """The trial that a person means who wants one void: the one being felt, or the newest answered one."""
-    if state.pending is not None and state.pending.step is not None:
-        return state.pending
-    return next((t for t in reversed(state.trials) if t.status == "answered"), None)
 
 
 def _number(state, phase, material):

@@ -13,9 +13,10 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session import actions as live
-from hilbo.session.actions import Header, LiveSession
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.look_ahead import LiveChooser
+from hilbo.session.records import Header
+from hilbo.session.state import LiveSession
 from hilbo.study.config import Study
 from hilbo.study.protocols import protocol
 

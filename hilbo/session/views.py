@@ -8,7 +8,6 @@ from typing import Any
 
 import msgspec
 
-from hilbo.session.actions import steps_of
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
 from hilbo.study.languages import language
@@ -65,7 +64,7 @@ def _shown_trial(state, trial: Trial):
         "again": trial.presentation > 1,
         "steps": [
             {"show": show, "seconds": seconds, "text": session.text(_step_text(show, alone))}
-            for show, seconds in steps_of(state, trial)
+            for show, seconds in state.steps_of(trial)
         ],
         "step": trial.step,
         "felt": trial.felt == frozenset(trial.renderings),
@@ -151,7 +150,7 @@ def _whole_trial(state, trial: Trial):
         "status": trial.status,
         "presentation": trial.presentation,
         "proposed": trial.proposed,
-        "steps": steps_of(state, trial),
+        "steps": state.steps_of(trial),
         "step": trial.step,
         "on": trial.on,
         "sent": dict(trial.sent),

@@ -35,10 +35,11 @@ from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
 from hilbo.simulation.presets import placed
 from hilbo.simulation.simulate import Person, Population, felt_apart, people, simulate_study
-from hilbo.study.aggregate import fit_cohort, map_optimum
+from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.learnt_study import resolved
+from hilbo.study.optima import map_optimum
 
 __all__ = ["Plan", "cores", "one_study", "power_table", "simulate_power", "summarise", "top_probability"]
 

@@ -1,77 +1,41 @@
-"""A cohort's posteriors, its population map by the study's rule, and the optima of both.
+"""A cohort's posteriors, its population map by the study's rule, and the optima of both, as one record.
 
     table     = read_trials("trials.csv", study)
     cohort    = cohort_of(table, study)
     aggregate = aggregate_cohort(study, cohort)
 
 All participants are fitted in one compiled batch over trials padded to one capacity. The population map is a
-committee machine over their posteriors (`hilbo.bcm`), or what the study's rule says (`hilbo.population.maps`); its
-optimum is searched like a session's.
+committee machine over their posteriors (`hilbo.bcm`), or what the study's rule says (`hilbo.population.maps`).
 """
 
-import dataclasses
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from hilbo import acquisition, bcm
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.host import placed
-from hilbo.numerics.shown import known, shown
+from hilbo.numerics.shown import known
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
-from hilbo.population import pointwise
 from hilbo.population.hierarchical import Share
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map, share_of
-from hilbo.population.newcomer import class_probabilities, log_highest
+from hilbo.population.newcomer import class_probabilities
 from hilbo.population.recipes import RECIPES
 from hilbo.search.apart import middle_of
 from hilbo.search.candidates import search_points
-from hilbo.search.space import SearchSpace
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Inference, Study
 from hilbo.study.learnt_study import resolved
+from hilbo.study.optima import Optimum, individual_optima, map_optimum, predict_map
 
-__all__ = [
-    "Aggregate",
-    "First",
-    "Optimum",
-    "aggregate_cohort",
-    "asked_variance",
-    "best_point",
-    "fit_cohort",
-    "individual_optima",
-    "map_optimum",
-    "other_inference",
-    "population",
-    "population_optimum",
-    "predict_map",
-]
+__all__ = ["Aggregate", "First", "aggregate_cohort", "asked_variance", "fit_cohort", "other_inference"]
 
-Rule = pointwise.Rule
 _LARGEST_POOL = 3000  # answers of the pooled alternative: its fit is cubic in their number
-
-
-class Optimum(eqx.Module):
-    """A point of the unit cube at which a map is largest, and the map there; leading axes for several.
-
-    Of a population, `mean` and `sd` are the map's own, and the class probabilities those of a new person's answer.
-    """
-
-    x: Float[Array, "*s d"]
-    mean: Float[Array, "*s"]
-    sd: Float[Array, "*s"]
-    class_probabilities: Float[Array, "*s C"]
-
-    def __repr__(self) -> str:
-        f, chances = f"{shown(self.mean)} ± {shown(self.sd)}", shown(self.class_probabilities)
-        return f"Optimum(x={shown(self.x)} of the unit cube, f = {f}, answers {chances})"
 
 
 First = Callable[[Optimum, RuleMap], None]
@@ -155,152 +119,6 @@ def _fit_cohort(gp: OrdinalGP, trials: Trials, inference: Inference) -> Posterio
 @program
 def _fit_own(gps: OrdinalGP, trials: Trials, inference: Inference) -> Posterior:
     return jax.vmap(lambda gp, t: fit(gp, t, inference=inference, throw=False))(gps, trials)
-
-
-@program
-def population(
-    posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm", share: Float[Array, ""] | None = None
-) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of the population map at points of the unit cube, aggregated point by point.
-
-    Of bcm, participants' predictions are made in blocks and never held all at once. `share`: of the hierarchical rule.
-    """
-    prior = jax.vmap(jax.tree.map(lambda leaf: leaf[0], posteriors.gp).kernel.diagonal)(x)
-    if rule != "bcm":
-        means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors)
-        return pointwise.aggregate(rule, means, explained, prior, share=share)
-    evidence = bcm.stream(lambda p: p.predict_explained(x), posteriors, prior)
-    return evidence.merge(prior)
-
-
-def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """Mean and variance (m,) of a population map at points of the unit cube; bcm's as a stream over people."""
-    return _predict_map(_nameless(map_), x)
-
-
-@program
-def _predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    return population(map_.experts, x) if map_.rule == "bcm" and map_.experts is not None else map_.predict(x)
-
-
-def population_optimum(
-    study: Study,
-    posteriors: Posterior,
-    candidates: Float[Array, "m d"],
-    rule: Rule = "bcm",
-    share: Float[Array, ""] | None = None,
-) -> Optimum:
-    """Where the population map's mean is largest in the feasible set.
-
-    `posteriors`: stacked, M people; `candidates` (m, d) feasible points of the unit cube.
-    """
-    return _population_optimum(study.gp, study.space, posteriors, candidates, rule, share)
-
-
-@program
-def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidates, rule, share) -> Optimum:
-    apart = 0.0 if share is None else (1.0 - share) * gp.kernel.variance
-    values = population(posteriors, candidates, rule, share)[0]
-    return _optimum(gp.likelihood, space, lambda x: population(posteriors, x, rule, share), candidates, values, apart)
-
-
-def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
-    """Where a rule's map has its largest mean in the feasible set; by a recipe that learns where a new person answers
-    with the highest category most often, or where the mean less so many standard deviations as the recipe's caution is
-    largest, among points of which the answers tell as much as of some that were asked.
-    `candidates` (m, d): feasible points of the unit cube, where the search begins.
-    """
-    return _map_optimum(study.gp.likelihood, study.space, _nameless(map_), candidates)
-
-
-def _nameless(map_: RuleMap) -> RuleMap:
-    """The map without the name of its rule where it predicts alike by all: from one function's posterior. One program
-    then serves them."""
-    exact = map_.method == "exact" and map_.rule not in RECIPES
-    return dataclasses.replace(map_, rule="hierarchical") if exact else map_
-
-
-@program
-def _map_optimum(
-    likelihood: OrdinalProbit, space: SearchSpace, map_: RuleMap, candidates: Float[Array, "m d"]
-) -> Optimum:
-    if map_.rule not in RECIPES:
-        single = jnp.float32  # which ranks the candidates; the best are scored again
-        values = predict_map(map_.astype(single), candidates.astype(single))[0]
-        return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, values, map_.apart)
-
-    def chance(mean, variance):
-        if map_.caution:
-            return mean - map_.caution * jnp.sqrt(variance)
-        return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
-
-    assert map_.reach is not None
-    largest_variance = jnp.maximum(map_.reach, jnp.min(map_.predict(candidates)[1]))  # of which there is one at least
-
-    def within_reach(x):
-        return map_.predict(x[None, :])[1][0] <= largest_variance
-
-    values = chance(*map_.predict(candidates))
-    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, chance, within_reach, map_.widths)
-
-
-def _optimum(
-    likelihood: OrdinalProbit,
-    space: SearchSpace,
-    predict: Callable,
-    candidates: Float[Array, "m d"],
-    values: Float[Array, " m"],
-    apart: ArrayLike,
-    height: Callable[[Array, Array], Array] | None = None,
-    allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
-    widths: bool = False,
-) -> Optimum:
-    """`values`: of the candidates, by which they are ranked; `apart`: variance of one person's function about the
-    map's; `height`: what is largest at the optimum, of means and variances (m,), by default the mean; `allowed`: where
-    it may be; `widths`: whether people differ in them."""
-    height = (lambda mean, _: mean) if height is None else height
-    choice = acquisition.maximise(
-        values,
-        candidates,
-        lambda x: height(*predict(x[None, :]))[0],
-        **space.searched,
-        allowed=allowed,
-        steps=300,
-    )
-    mean, variance = predict(choice.x[None, :])
-    probabilities = class_probabilities(likelihood, mean, variance + apart, widths)[0]
-    return Optimum(choice.x, mean[0], jnp.sqrt(variance[0]), probabilities)
-
-
-def individual_optima(study: Study, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
-    """Where each participant's posterior mean is largest in the feasible set, stacked; one after the other.
-
-    `posteriors`: stacked, M people; `candidates` (m, d) feasible points of the unit cube. All arrays of the result
-    begin with M.
-    """
-    return _individual_optima(study.space, posteriors, candidates)
-
-
-@program
-def _individual_optima(space: SearchSpace, posteriors: Posterior, candidates: Float[Array, "m d"]) -> Optimum:
-    def one(posterior):
-        x = best_point(space, posterior, candidates).x
-        mean, variance = posterior.predict(x[None, :])
-        probabilities = posterior.gp.likelihood.class_probabilities(mean[0], variance[0])
-        return Optimum(x, mean[0], jnp.sqrt(variance[0]), probabilities)
-
-    # On a CPU one after the other: each search stops when it is done, where a batch waits for its slowest.
-    return jax.lax.map(one, posteriors, batch_size=None if jax.default_backend() == "cpu" else 256)
-
-
-def best_point(space: SearchSpace, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
-    """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
-    return acquisition.maximise(
-        posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
-        candidates,
-        lambda x: posterior.mean(x[None, :])[0],
-        **space.searched,
-    )
 
 
 def other_inference(study: Study) -> Inference:

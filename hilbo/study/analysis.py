@@ -22,12 +22,13 @@ from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, aggregate_cohort, map_optimum
+from hilbo.study.aggregate import Aggregate, aggregate_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.learnt_study import learnt_sentences, resolved, that_learns
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
+from hilbo.study.optima import map_optimum
 from hilbo.study.optimum_location import location_sentences
 from hilbo.study.population_results import Population, Say, analyse_population
 from hilbo.study.progress import Progress

@@ -27,10 +27,10 @@ from hilbo.kernels import RBF, gram
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.population.pointwise import Rule, Sums, terms
-from hilbo.study.aggregate import Optimum, individual_optima
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Inference, Study
 from hilbo.study.distributed import AXIS, Crew
+from hilbo.study.optima import Optimum, individual_optima
 
 __all__ = ["Fitted", "Jets", "Population", "Say", "block_size", "jets", "population_of", "refit", "sums"]
 

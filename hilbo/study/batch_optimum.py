@@ -27,11 +27,12 @@ from hilbo.population.maps import share_of
 from hilbo.population.pointwise import RULES, Rule, Sums
 from hilbo.search.apart import middle_of
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Optimum, other_inference
+from hilbo.study.aggregate import other_inference
 from hilbo.study.batch import Jets, Population, Say, jets, population_of, refit, sums
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.distributed import Crew
+from hilbo.study.optima import Optimum
 
 __all__ = ["LargeAggregate", "aggregate_population", "optima_from", "optimum_near"]
 

@@ -10,8 +10,8 @@ from hilbo.population.hierarchical import Share
 from hilbo.population.maps import RuleMap
 from hilbo.population.pointwise import RULES
 from hilbo.population.recipes import RECIPES
-from hilbo.study.aggregate import predict_map
 from hilbo.study.config import Study
+from hilbo.study.optima import predict_map
 
 __all__ = ["ALIKE", "SURE", "heterogeneity", "in_place", "rule_warnings", "share_content"]
 

@@ -24,8 +24,9 @@ from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.pointwise import Rule, aggregate
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, fit_cohort, individual_optima, map_optimum
+from hilbo.study.aggregate import Aggregate, fit_cohort
 from hilbo.study.config import Study
+from hilbo.study.optima import individual_optima, map_optimum
 
 __all__ = ["Progress", "follow"]
 

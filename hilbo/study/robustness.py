@@ -26,9 +26,10 @@ from hilbo.population.pointwise import Rule
 from hilbo.population.recipes import RECIPES
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Optimum, fit_cohort, individual_optima, population, population_optimum
+from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.optima import Optimum, individual_optima, population, population_optimum
 from hilbo.study.resampled_optimum import resampled_tops
 
 __all__ = ["LIMIT", "Robustness", "robustness"]

@@ -35,11 +35,12 @@ from hilbo.population.pointwise import RULES
 from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
-from hilbo.study.aggregate import Aggregate, map_optimum
+from hilbo.study.aggregate import Aggregate
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.heterogeneity import ALIKE, SURE, share_content
 from hilbo.study.learnt_study import resolved, that_learns
+from hilbo.study.optima import map_optimum
 from hilbo.study.resampled_optimum import resampled_tops
 
 __all__ = ["KNOWN", "compare", "differences", "recommendation"]

@@ -9,9 +9,9 @@ from live import Driver
 
 from hilbo import Study
 from hilbo.cli import main
-from hilbo.session.actions import Block
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.plan import planned_header
+from hilbo.session.records import Block
 from hilbo.study.validation_table import read_validation, sets_frame
 
 TOML = """\

@@ -15,9 +15,10 @@ from hilbo.errors import InputError
 from hilbo.hyperparameters import maximum_evidence as hyper
 from hilbo.hyperparameters.coordinates import coordinates_of, log_prior, model_at
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
-from hilbo.study.aggregate import fit_cohort, population, population_optimum
+from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.optima import population, population_optimum
 from hilbo.study.robustness import robustness
 from tests.vectors.evidence import three
 

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares as scipy_least_squares
 from scipy.stats import t as student
 
 from hilbo.errors import InputError
-from hilbo.identification import intervals
+from hilbo.identification import intervals, residual_noise
 from hilbo.identification.fitting import Fit, Test, fit, residuals
 from hilbo.identification.sampled import Sampled
 from hilbo.numerics.least_squares import Solution
@@ -25,11 +25,11 @@ def found():
 
 @pytest.mark.deep
 def test_noise_is_recognised(found):
-    for part in intervals.noise(found):
+    for part in residual_noise.noise(found):
         assert int(part.order) >= 1
         assert float(part.lag_one) == pytest.approx(0.8, abs=0.1)
     sizes = [curve.time.size for curve in found.curves]
-    shares = [float(part.effective) / size for part, size in zip(intervals.noise(found), sizes, strict=True)]
+    shares = [float(part.effective) / size for part, size in zip(residual_noise.noise(found), sizes, strict=True)]
     assert shares == pytest.approx([1 / 9, 1 / 9], rel=0.5)  # (1 - 0.8)/(1 + 0.8)
 
 
@@ -40,7 +40,7 @@ def test_a_filtered_product_is_that_with_the_autocovariance_matrix():
     for _ in range(198):
         lags.append(a[0] * lags[-1] + a[1] * lags[-2])
     innovation = 1 - a @ lags[1:3]
-    model = intervals.Noise(
+    model = residual_noise.Noise(
         jnp.asarray(2),
         jnp.zeros(8).at[:2].set(a),
         jnp.asarray(0.0),
@@ -49,7 +49,7 @@ def test_a_filtered_product_is_that_with_the_autocovariance_matrix():
         jnp.asarray(innovation),
     )
     expected = slopes.T @ toeplitz(lags) @ slopes
-    np.testing.assert_allclose(intervals._filtered(jnp.asarray(slopes), model), expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(residual_noise.filtered(jnp.asarray(slopes), model), expected, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("freedom", [5, 12, 100])
@@ -108,7 +108,7 @@ def test_white_noise_has_the_classical_cut():
     found = fit(foam_tests(noise=0.01, hold=0.5, seed=3), Sampled())
     around = intervals.spread(found)
     m, p = sum(c.time.size for c in found.curves), 4
-    assert [int(part.order) for part in intervals.noise(found)] == [0, 0]
+    assert [int(part.order) for part in residual_noise.noise(found)] == [0, 0]
     classical = student.ppf(0.975, m - p) ** 2 * float(found.solution.cost)
     # Two curves of different length have weights of their own, so that the classical cut is met to first order.
     assert np.asarray(around.cut) == pytest.approx(np.full(4, classical / m), rel=0.6)

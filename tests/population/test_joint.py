@@ -9,7 +9,7 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.kernels import gram
 from hilbo.population.joint import joint_map
-from hilbo.study.aggregate import population
+from hilbo.study.optima import population
 
 GP = OrdinalGP(RBF(8.0, 1.7), OrdinalProbit((-0.5, 0.5), 0.5))
 

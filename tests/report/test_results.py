@@ -12,8 +12,9 @@ from studies import answered, plain_study
 
 from hilbo.report import participants, results
 from hilbo.search.rendering import K0_range, margin_of, set_of
-from hilbo.study.aggregate import aggregate_cohort, population
+from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.config import Study
+from hilbo.study.optima import population
 from hilbo.study.population_results import analyse_population
 
 PAPER = Study.load("hilbo/data/paper.toml")

@@ -24,11 +24,12 @@ from hilbo.report.hypotheses import _convergence, _materials, _nearer_to_others
 from hilbo.report.study import _alternatives, _shown, _tolerances
 from hilbo.report.study_figures import comparison_figures
 from hilbo.report.validation import validate
-from hilbo.study.aggregate import fit_cohort, population
+from hilbo.study.aggregate import fit_cohort
 from hilbo.study.analysis import limits_of
 from hilbo.study.cohort import Cohort
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.map_summary import tolerance
+from hilbo.study.optima import population
 from hilbo.study.progress import Progress, _counts, _splits, _to_other_half
 from hilbo.study.tolerance_intervals import tolerance_ends
 
@@ -97,10 +98,10 @@ def test_convergence_is_judged_by_people_who_are_not_among_them():
         (item,) = _convergence(SimpleNamespace(analysis=found, reference=None))
         assert item.side == side and f"{100 * halves:.0f} % (NRMSE, median of 4" in item.text
     own = np.linspace(0.5, 0.2, 6)[:, None] + np.array([0.0, 0.01, -0.01])
-    assert _nearer_to_others(progress._replace(own_to_half=own)).side == "supports"
-    assert _nearer_to_others(progress._replace(own_to_half=own[::-1])).side == "contradicts"
+    assert _nearer_to_others(progress._replace(individual_to_half=own)).side == "supports"
+    assert _nearer_to_others(progress._replace(individual_to_half=own[::-1])).side == "contradicts"
     random = np.random.default_rng(0).uniform(size=(6, 3))
-    assert _nearer_to_others(progress._replace(own_to_half=random)).side == "inconclusive"
+    assert _nearer_to_others(progress._replace(individual_to_half=random)).side == "inconclusive"
 
 
 def test_other_materials_are_the_others():

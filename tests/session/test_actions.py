@@ -10,8 +10,9 @@ from live import CHOOSER, KINDS, SETS, STUDY, Driver, header
 
 from hilbo.errors import InputError
 from hilbo.session import actions as live
-from hilbo.session.actions import Header, LiveSession, RefusedError
 from hilbo.session.export import presentations_table
+from hilbo.session.records import Event, Header, RefusedError
+from hilbo.session.state import LiveSession
 from hilbo.session.views import experimenter_view, participant_view
 
 anything = st.lists(st.tuples(st.sampled_from(KINDS), st.integers(0, 1000)), max_size=60)
@@ -313,13 +314,13 @@ def test_an_answered_trial_can_be_repeated_and_does_not_count():
 def test_a_repetition_of_what_does_not_count_any_more_is_not_asked(kind):
     driver = to_first_answerable(kind)
     driver.do("answer", 0)
-    source = live.last_answered(driver.state).id
+    source = driver.state.last_answered.id
     driver.do("again", source - 1)
     assert driver.state.wanted == (source,)
     driver.do("undo", 0)
     assert driver.state.wanted == () and driver.state.pending.repeats is None
     driver.do("answer", 0)
-    source = live.last_answered(driver.state).id
+    source = driver.state.last_answered.id
     driver.do("again", source - 1)
     driver.do("answer", 0)
     assert driver.state.pending.repeats == source  # and while it is being felt
@@ -333,7 +334,7 @@ def test_a_repetition_of_what_does_not_count_any_more_is_not_asked(kind):
 def test_an_answer_that_was_asked_again_since_is_not_restored(kind):
     driver = to_first_answerable(kind)
     driver.do("answer", 0)
-    voided = live.last_answered(driver.state)
+    voided = driver.state.last_answered
     driver.do("void old", voided.id - 1)
     assert driver.state.pending.renderings == voided.renderings
     driver.do("answer", 1)
@@ -345,11 +346,11 @@ def test_an_answer_that_was_asked_again_since_is_not_restored(kind):
 def test_a_repetition_is_not_restored_beside_the_one_in_its_place(answered):
     driver = to_first_answerable()
     driver.do("answer", 0)
-    source = live.last_answered(driver.state).id
+    source = driver.state.last_answered.id
     driver.do("again", source - 1)
     driver.do("answer", 0)
     driver.do("answer", 0)
-    repeat = live.last_answered(driver.state)
+    repeat = driver.state.last_answered
     assert repeat.repeats == source
     pending = driver.state.pending
     driver.log(live.void(driver.state, repeat.id, "a cough", 1.0))
@@ -369,12 +370,12 @@ def test_a_repetition_is_not_restored_beside_the_one_in_its_place(answered):
 def test_of_several_voided_repetitions_of_one_trial_one_is_restored():
     driver = to_first_answerable()
     driver.do("answer", 0)
-    source = live.last_answered(driver.state).id
+    source = driver.state.last_answered.id
     driver.do("again", source - 1)
     driver.do("answer", 0)
     for _ in range(2):  # the second in the place of the first
         driver.do("answer", 0)
-        driver.do("void old", live.last_answered(driver.state).id - 1)
+        driver.do("void old", driver.state.last_answered.id - 1)
         driver.do("answer", 0)
     first, second = (t.id for t in driver.state.trials if t.repeats == source and t.status == "void")
     driver.do("restore", first - 1)
@@ -401,10 +402,10 @@ def test_the_warm_up_goes_on_for_as_long_as_one_likes():
 def test_sides_come_in_the_order_of_the_trial():
     driver = to_first_answerable("validation")
     first, second = driver.state.pending, None
-    assert [show for show, _ in live.steps_of(driver.state, first)] == ["reference", "a", "neutral", "b"]
+    assert [show for show, _ in driver.state.steps_of(first)] == ["reference", "a", "neutral", "b"]
     driver.do("answer", 0)
     second = driver.state.pending
-    assert [show for show, _ in live.steps_of(driver.state, second)] == ["reference", "b", "neutral", "a"]
+    assert [show for show, _ in driver.state.steps_of(second)] == ["reference", "b", "neutral", "a"]
     assert first.sets == second.sets
 
 
@@ -417,7 +418,7 @@ def test_a_header_of_another_study_and_events_out_of_order_are_refused():
     with pytest.raises(InputError, match="does not follow event 1"):
         driver.state.after(driver.events[0])
     with pytest.raises(InputError, match="does not know"):
-        driver.state.after(live.Event(seq=2, kind="dance", time=0.0, data={}))
+        driver.state.after(Event(seq=2, kind="dance", time=0.0, data={}))
 
 
 def test_states_are_records():

@@ -9,10 +9,11 @@ from live import CHOOSER, RAW, SETS, beginning, header
 from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session import actions as live
-from hilbo.session.actions import Block, LiveSession, RefusedError
 from hilbo.session.confirmed import check_confirmed, counted
 from hilbo.session.export import trials_table
 from hilbo.session.look_ahead import Answers
+from hilbo.session.records import Block, RefusedError
+from hilbo.session.state import LiveSession
 
 STUDY = Study.from_dict(RAW | {"stimulus": {"tolerance": {"u": 0.01}, "within": 2.0}})
 ASKED = SETS["A"]

@@ -15,8 +15,9 @@ from live import CHOOSER, RAW, STUDY, Driver, header
 from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session import actions as live
-from hilbo.session.actions import Event, LiveSession
 from hilbo.session.event_log import EventLog, LogError, log_name, log_paths, read_log
+from hilbo.session.records import Event
+from hilbo.session.state import LiveSession
 
 CHILD = """
 import sys

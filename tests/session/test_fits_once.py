@@ -11,8 +11,9 @@ from live import STUDY, beginning, header
 from hilbo.app.slices import Maps
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.session import actions as live
-from hilbo.session.actions import Block, LiveSession
 from hilbo.session.look_ahead import LiveChooser
+from hilbo.session.records import Block
+from hilbo.session.state import LiveSession
 
 
 def model(theta=10.0):
@@ -57,7 +58,7 @@ def test_a_live_trial_fits_each_data_set_once():
         def trial(state):
             """A rendering is proposed and felt, the next is sought, and the experimenter looks."""
             state = state.after(live.propose(state, chooser, 0.0))
-            for step in range(len(live.steps_of(state, state.pending))):
+            for step in range(len(state.steps_of(state.pending))):
                 for event in beginning(state, state.pending.id, step, 0.0):
                     state = state.after(event)
             chooser.lookahead(state)

@@ -13,13 +13,14 @@ from hilbo.errors import InputError
 from hilbo.search.candidates import search_points
 from hilbo.session import actions as live
 from hilbo.session import explanation
-from hilbo.session.actions import Block, LiveSession
 from hilbo.session.event_log import EventLog, log_name, read_log
 from hilbo.session.excluded import APART
 from hilbo.session.logged_session import LoggedSession
 from hilbo.session.look_ahead import Answers, LiveChooser
 from hilbo.session.pace import minutes_left
 from hilbo.session.progress import consistency, trust_of
+from hilbo.session.records import Block
+from hilbo.session.state import LiveSession
 from hilbo.session.warm_start import informed, warm_start
 
 ANSWERS = ("similar", "different", "close", "close", "similar", "close")

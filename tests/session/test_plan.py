@@ -11,10 +11,10 @@ from live import RAW, STUDY
 from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session import actions as live
-from hilbo.session.actions import LiveSession
 from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue, warm_up
 from hilbo.session.plan_sets import aggregate_best_sets, check_participants
+from hilbo.session.state import LiveSession
 from hilbo.session.views import participant_view
 from hilbo.study.protocols import protocol
 from hilbo.study.result_file import Result, read_result

@@ -8,11 +8,11 @@ from live import CHOOSER, RAW
 from hilbo import Study
 from hilbo.report.validation import validate, validation_figures
 from hilbo.session import actions as live
-from hilbo.session.actions import LiveSession
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.export import psych_ds, read_sessions, sets_table
 from hilbo.session.plan import make_plan, planned_header
 from hilbo.session.records import Block, Header, Planned
+from hilbo.session.state import LiveSession
 from hilbo.statistics.paper_tables import paper_tables
 from hilbo.study.validation_table import read_validation, sets_frame
 

@@ -18,8 +18,9 @@ from live import RAW, beginning
 
 from hilbo import Study
 from hilbo.session import actions as live
-from hilbo.session.actions import LiveSession, RefusedError
 from hilbo.session.plan import header_for, make_plan, planned_header
+from hilbo.session.records import RefusedError
+from hilbo.session.state import LiveSession
 from hilbo.session.views import experimenter_view, participant_view
 
 MATERIALS = ("foam", "soft", "hard")
@@ -114,7 +115,7 @@ class Lab:
         trial = self.state.pending
         if trial is None:
             return
-        steps = live.steps_of(self.state, trial)
+        steps = self.state.steps_of(trial)
         last = len(steps) if self.rng.random() < 0.7 else int(self.rng.integers(1, len(steps) + 1))
         for step in range(last):
             for event in beginning(self.state, trial.id, step, self.clock):
@@ -157,7 +158,7 @@ class Lab:
         trial = self.state.pending
         if trial is None:
             return
-        steps = live.steps_of(self.state, trial)
+        steps = self.state.steps_of(trial)
         show = steps[self.rng.integers(len(steps))][0]
         self.log(live.missed(self.state, trial.id, show, "late", self.clock))
         if show in trial.renderings:
@@ -218,7 +219,7 @@ class Lab:
             return {"ready": "go_on", "rest": "go_on", "paused": "resume"}[screen]
         if trial.planned is None or trial.planned != self.stubborn:
             return "answer"
-        return "skip" if live.skippable(self.state) and self.rng.random() < 0.5 else "stop"
+        return "skip" if self.state.skippable and self.rng.random() < 0.5 else "stop"
 
     def finish(self):
         """What is asked is answered, and now and then the device stops; the session comes to its end."""

@@ -15,9 +15,10 @@ from hilbo.errors import InputError
 from hilbo.ordinal_gp import Trials, fit
 from hilbo.search.apart import nrmse
 from hilbo.session.ask_tell import physical_trials
-from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population
+from hilbo.study.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
+from hilbo.study.optima import population
 from hilbo.study.progress import follow
 from hilbo.study.trial_table import read_trials, write_trials
 

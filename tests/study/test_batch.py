@@ -14,10 +14,11 @@ from hilbo.errors import InputError
 from hilbo.population.pointwise import Sums
 from hilbo.search.candidates import search_points
 from hilbo.study import distributed
-from hilbo.study.aggregate import aggregate_cohort, fit_cohort, population, population_optimum
+from hilbo.study.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.batch import _one_block, block_size, jets, population_of, refit, sums
 from hilbo.study.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.study.cohort import cohort_of
+from hilbo.study.optima import population, population_optimum
 
 
 @functools.cache

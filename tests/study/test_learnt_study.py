@@ -17,10 +17,11 @@ from hilbo.population.maps import learnt_map
 from hilbo.population.recipes import RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.simulation.simulate import to_table
-from hilbo.study.aggregate import aggregate_cohort, map_optimum
+from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.learnt_study import learnt_content, learnt_sentences, resolved, that_learns
+from hilbo.study.optima import map_optimum
 from hilbo.study.robustness import robustness
 from hilbo.study.trial_table import read_trials
 

@@ -11,9 +11,9 @@ from hilbo import Study
 from hilbo.cli import main
 from hilbo.errors import InputError
 from hilbo.session import actions
-from hilbo.session.actions import RefusedError
 from hilbo.session.participants import add_person, read_people
 from hilbo.session.plan import make_plan
+from hilbo.session.records import RefusedError
 from hilbo.study.set_table import read_sets
 from hilbo.study.trial_table import read_trials
 from hilbo.study.validation_table import read_validation

@@ -7,7 +7,8 @@ import json
 
 from hilbo import Study
 from hilbo.session import actions as live
-from hilbo.session.actions import Block, Header, LiveSession, Planned, RefusedError
+from hilbo.session.records import Block, Header, Planned, RefusedError
+from hilbo.session.state import LiveSession
 
 RAW = {
     "schema": 1,
@@ -59,7 +60,7 @@ CHOOSER = FakeChooser()
 def beginning(state, id, step, at, values=None):
     """The events with which a step begins: what it renders is confirmed, and then it is on."""
     trial, events = state.trial(id), []
-    show = live.steps_of(state, trial)[step][0]
+    show = state.steps_of(trial)[step][0]
     if show in trial.renderings:
         confirmed = values or {name: trial.renderings[show][name] for name in state.study.space.names}
         events.append(live.sent(state, id, show, at, values=confirmed))
@@ -169,7 +170,7 @@ class Driver:
             self.log(event)
 
     def feel(self, trial, off=True):
-        for step in range(len(live.steps_of(self.state, trial))):
+        for step in range(len(self.state.steps_of(trial))):
             self.begin(trial, step)
             if off:
                 self.log(live.present(self.state, trial.id, step, False, self.clock))

@@ -38,9 +38,9 @@ from hilbo.report.figures.style import (
     star,
     title,
 )
-from hilbo.study.aggregate import predict_map
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.optima import predict_map
 from hilbo.study.population_results import Population
 from hilbo.study.progress import Progress
 

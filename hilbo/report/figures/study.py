@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 from jax.typing import ArrayLike
 from jaxtyping import Float
-from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -39,14 +38,13 @@ from hilbo.report.figures.style import (
     title,
 )
 from hilbo.search.apart import nrmse
-from hilbo.study.analysis import Analysis, Reading
+from hilbo.study.analysis import Analysis
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.map_summary import Sets, slice_through
+from hilbo.study.map_summary import Sets
 from hilbo.study.progress import Progress
 
 __all__ = [
-    "class_regions",
     "individual_convergence",
     "people_figure",
     "population_convergence",
@@ -209,84 +207,6 @@ def _sets_on_curve(study, surface, points):
         axes.autoscale(axis="y")
         axes.legend(frameon=False)
     return figure
-
-
-def class_regions(readings: Mapping[str, Reading]) -> Figure:
-    """The most probable answer around each reading's optimum, and its tolerance intervals. Paper, figure 8.
-
-    One row for each reading (fixed and optimised hyperparameters), with slices of the first parameter with the second
-    and with the third; of two parameters or one, the readings stand side by side. White: may not be rendered.
-    """
-    study = next(iter(readings.values())).study
-    d, labels = study.space.dim, study.responses
-    pairs = [(0, 1), (0, 2)] if d > 2 else [(0, d - 1)]
-    shades = ListedColormap(mpl.colormaps["cividis"](np.linspace(0.12, 1.0, len(labels))))
-    rows, across = (len(readings), len(pairs)) if len(pairs) > 1 else (1, len(readings))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS, 2.4 * rows + 0.4), layout="constrained")
-        grid = figure.subplots(rows, across, squeeze=False).reshape(len(readings), len(pairs))
-        for (name, reading), row in zip(readings.items(), grid, strict=True):
-            for axes, (i, j) in zip(row, pairs, strict=True):
-                if d == 1:
-                    _class_curves(axes, reading, shades)
-                else:
-                    _regions(axes, reading, i, j, shades)
-                title(axes, name)
-        handles: list[Any] = [
-            Patch(facecolor=shades(k), edgecolor="black", linewidth=0.5, label=label) for k, label in enumerate(labels)
-        ]
-        handles.append(Line2D([], [], color=RED, linewidth=2, label="tolerance interval"))
-        legend(figure, handles)
-    return figure
-
-
-def _regions(axes, reading, i, j, shades):
-    study, best = reading.study, np.asarray(reading.aggregate.optimum.x)
-    across, up = (study.space.parameters[k].axis(_CELLS) for k in (i, j))
-    x = np.tile(best, (len(up), len(across), 1))
-    x[..., i], x[..., j] = np.meshgrid(across, up)
-    flat = jnp.asarray(x.reshape(-1, x.shape[-1]))
-    likeliest = np.argmax(np.asarray(_probabilities(reading, flat)), axis=1).astype(float)
-    values = np.where(np.asarray(study.space.feasible(flat)), likeliest, np.nan).reshape(x.shape[:-1])
-    label_axes(axes, study, i, j)
-    sides = ((i, across), (j, up))
-    first, second = (np.asarray(study.space.parameters[k].to_physical(jnp.asarray(side))) for k, side in sides)
-    count = len(study.responses)
-    axes.pcolormesh(first, second, values, cmap=shades, vmin=-0.5, vmax=count - 0.5, shading="nearest", rasterized=True)
-    for index in (i, j):
-        _interval(axes, reading, index, i, j)
-    star(axes, study, best, (i, j))
-
-
-def _interval(axes, reading, index, i, j):
-    """The tolerance interval of a parameter as a line along the slice it was read on, with a bar at each end."""
-    study = reading.study
-    parameter = study.space.parameters[index]
-    interval, _ = reading.tolerances.get(parameter.name, (None, None))  # levels have none
-    if interval is None:
-        return
-    ends = np.asarray(parameter.to_unit(jnp.asarray([interval.low, interval.high])))
-    points, _ = slice_through(study, reading.aggregate.optimum.x, parameter.name, jnp.linspace(ends[0], ends[1], 65))
-    physical = np.asarray(study.space.to_physical(points))
-    axes.plot(physical[:, i], physical[:, j], color=RED, linewidth=2, solid_capstyle="butt")
-    axes.plot(physical[[0, -1], i], physical[[0, -1], j], linestyle="", marker="o", color=RED, markersize=3.5)
-
-
-def _class_curves(axes, reading, shades):
-    study = reading.study
-    side = jnp.linspace(0.0, 1.0, _CELLS)
-    physical_side = np.asarray(study.space.parameters[0].to_physical(side))
-    chances = np.asarray(_probabilities(reading, side[:, None])).T
-    label_axes(axes, study, 0, 0)
-    axes.stackplot(physical_side, chances, colors=[shades(k) for k in range(len(chances))])
-    interval, _ = reading.tolerances.get(study.space.parameters[0].name, (None, None))
-    if interval is not None:
-        axes.hlines(0.5, interval.low, interval.high, color=RED, linewidth=2)
-    axes.set(yscale="linear", ylabel="probability of each answer", ylim=(0, 1))
-
-
-def _probabilities(reading, x):
-    return reading.aggregate.class_probabilities(reading.study.gp.likelihood, x)
 
 
 def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
