@@ -47,6 +47,7 @@ def compare(study, trials):
     import jax.numpy as jnp
 
     from hilbo import acquisition
+    from hilbo.numerics import climbing
     from hilbo.ordinal_gp import fit
     from hilbo.session import selection
 
@@ -69,10 +70,10 @@ def compare(study, trials):
             values = score(*posterior.predict(every))
             inside = values[:POINTS]
             polished = acquisition.maximise(inside, many, at, **box, starts=1)
-            rows = acquisition.spread(values, every, PLACES, 0.05)
+            rows = climbing.spread(values, every, PLACES, 0.05)
             starts = jnp.concatenate([own[None, :], every[rows]])
             usable = jnp.concatenate([jnp.ones(1, bool), values[rows] > -jnp.inf])
-            known = acquisition.climb(starts, usable, at, **box, steps=100)
+            known = climbing.climb(starts, usable, at, **box, steps=100)
             return jnp.stack([at(own), jnp.max(inside), polished.value, known.value])
 
         return jax.lax.map(one, trials)

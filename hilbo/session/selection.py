@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo import acquisition
 from hilbo.kernels import gram
+from hilbo.numerics.climbing import Choice, climb, spread
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.search.candidates import CANDIDATES, search_points
 from hilbo.search.lattice import Lattice, nodes_for, screen, screen_points
@@ -112,7 +113,7 @@ def point_apart(
     return _highest(study, plan, posterior, acquisition.UCB(study.selection.weight), allowed).x
 
 
-def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
+def _highest(study, plan, posterior, score, allowed=None) -> Choice:
     """Where a score is largest in the feasible set; screened in float32."""
 
     def score_at(x):
@@ -132,9 +133,9 @@ def _highest(study, plan, posterior, score, allowed=None) -> acquisition.Choice:
             values = score(*short.predict(points.astype(jnp.float32)))
         return acquisition.maximise(values, points, score_at, **space, allowed=allowed)
     screened = screen(*fitted, plan.lattice, score, allowed)
-    rows = acquisition.spread(screened.hopes, screened.points, _STARTS)
+    rows = spread(screened.hopes, screened.points, _STARTS)
     usable = screened.hopes[rows] > -jnp.inf
-    return acquisition.climb(screened.points[rows], usable, score_at, **space, allowed=allowed)
+    return climb(screened.points[rows], usable, score_at, **space, allowed=allowed)
 
 
 def _score(study, posterior, weight):

@@ -26,6 +26,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition
 from hilbo.errors import InputError
+from hilbo.numerics.climbing import Choice
 from hilbo.numerics.tracing import program
 from hilbo.study.config import Study
 
@@ -219,7 +220,7 @@ def _maximum(
     candidates: Float[Array, "m d"],
     values: Float[Array, " m"],
     starts: int,
-) -> acquisition.Choice:
+) -> Choice:
     """The maximum of a function of one point, from those of the candidates where it is highest."""
     space = study.space
     return acquisition.maximise(

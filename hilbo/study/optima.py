@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo import acquisition, bcm
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.numerics.climbing import Choice
 from hilbo.numerics.shown import shown
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior
@@ -190,7 +191,7 @@ def _individual_optima(space: SearchSpace, posteriors: Posterior, candidates: Fl
     return jax.lax.map(one, posteriors, batch_size=None if jax.default_backend() == "cpu" else 256)
 
 
-def best_point(space: SearchSpace, posterior: Posterior, candidates: Float[Array, "m d"]) -> acquisition.Choice:
+def best_point(space: SearchSpace, posterior: Posterior, candidates: Float[Array, "m d"]) -> Choice:
     """Where the posterior mean is largest in the feasible set (paper, algorithm 1), searched from `candidates`."""
     return acquisition.maximise(
         posterior.astype(jnp.float32).mean(candidates.astype(jnp.float32)),
