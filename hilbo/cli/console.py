@@ -31,6 +31,7 @@ __all__ = [
     "Preset",
     "Say",
     "cache_folder",
+    "check_choice",
     "fail",
     "finish",
     "print_result",
@@ -203,6 +204,14 @@ class _Pace:
             return line, False
         self.last_shown = now
         return line, True
+
+
+def check_choice(option: str, value: Any, allowed: Collection[Any]) -> None:
+    """Raises InputError where an option has none of its values; None among them is one that was not given."""
+    if value not in allowed:
+        names = [str(name) for name in allowed if name is not None]
+        listed = f"one of {', '.join(names)}" if len(names) > 2 else " or ".join(names)
+        raise InputError(f'--{option} is "{value}"; it must be {listed}.')
 
 
 def finish(content: dict[str, Any], out: Path, as_json: bool, printed: Collection[str] = ()) -> None:

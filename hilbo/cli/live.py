@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from hilbo.cli.console import JsonToo, progress, seed_option, start
+from hilbo.cli.console import JsonToo, check_choice, progress, seed_option, start
 from hilbo.cli.device_options import Baud, Sim, Where, sim_options, takes
 from hilbo.errors import InputError
 
@@ -201,8 +201,7 @@ def live(
     from hilbo.app.robot import find_browser
     from hilbo.study.protocols import PHASES
 
-    if phase not in PHASES[1:]:
-        raise InputError(f'--kind is "{phase}", it must be one of {", ".join(PHASES[1:])}.')
+    check_choice("kind", phase, PHASES[1:])
     if find_browser() is None:
         raise InputError(
             "--live needs Chromium and playwright; install them (Debian: apt install chromium; pip install"

@@ -26,6 +26,7 @@ from hilbo.cli.console import (
     Json,
     Out,
     Preset,
+    check_choice,
     fail,
     finish,
     progress,
@@ -272,8 +273,7 @@ def _by_rule(study, rule):
         return study if study.rule == rule else that_learns(study, rule)
     if study.rule in RECIPES:
         raise InputError(f'--rule is "{rule}", and the study, whose rule is "{study.rule}", has no [gp] for it.')
-    if rule not in ALL_RULES:
-        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
+    check_choice("rule", rule, ALL_RULES)
     return dataclasses.replace(study, rule=rule)
 
 

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, Json, Out, finish, progress, results, seed_option, start
+from hilbo.cli.console import Force, Json, Out, check_choice, finish, progress, results, seed_option, start
 from hilbo.errors import InputError
 
 __all__ = ["identify", "passivity"]
@@ -35,10 +35,10 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Find the parameters of a material from creep and relaxation tests."""
-    _one_of("memory", memory, ("short", "full"))
-    _one_of("begin", begin, ("rest", "equilibrium"))
-    _one_of("model", model, ("fosls", "fractional-maxwell"))
-    _one_of("weights", weights, (None, "range", "relative"))
+    check_choice("memory", memory, ("short", "full"))
+    check_choice("begin", begin, ("rest", "equilibrium"))
+    check_choice("model", model, ("fosls", "fractional-maxwell"))
+    check_choice("weights", weights, (None, "range", "relative"))
     _positive("T", period)
     _positive("damping", damping)
     with results(out, force) as folder, progress() as say:
@@ -94,29 +94,18 @@ def passivity(
     if K1 is None or B1 is None or alpha is None:
         name = "K1" if K1 is None else "B1" if B1 is None else "alpha"
         raise InputError(f"--{name} is missing; a set has --K1, --B1 and --alpha.")
-    _one_of("memory", memory, (None, "short", "full"))
+    check_choice("memory", memory, (None, "short", "full"))
     _positive("T", period)
     _positive("damping", damping)
     start()
-    import numpy as np
-
     from hilbo.report.json_text import quoted
     from hilbo.report.passivity import passivity_result, passivity_words
-    from hilbo.viscoelastic import FOSLS
 
     given = {"N": taps, "T": period, "memory": memory, "K_eff": K_eff, "damping": damping}
     renderer = _renderer(study) | {name: value for name, value in given.items() if value is not None}
-    sampling = renderer["N"], renderer["T"]
-
-    def place(K0):  # of NumPy's numbers, so that NumPy computes, at once
-        return FOSLS(*map(np.float64, (K0, K1, B1, alpha)), *sampling, memory=renderer["memory"])  # type: ignore[call-arg]
-
-    if K0 is None:
-        _order(alpha)
-        K0 = renderer["K_eff"] - float(place(0.0).dc_gain())
-    elif K_eff is not None:
+    if K0 is not None and K_eff is not None:
         raise InputError("--K0 and --K-eff are both given; one follows from the other, leave one out.")
-    model = place(K0)
+    model = _rendered(K0, K1, B1, alpha, renderer)
     content = passivity_result(model, renderer["damping"])
     if out is not None:
         from hilbo.report.material import write_passivity
@@ -129,6 +118,22 @@ def passivity(
         print(passivity_words(content))
         if out is not None:
             print(f"{out / 'report.html'}", file=sys.stderr)
+
+
+def _rendered(K0: float | None, K1: float, B1: float, alpha: float, renderer: dict[str, Any]) -> Any:
+    """The FO-SLS as a renderer samples it; K0 from the effective stiffness where it is not given."""
+    import numpy as np
+
+    from hilbo.viscoelastic import FOSLS
+
+    def sampled(K0):  # of NumPy's numbers, so that NumPy computes, at once
+        numbers = map(np.float64, (K0, K1, B1, alpha))
+        return FOSLS(*numbers, renderer["N"], renderer["T"], memory=renderer["memory"])  # type: ignore[call-arg]
+
+    if K0 is None:
+        _order(alpha)
+        K0 = renderer["K_eff"] - float(sampled(0.0).dc_gain())
+    return sampled(K0)
 
 
 def _renderer(study):
@@ -146,11 +151,6 @@ def _renderer(study):
 def _order(alpha):
     if not 0 < alpha <= 1:
         raise InputError(f"alpha is {alpha}, it must be above 0 and at most 1: the order of the fractional element.")
-
-
-def _one_of(name, value, allowed):
-    if value not in allowed:
-        raise InputError(f'--{name} is "{value}"; it must be {" or ".join(str(k) for k in allowed if k)}.')
 
 
 def _positive(name, value):

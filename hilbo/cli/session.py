@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, ForceFile, JsonToo, progress, remark, results, seed_option, start
+from hilbo.cli.console import Force, ForceFile, JsonToo, check_choice, progress, remark, results, seed_option, start
 from hilbo.cli.new_file import check_free, new_file
 from hilbo.errors import InputError
 
@@ -52,36 +52,15 @@ def plan(
     if reissue is not None:
         _write_plan(_reissued(out, file, reissue), out, as_json)
         return
-    if kind not in PHASES[1:]:
-        raise InputError(f'--kind is "{kind}"; it must be one of {", ".join(PHASES[1:])}.')
-    if source not in ("aggregate", "individual"):
-        raise InputError(f'--source is "{source}"; it must be aggregate or individual.')
+    check_choice("kind", kind, PHASES[1:])
+    check_choice("source", source, ("aggregate", "individual"))
     people = _people(participants, names, "P" if kind == "optimisation" or source == "individual" else "V")
     materials = tuple(material or file.materials)
     for name in materials:
         file.material(name)  # refuses what is none
     paths = {} if kind == "optimisation" else _by_material(materials, results_ or [])
     check_free(out, force)
-    start()
-    from hilbo.session.plan import make_plan
-
-    with progress() as say:
-        if kind == "optimisation":
-            chosen, sets = _searchable(study), None
-        else:
-            chosen = _whole(study)
-            sets = _sets(chosen, kind, paths, trials, source, people, say)
-        label = session or {"optimisation": "1", "validation": "2", "aggregate-best": "3"}[kind]
-        content = make_plan(
-            chosen,
-            people,
-            seed,
-            kind,
-            materials=materials,
-            session=label,
-            sets=sets,
-            source=source if kind == "validation" else None,
-        )
+    content = _plan_of(study, kind, source, people, materials, paths, trials, session, seed)
     check_free(out, force)  # it may have been made in the meantime
     _write_plan(content, out, as_json)
     if register is not None:
@@ -150,6 +129,25 @@ def delete(
         typer.echo(f"{path}: LEFT; {why}", err=True)
     for command in done.commands:
         typer.echo(f"make again: {command}", err=True)
+
+
+def _plan_of(path, kind, source, people, materials, paths, trials, session, seed) -> dict[str, Any]:
+    """The plan; `paths`: material -> result.json, of which the sets of a validation are made."""
+    start()
+    from hilbo.session.plan import make_plan
+
+    with progress() as say:
+        study = _searchable(path) if kind == "optimisation" else _whole(path)
+        return make_plan(
+            study,
+            people,
+            seed,
+            kind,
+            materials=materials,
+            session=session or {"optimisation": "1", "validation": "2", "aggregate-best": "3"}[kind],
+            sets=None if kind == "optimisation" else _sets(study, kind, paths, trials, source, people, say),
+            source=source if kind == "validation" else None,
+        )
 
 
 def _people(count, names, letter) -> list[str]:

@@ -64,7 +64,7 @@ class LiveSession:
         return state
 
     def after(self, event: Event) -> "LiveSession":
-        """The next state."""
+        """The next state. Raises InputError for an event that does not follow, or of a kind that is not known."""
         if event.seq != self.seq + 1:
             raise InputError(f"event {event.seq} does not follow event {self.seq}; the log is not in order.")
         apply = APPLY.get(event.kind)

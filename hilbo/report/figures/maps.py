@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from hilbo.numerics.host import placed
+from hilbo.report.figures.answers import answer_handles, mark_along, mark_trials
 from hilbo.report.figures.style import (
     BLUE,
     GREEN,
@@ -27,14 +28,11 @@ from hilbo.report.figures.style import (
     RED,
     STYLE,
     TWO_COLUMNS,
-    answer_handles,
-    answer_look,
     band,
     few_ticks,
     label_axes,
     legend,
     level_words,
-    mark_trials,
     star,
     title,
 )
@@ -86,14 +84,15 @@ def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"],
     thirds = [None] if study.space.dim == 2 else _levels(study.space.parameters[2], float(optimum[2]))
     grids = [grid_slice(study, surface, optimum, third) for third in thirds]
     figure, panels, draw = map_panels(study, grids)
+    counts = []
     for axes, third, values in zip(panels, thirds, grids, strict=True):
         draw(axes, values)
-        mark_trials(axes, study, cohort, third)
+        counts.append(mark_trials(axes, study, cohort, third))
         here = third is None or third == float(optimum[2])
         if here:
             star(axes, study, optimum)
         title(axes, "" if third is None else level_words(study, 2, third) + (" (optimum)" if here else ""))
-    legend(figure, [*answer_handles(study), *map_handles()])
+    legend(figure, [*answer_handles(study, np.concatenate(counts)), *map_handles()])
     return figure
 
 
@@ -289,16 +288,10 @@ def _map_curve(study, surface, optimum, cohort):
         )
         axes.plot(physical, mean, color=BLUE, label="population map")
         axes.autoscale(axis="y")
-        mask = np.asarray(cohort.trials.mask)
-        answers = np.asarray(study.space.to_physical(np.asarray(cohort.trials.x)[mask]))[:, 0]
-        q, places = np.asarray(cohort.trials.q)[mask], axes.get_xaxis_transform()
-        for category in range(len(study.responses)):
-            shown = answers[q == category]
-            height = np.full(len(shown), 0.03 + 0.05 * category)
-            axes.scatter(shown, height, transform=places, clip_on=False, **answer_look(study, category))
+        counts = mark_along(axes, study, cohort)
         best = np.asarray(study.space.to_physical(np.asarray(optimum)))[0]
         axes.axvline(float(best), color=RED, linewidth=1, label="optimum")
-        legend(figure, [*axes.get_legend_handles_labels()[0], *answer_handles(study)])
+        legend(figure, [*axes.get_legend_handles_labels()[0], *answer_handles(study, counts, discs=False)])
     return figure
 
 

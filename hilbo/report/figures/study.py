@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from hilbo.report.figures.answers import answer_handles, mark_trials
 from hilbo.report.figures.maps import Slice, grid_slice, map_handles, map_panels, maps_beside, sides
 from hilbo.report.figures.style import (
     BLUE,
@@ -27,13 +28,11 @@ from hilbo.report.figures.style import (
     RED,
     STYLE,
     TWO_COLUMNS,
-    answer_handles,
     band,
     few_ticks,
     label_axes,
     legend,
     level_words,
-    mark_trials,
     star,
     title,
 )
@@ -79,13 +78,13 @@ def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: in
     third = float(optima[-1][2]) if study.space.dim > 2 else None
     grids = [grid_slice(study, predict, optima[-1], third) for predict in maps.values()]
     figure, panels, draw = map_panels(study, grids)
+    counts = []
     for axes, name, n, x, values in zip(panels, maps, progress.moments, optima, grids, strict=True):
         draw(axes, values)
-        mark_trials(axes, study, person.first(n), third)
+        counts.append(mark_trials(axes, study, person.first(n), third))
         star(axes, study, x)
         title(axes, name if third is None else f"{name}, {level_words(study, 2, third)}")
-    handles = [*answer_handles(study), *map_handles()]
-    legend(figure, handles)
+    legend(figure, [*answer_handles(study, np.concatenate(counts)), *map_handles()])
     return figure
 
 
@@ -150,11 +149,11 @@ def sets_on_map(
     thirds = {name: float(x[2]) for name, x in points.items()} if study.space.dim > 2 else {"best": None}
     grids = [grid_slice(study, surface, best, third) for third in thirds.values()]
     figure, panels, draw = map_panels(study, grids)
-    hatched = False
+    hatched, counts = False, []
     for axes, (name, third), values in zip(panels, thirds.items(), grids, strict=True):
         draw(axes, values)
         hatched |= _hatch(axes, study, values, prior)
-        mark_trials(axes, study, cohort, third)
+        counts.append(mark_trials(axes, study, cohort, third))
         for shown in points if third is None else [name]:
             _mark(axes, study, shown, points[shown])
         title(axes, "" if third is None else f"{level_words(study, 2, third)} ({name})")
@@ -162,7 +161,7 @@ def sets_on_map(
         Line2D([], [], linestyle="", marker=_MARKS[n][0], color=_MARKS[n][2], markeredgecolor="black", label=n)
         for n in points
     ]
-    handles += [*answer_handles(study), *map_handles()]
+    handles += [*answer_handles(study, np.concatenate(counts)), *map_handles()]
     if hatched:
         handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="hardly sampled"))
     legend(figure, handles)

@@ -1,17 +1,12 @@
-"""The style that all figures share: colours, widths, axes with units, marks of answers and of optima.
+"""The style that all figures share: colours, widths, axes with units, marks of optima.
 
 Maps use cividis and lines the Okabe-Ito colours, which people with colour-blindness can tell apart; what differs
 does so by shape too. Widths are those of one and of two columns of a journal.
 """
 
-from typing import Any
-
 import numpy as np
-from matplotlib.colors import to_rgb
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
 __all__ = [
@@ -23,14 +18,11 @@ __all__ = [
     "RED",
     "STYLE",
     "TWO_COLUMNS",
-    "answer_handles",
-    "answer_look",
     "band",
     "few_ticks",
     "label_axes",
     "legend",
     "level_words",
-    "mark_trials",
     "star",
     "title",
 ]
@@ -49,40 +41,7 @@ STYLE: dict = {
     "axes.spines.top": False,
     "axes.spines.right": False,
 }
-_NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are drawn on it
 _WIDEST = 1.1  # inches of an entry of a legend
-_SHAPES = ("v", "s", "o", "^", "D", "P", "X", "p", "h", "<", ">")
-
-
-def answer_look(study: Study, category: int) -> dict[str, Any]:
-    """Marker of an answer: a shape of its own, filled the more the higher the answer is; the highest is a circle."""
-    count = len(study.responses)
-    top = category == count - 1
-    shapes = [shape for shape in _SHAPES if shape != "o"]
-    share = category / (count - 1)
-    fill = tuple(1 - share * (1 - part) for part in to_rgb(ORANGE))
-    look: dict[str, Any] = {"marker": "o" if top else shapes[category % len(shapes)], "s": 15 if top else 9}
-    return look | {"facecolor": fill, "edgecolor": "black", "linewidth": 0.5}
-
-
-def answer_handles(study: Study) -> list[Any]:
-    """What a legend shows of the answers, lowest first."""
-    looks = [answer_look(study, k) for k in range(len(study.responses))]
-    return [
-        Line2D([], [], linestyle="", marker=look["marker"], markerfacecolor=look["facecolor"], markeredgecolor="black",
-               markeredgewidth=0.5, markersize=4.5, label=label)
-        for look, label in zip(looks, study.responses, strict=True)
-    ]  # fmt: skip
-
-
-def mark_trials(axes, study: Study, cohort: Cohort, third: float | None) -> None:
-    """Tested stimuli near a slice, each with the mark of its answer."""
-    mask = np.asarray(cohort.trials.mask)
-    x, q = np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
-    near = np.ones(len(x), bool) if third is None else np.abs(x[:, 2] - third) < _NEAR
-    physical = np.asarray(study.space.to_physical(x))
-    for category in range(len(study.responses)):
-        axes.scatter(*physical[near & (q == category), :2].T, clip_on=False, zorder=3, **answer_look(study, category))
 
 
 def few_ticks(axis, count: int = 4, *, integer: bool = False) -> None:

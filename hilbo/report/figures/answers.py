@@ -1,0 +1,123 @@
+"""Marks of answers on maps: one of its own for each answer, and a disc of shares where a place got several.
+
+Marks at one place would cover each other, and the category that is drawn last would hide all others.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+from matplotlib.colors import to_rgb
+from matplotlib.lines import Line2D
+
+from hilbo.report.figures.style import ORANGE
+from hilbo.study.cohort import Cohort
+from hilbo.study.config import Study
+
+__all__ = ["answer_handles", "mark_along", "mark_trials"]
+
+_NEAR = 0.08  # trials within this distance of a slice, in the unit cube, are drawn on it
+_SHAPES = ("v", "s", "^", "D", "P", "X", "p", "h", "<", ">")
+_FEW, _MANY = 24.0, 80.0  # areas of the discs of two answers and of the most, points²
+_CORNERS = 60  # of a whole disc
+
+
+def mark_trials(axes, study: Study, cohort: Cohort, third: float | None) -> Int[np.ndarray, " p"]:
+    """Tested stimuli near a slice, each with the mark of its answer, or with the shares of several; how many answers
+    each place has."""
+    x, q = _answers(cohort)
+    near = np.ones(len(x), bool) if third is None else np.abs(x[:, 2] - third) < _NEAR
+    points = np.asarray(study.space.to_physical(x))[near, :2]
+    places, place, counts = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+    place = place.reshape(-1)  # NumPy 2.0 gives it the shape of the points
+    alone = counts[place] == 1
+    for category in range(len(study.responses)):
+        shown = points[alone & (q[near] == category)]
+        axes.scatter(*shown.T, clip_on=False, zorder=3, **_look(study, category))
+    tally = np.zeros((len(places), len(study.responses)), int)
+    np.add.at(tally, (place, q[near]), 1)
+    for row in np.flatnonzero(counts > 1):
+        _disc(axes, study, places[row], tally[row], _area(int(counts[row]), int(counts.max())))
+    return counts
+
+
+def mark_along(axes, study: Study, cohort: Cohort) -> Int[np.ndarray, " p"]:
+    """Answers beside a map of one parameter: a row of marks for each category, larger where the same answer was given
+    more often; how many answers each mark stands for."""
+    x, q = _answers(cohort)
+    points, places = np.asarray(study.space.to_physical(x))[:, 0], axes.get_xaxis_transform()
+    marks = [np.unique(points[q == category], return_counts=True) for category in range(len(study.responses))]
+    counts = np.concatenate([number for _, number in marks])
+    for category, (shown, number) in enumerate(marks):
+        look = _look(study, category)
+        sizes = np.where(number > 1, _area(number, int(counts.max(initial=1))), look["s"])
+        height = np.full(len(shown), 0.03 + 0.05 * category)
+        axes.scatter(shown, height, transform=places, clip_on=False, **look | {"s": sizes})
+    return counts
+
+
+def answer_handles(study: Study, counts: Int[np.ndarray, " p"], *, discs: bool = True) -> list[Any]:
+    """What a legend shows of the answers, lowest first, and what discs, or larger marks, stand for.
+
+    `counts`: how many answers each place has, as `mark_trials` and `mark_along` return.
+    """
+    several = counts[counts > 1]
+    no_marks = discs and 0 < len(several) == len(counts)
+    handles = []
+    for category, label in enumerate(study.responses):
+        look = _look(study, category)
+        marker = "o" if no_marks else look["marker"]
+        handles.append(_handle(label, marker=marker, markerfacecolor=look["facecolor"]))
+    if len(several):
+        low, high = several.min(), several.max()
+        number = f"{low}\n" if low == high else f"{low}\nto {high} "
+        fills = {"markerfacecolor": _fill(study, len(study.responses) - 1), "markerfacecoloralt": _fill(study, 0)}
+        shares = {"marker": "o", "fillstyle": "left", **fills}
+        larger = {"marker": "o", "markerfacecolor": "none"}
+        words = ("shares of " if discs else "mark of ") + f"{number}answers"
+        handles.append(_handle(words, **(shares if discs else larger) | {"markersize": 7}))
+    return handles
+
+
+def _answers(cohort: Cohort) -> tuple[Float[np.ndarray, "n d"], Int[np.ndarray, " n"]]:
+    """Points of the unit cube and categories of all answers."""
+    mask = np.asarray(cohort.trials.mask)
+    return np.asarray(cohort.trials.x)[mask], np.asarray(cohort.trials.q)[mask]
+
+
+def _look(study: Study, category: int) -> dict[str, Any]:
+    """Marker of an answer: a shape of its own, filled the more the higher the answer is; the highest is a circle."""
+    top = category == len(study.responses) - 1
+    look: dict[str, Any] = {"marker": "o" if top else _SHAPES[category % len(_SHAPES)], "s": 15 if top else 9}
+    return look | {"facecolor": _fill(study, category), "edgecolor": "black", "linewidth": 0.5}
+
+
+def _fill(study: Study, category: int) -> tuple[float, ...]:
+    share = category / (len(study.responses) - 1)
+    return tuple(1 - share * (1 - part) for part in to_rgb(ORANGE))
+
+
+def _area(count: Any, most: int) -> Any:
+    """Points² of a disc of several answers: it grows evenly with their number."""
+    return _FEW + (_MANY - _FEW) * (count - 2) / max(most - 2, 1)
+
+
+def _disc(axes, study: Study, point: Float[np.ndarray, " 2"], tally: Int[np.ndarray, " C"], area: float) -> None:
+    """The shares of several answers at one place, lowest first, clockwise from the top."""
+    ends = 2 * np.pi * np.cumsum([0, *tally]) / tally.sum()
+    for category in np.flatnonzero(tally).tolist():
+        turns = np.linspace(ends[category], ends[category + 1], 2 + int(_CORNERS * tally[category] / tally.sum()))
+        corners = np.stack([np.sin(turns), np.cos(turns)], axis=1)
+        if tally[category] < tally.sum():
+            corners = np.concatenate([[[0.0, 0.0]], corners])
+        # Matplotlib scales a marker until its farthest corner is at the edge.
+        size = area * np.abs(corners).max() ** 2
+        fill = _fill(study, category)
+        axes.scatter(
+            *point, marker=corners, s=size, facecolor=fill, edgecolor="black", linewidth=0.4, clip_on=False, zorder=3
+        )
+
+
+def _handle(label: str, **look: Any) -> Line2D:
+    edge = {"markeredgecolor": "black", "markeredgewidth": 0.5, "markersize": 4.5}
+    return Line2D([], [], linestyle="", label=label, **edge | look)
