@@ -77,7 +77,7 @@ class Hub:
         self.invite: Callable[[Role], dict[str, str]] | None = None
         self._connect, self._make_maps, self._maps = connect, maps, None
         self.warm: asyncio.Future | None = None
-        self.watchers = Watchers(lambda: self.state.study.session.text("moved"))
+        self.watchers = Watchers(lambda: self.text("moved"))
         self._disk = ThreadPoolExecutor(1, "hilbo-disk")
         self.compute = ThreadPoolExecutor(1, "hilbo-choice")
         self._lock: asyncio.Lock | None = None
@@ -167,6 +167,10 @@ class Hub:
         self.watchers.tell()
 
     # What pages and programs ask for.
+
+    def text(self, key: str) -> str:
+        """What participants read, in the study's language."""
+        return self.state.study.session.text(key)
 
     def view(self, role: Role) -> dict[str, Any]:
         """What a role may see now."""

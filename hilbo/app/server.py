@@ -18,6 +18,7 @@ event loop only waits here: files, device and arithmetic have threads of their o
 
 import asyncio
 import contextlib
+import html
 import mimetypes
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -27,7 +28,7 @@ import msgspec
 from starlette.applications import Starlette
 from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 
 from hilbo.app import lines, messages
@@ -44,6 +45,7 @@ __all__ = ["application"]
 _FILES = {path.name: path.read_bytes() for path in (Path(__file__).parent / "static").iterdir()}
 _ALIVE = 5.0  # s between signs of life in a silent stream
 _DAY = 86_400
+_JOIN_TEXTS = ("lang", "wait", "no_link", "used_link", "no_server")
 _HEADERS = {
     b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
     b" img-src 'self' data:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -83,12 +85,12 @@ def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
     and has its page."""
     guarded = _for(hub, gate)
     routes = [
-        Route("/", _page("join.html")),
+        Route("/", _way_in(hub)),
         Route("/api/join", _either(_join(hub, gate)), methods=["POST"]),
         Route("/api/experimenter/map", guarded("experimenter", _map), methods=["GET"]),
     ]
     for role in PAGES:
-        routes += [Route(f"/{role}", _role_page(gate, role))]
+        routes += [Route(f"/{role}", _role_page(hub, gate, role))]
     for role in ("participant", "experimenter"):
         routes += [
             Route(f"/api/{role}", guarded(role, _view), methods=["GET"]),
@@ -108,8 +110,8 @@ def application(hub: Any, gate: Gate, tried: Tried | None = None) -> Starlette:
     return Starlette(routes=routes, middleware=[Middleware(_Guard, gate=gate)])
 
 
-def _file(name, status=200) -> Response:
-    return Response(_FILES[name], status, media_type=mimetypes.guess_type(name)[0])
+def _file(name) -> Response:
+    return Response(_FILES[name], media_type=mimetypes.guess_type(name)[0])
 
 
 def _page(name):
@@ -119,10 +121,25 @@ def _page(name):
     return page
 
 
-def _role_page(gate, role):
+def _join_page(hub, status=200) -> Response:
+    """The page that trades a link's token, in the study's language."""
+    page = _FILES["join.html"].decode()
+    for key in _JOIN_TEXTS:
+        page = page.replace(f"{{{key}}}", html.escape(hub.text(key)))
+    return HTMLResponse(page, status)
+
+
+def _way_in(hub):
+    async def page(_request: Request) -> Response:
+        return _join_page(hub)
+
+    return page
+
+
+def _role_page(hub, gate, role):
     async def page(request: Request) -> Response:
         if not gate.admits(role, request.cookies.get(gate.cookies[role])):
-            return _file("join.html", 401)
+            return _join_page(hub, 401)
         return _file(f"{role}.html")
 
     return page

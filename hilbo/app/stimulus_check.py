@@ -30,7 +30,7 @@ class Measured(NamedTuple):
 
 class StimulusCheck:
     """In the place of a hub, for `serve`. It waits `patience` s for the program; `done` is called in the end, once
-    `found` is there."""
+    `measured` is there."""
 
     def __init__(self, study: AnyStudy, patience: float):
         self.rig = StimulusRig(study, "check")
@@ -52,6 +52,10 @@ class StimulusCheck:
         """Measure no more."""
         if self._task is not None:
             self._task.cancel()
+
+    def text(self, key: str) -> str:
+        """What participants read, in the study's language."""
+        return self._study.session.text(key)
 
     def hang_up(self) -> None:
         """Let nobody wait."""

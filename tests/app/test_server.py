@@ -129,3 +129,28 @@ def test_the_documents_name_every_address():
     text = (Path(__file__).parents[2] / "docs" / "guides" / "live.md").read_text(encoding="utf-8")
     for name in (*PRESSES, *COMMANDS, "answer", "events", "join"):
         assert f"`{name}`" in text or f"/{name}" in text, name
+
+
+class German(Live):
+    """The same session in German, with a text of the study's own."""
+
+    def make_study(self, seconds, warm_up):
+        file = super().make_study(seconds, warm_up)
+        path = self.folder / "study.toml"
+        words = '[session]\nlanguage = "de"\ntexts = {no_link = "<b> \\"&"}\n'
+        path.write_text(path.read_text().replace("[session.warm_up]", f"{words}[session.warm_up]"))
+        return type(file).load(path)
+
+
+def test_the_way_in_speaks_the_language_of_the_study(tmp_path, quiet):
+    def page(live):
+        with ask(live, "/") as reply:
+            return reply.read().decode()
+
+    assert '<html lang="en">' in page(quiet) and "This page needs a link." in page(quiet)
+    with German(tmp_path, warm=False) as live:
+        german = page(live)
+    assert (
+        '<html lang="de">' in german and "Einen Moment bitte" in german and "Dieser Link wurde schon benutzt" in german
+    )
+    assert 'data-no-link="&lt;b&gt; &quot;&amp;"' in german and "{" not in german
