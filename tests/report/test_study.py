@@ -66,10 +66,10 @@ def test_halves_share_nobody_and_people_are_held_against_the_half_without_them()
     split = _splits(5, 0)
     assert split.shape == (50, 5) and (split.sum(axis=1) == 2).all() and not len(_splits(3, 0))
     tops = np.array([[[[0.0], [1.0]]], [[[0.2], [0.6]]]])  # after two numbers of trials, one split, two halves
-    halves, own = _to_other_half(tops, np.array([[[0.1], [0.1]], [[0.3], [0.5]]]), np.array([[True, False]]))
+    halves, own = _to_other_half((), tops, np.array([[[0.1], [0.1]], [[0.3], [0.5]]]), np.array([[True, False]]))
     np.testing.assert_allclose(halves, [[0.6, 0.8], [0.4, 0.4]])
     np.testing.assert_allclose(own, [[0.5, 0.1], [0.3, 0.3]])  # the first person is in the first half
-    none, nan = _to_other_half(tops[:, :0], np.zeros((2, 3, 1)), np.zeros((0, 3), bool))
+    none, nan = _to_other_half((), tops[:, :0], np.zeros((2, 3, 1)), np.zeros((0, 3), bool))
     assert none.shape == (2, 0) and np.isnan(nan).all()
 
 
