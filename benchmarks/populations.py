@@ -14,7 +14,10 @@ docs/methods/which_method.md.
 
 import argparse
 import json
+import os
 from pathlib import Path
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 

@@ -6,6 +6,8 @@ import itertools
 import os
 from pathlib import Path
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read once, by NumPy's and SciPy's import: as hilbo's commands run
+
 import jax
 import platformdirs
 import pytest

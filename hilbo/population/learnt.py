@@ -25,13 +25,15 @@ from hilbo.population.learnt_posterior import (
     LEFT,
     NOTHING,
     Coordinates,
+    Cost,
     Problem,
     Stated,
     cost_at,
     medians,
     model_at,
 )
-from hilbo.population.low_rank import PeopleModel, shared_function
+from hilbo.population.low_rank import shared_function
+from hilbo.population.people_model import PeopleModel
 from hilbo.population.recipes import LEARNT_1, Recipe
 from hilbo.population.shared_features import rank_for
 from hilbo.population.tallies import tallied
@@ -124,7 +126,7 @@ def learn(
         weights=end.weights,
         log_evidence=end.log_evidence,
         coordinates={name: value for name, value in chosen.coordinates.items() if name in free},
-        sd=_standard_deviations(chosen.coordinates, end.weights, problem, free),
+        sd=_standard_deviations(chosen.coordinates, end, problem, free),
         gain_of_widths=jnp.asarray(gain),
         steps=jnp.asarray(chosen.steps),
         rank=jnp.asarray(problem.rank),
@@ -200,11 +202,9 @@ def _gain_of_widths(alike: _Search, different: _Search, problem: Problem) -> flo
     return costs[0] - costs[1] - float(np.sum(np.log(problem.priors["widths"].sd * np.sqrt(curvature))))
 
 
-def _standard_deviations(
-    coordinates: Coordinates, start: Float[Array, "M n"], problem: Problem, free: Set[str]
-) -> Coordinates:
-    """Of the posterior of what is `free`, taken for normal: its curvature from differences of gradients. Infinite where
-    the curvature says that there is no maximum.
+def _standard_deviations(coordinates: Coordinates, end: Cost, problem: Problem, free: Set[str]) -> Coordinates:
+    """Of the posterior of what is `free`, taken for normal: its curvature from differences of gradients with that at
+    the `end` of the search. Infinite where the curvature says that there is no maximum.
 
     Widths of many people are taken for independent given the rest. What stands for each one's curvature is then its row
     of the Hessian added up, which keeps that of all widths together: they may rise where the gaps fall.
@@ -213,13 +213,9 @@ def _standard_deviations(
     flat, restore = ravel_pytree(common)
 
     def difference(way: Coordinates) -> Coordinates:
-        ahead, behind = (
-            cost_at(
-                {n: v + s * way[n] if n in way else v for n, v in coordinates.items()}, start, problem, coordinates
-            ).gradient
-            for s in (_FINE, -_FINE)
-        )
-        return jax.tree.map(lambda a, b: (a - b) / (2 * _FINE), ahead, behind)
+        moved = coordinates | {name: coordinates[name] + _FINE * step for name, step in way.items()}
+        ahead = cost_at(moved, end.weights, problem, coordinates).gradient
+        return jax.tree.map(lambda a, b: (a - b) / _FINE, ahead, end.gradient)
 
     def of_common(moved: Coordinates) -> np.ndarray:
         return np.asarray(ravel_pytree({name: moved[name] for name in common})[0])

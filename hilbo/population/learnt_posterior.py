@@ -13,7 +13,8 @@ from jaxtyping import Array, Bool, Float
 from hilbo.kernels import RBF, Levels, Stationary, theta_of
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP
-from hilbo.population.low_rank import PeopleModel, shared_evidence
+from hilbo.population.low_rank import shared_evidence
+from hilbo.population.people_model import PeopleModel
 from hilbo.population.recipes import LEARNT_1, Prior
 from hilbo.population.tallies import Tallies
 

@@ -13,16 +13,15 @@ and with W the curvatures, L_j L_j' = I + W_j^(1/2) K_j W_j^(1/2), A_j = L_j^-1 
 every system is solved by blocks of one person's answers and one of r x r: M n^3 + M n^2 r + M n r^2 + r^3 in place of
 (M n)^3. S is the posterior precision of the weights of g, g(x) = shared^(1/2) phi(x)'w.
 
-Laplace's method by Newton's steps, halved where the log posterior would fall. The evidence has exact first derivatives:
-a last step from the mode, whose derivative in its start is 0 there. References: Rasmussen & Williams (2006), sections
-3.4 and 5.5.1; Snelson & Ghahramani (2007), AISTATS, for what is kept within a block; Harbrecht, Peters & Schneider
-(2012), Applied Numerical Mathematics 62:428, for the factorisation.
+Laplace's method by Newton's steps, halved where the log posterior would fall. The evidence has exact first derivatives,
+by the implicit function theorem at the mode. References: Rasmussen & Williams (2006), sections 3.4 and 5.5.1;
+Snelson & Ghahramani (2007), AISTATS, for what is kept within a block; Harbrecht, Peters & Schneider (2012), Applied
+Numerical Mathematics 62:428, for the factorisation.
 """
 
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
@@ -30,66 +29,22 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
-from hilbo.kernels import RBF, Stationary, gram
+from hilbo.kernels import gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
+from hilbo.population.people_model import PeopleModel
 from hilbo.population.shared_features import TOLERANCE, Pivots, features_of, pivots_of, root_of_pivots
 from hilbo.population.tallies import Expansion, Tallies, expand_counts
 
 __all__ = [
-    "PeopleModel",
     "SharedEvidence",
     "shared_evidence",
     "shared_function",
 ]
 
 _STEPS, _HALVINGS = 60, 40
-
-
-class PeopleModel(eqx.Module):
-    """The hyperparameters of the hierarchical model of M people."""
-
-    theta: Float[Array, " d"]
-    """Inverse squared lengths, per squared unit of x."""
-    shared: Float[Array, ""]
-    """Prior variance of g."""
-    own: Float[Array, ""]
-    """Prior variance of each h_j."""
-    thresholds: Float[Array, " edges"]
-    noise: Float[Array, ""]
-    log_widths: Float[Array, " M"]
-    """Logarithm of each person's distances between thresholds, about their middle, in units of those above."""
-    kernel: type[Stationary] = eqx.field(static=True, default=RBF)
-    """Of g and of each h_j."""
-    levels: tuple[int, ...] = eqx.field(static=True, default=())
-    """For each coordinate its number of unordered levels, as kernels take it."""
-
-    @property
-    def share(self) -> Float[Array, ""]:
-        """The part of a person's prior variance that all people have in common."""
-        return self.shared / (self.shared + self.own)
-
-    @property
-    def gp(self) -> OrdinalGP:
-        """One person's model, with the median widths."""
-        return OrdinalGP(self.of_variance(self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
-
-    @property
-    def unit(self) -> Stationary:
-        """The kernel with a variance of 1."""
-        return self.of_variance(jnp.ones_like(self.shared))
-
-    def of_variance(self, variance: Float[Array, ""]) -> Stationary:
-        """The kernel with this variance."""
-        return self.kernel(self.theta, variance, self.levels)
-
-    @property
-    def person_thresholds(self) -> Float[Array, "M edges"]:
-        """Everybody's thresholds (M, C - 1)."""
-        middle = jnp.mean(self.thresholds)
-        return middle + jnp.exp(self.log_widths)[:, None] * (self.thresholds - middle)[None, :]
 
 
 # --- the prior, and what answers make of it
@@ -256,8 +211,8 @@ def shared_evidence(
     pivots = pivots_of(still(unit), answers, rank, tolerance)
     prior = _prior(model, answers, pivots)
     mode = still(_mode(still(model), answers, still(prior), start))
-    weights, _ = _newton_step(model, answers, prior, mode.weights)
-    value, _ = _value(model, answers, prior, weights)
+    weights, _ = still(_newton_step(still(model), answers, still(prior), mode.weights))
+    value = _evidence_at_mode(model, answers, prior, weights)
     arrived = (mode.residual <= mode.tolerance) & jnp.isfinite(value)
     return SharedEvidence(value, mode.weights, arrived, pivots.left)
 
@@ -320,6 +275,33 @@ def _value(
     terms = _expand(model, answers, eta)
     system = _system(prior, terms.curvature)
     return jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta) - 0.5 * system.log_determinant, system
+
+
+@jax.custom_vjp
+def _evidence_at_mode(
+    model: PeopleModel, answers: Tallies, prior: _Prior, weights: Float[Array, "M n"]
+) -> Float[Array, ""]:
+    """`_value` at the mode's weights, which follow model and prior. Differentiable once, in these two."""
+    return _value(model, answers, prior, weights)[0]
+
+
+def _evidence_forward(model: PeopleModel, answers: Tallies, prior: _Prior, weights: Float[Array, "M n"]):
+    value, pull, system = jax.vjp(lambda *at: _value(at[0], answers, *at[1:]), model, prior, weights, has_aux=True)
+    return value, (pull, system, model, answers, prior, weights)
+
+
+def _evidence_backward(kept, slope: Float[Array, ""]):
+    """The mode solves slope(K a) - a = 0, so that da = (I + W K)^-1 d slope. With g the derivative in the weights, what
+    moves with the mode is (I + K W)^-1 g times d slope, and (I + K W)^-1 = I - K (K + W^-1)^-1."""
+    pull, system, model, answers, prior, weights = kept
+    of_model, of_prior, of_weights = pull(slope)
+    adjoint = of_weights - prior.times(system.solve(of_weights))
+    slopes = jax.vjp(lambda model, prior: _expand(model, answers, prior.times(weights)).slope, model, prior)[1]
+    of_model, of_prior = jax.tree.map(jnp.add, (of_model, of_prior), slopes(adjoint))
+    return of_model, None, of_prior, None
+
+
+_evidence_at_mode.defvjp(_evidence_forward, _evidence_backward)
 
 
 def _rounding(

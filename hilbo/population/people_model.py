@@ -1,0 +1,56 @@
+"""The hyperparameters of the hierarchical model of M people: f_j = g + h_j, with a shared function g and one of each
+person's own, of one kernel."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hilbo.kernels import RBF, Stationary
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.ordinal_gp import OrdinalGP
+
+__all__ = ["PeopleModel"]
+
+
+class PeopleModel(eqx.Module):
+    """The hyperparameters of the hierarchical model of M people."""
+
+    theta: Float[Array, " d"]
+    """Inverse squared lengths, per squared unit of x."""
+    shared: Float[Array, ""]
+    """Prior variance of g."""
+    own: Float[Array, ""]
+    """Prior variance of each h_j."""
+    thresholds: Float[Array, " edges"]
+    noise: Float[Array, ""]
+    log_widths: Float[Array, " M"]
+    """Logarithm of each person's distances between thresholds, about their middle, in units of those above."""
+    kernel: type[Stationary] = eqx.field(static=True, default=RBF)
+    """Of g and of each h_j."""
+    levels: tuple[int, ...] = eqx.field(static=True, default=())
+    """For each coordinate its number of unordered levels, as kernels take it."""
+
+    @property
+    def share(self) -> Float[Array, ""]:
+        """The part of a person's prior variance that all people have in common."""
+        return self.shared / (self.shared + self.own)
+
+    @property
+    def gp(self) -> OrdinalGP:
+        """One person's model, with the median widths."""
+        return OrdinalGP(self.of_variance(self.shared + self.own), OrdinalProbit(self.thresholds, self.noise))
+
+    @property
+    def unit(self) -> Stationary:
+        """The kernel with a variance of 1."""
+        return self.of_variance(jnp.ones_like(self.shared))
+
+    def of_variance(self, variance: Float[Array, ""]) -> Stationary:
+        """The kernel with this variance."""
+        return self.kernel(self.theta, variance, self.levels)
+
+    @property
+    def person_thresholds(self) -> Float[Array, "M edges"]:
+        """Everybody's thresholds (M, C - 1)."""
+        middle = jnp.mean(self.thresholds)
+        return middle + jnp.exp(self.log_widths)[:, None] * (self.thresholds - middle)[None, :]
