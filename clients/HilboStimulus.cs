@@ -50,13 +50,14 @@ public class Order {
     public string What = "neutral", Show = "", Side = "", Trial = "";
     public int Step;
     public double WithinS;
-    public readonly Dictionary<string, double> Values = new Dictionary<string, double>();
-    public readonly Dictionary<string, string> Texts = new Dictionary<string, string>();  // the same as it is sent
+    public readonly Dictionary<string, double> Values = new Dictionary<string, double>();  // NaN for a level
+    public readonly Dictionary<string, string> Texts = new Dictionary<string, string>();  // as it is sent: a level's name
 }
 
 public class Parameter {
     public string Name, Unit;
     public double Low, High, Tolerance;
+    public string[] Levels;  // the names of what has no order; null of numbers
 }
 
 /// <summary>This program's part in a session.</summary>
@@ -140,13 +141,17 @@ public sealed class Stimulus : IDisposable {
 
     public double SilenceS { get { lock (_lock) return _silenceS; } }
 
-    /// <summary>What the last order asked for is shown from now on, with these values (by default those asked for).
-    /// False if that is not taken: too late, too far off; the trial is void then.</summary>
-    public bool Presented(IDictionary<string, double> values = null) {
+    /// <summary>What the last order asked for is shown from now on, with these numbers and levels (by default those
+    /// asked for). False if that is not taken: too late, too far off, another level; the trial is void then.</summary>
+    public bool Presented(IDictionary<string, double> values = null, IDictionary<string, string> levels = null) {
         Dictionary<string, string> texts;
         lock (_lock) texts = new Dictionary<string, string>(_handed.Texts);
+        if (levels != null) foreach (var level in levels) texts[level.Key] = level.Value;
         if (values != null) {
             foreach (var value in values) {
+                string asked;
+                if (double.IsNaN(value.Value) && texts.TryGetValue(value.Key, out asked) && double.IsNaN(Number(asked)))
+                    continue;  // a level
                 if (double.IsNaN(value.Value) || double.IsInfinity(value.Value))
                     throw new ArgumentException(value.Key + " is no number.");
                 texts[value.Key] = Text(value.Value);
@@ -222,7 +227,7 @@ public sealed class Stimulus : IDisposable {
         } else {
             var run = Field(found, "run");
             lock (_lock) {
-                _parameters = Array.ConvertAll(found.FindAll(line => line[0] == "parameter").ToArray(), ParameterOf);
+                _parameters = Array.ConvertAll(found.FindAll(IsParameter).ToArray(), ParameterOf);
                 _silenceS = Number(Field(found, "silence_s"));
                 _heard.Restart();
                 _run = run;
@@ -344,7 +349,14 @@ public sealed class Stimulus : IDisposable {
         return order;
     }
 
+    static bool IsParameter(string[] line) { return line[0] == "parameter" || line[0] == "levels"; }
+
     static Parameter ParameterOf(string[] line) {
+        if (line[0] == "levels") {
+            var levels = new string[line.Length - 2];
+            Array.Copy(line, 2, levels, 0, levels.Length);
+            return new Parameter { Name = line[1], Unit = "", Levels = levels };
+        }
         return new Parameter { Name = line[1], Low = Number(line[2]), High = Number(line[3]), Tolerance = Number(line[4]),
                                Unit = line[5] };
     }

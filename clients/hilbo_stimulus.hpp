@@ -62,8 +62,8 @@
 
 namespace hilbo {
 
-typedef std::map<std::string, double> Values;        // parameter -> number, in the study's units
-typedef std::map<std::string, std::string> Texts;    // the same as it is sent
+typedef std::map<std::string, double> Values;        // parameter -> number, in the study's units; NaN for a level
+typedef std::map<std::string, std::string> Texts;    // the same as it is sent: of a level its name
 typedef std::vector<std::vector<std::string>> Lines; // an answer: lines of fields
 
 // The session does not let this program in, and says why.
@@ -83,9 +83,11 @@ struct Order {
   double within_s = 0;
 };
 
+// levels: the names of what has no order; the rest is of numbers.
 struct Parameter {
   std::string name, unit;
   double low, high, tolerance;
+  std::vector<std::string> levels;
 };
 
 struct Options {
@@ -336,12 +338,15 @@ public:
     changed_.notify_all();
   }
 
-  // What the last order asked for is shown from now on, with the values that were asked for, or with these. False if
-  // that is not taken: too late, too far off; the trial is void then.
+  // What the last order asked for is shown from now on, with the values that were asked for, or with these numbers and
+  // levels. False if that is not taken: too late, too far off, another level; the trial is void then.
   bool presented() { return say("presented", handed().texts, ""); }
-  bool presented(const Values &values) {
+  bool presented(const Values &values, const Texts &levels = Texts()) {
     Texts texts = handed().texts;
+    for (const auto &level : levels) texts[level.first] = level.second;
     for (const auto &value : values) {
+      const auto asked = texts.find(value.first);
+      if (std::isnan(value.second) && asked != texts.end() && std::isnan(detail::number(asked->second))) continue;
       if (!std::isfinite(value.second)) throw std::invalid_argument(value.first + " is no number.");
       texts[value.first] = detail::text(value.second);
     }
@@ -441,7 +446,9 @@ private:
         for (const std::vector<std::string> &line : found) {
           if (line[0] == "parameter" && line.size() == 6)
             parameters_.push_back({line[1], line[5], detail::number(line[2]), detail::number(line[3]),
-                                   detail::number(line[4])});
+                                   detail::number(line[4]), {}});
+          if (line[0] == "levels" && line.size() > 2)
+            parameters_.push_back({line[1], "", 0, 0, 0, {line.begin() + 2, line.end()}});
         }
         silence_s_ = detail::number(detail::field(found, "silence_s"));
         run_ = detail::field(found, "run");

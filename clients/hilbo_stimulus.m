@@ -34,13 +34,13 @@ classdef hilbo_stimulus < handle
 % is handed to you until it is false. docs/guides/stimulus.md of hilbo has the protocol.
 %
 % An order is a struct: what ('present', 'neutral' or 'stop'), show ('test' or 'reference'), side ('a' or 'b' where two
-% tests are compared), values (containers.Map: parameter -> number in the study's unit), trial, step, number, within_s.
+% tests are compared), values (containers.Map: parameter -> number in the study's unit, or the name of a level), trial, step, number, within_s.
 
   properties
     contact = false;          % whether somebody touches what moves
   end
   properties (SetAccess = private)
-    parameters = struct('name', {}, 'unit', {}, 'low', {}, 'high', {}, 'tolerance', {});
+    parameters = struct('name', {}, 'unit', {}, 'low', {}, 'high', {}, 'tolerance', {}, 'levels', {});
     silence_s = 1;
   end
   properties (Access = private)
@@ -354,12 +354,16 @@ classdef hilbo_stimulus < handle
     end
 
     function parameters = parameters_of(found)
-      parameters = struct('name', {}, 'unit', {}, 'low', {}, 'high', {}, 'tolerance', {});
+      parameters = struct('name', {}, 'unit', {}, 'low', {}, 'high', {}, 'tolerance', {}, 'levels', {});
       for i = 1:numel(found)
         line = found{i};
         if strcmp(line{1}, 'parameter')
           parameters(end + 1) = struct('name', line{2}, 'unit', line{6}, 'low', str2double(line{3}), ...
-                                       'high', str2double(line{4}), 'tolerance', str2double(line{5})); %#ok<AGROW>
+                                       'high', str2double(line{4}), 'tolerance', str2double(line{5}), ...
+                                       'levels', {{}}); %#ok<AGROW>
+        elseif strcmp(line{1}, 'levels')
+          parameters(end + 1) = struct('name', line{2}, 'unit', '', 'low', 0, 'high', 0, 'tolerance', 0, ...
+                                       'levels', {line(3:end)}); %#ok<AGROW>
         end
       end
     end

@@ -57,7 +57,8 @@ class Order(NamedTuple):
     """What shall be the case from now on.
 
     `do`: "present", "neutral" (show nothing, push nothing) or "stop" (the same, at once). `show`: "test", with the
-    `values` of its parameters in the study's units, or "reference"; `side`: "a" or "b" where two tests are compared.
+    `values` of its parameters in the study's units, of levels their names, or "reference"; `side`: "a" or "b" where two
+    tests are compared.
     It has to be confirmed within `within_s`.
     """
 
@@ -67,7 +68,7 @@ class Order(NamedTuple):
     side: str = ""
     trial: str = ""
     step: int = 0
-    values: Mapping[str, float] = {}
+    values: Mapping[str, Any] = {}
     within_s: float = 0.0
 
 
@@ -99,7 +100,7 @@ class Stimulus:
         self._go_neutral, self._contact = go_neutral, False
         self._address = urlsplit(link).netloc
         self._key = self._keyed(urlsplit(link).fragment, key_file)
-        self.parameters: list = []  # of the study: name, unit, low, high, tolerance
+        self.parameters: list = []  # of the study: name, unit, low, high, tolerance; or name and levels
         self.silence_s, self._run = 1.0, ""
         self._changed = threading.Condition()
         self._order, self._handed = _SILENCE, _SILENCE
@@ -163,13 +164,13 @@ class Stimulus:
             elif self._closed:
                 return
 
-    def presented(self, values: Mapping[str, float] | None = None) -> bool:
+    def presented(self, values: Mapping[str, Any] | None = None) -> bool:
         """What the last order asked for is shown from now on, with these values (by default those asked for). False if
         that is not taken: too late, too far off; the trial is void then."""
         order = self._handed
         found = dict(order.values if values is None else values)
         for name, value in found.items():
-            if not math.isfinite(value):
+            if not isinstance(value, str) and not math.isfinite(value):
                 raise ValueError(f"{name} is {value}, which is no number.")
         return self._say(order, "presented", **({"values": found} if found else {}))
 

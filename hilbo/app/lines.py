@@ -13,7 +13,7 @@ from urllib.parse import parse_qsl
 
 from hilbo.errors import InputError
 
-__all__ = ["FORM", "fields_of", "lines_of"]
+__all__ = ["FORM", "fields_of", "lines_of", "number_or_name"]
 
 FORM = "application/x-www-form-urlencoded"
 _VALUE = "value."  # before a parameter's name
@@ -49,9 +49,23 @@ def _lines(content: Mapping[str, Any]) -> Iterator[tuple[Any, ...]]:
         if key == "values":
             yield from (("value", name, number) for name, number in value.items())
         elif key == "parameters":
-            yield from (("parameter", p["name"], p["low"], p["high"], p["tolerance"], p["unit"]) for p in value)
+            yield from map(_parameter, value)
         else:
             yield key, value
+
+
+def number_or_name(text: str) -> float | str:
+    """A value in a form: a number, or the name of a level, which never reads as one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _parameter(p: Mapping[str, Any]) -> tuple[Any, ...]:
+    if "levels" in p:
+        return "levels", p["name"], *p["levels"]
+    return "parameter", p["name"], p["low"], p["high"], p["tolerance"], p["unit"]
 
 
 def _field(value: Any) -> str:

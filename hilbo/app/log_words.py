@@ -124,7 +124,8 @@ def _row(state: LiveSession, trial: Trial, width: int) -> dict[str, Any]:
     if trial.sets:
         shown = [" / ".join(trial.sets.values()), *[""] * (width - 1)]
     else:
-        shown = [trial.presented["a"][name] for name in state.study.space.names]
+        values = trial.presented["a"]
+        shown = [p.shown(values[p.name]) if p.levels else values[p.name] for p in state.study.space.parameters]
     answer, remark = " ".join((trial.values or {}).values()), _remark(state, trial)
     discarded = trial.status not in ("pending", "answered")
     kind = "voided" if discarded else "now" if trial.status == "pending" else "repeated" if remark else ""

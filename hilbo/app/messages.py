@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from hilbo.app.lines import fields_of
+from hilbo.app.lines import fields_of, number_or_name
 from hilbo.errors import InputError
 
 __all__ = ["LARGEST", "Answer", "Command", "Hello", "Join", "Press", "Report", "TooLargeError", "read"]
@@ -15,6 +15,7 @@ __all__ = ["LARGEST", "Answer", "Command", "Hello", "Join", "Press", "Report", "
 LARGEST = 16_384  # bytes of a message
 
 _Id = Annotated[str, msgspec.Meta(min_length=1, max_length=200)]
+_Level = Annotated[str, msgspec.Meta(max_length=200)]
 _Text = Annotated[str, msgspec.Meta(max_length=2000)]
 _Number = Annotated[int, msgspec.Meta(ge=1, le=2**31)]
 _Milliseconds = Annotated[float, msgspec.Meta(ge=0, le=1e9)]
@@ -76,15 +77,15 @@ class Hello(_Message, frozen=True):
 class Report(_Message, frozen=True):
     """How a program that presents is: which order it knows, what it has done about it.
 
-    `values`: what is really in force, where the order's state is "presented" and the order had any. `wait_s`: how long
-    it would wait for another order.
+    `values`: what is really in force, numbers and names of levels, where the order's state is "presented" and the order
+    had any. `wait_s`: how long it would wait for another order.
     """
 
     run: _Id
     order: Annotated[int, msgspec.Meta(ge=0, le=2**53)]
     state: Literal["busy", "presented", "neutral", "failed"]
     trial: _Id | None = None
-    values: Annotated[dict[_Id, float], msgspec.Meta(max_length=32)] | None = None
+    values: Annotated[dict[_Id, float | _Level], msgspec.Meta(max_length=32)] | None = None
     contact: bool = False
     why: Annotated[str, msgspec.Meta(max_length=500)] = ""
     wait_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 0.0
@@ -96,7 +97,10 @@ def read(kind: type, body: bytes, form: bool = False) -> Any:
         raise TooLargeError(f"The message has more than {LARGEST} bytes, which are the most.")
     try:
         if form:
-            return msgspec.convert(fields_of(body), kind, strict=False)
+            fields = fields_of(body)
+            if "values" in fields:
+                fields["values"] = {name: number_or_name(text) for name, text in fields["values"].items()}
+            return msgspec.convert(fields, kind, strict=False)
         return msgspec.json.decode(body or b"{}", type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"The message is not understood: {error}.") from None

@@ -21,6 +21,7 @@ import numpy as np
 from hilbo.app.robot import SIZES, Participant, browser, held, screenshots
 from hilbo.device.simulator import Simulator
 from hilbo.errors import InputError
+from hilbo.search.apart import levels_of, nrmse
 from hilbo.session.event_log import read_log
 from hilbo.session.plan import make_plan
 from hilbo.simulation import simulate
@@ -68,7 +69,8 @@ class Decider:
         return np.asarray(space.to_unit(np.array([values[name] for name in space.names])))
 
     def _distance(self, x):
-        return float(np.linalg.norm((x - np.asarray(self._person.optimum)) / np.asarray(self._person.tolerance)))
+        away = simulate.felt_apart(self._person.levels, x, np.asarray(self._person.optimum))
+        return float(np.linalg.norm(away / np.asarray(self._person.tolerance)))
 
 
 def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int | None = None) -> Path:
@@ -90,7 +92,7 @@ def example_sets(study: Study, population: Population) -> dict[str, dict[str, fl
     space, truth = study.space, population.truth
     points = space.candidates(256, 0)
     centre = np.asarray(space.to_unit(np.array([truth[name] for name in space.names])))
-    order = np.argsort(np.linalg.norm(points - centre, axis=1))
+    order = np.argsort(nrmse(points, centre, levels_of(space.parameters)))
     chosen = {"best": points[order[0]], "mid": points[order[len(order) // 3]], "worst": points[order[-1]]}
     return {
         n: dict(zip(space.names, np.asarray(space.to_physical(x)).tolist(), strict=True)) for n, x in chosen.items()

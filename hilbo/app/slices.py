@@ -11,6 +11,8 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
+from hilbo.search.apart import differences
+from hilbo.search.box import Parameter
 from hilbo.session import progress
 from hilbo.session.look_ahead import Answers, LiveChooser
 from hilbo.session.state import LiveSession
@@ -65,7 +67,10 @@ class Maps:
         answers = Answers.of(state, block)
         slices = self._sliced(answers, asked) if answers.categories else []
         parameters = self._chooser.study(block).space.parameters
-        ranges = {p.name: {"unit": p.unit, "scale": p.scale, "low": p.low, "high": p.high} for p in parameters}
+        ranges = {
+            p.name: {"unit": p.unit, "scale": p.scale, "low": p.low, "high": p.high, "levels": p.levels}
+            for p in parameters
+        }
         return {"slices": slices, "ranges": ranges}
 
     def _sliced(self, answers: Answers, asked: Mapping[str, float] | None) -> list[dict[str, Any]]:
@@ -93,11 +98,11 @@ def _slice(study, maps: _Slices, k: int, pair: tuple[int, int], marks, levels, f
     """One grid, for the page; `marks` (n, d) and `levels` (n,) are the answers, `felt` (d,) what is being felt."""
     best, names = maps.best, study.space.names
     others = [i for i in range(len(names)) if i not in pair]
-    held = [f"{names[i]} = {float(study.space.parameters[i].to_physical(jnp.asarray(best[i]))):.3g}" for i in others]
+    held = [_held(study.space.parameters[i], float(best[i])) for i in others]
     across, up = pair
     trials = [
         {"x": float(x[across]), "y": float(x[up]), "level": float(level), "now": False,
-         "away": float(np.linalg.norm((x - best)[others]) / 0.35)}
+         "away": float(np.linalg.norm(differences(study.gp.kernel.levels, x, best)[others]) / 0.35)}
         for x, level in zip(marks, levels, strict=True)
     ]  # fmt: skip
     if felt is not None:
@@ -114,6 +119,11 @@ def _slice(study, maps: _Slices, k: int, pair: tuple[int, int], marks, levels, f
         "mean": shown,
         "trials": trials,
     }
+
+
+def _held(parameter: Parameter, unit: float) -> str:
+    value = float(parameter.to_physical(np.asarray(unit)))
+    return f"{parameter.name} = {parameter.words(value) if parameter.levels else f'{value:.3g}'}"
 
 
 @program

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from hilbo.app.messages import Hello, Report
 from hilbo.app.rig import Loaded, MissedError, Showing, Snapshot
 from hilbo.errors import InputError
-from hilbo.session.confirmed import check_confirmed
+from hilbo.session.confirmed import check_confirmed, in_numbers, in_words
 from hilbo.session.header_check import study_of
 from hilbo.session.records import RefusedError
 from hilbo.session.set_codes import label_of
@@ -75,7 +75,9 @@ class StimulusRig:
         self._run = ""
         self._news, self._moved = asyncio.Event(), asyncio.Event()
         self._asked: asyncio.Future[Loaded] | None = None  # what the present order's confirmation settles
-        self._given: tuple[int, Mapping[str, float] | None] | None = None  # the confirmation that was accepted last
+        self._given: tuple[int, Mapping[str, float | str] | None] | None = (
+            None  # the confirmation that was accepted last
+        )
         self._since = 0.0  # when the present order was given, monotonic
         self._stopped: float | None = None  # s that the stop took when it was measured
         self._timers: dict[str, asyncio.TimerHandle] = {}
@@ -153,17 +155,20 @@ class StimulusRig:
             if self._given[1] != report.values and report.values is not None:
                 raise OverError(f"Order {order.number} was confirmed with other values before; those count.")
             return
-        asked, values = order.showing.values, report.values
+        values: Mapping[str, Any] | None = report.values
+        asked = order.showing.values
         if asked is None and values:
             raise OverError(f"Order {order.number} is to show the {order.showing.show}, which has no values.")
         try:
             if asked is not None:
-                check_confirmed(study_of(self._study, order.showing.material), asked, values)
+                here = study_of(self._study, order.showing.material)
+                values = in_numbers(here, report.values)
+                check_confirmed(here, asked, values)
         except RefusedError as error:
             if error.code == "off":
                 self._miss(f"off: {error}")
             raise OverError(str(error)) from None
-        self._given, self._refused = (order.number, values), ""
+        self._given, self._refused = (order.number, report.values), ""
         if self._asked is not None and not self._asked.done():
             took = time.monotonic() - self._since
             self._asked.set_result(Loaded({"values": values, "took_s": took, **self._who()}, took))
@@ -338,7 +343,9 @@ class StimulusRig:
 
     def _parameters(self) -> list[dict[str, Any]]:
         return [
-            {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "tolerance": self._table.off_by(p)}
+            {"name": p.name, "levels": list(p.levels)}
+            if p.levels
+            else {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "tolerance": self._table.off_by(p)}
             for p in self._study.space.parameters
         ]
 
@@ -354,7 +361,7 @@ class StimulusRig:
             "step": showing.step,
             "show": "test" if rendering else showing.show,
             "side": showing.show if rendering else "",
-            "values": dict(showing.values) if showing.values is not None else {},
+            "values": in_words(study_of(self._study, showing.material), showing.values or {}),
             "label": label_of(showing.values, self._tag) if showing.values is not None else "",
             "within_s": self._table.within,
         }

@@ -175,10 +175,9 @@ def _trial_rows(hub, trial):
         rows.append(["Time left", f"about {left:.0f} min" if left >= 1 else "below a minute"])
     if trial is None:
         return rows
-    units = {p.name: p.unit for p in state.study.space.parameters} | {"K0": "N/mm"}
     for side, values in trial.renderings.items():
         name = trial.sets.get(side)
-        rows.append([f"Rendering {side.upper()}" + (f" ({name})" if name else ""), _set_words(values, units)])
+        rows.append([f"Rendering {side.upper()}" + (f" ({name})" if name else ""), _set_words(state.study, values)])
     rows += choice_rows(trial.data.get("choice", {}))
     if hub.delays:
         rows.append(["Answer to device", f"{1000 * hub.delays[-1]['total']:.0f} ms"])
@@ -217,8 +216,15 @@ def _how_far(state: LiveSession, block: int) -> str:
     return "; ".join(words)
 
 
-def _set_words(values, units):
-    return ", ".join(f"{name} {value:.4g} {units.get(name, '')}".strip() for name, value in values.items())
+def _set_words(study, values):
+    """Of levels their names; K0 is no parameter, and follows."""
+    parameters = {p.name: p for p in study.space.parameters}
+    return ", ".join(
+        f"{name} {parameters[name].words(value)} {parameters[name].unit}".strip()
+        if name in parameters
+        else f"{name} {value:.4g} N/mm"
+        for name, value in values.items()
+    )
 
 
 def _device(hub):

@@ -21,7 +21,10 @@ def init(
     name: Annotated[str | None, typer.Option(help="What the study is called; by default as its file.")] = None,
     parameter: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=LOW:HIGH:UNIT, with :log behind it if steps are ratios, or :integer. Once for each."),
+        typer.Option(
+            help="NAME=LOW:HIGH:UNIT, with :log behind it if steps are ratios, or :integer; or NAME=LEVEL,LEVEL,LEVEL."
+            " Once for each."
+        ),
     ] = None,
     responses: Annotated[str, typer.Option(help="The answers, lowest first.")] = "different,similar,close",
     trials: Annotated[int, typer.Option(min=1, help="How many trials a participant has.")] = 25,

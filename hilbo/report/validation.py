@@ -202,7 +202,7 @@ def write_validation(
     """Write the folder of `hilbo validate`; returns the content of result.json."""
     say("reading")
     table = _read(path, study, material)
-    sets_by_id = None if sets is None else sets_frame(sets, study.space.names)
+    sets_by_id = None if sets is None else sets_frame(sets, study.space.names, study.space.parameters)
     contents, sections = [], []
     names = materials_of(table)
     for name in names:

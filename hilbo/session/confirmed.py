@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from hilbo.session.records import RefusedError
 from hilbo.study.study_file import AnyStudy
 
-__all__ = ["check_confirmed", "counted"]
+__all__ = ["check_confirmed", "counted", "in_numbers", "in_words"]
 
 
 def check_confirmed(study: AnyStudy, asked: Mapping[str, float], values: Mapping[str, float] | None) -> None:
@@ -26,6 +26,9 @@ def check_confirmed(study: AnyStudy, asked: Mapping[str, float], values: Mapping
         value, wanted, most = values[parameter.name], asked[parameter.name], study.stimulus.off_by(parameter)
         if not math.isfinite(value):
             raise RefusedError("bad-answer", f"{parameter.name} is confirmed as {value}, which is no number.")
+        if parameter.levels and value != wanted:
+            shown, other = parameter.shown(value), parameter.shown(wanted)
+            raise RefusedError("off", f"{parameter.name} is confirmed as {shown}, and {other} was asked for.")
         if abs(value - wanted) > most:
             raise RefusedError(
                 "off",
@@ -33,6 +36,30 @@ def check_confirmed(study: AnyStudy, asked: Mapping[str, float], values: Mapping
                 f" {parameter.unit}".rstrip()
                 + "; round less, or raise the study's tolerance.",
             )
+
+
+def in_words(study: AnyStudy, values: Mapping[str, float]) -> dict[str, float | str]:
+    """Values as whoever presents is told them: levels by their names. What is no parameter, such as K0, stays."""
+    parameters = {p.name: p for p in study.space.parameters}
+    return {n: parameters[n].shown(v) if n in parameters and parameters[n].levels else v for n, v in values.items()}
+
+
+def in_numbers(study: AnyStudy, values: Mapping[str, float | str] | None) -> dict[str, float] | None:
+    """Confirmed values as the log holds them: of a level its place in the study's list. Raises RefusedError with the
+    code "bad-answer" for a text that is none of the levels."""
+    if values is None:
+        return None
+    return {name: _number(study, name, value) for name, value in values.items()}
+
+
+def _number(study: AnyStudy, name: str, value: float | str) -> float:
+    p = next((p for p in study.space.parameters if p.name == name), None)
+    if p is None or not (p.levels or isinstance(value, str)):
+        return math.nan if isinstance(value, str) else value
+    number = p.number(value)
+    if math.isnan(number):
+        raise RefusedError("bad-answer", f"{name} is confirmed as {value}; it must be {p.range_words}.")
+    return number
 
 
 def counted(study: AnyStudy, values: Mapping[str, float]) -> dict[str, float]:

@@ -18,6 +18,7 @@ from typing import Any
 import pandas as pd
 
 from hilbo.errors import InputError
+from hilbo.session.confirmed import in_words
 from hilbo.session.event_log import log_name, log_paths, read_session
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
@@ -99,7 +100,7 @@ def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
                 rows.append(
                     _place(state, trial)
                     | {"response": trial.values["class_a"]}
-                    | trial.presented["a"]
+                    | in_words(state.study, trial.presented["a"])
                     | {"voided": int(trial.status != "answered"), "status": trial.status}
                     | {"unblinded": state.header.unblinded or None}
                     | _times(trial)
@@ -152,10 +153,10 @@ def computes_sets(sessions: Sequence[LiveSession]) -> bool:
     return compared and any(state.study.space.mechanics is not None for state in sessions)
 
 
-def _parameters(box, values: Mapping[str, float]) -> dict[str, float]:
+def _parameters(box, values: Mapping[str, float]) -> dict[str, Any]:
     """A set's parameters, with the K0 of one that is rendered."""
     if box.mechanics is None:
-        return {name: float(values[name]) for name in box.names}
+        return {p.name: p.shown(values[p.name]) if p.levels else float(values[p.name]) for p in box.parameters}
     from hilbo.search.space import SearchSpace
     from hilbo.session.set_facts import described
 

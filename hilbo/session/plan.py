@@ -87,7 +87,7 @@ def warm_up(study: AnyStudy, seed: int, material: str | None = None) -> tuple[Bl
 
     count = protocol(study.session, "warm-up").count
     box = _of(study, material).space
-    space = SearchSpace(box.parameters, box.mechanics)
+    space = SearchSpace(box.parameters, box.mechanics, box.constraints)
     unit = np.concatenate([space.latin_hypercube(count, seed_of(seed, k)) for k in range(_SPARE)])
     physical = np.asarray(space.to_physical(unit))
     names = [f"warm-up {i + 1}" for i in range(len(physical))]

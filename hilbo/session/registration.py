@@ -72,6 +72,9 @@ def _stimuli(study: StudyFile) -> list[str]:
     lines = ["| parameter | from | to | unit | scale |", "|---|---:|---:|---|---|"]
     for parameter in study.space.parameters:
         ends = f"{parameter.low:g} | {parameter.high:g}"
+        if parameter.levels:
+            lines.append(f"| {parameter.name} | {_list(parameter.levels)} | | | levels, without an order |")
+            continue
         lines.append(f"| {parameter.name} | {ends} | {parameter.unit} | {parameter.scale} |")
     kind = (
         "Only renderings that are passive on the device are presented."

@@ -68,7 +68,7 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
         raise InputError(f"{folder}: holds no trials.csv (nor .parquet, nor trials-*.csv); put the trial table there.")
     validation = [_validation(path, study) for path in _table_paths(folder, "validation")]
     sets_path, truth_path = folder / "sets.csv", folder / "truth.csv"
-    sets = sets_frame(sets_path, study.space.names) if sets_path.exists() else None
+    sets = sets_frame(sets_path, study.space.names, study.space.parameters) if sets_path.exists() else None
     truth = _read_truth(truth_path, study) if truth_path.exists() else None
     compared = pd.concat(validation, ignore_index=True) if validation else None
     names = _material_names(study, trials)

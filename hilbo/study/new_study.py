@@ -57,7 +57,7 @@ _DEVICE = (
     Parameter("B1", 0.001, 32.0, "N.s^alpha/mm"),
     Parameter("alpha", 0.01, 0.99),
 )
-_FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT or NAME=LOW:HIGH:UNIT:log (or :integer)"
+_FORM = "NAME=LOW:HIGH, NAME=LOW:HIGH:UNIT, NAME=LOW:HIGH:UNIT:log (or :integer) or NAME=LEVEL,LEVEL"
 
 
 class NewStudy(NamedTuple):
@@ -75,6 +75,8 @@ class NewStudy(NamedTuple):
 def parameter_of(text: str) -> Parameter:
     """A parameter as it is written on the command line. Raises InputError."""
     name, equals, rest = text.partition("=")
+    if equals and name.strip() and name.isprintable() and ":" not in rest and "," in rest:
+        return Parameter.of_levels(name.strip(), tuple(level.strip() for level in rest.split(",")))
     low, *others = rest.split(":")
     try:
         ends = float(low), float(others[0])
@@ -154,6 +156,10 @@ def _parameters(new: NewStudy) -> Sequence[Parameter]:
 
 def _table(p: Parameter) -> list[str]:
     key = p.name if re.fullmatch(r"[A-Za-z0-9_-]+", p.name) else _quoted(p.name)
+    if p.levels:
+        levels = _line(f"levels = [{', '.join(map(_quoted, p.levels))}]", "without an order")
+        alike = _line(f"correlation = {p.correlation}", "how alike two of them are taken to be before any answer")
+        return ["", f"[parameters.{key}]", levels, alike]
     scale = ['scale = "log"                        # steps are ratios'] if p.scale == "log" else []
     steps = ["integer = true                       # only whole numbers may be presented"] if p.integer else []
     return [
@@ -176,7 +182,9 @@ def _presenting(new: NewStudy, parameters: Sequence[Parameter]) -> str:
 
 
 def _tolerance(parameters: Sequence[Parameter], part: int) -> str:
-    return "{" + ", ".join(f"{_quoted(p.name)} = {(p.high - p.low) / part:.2g}" for p in parameters) + "}"
+    return (
+        "{" + ", ".join(f"{_quoted(p.name)} = {(p.high - p.low) / part:.2g}" for p in parameters if not p.levels) + "}"
+    )
 
 
 def _thresholds(count: int) -> list[float]:

@@ -18,9 +18,9 @@ _WHAT = "is no result.json of hilbo; give the one that hilbo aggregate wrote"
 
 
 class FoundOptimum(msgspec.Struct, frozen=True):
-    """An optimum: parameter -> value in physical units."""
+    """An optimum: parameter -> value in physical units, of levels their names."""
 
-    parameters: dict[str, float | None]
+    parameters: dict[str, float | str | None]
 
 
 class FoundPerson(msgspec.Struct, frozen=True):

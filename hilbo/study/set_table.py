@@ -9,8 +9,9 @@ import csv
 import math
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from hilbo.errors import InputError
@@ -27,11 +28,15 @@ _INDIVIDUAL = "individual:"
 _NUMERAL = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")  # Python also reads 1_5, as 15, and nan
 
 
-def read_sets(path: str | os.PathLike, needs: Sequence[str] = ("K1", "B1", "alpha")) -> dict[str, dict[str, Any]]:
+def read_sets(
+    path: str | os.PathLike,
+    needs: Sequence[str] = ("K1", "B1", "alpha"),
+    levels: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> dict[str, dict[str, Any]]:
     """Each set's name and values, in the order of the file; empty cells are left out.
 
-    `needs`: columns that every set has a value in, beside `set_id`; of these all but `source` are numbers. Raises
-    `InputError`, one sentence with file and line.
+    `needs`: columns that every set has a value in, beside `set_id`; of these all but `source` are numbers, or one of
+    their `levels`. Raises `InputError`, one sentence with file and line.
     """
     source = str(path)
     columns, rows, comma = _table(Path(path), source)
@@ -57,7 +62,9 @@ def read_sets(path: str | os.PathLike, needs: Sequence[str] = ("K1", "B1", "alph
         check_text(name, "set_id", place)
         if name in sets:
             raise InputError(f'{place}: set_id "{name}" stands there already; name every set once.')
-        sets[name] = {column: _value(column, text, needs, place, comma) for column, text in given.items() if text}
+        sets[name] = {
+            column: _value(column, text, needs, levels, place, comma) for column, text in given.items() if text
+        }
         empty = next((column for column in needs if column not in sets[name]), None)
         if empty is not None:
             raise InputError(f'{place}: {empty} is ""; every set has one.')
@@ -108,8 +115,14 @@ def _table(path: Path, source: str) -> tuple[list[str], Iterator[tuple[int, list
     return [name.strip() for name in rows[0][1]], iter(rows[1:]), delimiter != ","
 
 
-def _value(column: str, text: str, needs: Sequence[str], place: str, comma: bool) -> Any:
+def _value(
+    column: str, text: str, needs: Sequence[str], levels: Mapping[str, Sequence[str]], place: str, comma: bool
+) -> Any:
     """A cell as what its column holds: a number, a whole number, or text."""
+    if column in levels:
+        if text not in levels[column]:
+            raise InputError(f'{place}: {column} is "{text}"; it must be one of {", ".join(levels[column])}.')
+        return text
     if column == "source":
         if "source" in needs and source_kind(text) is None:
             raise InputError(f'{place}: source is "{text}"; it must be aggregate, sysid or individual:PARTICIPANT.')

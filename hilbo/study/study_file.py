@@ -18,7 +18,7 @@ from typing import Any, Protocol, TypeVar, runtime_checkable
 import msgspec
 
 from hilbo.errors import InputError
-from hilbo.search.box import Box, Mechanics, Parameter
+from hilbo.search.box import Box, Constraint, Mechanics, Parameter
 from hilbo.study.fields import enclosing, lines_of, prefix
 from hilbo.study.protocols import SessionTable
 from hilbo.study.stimulus_table import StimulusTable
@@ -97,6 +97,9 @@ class _AnySpace(Protocol):
 
     @property
     def mechanics(self) -> Mechanics | None: ...
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]: ...
 
     @property
     def names(self) -> tuple[str, ...]: ...

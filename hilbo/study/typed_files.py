@@ -81,12 +81,20 @@ def unsealed(content: bytes, digest: str | None, source: str) -> None:
 
 
 def check_values(
-    values: Mapping[str, float | None], parameters: Iterable[Parameter], source: str, what: str
+    values: Mapping[str, float | str | None], parameters: Iterable[Parameter], source: str, what: str
 ) -> dict[str, float]:
-    """A rendering's parameters in physical units, each a finite number in the study's range. Raises InputError."""
+    """A rendering's parameters in physical units, each a finite number in the study's range, or a level by its name or
+    its place in the list, which is what becomes of it. Raises InputError."""
     checked = {}
     for parameter in parameters:
         value = values.get(parameter.name)
+        if isinstance(value, str):
+            if value not in parameter.levels:
+                raise InputError(
+                    f"{source}: {parameter.name} of {what} is {value}, it must be {parameter.range_words};"
+                    " make the file again."
+                )
+            value = parameter.number(value)
         slack = _SLACK * (parameter.high - parameter.low)
         if value is None or not math.isfinite(value):
             raise InputError(f"{source}: {what} has no number for {parameter.name}; make the file again.")
@@ -95,6 +103,10 @@ def check_values(
                 f"{source}: {parameter.name} of {what} is {value:g}, it must be from {parameter.low:g} to"
                 f" {parameter.high:g} {parameter.unit}".rstrip()
                 + ", the study's range; make the file again."
+            )
+        if parameter.levels and value != round(value):
+            raise InputError(
+                f"{source}: {parameter.name} of {what} is {value}, which is no level; make the file again."
             )
         checked[parameter.name] = float(value)
     return checked

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from hilbo.errors import InputError
+from hilbo.search.box import Parameter
 from hilbo.study.cells import numbers, read_cells, refuse
 from hilbo.study.set_table import read_sets
 from hilbo.study.trial_table import check_people, check_texts
@@ -106,9 +107,16 @@ def of_material(table: pd.DataFrame, material: str | None, source: str = "valida
     return table[table["material"] == material]
 
 
-def sets_frame(path: str | os.PathLike, parameters: Sequence[str] = ()) -> pd.DataFrame:
-    """A sets table (`set_table.read_sets`) whose sets say where they are from, indexed by `set_id`."""
-    frame = pd.DataFrame.from_dict(read_sets(path, ("source", *parameters)), orient="index").rename_axis("set_id")
+def sets_frame(
+    path: str | os.PathLike, names: Sequence[str] = (), parameters: Sequence[Parameter] = ()
+) -> pd.DataFrame:
+    """A sets table (`set_table.read_sets`) whose sets say where they are from, indexed by `set_id`. `names`: columns of
+    numbers; `parameters`: those among them that may be levels, whose names become their places in the list."""
+    chosen = [p for p in parameters if p.levels]
+    sets = read_sets(path, ("source", *names), {p.name: p.levels for p in chosen})
+    frame = pd.DataFrame.from_dict(sets, orient="index").rename_axis("set_id")
+    for p in chosen:
+        frame[p.name] = [p.number(value) for value in frame[p.name]]
     text = frame.select_dtypes(exclude="number").columns
     return frame.fillna(dict.fromkeys(text, ""))
 

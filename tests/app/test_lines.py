@@ -109,8 +109,8 @@ def test_a_session_by_forms_and_what_is_refused(tmp_path):
         assert values == {f"value.{name}": repr(number) for name, number in SETS["best"].items()}
         for status, words, wrong in (
             ("409", "which is no number", {"value.hue": "nan"}),
-            ("400", "not understood", {"value.hue": "red"}),
-            ("400", "not understood", {"value.hue": "1e999"}),
+            ("409", "hue is confirmed as red; it must be a number from", {"value.hue": "red"}),
+            ("409", "hue is confirmed as inf, which is no number", {"value.hue": "1e999"}),
             ("400", "unknown field", {"colour": "3"}),
             ("409", "and for nothing else", {"value.depth": "3"}),
         ):

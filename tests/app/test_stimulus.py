@@ -154,11 +154,12 @@ def test_what_is_not_understood_or_not_of_the_order_changes_nothing(live):
         "and no other": {"trial": "tag:9.1"},
         "a value for hue, light": {"values": {"hue": 1.0}},
         "and for nothing else": {"values": order["values"] | {"depth": 1.0}},
+        "hue is confirmed as red; it must be a number from 0 to 360 deg.": {"values": {"hue": "red", "light": 1.0}},
     }.items():
         with refused(409, words):
             program.report(**good | more)
     for words, more in {
-        "`float`": {"values": {"hue": "red", "light": 1.0}},
+        "`float | str`": {"values": {"hue": None, "light": 1.0}},
         "not understood": {"state": "dancing"},
         "order`": {"order": -1},
         "unknown field": {"colour": 3},

@@ -14,7 +14,7 @@ import time
 import pytest
 from client_programs import each_language, hung, sources
 from killed_session import PATIENCE, Session
-from live_stimulus import CLIENTS, SETS, LiveStimulus
+from live_stimulus import CLIENTS, SETS, LiveLevels, LiveStimulus
 
 from hilbo.session.records import Block, Planned
 from hilbo.study.config import Study
@@ -75,6 +75,14 @@ def test_the_example_presents_a_whole_session_and_confirms_what_was_asked_for(la
     assert [data["values"] for data in sent] == list(SETS.values())
     assert all(data["program"].startswith("example_patch") and not data["force"] for data in sent)
     assert all(word in program.out.read_text() for word in ("Reference", "Test"))
+
+
+@pytest.mark.parametrize("language", each_language.args[1][1:])  # the example in Python refuses other parameters
+def test_the_example_confirms_a_level_that_it_does_not_know(language, built, tmp_path):
+    command = language.build("example_patch", built)
+    with LiveLevels(tmp_path, blocks=SINGLE) as live, Running([*command, live.link()], tmp_path):
+        sent = all_answered(live)
+    assert [data["values"] for data in sent] == list(live.sets().values())
 
 
 @each_language

@@ -165,6 +165,14 @@ def test_warm_up_renderings_are_feasible_spread_and_seeded():
     assert apart.min() > 0.03
 
 
+def test_a_warm_up_keeps_the_constraints():
+    bound = {"terms": {"u": 1.0, "v": 1.0}, "most": 0.8}
+    study = Study.from_dict(RAW | {"constraints": [bound]})
+    for seed in range(4):
+        sets = warm_up(study, seed)[1]
+        assert sets and all(values["u"] + values["v"] <= 0.8 for values in sets.values())
+
+
 def test_a_planned_validation_session_runs_blind():
     head = planned_header(make_plan(STUDY, PEOPLE, 0, "validation", sets={"": SETS}, source="aggregate"), STUDY, "P01")
     state = LiveSession.start(STUDY, head)

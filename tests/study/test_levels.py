@@ -1,6 +1,7 @@
 """Unordered levels: what a study file may say of them, their names in tables, and that their order means nothing."""
 
 import itertools
+import tomllib
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,12 +17,17 @@ from hilbo.kernels import RBF, Matern32, embedded, gram, theta_of
 from hilbo.population.recipes import RECIPES
 from hilbo.search.apart import differences, middle_of, nrmse
 from hilbo.search.rendering import set_of
+from hilbo.simulation.presets import population_of
+from hilbo.simulation.simulate import people
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
 from hilbo.study.hills import hills_of
 from hilbo.study.learnt_study import that_learns
+from hilbo.study.new_study import NewStudy, parameter_of, study_text
 from hilbo.study.trial_table import read_trials, write_trials
+from hilbo.study.typed_files import check_values
+from hilbo.study.validation_table import sets_frame
 
 orders = st.permutations(TEXTURES)
 correlations = st.floats(0.02, 0.98)
@@ -191,3 +197,41 @@ def test_recipes_begin_with_the_stated_correlation(recipe):
     study = that_learns(surfaces(), recipe)
     assert study.gp.kernel.levels == (0, 3, 0) and study.stated.numbers == {}
     np.testing.assert_allclose(study.gp.kernel.theta, [12.0, np.log(2.0), 12.0])
+
+
+def test_a_new_study_has_levels():
+    new = NewStudy("surfaces", tuple(map(parameter_of, ("hue=0:360:deg", "texture=silk, wood"))), by="person")
+    study = Study.from_dict(tomllib.loads(study_text(new)))
+    assert study.space.parameters[1].levels == ("silk", "wood") and set(study.stimulus.tolerance) == {"hue"}
+
+
+def test_a_confirmed_level_is_not_nearly_another():
+    with pytest.raises(InputError, match=r"stimulus\.tolerance\.texture is of levels, and another level is none"):
+        surfaces(stimulus={"tolerance": {"texture": 1.0}})
+    assert surfaces(stimulus={}).stimulus.off_by(surfaces().space.parameters[1]) == 0
+
+
+def test_simulated_people_are_around_a_level():
+    study = surfaces(simulation={"truth": {"hue": 90.0, "texture": "stone", "light": 40.0}, "spread": 0.2})
+    crowd = people(study, population_of(study)[1], 500, 0)
+    texture = np.asarray(crowd.optimum)[:, 1]
+    assert np.mean(texture == 1.0) == pytest.approx(0.8, abs=0.06) and set(texture) == {0.0, 0.5, 1.0}
+    with pytest.raises(InputError, match=r'truth\.texture is "glass", it must be one of silk, wood, stone'):
+        surfaces(simulation={"truth": {"hue": 90.0, "texture": "glass", "light": 40.0}})
+
+
+def test_sets_hold_the_names(tmp_path):
+    parameters, path = surfaces().space.parameters, tmp_path / "sets.csv"
+    path.write_text("set_id,source,hue,texture,light\nbest,aggregate,10,stone,30\n")
+    assert sets_frame(path, ("hue", "texture", "light"), parameters)["texture"].tolist() == [2.0]
+    path.write_text("set_id,source,hue,texture,light\nbest,aggregate,10,glass,30\n")
+    with pytest.raises(InputError, match=r'sets\.csv:2: texture is "glass"; it must be one of silk, wood, stone'):
+        sets_frame(path, ("hue", "texture", "light"), parameters)
+
+
+def test_renderings_of_other_files_are_named_or_placed():
+    parameters, good = surfaces().space.parameters, {"hue": 1.0, "texture": "stone", "light": 30.0}
+    assert check_values(good, parameters, "f", "the best") == check_values(good | {"texture": 2}, parameters, "f", "it")
+    for wrong, words in (("glass", "it must be one of silk, wood, stone"), (0.5, "which is no level"), (3.0, "0 to 2")):
+        with pytest.raises(InputError, match=words):
+            check_values(good | {"texture": wrong}, parameters, "f", "the best")

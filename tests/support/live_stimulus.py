@@ -13,7 +13,7 @@ from hilbo.app.robot import Client
 from hilbo.app.stimulus_rig import StimulusRig
 from hilbo.study.config import Study
 
-__all__ = ["CLIENTS", "SETS", "ByHand", "LiveStimulus", "Presenter", "module"]
+__all__ = ["CLIENTS", "SETS", "ByHand", "LiveLevels", "LiveStimulus", "Presenter", "module"]
 
 CLIENTS = Path(__file__).parents[2] / "clients"
 SETS = {
@@ -98,6 +98,18 @@ class LiveStimulus(Live):
         return Presenter(self.link())
 
 
+class LiveLevels(LiveStimulus):
+    """The same with a parameter of levels between the two."""
+
+    def make_study(self, seconds, warm_up):
+        table = '[parameters.texture]\nlevels = ["silk", "wood", "smooth stone"]\n'
+        self.text = self.text.replace("[parameters.light]", table + "[parameters.light]")
+        return super().make_study(seconds, warm_up)
+
+    def sets(self):
+        return {name: values | {"texture": float(k)} for k, (name, values) in enumerate(SETS.items())}
+
+
 class ByHand(Client):
     """A program with the stimulus's key, report by report; or in the place of the preparer's page."""
 
@@ -156,7 +168,7 @@ class Presenter:
             for order in self.stimulus:
                 if order.do == "present":
                     self.shown.append(order)
-                    values = {name: value + self.off * (name == "hue") for name, value in order.values.items()}
+                    values = order.values | ({"hue": order.values["hue"] + self.off} if order.values else {})
                     self.stimulus.presented(values or None)
                 else:
                     self.stimulus.neutral()

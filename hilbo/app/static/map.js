@@ -52,7 +52,7 @@ function dot(c, x, y, t) {
   c.globalAlpha = 1;
 }
 
-// `across` and `up`: name, unit, scale, low, high; with `hidden_unit` in both, the truth is marked too.
+// `across` and `up`: name, unit, scale, low, high, levels; with `hidden_unit` in both, the truth is marked too.
 function drawSlice(canvas, slice, across, up, range) {
   const ratio = devicePixelRatio, w = canvas.clientWidth, h = canvas.clientHeight, c = canvas.getContext("2d");
   const text = w < 320 ? 12 : 14, left = 3.4 * text + 10, foot = 2.9 * text + 4, head = 1.2 * text + 4, font = "px system-ui, sans-serif";
@@ -66,11 +66,15 @@ function drawSlice(canvas, slice, across, up, range) {
   if (across.hidden_unit !== undefined) twice(c, "#d1495b", [6, 3], () => ring(c, ...place(across.hidden_unit, up.hidden_unit)));
   c.fillStyle = "#1d2733"; c.font = text + font; c.textAlign = "center";
   if (slice.held) c.fillText(`at ${slice.held}`, x + side / 2, y - 6);
-  const value = (p, u) => Number((p.scale === "log" ? p.low * (p.high / p.low) ** u : p.low + (p.high - p.low) * u).toPrecision(2));
-  for (const u of [0, 0.5, 1]) {
+  const last = (p) => (p.levels || []).length - 1;      // of unordered levels, all of which have a tick
+  const ticks = (p) => last(p) > 0 ? p.levels.map((_, i) => i / last(p)) : [0, 0.5, 1];
+  const value = (p, u) => last(p) > 0 ? p.levels[Math.round(last(p) * u)] : Number((p.scale === "log" ? p.low * (p.high / p.low) ** u : p.low + (p.high - p.low) * u).toPrecision(2));
+  for (const u of ticks(across)) {
     c.textAlign = u === 0 ? "left" : u === 1 ? "right" : "center";
     c.fillText(value(across, u), x + u * side, y + side + 1.2 * text);
-    c.textAlign = "right";
+  }
+  c.textAlign = "right";
+  for (const u of ticks(up)) {
     c.fillText(value(up, u), x - 5, y + (1 - u) * side + (u === 1 ? .8 * text : u === 0 ? 0 : .35 * text));
   }
   const label = (p) => p.name + (p.unit ? ` (${p.unit})` : "");

@@ -9,7 +9,7 @@ const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent 
 const show = (id, yes) => { at(id).hidden = !yes; };
 const SETTLES = 300;                 // ms: a tap that comes sooner was for what stood there before
 
-let run = null, silence = 10, units = {}, digits = {};
+let run = null, silence = 10, units = {}, digits = {}, levels = {};
 let order = { order: 0, do: "neutral" }, done = "neutral";   // the newest order, and what was done about it
 let since = 0, heard = 0, alerted = "", over = "";           // when it came, when the server was heard (performance.now())
 let presentedBefore = false;         // something stands there that is to be taken away
@@ -30,7 +30,7 @@ async function ready() {
     if (status !== 200) { refuse(status, found); return; }
     run = found.run; silence = found.silence_s; presentedBefore = false; alerted = "";
     for (const p of found.parameters) {
-      units[p.name] = p.unit;
+      units[p.name] = p.unit; levels[p.name] = p.levels || null;
       // Rounded to these many digits, a value is off by half of what is borne at most.
       digits[p.name] = p.tolerance > 0 ? Math.min(12, Math.max(0, Math.ceil(-Math.log10(p.tolerance)))) : null;
     }
@@ -81,7 +81,11 @@ function lost(why) { if (run === null && alerted) return; run = null; alerted = 
 function layOut() {
   const box = at("setting"), values = order.values || {};
   box.replaceChildren(...Object.keys(values).flatMap((name, i) => {
-    const input = Object.assign(document.createElement("input"), { id: `value-${i}`, inputMode: "decimal", autocomplete: "off" });
+    const choice = levels[name];
+    const input = choice
+      ? Object.assign(document.createElement("select"), { id: `value-${i}` })
+      : Object.assign(document.createElement("input"), { id: `value-${i}`, inputMode: "decimal", autocomplete: "off" });
+    if (choice) input.replaceChildren(...choice.map((level) => new Option(level, level)));
     input.value = typeof values[name] === "number" && digits[name] !== null ? String(Number(values[name].toFixed(digits[name]))) : String(values[name]);
     input.dataset.name = name;
     input.dataset.number = typeof values[name] === "number" ? "yes" : "";
@@ -95,7 +99,7 @@ function layOut() {
 // What is really in force: what stands in the fields. null where one is no number.
 function values() {
   const found = {};
-  for (const input of at("setting").querySelectorAll("input")) {
+  for (const input of at("setting").querySelectorAll("input, select")) {
     const text = input.value.trim().replace(",", "."), number = Number(text);
     if (input.dataset.number && (text === "" || !Number.isFinite(number))) return null;
     found[input.dataset.name] = input.dataset.number ? number : input.value.trim();
@@ -113,7 +117,7 @@ function phase() {
 const WORDS = {
   over: ["This page is no longer part of the session", "", ""],
   ready: ["Are you there, and is nothing presented?", "What you are to present stands here, one after the other. Keep this page open, and let nobody else see it.", "Ready"],
-  present: ["", "Present this, correct the numbers if something else is in force, then press.", "Presented"],
+  present: ["", "Present this, correct what stands here if something else is in force, then press.", "Presented"],
   shown: ["It is presented", "Leave it as it is.", ""],
   away: ["Take it away", "The participant answers.", "Taken away"],
   wait: ["Nothing is to be presented now", "The next one comes by itself.", ""],
@@ -128,7 +132,7 @@ function draw() {
   put("message", over || (now === "present" && order.show === "reference" ? "Then press." : message));
   put("label", label); show("label", presents && !!label);
   show("setting", presents && order.show === "test");
-  for (const input of at("setting").querySelectorAll("input")) input.disabled = now !== "present";
+  for (const input of at("setting").querySelectorAll("input, select")) input.disabled = now !== "present";
   show("go", !!button); put("go", button);
   show("could-not", now === "present" && !asking);
   show("why", now === "present" && asking);

@@ -1,0 +1,77 @@
+"""Levels in a live session: whoever presents is told their names and confirms them; another one voids the trial."""
+
+import pytest
+from live_server import check_blinding, refused
+from live_stimulus import SETS, LiveLevels
+
+from hilbo.app.lines import lines_of
+from hilbo.app.log_words import table
+from hilbo.session.export import sets_table, trials_table
+from hilbo.session.records import Block, Planned
+from hilbo.study.cohort import cohort_of
+
+LEVELS = ("silk", "wood", "smooth stone")
+SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
+
+
+def test_names_are_told_confirmed_and_written(tmp_path):
+    with LiveLevels(tmp_path, blocks=SINGLE) as live, live.present() as program:
+        live.begin()
+        for _ in range(3):
+            live.answer()
+        live.until(lambda view: view["phase"] == "done")
+        assert [order.values["texture"] for order in program.shown if order.show == "test"] == list(LEVELS)
+        assert program.stimulus.parameters[1] == {"name": "texture", "levels": list(LEVELS)}
+        assert [event.data["values"]["texture"] for event in live.events("sent")] == [0.0, 1.0, 2.0]
+        state = live.replayed()
+        assert trials_table([state])["texture"].tolist() == list(LEVELS)
+        live.replays()
+
+
+@pytest.mark.deep  # it compiles a step
+def test_a_session_that_chooses_is_aggregated_from_its_table(tmp_path):
+    with LiveLevels(tmp_path, blocks=(Block("optimisation", 6),)) as live, live.present() as program:
+        live.begin()
+        for _ in range(6):
+            live.answer()
+        live.until(lambda view: view["phase"] == "done")
+        chosen = [order.values["texture"] for order in program.shown if order.show == "test"]
+        frame = trials_table([live.replayed()])
+        assert set(chosen) <= set(LEVELS) and frame["texture"].tolist() == chosen
+        cohort = cohort_of(frame, live.study)
+        assert [LEVELS[int(k)] for k in cohort.physical[0, :, 1]] == chosen
+        assert [row["cells"][4] for row in table(live.replayed())["rows"]] == chosen[::-1]
+        live.replays()
+
+
+def test_another_level_voids_the_trial_and_what_is_none_is_refused(tmp_path):
+    with LiveLevels(tmp_path, blocks=SINGLE) as live:
+        program = live.by_hand()
+        live.begin()
+        order = program.asked(live)
+        assert order["values"]["texture"] == "silk"
+        for wrong in ("glass", 1.0, "0"):
+            with refused(409, "it must be one of silk, wood, smooth stone."):
+                program.report("presented", values=order["values"] | {"texture": wrong})
+        assert not live.events("sent") and not live.events("missed")
+        with refused(409, "texture is confirmed as wood, and silk was asked for."):
+            program.report("presented", values=order["values"] | {"texture": "wood"})
+        whole = live.until(lambda v: any(t["voided"] for t in v["whole"]["trials"]), live.whole)["whole"]
+        assert "texture is confirmed as wood" in next(t for t in whole["trials"] if t["voided"])["voided"]["reason"]
+
+
+def test_comparisons_are_blind_and_their_sets_are_written_by_name(tmp_path):
+    with LiveLevels(tmp_path, repeats=1) as live, live.present():
+        live.begin()
+        for _ in range(3):
+            live.answer()
+        view = live.until(lambda view: view["phase"] == "done")
+        check_blinding(str(view), live.hub.state, "texture", "hue", *LEVELS)
+        sets = sets_table([live.replayed()]).set_index("set_id")
+        assert sets["texture"].to_dict() == dict(zip(SETS, LEVELS, strict=True))
+
+
+def test_lines_have_the_names():
+    said = {"parameters": [{"name": "texture", "levels": list(LEVELS)}], "values": {"texture": LEVELS[2], "hue": 1.5}}
+    lines = lines_of(200, said).splitlines()
+    assert lines[1:] == ["levels\ttexture\tsilk\twood\tsmooth stone", "value\ttexture\tsmooth stone", "value\thue\t1.5"]
