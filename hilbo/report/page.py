@@ -11,11 +11,23 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescap
 from hilbo.report.participants import People
 from hilbo.study.config import Study
 
-__all__ = ["Pictures", "heads", "number", "percent", "rendered", "results_page"]
+__all__ = ["Pictures", "estimate_words", "heads", "number", "percent", "rendered", "results_page"]
 
 Pictures = dict[str, dict[str, str]]
 """Figures by name, each with `png` (base64) and `width` (pixels), of `results.save_figures`."""
 
+_ESTIMATES = {
+    "average": "plain average of the latent functions",
+    "bcm": "committee machine (bcm)",
+    "ep": "population map, expectation propagation",
+    "hierarchical": "people who differ (hierarchical)",
+    "laplace": "population map, Laplace",
+    "learnt-1": "people who differ, hyperparameters learnt (learnt-1)",
+    "learnt-2": "people who differ, hyperparameters learnt (learnt-2)",
+    "mean_of_optima": "mean of the individual optima",
+    "pooled": "one model of all answers",
+    "rbcm": "robust committee machine (rbcm)",
+}
 _SHOWN = 200  # participants in the page's table
 
 
@@ -58,6 +70,11 @@ def results_page(
     )
 
 
+def estimate_words(name: str, rule: str) -> str:
+    """What an estimate of the optimum is called on pages; `name`: its key in result.json, `rule`: the study's."""
+    return f"population map ({rule})" if name == "aggregate" else _ESTIMATES[name]
+
+
 def rendered(name: str, **facts: Any) -> str:
     """The page of a template, which escapes what it is given."""
     return _environment().get_template(name).render(**facts)
@@ -70,7 +87,7 @@ def _environment() -> Environment:
         loader=PackageLoader("hilbo.report"), autoescape=select_autoescape(), undefined=StrictUndefined
     )
     environment.filters |= {"number": number, "percent": percent, "symbol": _symbol, "unit": _unit, "each": _each}
-    environment.globals |= {"heads": heads, "zip": zip}
+    environment.globals |= {"heads": heads, "zip": zip, "estimate_words": estimate_words}
     return environment
 
 

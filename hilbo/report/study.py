@@ -20,7 +20,7 @@ from hilbo.report.checklist import checklist
 from hilbo.report.comparison import comparison_section, comparison_table
 from hilbo.report.dictionary import dictionary
 from hilbo.report.hypotheses import Results, hypotheses
-from hilbo.report.page import Pictures, heads, number, percent, rendered
+from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
 from hilbo.report.participants import people_of
 from hilbo.report.result_tables import convergence_table, passivity_table, table_1, tolerance_table
 from hilbo.report.results import as_json, map_dataset, optima_table, result, save_figures, versions
@@ -33,6 +33,7 @@ from hilbo.study.heterogeneity import in_place
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.map_file import write_map
 from hilbo.study.rule_comparison import compare
+from hilbo.study.set_table import ROLES
 
 __all__ = ["write_study"]
 
@@ -209,10 +210,21 @@ def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
     parameters = [name for name in shown if name not in forms]
     names = dict(zip(parameters, heads(study, parameters), strict=True)) | {k: head for k, (head, _) in forms.items()}
     rows = [
-        [label, *("" if pd.isna(value) else forms.get(name, ("", number))[1](value) for name, value in row.items())]
+        [
+            _estimate(label, study.rule),
+            *("" if pd.isna(value) else forms.get(name, ("", number))[1](value) for name, value in row.items()),
+        ]
         for label, row in zip(table["optimum"], shown.to_dict("records"), strict=True)
     ]
     return {"head": ["", *(names[name] for name in shown)], "rows": rows}
+
+
+def _estimate(label: str, rule: str) -> str:
+    """The words of a row of `passivity_table`."""
+    if label in ROLES:
+        return f"{label} of the sets to compare"
+    name = "aggregate" if label == "population" else label.removeprefix("population, ")
+    return name if " " in name else estimate_words(name, rule)
 
 
 def _with_units(study: Study, table: pd.DataFrame) -> tuple[list[str], list[list[str]]]:

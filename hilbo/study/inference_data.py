@@ -1,22 +1,24 @@
 """A material's results for ArviZ: posterior, posterior predictive and observed answers as netCDF groups.
 
-Groups and variables (dimensions chain, draw, participant, trial):
+Groups and variables (dimensions chain, draw, participant, trial; of log_likelihood chain, draw, obs_id):
     posterior             f: latent score at everybody's own trials, drawn from N(mode, K - K C K)
     posterior_predictive  response: answers (categories from 0) that would be given there again
-    log_likelihood        response: log P(answer | f)
+    log_likelihood        response: log P(answer | f) of the answers alone, with participant and trial of each, since
+                          `arviz.loo` takes every element for an answer
     observed_data         response: the answers, -1 where there is none
     constant_data         one variable for each parameter, in its unit; thresholds and noise of the likelihood
 `arviz.from_netcdf` and `xarray.open_datatree` read the file. Everybody's posterior is their own: nothing is shared.
 """
 
 import os
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import xarray as xr
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from hilbo.kernels import gram
 from hilbo.numerics.linalg import eigh
@@ -53,10 +55,26 @@ def groups(
     return {
         "posterior": xr.Dataset({"f": (_DIMS, np.where(held, f, np.nan), {"long_name": study.attribute})}, chains),
         "posterior_predictive": xr.Dataset({"response": (_DIMS, np.where(held, response, -1), say)}, chains),
-        "log_likelihood": xr.Dataset({"response": (_DIMS, np.where(held, log_likelihood, np.nan))}, chains),
+        "log_likelihood": _of_answers(log_likelihood, mask, cohort.names),
         "observed_data": xr.Dataset({"response": (("participant", "trial"), observed, say)}, coords),
         "constant_data": xr.Dataset(constants, coords, {"study": study.hash, "inference": study.inference}),
     }
+
+
+def _of_answers(
+    values: Float[np.ndarray, "1 draws M n"], mask: Bool[np.ndarray, "M n"], names: Sequence[str]
+) -> xr.Dataset:
+    """The values where somebody answered, by person and then by trial."""
+    person, trial = np.nonzero(mask)
+    chain, draw, *_ = values.shape
+    coords = {
+        "chain": np.arange(chain),
+        "draw": np.arange(draw),
+        "obs_id": np.arange(1, len(person) + 1),
+        "participant": ("obs_id", np.array(names, object)[person]),
+        "trial": ("obs_id", trial + 1),
+    }
+    return xr.Dataset({"response": (("chain", "draw", "obs_id"), values[..., person, trial])}, coords)
 
 
 def inference_data(study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0) -> Any:

@@ -17,7 +17,7 @@ from commands import run
 from studies import paper_counts, plain
 
 from hilbo import Trials
-from hilbo.population.maps import RuleMap
+from hilbo.population.maps import ALL_RULES, RuleMap
 from hilbo.report.comparison import comparison_section
 from hilbo.report.figures.study import individual_convergence
 from hilbo.report.hypotheses import _convergence, _materials, _nearer_to_others
@@ -165,6 +165,15 @@ def test_groups_are_what_arviz_reads(tmp_path):
     np.testing.assert_allclose(f[:, 0].mean(axis=0), mean[0], atol=0.06)
     np.testing.assert_allclose(f[:, 0].var(axis=0), variance[0], atol=0.06)
     assert np.isnan(f[:, 1, 4:]).all() and (found["observed_data"]["response"].values[1, 4:] == -1).all()
+    given = found["log_likelihood"]["response"]
+    expected = jax.vmap(study.gp.likelihood.log_prob)(f[0, 1, :4], np.asarray(cohort.trials.q)[1, :4])
+    np.testing.assert_allclose(given.values[0, 0, -4:], expected)
+    assert list(given["participant"].values[-5:]) == ["P0", *["P1"] * 4] and list(given["trial"].values[-4:]) == [
+        1,
+        2,
+        3,
+        4,
+    ]
     observed, predicted = predictive_shares(found, 3)
     assert observed.sum() == pytest.approx(1.0) and predicted.shape == (4000, 3)
     write_groups(found, tmp_path / "inference.nc")
@@ -172,6 +181,8 @@ def test_groups_are_what_arviz_reads(tmp_path):
     assert {"posterior", "posterior_predictive", "observed_data", "log_likelihood", "constant_data"} <= set(
         read.groups()
     )
+    with pytest.warns(UserWarning, match="Pareto"):  # four answers of somebody: each weighs much
+        assert np.isfinite(az.loo(read).elpd_loo)
     tree = xr.open_datatree(tmp_path / "inference.nc", engine="h5netcdf")
     np.testing.assert_array_equal(tree["constant_data"]["u"].values[0], cohort.physical[0, :, 0])
     tree.close()
@@ -255,4 +266,15 @@ def test_the_comparison_of_rules_is_shown():
 def test_no_column_of_what_is_not_there():
     rows = {"optimum": ["population", "mid"], "u": [0.25, 1.0], "f": [0.123, np.nan], "passivity_margin": [None, None]}
     shown = _alternatives(plain(), pd.DataFrame(rows))
-    assert shown == {"head": ["", "u", "f"], "rows": [["population", "0.25", "0.12"], ["mid", "1", ""]]}
+    assert shown["head"] == ["", "u", "f"]
+    assert shown["rows"] == [["population map (bcm)", "0.25", "0.12"], ["mid of the sets to compare", "1", ""]]
+
+
+def test_every_estimate_of_the_optimum_has_words():
+    labels = [
+        "population",
+        *(f"population, {name}" for name in ("ep", "laplace", *ALL_RULES, "optimised hyperparameters")),
+    ]
+    rows = _alternatives(plain(), pd.DataFrame({"optimum": labels, "u": 0.5}))["rows"]
+    words = [row[0] for row in rows]
+    assert len(set(words)) == len(words) and not any(label in words for label in labels[:-1])
