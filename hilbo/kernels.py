@@ -23,7 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
-from scipy.special import lambertw
 
 from hilbo.numerics.shown import check_positive, numbers, shown
 
@@ -148,6 +147,8 @@ def theta_of(kernel: type[Stationary], correlation: float) -> float:
     """
     if kernel is RBF:
         return -math.log(correlation)
+    from scipy.special import lambertw  # loaded only where a study has levels
+
     # (1 + s) exp(-s) = c has s = -1 - W(-c/e) on the lower branch of Lambert's function.
     return (-1.0 - float(lambertw(-correlation / math.e, -1).real)) ** 2 / 6.0
 
