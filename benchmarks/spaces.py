@@ -8,9 +8,14 @@ dimensions; a run that was stopped goes on where it was. A participant answers "
 the function over the feasible set, "high" above the 90 (or 99) % one, without noise. All three ways give the same model
 as many answers, beginning with the same space-filling trials; what is judged is the rendering with its largest
 posterior mean: the share of the feasible set that is better. --write puts the tables into docs/results/spaces.md.
+
+Hartmann 3 and 6: Surjanovic & Bingham, Virtual library of simulation experiments. Func-2C, of two levels and two
+numbers: Ru, Alvi, Nguyen, Osborne & Roberts (2020), Bayesian optimisation over multiple continuous and categorical
+inputs, ICML; as its authors have it, of the second level's five values the last three are the same function.
 """
 
 import argparse
+import functools
 import itertools
 import time
 from pathlib import Path
@@ -50,8 +55,23 @@ def hartmann(x, slopes, places):
     return (ALPHA * np.exp(-away)).sum(-1)
 
 
-def study_of(dim, trials, length, whole=(), constraints=()):
-    parameters = {f"x{i + 1}": {"low": 0, "high": 1} for i in range(dim)}
+def unit_hartmann(slopes, places):
+    """Of points (n, d) in physical numbers of a study."""
+    return lambda space, physical: hartmann(np.asarray(space.to_unit(physical)), slopes, places)
+
+
+def func_2c(_, physical):
+    """Higher is better; columns x1, x2 in [-2, 2], and the places of the levels."""
+    x1, x2, first, second = physical.T
+    rosenbrock = (100 * (x2 - x1**2) ** 2 + (x1 - 1) ** 2) / 300
+    camel = ((4 - 2.1 * x1**2 + x1**4 / 3) * x1**2 + x1 * x2 + (4 * x2**2 - 4) * x2**2) / 10
+    beale = sum((c - x1 + x1 * x2**k) ** 2 for k, c in ((1, 1.5), (2, 2.25), (3, 2.625))) / 50
+    terms, rows = np.stack([rosenbrock, camel, beale]), np.arange(len(x1))
+    return -terms[first.astype(int), rows] - terms[np.minimum(second, 2).astype(int), rows]
+
+
+def study_of(dim, trials, length, whole=(), constraints=(), parameters=None):
+    parameters = parameters or {f"x{i + 1}": {"low": 0, "high": 1} for i in range(dim)}
     parameters |= {f"x{i + 1}": {"low": 0, "high": 10, "integer": True} for i in whole}
     return Study.from_dict(
         {
@@ -67,11 +87,14 @@ def study_of(dim, trials, length, whole=(), constraints=()):
 
 SUM = {"terms": {f"x{i}": 1.0 for i in range(1, 7)}, "most": 1.8}
 PAIR = {"terms": {"x6": 1.0, "x3": -1.0}, "most": 0.1}
+MIXED = {f"x{i}": {"low": -2, "high": 2} for i in (1, 2)}
+MIXED |= {f"h{i}": {"levels": list("abcde"[:count])} for i, count in ((1, 3), (2, 5))}
 FUNCTIONS = {
-    "Hartmann 3": (study_of(3, 30, 0.3), A3, P3),
-    "Hartmann 6": (study_of(6, 50, 0.5), A6, P6),
-    "Hartmann 3, two parameters of 11 steps": (study_of(3, 30, 0.3, whole=(1, 2)), A3, P3),
-    "Hartmann 6, two linear constraints": (study_of(6, 50, 0.5, constraints=(SUM, PAIR)), A6, P6),
+    "Hartmann 3": (study_of(3, 30, 0.3), unit_hartmann(A3, P3)),
+    "Hartmann 6": (study_of(6, 50, 0.5), unit_hartmann(A6, P6)),
+    "Hartmann 3, two parameters of 11 steps": (study_of(3, 30, 0.3, whole=(1, 2)), unit_hartmann(A3, P3)),
+    "Hartmann 6, two linear constraints": (study_of(6, 50, 0.5, constraints=(SUM, PAIR)), unit_hartmann(A6, P6)),
+    "Func-2C, levels of 3 and 5 and two numbers": (study_of(4, 40, 0.3, parameters=MIXED), func_2c),
 }
 
 
@@ -83,15 +106,20 @@ def feasible(study, physical):
         inside &= total <= constraint.most
     for i, p in enumerate(study.space.parameters):
         inside &= (p.low <= physical[:, i]) & (physical[:, i] <= p.high)
-        inside &= (physical[:, i] % 1 == 0) | (not p.integer)
+        inside &= (physical[:, i] % 1 == 0) | (not p.discrete)
     return inside
+
+
+def numbers(space, at):
+    """A rendering as a row (1, d) of physical numbers."""
+    return np.array([[p.number(at[p.name]) for p in space.parameters]])
 
 
 def one(name, seed, cut):
     """For each way the share of the feasible set that is better than its best, after every fifth trial."""
-    study, *coefficients = FUNCTIONS[name]
+    study, function = FUNCTIONS[name]
     space = study.space
-    value = lambda physical: hartmann(np.asarray(space.to_unit(physical)), *coefficients)  # noqa: E731
+    value = functools.partial(function, space)
     crowd = value(np.asarray(space.to_physical(space.candidates(4096, 10**6))))
     edges = np.quantile(crowd, np.array(cut) / 100)
     chance = space.candidates(2048, 7 + seed)[np.random.default_rng(seed).permutation(2048)]
@@ -103,12 +131,13 @@ def one(name, seed, cut):
             if way == "hilbo" or trial < study.selection.space_filling:
                 at = session.ask()
             else:
-                at = dict(zip(space.names, np.asarray(space.to_physical(others[way][trial])).tolist(), strict=True))
-            point = np.array([list(at.values())])
+                values = np.asarray(space.to_physical(others[way][trial])).tolist()
+                at = {p.name: p.shown(value) for p, value in zip(space.parameters, values, strict=True)}
+            point = numbers(space, at)
             outside += int(not feasible(study, point)[0])
             session = session.tell(study.responses[int((value(point)[0] > edges).sum())], at=at)
             if (trial + 1) % 10 == 0:
-                best = np.array([list(session.best().values())])
+                best = numbers(space, session.best())
                 curve[str(trial + 1)] = float(np.mean(crowd > value(best)[0]))
         found[way] = curve
     return {"function": name, "seed": seed, "cut": cut, "better": found, "outside": outside}
