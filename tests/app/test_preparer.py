@@ -7,7 +7,7 @@ import urllib.error
 
 import pytest
 from live_server import PATIENCE, check_blinding, listen, refused
-from live_stimulus import SETS, ByHand, LiveStimulus
+from live_stimulus import SETS, SINGLE, ByHand, LiveStimulus
 
 from hilbo.app.blind import _SAME
 from hilbo.app.opening import Wanted, _header
@@ -16,12 +16,10 @@ from hilbo.app.slices import Maps
 from hilbo.cli import doctor
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, read_log
-from hilbo.session.records import Block, Planned
 from hilbo.session.set_codes import label_of
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
 from hilbo.study.study_file import StudyFile
 
-SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
 BY_PERSON = 'by = "person"\n'
 
 

@@ -7,16 +7,14 @@ import urllib.request
 
 import pytest
 from live_server import DATA, PATIENCE, Live, check_blinding, listen, refused
-from live_stimulus import SETS, ByHand, LiveStimulus, Presenter, module
+from live_stimulus import SETS, SINGLE, ByHand, LiveStimulus, Presenter, module
 
 from hilbo.app.robot import Client
 from hilbo.cli import doctor
 from hilbo.errors import InputError
 from hilbo.session.export import trials_table
-from hilbo.session.records import Block, Planned
+from hilbo.session.records import Block
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
-
-SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
 
 
 @pytest.fixture

@@ -2,16 +2,15 @@
 
 import pytest
 from live_server import check_blinding, refused
-from live_stimulus import SETS, LiveLevels
+from live_stimulus import SETS, SINGLE, LiveLevels
 
 from hilbo.app.lines import lines_of
 from hilbo.app.log_words import table
 from hilbo.session.export import sets_table, trials_table
-from hilbo.session.records import Block, Planned
+from hilbo.session.records import Block
 from hilbo.study.cohort import cohort_of
 
 LEVELS = ("silk", "wood", "smooth stone")
-SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
 
 
 def test_names_are_told_confirmed_and_written(tmp_path):

@@ -9,33 +9,13 @@ import threading
 
 import pytest
 from live_server import PATIENCE
-from live_stimulus import CLIENTS, SETS, LiveStimulus, Presenter, module
-
-from hilbo.session.records import Block, Planned
-
-SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
+from live_stimulus import CLIENTS, SINGLE, LiveStimulus, Presenter, all_answered, module
 
 
 @pytest.fixture
 def live(tmp_path):
     with LiveStimulus(tmp_path, blocks=SINGLE) as found:
         yield found
-
-
-def all_answered(live):
-    """The participant takes part to the end, and presses Begin whenever that is asked for."""
-
-    def acted():
-        view = live.view()
-        if view["may"]["begin"]:
-            live.participant.post("/api/participant/begin", {})
-        elif view["questions"]:
-            live.answer(view)
-        return view
-
-    live.until(lambda view: view["phase"] == "done", acted)
-    live.replays()
-    return [event.data for event in live.events("sent")]
 
 
 @contextlib.contextmanager

@@ -16,12 +16,10 @@ from client_programs import each_language, hung, sources
 from killed_session import PATIENCE, Session
 from live_stimulus import CLIENTS, SETS, LiveLevels, LiveStimulus
 
-from hilbo.session.records import Block, Planned
 from hilbo.study.config import Study
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
 
 pytestmark = [pytest.mark.deep, pytest.mark.skipif(sys.platform == "win32", reason="SIGKILL")]
-SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
 SILENCE, OWN = 1.0, 0.05  # s: the study's, and what the examples state
 FORCE = re.compile(r"^(\d+\.\d+) (force|neutral)$", re.MULTILINE)
 
@@ -49,22 +47,6 @@ class Running:
     def force(self):
         """When its loop set a force, or none: (s since 1970, whether there was one)."""
         return [(float(at), what == "force") for at, what in FORCE.findall(self.err.read_text())]
-
-
-def all_answered(live):
-    """The participant takes part to the end."""
-
-    def acted():
-        view = live.view()
-        if view["may"]["begin"]:
-            live.participant.post("/api/participant/begin", {})
-        elif view["questions"]:
-            live.answer(view)
-        return view
-
-    live.until(lambda view: view["phase"] == "done", acted)
-    live.replays()
-    return [event.data for event in live.events("sent")]
 
 
 @each_language

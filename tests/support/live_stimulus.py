@@ -11,9 +11,10 @@ from live_server import Live
 
 from hilbo.app.robot import Client
 from hilbo.app.stimulus_rig import StimulusRig
+from hilbo.session.records import Block, Planned
 from hilbo.study.config import Study
 
-__all__ = ["CLIENTS", "SETS", "ByHand", "LiveLevels", "LiveStimulus", "Presenter", "module"]
+__all__ = ["CLIENTS", "SETS", "SINGLE", "ByHand", "LiveLevels", "LiveStimulus", "Presenter", "all_answered", "module"]
 
 CLIENTS = Path(__file__).parents[2] / "clients"
 SETS = {
@@ -21,6 +22,7 @@ SETS = {
     "mid": {"hue": 222.333444, "light": 33.777111},
     "worst": {"hue": 301.987654, "light": 71.123456},
 }
+SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
 _TEXT = """schema = 1
 [study]
 name = "patch"
@@ -96,6 +98,22 @@ class LiveStimulus(Live):
     def present(self) -> "Presenter":
         """A program that presents all it is asked for, by the client that is shipped."""
         return Presenter(self.link())
+
+
+def all_answered(live):
+    """The participant takes part to the end, and presses Begin whenever that is asked for."""
+
+    def acted():
+        view = live.view()
+        if view["may"]["begin"]:
+            live.participant.post("/api/participant/begin", {})
+        elif view["questions"]:
+            live.answer(view)
+        return view
+
+    live.until(lambda view: view["phase"] == "done", acted)
+    live.replays()
+    return [event.data for event in live.events("sent")]
 
 
 class LiveLevels(LiveStimulus):
