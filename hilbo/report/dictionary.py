@@ -15,7 +15,7 @@ _INTERVAL = {"low": ("", "lower end of the 95 % interval"), "high": ("", "upper 
 _REGRESSION = {
     "term": ("", "what the coefficient belongs to"),
     "estimate": ("logit", "maximum-likelihood coefficient"),
-    "errors": ("", "how standard errors were computed: iid, clustered by person, two-way, wild bootstrap"),
+    "errors": ("", "how standard errors were computed: iid, clustered by person, two-way"),
     "std_error": ("logit", "standard error"),
     "statistic": ("", "estimate over its standard error"),
     "degrees_of_freedom": ("", "of the t distribution that p and interval are from"),

@@ -128,14 +128,7 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
     grid = map_dataset(study, analysis.aggregate.surface)
     grid.attrs |= {"rule": content["rule"], "optimum": json.dumps(content["optimum"]["parameters"])}
     write_map(grid, folder / "map.nc")
-    tables = {
-        "optima": optima_table(content, people),
-        "table_I": table_1(analysis, material.reference),
-        "convergence": convergence_table(analysis),
-        "tolerance": tolerance_table(analysis),
-        "people": analysis.people.assign(left_out=analysis.people["participant"].map(analysis.left_out)),
-        "passivity": passivity_table(analysis),
-    }
+    tables = _tables(analysis, material, content, people)
     shares = predictive_shares(data, len(study.responses))
     figures, hatched = study_figures(analysis, material, shares)
     pictures = save_figures(figures, folder)
@@ -152,18 +145,36 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
     content |= {
         "left_out": analysis.left_out,
         "limits": list(analysis.limits),
-        "optimised": {
-            "theta": np.asarray(analysis.learned.gp.kernel.theta).tolist(),
-            "noise": float(analysis.learned.gp.likelihood.noise),
-            "thresholds": np.asarray(analysis.learned.gp.likelihood.thresholds).tolist(),
-            "nrmse": moved_by_evidence(analysis),
-        },
+        "optimised": _optimised(analysis),
         "tolerance": tables["tolerance"].to_dict("records"),
         "comparison": compared,
     }
     section = _section(material, analysis, validated, tables, pictures, content)
     items = checklist(analysis, content, validated is not None)
     return content, section | {"hatched": hatched, "checklist": items, "dictionary": tables["dictionary"]}
+
+
+def _tables(analysis: Analysis, material: Material, content, people) -> dict[str, pd.DataFrame]:
+    """The tables that every material has, by the names of their files."""
+    return {
+        "optima": optima_table(content, people),
+        "table_I": table_1(analysis, material.reference),
+        "convergence": convergence_table(analysis),
+        "tolerance": tolerance_table(analysis),
+        "people": analysis.people.assign(left_out=analysis.people["participant"].map(analysis.left_out)),
+        "passivity": passivity_table(analysis),
+    }
+
+
+def _optimised(analysis: Analysis) -> dict[str, Any]:
+    """The hyperparameters of maximum evidence, and how far the optimum moves by them."""
+    gp = analysis.learned.gp
+    return {
+        "theta": np.asarray(gp.kernel.theta).tolist(),
+        "noise": float(gp.likelihood.noise),
+        "thresholds": np.asarray(gp.likelihood.thresholds).tolist(),
+        "nrmse": moved_by_evidence(analysis),
+    }
 
 
 def _section(material: Material, analysis: Analysis, validated, tables, pictures: Pictures, content) -> dict[str, Any]:

@@ -80,18 +80,7 @@ def simulate_power(
     `say` is told how many studies are done.
     Raises `InputError` for numbers of people or of answers that the study's rule cannot aggregate.
     """
-    if study.rule == "hierarchical" and min(plan.participants) < 2:
-        raise InputError(
-            'power: the rule "hierarchical" learns how people differ and needs two of them; ask for 2 participants or'
-            " more, or use another rule."
-        )
-    answers = max(plan.participants) * max(plan.trials)
-    if study.rule == "pooled" and answers > LARGEST_EXACT:
-        raise InputError(
-            f'power: the rule "pooled" fits one model to all answers, at most {LARGEST_EXACT:,}, and'
-            f" {max(plan.participants)} participants with {max(plan.trials)} trials give {answers:,}; ask for fewer, or"
-            " use another rule."
-        )
+    _check_rule(study.rule, plan)
     jobs = min(cores() if jobs is None else jobs, plan.studies)
     content = study.content
     blocks: dict[int, pd.DataFrame] = {}
@@ -106,6 +95,22 @@ def simulate_power(
                 blocks[work[done]] = done.result()
                 say(len(blocks))
     return pd.concat([blocks[index] for index in range(plan.studies)], ignore_index=True)
+
+
+def _check_rule(rule: str, plan: Plan) -> None:
+    """Raises InputError for numbers of people or of answers that the rule cannot aggregate."""
+    if rule == "hierarchical" and min(plan.participants) < 2:
+        raise InputError(
+            'power: the rule "hierarchical" learns how people differ and needs two of them; ask for 2 participants or'
+            " more, or use another rule."
+        )
+    answers = max(plan.participants) * max(plan.trials)
+    if rule == "pooled" and answers > LARGEST_EXACT:
+        raise InputError(
+            f'power: the rule "pooled" fits one model to all answers, at most {LARGEST_EXACT:,}, and'
+            f" {max(plan.participants)} participants with {max(plan.trials)} trials give {answers:,}; ask for fewer, or"
+            " use another rule."
+        )
 
 
 def cores() -> int:

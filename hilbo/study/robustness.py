@@ -101,13 +101,7 @@ def robustness(
     `shared`: one set of hyperparameters for all, else each participant's own. `weak_priors` keep the learnt values
     finite where 25 ordinal answers do not (`learned.runaway` says where even they ran away).
     """
-    if "variance" in learn:
-        raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
-    if study.rule in RECIPES:
-        raise InputError(
-            f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{study.rule}" has no fixed'
-            " ones; its result.json has their intervals."
-        )
+    _check(study, learn)
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)
     judged = maximise_judged(
@@ -144,6 +138,17 @@ def robustness(
         rule=rule,
         shares=shares,
     )
+
+
+def _check(study: Study, learn: Sequence[str]) -> None:
+    """Raises InputError for a study, or hyperparameters, that cannot be compared."""
+    if "variance" in learn:
+        raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
+    if study.rule in RECIPES:
+        raise InputError(
+            f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{study.rule}" has no fixed'
+            " ones; its result.json has their intervals."
+        )
 
 
 def _resampled(
