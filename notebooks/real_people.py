@@ -20,7 +20,7 @@ import pandas as pd
 import hilbo
 from hilbo import Study
 from hilbo.population.response_quality import excluded, measure_people
-from hilbo.report.figures.study import people_figure
+from hilbo.report.figures.people import people_figure
 from hilbo.search.apart import nrmse
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import cohort_of

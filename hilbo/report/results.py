@@ -290,12 +290,13 @@ def _figures(population: Population, truth: Float[np.ndarray, " d"] | None) -> d
     """Name -> figure."""
     from hilbo.report.figures import maps
     from hilbo.report.figures.effects import effects_figure
+    from hilbo.report.figures.progress import progress_figure
 
     study, aggregate = population.study, population.aggregate
     best = np.asarray(aggregate.optimum.x)
     figures = {
         "map": maps.map_slices(study, aggregate.surface, best, population.cohort),
-        "progress": maps.progress_figure(study, population, truth),
+        "progress": progress_figure(study, population, truth),
         "slices": maps.slices_after(study, population.progress),
     }
     if not on_grid(study.space):

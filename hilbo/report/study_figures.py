@@ -19,7 +19,8 @@ def study_figures(
 ) -> tuple[Figures, bool]:
     """Figures 4, 5, 6a, 7 and 8, people, individual optima and the predictive check; and whether a part of the map is
     hatched. `shares`: of `inference_data.predictive_shares`."""
-    from hilbo.report.figures import maps, study
+    from hilbo.report.figures import maps, people, study
+    from hilbo.report.figures import progress as progress_figures
     from hilbo.report.figures.effects import effects_figure
     from hilbo.report.figures.regions import class_regions
 
@@ -30,13 +31,13 @@ def study_figures(
     map_, hatched = study.sets_on_map(chosen, aggregate.surface, analysis.sets, best, cohort, prior)
     figures = {
         "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(analysis)),
-        "convergence": study.individual_convergence(chosen, cohort, progress),
+        "convergence": progress_figures.individual_convergence(chosen, cohort, progress),
         "map": map_,
         "maps-after": maps.slices_after(chosen, progress),
-        "population-convergence": study.population_convergence(progress, references),
+        "population-convergence": progress_figures.population_convergence(progress, references),
         "classes": class_regions(regions),
-        "people": study.people_figure(analysis.people, analysis.left_out),
-        "predictive": study.predictive_check(chosen.responses, *shares),
+        "people": people.people_figure(analysis.people, analysis.left_out),
+        "predictive": people.predictive_check(chosen.responses, *shares),
     }
     if not on_grid(chosen.space):
         effects = effects_of(chosen, aggregate.surface, best, analysis.population.seed)

@@ -18,6 +18,7 @@ from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.maps import RuleMap, point_rule
 from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.population.pointwise import RULES
+from hilbo.report.figures import regions
 from hilbo.report.figures import study as plotting_study
 from hilbo.report.figures.maps import Slice
 from hilbo.study import analysis
@@ -134,7 +135,7 @@ def test_readings_are_of_new_people(monkeypatch):
     monkeypatch.setattr(analysis, "tolerance_ends", lambda *args, **named: None)
     read = analysis._reading(STUDY, aggregate, 0)
     assert all(found[0] is aggregate.newcomer for found in read.tolerances.values())
-    np.testing.assert_allclose(plotting_study._probabilities(read, jnp.zeros((1, 2)))[0], chances(0.0, 3.0), rtol=1e-12)
+    np.testing.assert_allclose(regions._probabilities(read, jnp.zeros((1, 2)))[0], chances(0.0, 3.0), rtol=1e-12)
 
 
 @pytest.mark.parametrize(("prior", "hatched"), [(0.1, True), (1.0, False)])

@@ -19,7 +19,7 @@ from studies import paper_counts, plain
 from hilbo import Trials
 from hilbo.population.maps import ALL_RULES, RuleMap
 from hilbo.report.comparison import comparison_section
-from hilbo.report.figures.study import individual_convergence
+from hilbo.report.figures.progress import individual_convergence
 from hilbo.report.hypotheses import _convergence, _materials, _nearer_to_others
 from hilbo.report.study import _alternatives, _shown, _tolerances
 from hilbo.report.study_figures import comparison_figures

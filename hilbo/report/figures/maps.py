@@ -28,7 +28,6 @@ from hilbo.report.figures.style import (
     RED,
     STYLE,
     TWO_COLUMNS,
-    band,
     few_ticks,
     label_axes,
     legend,
@@ -39,7 +38,6 @@ from hilbo.report.figures.style import (
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.optima import predict_map
-from hilbo.study.population_results import Population
 from hilbo.study.progress import Progress
 
 __all__ = [
@@ -51,7 +49,6 @@ __all__ = [
     "maps_beside",
     "moved_optima",
     "optima_scatter",
-    "progress_figure",
     "sides",
     "slices_after",
 ]
@@ -131,39 +128,6 @@ def moved_optima(names: Sequence[str], moves: Float[ArrayLike, " M"], population
         axes.set_yticks(rows, [names[int(i)] for i in order], fontsize=7)
         axes.set(xlabel="NRMSE between the optima (%)", xlim=(0, None), ylim=(-0.7, len(percent) - 0.3))
         legend(figure, axes.get_legend_handles_labels()[0])
-    return figure
-
-
-def progress_figure(study: Study, population: Population, truth: Float[np.ndarray, " d"] | None = None) -> Figure:
-    """How the optima settle (left, NRMSE to the last trial's, or to the truth), and answers in the top category."""
-    progress, cohort = population.progress, population.cohort
-    trials = progress.counts
-    to_end, individual_errors = progress.to_end()
-    from_goal = to_end
-    if truth is not None:
-        from_goal = np.sqrt(np.mean((progress.population - truth) ** 2, axis=1))
-        individual_errors = np.sqrt(np.mean((progress.individual - truth) ** 2, axis=2))
-    top = (np.asarray(cohort.trials.q) == len(study.responses) - 1) & np.asarray(cohort.trials.mask)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(TWO_COLUMNS, 2.7), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        goal = "the final optimum" if truth is None else "the truth"
-        band(left, trials, 100 * individual_errors.T, BLUE, "individuals: median, quartiles")
-        left.plot(trials, 100 * from_goal, color=RED, marker="o", markersize=3, label="population map")
-        if truth is not None:
-            left.plot(trials, 100 * to_end, color=GREY, linestyle="--", label="population map, to its final optimum")
-        elif progress.splits:
-            halves = 100 * np.median(progress.halves, axis=1)
-            left.plot(trials, halves, color=GREY, linestyle="--", label="between halves of the people")
-        left.set(xlabel="trials of each participant", ylabel=f"NRMSE to {goal} (%)")
-        left.set_ylim(0, left.get_ylim()[1] * 1.25)  # room for the legend
-        left.legend(frameon=False, loc="upper right")
-        band(right, trials, np.cumsum(top, axis=1)[:, trials - 1], GREEN, "median, quartiles")
-        right.set(xlabel="trials of each participant", ylabel=f'answers "{study.responses[-1]}" so far', ylim=(0, None))
-        right.legend(frameon=False, loc="upper left")
-        few_ticks(right.yaxis, 5, integer=True)
-        for axes in (left, right):
-            few_ticks(axes.xaxis, 6, integer=True)
     return figure
 
 
