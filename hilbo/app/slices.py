@@ -44,7 +44,9 @@ class Maps:
         block = next((i for i in chosen if not state.full(i)), chosen[-1] if chosen else None)
         trust = None if block is None else progress.trust_of(state, block, self._chooser)
         if trust is not None:
-            rows.append(["Best so far", ", ".join(f"{name} {value:.3g}" for name, value in trust.best.items())])
+            parameters = ((p, trust.best[p.name]) for p in state.study.space.parameters)
+            named = (f"{p.name} {p.words(value) if p.levels else f'{value:.3g}'}" for p, value in parameters)
+            rows.append(["Best so far", ", ".join(named)])
             top = state.study.responses[-1]
             rows.append([f'… would be "{top}"', f"{100 * trust.top:.0f} %"])
             if trust.movement is not None:

@@ -32,12 +32,14 @@ from hilbo.hyperparameters.coordinates import Coordinates, Learnable, coordinate
 from hilbo.hyperparameters.cost import divisor, evidence_cost
 from hilbo.numerics.linalg import eigh, one_at_a_time
 from hilbo.numerics.newton import Expansion, TrustRegionNewton, arrives
+from hilbo.numerics.polytope import Polytope, projector, walls_of_cube
 from hilbo.numerics.shown import known, shown
 from hilbo.ordinal_gp import OrdinalGP, Trials
 
 __all__ = ["Learned", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
 
 _RUNAWAY = 6.9  # a factor of 1000: that far from where the search began there is no maximum to speak of
+_AT_A_WALL = 1e-6  # of a coordinate's range
 _FLAT = 1e-3  # curvature of the log evidence: less leaves a hyperparameter open by a factor exp(30) either way
 
 
@@ -231,25 +233,41 @@ def optimum_sensitivity(
     gp: OrdinalGP,
     from_box: Callable[[Float[Array, " d"]], Float[Array, " d"]],
     learn: Sequence[str] = ("theta", "noise", "thresholds"),
+    *,
+    walls: Polytope | None = None,
+    held: Bool[Array, " d"] | None = None,
 ) -> Coordinates:
     """How an optimum moves with the hyperparameters: d x / d(coordinate), (d, ...) in units of the search ranges.
 
-    At a maximum over the cube the gradient along free coordinates is 0, so that by the implicit function theorem
-    dw = -H^-1 d(gradient); coordinates at a wall stay there. Positive hyperparameters are on a log scale.
+    At a maximum the gradient along free directions is 0, so that by the implicit function theorem dw = -H^-1
+    d(gradient) there; what lies at a wall stays in it. Positive hyperparameters are on a log scale.
 
     **Arguments:** `height` of the map at box coordinates, given what `refit` makes of a model; its maximum `w`; the
-    model; and `from_box`, to the unit cube.
+    model; and `from_box`, to the unit cube. `walls`: those between which the maximum is sought, beside the cube's;
+    `held`: coordinates that have steps, which a small change does not move.
     """
     coordinates = coordinates_of(gp, learn)
     # Forward over forward: forward over reverse drops custom derivative rules inside a scan (docs/design.md).
     slope = jax.jacfwd(height)
-    free = (w > 1e-6) & (w < 1.0 - 1e-6)
+    free = _free_directions(w, walls, held)
     hessian = jax.jacfwd(slope)(w, refit(gp))
-    held = jnp.where(free[:, None] & free[None, :], hessian, -jnp.eye(w.shape[0], dtype=w.dtype))
-    mixed = jax.jacfwd(lambda c: jnp.where(free, slope(w, refit(model_at(c, gp))), 0.0))(coordinates)
+    along = free @ hessian @ free - (jnp.eye(w.shape[0], dtype=w.dtype) - free)
+    mixed = jax.jacfwd(lambda c: free @ slope(w, refit(model_at(c, gp))))(coordinates)
     to_unit = jax.jacfwd(from_box)(w)
 
     def moved(block):
-        return (-to_unit @ jnp.linalg.solve(held, block.reshape(w.shape[0], -1))).reshape(block.shape)
+        return (-to_unit @ jnp.linalg.solve(along, block.reshape(w.shape[0], -1))).reshape(block.shape)
 
     return jax.tree.map(moved, mixed)
+
+
+def _free_directions(
+    w: Float[Array, " d"], walls: Polytope | None, held: Bool[Array, " d"] | None
+) -> Float[Array, "d d"]:
+    """The projection onto the directions in which a maximum may move: along the walls that it lies at."""
+    inside = (w > _AT_A_WALL) & (w < 1.0 - _AT_A_WALL)
+    if walls is None:
+        return jnp.diag(inside.astype(w.dtype))
+    still = jnp.zeros_like(inside) if held is None else held
+    around = walls_of_cube(walls, still, w)
+    return projector(around.normals, around.offsets <= _AT_A_WALL) * (~still).astype(w.dtype)[None, :]

@@ -114,7 +114,9 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
 def _warnings(check, stacked):
     """What the learnt hyperparameters themselves say against the comparison, in sentences."""
     converged, runaway = stacked
-    theta = float(np.median(check.learned.gp.kernel.theta))
+    kernel = check.learned.gp.kernel
+    of_numbers = np.array(kernel.levels) == 0 if kernel.levels else ...
+    theta = float(np.median(np.asarray(kernel.theta)[of_numbers]))
     alike = float(np.exp(-theta * _TENTH**2))
     sentences = []
     if alike < _UNRELATED:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
+from hilbo.search.apart import differences
 from hilbo.session.selection import Design, point_apart
 from hilbo.session.warm_start import WarmStart, warm_point
 from hilbo.study.config import Study
@@ -27,7 +28,7 @@ def is_near(study: Study, point: Float[np.ndarray, " d"], excluded: Float[np.nda
     if not len(excluded):
         return False
     unit = _to_unit(study, np.concatenate([excluded, np.asarray(point)[None]]))
-    return bool(np.min(np.linalg.norm(unit[:-1] - unit[-1], axis=1)) < APART)
+    return bool(np.min(np.linalg.norm(differences(study.gp.kernel.levels, unit[:-1], unit[-1]), axis=1)) < APART)
 
 
 def spread_point(
@@ -36,7 +37,7 @@ def spread_point(
     """A space-filling point in place of an excluded one: the candidate farthest from all points, physical units."""
     candidates = study.space.candidates(_SPREAD, seed)
     taken = _to_unit(study, np.concatenate([others, excluded]))
-    distance = np.linalg.norm(candidates[:, None] - taken[None], axis=2)
+    distance = np.linalg.norm(differences(study.gp.kernel.levels, candidates[:, None], taken[None]), axis=2)
     return np.asarray(study.space.to_physical(candidates[int(distance.min(axis=1).argmax())]))
 
 

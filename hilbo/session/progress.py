@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hilbo.numerics.tracing import program
+from hilbo.search.apart import nrmse
 from hilbo.session.look_ahead import Answers, LiveChooser
 from hilbo.session.state import LiveSession
 from hilbo.session.step import Fitted
@@ -61,7 +62,7 @@ def trust(
     if upcoming is None:
         return Trust(named, float(top[-1]), None)
     units = np.asarray(_units(study, bests))
-    moved = np.sqrt(np.mean((units[1:] - units[0]) ** 2, axis=1))
+    moved = np.asarray(nrmse(units[1:], units[0], study.gp.kernel.levels))
     return Trust(named, float(top[-1]), float(chances @ moved))
 
 

@@ -18,6 +18,7 @@ from hilbo import acquisition
 from hilbo.kernels import gram
 from hilbo.numerics.climbing import Choice, climb, spread
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
+from hilbo.search.apart import differences
 from hilbo.search.candidates import CANDIDATES, search_points
 from hilbo.search.lattice import Lattice, nodes_for, screen, screen_points
 from hilbo.search.space import SearchSpace
@@ -96,7 +97,7 @@ def point_after(
     allowed = None
     if distance:
         points, usable = _searched(plan, _JOINT_CANDIDATES if thompson else None)
-        allowed = _apart_from(posterior.trials, points, usable, distance)
+        allowed = _apart_from(study.gp.kernel.levels, posterior.trials, points, usable, distance)
     if thompson:
         return _thompson_point(posterior, plan, trial, allowed)
     return _highest(study, plan, posterior, _score(study, posterior, weight), allowed).x
@@ -108,7 +109,7 @@ def point_apart(
     """The highest UCB (d,) at least `apart` from the points `excluded`, all in the unit cube; traceable."""
 
     def allowed(x):
-        return jnp.all(jnp.sum((excluded - x[None, :]) ** 2, axis=1) >= apart**2)
+        return jnp.all(jnp.sum(differences(study.gp.kernel.levels, excluded, x[None, :]) ** 2, axis=1) >= apart**2)
 
     return _highest(study, plan, posterior, acquisition.UCB(study.selection.weight), allowed).x
 
@@ -160,14 +161,19 @@ def _searched(plan: Design, count: int | None) -> tuple[Float[Array, "m d"], Boo
 
 
 def _apart_from(
-    trials: Trials, points: Float[Array, "m d"], usable: Bool[Array, " m"], distance: float
+    levels: tuple[int, ...],
+    trials: Trials,
+    points: Float[Array, "m d"],
+    usable: Bool[Array, " m"],
+    distance: float,
 ) -> Callable[[Float[Array, " d"]], Bool[Array, ""]]:
     """Whether a point keeps the distance to every earlier trial; where none of the usable points does, whether it is as
     far from all trials as one of them can be."""
 
     def gap(x: Float[Array, " d"]) -> Float[Array, ""]:
         """Squared distance to the nearest trial."""
-        return jnp.min(jnp.where(trials.mask, jnp.sum((trials.x - x[None, :]) ** 2, axis=1), jnp.inf))
+        away = differences(levels, trials.x, x[None, :])
+        return jnp.min(jnp.where(trials.mask, jnp.sum(away**2, axis=1), jnp.inf))
 
     farthest = jnp.max(jnp.where(usable, jax.vmap(gap)(points), 0.0))
     rounding = 1.0 - 8.0 * jnp.finfo(trials.x.dtype).eps

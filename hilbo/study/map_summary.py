@@ -28,6 +28,7 @@ from hilbo import acquisition
 from hilbo.errors import InputError
 from hilbo.numerics.climbing import Choice
 from hilbo.numerics.tracing import program
+from hilbo.search.apart import differences
 from hilbo.study.config import Study
 
 __all__ = ["End", "Predict", "Sets", "Tolerance", "best_mid_worst", "dominant", "slice_through", "tolerance"]
@@ -90,7 +91,10 @@ def best_mid_worst(
     worst = minima[int(np.argmin(np.where(usable, depth, np.inf)))]
     ends = jnp.stack([best, worst])
     middle = jnp.mean(_mean_and_sd(predict, ends)[0])
-    far = jnp.min(jnp.linalg.norm(candidates[:, None] - ends[None], axis=-1), axis=1) >= apart
+    far = (
+        jnp.min(jnp.linalg.norm(differences(study.gp.kernel.levels, candidates[:, None], ends[None]), axis=-1), axis=1)
+        >= apart
+    )
     fits = np.asarray(far & (sd <= limit))
     if not fits.any():
         raise InputError(
@@ -197,7 +201,8 @@ def _minima(
     rows = []
     while len(rows) < _STARTS and np.isfinite(left).any():
         rows.append(int(left.argmin()))
-        left[np.linalg.norm(points - points[rows[-1]], axis=1) < _SEPARATE] = np.inf
+        away = differences(study.gp.kernel.levels, points, points[rows[-1]])
+        left[np.linalg.norm(away, axis=1) < _SEPARATE] = np.inf
     if not rows:
         return candidates[:0]
     padded = rows + [rows[0]] * (_STARTS - len(rows))  # one shape, one compilation

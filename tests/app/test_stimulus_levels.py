@@ -6,6 +6,8 @@ from live_stimulus import SETS, SINGLE, LiveLevels
 
 from hilbo.app.lines import lines_of
 from hilbo.app.log_words import table
+from hilbo.app.robot import browser, find_browser
+from hilbo.app.slices import Maps
 from hilbo.session.export import sets_table, trials_table
 from hilbo.session.records import Block
 from hilbo.study.cohort import cohort_of
@@ -74,3 +76,37 @@ def test_lines_have_the_names():
     said = {"parameters": [{"name": "texture", "levels": list(LEVELS)}], "values": {"texture": LEVELS[2], "hue": 1.5}}
     lines = lines_of(200, said).splitlines()
     assert lines[1:] == ["levels\ttexture\tsilk\twood\tsmooth stone", "value\ttexture\tsmooth stone", "value\thue\t1.5"]
+
+
+@pytest.mark.deep  # it starts a browser
+@pytest.mark.skipif(find_browser() is None, reason="needs playwright and Chromium (Debian: chromium)")
+def test_the_preparer_chooses_among_the_names(tmp_path):
+    by, blocks = 'by = "person"\nexperimenter_sees = true\n', (Block("optimisation", 4),)
+    with LiveLevels(tmp_path, within=600.0, more=by, blocks=blocks, maps=Maps) as live, browser() as program:
+        page = program.new_context(viewport={"width": 1024, "height": 768}).new_page()
+        page.goto(live.place.link("preparer"))
+        page.wait_for_url("**/preparer")
+        chosen = []
+
+        def acted():
+            view, phase = live.view(), page.evaluate("document.body.dataset.phase")
+            if view["may"]["begin"]:
+                live.participant.post("/api/participant/begin", {})
+            elif view["questions"]:
+                live.answer(view)
+            if phase in ("ready", "present", "away"):
+                page.wait_for_timeout(350)
+                if phase == "present" and page.evaluate("order.show") == "test":
+                    assert page.locator("#setting select option").all_inner_texts() == list(LEVELS)
+                    chosen.append(page.locator("#setting select").input_value())
+                    page.screenshot(path=tmp_path / "preparer.png")
+                page.click("#go")
+            return view
+
+        live.until(lambda view: view["phase"] == "done", acted)
+        experimenter = program.new_context(viewport={"width": 1440, "height": 900}).new_page()
+        experimenter.goto(live.place.link("experimenter"))
+        experimenter.wait_for_selector("#log li")
+        experimenter.wait_for_timeout(1500)
+        experimenter.screenshot(path=tmp_path / "experimenter.png", full_page=True)
+        assert [LEVELS[int(e.data["values"]["texture"])] for e in live.events("sent")] == chosen and len(chosen) == 4

@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from hilbo.errors import InputError
 from hilbo.hyperparameters import maximum_evidence as hyper
 from hilbo.hyperparameters.coordinates import coordinates_of, log_prior, model_at
+from hilbo.numerics.polytope import Polytope
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
@@ -186,3 +187,40 @@ def test_one_threshold_alone_is_learnt():
     learned = hyper.maximise_evidence(gp, trials, ("thresholds",), weak_priors=True, starts=1)
     assert bool(learned.converged)
     assert -2.0 < float(learned.gp.likelihood.thresholds[0]) < -0.1
+
+
+WALL = Polytope(np.array([[0.6, 0.8, 0.0]]), np.array([1.0]))
+HELD = np.array([False, False, True])
+
+
+def test_free_directions_are_along_the_walls_and_change_no_step():
+    across, along = np.array([0.6, 0.8, 0.0]), np.array([0.8, -0.6, 0.0])
+    for w, expected in (
+        ([0.2, 0.3, 0.5], np.diag([1.0, 1.0, 0.0])),
+        ([0.6, 0.8, 0.5], np.outer(along, along)),
+        ([1.0, 0.5, 0.5], np.zeros((3, 3))),
+        ([0.0, 0.5, 0.5], np.diag([0.0, 1.0, 0.0])),
+    ):
+        free = hyper._free_directions(jnp.array(w), Polytope(*map(jnp.asarray, WALL)), jnp.asarray(HELD))
+        np.testing.assert_allclose(free, expected, atol=1e-12)
+    np.testing.assert_allclose(across @ along, 0.0, atol=1e-15)
+
+
+def test_an_optimum_at_a_linear_wall_moves_along_it_and_steps_do_not_move():
+    gp = OrdinalGP(RBF(4.0), OrdinalProbit((-0.5, 0.5), 0.5))
+    sharp, way = np.array([[4.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 0.0]]), np.array([0.3, -0.1, 0.4])
+
+    def height(w, top):
+        return -0.5 * (w - top) @ sharp @ (w - top)
+
+    def refit(model):
+        return jnp.array([0.7, 0.9, 0.5]) + way * (jnp.log(model.kernel.theta) - jnp.log(4.0))
+
+    def moved(w):
+        between = {"walls": Polytope(*map(jnp.asarray, WALL)), "held": jnp.asarray(HELD)}
+        return hyper.optimum_sensitivity(height, refit, jnp.array(w), gp, lambda w: w, ("theta",), **between)["theta"]
+
+    along = np.array([0.8, -0.6, 0.0])  # on the wall only what is along it counts
+    expected = along * (along @ sharp @ way) / (along @ sharp @ along)
+    np.testing.assert_allclose(moved([0.6, 0.8, 0.5]), expected, atol=1e-12)
+    np.testing.assert_allclose(moved([0.2, 0.3, 0.5]), way * np.array([1.0, 1.0, 0.0]), atol=1e-12)

@@ -71,11 +71,11 @@ function drawSlice(canvas, slice, across, up, range) {
   const value = (p, u) => last(p) > 0 ? p.levels[Math.round(last(p) * u)] : Number((p.scale === "log" ? p.low * (p.high / p.low) ** u : p.low + (p.high - p.low) * u).toPrecision(2));
   for (const u of ticks(across)) {
     c.textAlign = u === 0 ? "left" : u === 1 ? "right" : "center";
-    c.fillText(value(across, u), x + u * side, y + side + 1.2 * text);
+    c.fillText(value(across, u), x + u * side, y + side + 1.2 * text, side / ticks(across).length);
   }
   c.textAlign = "right";
   for (const u of ticks(up)) {
-    c.fillText(value(up, u), x - 5, y + (1 - u) * side + (u === 1 ? .8 * text : u === 0 ? 0 : .35 * text));
+    c.fillText(value(up, u), x - 5, y + (1 - u) * side + (u === 1 ? .8 * text : u === 0 ? 0 : .35 * text), left - 1.2 * text);
   }
   const label = (p) => p.name + (p.unit ? ` (${p.unit})` : "");
   c.font = `600 ${text}${font}`; c.textAlign = "center";

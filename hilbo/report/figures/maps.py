@@ -195,6 +195,8 @@ def map_panels(study: Study, grids):
         axes.pcolormesh(first, second, mean, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
         if np.isnan(mean).all() or min(mean.shape) < 2:  # nothing may be rendered, or nothing is between the steps
             return
+        if any(p.levels for p in study.space.parameters[:2]):  # between levels there is nothing
+            return
         if np.nanmax(mean) > np.nanmin(mean):
             axes.contour(first, second, mean, levels=_MEANS, colors="white", linewidths=0.4, linestyles="solid")
         if np.nanmax(sd) > np.nanmin(sd):
