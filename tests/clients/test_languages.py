@@ -14,7 +14,7 @@ import time
 import pytest
 from client_programs import each_language, hung, sources
 from killed_session import PATIENCE, Session
-from live_stimulus import CLIENTS, SETS, LiveLevels, LiveStimulus
+from live_stimulus import CLIENTS, SETS, SINGLE, LiveLevels, LiveStimulus, all_answered
 
 from hilbo.study.config import Study
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
