@@ -39,6 +39,7 @@ __all__ = ["LargeAggregate", "aggregate_population", "optima_from", "optimum_nea
 _STEPS = 60
 _STATIONARY, _RESOLUTION = 1e-8, 1e-6  # as a session's optimum: gradient, and radius at a kink of the passive set
 _STARTS, _APART = 3, 0.1
+_MOST_STEPS = 20  # rounds, each of which asks all people
 _PILOT, _PILOT_SHARE = 1000, 20  # people asked first by another inference: so many, or this part of all,
 _FEWEST = 50  # and nobody if that is too few
 _SETTLED = 0.003  # of the search ranges: a Newton step of this size leaves an error of its square over a lengthscale
@@ -133,7 +134,32 @@ def optima_from(
         candidate = _optimum_at(
             population.study, candidates[top], mean, variance, _variance_apart(population.study, rule, population.share)
         )
-        best[rule] = max([candidate, *usable], key=lambda optimum: float(optimum.mean))
+        best[rule] = _by_steps(population, max([candidate, *usable], key=_height), rule)
+    return best
+
+
+def _height(optimum: Optimum) -> float:
+    return float(optimum.mean)
+
+
+def _by_steps(population: Population, best: Optimum, rule: Rule) -> Optimum:
+    """From an optimum the highest of those a step of whole numbers or levels away, polished, until none is higher."""
+    study, neighbours = population.study, population.study.space.searched.get("neighbours")
+    if neighbours is None:
+        return best
+    for _ in range(_MOST_STEPS):
+        near = np.asarray(neighbours(jnp.asarray(best.x)))
+        prior = np.asarray(jax.vmap(study.gp.kernel.diagonal)(jnp.asarray(near)))
+        totals = sums(population, near, "participants, trying steps nearby")
+        mean, variance = totals.merge(prior, population.people, rule, population.share)
+        top = int(np.argmax(np.where(np.asarray(_feasible(study, near)), mean, -np.inf)))
+        if mean[top] <= best.mean:
+            break
+        apart = _variance_apart(study, rule, population.share)
+        step = _optimum_at(study, near[top], mean[top], variance[top], apart)
+        (polished,) = optimum_near(population, near[top : top + 1], (rule,))
+        allowed = bool(np.asarray(_feasible(study, np.asarray(polished.x)[None, :]))[0])
+        best = max([step, polished] if allowed else [step], key=_height)
     return best
 
 

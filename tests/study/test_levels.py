@@ -19,7 +19,11 @@ from hilbo.search.apart import differences, middle_of, nrmse
 from hilbo.search.rendering import set_of
 from hilbo.simulation.presets import population_of
 from hilbo.simulation.simulate import people
+from hilbo.study import distributed
 from hilbo.study.aggregate import aggregate_cohort
+from hilbo.study.batch import population_of as population_of_many
+from hilbo.study.batch import refit
+from hilbo.study.batch_optimum import optima_from
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
 from hilbo.study.hills import hills_of
@@ -235,3 +239,16 @@ def test_renderings_of_other_files_are_named_or_placed():
     for wrong, words in (("glass", "it must be one of silk, wood, stone"), (0.5, "which is no level"), (3.0, "0 to 2")):
         with pytest.raises(InputError, match=words):
             check_values(good | {"texture": wrong}, parameters, "f", "the best")
+
+
+@pytest.mark.deep  # it compiles the search of many people
+def test_a_streamed_optimum_tries_the_other_levels():
+    study = surfaces()
+    cohort = cohort_of(pd.concat([answers(), answers().assign(participant="B")]), study)
+    points = np.asarray(study.space.candidates(300, 0))
+    best = aggregate_cohort(study, cohort, alternatives=False).optimum
+    elsewhere = points[points[:, 1] != float(best.x[1])]
+    fitted = refit(population_of_many(study, cohort, distributed.alone()), elsewhere, False)
+    found = optima_from(fitted.population, elsewhere, fitted.sums)["bcm"]
+    assert float(found.x[1]) == float(best.x[1])
+    assert float(found.mean) == pytest.approx(float(best.mean), abs=1e-6)
