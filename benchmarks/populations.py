@@ -26,6 +26,7 @@ jax.config.update("jax_enable_x64", True)
 import equinox as eqx  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from pages import put  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
 from rows import Rows  # noqa: E402
 
@@ -42,9 +43,7 @@ from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
 from hilbo.study.optima import individual_optima, map_optimum  # noqa: E402
 from hilbo.study.optimum_region import optimum_region  # noqa: E402
 
-ROOT = Path(__file__).parents[1]
 RULES = ("learnt-2", "learnt-1", "centre of its hill", "bcm", "average", "mean of the individual optima")
-LARGE = 0.05  # a regret of the committee machine that is worth fixing
 
 
 def main():
@@ -171,51 +170,87 @@ def highest(study, chance, candidates):
     ).x
 
 
-def paired(rows, rule, measure="regret"):
-    values = np.array([row["rules"][rule][measure] for row in rows])
-    return values, np.array([row["rules"]["bcm"][measure] for row in rows]) - values
+GROUPS = {
+    "`paper-01` to `paper-30`": lambda name: name[6:].isdigit(),
+    "`paper-individuals` and its variants": lambda name: not name[6:].isdigit() and not name.startswith("functions"),
+    "functions drawn": lambda name: name.startswith("functions"),
+    "all": lambda name: True,
+}
+ENOUGH = 10  # studies for a row of a population's own
 
 
-def error(values):
-    return values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else float("nan")
+def interval(values, digits=3):
+    """The mean with its standard error over studies."""
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
+    return f"{values.mean():.{digits}f} ± {error:.{digits}f}"
 
 
-def table(rows, design):
-    """A row for each population: regret of every rule, and what learnt-2 gains on the committee, with its interval."""
-    lines = [
-        "| population | studies | " + " | ".join(RULES) + " | bcm less learnt-2, 95 % | learnt-2: NRMSE to the best |",
-        "|---|---:|" + "---:|" * (len(RULES) + 2),
+def values_of(rows, rule, measure="regret"):
+    return np.array([row["rules"][rule][measure] for row in rows])
+
+
+def tables(rows):
+    """Of the rows of one design: regret by rule, paired differences, and what the recommended recipe says of itself."""
+    parts = {group: [row for row in rows if belongs(row["population"])] for group, belongs in GROUPS.items()}
+    own = {name: [row for row in rows if row["population"] == name] for name in POPULATIONS}
+    parts = {name: part for name, part in parts.items() if len(part) > 1}
+    parts |= {f"`{name}`": part for name, part in own.items() if len(part) >= ENOUGH}
+    return "\n\n".join((regrets(parts), differences(parts), itself(parts)))
+
+
+def lined(heads, lines):
+    marks = "|---|" + "---:|" * (len(heads) - 1)
+    return "\n".join(["| " + " | ".join(heads) + " |", marks, *("| " + " | ".join(line) + " |" for line in lines)])
+
+
+def regrets(parts):
+    heads = ["regret: populations", "studies", *RULES]
+    return lined(
+        heads,
+        ([name, str(len(part)), *(interval(values_of(part, rule)) for rule in RULES)] for name, part in parts.items()),
+    )
+
+
+def differences(parts):
+    """Paired: what the recommended recipe loses less, with its 95 % interval, and distances."""
+    others = ("learnt-1", "bcm", "average")
+    heads = ["studies of", *(f"{other} less {RECOMMENDED}, 95 %" for other in others), "NRMSE to the best, median"]
+    lines = []
+    for name, part in parts.items():
+        cells = [name]
+        for other in others:
+            gain = values_of(part, other) - values_of(part, RECOMMENDED)
+            half = 1.96 * gain.std(ddof=1) / np.sqrt(len(gain))
+            cells.append(f"{gain.mean():+.3f} [{gain.mean() - half:+.3f}, {gain.mean() + half:+.3f}]")
+        far = {rule: 100 * np.median(values_of(part, rule, "nrmse")) for rule in (RECOMMENDED, "bcm")}
+        lines.append([*cells, f"{far[RECOMMENDED]:.1f} % (bcm {far['bcm']:.1f} %)"])
+    return lined(heads, lines)
+
+
+def itself(parts):
+    """Whether the 95 % region held the best rendering, its volume, and what was promised less what is so."""
+    heads = [
+        "studies of",
+        "the region held the best",
+        "its volume, mean",
+        "promised less true P(highest)",
+        "not converged",
     ]
-    for name in POPULATIONS:
-        some = [
-            row for row in rows if row["population"] == name and row["design"] == design and RECOMMENDED in row["rules"]
-        ]
-        if len(some) < 2:
-            continue
-        cells = []
-        for rule in RULES:
-            values = np.array([row["rules"][rule]["regret"] for row in some if rule in row["rules"]])
-            cells.append(f"{values.mean():.3f} ± {error(values):.3f}" if len(values) > 1 else "–")
-        _, gain = paired(some, RECOMMENDED)
-        low, high = gain.mean() - 1.96 * error(gain), gain.mean() + 1.96 * error(gain)
-        nrmse = 100 * np.median([row["rules"][RECOMMENDED]["nrmse"] for row in some])
-        of_bcm = 100 * np.median([row["rules"]["bcm"]["nrmse"] for row in some])
-        ends = f"{gain.mean():.3f} [{low:.3f}, {high:.3f}]"
-        lines.append(f"| {name} | {len(some)} | {' | '.join(cells)} | {ends} | {nrmse:.1f} % (bcm {of_bcm:.1f} %) |")
-    return "\n".join(lines)
+    lines = []
+    for name, part in parts.items():
+        held = [row["region"]["holds"] for row in part]
+        volume = np.mean([row["region"]["volume"] for row in part])
+        promised = np.array([row["said"] - row["is"] for row in part])
+        failed = sum(not row["converged"] for row in part)
+        share = f"{sum(held)} of {len(held)} ({100 * np.mean(held):.0f} %)"
+        lines.append([name, share, f"{100 * volume:.0f} %", interval(promised), str(failed)])
+    return lined(heads, lines)
 
 
 def write(rows):
-    page = ROOT / "docs" / "methods" / "which_method.md"
-    text = page.read_text()
-    for design in sorted({row["design"] for row in rows}, reverse=True):
-        mark = f"<!-- {design} -->"
-        if mark not in text:
-            text = text.rstrip("\n") + f"\n\n### {design}\n\n{mark}\n<!-- end -->\n"
-        before, _, rest = text.partition(mark)
-        _, _, after = rest.partition("<!-- end -->")
-        text = f"{before}{mark}\n{table(rows, design)}\n<!-- end -->{after}"
-    page.write_text(text)
+    for design in sorted({row["design"] for row in rows}):
+        text = tables([row for row in rows if row["design"] == design])
+        put("methods/which_method.md", f"populations {design}", text)
 
 
 if __name__ == "__main__":

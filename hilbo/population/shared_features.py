@@ -23,7 +23,7 @@ __all__ = ["TOLERANCE", "Pivots", "features_of", "pivots_of", "rank_for", "root_
 
 TOLERANCE = 1e-6
 """Largest part of the prior variance of g that the features may leave at an answered point."""
-_RANKS = (32, 64, 128, 256, 512, 1024)
+_RANKS = (32, 64, 128, 256, 640, 1024)  # 640: all points of 24 people with 25 answers
 
 
 class Pivots(NamedTuple):
