@@ -31,6 +31,10 @@ class Nothing(Hub):
     def publish(self) -> None:
         """No news."""
 
+    def text(self, key: str) -> str:
+        """No words but their key."""
+        return key
+
     def view(self, role: str) -> dict[str, Any]:
         """What there is to see."""
         return {"role": role}

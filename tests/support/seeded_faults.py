@@ -77,7 +77,7 @@ FAULTS = (
     ),
     Fault(
         "an undone answer still counts",
-        "hilbo/session/state.py",
+        "hilbo/session/transitions.py",
         'state = _taken_out(state, trial, status="undone")',
         'state = _taken_out(state, trial, status="answered")',
         "tests/session",
