@@ -113,8 +113,8 @@ FAULTS = (
     Fault(
         "a program's renderings are shown before they are confirmed",
         "hilbo/session/actions.py",
-        "and show not in found.confirmed:",
-        "and show not in found.renderings:",
+        "and show not in pending.confirmed:",
+        "and show not in pending.renderings:",
         "tests/session/test_confirmed.py",
     ),
     Fault(
@@ -134,7 +134,7 @@ FAULTS = (
     Fault(
         "a program that is not neutral in time is believed",
         "hilbo/app/stimulus_rig.py",
-        'self._on("neutral", said.neutral_within_s + _TRAVEL, words)',
+        'self._on("neutral", program.neutral_within_s + _TRAVEL, words)',
         'self._off("neutral")',
         "tests/app/test_stimulus.py",
     ),
