@@ -35,8 +35,8 @@ def print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> No
         passive = f"{'yes' if margin >= 0 else 'no'}, {margin:+.3f}"
         table.add_row(name, f"{100 * miss['nrmse']:.1f} %", f"{100 * miss['nrmse_with_K0']:.1f} %", passive, paper)
 
-    row("population (BCM)", "aggregate", simulated["optimum"], "4 %, yes")
-    row(f"population ({RECOMMENDED})", RECOMMENDED, simulated["alternatives"][RECOMMENDED], "")
+    row("map by bcm", "aggregate", simulated["optimum"], "4 %, yes")
+    row(f"map by {RECOMMENDED}", RECOMMENDED, simulated["alternatives"][RECOMMENDED], "")
     q, qk = truth["individuals"]["quartiles"], truth["individuals"]["with_K0"]
     spread = [f"{100 * v[1]:.0f} % ({100 * v[0]:.0f}–{100 * v[2]:.0f})" for v in (q, qk)]
     margins = [person["optimum"]["passivity_margin"] for person in simulated["participants"]]
