@@ -256,7 +256,7 @@ def _map(path: Path, study: Study) -> Path:
         x = np.asarray(x)
         return x.sum(axis=1) - 1.5, 0.1 + 0.2 * x[:, 0]
 
-    grid = map_dataset(study, surface, study.space.to_unit(np.ones(study.space.dim)), 5)
+    grid = map_dataset(study, surface, 5)
     write_map(grid.assign_attrs(rule="bcm"), path)
     return path
 
