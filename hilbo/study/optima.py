@@ -127,7 +127,7 @@ def _map_optimum(
         values = predict_map(map_.astype(single), candidates.astype(single))[0]
         return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, values, map_.apart)
 
-    def chance(mean, variance):
+    def height(mean, variance):
         if map_.caution:
             return mean - map_.caution * jnp.sqrt(variance)
         return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
@@ -138,8 +138,8 @@ def _map_optimum(
     def within_reach(x):
         return map_.predict(x[None, :])[1][0] <= largest_variance
 
-    values = chance(*map_.predict(candidates))
-    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, chance, within_reach, map_.widths)
+    values = height(*map_.predict(candidates))
+    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, height, within_reach, map_.widths)
 
 
 def _optimum(
