@@ -7,7 +7,7 @@ import pytest
 from jinja2 import UndefinedError
 from studies import plain_study
 
-from hilbo.report.page import rendered
+from hilbo.report.page import _environment, rendered
 from hilbo.report.robustness import robustness_page
 from hilbo.search.rendering import set_of
 
@@ -75,3 +75,11 @@ def test_the_page_of_a_robustness_check():
     own = robust(shared=False, nrmse=0.03)
     assert "each person's own" in own.replace("&#39;", "'") and "[gp]" not in own
     assert "which is 3 % or more: it is not robust" in own and "the shift is more than that" in own
+
+
+def test_a_sentence_in_a_table_wraps_and_a_number_does_not():
+    """A sentence on one line would end beyond the right edge of the page."""
+    row = (
+        _environment().get_template("parts.html").module.row(["hierarchical", "4.07", "an extrapolation: " + "x " * 20])
+    )
+    assert row.count("<td") == 2 and row.count('<td class="n">') == 1 and '<td class="n">4.07' in row
