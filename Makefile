@@ -9,9 +9,9 @@ PYTEST_ARGS ?=
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.hilbo-setup
 DOCS_STAMP := $(VENV)/.hilbo-docs
-# Installed quietly first. Where that fails, after pauses and aloud: a registry may have been silent for a moment (pip then takes
-# a version for one that does not exist), and pip says which requirements are in conflict only when it may speak.
-PAUSES ?= 20 60 180 600
+# Installed quietly first. Where that fails, after pauses and aloud: a registry may have been silent for a moment, and pip says which
+# requirements are in conflict only when it may speak.
+PAUSES ?= 20 180
 PIP = $(BIN)/pip install --disable-pip-version-check -c constraints.txt -e '$(WHAT)'
 PATIENTLY = $(PIP) --quiet || { for pause in $(PAUSES); do sleep $$pause; $(PIP) && exit; done; exit 1; }
 $(STAMP): WHAT = .[dev,hardware,live,browser]
