@@ -12,8 +12,9 @@ import numpy as np
 from run_tasks import once
 
 from hilbo.hyperparameters.maximum_evidence import maximise_evidence
+from hilbo.likelihoods import OrdinalTerms
 from hilbo.numerics.linalg import cholesky, solve_lower
-from hilbo.ordinal_gp import OrdinalTerms, Trials, fit
+from hilbo.ordinal_gp import Trials, fit
 
 
 def floors(rounds, scene):

@@ -30,7 +30,8 @@ def tasks():
     from hilbo.acquisition import UCB
     from hilbo.kernels import gram
     from hilbo.laplace import _whitened_mode, plain_mode
-    from hilbo.ordinal_gp import OrdinalTerms, fit
+    from hilbo.likelihoods import OrdinalTerms
+    from hilbo.ordinal_gp import fit
     from hilbo.search import lattice
     from hilbo.search.space_lattice import lattice_of
 

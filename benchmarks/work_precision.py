@@ -33,7 +33,8 @@ from hilbo import RBF, OrdinalGP, OrdinalProbit, Study, Trials, fit  # noqa: E40
 from hilbo.inference.ep import ep  # noqa: E402
 from hilbo.inference.exact import exact  # noqa: E402
 from hilbo.kernels import gram  # noqa: E402
-from hilbo.ordinal_gp import Posterior, TiltedTerms  # noqa: E402
+from hilbo.likelihoods import TiltedTerms  # noqa: E402
+from hilbo.ordinal_gp import Posterior  # noqa: E402
 from hilbo.study.cohort import cohort_of  # noqa: E402
 from hilbo.study.trial_table import read_trials  # noqa: E402
 

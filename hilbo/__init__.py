@@ -35,6 +35,7 @@ _names, __dir__, __all__ = lazy_loader.attach(
         "simulation",
         "statistics",
         "study",
+        "trials",
         "viscoelastic",
     ],
     submod_attrs={
@@ -71,6 +72,7 @@ if TYPE_CHECKING:  # the same names for type checkers and editors; a test compar
     from hilbo import simulation as simulation
     from hilbo import statistics as statistics
     from hilbo import study as study
+    from hilbo import trials as trials
     from hilbo import viscoelastic as viscoelastic
     from hilbo.errors import InputError as InputError
     from hilbo.ordinal_gp import RBF as RBF

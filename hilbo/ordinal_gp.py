@@ -1,12 +1,11 @@
-"""Gaussian process with an ordinal likelihood: the model of one participant, its data and its posterior.
+"""Gaussian process with an ordinal likelihood: the model of one participant, and its posterior given the answers.
 
     gp        = OrdinalGP(kernel=RBF(theta=30.0, variance=1.0), likelihood=OrdinalProbit((-0.5, 0.5), noise=0.5))
     trials    = Trials.from_arrays(x, q)
     posterior = fit(gp, trials)
     mean, variance = posterior.predict(x_new)
 
-Trials are padded to a capacity and masked, so that a session that grows from 0 to 25 answers compiles once. Everything
-is a pytree: `jax.vmap(fit)` over stacked trials fits all participants, `jax.grad` through `fit` is exact.
+Everything is a pytree: `jax.vmap(fit)` over stacked trials fits all participants, `jax.grad` through `fit` is exact.
 Reference: paper, section IV.
 """
 
@@ -20,7 +19,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike, DTypeLike
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from hilbo.errors import InputError
 from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained, shortfall
@@ -29,11 +28,11 @@ from hilbo.inference.ep_corrected import ep_corrected
 from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, Stationary, gram
 from hilbo.laplace import laplace
-from hilbo.likelihoods import OrdinalProbit
+from hilbo.likelihoods import OrdinalProbit, OrdinalTerms, TiltedTerms
 from hilbo.numerics.shown import concrete, known, numbers, shown
-from hilbo.numerics.tracing import traced_once
+from hilbo.trials import Trials
 
-__all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "OrdinalTerms", "Posterior", "Trials", "fit"]
+__all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
 
 
 def __dir__() -> list[str]:
@@ -48,7 +47,6 @@ _SOUGHT = {
 }
 _PointsLike = ArrayLike | Sequence[Sequence[float]]
 _CACHED, _PARTS = 2**16, 8  # covariances held at a time when many points are predicted, in at most so many parts
-_BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
 
 
 class InferenceError(RuntimeError):
@@ -68,115 +66,6 @@ class OrdinalGP(eqx.Module):
 
     def __repr__(self) -> str:
         return f"OrdinalGP({self.kernel!r}, {self.likelihood!r})"
-
-
-class Trials(eqx.Module):
-    """Answers of one participant, padded to a fixed capacity.
-
-    `x` (capacity, d) are the asked points in the unit cube, `q` (capacity,) the categories 0..C-1, `mask` says which
-    rows hold an answer. Rows without an answer have no influence whatever they contain.
-    """
-
-    x: Float[Array, "n d"]
-    q: Int[Array, " n"]
-    mask: Bool[Array, " n"]
-
-    @classmethod
-    def from_arrays(cls, x: ArrayLike, q: ArrayLike, capacity: int | None = None) -> "Trials":
-        """Trials from points `x` (n, d) and categories `q` (n,).
-
-        `capacity` defaults to n rounded up to a multiple of 32. Raises `InputError` for shapes that do not match,
-        values that are not finite, categories that are not integers >= 0, or a capacity below n.
-        """
-        points, answers = np.asarray(x), np.asarray(q)
-        _check_arrays(points, answers)
-        count = len(points)
-        capacity = max(_BLOCK * -(-count // _BLOCK), _BLOCK) if capacity is None else capacity
-        if capacity < max(count, 1):
-            raise InputError(f"Trials: capacity is {capacity}, but {count} answers need at least {count or 1}.")
-        dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(float)
-        padded = np.zeros((capacity, points.shape[1]), jax.dtypes.canonicalize_dtype(dtype))
-        categories = np.zeros(capacity, np.int32)
-        padded[:count], categories[:count] = points, answers
-        return cls(jnp.asarray(padded), jnp.asarray(categories), jnp.arange(capacity) < count)
-
-    def __repr__(self) -> str:
-        if not known(self.x, self.mask):
-            return eqx.tree_pformat(self)
-        people = f"{self.x.shape[0]} people, " if self.mask.ndim == 2 else ""
-        return (
-            f"Trials({people}{int(self.mask.sum())} answers, {self.x.shape[-1]} parameters, room for {self.capacity})"
-        )
-
-    @classmethod
-    def empty(cls, capacity: int, dim: int) -> "Trials":
-        """No answers yet, room for `capacity` of them."""
-        return cls.from_arrays(np.zeros((0, dim)), np.zeros(0, int), capacity)
-
-    @property
-    def capacity(self) -> int:
-        """How many answers there is room for."""
-        return self.x.shape[-2]
-
-    def append(self, x: Float[Array, " d"], q: ArrayLike) -> "Trials":
-        """With one more answer in the first free row: the shapes stay, nothing recompiles. A full table becomes NaN.
-
-        `x` (d,) in the unit cube, `q` a category in 0..C-1.
-        """
-        row = jnp.sum(self.mask)
-        full = row >= self.capacity
-        return Trials(
-            jnp.where(full, jnp.nan, self.x.at[row].set(x.astype(self.x.dtype))),
-            self.q.at[row].set(jnp.asarray(q, self.q.dtype)),
-            self.mask.at[row].set(True),
-        )
-
-    def first(self, count: ArrayLike) -> "Trials":
-        """Only the first `count` rows, with the same capacity. `count`: an int, from 0 to the capacity."""
-        keep = jnp.arange(self.capacity) < count
-        return Trials(self.x, self.q, self.mask & keep)
-
-
-def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
-    if points.ndim != 2 or answers.ndim != 1 or len(points) != len(answers):
-        raise InputError(
-            f"Trials: x has shape {points.shape} and q has shape {answers.shape}; give x as (n, d) and q as (n,)."
-        )
-    if not np.all(np.isfinite(points)):
-        row = int(np.argwhere(~np.isfinite(points))[0, 0])
-        raise InputError(f"Trials: x[{row}] holds a value that is not finite; remove that answer or fix it.")
-    if len(answers) and (not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0):
-        raise InputError("Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).")
-
-
-class OrdinalTerms(eqx.Module):
-    """The answers as log-likelihood terms with slopes and curvatures, 0 where there is no answer."""
-
-    likelihood: OrdinalProbit
-    q: Int[Array, " n"]
-    mask: Bool[Array, " n"]
-
-    @traced_once
-    def __call__(self, eta: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
-        expansion = jax.vmap(self.likelihood.expand)(eta, self.q)
-        value, slope, curvature = (jnp.where(self.mask, term, jnp.zeros_like(term)) for term in expansion)
-        return value, slope, curvature
-
-
-class TiltedTerms(eqx.Module):
-    """The same answers averaged over cavities, for expectation propagation."""
-
-    likelihood: OrdinalProbit
-    q: Int[Array, " n"]
-    mask: Bool[Array, " n"]
-
-    @traced_once
-    def __call__(
-        self, mean: Float[Array, " n"], variance: Float[Array, " n"]
-    ) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, " n"]]:
-        smoothed = jax.vmap(self.likelihood.smoothed)(mean, variance, self.q)
-        value, slope, precision = (jnp.where(self.mask, term, jnp.zeros_like(term)) for term in smoothed)
-        return value, slope, precision
 
 
 class Posterior(eqx.Module):

@@ -25,8 +25,9 @@ MAY_IMPORT = {
     "likelihoods": {"numerics"},
     "gaussian": {"numerics"},
     "laplace": {"gaussian"},
-    "inference": {"laplace", "likelihoods"},
-    "ordinal_gp": {"inference", "kernels"},
+    "trials": {"numerics"},
+    "inference": {"laplace"},
+    "ordinal_gp": {"inference", "kernels", "likelihoods", "trials"},
     "hyperparameters": {"ordinal_gp"},
     "population": {"ordinal_gp", "bcm"},
     "mechanics": {"numerics"},
@@ -47,6 +48,7 @@ MAY_IMPORT = {
 # The mathematics: no files, clock, printing or environment.
 MATHS = {
     *("kernels", "bcm", "numerics", "acquisition", "likelihoods", "gaussian", "laplace", "inference", "ordinal_gp"),
+    "trials",
     *("hyperparameters", "population", "mechanics", "viscoelastic", "passivity", "search"),
     *(f"statistics.{name}" for name in ("ordered_logit", "separation", "cluster_robust", "regression")),
     *(

@@ -16,7 +16,7 @@ EXECUTED = ROOT / "build" / "notebooks"  # what `make notebooks` makes; where it
 
 # A page of the API reference: its title, and the modules in the order of reading.
 API = {
-    "model": ("The model", "ordinal_gp kernels likelihoods acquisition numerics.climbing errors"),
+    "model": ("The model", "ordinal_gp trials kernels likelihoods acquisition numerics.climbing errors"),
     "inference": ("Inference and hyperparameters", "laplace gaussian inference.exact hyperparameters.maximum_evidence"),
     "aggregation": (
         "Aggregation",

@@ -16,9 +16,10 @@ from hilbo.hyperparameters.coordinates import OF_THE_LIKELIHOOD, Coordinates, co
 from hilbo.hyperparameters.ep_evidence import ep_evidence
 from hilbo.hyperparameters.laplace_evidence import Evidence, laplace_evidence
 from hilbo.kernels import gram
+from hilbo.likelihoods import OrdinalProbit, OrdinalTerms, TiltedTerms
 from hilbo.numerics.linalg import one_at_a_time
 from hilbo.numerics.newton import Expansion, expanded
-from hilbo.ordinal_gp import OrdinalGP, OrdinalProbit, OrdinalTerms, TiltedTerms, Trials, fit
+from hilbo.ordinal_gp import OrdinalGP, Trials, fit
 
 __all__ = ["Seen", "divisor", "evidence_cost", "person_ep_evidence", "person_evidence"]
 

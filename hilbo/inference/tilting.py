@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
-from hilbo.likelihoods import confined_normal
 from hilbo.numerics.linalg import cholesky, one_at_a_time, solve_lower
 from hilbo.numerics.normal import HALF_LOG_2PI, excess_hazard
+from hilbo.numerics.truncated_normal import confined_normal
 
 __all__ = ["Box", "Tilt", "accepted", "ordered_box", "propose", "tilting"]
 

@@ -21,8 +21,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.gaussian import GaussianPosterior, certify
 from hilbo.kernels import gram
+from hilbo.likelihoods import OrdinalTerms
 from hilbo.numerics.tracing import OfArrays, arrays_in, prepared, program, traced_once
-from hilbo.ordinal_gp import OrdinalTerms, Posterior, Trials, fit
+from hilbo.ordinal_gp import Posterior, Trials, fit
 from hilbo.session.selection import Choosing, Design, point_after
 from hilbo.study.config import Study
 

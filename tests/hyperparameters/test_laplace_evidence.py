@@ -18,7 +18,8 @@ from hilbo.hyperparameters.coordinates import coordinates_of, model_at
 from hilbo.hyperparameters.cost import person_ep_evidence, person_evidence
 from hilbo.inference.ep_search import Cavities, find
 from hilbo.kernels import gram
-from hilbo.ordinal_gp import TiltedTerms, fit
+from hilbo.likelihoods import TiltedTerms
+from hilbo.ordinal_gp import fit
 from tests.vectors import evidence
 from tests.vectors.evidence import EVERY, HASTY, STEP
 

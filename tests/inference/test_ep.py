@@ -14,6 +14,7 @@ from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit, ordinal_gp
 from hilbo.gaussian import mean_and_explained
 from hilbo.inference.ep import ep
 from hilbo.kernels import gram
+from hilbo.likelihoods import TiltedTerms
 from hilbo.ordinal_gp import InferenceError
 
 
@@ -267,6 +268,6 @@ def test_a_failed_fit_says_so():
         fit(gp, answers(data), inference="ep")
     assert not fit(gp, answers(data), inference="ep", throw=False).certificate.converged
     kernel, full = model(data).kernel, answers(data)
-    terms = ordinal_gp.TiltedTerms(model(data).likelihood, full.q, full.mask)
+    terms = TiltedTerms(model(data).likelihood, full.q, full.mask)
     stopped = jax.jit(lambda covariance: ep(covariance, terms, max_steps=2))(gram(kernel, full.x, full.x)).certificate
     assert stopped.iterations == 2 and not stopped.converged and stopped.residual > stopped.tolerance

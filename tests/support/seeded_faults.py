@@ -28,7 +28,7 @@ class Fault(NamedTuple):
 FAULTS = (
     Fault(
         "sign in the likelihood's third derivative",
-        "hilbo/likelihoods.py",
+        "hilbo/numerics/truncated_normal.py",
         "- variance, y**2 - variance) - out.skew * shift",
         "- variance, y**2 - variance) + out.skew * shift",
         "tests/test_likelihoods.py",

@@ -1,0 +1,102 @@
+"""The answers of one participant as arrays: asked points and categories, padded to a capacity and masked.
+
+With a fixed capacity a session that grows from 0 to 25 answers compiles once.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from hilbo.errors import InputError
+from hilbo.numerics.shown import known
+
+__all__ = ["Trials"]
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+_BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
+
+
+class Trials(eqx.Module):
+    """Answers of one participant, padded to a fixed capacity.
+
+    `x` (capacity, d) are the asked points in the unit cube, `q` (capacity,) the categories 0..C-1, `mask` says which
+    rows hold an answer. Rows without an answer have no influence whatever they contain.
+    """
+
+    x: Float[Array, "n d"]
+    q: Int[Array, " n"]
+    mask: Bool[Array, " n"]
+
+    @classmethod
+    def from_arrays(cls, x: ArrayLike, q: ArrayLike, capacity: int | None = None) -> "Trials":
+        """Trials from points `x` (n, d) and categories `q` (n,).
+
+        `capacity` defaults to n rounded up to a multiple of 32. Raises `InputError` for shapes that do not match,
+        values that are not finite, categories that are not integers >= 0, or a capacity below n.
+        """
+        points, answers = np.asarray(x), np.asarray(q)
+        _check_arrays(points, answers)
+        count = len(points)
+        capacity = max(_BLOCK * -(-count // _BLOCK), _BLOCK) if capacity is None else capacity
+        if capacity < max(count, 1):
+            raise InputError(f"Trials: capacity is {capacity}, but {count} answers need at least {count or 1}.")
+        dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(float)
+        padded = np.zeros((capacity, points.shape[1]), jax.dtypes.canonicalize_dtype(dtype))
+        categories = np.zeros(capacity, np.int32)
+        padded[:count], categories[:count] = points, answers
+        return cls(jnp.asarray(padded), jnp.asarray(categories), jnp.arange(capacity) < count)
+
+    def __repr__(self) -> str:
+        if not known(self.x, self.mask):
+            return eqx.tree_pformat(self)
+        people = f"{self.x.shape[0]} people, " if self.mask.ndim == 2 else ""
+        return (
+            f"Trials({people}{int(self.mask.sum())} answers, {self.x.shape[-1]} parameters, room for {self.capacity})"
+        )
+
+    @classmethod
+    def empty(cls, capacity: int, dim: int) -> "Trials":
+        """No answers yet, room for `capacity` of them."""
+        return cls.from_arrays(np.zeros((0, dim)), np.zeros(0, int), capacity)
+
+    @property
+    def capacity(self) -> int:
+        """How many answers there is room for."""
+        return self.x.shape[-2]
+
+    def append(self, x: Float[Array, " d"], q: ArrayLike) -> "Trials":
+        """With one more answer in the first free row: the shapes stay, nothing recompiles. A full table becomes NaN.
+
+        `x` (d,) in the unit cube, `q` a category in 0..C-1.
+        """
+        row = jnp.sum(self.mask)
+        full = row >= self.capacity
+        return Trials(
+            jnp.where(full, jnp.nan, self.x.at[row].set(x.astype(self.x.dtype))),
+            self.q.at[row].set(jnp.asarray(q, self.q.dtype)),
+            self.mask.at[row].set(True),
+        )
+
+    def first(self, count: ArrayLike) -> "Trials":
+        """Only the first `count` rows, with the same capacity. `count`: an int, from 0 to the capacity."""
+        keep = jnp.arange(self.capacity) < count
+        return Trials(self.x, self.q, self.mask & keep)
+
+
+def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
+    if points.ndim != 2 or answers.ndim != 1 or len(points) != len(answers):
+        raise InputError(
+            f"Trials: x has shape {points.shape} and q has shape {answers.shape}; give x as (n, d) and q as (n,)."
+        )
+    if not np.all(np.isfinite(points)):
+        row = int(np.argwhere(~np.isfinite(points))[0, 0])
+        raise InputError(f"Trials: x[{row}] holds a value that is not finite; remove that answer or fix it.")
+    if len(answers) and (not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0):
+        raise InputError("Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).")
