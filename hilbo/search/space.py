@@ -4,19 +4,15 @@ Three coordinates of one point:
 
 - *physical*: the numbers of tables and devices, in the units of the parameters; of a level its place in the list;
 - *unit cube* x: every parameter on [0, 1] over its full range, linear or logarithmic; kernels see only these;
-- *box* w: the optimiser's coordinates, in which the feasible set is a polytope within [0, 1]^d. With mechanics,
-  x_K1 = w_K1 · x_K1max(B1, α), where K1max is the largest passive K1 (`passivity.largest_K1`). A parameter in a linear
+- *box* w: the optimiser's coordinates, in which the feasible set is a polytope within [0, 1]^d. With mechanics, w_K1 is
+  the share of a column along K1, from its first feasible point to its last (`columns`). A parameter in a linear
   constraint is linear in its unit (`linear`); all others are w = x.
 
 Without constraints the polytope is the whole cube. With mechanics, a constraint on K1 bounds its column instead. Whole
 numbers and levels are steps of their coordinate: a search changes the others, then tries `neighbours`.
 
-With a range of effective damping the column starts above the lowest K1 too, and x_K1 = start + w_K1 · width
-(`feasibility` has both ends).
-
-A column (B1, α) with K1max below the lowest K1, or no K1 in the range, has width 0 and holds no feasible point. Points
-that fill the feasible set evenly come from uniform numbers by the Rosenblatt map whose density is the column's width;
-Rosenblatt (1952), Ann. Math. Stat. 23:470.
+Points that fill the feasible set evenly come from uniform numbers: by the widths of the columns with mechanics, by
+refusing or by hit and run between the walls of constraints.
 """
 
 import functools
@@ -35,20 +31,15 @@ from hilbo.numerics.polytope import Polytope
 from hilbo.numerics.tracing import program
 from hilbo.search import linear
 from hilbo.search.box import Box, Constraint, Mechanics, Parameter
-from hilbo.search.feasibility import K0_of, K1_interval, allowed, keeps, largest_K1, minimum_damping
+from hilbo.search.columns import Columns, check_volume, rosenblatt, volume
+from hilbo.search.feasibility import K0_of, allowed, keeps, minimum_damping
 from hilbo.search.space_filling import HELD, Chunks, latin_chunks, sobol_chunks, spread_out, take, wall_chunks
 from hilbo.search.steps import neighbours, steps_of
 
-__all__ = ["COLUMNS", "ROWS", "SearchSpace", "column_ends", "column_table"]
+__all__ = ["SearchSpace"]
 
-# Cells of the table of column widths. At small B1 the width falls from all to little within 1/1000 of the range, so
-# the rows crowd there: with even rows the share of the first one alone would be off by a sixth.
-_CELLS = 256
-ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
-COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
 _ROOMY, _PILOT = 0.02, 4096  # share of the cube, of so many points, from which constrained points are drawn in it
 _CLUSTERED = 200  # points for each of a space-filling design between walls
-_Batch = Float[Array, "*batch"]
 
 
 class SearchSpace(eqx.Module):
@@ -64,26 +55,12 @@ class SearchSpace(eqx.Module):
 
     def __check_init__(self):
         Box(self.parameters, self.mechanics, self.constraints)  # refuses what is no box
-        if self.mechanics is not None:
-            self._check_volume(self.mechanics)
+        if self.columns is not None:
+            check_volume(self.columns)
         if self.constraints:
             linear.check_room(self.parameters, self.constraints)
             if self.mechanics is not None or any(self.discrete):
                 self.candidates(1, 0)  # or says that nothing is left
-
-    def _check_volume(self, mechanics: Mechanics) -> None:
-        if not _cumulative_volume(self)[0][-1] > 0:
-            if mechanics.effective_damping is not None:
-                raise InputError(
-                    f"renderer.effective_damping leaves no parameter set: none is passive with renderer.damping = "
-                    f"{mechanics.damping} N.s/m and between {mechanics.effective_damping[0]} and "
-                    f"{mechanics.effective_damping[1]} N.s/m; widen it."
-                )
-            raise InputError(
-                f"renderer.damping is {mechanics.damping} N.s/m, with which no K1 from "
-                f"{self.parameters[self._index('K1')].low} N/mm up is passive for any B1 and alpha; "
-                "check its unit, or lower K_eff or parameters.K1.low."
-            )
 
     @property
     def dim(self) -> int:
@@ -118,6 +95,14 @@ class SearchSpace(eqx.Module):
             "held": jnp.asarray(self.discrete),
             "neighbours": functools.partial(neighbours, self.parameters, coupled) if any(self.discrete) else None,
         }
+
+    @property
+    def columns(self) -> Columns | None:
+        """Along K1, with mechanics; None without."""
+        if self.mechanics is None:
+            return None
+        on_K1 = (c for c in self.constraints if any(name == "K1" and weight for name, weight in c.terms))
+        return Columns(self.parameters, self.mechanics, tuple(on_K1))
 
     @property
     def _walls(self) -> linear.Walls:
@@ -157,13 +142,7 @@ class SearchSpace(eqx.Module):
         w = _on_device(w)
         for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
             w = w.at[..., i].set(p.to_unit(p.low + (p.high - p.low) * w[..., i])) if linear_in_box else w
-        if self.mechanics is None:
-            return w
-        K1 = self._index("K1")
-        if not self._between:
-            return w.at[..., K1].multiply(self._limit(self.mechanics, w))
-        low, width = self._interval(self.mechanics, w)
-        return w.at[..., K1].set(low + w[..., K1] * width)
+        return w if self.columns is None else self.columns.from_shares(w)
 
     def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Inverse of `from_box`, for `x` in the feasible set. (..., d) -> (..., d)."""
@@ -171,13 +150,7 @@ class SearchSpace(eqx.Module):
         w = x
         for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
             w = w.at[..., i].set((p.to_physical(x[..., i]) - p.low) / (p.high - p.low)) if linear_in_box else w
-        if self.mechanics is None:
-            return w
-        K1 = self._index("K1")
-        if not self._between:
-            return w.at[..., K1].divide(self._limit(self.mechanics, x))
-        low, width = self._interval(self.mechanics, x)
-        return w.at[..., K1].set((x[..., K1] - low) / width)
+        return w if self.columns is None else self.columns.to_shares(w, x)
 
     def feasible(self, x: Real[ArrayLike, "*batch d"]) -> Bool[Array, "*batch"]:
         """Whether points of the unit cube are in the box, passive with the search margin, damped as asked for, and
@@ -213,7 +186,7 @@ class SearchSpace(eqx.Module):
 
     def volume(self) -> float:
         """Share of the unit cube that is passive: the mean width of its columns, on a grid; 1 without mechanics."""
-        return 1.0 if self.mechanics is None else float(_cumulative_volume(self)[0][-1])
+        return 1.0 if self.columns is None else volume(self.columns)
 
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol').
@@ -250,89 +223,12 @@ class SearchSpace(eqx.Module):
         x, feasible = _from_box(self, ends)
         return np.where(np.asarray(feasible)[:, None], np.asarray(x), starts)
 
-    @property
-    def _between(self) -> bool:
-        """Whether a column of K1 has a lower end, and an upper one besides the passive wall."""
-        mechanics = self.mechanics
-        return mechanics is not None and (mechanics.effective_damping is not None or self._bounds_K1 != ())
-
-    @property
-    def _bounds_K1(self) -> tuple[Constraint, ...]:
-        """The constraints on K1, with mechanics."""
-        bounds = [c for c in self.constraints if any(name == "K1" and weight for name, weight in c.terms)]
-        return () if self.mechanics is None else tuple(bounds)
-
-    def _index(self, name: str) -> int:
-        return self.names.index(name)
-
     def _split(self, physical: Float[Array, "*batch d"]) -> dict[str, Float[Array, "*batch"]]:
         return {name: physical[..., i] for i, name in enumerate(self.names)}
-
-    def _limit(self, m: Mechanics, x: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
-        """Width of the column of each point: the largest feasible x_K1, 0 where there is none."""
-        K1 = self.parameters[self._index("K1")]
-        B1, alpha = (self.parameters[i].to_physical(x[..., i]) for i in (self._index("B1"), self._index("alpha")))
-        return K1.to_unit(jnp.clip(largest_K1(m, B1, alpha), K1.low, K1.high))
-
-    def _interval(self, m: Mechanics, x: Float[Array, "*batch d"]) -> tuple[_Batch, _Batch]:
-        """Start and width of the column of each point, in x_K1, with a range of effective damping or constraints."""
-        K1 = self.parameters[self._index("K1")]
-        low, high = K1_interval(m, K1, self._bounds_K1, self._split(self.to_physical(x)))
-        high = jnp.minimum(high, self._limit(m, x))
-        return low, jnp.maximum(high - low, 0)
 
 
 def _on_device(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
     return placed(x, jnp.result_type(1.0, x))
-
-
-@functools.lru_cache(maxsize=16)
-def column_table(space: SearchSpace) -> tuple[Float[np.ndarray, "r c"], Float[np.ndarray, "r c"]]:
-    """Both ends of the columns, (B1, α), on a grid: at the x_B1 `ROWS` and the x_alpha `COLUMNS`."""
-    x = np.full((_CELLS + 1, _CELLS + 1, space.dim), 0.5)
-    x[..., space._index("B1")], x[..., space._index("alpha")] = ROWS[:, None], COLUMNS
-    low, high = column_ends(space, x)
-    return np.asarray(low, float), np.asarray(high, float)
-
-
-@functools.lru_cache(maxsize=16)
-def _cumulative_volume(space: SearchSpace) -> tuple[Float[np.ndarray, " r"], Float[np.ndarray, "cells c"]]:
-    """Cumulative volume of the columns: over the rows of B1, and within each row over α, there from 0 to 1."""
-    low, high = column_table(space)
-    node = high - low
-    mean = (node[1:, 1:] + node[1:, :-1] + node[:-1, 1:] + node[:-1, :-1]) / 4
-    volume = mean * np.diff(ROWS)[:, None] * np.diff(COLUMNS)
-    within = np.pad(np.cumsum(volume, axis=1), ((0, 0), (1, 0)))
-    total = within[:, -1:]
-    within = np.where(total > 0, within, COLUMNS) / np.where(total > 0, total, 1)
-    return np.pad(np.cumsum(total), (1, 0)), within
-
-
-def _rosenblatt(space: SearchSpace, uniform: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
-    """Uniform numbers (n, d) to box coordinates in which a column is as likely as it is wide."""
-    if space.mechanics is None:
-        return uniform
-    rows, within = _cumulative_volume(space)
-    B1, alpha = space._index("B1"), space._index("alpha")
-    w = uniform.copy()
-    w[:, B1] = np.interp(uniform[:, B1] * rows[-1], rows, ROWS)
-    row = np.searchsorted(ROWS[1:-1], w[:, B1], side="right")
-    # All rows at once: row r of the table climbs from r to r + 1.
-    climbing = (within + np.arange(_CELLS)[:, None]).ravel()
-    w[:, alpha] = np.interp(row + uniform[:, alpha], climbing, np.tile(COLUMNS, _CELLS))
-    return w
-
-
-@program
-def column_ends(space: SearchSpace, x: Float[ArrayLike, "*batch d"]) -> tuple[_Batch, _Batch]:
-    """Both ends (...,) of the column of each point (..., d) of the unit cube, in x_K1; equal where none is feasible."""
-    x, mechanics = _on_device(x), space.mechanics
-    assert mechanics is not None
-    if mechanics.effective_damping is None:
-        high = space._limit(mechanics, x)
-        return jnp.zeros_like(high), high
-    low, width = space._interval(mechanics, x)
-    return low, low + width
 
 
 @functools.lru_cache(maxsize=16)
@@ -377,7 +273,7 @@ def _take_feasible(
     """The first `count` feasible points out of chunks of uniform numbers, some coordinates held at an end."""
 
     def place(uniform):
-        w = _rosenblatt(space, uniform)
+        w = uniform if space.columns is None else rosenblatt(space.columns, uniform)
         if hold is not None:
             ends = next(hold)
             w = np.where(np.isnan(ends), w, ends)

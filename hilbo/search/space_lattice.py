@@ -10,8 +10,9 @@ import functools
 import jax
 import numpy as np
 
+from hilbo.search.columns import COLUMNS, ROWS, column_ends, column_table
 from hilbo.search.lattice import Lattice
-from hilbo.search.space import COLUMNS, ROWS, SearchSpace, column_ends, column_table
+from hilbo.search.space import SearchSpace
 from hilbo.search.space_filling import crossings
 
 __all__ = ["lattice_of"]
@@ -42,7 +43,7 @@ def _on_device(nodes, inside, ends, present, extra, along, dim) -> Lattice:
 
 def _steep_wall(space, levels):
     """Points of the wall at every second of these x_K1, (p, 3), for a space of K1, B1 and alpha alone."""
-    high, rises = column_table(space)[1], levels[-1:0:-2]
+    high, rises = column_table(space.columns)[1], levels[-1:0:-2]
     points = np.ones((0, 3))
     for table, lines, positions, names in (
         (high.T, COLUMNS, ROWS, ("alpha", "B1")),
@@ -66,6 +67,6 @@ def _ends_of(space, points):
         part = points[begin : begin + shape[0] * shape[1]]
         filled = np.full((shape[0] * shape[1], space.dim), 0.5)
         filled[: len(part)] = part
-        ends = column_ends(space, filled.reshape(shape))
+        ends = column_ends(space.columns, filled.reshape(shape))
         parts.append([np.asarray(end).reshape(-1)[: len(part)] for end in ends])
     return tuple(np.concatenate(end) for end in zip(*parts, strict=True))
