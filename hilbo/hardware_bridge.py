@@ -20,8 +20,9 @@ from functools import partial
 from typing import Any, Literal, SupportsFloat
 
 from hilbo.device import protocol
+from hilbo.device.failures import DeviceError, RefusalError
 from hilbo.device.handshake import greet, take_over
-from hilbo.device.link import DeviceError, Link, RefusalError
+from hilbo.device.link import Link
 from hilbo.device.messages import Status
 from hilbo.device.parameter_sets import InForce, in_force, wanted_for
 from hilbo.device.ports import BAUD, list_ports, open_port

@@ -82,7 +82,7 @@ def takes(**groups: type) -> Callable:
         @functools.wraps(command)
         def run(**given: Any) -> None:
             records = {name: kind(**{f: given.pop(f) for f in kind._fields}) for name, kind in groups.items()}  # type: ignore[attr-defined]
-            from hilbo.device.link import DeviceError
+            from hilbo.device.failures import DeviceError
 
             try:
                 command(**given, **records)

@@ -200,7 +200,7 @@ def _step(study: Any) -> Check:
 
 
 def _device(connect: Callable[[float | None], Any], file: Any) -> Iterator[Check]:
-    from hilbo.device.link import DeviceError
+    from hilbo.device.failures import DeviceError
 
     mechanics = file.space.mechanics if file is not None else None
     needs = None if mechanics is None else float(mechanics.damping)

@@ -8,8 +8,9 @@ import time
 from typing import SupportsFloat
 
 from hilbo.device import protocol
+from hilbo.device.failures import DeviceError
 from hilbo.device.heartbeat import BEAT
-from hilbo.device.link import DeviceError, Link
+from hilbo.device.link import Link
 from hilbo.device.messages import HelloReply
 from hilbo.device.reasons import State, held_because, meaning
 from hilbo.errors import InputError

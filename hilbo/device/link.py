@@ -15,14 +15,15 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from hilbo.device import protocol
+from hilbo.device import failures, protocol
+from hilbo.device.failures import DeviceError
 from hilbo.device.frames import Receiver, WireError
-from hilbo.device.heartbeat import BEAT, GRACE, HelperHeart, ThreadHeart, heart_for
+from hilbo.device.heartbeat import BEAT, HelperHeart, ThreadHeart, heart_for
 from hilbo.device.messages import Ack, Message, Nack, Notice, Status, Telemetry, code_of, name_of
-from hilbo.device.reasons import ABOUT_INPUT, NackReason, sentence
+from hilbo.device.reasons import NackReason
 from hilbo.errors import InputError
 
-__all__ = ["DeviceError", "Link", "RefusalError"]
+__all__ = ["Link"]
 
 _ANSWER = {
     protocol.Hello: protocol.HelloReply,
@@ -33,22 +34,6 @@ _ANSWER = {
 }
 _URGENT = frozenset({code_of(protocol.Stop), code_of(protocol.Estop)})
 _ALWAYS = (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop)  # are for restarted devices too
-
-
-class DeviceError(RuntimeError):
-    """The device, or the line to it, does not do what was asked; `nack` is its refusal, if that is what it was."""
-
-    def __init__(self, words: str, nack: Nack | None = None):
-        super().__init__(words)
-        self.nack = nack
-
-
-class RefusalError(InputError):
-    """The device refuses numbers that it was sent; `nack` has its reason and the numbers behind it."""
-
-    def __init__(self, words: str, nack: Nack):
-        super().__init__(words)
-        self.nack = nack
 
 
 class Link:
@@ -100,10 +85,10 @@ class Link:
         if isinstance(message, protocol.Estop) and not self.lost:
             self.shout(message)
         if isinstance(message, protocol.Stop | protocol.Estop) and self.lost:
-            raise DeviceError(self._shouted_words(message, self.shout(message)))
+            raise DeviceError(failures.urgent(self.lost, name_of(type(message)), self.shout(message)))
         with self._asking:
             if (self.restarted or self.faint) and not self.lost and not isinstance(message, _ALWAYS):
-                raise DeviceError(self._restart_words() if self.restarted else self._faint_words())
+                raise DeviceError((failures.restarted if self.restarted else failures.fainted)(self.name))
             self._seq = (self._seq + 1) % 256
             try:
                 frame = protocol.encode(message, self._seq)
@@ -112,7 +97,10 @@ class Link:
             kind = type(message)
             answer = self._ask(frame, (self._seq, code_of(kind), _ANSWER.get(kind, Ack)))
         if answer is None:
-            raise DeviceError(self._silence_words(name_of(kind)))
+            foreign = bool(self._receiver.dropped) and self.boot_id is None
+            raise DeviceError(
+                failures.silent(self.name, name_of(kind), self.tries, received=self.received > 0, foreign=foreign)
+            )
         if isinstance(answer, Nack):
             raise self._refusal(answer, name_of(kind))
         return answer
@@ -248,10 +236,7 @@ class Link:
             try:
                 self._heard(data)
             except Exception as error:  # of whoever takes what arrives: without a reader nobody may go on beating
-                self._end(
-                    f"{self.name}: what the device says cannot be taken ({error}); heartbeats have ended and the device"
-                    " stops by itself; remove the cause, then connect again."
-                )
+                self._end(failures.not_taken(self.name, error))
                 return
 
     def _heard(self, data: bytes) -> None:
@@ -287,10 +272,7 @@ class Link:
                 self.stray += 1
 
     def _lose(self, error: OSError) -> str:
-        return self._end(
-            f"{self.name}: the line to the device is gone ({error}); it stops by itself, check power and cable,"
-            " then connect again."
-        )
+        return self._end(failures.line_gone(self.name, error))
 
     def _end(self, why: str) -> str:
         """The conversation is over, and so are the heartbeats; returns why it ended first."""
@@ -301,37 +283,11 @@ class Link:
         self._end_beats()
         return why
 
-    def _refusal(self, nack, request) -> Exception:
+    def _refusal(self, nack: Nack, request: str) -> Exception:
         if nack.reason in (NackReason.BOOT_ID, NackReason.NO_HELLO) and request != "HELLO":
             self.restarted = True
-            return DeviceError(self._restart_words(), nack)
-        words = sentence(nack.reason, request, nack.ticks, nack.value, nack.limit)
-        return (RefusalError if nack.reason in ABOUT_INPUT else DeviceError)(words, nack)
-
-    def _restart_words(self) -> str:
-        return (
-            f"{self.name}: the device has restarted; it is stopped and knows no set: connect again, then send the set."
-        )
-
-    def _faint_words(self) -> str:
-        return (
-            f"{self.name}: heartbeats have ended, because this program hung for {GRACE:g} s or their process was ended;"
-            " the device lets go: connect again."
-        )
-
-    def _shouted_words(self, message: Message, written: bool) -> str:
-        name = name_of(type(message))
-        how = "was written all the same; no answer can come" if written else "cannot be written"
-        return f"{self.lost} {name} {how}: see that the device rests."
-
-    def _silence_words(self, request) -> str:
-        if self.received == 0:
-            why = "nothing at all comes back; check power, cable and port"
-        elif self._receiver.dropped and self.boot_id is None:
-            why = "what comes back is not of this protocol; check the port and its baud rate"
-        else:
-            why = "check the line"
-        return f"{self.name}: {request} has had no answer in {self.tries} tries; {why}."
+            return DeviceError(failures.restarted(self.name), nack)
+        return failures.refusal(nack, request)
 
 
 def _fits(seq: int, message: Message, expected: tuple[int, int, type]) -> bool:

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hilbo.device.link import DeviceError
+from hilbo.device.failures import DeviceError
 from hilbo.errors import InputError
 
 __all__ = ["Simulator", "built"]

@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 from hilbo.device import protocol
-from hilbo.device.link import DeviceError, Link
+from hilbo.device.failures import DeviceError
+from hilbo.device.link import Link
 from hilbo.device.messages import Ack, HelloReply, Message, SetParams, SetStates, Status
 from hilbo.device.parameter_sets import InForce, ParameterSet, crc_of, differences, in_force
 from hilbo.device.reasons import NackReason

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hilbo.device.link import DeviceError
+from hilbo.device.failures import DeviceError
 from hilbo.device.telemetry import Samples
 
 __all__ = ["Pressed", "pressed", "table_of"]
