@@ -1,14 +1,35 @@
-"""The last words of `hilbo demo`."""
+"""`hilbo demo`: real people's answers, and a simulated study beside its truth and the paper."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from hilbo.cli.console import PARTS
+from hilbo.cli.aggregate import aggregate_cohort, read_cohort
+from hilbo.cli.console import PARTS, Force, Out, progress, results, seed_option
+from hilbo.cli.study import simulated_report
 
-__all__ = ["print_demo"]
+__all__ = ["demo"]
 
 
-def print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> None:
+def demo(
+    out: Out = Path("demo-results"),
+    seed: Annotated[int, seed_option("of the simulated people and of the points among which optima are sought")] = 0,
+    force: Force = False,
+) -> None:
+    """Real people's answers, then a whole simulated haptic study of known truth and its report."""
+    from importlib.resources import files
+
+    data = files("hilbo") / "data"
+    with results(out, force) as folder, progress() as say:
+        for name in PARTS:
+            (folder / name).mkdir()
+        table, study = (Path(str(data / f"video_quality.{kind}")) for kind in ("csv", "toml"))
+        chosen, cohort = read_cohort(table, study, None, say)
+        real = aggregate_cohort(chosen, cohort, folder / PARTS[0], seed, say)
+        simulated = simulated_report(folder / PARTS[1], seed, say)["materials"][""]
+    _print_demo(real, simulated, out)
+
+
+def _print_demo(real: dict[str, Any], simulated: dict[str, Any], out: Path) -> None:
     """The real optimum in a line, and the simulated misses beside the paper's; from both contents of result.json."""
     from rich import box
     from rich.console import Console

@@ -1,0 +1,177 @@
+"""`hilbo aggregate` and `hilbo robustness`: what asks for people's answers and the study that they belong to."""
+
+import contextlib
+import importlib
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilbo.cli.console import Force, Json, Out, check_choice, finish, progress, remark, results, seed_option, start
+from hilbo.errors import InputError
+
+__all__ = ["aggregate", "aggregate_cohort", "read_cohort", "robustness"]
+
+# What draws and writes, loaded beside the arithmetic. Packages that the arithmetic never imports, because two threads
+# that import one package at once may see half of it.
+_DRAW_AND_WRITE = ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2")
+_LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
+
+StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
+Table = Annotated[
+    Path, typer.Argument(help="Trial table (CSV or Parquet), or a folder of session logs.", show_default=False)
+]
+
+
+def aggregate(
+    trials: Table,
+    study: StudyOption,
+    out: Out,
+    seed: Annotated[int, seed_option("of the points among which the optimum is sought")] = 0,
+    material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
+    participants: Annotated[str | None, typer.Option(help="Only these, separated by commas.")] = None,
+    first: Annotated[int | None, typer.Option(min=1, help="Only everybody's first so many trials.")] = None,
+    individuals: Annotated[bool, typer.Option(help="Seek everybody's own optimum: most of the work.")] = True,
+    rule: Annotated[
+        str | None,
+        typer.Option(
+            help="Rule of aggregation in place of the study file's: bcm, rbcm, hierarchical, average, pooled, or"
+            " learnt-1 and learnt-2, which learn [gp] too."
+        ),
+    ] = None,
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Besides, compare all rules: comparison.json, comparison.csv, figures.")
+    ] = False,
+    devices: Annotated[int | None, typer.Option(min=1, help="Deal people to so many cores of the CPU.")] = None,
+    distributed: Annotated[
+        bool, typer.Option("--distributed", help="One of several processes: under srun, mpirun, or as the next three.")
+    ] = False,
+    coordinator: Annotated[
+        str | None, typer.Option(envvar="JAX_COORDINATOR_ADDRESS", help="HOST:PORT of process 0.")
+    ] = None,
+    processes: Annotated[
+        int | None, typer.Option(min=1, envvar="JAX_NUM_PROCESSES", help="How many processes there are.")
+    ] = None,
+    process_id: Annotated[
+        int | None, typer.Option(min=0, envvar="JAX_PROCESS_ID", help="Which one this is, from 0.")
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Aggregate people's answers into one population map and find its optimum."""
+    start(devices)
+    from hilbo.study.distributed import crew, digest
+
+    with crew(distributed, coordinator, processes, process_id) as team, contextlib.ExitStack() as held:
+        say = held.enter_context(progress(quiet=not team.writes))
+        with team.agreement() as agree:
+            folder = held.enter_context(results(out, force)) if team.writes else None
+            chosen, cohort = read_cohort(trials, study, material, say)
+            chosen = chosen if rule is None else _by_rule(chosen, rule)
+            cohort = cohort.of(participants.split(",")) if participants else cohort
+            cohort = cohort.first(first) if first else cohort
+            agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
+        if team.devices == 1 and len(cohort.names) <= _LARGE and individuals:
+            content = aggregate_cohort(chosen, cohort, folder, seed, say, compare=compare)
+        elif compare:
+            raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
+        else:
+            content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say)
+    if team.writes:
+        finish(content, out, as_json, say.printed)
+
+
+def robustness(
+    trials: Table,
+    study: StudyOption,
+    out: Out,
+    seed: Annotated[int, seed_option("of the points among which optima are sought")] = 0,
+    own: Annotated[
+        bool, typer.Option("--own", help="Each person's own hyperparameters instead of shared ones.")
+    ] = False,
+    learn: Annotated[
+        str, typer.Option(help="What the evidence chooses of theta, noise and thresholds, separated by commas.")
+    ] = "theta,noise,thresholds",
+    material: Annotated[str | None, typer.Option(help="Which of the table's materials.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
+    with results(out, force) as folder, progress() as say:
+        chosen, cohort = read_cohort(trials, study, material, say)
+        from hilbo.report.robustness import write_robustness
+        from hilbo.study.robustness import robustness as check
+
+        say("hyperparameters by maximum evidence")
+        comparison = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
+        say("maps, figures and report")
+        content = write_robustness(chosen, cohort, comparison, folder, seed)
+    finish(content, out, as_json)
+
+
+def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tuple[Any, Any]:
+    """The study and the cohort of a trial table, or of a folder of session logs. Raises `InputError`."""
+    say("reading")
+    start()
+    from hilbo.study.cohort import cohort_of
+    from hilbo.study.config import Study
+    from hilbo.study.trial_table import read_trials
+
+    whole = Study.load(study)
+    chosen = whole.material(material) if material and whole.materials else whole
+    if trials.is_dir():
+        from hilbo.session.export import read_log_trials
+
+        table = read_log_trials(trials, whole, material, others=False, note=remark)
+    else:
+        table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
+    return chosen, cohort_of(table, chosen)
+
+
+def _by_rule(study, rule):
+    import dataclasses
+
+    from hilbo.population.maps import ALL_RULES
+    from hilbo.population.recipes import RECIPES
+    from hilbo.study.learnt_study import that_learns
+
+    if rule in RECIPES:
+        return study if study.rule == rule else that_learns(study, rule)
+    if study.rule in RECIPES:
+        raise InputError(f'--rule is "{rule}", and the study, whose rule is "{study.rule}", has no [gp] for it.')
+    check_choice("rule", rule, ALL_RULES)
+    return dataclasses.replace(study, rule=rule)
+
+
+def aggregate_cohort(study, cohort, folder, seed, say, truth=None, compare=False, selection="") -> dict[str, Any]:
+    """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
+    from hilbo.study.population_results import analyse_population
+
+    with ThreadPoolExecutor(1) as other_core:
+
+        def report_early(sentences):
+            say.tell(sentences)
+            other_core.submit(list, map(importlib.import_module, _DRAW_AND_WRITE))
+
+        population = analyse_population(study, cohort, seed, say, report_early)
+    from hilbo.report.results import write_results
+
+    beside: dict[str, Any] = {}
+    if compare:
+        from hilbo.report.comparison import write_comparison
+
+        say("every rule, with each person left out")
+        compared = write_comparison(study, population.aggregate, folder, seed)
+        beside = {"comparison": compared.section, "pictures": compared.pictures}
+    return write_results(population, folder, truth, say, selection=selection, **beside)
+
+
+def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -> dict[str, Any]:
+    """As `aggregate_cohort` for a large cohort or several devices: by the whole crew, of which one process writes."""
+    from hilbo.report.large_population import population_map, write_population
+    from hilbo.study.batch_optimum import aggregate_population
+
+    large = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
+    grid = population_map(study, large)
+    return {} if folder is None else write_population(study, large, grid, folder, seed, say)

@@ -1,0 +1,62 @@
+"""`hilbo simulate`: a study whose truth is known, or one session without people."""
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from hilbo.cli.aggregate import aggregate_cohort
+from hilbo.cli.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
+from hilbo.cli.live import live as hold_session
+
+__all__ = ["simulate"]
+
+
+def simulate(
+    out: Out,
+    preset: Preset = None,
+    study: Annotated[Path | None, typer.Option("--study", help="Study file; by default the paper's.")] = None,
+    participants: Annotated[int, typer.Option(min=1, help="How many people.")] = 24,
+    seed: Annotated[
+        int, seed_option("of the people, of their answers and of the points among which optima are sought")
+    ] = 0,
+    force: Force = False,
+    as_json: Json = False,
+    live: Annotated[
+        bool, typer.Option("--live", help="One person's session instead: real server, pages and simulated device.")
+    ] = False,
+    kind: Annotated[str, typer.Option(help="With --live: optimisation, validation or aggregate-best.")] = (
+        "optimisation"
+    ),
+    seconds: Annotated[float | None, typer.Option(min=0.05, help="With --live: duration of every step.")] = None,
+) -> None:
+    """Simulate a study whose truth is known, and aggregate it; or hold one session without people."""
+    if live:
+        _simulate_live(preset, study, out, kind, seconds, seed, as_json)
+        return
+    with results(out, force) as folder, progress() as say:
+        content = _simulate(preset, study, participants, seed, folder, say)
+    finish(content, out, as_json, say.printed)
+
+
+def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
+    say("simulating")
+    start()
+    from hilbo.session.registration import selection_words
+    from hilbo.simulation.folder import simulate_folder
+
+    simulated = simulate_folder(folder, preset, count, seed, study)
+    chosen = selection_words(simulated.study.selection)
+    return aggregate_cohort(simulated.study, simulated.cohort, folder, seed, say, simulated.truth, selection=chosen)
+
+
+def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:
+    from importlib.resources import files
+
+    source = Path(str(files("hilbo") / "data" / "paper.toml")) if study is None else study
+    with progress() as say:
+        summary = hold_session(source, out, preset, phase, seconds, seed, say)
+    print(
+        json.dumps(summary, indent=2) if as_json else f"{summary['answers']} answers in {summary['seconds']} s: {out}"
+    )
