@@ -15,36 +15,23 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from hilbo.app import blind, views
+from hilbo.app import blind, commands, views
+from hilbo.app.commands import NotNowError
 from hilbo.app.interruptions import Interruptions
 from hilbo.app.messages import Answer, Command, Press
 from hilbo.app.rig import Rig, Snapshot
 from hilbo.app.runner import Runner
 from hilbo.app.security import Role
 from hilbo.app.watchers import Watchers
-from hilbo.errors import InputError
 from hilbo.session import actions
 from hilbo.session.event_log import LogError
 from hilbo.session.records import RefusedError
 from hilbo.session.state import LiveSession
 
-__all__ = ["COMMANDS", "PRESSES", "Hub", "NotNowError", "others_present"]
+__all__ = ["PRESSES", "Hub"]
 
 _RECENT = 200  # events that the experimenter's page may show
 PRESSES = ("begin", "break", "more", "here")
-COMMANDS = (
-    *("pause", "resume", "repeat", "undo", "void", "restore", "skip", "abort", "note", "estop", "clear", "invite"),
-)
-
-
-def others_present(title: str) -> str:
-    """Why somebody is not who presents, by the title of the rig that does."""
-    who = {"Stimulus": "a program presents, and no person", "Preparer": "a person presents, and no program"}
-    return f"In this session {who.get(title, 'a device renders, and no program presents')}."
-
-
-class NotNowError(InputError):
-    """What cannot be done now; the view says what can."""
 
 
 class Hub:
@@ -223,63 +210,7 @@ class Hub:
 
     async def command(self, what: str, message: Command) -> dict[str, Any]:
         """An experimenter's command. Raises `NotNowError`."""
-        if what == "estop":
-            return await self._estop()
-        if what == "clear":
-            return await self._clear()
-        if what == "invite":
-            if self.invite is None:
-                raise NotNowError("This session gives no links.")
-            stimulus = self.state.study.stimulus
-            if message.role not in ("participant", None if stimulus is None else stimulus.role):
-                assert self.rig is not None
-                raise NotNowError(others_present(self.rig.title))
-            return self.invite(message.role)
-        try:
-            await self.commit(self._event_of(what, message))
-        except RefusedError as error:
-            raise NotNowError(str(error)) from None
-        return {"done": what}
-
-    def _event_of(self, what, message):
-        if what == "note":
-            if not message.text.strip():
-                raise InputError("The note is empty; write something.")
-            return lambda state, at: actions.note(state, message.text.strip(), at)
-        if what == "restore":
-            if message.trial is None:
-                raise InputError("An answer is restored by the id of its trial.")
-            return lambda state, at: actions.restore(state, message.trial, at)
-        if what == "skip":
-            return lambda state, at: actions.skip(state, message.reason, at, message.trial)
-        if what in ("void", "undo"):
-            return lambda state, at: _taken(state, what, message, at)
-        if what == "abort":
-            return lambda state, at: actions.abort(state, message.reason, at)
-        if what == "pause":
-            return lambda state, at: actions.pause(state, "experimenter", at)
-        return self._goes_on if what == "resume" else actions.repeat
-
-    def _goes_on(self, state, at):
-        event = (actions.resume if state.paused is not None else actions.go_on)(state, at)
-        self.begun = self.watchers.participant_here  # who comes later presses Begin
-        return event
-
-    async def _estop(self):
-        assert self.rig is not None
-        try:
-            await self.rig.estop()
-        except (RuntimeError, ValueError) as error:
-            raise NotNowError(f"The {self.rig.title.lower()} could not be told: {error}") from None
-        return {"done": "estop"}
-
-    async def _clear(self):
-        assert self.rig is not None
-        try:
-            await self.rig.clear()
-        except (RuntimeError, ValueError) as error:
-            raise NotNowError(str(error)) from None
-        return {"done": "clear"}
+        return await commands.carry_out(self, what, message)
 
     async def map(self) -> dict[str, Any] | None:
         """Slices of the posterior, made once for each state of the answers; None where there is nothing to show, empty
@@ -325,15 +256,3 @@ class Hub:
 
     def _noticed(self, sentence: str) -> None:
         self._loop.call_soon_threadsafe(self.publish)
-
-
-def _taken(state, what, message, at):
-    """A trial made void, or an answer taken back: that of the trial which the sender saw, or none."""
-    trial = state.voidable if what == "void" else state.last_answered
-    if trial is None:
-        raise RefusedError("nothing", f"There is no trial to {what} yet.")
-    if message.trial not in (None, trial.id):
-        raise RefusedError("old-trial", f"Meanwhile {views.place_of(trial)} has come; look again.")
-    if what == "void":
-        return actions.void(state, trial.id, message.reason, at)
-    return actions.undo(state, at, message.reason)

@@ -32,7 +32,8 @@ from starlette.responses import HTMLResponse, JSONResponse, Response, StreamingR
 from starlette.routing import Route
 
 from hilbo.app import lines, messages
-from hilbo.app.hub import COMMANDS, PRESSES, NotNowError, others_present
+from hilbo.app.commands import COMMANDS, NotNowError, others_present
+from hilbo.app.hub import PRESSES
 from hilbo.app.security import PAGES, Gate, Role
 from hilbo.app.stimulus_rig import OverError, StimulusRig
 from hilbo.app.tried import Tried

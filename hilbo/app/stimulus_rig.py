@@ -3,10 +3,9 @@ and when it is not believed.
 
     program --> hello, then reports --> this rig --> orders, one at a time, each with a number of its own
 
-An order says what shall be the case from now on (`present`, `neutral`, `stop`), not what shall change, so that nothing
-is lost with a message: whoever asks is told the newest. The program says which order it knows and what it has done
-about it; it asks again and again, which is its sign of life, and the answer is the server's. All of it happens in the
-event loop. docs/guides/stimulus.md has every message.
+Whoever asks is told the newest order (`orders`). The program says which order it knows and what it has done about it;
+it asks again and again, which is its sign of life, and the answer is the server's. All of it happens in the event loop.
+docs/guides/stimulus.md has every message.
 """
 
 import asyncio
@@ -15,18 +14,18 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from hilbo.app.messages import Hello, Report
+from hilbo.app.orders import Order, as_sent, parameters_of
 from hilbo.app.rig import Loaded, MissedError, Showing, Snapshot
 from hilbo.errors import InputError
-from hilbo.session.confirmed import check_confirmed, in_numbers, in_words
+from hilbo.session.confirmed import check_confirmed, in_numbers
 from hilbo.session.header_check import study_of
 from hilbo.session.records import RefusedError
-from hilbo.session.set_codes import label_of
 from hilbo.study.study_file import AnyStudy
 
-__all__ = ["Order", "OverError", "StimulusRig"]
+__all__ = ["OverError", "StimulusRig"]
 
 _TRAVEL = 0.5  # s that a message there and back may take, and a busy computer
 _NOBODY = {"stimulus": "No program that presents has joined yet.", "preparer": "The preparer has not joined yet."}
@@ -40,15 +39,6 @@ class OverError(InputError):
     """
 
     standing: Mapping[str, Any] = {}
-
-
-class Order(NamedTuple):
-    """What shall be the case. `do`: present, neutral or stop; `trial`: a name for the trial that is presented."""
-
-    number: int
-    do: str
-    showing: Showing | None = None
-    trial: str = ""
 
 
 class StimulusRig:
@@ -75,9 +65,8 @@ class StimulusRig:
         self._run = ""
         self._news, self._moved = asyncio.Event(), asyncio.Event()
         self._asked: asyncio.Future[Loaded] | None = None  # what the present order's confirmation settles
-        self._given: tuple[int, Mapping[str, float | str] | None] | None = (
-            None  # the confirmation that was accepted last
-        )
+        # The confirmation that was accepted last: number of its order, and values.
+        self._given: tuple[int, Mapping[str, float | str] | None] | None = None
         self._since = 0.0  # when the present order was given, monotonic
         self._stopped: float | None = None  # s that the stop took when it was measured
         self._timers: dict[str, asyncio.TimerHandle] = {}
@@ -107,7 +96,7 @@ class StimulusRig:
         self._give("stop")
         self._heard()
         return {"run": self._run, "silence_s": self._table.silence, "within_s": self._table.within,
-                "study": self._study.name, "parameters": self._parameters(), **self._order_message()}  # fmt: skip
+                "study": self._study.name, "parameters": parameters_of(self._study), **self._standing()}  # fmt: skip
 
     async def report(self, report: Report) -> dict[str, Any]:
         """What the program says; the newest order, as soon as there is one that it does not know, or it has waited.
@@ -120,14 +109,14 @@ class StimulusRig:
         try:
             self._take(report)
         except OverError as error:
-            self._refused, error.standing = str(error), self._order_message()
+            self._refused, error.standing = str(error), self._standing()
             self._see(self.snapshot)
             raise
         wait = min(report.wait_s, self._table.silence / _PART)
         if report.order == self.order.number and wait and not self._ended:
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._news.wait(), wait)
-        return self._order_message()
+        return self._standing()
 
     def _take(self, report: Report) -> None:
         """What a report says of the present order, and of contact."""
@@ -335,33 +324,10 @@ class StimulusRig:
     def _moves(self) -> bool:
         return self._hello is not None and self._hello.force
 
-    # In words.
+    def _standing(self) -> dict[str, Any]:
+        """The order that stands, as it is sent."""
+        return as_sent(self.order, self._study, self._tag)
 
     def _who(self) -> dict[str, Any]:
         program = self._hello
         return {} if program is None else {"program": program.name, "version": program.version, "force": program.force}
-
-    def _parameters(self) -> list[dict[str, Any]]:
-        return [
-            {"name": p.name, "levels": list(p.levels)}
-            if p.levels
-            else {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "tolerance": self._table.off_by(p)}
-            for p in self._study.space.parameters
-        ]
-
-    def _order_message(self) -> dict[str, Any]:
-        """The order, as it is sent."""
-        order, showing = self.order, self.order.showing
-        message: dict[str, Any] = {"order": order.number, "do": order.do}
-        if showing is None:
-            return message
-        rendering = showing.values is not None
-        return message | {
-            "trial": order.trial,
-            "step": showing.step,
-            "show": "test" if rendering else showing.show,
-            "side": showing.show if rendering else "",
-            "values": in_words(study_of(self._study, showing.material), showing.values or {}),
-            "label": label_of(showing.values, self._tag) if showing.values is not None else "",
-            "within_s": self._table.within,
-        }
