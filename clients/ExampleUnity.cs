@@ -4,8 +4,8 @@
 //     hilbo session colour.toml --participant P01 --dry-run      # prints the links
 //
 // Copy this file and HilboStimulus.cs into Assets, add this script to a cube, give it the link of the stimulus in the
-// inspector, press Play. Each link opens once: for the next Play, make a new one on the experimenter's page. An order is
-// confirmed in the frame after the one that was drawn with it. Written without Unity, and never run in it.
+// inspector, press Play. The next Play takes the same link, as soon as the last one is gone. An order is confirmed in the frame
+// after the one that was drawn with it. Written without Unity, and never run in it.
 
 using UnityEngine;
 

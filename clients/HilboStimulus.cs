@@ -78,7 +78,7 @@ public sealed class Stimulus : IDisposable {
     double _silenceS = 1;
     bool _contact, _closed;
 
-    /// <param name="link">The one that `hilbo session` prints for the stimulus, good once.</param>
+    /// <param name="link">The one that `hilbo session` prints for the stimulus, for one program at a time.</param>
     /// <param name="neutralWithinS">So soon is everything neutral after goNeutral was called, or after an order.</param>
     /// <param name="log">Told what goes wrong; by default it is on stderr, with the time in s since 1970.</param>
     /// <exception cref="StimulusException">The session does not let it in.</exception>

@@ -282,8 +282,8 @@ private:
 
 } // namespace detail
 
-// This program's part in a session. link: the one that `hilbo session` prints for the stimulus, good once. Throws Error
-// if the session does not let it in.
+// This program's part in a session. link: the one that `hilbo session` prints for the stimulus, for one program at a
+// time. Throws Error if the session does not let it in.
 class Stimulus {
 public:
   Stimulus(const std::string &link, const std::string &name, const std::string &version = "",

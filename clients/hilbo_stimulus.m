@@ -61,8 +61,8 @@ classdef hilbo_stimulus < handle
 
   methods
     function s = hilbo_stimulus(link, name, version, varargin)
-      % LINK: the one that hilbo session prints for the stimulus, good once. Options: 'force', 'go_neutral',
-      % 'neutral_within_s' (so soon is everything neutral after go_neutral, or after an order; 1 s).
+      % LINK: the one that hilbo session prints for the stimulus, for one program at a time. Options: 'force',
+      % 'go_neutral', 'neutral_within_s' (so soon is everything neutral after go_neutral, or after an order; 1 s).
       options = struct('force', false, 'go_neutral', [], 'neutral_within_s', 1);
       for i = 1:2:numel(varargin)
         if ~isfield(options, varargin{i})

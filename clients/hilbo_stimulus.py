@@ -76,11 +76,12 @@ _SILENCE = Order(0, "neutral")  # before a server has spoken, and after one is s
 
 
 class Stimulus:
-    """This program's part in a session. `link`: the one that `hilbo session` prints for the stimulus, good once.
+    """This program's part in a session. `link`: what `hilbo session` prints for the stimulus, one program at a time.
 
-    `key_file`: where the key that it was traded for is kept, readable by you alone, so that the program can be started
-    again in the same session. `neutral_within_s`: so soon is everything neutral after `go_neutral` was called, or after
-    an order, and the session is told so. Raises `StimulusError` if the session does not let it in.
+    `key_file`: where the key that it was traded for is kept, readable by you alone: a program that is started again
+    with it does not wait until the one before counts as gone. `neutral_within_s`: so soon is everything neutral after
+    `go_neutral` was called, or after an order, and the session is told so. Raises `StimulusError` if the session does
+    not let it in.
     """
 
     def __init__(
@@ -319,7 +320,7 @@ class Stimulus:
     def _keyed(self, token: str, file: str | None) -> str:
         """The key for this session, from the file or for the link's token."""
         kept = {}
-        if file:  # opened first: a link is good once, and its key has to go somewhere
+        if file:  # opened first: the key that the link is traded for has to go somewhere
             with open(os.open(file, os.O_RDWR | os.O_CREAT, 0o600), encoding="utf-8") as opened:
                 kept = _read(opened.read())
         if kept.get("token") == token and kept.get("address") == self._address:

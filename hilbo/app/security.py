@@ -2,7 +2,9 @@
 
 A link ends in `#token`, which browsers do not send: the page that it opens trades the token, once, for the role's key,
 in a cookie that scripts cannot read (or, for programs, in the answer). Keys outlive the server, in a file beside the
-log that only its owner may read, so that pages find their session again after a restart; tokens do not.
+log that only its owner may read, so that pages find their session again after a restart; tokens that nobody has used
+do not. A used link opens nothing new: its own browser finds its page by it, and a program that presents, once it is
+gone, is taken back by the link that let it in (`Gate.let_in`).
 
 Host and Origin of every request are compared with the addresses that the server was started for: a page of somebody
 else's that reaches this computer by a name of its own (DNS rebinding) or by a form is refused, whatever cookies it has.
@@ -53,7 +55,8 @@ class Gate:
         ]
         self.origins = frozenset(f"http://{host}" for host in self.hosts)
         self._file = keys
-        self._keys: dict[Role, str] = _kept(keys)
+        self._keys: dict[Role, str] = _kept(keys, "keys")
+        self._links: dict[Role, str] = _kept(keys, "links")  # role -> the token for which its key was given
         self._tokens: dict[str, Role] = {}
 
     def invite(self, role: Role) -> str:
@@ -67,20 +70,26 @@ class Gate:
         """The role of a token that is still good."""
         return self._tokens.get(_digest(token))
 
-    def redeem(self, token: str) -> tuple[Role, str] | None:
-        """The role of a token and a new key for it, None if it is unknown or used.
+    def let_in(self, token: str) -> Role | None:
+        """The role whose key was given for this token, if none was given for another since."""
+        digest = _digest(token)
+        return next((role for role, used in self._links.items() if hmac.compare_digest(used, digest)), None)
+
+    def redeem(self, token: str, again: bool = False) -> tuple[Role, str] | None:
+        """The role of a token and a new key for it, None if it is unknown or used; `again`: used is as good.
 
         The key replaces the one before: a participant's second browser ends the first. Raises `InputError` if it cannot
         be kept; the token is still good then, and the key before too.
         """
-        role = self.asked_for(token)
+        role = self.asked_for(token) or (self.let_in(token) if again else None)
         if role is None:
             return None
         key = secrets.token_urlsafe(_BYTES)
         keys: dict[Role, str] = {**self._keys, role: _digest(key)}
-        self._keep(keys)
-        self._keys = keys
-        del self._tokens[_digest(token)]
+        links: dict[Role, str] = {**self._links, role: _digest(token)}
+        self._keep({"keys": keys, "links": links})
+        self._keys, self._links = keys, links
+        self._tokens.pop(_digest(token), None)
         return role, key
 
     def admits(self, role: Role, key: str | None) -> bool:
@@ -108,13 +117,13 @@ class Gate:
             return "The request does not say which page it comes from; a program sends its key in Authorization."
         return None
 
-    def _keep(self, keys: dict[Role, str]) -> None:
+    def _keep(self, digests: Mapping[str, Mapping[Role, str]]) -> None:
         if self._file is None:
             return
         part = self._file.with_name(f"{self._file.name}.part")
         try:
             with open(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w", encoding="utf-8") as file:
-                json.dump(keys, file)
+                json.dump(digests, file)
             part.replace(self._file)
         except OSError as error:
             raise InputError(f"{self._file}: cannot be written ({error.strerror}); make room for it.") from error
@@ -124,12 +133,14 @@ def _digest(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _kept(file: Path | None) -> dict[Role, str]:
-    """The digests in a file of keys; none where it is missing or damaged, and everybody is invited again."""
+def _kept(file: Path | None, what: str) -> dict[Role, str]:
+    """The digests of keys, or of links, in a file; none where it is missing or damaged, and everybody is invited
+    again."""
     try:
-        digests = json.loads(file.read_text(encoding="utf-8")) if file else {}
+        content = json.loads(file.read_text(encoding="utf-8")) if file else {}
     except (OSError, ValueError):
         return {}
+    digests = content.get(what) if isinstance(content, dict) else None
     if not isinstance(digests, dict):
         return {}
     return {role: digests[role] for role in get_args(Role) if isinstance(digests.get(role), str)}

@@ -46,6 +46,7 @@ __all__ = ["application"]
 _FILES = {path.name: path.read_bytes() for path in (Path(__file__).parent / "static").iterdir()}
 _ALIVE = 5.0  # s between signs of life in a silent stream
 _DAY = 86_400
+_TAKEN = "This link has been used by a program that is still there; end that one first, or ask for a new link."
 _JOIN_TEXTS = ("lang", "wait", "no_link", "used_link", "no_server")
 _HEADERS = {
     b"content-security-policy": b"default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
@@ -178,8 +179,14 @@ def _join(hub, gate):
             return _not_understood(error)
         if gate.asked_for(message.token) == "stimulus" and not message.bearer:
             return _error(400, "This link is for a program that presents, not for a browser; give it to the program.")
+        used_by = gate.let_in(message.token)
+        if used_by in PAGES and gate.admits(used_by, request.cookies.get(gate.cookies[used_by])):
+            return JSONResponse({"role": used_by})  # the same browser opens its link again
+        back = used_by == "stimulus" and message.bearer and isinstance(hub.rig, StimulusRig)
+        if back and not await hub.rig.free():
+            return _error(401, _TAKEN)
         try:
-            granted = gate.redeem(message.token)
+            granted = gate.redeem(message.token, again=back)
         except InputError as error:
             return _error(503, str(error))
         if granted is None:

@@ -29,6 +29,8 @@ __all__ = ["OverError", "StimulusRig"]
 
 _TRAVEL = 0.5  # s that a message there and back may take, and a busy computer
 _NOBODY = {"stimulus": "No program that presents has joined yet.", "preparer": "The preparer has not joined yet."}
+_WAIT = 5.0  # s that a program which joins may be kept waiting: clients wait for 10
+_TURN = 0.1  # s in which the timer of a silence has its turn
 _PART = 3  # a question is held for so small a part of the silence that is borne
 
 
@@ -97,6 +99,13 @@ class StimulusRig:
         self._heard()
         return {"run": self._run, "silence_s": self._table.silence, "within_s": self._table.within,
                 "study": self._study.name, "parameters": parameters_of(self._study), **self._standing()}  # fmt: skip
+
+    async def free(self) -> bool:
+        """Whether nobody presents: no program was heard for as long as it may be silent, which is waited for."""
+        end = time.monotonic() + min(self._table.silence + _TURN, _WAIT)
+        while not self.snapshot.lost and (left := end - time.monotonic()) > 0:
+            await self._after(self._moved, left)
+        return self.snapshot.lost is not None
 
     async def report(self, report: Report) -> dict[str, Any]:
         """What the program says; the newest order, as soon as there is one that it does not know, or it has waited.

@@ -123,7 +123,11 @@ def _started(hub, place, served, as_json) -> None:
     for role in ("preparer", "participant") if served.lan else ():
         if role in links:
             print(f"{role}:\n{serve.qr_text(links[role])}", file=sys.stderr)
-    print("Each link opens once. Ctrl-C ends the server; --resume goes on.", file=sys.stderr, flush=True)
+    print(
+        "Each link is for one program or browser. Ctrl-C ends the server; --resume goes on.",
+        file=sys.stderr,
+        flush=True,
+    )
     if as_json:
         print(json.dumps(links | {"log": str(hub.log.path), "device": hub.rig.words.partition(",")[0]}), flush=True)
     if served.browse:

@@ -74,6 +74,20 @@ def test_keys_outlive_the_server_and_only_their_owner_may_read_them(gate, tmp_pa
     assert again.redeem(token) is None
 
 
+def test_a_used_link_says_whom_it_let_in_until_another_did_and_after_a_restart(gate, tmp_path):
+    first, second = gate.invite("stimulus"), None
+    assert gate.let_in(first) is None
+    _, key = gate.redeem(first)
+    assert gate.let_in(first) == "stimulus" and gate.redeem(first) is None
+    again = Gate([HERE], tmp_path / "keys")
+    second = again.invite("stimulus")
+    assert again.let_in(first) == "stimulus" and again.let_in(second) is None
+    _, other = again.redeem(first, again=True)
+    assert again.admits("stimulus", other) and not again.admits("stimulus", key)
+    again.redeem(second)
+    assert again.let_in(first) is None and again.redeem(first, again=True) is None
+
+
 def test_a_link_that_could_not_be_opened_is_still_good_and_the_first_browser_stays(gate, tmp_path):
     _, first = gate.redeem(gate.invite("participant"))
     token = gate.invite("participant")
@@ -88,7 +102,7 @@ def test_a_link_that_could_not_be_opened_is_still_good_and_the_first_browser_sta
     assert gate.redeem(token) is None
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{", '{"experimenter": 1}', "\0"])
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"keys": 1}', '{"keys": {"experimenter": 1}, "links": []}', "\0"])
 def test_a_damaged_file_of_keys_admits_nobody(tmp_path, text):
     (tmp_path / "keys").write_text(text)
     gate = Gate([HERE], tmp_path / "keys")

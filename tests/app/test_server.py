@@ -114,6 +114,18 @@ def quiet_post(live, name, data):
     ask(live, f"/api/participant/{name}", data=data, Authorization=f"Bearer {live.participant._key}")
 
 
+def test_a_browser_that_opens_its_used_link_again_finds_its_page_and_nobody_else_does(quiet):
+    body = json.dumps({"token": quiet.place.link("preparer").partition("#")[2]}).encode()
+    page = {"Content-Type": "application/json", "Origin": quiet.participant.address}
+    with ask(quiet, "/api/join", data=body, **page) as first:
+        cookie = first.headers["Set-Cookie"].partition(";")[0]
+    with ask(quiet, "/api/join", data=body, **page, Cookie=cookie) as again:
+        assert json.load(again) == {"role": "preparer"} and again.headers["Set-Cookie"] is None
+    for other in ({}, {"Cookie": cookie[:-1] + "-"}):
+        with refused(401, "This link has been used"):
+            ask(quiet, "/api/join", data=body, **page, **other)
+
+
 class refused_somehow:  # noqa: N801  (read as a word)
     def __enter__(self):
         return self

@@ -7,14 +7,16 @@ import urllib.request
 
 import pytest
 from live_server import DATA, PATIENCE, Live, check_blinding, listen, refused
-from live_stimulus import SETS, SINGLE, ByHand, LiveStimulus, Presenter, module
+from live_stimulus import SETS, SINGLE, ByHand, LiveStimulus, Presenter, all_answered, module
 
 from hilbo.app.robot import Client
 from hilbo.cli import doctor
 from hilbo.errors import InputError
 from hilbo.session.export import trials_table
-from hilbo.session.records import Block
+from hilbo.session.records import Block, Planned
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
+
+ONE = (Block("warm-up", 1, (Planned("best"),)),)
 
 
 @pytest.fixture
@@ -387,6 +389,31 @@ def test_a_link_that_is_not_the_stimulus_s_is_refused(live):
         client.Stimulus(live.place.link("participant"), "a")
     with pytest.raises(client.StimulusError, match="has been used"):
         client.Stimulus(live.link() + "x", "a")
+
+
+def test_a_program_that_was_killed_is_taken_back_by_its_link_and_its_trial_is_void(tmp_path):
+    with LiveStimulus(tmp_path, silence=0.5, blocks=ONE) as live:
+        link = live.link()
+        killed = ByHand(link)
+        live.begin()
+        killed.asked(live)  # and nothing more is heard of it
+        with Presenter(link):
+            with refused(401, "no longer part of it"):
+                killed.report("busy")
+            assert len(all_answered(live)) == 1
+        voided = [trial.voided for trial in live.replayed().trials if trial.status == "void"]
+        assert len(voided) == 1 and "has been silent for 0.5 s" in str(voided)
+
+
+def test_a_second_program_with_the_link_of_one_that_lives_is_refused(tmp_path):
+    with LiveStimulus(tmp_path, silence=0.5, blocks=ONE) as live:
+        link = live.link()
+        with Presenter(link):
+            live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+            with refused(401, "used by a program that is still there; end that one first"):
+                ByHand(link)
+            assert len(all_answered(live)) == 1
+        assert not any(trial.status == "void" for trial in live.replayed().trials)
 
 
 def test_no_program_presents_where_a_device_does(tmp_path):

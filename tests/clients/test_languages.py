@@ -68,6 +68,22 @@ def test_the_example_confirms_a_level_that_it_does_not_know(language, built, tmp
 
 
 @each_language
+def test_an_example_that_was_killed_while_it_presented_goes_on_by_the_same_link(language, built, tmp_path):
+    command = language.build("example_patch", built)
+    with LiveStimulus(tmp_path, silence=1.0, seconds=1.5, blocks=SINGLE) as live:
+        command = [*command, live.link()]
+        with Running(command, tmp_path):
+            live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+            live.begin()
+            live.until(lambda _: live.events("stimulus"), lambda: None)
+        with Running(command, tmp_path):
+            all_answered(live)
+        state = live.replayed()
+    assert sum(trial.status == "answered" for trial in state.trials) == 3
+    assert any("has been silent" in str(trial.voided) for trial in state.trials if trial.status == "void")
+
+
+@each_language
 def test_the_example_says_in_a_sentence_why_it_cannot_join(language, built, tmp_path):
     command = language.build("example_patch", built)
     with LiveStimulus(tmp_path, blocks=SINGLE) as live, Running([*command, live.link() + "x"], tmp_path) as program:
