@@ -259,10 +259,11 @@ class Runner:
         return hub.begun and hub.warm.done() and hub.watchers.participant_here
 
     def _look_ahead(self) -> None:
-        """In the choosing's thread, while somebody feels: what comes next after each possible answer."""
+        """In the choosing's thread, while somebody feels: what comes next after each possible answer. It ends with the
+        answer: what follows is chosen in the same thread."""
         hub = self.hub
-        state = hub.state
-        self._ahead = hub.compute.submit(hub.chooser.lookahead, state)
+        state, key = hub.state, self.key()
+        self._ahead = hub.compute.submit(hub.chooser.lookahead, state, lambda: self.key() == key)
 
 
 def _next_side(steps, i) -> str | None:

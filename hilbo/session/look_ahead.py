@@ -9,7 +9,7 @@ space-filling point without an answer that counts comes before all others. With 
 """
 
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -123,17 +123,23 @@ class LiveChooser:
             self.looked_up += situation in self._choices
             return self._choice(situation)
 
-    def lookahead(self, state: LiveSession) -> dict[str, dict[str, Any]]:
-        """For each answer to the pending optimisation trial: what would be proposed after it. Empty where that is
-        known without a fit."""
+    def lookahead(self, state: LiveSession, wanted: Callable[[], bool] = lambda: True) -> dict[str, dict[str, Any]]:
+        """For each answer to the pending optimisation trial, the likely ones first: what would be proposed after it.
+        Empty where that is known without a fit; ends when it is not `wanted` any more."""
         trial = state.pending
         if trial is None or trial.repeats is not None or state.header.blocks[trial.block].trials:
             return {}
         if len(state.answers(trial.block)) + 1 >= state.quota(trial.block):
             return {}
         excluded = _Situation.of(state, trial.block).excluded
-        following = zip(state.study.responses, _following(state), strict=True)
-        return {response: self._choice(_Situation(answers, excluded)) for response, answers in following}
+        following = dict(zip(state.study.responses, _following(state), strict=True))
+        likely = trial.data.get("choice", {}).get("probabilities", {})
+        ahead: dict[str, dict[str, Any]] = {}
+        for response in sorted(following, key=lambda response: -likely.get(response, 0.0)):
+            if not wanted():
+                break
+            ahead[response] = self._choice(_Situation(following[response], excluded))
+        return ahead
 
     # What the experimenter's page reads.
 

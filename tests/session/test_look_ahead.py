@@ -118,6 +118,19 @@ def test_a_rendering_stopped_twice_is_replaced_by_a_feasible_one_apart(chooser, 
     assert state.pending.renderings["a"] != point
 
 
+def test_the_likeliest_answer_is_looked_ahead_to_first_and_no_other_once_nobody_wants_it(chooser):
+    state = start()
+    for response in ANSWERS[:3]:
+        state = told(asked(state, chooser), response)
+    state = asked(state, chooser)
+    likely = state.pending.data["choice"]["probabilities"]
+    order = sorted(likely, key=lambda response: -likely[response])
+    assert order != list(STUDY.responses) and list(chooser.lookahead(state)) == order
+    for many in range(3):
+        left = iter([True] * many + [False])
+        assert list(chooser.lookahead(state, lambda left=left: next(left))) == order[:many]
+
+
 def test_a_warm_start_chooses_from_the_map_and_is_in_the_header():
     points = search_points(STUDY.space, 0)
     mean = 2.0 - 40.0 * ((points - np.array([0.7, 0.2])[None, :]) ** 2).sum(axis=1)
