@@ -1,12 +1,15 @@
-"""A whole session without people: a simulated participant drives real server, real pages and a simulated device.
+"""A whole session without people: a simulated participant drives real server, real pages and what renders.
 
 The server is a process of its own, as `hilbo session` starts it; the device is the firmware's core on a
-pseudo-terminal, whose finger presses while a rendering is shown; the participant's page is in Chromium. The participant
-is drawn from the study's simulated population (`simulation.presets`) and answers from what was really on the device.
+pseudo-terminal, whose finger presses while a rendering is shown; in a study without our device a stand-in confirms what
+it is asked for (`stand_in`). The participant's page is in Chromium. The participant is drawn from the study's simulated
+population (`simulation.presets`) and answers from what was really on the device, or was confirmed.
 """
 
 import contextlib
+import functools
 import json
+import re
 import subprocess
 import sys
 import time
@@ -19,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from hilbo.app.robot import SIZES, Participant, browser, held, screenshots
+from hilbo.app.stand_in import StandIn
 from hilbo.device.simulator import Simulator
-from hilbo.errors import InputError
 from hilbo.search.apart import levels_of, nrmse
 from hilbo.session.event_log import read_log
 from hilbo.session.plan import make_plan
@@ -28,7 +31,6 @@ from hilbo.simulation import simulate
 from hilbo.simulation.presets import placed, population_of
 from hilbo.simulation.simulate import Population
 from hilbo.study.config import Study
-from hilbo.study.study_file import StudyFile
 
 __all__ = ["HILBO", "Decider", "example_sets", "fast_study", "rehearse", "server"]
 
@@ -74,12 +76,14 @@ class Decider:
 
 
 def fast_study(source: Path, target: Path, seconds: float | None, warm_up: int | None = None) -> Path:
-    """A copy of a study file, whose steps all last `seconds`. Raises `InputError` if it has its own."""
+    """A copy of a study file, whose steps all last `seconds`. `warm_up`: how many trials of it, where the file has no
+    table for them."""
     text = source.read_text(encoding="utf-8")
     if seconds is not None:
-        if "[session" in text:
-            raise InputError(f"{source}: has a [session] of its own; leave --seconds out.")
+        text = re.sub(r"\bseconds\s*=\s*[\d.]+", f"seconds = {seconds}", text)
         for name, shows in _STEPS.items():
+            if re.search(rf"^\s*\[session\.{name}\]", text, re.MULTILINE):
+                continue
             steps = ", ".join(f'{{show = "{show}", seconds = {seconds}}}' for show in shows)
             text += f"\n[session.{name}]\nsteps = [{steps}]\n"
             text += f"count = {warm_up}\n" if name == "warm_up" and warm_up else ""
@@ -149,39 +153,47 @@ def rehearse(
     say: Callable[[str], Any] = lambda _: None,
 ) -> dict[str, Any]:
     """The session's log, screenshots of both pages, and how long answers took to be felt, in `out`."""
-    if StudyFile.load(source).stimulus is not None:
-        raise InputError(f"{source}: has no [renderer], and a rehearsal is with a simulated device; use --dry-run.")
+    Study.load(source)  # what is refused leaves no folder behind
     out.mkdir(parents=True, exist_ok=True)
     file = fast_study(source, out / "study.toml", seconds, warm_up)
     study = Study.load(file)
     population = placed(study, population_of(study, preset)[1], seed)
-    arguments = [
-        str(file),
-        "--participant",
-        "P01",
-        "--logs",
-        str(out / "logs"),
-        "--port",
-        "0",
-        "--seed",
-        str(seed),
-        "--dry-run",
-    ]
-    arguments += ["--gap", "0.7" if seconds is None else "0.05"]
+    arguments = [str(file), "--participant", "P01", "--logs", str(out / "logs"), "--port", "0"]
+    arguments += ["--seed", str(seed), "--dry-run", "--gap", "0.7" if seconds is None else "0.05"]
     if phase != "optimisation":
         arguments += ["--plan", str(_plan(study, population, out, phase, seed))]
     say("starting the server")
-    finger = Simulator(finger="rest")
-    try:
-        with server(*arguments, "--device", finger.port) as (_, links), browser() as program:
-            say("in session")
-            summary = _session(program, links, Decider(study, population, seed), finger, out, say)
-        summary["log"] = links["log"]
-        summary["events"] = len(read_log(links["log"], study)[1])
-    finally:
-        finger.close()
+    rendered = _by_device if study.stimulus is None else functools.partial(_by_stand_in, study)
+    with rendered(arguments, Decider(study, population, seed)) as (links, decide, touches), browser() as program:
+        say("in session")
+        summary = _session(program, links, decide, touches, out, say)
+    summary["log"] = links["log"]
+    summary["events"] = len(read_log(links["log"], study)[1])
     (out / "result.json").write_text(json.dumps(summary, indent=2), encoding="utf-8")
     return summary
+
+
+@contextlib.contextmanager
+def _by_device(arguments, decide):
+    """Links, what decides, and what makes a hand (given how to look at the session), with a simulated device."""
+    finger = Simulator(finger="rest")
+    try:
+        with server(*arguments, "--device", finger.port) as (_, links):
+            yield links, decide, functools.partial(_presser, finger)
+    finally:
+        finger.close()
+
+
+@contextlib.contextmanager
+def _by_stand_in(study, arguments, decide):
+    """The same with who presents in place of a device."""
+    role = study.stimulus.role
+    with server(*arguments) as (_, links), StandIn(study, links[role], role) as presents:
+        yield (
+            links,
+            lambda trial, ask: decide({"renderings": presents.presented(trial["id"])}, ask),
+            lambda _watch: lambda _on: None,
+        )
 
 
 def _plan(study, population, out, phase, seed) -> Path:
@@ -194,7 +206,7 @@ def _plan(study, population, out, phase, seed) -> Path:
     return path
 
 
-def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
+def _session(program, links, decide, touches, out, say) -> dict[str, Any]:
     screens = out / "screens"
     screens.mkdir(exist_ok=True)
     desk = dict(zip(("width", "height"), SIZES[0], strict=True))
@@ -209,7 +221,7 @@ def _session(program, links, decide, finger, out, say) -> dict[str, Any]:
     mishaps: list[str] = []
     for page in (window, experimenter):
         page.on("pageerror", lambda error: mishaps.append(str(error)))
-    participant = Participant(window, links["participant"], watch, decide, _presser(finger, watch))
+    participant = Participant(window, links["participant"], watch, decide, touches(watch))
     begun = time.monotonic()
     cleared = _lead(participant, window, experimenter, screens, say)
     view = watch()

@@ -14,6 +14,7 @@ from hilbo.app.slices import Maps
 from hilbo.session.event_log import EventLog, read_log
 from hilbo.session.records import Block, Planned
 from hilbo.study.config import Study
+from hilbo.study.new_study import NewStudy, parameter_of, study_text
 
 pytestmark = [
     pytest.mark.deep,
@@ -40,6 +41,18 @@ def test_a_whole_session_by_one_command(tmp_path, kind, trials):
     assert sum(event.kind == "answer" for event in events) == 3 + trials
     with EventLog.resume(found["log"], study) as log:
         assert log.state.screen == "done"
+
+
+@pytest.mark.parametrize("by", ["program", "person"])
+def test_a_whole_session_of_levels_without_a_device_by_one_command(tmp_path, by):
+    named = ("texture=silk,wood,stone", "grains=0:6::integer", "gain=0.5:20:N")
+    (tmp_path / "base.toml").write_text(study_text(NewStudy("s", tuple(map(parameter_of, named)), trials=9, by=by)))
+    command = [*rehearsal.HILBO, "simulate", "--live", "--study", str(tmp_path / "base.toml")]
+    command += ["--out", str(tmp_path / "out"), "--seconds", "0.3", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=900)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["answers"] == 12 and found["mishaps"] == []
 
 
 @pytest.fixture

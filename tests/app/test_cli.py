@@ -15,7 +15,7 @@ from msgspec import to_builtins
 
 from hilbo.app import serve
 from hilbo.app.opening import Wanted, opened
-from hilbo.app.rehearsal import example_sets, rehearse
+from hilbo.app.rehearsal import example_sets, fast_study, rehearse
 from hilbo.cli import doctor
 from hilbo.cli.main import app
 from hilbo.device.simulator import Simulator
@@ -27,6 +27,9 @@ from hilbo.session.participants import add_person
 from hilbo.session.plan import header_for, make_plan, plan_hash
 from hilbo.session.warm_start import read_warm_start
 from hilbo.simulation.presets import preset_of
+from hilbo.study.config import Study
+from hilbo.study.new_study import NewStudy, parameter_of, study_text
+from hilbo.study.protocols import protocol
 
 PERSON = {"participant": "P01", "consent_time": "2026-03-02T10:00", "protocol_number": "7", "age": "", "handedness": ""}
 
@@ -50,8 +53,8 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
     device = ("--device", tmp_path / "none")
     words = refused(DATA.parent / "video_quality.toml", *place, "--dry-run", *device)
     assert "has no [renderer], and a device nothing to render; leave --device out" in words
-    with pytest.raises(InputError, match="a rehearsal is with a simulated device"):
-        rehearse(DATA.parent / "video_quality.toml", tmp_path / "rehearsal")
+    with pytest.raises(InputError, match="cannot be read"):
+        rehearse(tmp_path / "none.toml", tmp_path / "rehearsal")
     assert not (tmp_path / "rehearsal").exists()
     assert "cannot be read" in refused(tmp_path / "none.toml", *place)
     assert "participants.csv: cannot be read" in refused(DATA, *place)
@@ -67,6 +70,15 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
         other.listen()
         assert "choose another --port" in refused(DATA, *place[:2], "--port", other.getsockname()[1], *place[4:])
     assert list(logs.glob("*.jsonl")) == []
+
+
+def test_a_study_is_made_fast_whether_it_has_steps_or_not(tmp_path):
+    text = study_text(NewStudy("s", (parameter_of("texture=silk,wood"), parameter_of("gain=0:1:N"))))
+    for source in (text, text.partition("[session]")[0]):
+        (tmp_path / "base.toml").write_text(source)
+        session = Study.load(fast_study(tmp_path / "base.toml", tmp_path / "fast.toml", 0.1, 2)).session
+        for phase in ("warm-up", "optimisation", "validation", "aggregate-best"):
+            assert {step.seconds for step in protocol(session, phase).steps} == {0.1}
 
 
 def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_path):

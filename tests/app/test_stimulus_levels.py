@@ -2,12 +2,13 @@
 
 import pytest
 from live_server import check_blinding, refused
-from live_stimulus import SETS, SINGLE, LiveLevels
+from live_stimulus import SETS, SINGLE, LiveLevels, all_answered
 
 from hilbo.app.lines import lines_of
 from hilbo.app.log_words import table
 from hilbo.app.robot import browser, find_browser
 from hilbo.app.slices import Maps
+from hilbo.app.stand_in import StandIn
 from hilbo.session.export import sets_table, trials_table
 from hilbo.session.records import Block
 from hilbo.study.cohort import cohort_of
@@ -43,6 +44,17 @@ def test_a_session_that_chooses_is_aggregated_from_its_table(tmp_path):
         assert [LEVELS[int(k)] for k in cohort.physical[0, :, 1]] == chosen
         assert [row["cells"][4] for row in table(live.replayed())["rows"]] == chosen[::-1]
         live.replays()
+
+
+@pytest.mark.parametrize("by", ["program", "person"])
+def test_a_stand_in_presents_and_knows_what_by_place_in_the_list(tmp_path, by):
+    more = 'by = "person"\n' if by == "person" else ""
+    with LiveLevels(tmp_path, more=more, blocks=SINGLE) as live:
+        role = live.study.stimulus.role
+        with StandIn(live.study, live.place.link(role), role) as presents:
+            all_answered(live)
+            assert [presents.presented(k)["a"] for k in (1, 2, 3)] == list(live.sets().values())
+            assert presents.presented(4) == {}
 
 
 def test_another_level_voids_the_trial_and_what_is_none_is_refused(tmp_path):
