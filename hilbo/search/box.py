@@ -168,6 +168,16 @@ class Constraint:
     least: float | None = None
     most: float | None = None
 
+    @property
+    def words(self) -> str:
+        """Such as `0 <= gain + 2 grains <= 24`."""
+        parts = [
+            f"{'-' if w < 0 else '+'} {'' if abs(w) == 1 else f'{abs(w):g} '}{name}" for name, w in self.terms if w
+        ]
+        total = " ".join(parts).removeprefix("+ ")
+        low = "" if self.least is None else f"{self.least:g} <= "
+        return low + total + ("" if self.most is None else f" <= {self.most:g}")
+
 
 @dataclass(frozen=True)
 class Mechanics:

@@ -75,13 +75,17 @@ def _stimuli(study: StudyFile) -> list[str]:
         if parameter.levels:
             lines.append(f"| {parameter.name} | {_list(parameter.levels)} | | | levels, without an order |")
             continue
-        lines.append(f"| {parameter.name} | {ends} | {parameter.unit} | {parameter.scale} |")
-    kind = (
-        "Only renderings that are passive on the device are presented."
-        if study.tables.renderer is not None
-        else "A program presents them, and confirms what is in force; analyses use the confirmed values."
-    )
-    return [*lines, "", kind]
+        whole = ", whole numbers" if parameter.integer else ""
+        lines.append(f"| {parameter.name} | {ends} | {parameter.unit} | {parameter.scale}{whole} |")
+    bounds = [f"Nothing is presented but what keeps {constraint.words}." for constraint in study.space.constraints]
+    return [*lines, "", *bounds, _presenting(study)]
+
+
+def _presenting(study: StudyFile) -> str:
+    if study.stimulus is None:
+        return "Only renderings that are passive on the device are presented."
+    who = "A program" if study.stimulus.by == "program" else "A person"
+    return f"{who} presents them, and confirms what is in force; analyses use the confirmed values."
 
 
 def _trials(study: StudyFile, phase: Phase) -> list[str]:
@@ -142,7 +146,8 @@ def _model(study: StudyFile) -> str:
         "noise": gp.noise,
     }
     stated = [f"{name} {_value(value)}" for name, value in given.items() if value is not None]
-    return ", ".join([f"inference {gp.inference}", *stated]) + (
+    alike = [f"correlation {p.correlation:g} of any two levels of {p.name}" for p in study.space.parameters if p.levels]
+    return ", ".join([f"inference {gp.inference}", *stated, *alike]) + (
         "" if len(stated) == len(given) else ", the rest learnt"
     )
 

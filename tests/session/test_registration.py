@@ -10,6 +10,7 @@ from hilbo.errors import InputError
 from hilbo.session.plan import make_plan
 from hilbo.session.registration import registration
 from hilbo.study.departures import departures
+from hilbo.study.new_study import NewStudy, parameter_of, study_text
 from hilbo.study.study_file import StudyFile
 
 PAPER = Path("hilbo/data/paper.toml")
@@ -25,6 +26,23 @@ def page(tmp_path):
         return registration(study, make_plan(study, people, 5, **others), "1.2.3")
 
     return of
+
+
+def test_levels_whole_numbers_constraints_and_a_person_who_presents_stand_on_the_page(tmp_path):
+    named = ("texture=silk,wood", "grains=0:6::integer", "gain=0.5:20:N")
+    text = study_text(NewStudy("s", tuple(map(parameter_of, named)), by="person"))
+    text += "[[constraints]]\nterms = {gain = 1, grains = -2.5}\nleast = -3\nmost = 24\n"
+    (tmp_path / "study.toml").write_text(text)
+    planned = make_plan(StudyFile.load(PAPER), ("P01",), 5)  # of another study, whose points are drawn already
+    written = registration(StudyFile.load(tmp_path / "study.toml"), planned, "1.2.3")
+    for part in (
+        '| texture | "silk", "wood" | | | levels, without an order |',
+        "| grains | 0 | 6 |  | linear, whole numbers |",
+        "Nothing is presented but what keeps -3 <= gain - 2.5 grains <= 24.",
+        "A person presents them",
+        "correlation 0.5 of any two levels of texture",
+    ):
+        assert part in written
 
 
 def test_what_is_fixed_stands_on_the_page(page):
