@@ -128,15 +128,23 @@ def _held(parameter: Parameter, unit: float) -> str:
     return f"{parameter.name} = {parameter.words(value) if parameter.levels else f'{value:.3g}'}"
 
 
+def _axis(parameter: Parameter) -> Float[np.ndarray, " side"]:
+    """Where an axis of the grids is, in the unit cube: of levels bands of one width."""
+    count = len(parameter.levels)
+    if not count:
+        return np.linspace(0.0, 1.0, _SIDE)
+    return np.floor((np.arange(_SIDE) + 0.5) * count / _SIDE) / (count - 1)
+
+
 @program
 def _slices(study: Study, posterior: Posterior, physical: Float[Array | np.ndarray, " d"]) -> _Slices:
     best = study.space.to_unit(physical)
-    axis = jnp.linspace(0.0, 1.0, _SIDE, dtype=best.dtype)
-    up, across = jnp.meshgrid(axis, axis, indexing="ij")
-    grids = [
-        jnp.broadcast_to(best, (_SIDE * _SIDE, best.shape[0])).at[:, i].set(across.ravel()).at[:, j].set(up.ravel())
-        for i, j in itertools.combinations(range(study.space.dim), 2)
-    ]
+    axes = [jnp.asarray(_axis(p), best.dtype) for p in study.space.parameters]
+    grids = []
+    for i, j in itertools.combinations(range(study.space.dim), 2):
+        up, across = jnp.meshgrid(axes[j], axes[i], indexing="ij")
+        grid = jnp.broadcast_to(best, (_SIDE * _SIDE, best.shape[0]))
+        grids.append(grid.at[:, i].set(across.ravel()).at[:, j].set(up.ravel()))
     points = jnp.concatenate(grids)
     shape = (len(grids), _SIDE, _SIDE)
     return _Slices(best, posterior.mean(points).reshape(shape), study.space.feasible(points).reshape(shape))

@@ -180,7 +180,7 @@ def _trial_rows(hub, trial):
         rows.append([f"Rendering {side.upper()}" + (f" ({name})" if name else ""), _set_words(state.study, values)])
     rows += choice_rows(trial.data.get("choice", {}))
     if hub.delays:
-        rows.append(["Answer to device", f"{1000 * hub.delays[-1]['total']:.0f} ms"])
+        rows.append([f"Answer to {hub.rig.title.lower()}", f"{1000 * hub.delays[-1]['total']:.0f} ms"])
     return rows
 
 

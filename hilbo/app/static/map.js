@@ -60,15 +60,16 @@ function drawSlice(canvas, slice, across, up, range) {
   canvas.width = w * ratio; canvas.height = h * ratio;
   c.scale(ratio, ratio);
   c.save(); c.translate(x, y); drawMean(c, slice, range, side); c.restore();
-  const place = (u, v) => [x + u * side, y + (1 - v) * side];
+  const count = (p) => (p.levels || []).length;         // of unordered levels: bands of one width, each with a tick
+  const shown = (p, u) => count(p) ? (Math.round(u * (count(p) - 1)) + .5) / count(p) : u;
+  const place = (u, v) => [x + shown(across, u) * side, y + (1 - shown(up, v)) * side];
   for (const t of slice.trials) dot(c, ...place(t.x, t.y), t);
   if (range[1] > range[0]) twice(c, "#111", [4, 1.8], () => cross(c, ...place(...slice.best)));
   if (across.hidden_unit !== undefined) twice(c, "#d1495b", [6, 3], () => ring(c, ...place(across.hidden_unit, up.hidden_unit)));
   c.fillStyle = "#1d2733"; c.font = text + font; c.textAlign = "center";
   if (slice.held) c.fillText(`at ${slice.held}`, x + side / 2, y - 6);
-  const last = (p) => (p.levels || []).length - 1;      // of unordered levels, all of which have a tick
-  const ticks = (p) => last(p) > 0 ? p.levels.map((_, i) => i / last(p)) : [0, 0.5, 1];
-  const value = (p, u) => last(p) > 0 ? p.levels[Math.round(last(p) * u)] : Number((p.scale === "log" ? p.low * (p.high / p.low) ** u : p.low + (p.high - p.low) * u).toPrecision(2));
+  const ticks = (p) => count(p) ? p.levels.map((_, i) => (i + .5) / count(p)) : [0, 0.5, 1];
+  const value = (p, u) => count(p) ? p.levels[Math.floor(count(p) * u)] : Number((p.scale === "log" ? p.low * (p.high / p.low) ** u : p.low + (p.high - p.low) * u).toPrecision(2));
   for (const u of ticks(across)) {
     c.textAlign = u === 0 ? "left" : u === 1 ? "right" : "center";
     c.fillText(value(across, u), x + u * side, y + side + 1.2 * text, side / ticks(across).length);
