@@ -76,24 +76,43 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any], 
 
     Raises what keeps the hub from opening, `InputError` or `DeviceError`; nobody has been answered then.
     """
+    from hilbo.app.porter import Porter
+
+    sys.setswitchinterval(_SWITCH)
+    server = _server(place.gate, hub, tried)
+    admission = _Admission(server)
+    porter = Porter(place.socket, place.gate, max(1, _files() - _RESERVED), admission.admit)
+    _open_and_close(server, hub, porter, admission, started)
+    try:
+        # The default of Windows has no add_reader, which the porter needs.
+        with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
+            runner.run(server.serve(sockets=[]))  # the porter has it
+    finally:
+        place.socket.close()
+
+
+def _server(gate: Gate, hub: Any, tried: Any) -> Any:
+    """A server of uvicorn's that answers for the hub, with connections of our own."""
     import uvicorn
 
     from hilbo.app.connections import Connection, Connections
-    from hilbo.app.porter import Porter
     from hilbo.app.server import application
 
-    sys.setswitchinterval(_SWITCH)
     config = uvicorn.Config(
-        application(hub, place.gate, tried), log_level="error", access_log=False, lifespan="off", server_header=False,
+        application(hub, gate, tried), log_level="error", access_log=False, lifespan="off", server_header=False,
         timeout_graceful_shutdown=_LINGER, ws="none",
-        http=functools.partial(Connection, Connections(place.gate)),  # type: ignore[arg-type]
+        http=functools.partial(Connection, Connections(gate)),  # type: ignore[arg-type]
     )  # fmt: skip
-    server = uvicorn.Server(config)
-    listen, hang_up = server.startup, server.shutdown
-    admission = _Admission(config, server)
-    porter = Porter(place.socket, place.gate, max(1, _files() - _RESERVED), admission.admit)
+    return uvicorn.Server(config)
 
-    # Not as ASGI's lifespan, which swallows what the hub raises.
+
+def _open_and_close(
+    server: Any, hub: Any, porter: Any, admission: "_Admission", started: Callable[[Callable[[], None]], Any]
+) -> None:
+    """Have the hub opened before the server answers, and closed after it. Not as ASGI's lifespan, which swallows what
+    the hub raises."""
+    listen, hang_up = server.startup, server.shutdown
+
     async def startup(sockets=None):
         try:
             await hub.open()
@@ -117,21 +136,15 @@ def serve(place: Place, hub: Any, started: Callable[[Callable[[], None]], Any], 
     def stop() -> None:
         server.should_exit = True
 
-    server.startup, server.shutdown = startup, shutdown  # type: ignore[method-assign]
-    try:
-        # The default of Windows has no add_reader, which the porter needs.
-        with asyncio.Runner(loop_factory=asyncio.SelectorEventLoop) as runner:
-            runner.run(server.serve(sockets=[]))  # the porter has it
-    finally:
-        place.socket.close()
+    server.startup, server.shutdown = startup, shutdown
 
 
 class _Admission:
     """Has uvicorn serve connections that were accepted elsewhere."""
 
-    def __init__(self, config, server):
+    def __init__(self, server: Any):
         self._protocol = functools.partial(
-            config.http, config=config, server_state=server.server_state, app_state=dict[str, Any]()
+            server.config.http, config=server.config, server_state=server.server_state, app_state=dict[str, Any]()
         )
         self._tasks: set[asyncio.Task] = set()
 

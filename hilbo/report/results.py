@@ -91,17 +91,17 @@ def result(
 ) -> dict[str, Any]:
     """The content of result.json."""
     people = people_of(study, aggregate) if people is None else people
-    best, mean = aggregate.optimum, aggregate.mean_of_optima
+    best, whole = aggregate.optimum, None if isinstance(aggregate, LargeAggregate) else aggregate
+    region = None if whole is None else optimum_region(study, whole.map, seed)
+    check = None if whole is None else model_check(study, whole)
     content = {
         "optimum": optimum_content(study, best) | {"location": _location(study, aggregate, study.rule, best)},
-        "participants": people if isinstance(aggregate, LargeAggregate) else list(people.entries()),
+        "participants": people if whole is None else list(people.entries()),
         "alternatives": {
             name: optimum_content(study, optimum) | {"location": _location(study, aggregate, name, optimum)}
             for name, optimum in aggregate.alternatives.items()
         },
-        "mean_of_optima": None
-        if mean is None
-        else {"parameters": set_of(study.space, mean), "passivity_margin": margin_of(study.space, mean)},
+        "mean_of_optima": _mean_of_optima(study, aggregate.mean_of_optima),
         "rule": study.rule,
         "learnt": learnt_content(study, people.names),
         "heterogeneity": heterogeneity(aggregate),
@@ -113,18 +113,21 @@ def result(
     other = other_inference(study)
     if other in aggregate.alternatives:
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
-    failed = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
-    content["warnings"] = ([_not_converged(failed)] if failed else []) + rule_warnings(study, aggregate)
-    asked = None if isinstance(aggregate, LargeAggregate) else aggregate.asked_variance
-    region = None if isinstance(aggregate, LargeAggregate) else optimum_region(study, aggregate.map, seed)
+    warnings = _not_converged(people) + rule_warnings(study, aggregate) + learnt_sentences(study)
+    warnings += location_sentences(study, best.x, best.sd, None if whole is None else whole.asked_variance)
+    content["warnings"] = warnings + region_sentences(region) + check_sentences(check)
     content["optimum_region"] = region_content(study, region)
-    content["warnings"] += learnt_sentences(study) + location_sentences(study, best.x, best.sd, asked)
-    content["warnings"] += region_sentences(region)
-    content["model_check"] = None if isinstance(aggregate, LargeAggregate) else model_check(study, aggregate)
-    content["warnings"] += check_sentences(content["model_check"])
+    content["model_check"] = check
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content
+
+
+def _mean_of_optima(study: Study, mean: Float[Array, " d"] | None) -> dict[str, Any] | None:
+    """The mean of everybody's own optimum, which nobody was asked about; None where no optimum was sought."""
+    if mean is None:
+        return None
+    return {"parameters": set_of(study.space, mean), "passivity_margin": margin_of(study.space, mean)}
 
 
 def _location(study: Study, aggregate: Aggregate | LargeAggregate, name: str, optimum: Optimum) -> list[str]:
@@ -154,13 +157,17 @@ def _way(start: float | str, end: float | str) -> float | str:
     return end - start
 
 
-def _not_converged(names):
+def _not_converged(people: People) -> list[str]:
+    """A warning that names those whose fit is not certified, if there are any."""
+    names = [name for name, good in zip(people.names, people.certificate["converged"], strict=True) if not good]
+    if not names:
+        return []
     one = len(names) == 1
     shown = names if len(names) <= 10 else [*names[:10], f"{len(names) - 10:,} others"]
-    return (
+    return [
         f"The {'fit' if one else 'fits'} of {', '.join(shown)} did not reach {'its' if one else 'their'} tolerance, so"
         " that the results may be off by more than rounding; see the certificates in result.json."
-    )
+    ]
 
 
 def optimum_content(study: Study, optimum: Optimum) -> dict[str, Any]:

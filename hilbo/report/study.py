@@ -76,7 +76,12 @@ def write_study(
     content = _content(folder, contents, claims, seed)
     (out / "result.json").write_text(as_json(content), encoding="utf-8")
     say("the page")
-    page = rendered(
+    (out / "report.html").write_text(_page(folder, content, sections, claims), encoding="utf-8")
+    return content
+
+
+def _page(folder: StudyFolder, content, sections, claims) -> str:
+    return rendered(
         "study.html",
         study=folder.study,
         content=content,
@@ -86,8 +91,6 @@ def write_study(
         people=sum(len(m.cohort.names) for m in folder.materials),
         hypotheses=claims,
     )
-    (out / "report.html").write_text(page, encoding="utf-8")
-    return content
 
 
 def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:

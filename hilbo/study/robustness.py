@@ -20,7 +20,7 @@ from hilbo.errors import InputError
 from hilbo.hyperparameters.judged_evidence import Judged, maximise_judged
 from hilbo.hyperparameters.maximum_evidence import Learned, optimum_sensitivity
 from hilbo.numerics.tracing import program
-from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population.maps import point_rule, share_of
 from hilbo.population.pointwise import Rule
 from hilbo.population.recipes import RECIPES
@@ -107,13 +107,7 @@ def robustness(
     judged = maximise_judged(
         study.gp, cohort.trials, learn, shared=shared, weak_priors=weak_priors, inference=study.inference
     )
-    learned = judged.learned
-    if shared:
-        study_learnt = eqx.tree_at(lambda s: s.gp, study, learned.gp)
-        again = fit_cohort(study_learnt, cohort)
-    else:
-        study_learnt = study
-        again = fit_cohort(study, cohort, learned.gp)
+    study_learnt, again = _refitted(study, cohort, judged.learned.gp, shared)
     rule, share = point_rule(study.rule, _share(study, cohort))
     shares = share, None if share is None else _share(study_learnt, cohort)
     fixed, optimised = (
@@ -149,6 +143,15 @@ def _check(study: Study, learn: Sequence[str]) -> None:
             f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{study.rule}" has no fixed'
             " ones; its result.json has their intervals."
         )
+
+
+def _refitted(study: Study, cohort: Cohort, gp: OrdinalGP, shared: bool) -> tuple[Study, Posterior]:
+    """The study with learnt hyperparameters where everybody shares them, and the posteriors under these or each
+    person's own."""
+    if not shared:
+        return study, fit_cohort(study, cohort, gp)
+    learnt = eqx.tree_at(lambda s: s.gp, study, gp)
+    return learnt, fit_cohort(learnt, cohort)
 
 
 def _resampled(

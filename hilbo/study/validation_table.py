@@ -49,6 +49,27 @@ def check_validation(
 
     Raises `InputError` for a missing column, a table without rows, and values that cannot be.
     """
+    _check_columns(table, source)
+    text = _as_text(table)
+    out = text.copy()
+    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
+    out["trial"] = whole.astype(int)
+    check_people(text, source)
+    check_texts(text, source, ("trial",))
+    _check_sets(text, source)
+    for column in ("class_a", "class_b"):
+        out[column] = _classes(text, column, responses, source)
+    out["preferred"] = _chosen(text, "preferred", (TIE,), source)
+    if "first" in text:
+        out["first"] = _chosen(text, "first", (), source)
+    nothing = (out["class_a"] == NONE) & (out["class_b"] == NONE) & (out["preferred"] == NONE)
+    refuse(nothing, source, lambda row: "holds no answer; fill in class_a and class_b, or preferred, or leave it out.")
+    _check_duplicates(out, source)
+    return out
+
+
+def _check_columns(table: pd.DataFrame, source: str) -> None:
+    """Refuse a table that lacks a column, or has no rows."""
     missing = [name for name in _NEEDED if name not in table.columns]
     if missing:
         raise InputError(
@@ -57,15 +78,19 @@ def check_validation(
         )
     if table.empty:
         raise InputError(f"{source}: has no rows; a validation table needs at least one comparison.")
+
+
+def _as_text(table: pd.DataFrame) -> pd.DataFrame:
+    """The table with its own columns as text without blanks around it, empty where nothing is."""
     text = table.copy()
     for column in (*_NEEDED, *(name for name in _OPTIONAL if name in text)):
         cells = ["" if pd.isna(cell) else str(cell).strip() for cell in text[column]]
         text[column] = ["" if cell == "nan" else cell for cell in cells]  # a column of nothing, read from Parquet
-    out = text.copy()
-    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
-    out["trial"] = whole.astype(int)
-    check_people(text, source)
-    check_texts(text, source, ("trial",))
+    return text
+
+
+def _check_sets(text: pd.DataFrame, source: str) -> None:
+    """Refuse comparisons of anything but two sets with names of their own."""
     for column in ("set_a", "set_b"):
         refuse(text[column] == "", source, lambda row, c=column: f"{c} is empty; every comparison has one.")
     for column in ("set_a", "set_b"):
@@ -78,15 +103,6 @@ def check_validation(
         )
     same = text["set_a"] == text["set_b"]
     refuse(same, source, lambda row: f'set_a and set_b are both "{text.at[row, "set_a"]}"; compare two sets.')
-    for column in ("class_a", "class_b"):
-        out[column] = _classes(text, column, responses, source)
-    out["preferred"] = _chosen(text, "preferred", (TIE,), source)
-    if "first" in text:
-        out["first"] = _chosen(text, "first", (), source)
-    nothing = (out["class_a"] == NONE) & (out["class_b"] == NONE) & (out["preferred"] == NONE)
-    refuse(nothing, source, lambda row: "holds no answer; fill in class_a and class_b, or preferred, or leave it out.")
-    _check_duplicates(out, source)
-    return out
 
 
 def of_material(table: pd.DataFrame, material: str | None, source: str = "validation table") -> pd.DataFrame:
