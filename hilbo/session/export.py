@@ -223,7 +223,9 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> 
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^A-Za-z0-9]", "", study.name) or "study"
-    words = _WORDS | {p.name: f"Parameter, {p.unit or 'no unit'}" for p in study.space.parameters}
+    words = _WORDS | {
+        p.name: f"Parameter, {p.range_words if p.levels else p.unit or 'no unit'}" for p in study.space.parameters
+    }
     written, columns = [], {}
     for kind, table in tables.items():
         if table.empty:

@@ -15,8 +15,8 @@ __all__ = ["netcdf"]
 
 def netcdf(sessions: Sequence[LiveSession], path: Path, study: AnyStudy) -> bool:
     """The answers to single renderings that count as groups of a netCDF file: observed_data has the categories and
-    constant_data what they are about, along `obs_id`; attributes name the study. xarray reads it as a DataTree, ArviZ
-    as InferenceData. False, and no file, where there are none."""
+    constant_data what they are about, along `obs_id`, levels by their names; attributes name the study. xarray reads it
+    as a DataTree, ArviZ as InferenceData. False, and no file, where there are none."""
     table = trials_table(sessions)
     table = table[(table["voided"] == 0) & (table["phase"] != "warm-up")] if len(table) else table
     if table.empty:
@@ -31,8 +31,13 @@ def netcdf(sessions: Sequence[LiveSession], path: Path, study: AnyStudy) -> bool
             constant[column] = ("obs_id", table[column].to_numpy(str).astype(object))
     constant["trial"] = ("obs_id", table["trial"].to_numpy(int))
     for parameter in study.space.parameters:
-        constant[parameter.name] = ("obs_id", table[parameter.name].to_numpy(float))
-        constant[parameter.name].attrs["units"] = parameter.unit
+        values = table[parameter.name]
+        if parameter.levels:
+            constant[parameter.name] = ("obs_id", values.to_numpy(str).astype(object))
+            constant[parameter.name].attrs["levels"] = list(parameter.levels)
+        else:
+            constant[parameter.name] = ("obs_id", values.to_numpy(float))
+            constant[parameter.name].attrs["units"] = parameter.unit
     attributes = {"study": study.hash, "study_name": study.name, "made_by": "hilbo"}
     groups = {"observed_data": observed, "constant_data": constant}
     tree = xr.DataTree.from_dict({name: group.assign_attrs(attributes) for name, group in groups.items()})

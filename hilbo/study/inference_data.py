@@ -24,6 +24,7 @@ from hilbo.kernels import gram
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
+from hilbo.search.box import Parameter
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
@@ -44,7 +45,7 @@ def groups(
     held = mask[None, None]
     observed = np.where(mask, np.asarray(cohort.trials.q), -1)
     constants: dict[str, Any] = {
-        p.name: (("participant", "trial"), np.where(mask, cohort.physical[..., i], np.nan), {"units": p.unit})
+        p.name: (("participant", "trial"), np.where(mask, cohort.physical[..., i], np.nan), _of(p))
         for i, p in enumerate(study.space.parameters)
     }
     likelihood = study.gp.likelihood
@@ -59,6 +60,13 @@ def groups(
         "observed_data": xr.Dataset({"response": (("participant", "trial"), observed, say)}, coords),
         "constant_data": xr.Dataset(constants, coords, {"study": study.hash, "inference": study.inference}),
     }
+
+
+def _of(parameter: Parameter) -> dict[str, Any]:
+    """Attributes of a parameter's values: its unit; of levels what each number stands for."""
+    if not parameter.levels:
+        return {"units": parameter.unit}
+    return {"levels": ", ".join(f"{k} = {level}" for k, level in enumerate(parameter.levels))}
 
 
 def _of_answers(

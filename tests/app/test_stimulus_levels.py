@@ -1,6 +1,8 @@
 """Levels in a live session: whoever presents is told their names and confirms them; another one voids the trial."""
 
+import msgspec
 import pytest
+import xarray as xr
 from live_server import check_blinding, refused
 from live_stimulus import SETS, SINGLE, LiveLevels, all_answered
 
@@ -9,7 +11,8 @@ from hilbo.app.log_words import table
 from hilbo.app.robot import browser, find_browser
 from hilbo.app.slices import Maps
 from hilbo.app.stand_in import StandIn
-from hilbo.session.export import sets_table, trials_table
+from hilbo.session.export import psych_ds, sets_table, trials_table
+from hilbo.session.netcdf import netcdf
 from hilbo.session.records import Block
 from hilbo.study.cohort import cohort_of
 
@@ -17,7 +20,8 @@ LEVELS = ("silk", "wood", "smooth stone")
 
 
 def test_names_are_told_confirmed_and_written(tmp_path):
-    with LiveLevels(tmp_path, blocks=SINGLE) as live, live.present() as program:
+    blocks = (msgspec.structs.replace(SINGLE[0], phase="optimisation"),)  # a warm-up is in no file
+    with LiveLevels(tmp_path, blocks=blocks) as live, live.present() as program:
         live.begin()
         for _ in range(3):
             live.answer()
@@ -28,6 +32,13 @@ def test_names_are_told_confirmed_and_written(tmp_path):
         state = live.replayed()
         assert trials_table([state])["texture"].tolist() == list(LEVELS)
         live.replays()
+    netcdf([state], tmp_path / "trials.nc", live.study)
+    with xr.open_datatree(tmp_path / "trials.nc", engine="h5netcdf") as tree:
+        texture = tree["constant_data"]["texture"]
+        assert texture.values.tolist() == texture.attrs["levels"] == list(LEVELS)
+    psych_ds([state], tmp_path / "out", live.study)
+    words = (tmp_path / "out" / "dataset_description.json").read_text()
+    assert "Parameter, one of silk, wood, smooth stone" in words
 
 
 @pytest.mark.deep  # it compiles a step
