@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 from studies import population_study
 
 from hilbo.report.figures.answers import answer_handles, mark_along, mark_trials
+from hilbo.report.figures.maps import map_handles
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
 
@@ -75,3 +76,18 @@ def test_beside_a_map_of_one_parameter_a_mark_grows_with_its_answers():
     assert sorted(counts) == [1, 2, 3]
     bad, good = (dict(zip(m.get_offsets()[:, 0], m.get_sizes(), strict=True)) for m in axes.collections)
     assert bad[2.0] > bad[4.0] > good[2.0]
+
+
+def test_a_legend_has_contours_only_where_a_map_has_them():
+    assert [line.get_label() for line in map_handles(STUDY)] == ["mean", "standard deviation"]
+    levels = {"gain": {"low": 1.0, "high": 9.0}, "texture": {"levels": ["silk", "wood"]}}
+    study = Study.from_dict(
+        {
+            "schema": 1,
+            "study": {"name": "levels", "responses": ["bad", "good"]},
+            "parameters": levels,
+            "gp": {"theta": 5.0, "variance": 1.0, "thresholds": [0.0], "noise": 0.5},
+            "selection": {"trials": 6},
+        }
+    )
+    assert map_handles(study) == []

@@ -89,7 +89,7 @@ def map_slices(study: Study, surface: Surface, optimum: Float[np.ndarray, " d"],
         if here:
             star(axes, study, optimum)
         title(axes, "" if third is None else level_words(study, 2, third) + (" (optimum)" if here else ""))
-    legend(figure, [*answer_handles(study, np.concatenate(counts)), *map_handles()])
+    legend(figure, [*answer_handles(study, np.concatenate(counts)), *map_handles(study)])
     return figure
 
 
@@ -195,7 +195,7 @@ def map_panels(study: Study, grids):
         axes.pcolormesh(first, second, mean, cmap="cividis", norm=scale.norm, shading="nearest", rasterized=True)
         if np.isnan(mean).all() or min(mean.shape) < 2:  # nothing may be rendered, or nothing is between the steps
             return
-        if any(p.levels for p in study.space.parameters[:2]):  # between levels there is nothing
+        if not _has_lines(study):
             return
         if np.nanmax(mean) > np.nanmin(mean):
             axes.contour(first, second, mean, levels=_MEANS, colors="white", linewidths=0.4, linestyles="solid")
@@ -206,8 +206,15 @@ def map_panels(study: Study, grids):
     return figure, panels, draw
 
 
-def map_handles() -> list[Any]:
+def _has_lines(study: Study) -> bool:
+    """Whether a map has contours: between levels there is nothing."""
+    return not any(p.levels for p in study.space.parameters[:2])
+
+
+def map_handles(study: Study) -> list[Any]:
     """What a legend shows of a map's lines."""
+    if not _has_lines(study):
+        return []
     white = Line2D([], [], color="#bbbbbb", linewidth=0.8, label="mean")
     return [white, Line2D([], [], color="black", linewidth=0.8, linestyle="dotted", label="standard deviation")]
 

@@ -70,7 +70,7 @@ def posterior_progress(study: Study, cohort: Cohort, progress: Progress, row: in
         counts.append(mark_trials(axes, study, person.first(n), third))
         star(axes, study, x)
         title(axes, name if third is None else f"{name}, {level_words(study, 2, third)}")
-    legend(figure, [*answer_handles(study, np.concatenate(counts)), *map_handles()])
+    legend(figure, [*answer_handles(study, np.concatenate(counts)), *map_handles(study)])
     return figure
 
 
@@ -99,7 +99,7 @@ def sets_on_map(
         Line2D([], [], linestyle="", marker=_MARKS[n][0], color=_MARKS[n][2], markeredgecolor="black", label=n)
         for n in points
     ]
-    handles += [*answer_handles(study, np.concatenate(counts)), *map_handles()]
+    handles += [*answer_handles(study, np.concatenate(counts)), *map_handles(study)]
     if hatched:
         handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="hardly sampled"))
     legend(figure, handles)
