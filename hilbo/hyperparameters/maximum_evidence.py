@@ -171,12 +171,9 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> Learned:
     # evidence is sought from the one before's.
     no_ends = jnp.full((options.starts, nothing.coordinates.size), jnp.nan, nothing.coordinates.dtype)
     _, ends = jax.lax.scan(ended, (no_ends, nothing), _spread(initial, options.starts))
-    # The search from the model itself wins a tie: where there are no answers, and where no search ended well.
-    model_first = (jnp.arange(options.starts) + _row_of_model(options.starts)) % options.starts
-    best = model_first[jnp.argmin(ends.value[model_first])]
-    end = jax.tree.map(lambda leaf: leaf[best], ends)
+    end = _best(ends, options.starts)
     runaway = end.flat
-    for name in initial.keys() - {"first"}:
+    for name in sorted(initial.keys() - {"first"}):  # in one order, so that every process makes the same program
         runaway |= jnp.any(jnp.abs(end.coordinates[name] - initial[name]) > _RUNAWAY)
     return Learned(model_at(end.coordinates, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
 
@@ -190,6 +187,14 @@ class _End(NamedTuple):
     steps: Int[Array, ""]
     done: Bool[Array, ""]
     flat: Bool[Array, ""]
+
+
+def _best(ends: _End, starts: int) -> _End:
+    """The best of stacked ends. The search from the model itself wins a tie: where there are no answers, and where no
+    search ended well."""
+    model_first = (jnp.arange(starts) + _row_of_model(starts)) % starts
+    best = model_first[jnp.argmin(ends.value[model_first])]
+    return jax.tree.map(lambda leaf: leaf[best], ends)
 
 
 def _flat(end: Expansion, trials: Trials) -> Bool[Array, ""]:

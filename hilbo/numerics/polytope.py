@@ -54,6 +54,20 @@ def projector(normals: Float[Array, "k d"], active: Bool[Array, " k"]) -> Float[
     return free @ free.T
 
 
+class _Turned(NamedTuple):
+    """The walls in coordinates in which the metric is plain."""
+
+    normals: Float[Array, "k d"]
+    sizes: Float[Array, " k"]  # of the normals
+    usable: Bool[Array, " k"]  # what has a normal
+    beyond: Float[Array, " k"]  # how far the target is beyond each wall
+    tolerance: Float[Array, " k"]
+
+    def violations(self, multipliers: Float[Array, " k"]) -> Float[Array, " k"]:
+        """How far the point with these multipliers is beyond each wall."""
+        return self.beyond - self.normals @ (self.normals.T @ multipliers)
+
+
 class _State(NamedTuple):
     active: Bool[Array, " k"]
     multipliers: Float[Array, " k"]
@@ -64,58 +78,59 @@ class _State(NamedTuple):
 def nearest(walls: Polytope, target: Float[Array, " d"], spread: Float[Array, "d d"]) -> Nearest:
     """The point between the walls that is nearest to the target. `spread` is a square root of the inverse metric, the
     identity for plain distances."""
-    turned = walls.normals @ spread  # in coordinates in which the metric is plain
-    sizes = jnp.sqrt(jnp.sum(turned**2, axis=1))
+    normals = walls.normals @ spread
+    sizes = jnp.sqrt(jnp.sum(normals**2, axis=1))
     eps = jnp.finfo(target.dtype).eps
     tolerance = _ROUNDING * eps * (1.0 + jnp.sqrt(jnp.sum(walls.normals**2, axis=1)))
-    beyond = walls.normals @ target - walls.offsets
-    usable = sizes > 0.0
-
-    def violations(multipliers):
-        return beyond - turned @ (turned.T @ multipliers)
+    turned = _Turned(normals, sizes, sizes > 0.0, walls.normals @ target - walls.offsets, tolerance)
 
     def going(state):
-        wrong = jnp.where(usable & ~state.active, violations(state.multipliers) - tolerance, -1.0)
+        wrong = jnp.where(turned.usable & ~state.active, turned.violations(state.multipliers) - tolerance, -1.0)
         return ((state.entering >= 0) | jnp.any(wrong > 0.0)) & (state.count < _STEPS * len(walls.offsets))
-
-    def step(state):
-        left = violations(state.multipliers)
-        worst = jnp.argmax(
-            jnp.where(usable & ~state.active & (left > tolerance), left / jnp.where(usable, sizes, 1.0), -jnp.inf)
-        )
-        entering = jnp.where(state.entering >= 0, state.entering, worst.astype(state.entering.dtype))
-        normal = turned[entering]
-        share = _in_the_span_of(turned, state.active, normal)
-        outside = normal - turned.T @ share
-        square = outside @ outside
-        blocked = state.active & (share > 0.0)
-        lengths = jnp.where(blocked, state.multipliers / jnp.where(blocked, share, 1.0), jnp.inf)
-        partial = jnp.min(lengths)
-        free = square > _DEPENDENT * (normal @ normal)
-        full = jnp.where(free, left[entering] / jnp.where(free, square, 1.0), jnp.inf)
-        length = jnp.minimum(partial, full)
-        ends = ~jnp.isfinite(length)  # a wall that no point can keep: rounding alone
-        length = jnp.where(ends, 0.0, length)
-        multipliers = (state.multipliers - length * share).at[entering].add(length)
-        whole = full <= partial
-        active = jnp.where(whole, state.active.at[entering].set(~ends), state.active.at[jnp.argmin(lengths)].set(False))
-        settled = whole | ends
-        kept = active | (jnp.arange(len(active), dtype=entering.dtype) == entering)
-        multipliers = jnp.where(kept, jnp.maximum(multipliers, 0.0), 0.0)
-        count = jnp.where(ends, _STEPS * len(walls.offsets), state.count + 1)
-        return _State(active, multipliers, jnp.where(settled, -1, entering), count)
 
     none = jnp.zeros(len(walls.offsets), target.dtype)
     start = _State(none > 0, none, jnp.asarray(-1, jnp.int32), jnp.asarray(0, jnp.int32))
-    multipliers = jax.lax.while_loop(going, step, start).multipliers
-    return Nearest(target - spread @ (turned.T @ multipliers), multipliers)
+    multipliers = jax.lax.while_loop(going, lambda state: _step(turned, state), start).multipliers
+    return Nearest(target - spread @ (normals.T @ multipliers), multipliers)
+
+
+def _step(turned: _Turned, state: _State) -> _State:
+    """Towards the entering wall, up to it, or up to where an active wall would begin to pull and is let go."""
+    left = turned.violations(state.multipliers)
+    entering = jnp.where(state.entering >= 0, state.entering, _worst(turned, state, left))
+    normal = turned.normals[entering]
+    share = _in_the_span_of(turned.normals, state.active, normal)
+    outside = normal - turned.normals.T @ share
+    square = outside @ outside
+    blocked = state.active & (share > 0.0)
+    lengths = jnp.where(blocked, state.multipliers / jnp.where(blocked, share, 1.0), jnp.inf)
+    partial = jnp.min(lengths)
+    free = square > _DEPENDENT * (normal @ normal)
+    full = jnp.where(free, left[entering] / jnp.where(free, square, 1.0), jnp.inf)
+    length = jnp.minimum(partial, full)
+    ends = ~jnp.isfinite(length)  # a wall that no point can keep: rounding alone
+    length = jnp.where(ends, 0.0, length)
+    multipliers = (state.multipliers - length * share).at[entering].add(length)
+    whole = full <= partial
+    active = jnp.where(whole, state.active.at[entering].set(~ends), state.active.at[jnp.argmin(lengths)].set(False))
+    kept = active | (jnp.arange(len(active), dtype=entering.dtype) == entering)
+    multipliers = jnp.where(kept, jnp.maximum(multipliers, 0.0), 0.0)
+    count = jnp.where(ends, _STEPS * len(active), state.count + 1)
+    return _State(active, multipliers, jnp.where(whole | ends, -1, entering), count)
+
+
+def _worst(turned: _Turned, state: _State, left: Float[Array, " k"]) -> Int[Array, ""]:
+    """The wall that is violated most, in units of its normal, of those that are not active."""
+    violated = turned.usable & ~state.active & (left > turned.tolerance)
+    worst = jnp.argmax(jnp.where(violated, left / jnp.where(turned.usable, turned.sizes, 1.0), -jnp.inf))
+    return worst.astype(state.entering.dtype)
 
 
 def _in_the_span_of(
-    turned: Float[Array, "k d"], active: Bool[Array, " k"], normal: Float[Array, " d"]
+    normals: Float[Array, "k d"], active: Bool[Array, " k"], normal: Float[Array, " d"]
 ) -> Float[Array, " k"]:
     """The coefficients (k,) of the active normals whose sum is nearest to a normal."""
-    rows = jnp.where(active[:, None], turned, 0.0)
+    rows = jnp.where(active[:, None], normals, 0.0)
     gram = rows @ rows.T + jnp.diag(jnp.where(active, 0.0, 1.0).astype(rows.dtype))
     factor = cholesky(gram)
     right = rows @ normal

@@ -136,49 +136,71 @@ def _newton_step(
     return weights + off - system.solve(prior.times(off)), system
 
 
+class _Height(NamedTuple):
+    """The log posterior at some weights, the size of its terms, and how far off the weights are."""
+
+    value: Float[Array, ""]
+    size: Float[Array, ""]
+    residual: Float[Array, ""]
+    tolerance: Float[Array, ""]
+
+
+class _Search(NamedTuple):
+    weights: Float[Array, "M n"]
+    height: _Height
+    steps: Int[Array, ""]
+    risen: Bool[Array, ""]  # whether the last step did not fall
+
+
+def _height(
+    model: PeopleModel, answers: Tallies, prior: _Prior, sizes: _Prior, weights: Float[Array, "M n"]
+) -> _Height:
+    """`sizes`: of the numbers of the prior, because latent values are sums whose terms may cancel."""
+    epsilon = jnp.finfo(weights.dtype).eps
+    eta = prior.times(weights)
+    terms = _expand(model, answers, eta)
+    value, size = jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta), jnp.sum(jnp.abs(terms.value))
+    off = terms.slope - weights
+    summed = terms.slopes + terms.curvature * sizes.times(jnp.abs(weights)) + jnp.abs(weights)
+    residual, rounding = (
+        jnp.sqrt(jnp.linalg.norm(vector) * jnp.linalg.norm(prior.times(vector))) for vector in (off, summed)
+    )
+    tolerance = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
+    return _Height(value, size + 0.5 * jnp.abs(jnp.sum(weights * eta)), residual, tolerance)
+
+
 def _mode(model: PeopleModel, answers: Tallies, prior: _Prior, start: Float[Array, "M n"]) -> _Mode:
     """Newton's steps on the weights, from `start`; the residual is that of `laplace`."""
     epsilon = jnp.finfo(start.dtype).eps
-    sizes = jax.tree.map(jnp.abs, prior)  # the latent values are sums whose terms may cancel
+    height = partial(_height, model, answers, prior, jax.tree.map(jnp.abs, prior))
 
-    def height(weights):
-        eta = prior.times(weights)
-        terms = _expand(model, answers, eta)
-        value, size = jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta), jnp.sum(jnp.abs(terms.value))
-        off = terms.slope - weights
-        summed = terms.slopes + terms.curvature * sizes.times(jnp.abs(weights)) + jnp.abs(weights)
-        residual, rounding = (
-            jnp.sqrt(jnp.linalg.norm(vector) * jnp.linalg.norm(prior.times(vector))) for vector in (off, summed)
-        )
-        tolerance = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
-        return value, size + 0.5 * jnp.abs(jnp.sum(weights * eta)), residual, tolerance
+    def going(search):
+        here = search.height
+        return search.risen & (here.residual > here.tolerance) & (search.steps < _STEPS)
 
-    def going(state):
-        _, (_, _, residual, tolerance), steps, risen = state
-        return risen & (residual > tolerance) & (steps < _STEPS)
-
-    def forward(state):
-        weights, (value, size, _, _), steps, _ = state
+    def forward(search):
+        weights, here = search.weights, search.height
         full, _ = _newton_step(model, answers, prior, weights)
 
+        def not_below(reached):
+            return reached.value >= here.value - 8.0 * epsilon * here.size
+
         def lower(trial):
-            scale, (reached, _, _, _) = trial
-            fell = ~(reached >= value - 8.0 * epsilon * size)
-            return fell & (scale > 0.5**_HALVINGS)
+            scale, reached = trial
+            return ~not_below(reached) & (scale > 0.5**_HALVINGS)
 
         def shorter(trial):
             scale = 0.5 * trial[0]
             return scale, height(weights + scale * (full - weights))
 
-        scale, reached = jax.lax.while_loop(lower, shorter, (jnp.ones_like(value), height(full)))
-        risen = reached[0] >= value - 8.0 * epsilon * size
+        scale, reached = jax.lax.while_loop(lower, shorter, (jnp.ones_like(here.value), height(full)))
+        risen = not_below(reached)
         moved = jnp.where(scale == 1.0, full, weights + scale * (full - weights))
-        kept = jax.tree.map(lambda new, old: jnp.where(risen, new, old), (moved, reached), (weights, state[1]))
-        return *kept, steps + 1, risen
+        kept = jax.tree.map(lambda new, old: jnp.where(risen, new, old), (moved, reached), (weights, here))
+        return _Search(kept[0], kept[1], search.steps + 1, risen)
 
-    first = start, height(start), jnp.asarray(0), jnp.asarray(True)
-    weights, (_, _, residual, tolerance), steps, _ = jax.lax.while_loop(going, forward, first)
-    return _Mode(weights, residual, tolerance, steps)
+    end = jax.lax.while_loop(going, forward, _Search(start, height(start), jnp.asarray(0), jnp.asarray(True)))
+    return _Mode(end.weights, end.height.residual, end.height.tolerance, end.steps)
 
 
 class SharedEvidence(NamedTuple):
@@ -238,10 +260,7 @@ def shared_function(
     root = jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
     together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
     weights = jnp.where(pivots.used, solve_triangular(root, together, lower=True, trans=1), 0.0)
-    excess, vectors = eigh(system.precision - jnp.eye(root.shape[0], dtype=root.dtype))
-    explained = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
-    factor = explained[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
-    factor = jnp.where(pivots.used[None, :], factor, 0.0)
+    factor = jnp.where(pivots.used[None, :], _explained(system.precision, root), 0.0)
 
     kernel = model.of_variance(model.shared)
     covariance = gram(kernel, pivots.points, pivots.points)
@@ -265,6 +284,13 @@ def shared_function(
     latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, value, certificate)
     asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.used)
     return Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
+
+
+def _explained(precision: Float[Array, "r r"], root: Float[Array, "r r"]) -> Float[Array, "r r"]:
+    """V with V'V = L^-T (I - S^-1) L^-1, of S and L."""
+    excess, vectors = eigh(precision - jnp.eye(root.shape[0], dtype=root.dtype))
+    explained = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
+    return explained[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
 
 
 def _value(
