@@ -33,7 +33,7 @@ from rows import Rows  # noqa: E402
 from hilbo import acquisition  # noqa: E402
 from hilbo.ordinal_gp import Trials  # noqa: E402
 from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
-from hilbo.population.recipes import LEARNT_1, RECIPES, RECOMMENDED  # noqa: E402
+from hilbo.population.recipes import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
 from hilbo.study.aggregate import fit_cohort  # noqa: E402
@@ -43,7 +43,7 @@ from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
 from hilbo.study.optima import individual_optima, map_optimum  # noqa: E402
 from hilbo.study.optimum_region import optimum_region  # noqa: E402
 
-RULES = ("learnt-2", "learnt-1", "centre of its hill", "bcm", "average", "mean of the individual optima")
+RULES = ("learnt-2", "learnt-1", "bcm", "average", "mean of the individual optima")
 
 
 def main():
@@ -79,8 +79,7 @@ def rounded(row):
 
 
 def one_study(name, design, seed):
-    """Regret and distances of every rule's optimum, and what the recommended recipe says of its own; the hill is
-    that of learnt-1's optimum."""
+    """Regret and distances of every rule's optimum, and what the recommended recipe says of its own."""
     people, trials = map(int, design.split()[0].split("x"))
     study = with_trials(POPULATIONS[name].study, trials)
     scene = POPULATIONS[name].scene(study, people, seed)
@@ -98,9 +97,7 @@ def one_study(name, design, seed):
     learnt = {recipe: by_recipe(study, cohort, recipe, candidates, seed) for recipe in RECIPES}
     resolved_study, optimum, region = learnt[RECOMMENDED]
     held = region.holds(np.asarray(best), resolved_study.gp.kernel)
-    _, of_learnt_1, hills = learnt[LEARNT_1.name]
     places = {recipe: optimum.x for recipe, (_, optimum, _) in learnt.items()} | {
-        "centre of its hill": centre_of_hill(study.space, hills, of_learnt_1.x),
         "bcm": map_optimum(study, rule_map(study.gp, answers, "bcm", posteriors=posteriors), candidates).x,
         "average": map_optimum(study, rule_map(study.gp, answers, "average", posteriors=posteriors), candidates).x,
         "mean of the individual optima": study.space.from_box(jnp.clip(study.space.to_box(individual), 0, 1)),
@@ -125,13 +122,6 @@ def by_recipe(study, cohort, recipe, candidates, seed):
     learns = resolved(that_learns(study, recipe), cohort)
     map_ = learnt_map(learns.learnt, cohort.trials)
     return learns, map_optimum(learns, map_, candidates), optimum_region(learns, map_, seed)
-
-
-def centre_of_hill(space, region, x):
-    """Of the hill whose top is nearest to the optimum."""
-    box = np.asarray(space.to_box(x))
-    hill = min(region.hills, key=lambda hill: np.sum((hill.top - box) ** 2))
-    return space.from_box(jnp.asarray(hill.centre))
 
 
 def with_trials(study, trials):

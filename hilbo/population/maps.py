@@ -75,8 +75,8 @@ class RuleMap(eqx.Module):
     """By a recipe the largest variance of the map where somebody answered: beyond it no optimum is sought."""
     widths: bool = eqx.field(static=True, default=False)
     """Whether people differ in the widths of their middle categories."""
-    caution: float = eqx.field(static=True, default=0.0)
-    """Standard deviations of the map by which its mean is lowered where the optimum is sought; 0: see `map_optimum`."""
+    centred: bool = eqx.field(static=True, default=False)
+    """By a recipe whether the optimum is the centre of where joint draws are largest; see `map_optimum`."""
 
     def __repr__(self) -> str:
         people = (
@@ -137,8 +137,8 @@ def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
     _, variances = shared.predict(trials.x.reshape(-1, trials.x.shape[-1]))
     reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
     model = learnt.model
-    prior, caution = model.shared + model.own, RECIPES[learnt.recipe].caution
-    return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.widths, caution)
+    prior, centred = model.shared + model.own, RECIPES[learnt.recipe].centred
+    return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.widths, centred)
 
 
 def rule_map(

@@ -6,6 +6,7 @@ its optimum is searched like a session's.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -24,6 +25,7 @@ from hilbo.population.maps import RuleMap
 from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.population.recipes import RECIPES
 from hilbo.search.space import SearchSpace
+from hilbo.study.best_places import best_places, nearness
 from hilbo.study.config import Study
 
 __all__ = [
@@ -37,6 +39,7 @@ __all__ = [
 ]
 
 Rule = pointwise.Rule
+_LOSS = 0.05  # of the probability of the highest answer, for an optimum in the middle of where the best may be
 
 
 class Optimum(eqx.Module):
@@ -104,10 +107,14 @@ def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidate
 
 def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:
     """Where a rule's map has its largest mean in the feasible set; by a recipe that learns where a new person answers
-    with the highest category most often, or where the mean less so many standard deviations as the recipe's caution is
-    largest, among points of which the answers tell as much as of some that were asked.
+    with the highest category most often; or what the best rendering is most often near, of places where a new person
+    does so at most `_LOSS` less often. Among points of which the answers tell as much as of some that were asked.
     `candidates` (m, d): feasible points of the unit cube, where the search begins.
     """
+    if map_.centred:
+        assert map_.shared is not None
+        places = best_places(study.space, map_.shared)
+        return _centre(study.gp.likelihood, study.space, map_, candidates, places.points, places.share)
     return _map_optimum(study.gp.likelihood, study.space, _nameless(map_), candidates)
 
 
@@ -127,19 +134,59 @@ def _map_optimum(
         values = predict_map(map_.astype(single), candidates.astype(single))[0]
         return _optimum(likelihood, space, lambda x: predict_map(map_, x), candidates, values, map_.apart)
 
-    def height(mean, variance):
-        if map_.caution:
-            return mean - map_.caution * jnp.sqrt(variance)
-        return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
+    log_chance = partial(_log_chance, likelihood, map_)
+    mean, variance = map_.predict(candidates)
+    surest = _reach(map_, variance)
+    return _optimum(
+        likelihood,
+        space,
+        map_.predict,
+        candidates,
+        log_chance(mean, variance),
+        map_.apart,
+        lambda x: log_chance(*map_.predict(x[None, :]))[0],
+        lambda x: map_.predict(x[None, :])[1][0] <= surest,
+        map_.widths,
+    )
 
+
+@program
+def _centre(
+    likelihood: OrdinalProbit,
+    space: SearchSpace,
+    map_: RuleMap,
+    candidates: Float[Array, "m d"],
+    places: Float[Array, "p d"],
+    share: Float[Array, " p"],
+) -> Optimum:
+    """What the best rendering is most often near, where a new person gives the highest answer nearly as often as at the
+    best of the candidates; `share`: how often each of the places was the best of a draw."""
+    assert map_.shared is not None
+    near = partial(nearness, map_.shared.gp.kernel, places, share)
+    mean, variance = map_.predict(candidates)
+    surest = _reach(map_, variance)
+    chances = jnp.exp(_log_chance(likelihood, map_, mean, variance))
+    least = jnp.max(jnp.where(variance <= surest, chances, 0.0)) - _LOSS
+
+    def allowed(x):
+        mean, variance = map_.predict(x[None, :])
+        return (variance[0] <= surest) & (jnp.exp(_log_chance(likelihood, map_, mean, variance)[0]) >= least)
+
+    values = jax.vmap(near)(candidates)
+    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, near, allowed, map_.widths)
+
+
+def _log_chance(
+    likelihood: OrdinalProbit, map_: RuleMap, mean: Float[Array, " m"], variance: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """Log probability of a new person's highest answer, by means and variances of the map."""
+    return log_highest(likelihood, mean, variance + map_.apart, map_.widths)
+
+
+def _reach(map_: RuleMap, variances: Float[Array, " m"]) -> Float[Array, ""]:
+    """Largest variance that an optimum may have: that of some point that was asked; or the candidates' least."""
     assert map_.reach is not None
-    largest_variance = jnp.maximum(map_.reach, jnp.min(map_.predict(candidates)[1]))  # of which there is one at least
-
-    def within_reach(x):
-        return map_.predict(x[None, :])[1][0] <= largest_variance
-
-    values = height(*map_.predict(candidates))
-    return _optimum(likelihood, space, map_.predict, candidates, values, map_.apart, height, within_reach, map_.widths)
+    return jnp.maximum(map_.reach, jnp.min(variances))
 
 
 def _optimum(
@@ -149,18 +196,17 @@ def _optimum(
     candidates: Float[Array, "m d"],
     values: Float[Array, " m"],
     apart: ArrayLike,
-    height: Callable[[Array, Array], Array] | None = None,
+    score: Callable[[Float[Array, " d"]], Float[Array, ""]] | None = None,
     allowed: Callable[[Float[Array, " d"]], Bool[Array, ""]] | None = None,
     widths: bool = False,
 ) -> Optimum:
     """`values`: of the candidates, by which they are ranked; `apart`: variance of one person's function about the
-    map's; `height`: what is largest at the optimum, of means and variances (m,), by default the mean; `allowed`: where
-    it may be; `widths`: whether people differ in them."""
-    height = (lambda mean, _: mean) if height is None else height
+    map's; `score`: what is largest at the optimum, by default the mean; `allowed`: where it may be; `widths`: whether
+    people differ in them."""
     choice = acquisition.maximise(
         values,
         candidates,
-        lambda x: height(*predict(x[None, :]))[0],
+        (lambda x: predict(x[None, :])[0][0]) if score is None else score,
         **space.searched,
         allowed=allowed,
         steps=300,

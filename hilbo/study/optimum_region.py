@@ -6,24 +6,21 @@ the draws are among them, are the region. The points are spread evenly over the 
 
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from hilbo.kernels import Stationary, embedded
-from hilbo.population.joint import posterior_map
 from hilbo.population.maps import RuleMap
 from hilbo.search.box import Parameter
-from hilbo.search.candidates import search_points
 from hilbo.search.rendering import set_of
+from hilbo.study.best_places import POINTS, best_places
 from hilbo.study.config import Study
 from hilbo.study.hills import Hill, hills_of
 
 __all__ = ["Region", "optimum_region", "region_content", "region_sentences"]
 
 PROBABILITY = 0.95
-_POINTS, _DRAWS = 800, 4000
 _LOCATED = 0.25  # of the feasible set: a larger region locates nothing
 _RIVAL = 0.2  # of the draws on another hill
 
@@ -52,21 +49,19 @@ class Region(NamedTuple):
         return bool(near <= far)
 
 
-def optimum_region(study: Study, map_: RuleMap, seed: int = 0) -> Region | None:
-    """The region; None for maps without a joint posterior (those that are aggregated point by point)."""
+def optimum_region(study: Study, map_: RuleMap, seed: int = 0, count: int = POINTS) -> Region | None:
+    """The region, of `count` even points of the feasible set and a quarter as many on its walls; None for maps without
+    a joint posterior (those that are aggregated point by point)."""
     if map_.shared is None:
         return None
-    x = search_points(study.space, seed, _POINTS)
-    joint = posterior_map(map_.shared, x)
-    weight = np.asarray(joint.optima(jax.random.key(seed), _DRAWS))
+    places = best_places(study.space, map_.shared, seed, count)
+    points, weight, mean, sd = map(np.asarray, places)
     order = np.argsort(-weight, kind="stable")
-    count = int(np.searchsorted(np.cumsum(weight[order]), PROBABILITY)) + 1
+    held = int(np.searchsorted(np.cumsum(weight[order]), PROBABILITY)) + 1
     inside = np.zeros(len(weight), bool)
-    inside[order[:count]] = True
-    points, box = np.asarray(x), np.asarray(study.space.to_box(x))
-    mean, sd = np.asarray(joint.mean), np.sqrt(np.asarray(joint.variance))
-    hills = hills_of(box, mean, sd, weight, study.gp.kernel)
-    return Region(points[inside], points[~inside], float(inside[:_POINTS].mean()), hills)
+    inside[order[:held]] = True
+    hills = hills_of(np.asarray(study.space.to_box(places.points)), mean, sd, weight, study.gp.kernel)
+    return Region(points[inside], points[~inside], float(inside[:count].mean()), hills)
 
 
 def region_content(study: Study, region: Region | None) -> dict[str, Any] | None:

@@ -228,14 +228,14 @@ def test_a_flood_takes_nothing_from_others(live):
 
 
 def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
-    with LiveStimulus(tmp_path, silence=0.3, seconds=2.0) as live:
+    with LiveStimulus(tmp_path, silence=0.8, seconds=2.0) as live:
         program = live.by_hand()
         live.begin()
         order = live.until(lambda o: o["do"] == "present", lambda: program.report("neutral"))
         program.report("presented")
         live.until(lambda view: view["step"])
         live.until(lambda v: v["device"]["state"] == "lost", live.whole)
-        voided(live, "device: lost (by hand has been silent for 0.3 s.)", "trouble")
+        voided(live, "device: lost (by hand has been silent for 0.8 s.)", "trouble")
         with refused(409, "say hello first"):
             program.report("presented", order=order["order"])
         program.hello()

@@ -6,7 +6,6 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.population.maps import RuleMap
-from hilbo.study import optimum_region as module
 from hilbo.study.config import Study
 from hilbo.study.hills import Hill
 from hilbo.study.optimum_region import Region, optimum_region, region_content, region_sentences
@@ -15,7 +14,7 @@ STUDY = Study.load("hilbo/data/video_quality.toml")
 THETA = np.array([6.0, 6.0])
 
 
-def region_of(count, seed=0):
+def region_of(count, seed=0, points=200):
     """The region after `count` answers about a function that is known: its best place is (0.3, 0.6)."""
     gp = OrdinalGP(RBF(6.0, 4.0), OrdinalProbit((-0.5, 0.5), 0.5))
     rng = np.random.default_rng(seed)
@@ -23,12 +22,10 @@ def region_of(count, seed=0):
     felt = 2.0 - 12.0 * ((x - [0.3, 0.6]) ** 2).sum(axis=1) + 0.5 * rng.normal(size=count)
     posterior = fit(gp, Trials.from_arrays(x, (felt > -0.5).astype(int) + (felt > 0.5), 64))
     one = jnp.ones(())
-    return optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), seed)
+    return optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), seed, points)
 
 
-def test_more_answers_leave_less_and_hold_the_best(monkeypatch):
-    monkeypatch.setattr(module, "_POINTS", 200)  # 800 take a quarter of a minute
-    monkeypatch.setattr(module, "_DRAWS", 1000)
+def test_more_answers_leave_less_and_hold_the_best():
     few, many = region_of(4), region_of(60)
     assert few is not None and many is not None
     assert 0 < many.volume < 0.5 * few.volume

@@ -1,0 +1,65 @@
+"""Where joint draws of a map are largest: what the answers say of where the best rendering is.
+
+The points are spread evenly over the feasible set, its walls included. Their shares of the draws are the posterior
+probability, point by point, that nothing is better.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from hilbo.kernels import RBF, Stationary
+from hilbo.numerics.host import placed
+from hilbo.numerics.tracing import program
+from hilbo.ordinal_gp import Posterior
+from hilbo.population.joint import posterior_map
+from hilbo.search.candidates import search_points
+from hilbo.search.space import SearchSpace
+
+__all__ = ["POINTS", "BestPlaces", "best_places", "nearness"]
+
+POINTS = 800
+"""Inside the feasible set; a quarter more are on its walls."""
+_DRAWS = 4000
+_NEAR = 0.5  # lengths of the kernel
+
+
+class BestPlaces(NamedTuple):
+    """Even points of the unit cube, how often each was the best, and the map there."""
+
+    points: Float[Array, "m d"]
+    share: Float[Array, " m"]
+    """Of the draws that are largest at each point."""
+    mean: Float[Array, " m"]
+    sd: Float[Array, " m"]
+
+
+def best_places(space: SearchSpace, function: Posterior, seed: int = 0, count: int = POINTS) -> BestPlaces:
+    """By joint draws of a posterior at `count` even points, and a quarter as many on the walls."""
+    points = search_points(space, seed, count)
+    return BestPlaces(points, *_drawn(function, points, placed(seed)))
+
+
+@program
+def _drawn(
+    function: Posterior, points: Float[Array, "m d"], seed: ArrayLike
+) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, " m"]]:
+    joint = posterior_map(function, points)
+    return joint.optima(jax.random.key(seed), _DRAWS), joint.mean, jnp.sqrt(joint.variance)
+
+
+def nearness(
+    kernel: Stationary, points: Float[Array, "m d"], share: Float[Array, " m"], x: Float[Array, " d"]
+) -> Float[Array, ""]:
+    """The mean of exp(-s^2 / (2 * 0.5^2)) over the draws, s the distance of `x` from the best place of a draw in
+    lengths of the kernel.
+
+    Where it is largest the best rendering is most often near. Where draws scatter about one place that is their middle;
+    of several places it is in the most crowded one, never between them. It is the decision for a loss that no longer
+    grows from about a length on: so far away one wrong rendering is as wrong as another.
+    """
+    narrow = RBF(kernel.theta / _NEAR**2, jnp.ones_like(kernel.variance), kernel.levels)
+    return share @ jax.vmap(lambda place: narrow(x, place))(points)
