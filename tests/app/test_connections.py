@@ -259,7 +259,8 @@ def test_who_is_just_let_in_when_the_server_ends_is_known_to_it():
             known.append(transport)
 
     async def admitted(line):
-        admission = _Admission(SimpleNamespace(http=Known), SimpleNamespace(server_state=None))
+        server = SimpleNamespace(config=SimpleNamespace(http=Known), server_state=None)
+        admission = _Admission(server)
         admission.admit(line, None)
         await admission.settled()
         known.pop().abort()
