@@ -79,7 +79,7 @@ class Stimulus:
     """This program's part in a session. `link`: what `hilbo session` prints for the stimulus, one program at a time.
 
     `key_file`: where the key that it was traded for is kept, readable by you alone: a program that is started again
-    with it does not wait until the one before counts as gone. `neutral_within_s`: so soon is everything neutral after
+    with it does not wait until the one before counts as lost. `neutral_within_s`: so soon is everything neutral after
     `go_neutral` was called, or after an order, and the session is told so. Raises `StimulusError` if the session does
     not let it in.
     """
