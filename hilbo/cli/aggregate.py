@@ -10,6 +10,7 @@ import typer
 
 from hilbo.cli.console import Force, Json, Out, check_choice, finish, progress, remark, results, seed_option, start
 from hilbo.errors import InputError
+from hilbo.report.figures.painter import begin_painter
 
 __all__ = ["aggregate", "aggregate_cohort", "read_cohort", "robustness"]
 
@@ -60,6 +61,8 @@ def aggregate(
     as_json: Json = False,
 ) -> None:
     """Aggregate people's answers into one population map and find its optimum."""
+    if not distributed:
+        begin_painter()
     start(devices)
     from hilbo.study.distributed import crew, digest
 

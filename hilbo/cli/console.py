@@ -5,6 +5,7 @@ and nothing is overwritten without `--force`. Progress goes to stderr, results w
 """
 
 import contextlib
+import gc
 import json
 import math
 import os
@@ -74,6 +75,8 @@ def start(devices: int | None = None) -> None:
     """
     # Matrices are small here: a second thread of OpenBLAS, which reads this once, keeps a core busy by waiting.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Programs and figures are many small objects that live until the end: looking for cycles among them finds none.
+    gc.set_threshold(50_000, 20, 50)
     from hilbo.numerics.compiling import set_flags
 
     set_flags()
@@ -107,10 +110,12 @@ def _keep_programs() -> None:
 def results(out: Path, force: bool) -> Iterator[Path]:
     """A new folder that becomes `out` when everything in it is complete; with a list of what it holds, so that
     `force` replaces nothing else later."""
+    from hilbo.report.figures.painter import begin_painter
     from hilbo.study.results_list import list_files
 
     out = out.resolve()
     _check_free(out, force)
+    begin_painter()
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         made = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))

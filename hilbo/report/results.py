@@ -19,6 +19,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Array, Float
 
+from hilbo.report.figures.painter import write_figures
 from hilbo.report.page import Pictures, results_page
 from hilbo.report.participants import People, as_json, json_lines, people_of
 from hilbo.search.apart import differences, nrmse
@@ -243,13 +244,11 @@ def write_results(
 
 def save_figures(figures: Mapping[str, Any], folder: Path) -> Pictures:
     """Write figures by name as PNG, SVG and PDF; returns what a page needs to hold them."""
-    from hilbo.report.figures.files import write_figure
-
-    pictures = {}
-    for name, figure in figures.items():
-        png = base64.b64encode(write_figure(figure, folder, name)).decode()
-        pictures[name] = {"png": png, "width": str(round(_PIXELS * figure.get_figwidth()))}
-    return pictures
+    widths = {name: str(round(_PIXELS * figure.get_figwidth())) for name, figure in figures.items()}
+    return {
+        name: {"png": base64.b64encode(png).decode(), "width": widths[name]}
+        for name, png in write_figures(figures, folder).items()
+    }
 
 
 def optima_table(content: dict[str, Any], people: People) -> pd.DataFrame:

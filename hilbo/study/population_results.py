@@ -4,6 +4,7 @@ What `hilbo aggregate` writes. `hilbo.study.analysis` adds what a report says be
 """
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 from hilbo.population.recipes import RECIPES
@@ -24,13 +25,19 @@ class Population(NamedTuple):
 
     study: Study
     aggregate: Aggregate
-    progress: Progress
+    following: Future[Progress]
+    """What becomes `progress`: computed beside what is read from the aggregate."""
     seed: int
 
     @property
     def cohort(self) -> Cohort:
         """Whose answers these are."""
         return self.aggregate.cohort
+
+    @property
+    def progress(self) -> Progress:
+        """The optima after fewer trials; waits for them."""
+        return self.following.result()
 
 
 def analyse_population(
@@ -40,8 +47,8 @@ def analyse_population(
     say: Say = lambda text: None,
     tell: Callable[[list[str]], None] = lambda sentences: None,
 ) -> Population:
-    """The aggregate of a cohort, and its optima after fewer trials; everything is fitted once. `tell` is given the
-    optimum in sentences as soon as it is known."""
+    """The aggregate of a cohort, and its optima after fewer trials, which a thread goes on to compute; everything is
+    fitted once. `tell` is given the optimum in sentences as soon as it is known."""
     if study.rule in RECIPES:
         say("learning the hyperparameters from all answers")
     study = resolved(study, cohort)
@@ -53,4 +60,7 @@ def analyse_population(
 
     aggregate = aggregate_cohort(study, cohort, seed, first=first)
     say("the optima after fewer trials")
-    return Population(study, aggregate, follow(study, aggregate, seed), seed)
+    beside = ThreadPoolExecutor(1, "progress")
+    following = beside.submit(follow, study, aggregate, seed)
+    beside.shutdown(wait=False)
+    return Population(study, aggregate, following, seed)

@@ -1,0 +1,88 @@
+"""A second process that writes figures, so that two cores draw.
+
+It is forked before this process has threads, loads matplotlib while this one loads JAX, and ends with it. A figure is
+the same files, byte for byte, whoever writes it.
+"""
+
+import contextlib
+import importlib
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections import deque
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+__all__ = ["begin_painter", "write_figures"]
+
+_painter: list[Connection] = []
+
+
+def begin_painter() -> None:
+    """From now on `write_figures` has a second process. Nothing happens where there is one core, where nothing can be
+    forked, and where a fork is unsafe: once there are threads, as JAX has."""
+    if _painter or not hasattr(os, "fork") or sys.platform == "darwin" or (os.cpu_count() or 1) < 2:
+        return
+    if threading.active_count() > 1 or "jax" in sys.modules:
+        return
+    context = multiprocessing.get_context("fork")
+    here, there = context.Pipe()
+    context.Process(target=_paint, args=(there, here), daemon=True, name="painter").start()
+    there.close()
+    _painter.append(here)
+
+
+def write_figures(figures: Mapping[str, Any], folder: Path) -> dict[str, bytes]:
+    """Write matplotlib figures by name, as `files.write_figure` does: name -> PNG, in their order."""
+    from hilbo.report.figures.files import write_figure
+
+    left, written = deque(figures.items()), {}
+    with ThreadPoolExecutor(1) as beside:
+        given = beside.submit(_give, _painter[0], left, folder, written) if _painter else None
+        while left:
+            with contextlib.suppress(IndexError):  # the painter has taken the last one
+                name, figure = left.pop()
+                written[name] = write_figure(figure, folder, name)
+    if given is not None:
+        given.result()
+    for name in (name for name in figures if name not in written):  # the painter failed, or was killed
+        written[name] = write_figure(figures[name], folder, name)
+    return {name: written[name] for name in figures}
+
+
+def _give(painter: Connection, left: deque[tuple[str, Any]], folder: Path, written: dict[str, bytes]) -> None:
+    """Give the painter one figure after the other, from the front."""
+    with contextlib.suppress(IndexError):
+        while True:
+            name, figure = left.popleft()
+            try:
+                painter.send((figure, folder, name))
+                png = painter.recv()
+            except (EOFError, OSError):
+                _painter.clear()
+                return
+            if png is not None:
+                written[name] = png
+
+
+def _paint(pipe: Connection, others: Connection) -> None:
+    """The second process: figures in, PNGs out; None for one that cannot be drawn, as the first will find, too."""
+    others.close()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process decides what an interruption ends
+    for backend in ("agg", "pdf", "svg"):  # loaded before they are needed
+        importlib.import_module(f"matplotlib.backends.backend_{backend}")
+    from hilbo.report.figures.files import write_figure
+
+    with contextlib.suppress(EOFError, OSError):
+        while True:
+            figure, folder, name = pipe.recv()
+            try:
+                png = write_figure(figure, folder, name)
+            except Exception:
+                png = None
+            pipe.send(png)
