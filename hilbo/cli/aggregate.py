@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli.console import Force, Json, Out, check_choice, finish, progress, remark, results, seed_option, start
+from hilbo.cli.console import Force, Json, Out, finish, progress, remark, results, seed_option, start
 from hilbo.errors import InputError
 from hilbo.report.figures.painter import begin_painter
 
@@ -65,13 +65,14 @@ def aggregate(
         begin_painter()
     start(devices)
     from hilbo.study.distributed import crew, digest
+    from hilbo.study.learnt_study import by_rule
 
     with crew(distributed, coordinator, processes, process_id) as team, contextlib.ExitStack() as held:
         say = held.enter_context(progress(quiet=not team.writes))
         with team.agreement() as agree:
             folder = held.enter_context(results(out, force)) if team.writes else None
             chosen, cohort = read_cohort(trials, study, material, say)
-            chosen = chosen if rule is None else _by_rule(chosen, rule)
+            chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.of(participants.split(",")) if participants else cohort
             cohort = cohort.first(first) if first else cohort
             agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
@@ -130,21 +131,6 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
     else:
         table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
     return chosen, cohort_of(table, chosen)
-
-
-def _by_rule(study, rule):
-    import dataclasses
-
-    from hilbo.population.maps import ALL_RULES
-    from hilbo.population.recipes import RECIPES
-    from hilbo.study.learnt_study import that_learns
-
-    if rule in RECIPES:
-        return study if study.rule == rule else that_learns(study, rule)
-    if study.rule in RECIPES:
-        raise InputError(f'--rule is "{rule}", and the study, whose rule is "{study.rule}", has no [gp] for it.')
-    check_choice("rule", rule, ALL_RULES)
-    return dataclasses.replace(study, rule=rule)
 
 
 def aggregate_cohort(study, cohort, folder, seed, say, truth=None, compare=False, selection="") -> dict[str, Any]:

@@ -39,6 +39,7 @@ def power(
     study: Annotated[Path, typer.Argument(help="Study file (TOML).", show_default=False)],
     out: Out,
     preset: Preset = None,
+    rule: Annotated[str | None, typer.Option(help="Rule of aggregation in place of the study file's.")] = None,
     participants: Annotated[str, typer.Option(help="How many people, separated by commas.")] = "6,12,24",
     trials: Annotated[str, typer.Option(help="How many trials each, separated by commas.")] = "10,15,20,25",
     error: Annotated[
@@ -58,8 +59,10 @@ def power(
         from hilbo.simulation.power import Plan, cores, simulate_power
         from hilbo.simulation.presets import population_of
         from hilbo.study.config import Study
+        from hilbo.study.learnt_study import by_rule
 
         chosen = Study.load(study)
+        chosen = chosen if rule is None else by_rule(chosen, rule)
         name, population = population_of(chosen, preset)
         plan = Plan(_numbers(participants, "--participants"), _numbers(trials, "--trials"), studies, seed)
         jobs = min(jobs or cores(), studies)

@@ -31,6 +31,7 @@ from scipy.stats import binomtest
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
 from hilbo.population.maps import LARGEST_EXACT, RuleMap, learnt_map, rule_map
+from hilbo.population.recipes import RECIPES
 from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
 from hilbo.simulation.presets import placed
@@ -38,7 +39,7 @@ from hilbo.simulation.simulate import Person, Population, felt_apart, people, si
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.learnt_study import resolved
+from hilbo.study.learnt_study import by_rule, resolved
 from hilbo.study.optima import map_optimum
 
 __all__ = ["Plan", "cores", "one_study", "power_table", "simulate_power", "summarise", "top_probability"]
@@ -82,15 +83,15 @@ def simulate_power(
     """
     _check_rule(study.rule, plan)
     jobs = min(cores() if jobs is None else jobs, plan.studies)
-    content = study.content
+    sent = study.content, study.rule, population_, plan
     blocks: dict[int, pd.DataFrame] = {}
     if jobs == 1:
         for index in range(plan.studies):
-            blocks[index] = _study_in_process(content, population_, plan, index)
+            blocks[index] = _study_in_process(*sent, index)
             say(len(blocks))
     else:
         with _pool(jobs, begin) as pool:
-            work = {pool.submit(_study_in_process, content, population_, plan, i): i for i in range(plan.studies)}
+            work = {pool.submit(_study_in_process, *sent, i): i for i in range(plan.studies)}
             for done in as_completed(work):
                 blocks[work[done]] = done.result()
                 say(len(blocks))
@@ -133,9 +134,9 @@ def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[Process
             os.environ["XLA_FLAGS"] = before
 
 
-def _study_in_process(content: str, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
+def _study_in_process(content: str, rule: str, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
     """One study, from what can be sent to another process."""
-    study = Study.from_dict({"schema": 1} | json.loads(content))
+    study = by_rule(Study.from_dict({"schema": 1} | json.loads(content)), rule)
     return one_study(study, population_, plan, index)
 
 
@@ -158,7 +159,7 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     rows = []
     for count in plan.trials:
         so_far = cohort.first(count)
-        posteriors = fit_cohort(staged, so_far)
+        posteriors = None if study.rule in RECIPES else fit_cohort(staged, so_far)
         for m in plan.participants:
             some, given = jax.tree.map(lambda leaf, m=m: leaf[:m], (posteriors, so_far.trials))
             judged = resolved(study, so_far.rows(np.arange(m)))
@@ -188,7 +189,7 @@ def _with_trials(study: Study, trials: int) -> Study:
     content.setdefault("selection", {})["trials"] = trials
     filling = min(study.selection.space_filling, trials)
     content["selection"]["space_filling"] = filling
-    return Study.from_dict({"schema": 1} | content)
+    return by_rule(Study.from_dict({"schema": 1} | content), study.rule)
 
 
 def top_probability(persons: Person, categories: int, x: Float[np.ndarray, "m d"]) -> Float[np.ndarray, " m"]:

@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 
+from hilbo.errors import InputError
 from hilbo.population.learnt import Learnt, learn
 from hilbo.population.learnt_posterior import Stated, prior_model
+from hilbo.population.maps import ALL_RULES
 from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
-__all__ = ["learnt_content", "learnt_sentences", "resolved", "that_learns"]
+__all__ = ["by_rule", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
 
 _UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
 
@@ -23,6 +25,20 @@ def that_learns(study: Study, recipe: str = RECOMMENDED) -> Study:
     stated = Stated(levels=study.stated.levels)
     gp = prior_model(study.space.dim, len(study.responses), stated)
     return dataclasses.replace(study, rule=recipe, gp=gp, inference="laplace", stated=stated, learnt=None)
+
+
+def by_rule(study: Study, rule: str) -> Study:
+    """The same study by another rule of aggregation. Raises InputError for a rule that there is not, and for one that
+    needs a [gp] where the study learns its own."""
+    if rule == study.rule:
+        return study
+    if rule in RECIPES:
+        return that_learns(study, rule)
+    if study.rule in RECIPES:
+        raise InputError(f'--rule is "{rule}", and the study, whose rule is "{study.rule}", has no [gp] for it.')
+    if rule not in ALL_RULES:
+        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
+    return dataclasses.replace(study, rule=rule)
 
 
 def resolved(study: Study, cohort: Cohort) -> Study:

@@ -16,9 +16,18 @@ from hilbo.cli import main
 from hilbo.errors import InputError
 from hilbo.report.figures.power import power_figure
 from hilbo.report.power import enough, write_power
-from hilbo.simulation.power import Plan, one_study, power_table, simulate_power, summarise, top_probability
+from hilbo.simulation.power import (
+    Plan,
+    _with_trials,
+    one_study,
+    power_table,
+    simulate_power,
+    summarise,
+    top_probability,
+)
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import people
+from hilbo.study.learnt_study import by_rule
 
 
 def study():
@@ -94,6 +103,12 @@ def test_the_surest_share_is_the_exact_bound():
     all_of_them = summarise(errors.assign(optimum=0.0), 0.5)["reached_surely"][0]
     assert all_of_them == pytest.approx(0.05 ** (1 / 40), rel=1e-12)
     assert summarise(errors.assign(optimum=1.0), 0.5)["reached_surely"][0] == 0.0
+
+
+@pytest.mark.parametrize("rule", ["average", "learnt-2"])
+def test_a_rule_in_place_of_the_files_stays_with_other_numbers_of_trials(rule):
+    shorter = _with_trials(by_rule(study(), rule), 7)
+    assert (shorter.rule, shorter.selection.trials) == (rule, 7)
 
 
 def test_one_person_cannot_differ():
