@@ -19,7 +19,7 @@ $(DOCS_STAMP): WHAT = .[docs]
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo firmware test test-deep lint docs notebooks wheel bench clean
+.PHONY: help setup demo firmware test test-deep lint docs notebooks wheel floors bench clean
 
 help:  ## show the targets
 	@sed -n 's/^\([a-z-]*\):.*## /  \1\t/p' $(firstword $(MAKEFILE_LIST)) | expand -t 14
@@ -52,6 +52,9 @@ notebooks: $(DOCS_STAMP)  ## the notebooks as .ipynb with their outputs, into bu
 
 wheel:  ## the sdist and the wheel, into dist, and what a stranger does with them in fresh environments
 	.ci/wheel $(PYTHON)
+
+floors:  ## the default tests with the lowest dependencies that pyproject.toml allows
+	JOBS=$(JOBS) .ci/floors $(PYTHON) $(PYTEST_ARGS)
 
 bench: $(STAMP)  ## time hilbo against the textbook NumPy form
 	$(BIN)/python benchmarks/run.py
