@@ -78,10 +78,10 @@ _SILENCE = Order(0, "neutral")  # before a server has spoken, and after one is s
 class Stimulus:
     """This program's part in a session. `link`: what `hilbo session` prints for the stimulus, one program at a time.
 
-    `key_file`: where the key that it was traded for is kept, readable by you alone: a program that is started again
-    with it does not wait until the one before counts as lost. `neutral_within_s`: so soon is everything neutral after
-    `go_neutral` was called, or after an order, and the session is told so. Raises `StimulusError` if the session does
-    not let it in.
+    `key_file`: where the key that it was traded for is kept, readable by you alone: a program that is started with it
+    waits, and says so once, until the one before has been silent. `neutral_within_s`: so soon is everything neutral
+    after `go_neutral` was called, or after an order, and the session is told so. Raises `StimulusError` if the session
+    does not let it in.
     """
 
     def __init__(
@@ -108,6 +108,7 @@ class Stimulus:
         self._done = (0, "busy")  # the newest order that something was done about, and what
         self._heard = time.monotonic()
         self._why: str | None = None
+        self._waits = ""  # for what, since the last time that it was said
         self._closed = False
         self._lines: dict = {}  # thread -> its connection
         self._thread = threading.Thread(target=self._talk, name="hilbo-stimulus", daemon=True)
@@ -237,9 +238,13 @@ class Stimulus:
             self.silence_s, self.parameters = found["silence_s"], found["parameters"]
             self._heard, self._run = time.monotonic(), found["run"]
             self._take(found["run"], found)
+            self._waits = ""
         elif status in (400, 401, 403):
             self._end(found["error"])
         else:
+            if found["error"] != self._waits:
+                _log.warning("waiting: %s", found["error"])
+            self._waits = found["error"]
             time.sleep(_AGAIN)
 
     def _say(self, order: Order, state: str, **more: Any) -> bool:

@@ -272,7 +272,8 @@ def _presenter(hub, role) -> StimulusRig:
 
 
 async def _hello(hub, role, request) -> Response:
-    return _json(await _presenter(hub, role).hello(await _message(messages.Hello, request)))
+    message = await _message(messages.Hello, request)
+    return _json(await _presenter(hub, role).hello(message, _bearer(request) or ""))
 
 
 async def _report(hub, role, request) -> Response:

@@ -29,6 +29,10 @@ __all__ = ["OverError", "StimulusRig"]
 
 _TRAVEL = 0.5  # s that a message there and back may take, and a busy computer
 _NOBODY = {"stimulus": "No program that presents has joined yet.", "preparer": "The preparer has not joined yet."}
+_HEARD = (
+    "A program that joined by this link is still heard; end that one. {name} can begin once it has been silent for"
+    " {silence:g} s."
+)
 _WAIT = 5.0  # s that a program which joins may be kept waiting: clients wait for 10
 _TURN = 0.1  # s in which the timer of a silence has its turn
 _PART = 3  # a question is held for so small a part of the silence that is borne
@@ -64,7 +68,7 @@ class StimulusRig:
         self.order = Order(1, "neutral")
         self.snapshot = Snapshot("LOST", False, _NOBODY[self.role], excused=True)
         self._hello: Hello | None = None
-        self._run = ""
+        self._run, self._key = "", ""  # of the program that presents; no run while there is none
         self._news, self._moved = asyncio.Event(), asyncio.Event()
         self._asked: asyncio.Future[Loaded] | None = None  # what the present order's confirmation settles
         # The confirmation that was accepted last: number of its order, and values.
@@ -88,12 +92,18 @@ class StimulusRig:
 
     # What the program says.
 
-    async def hello(self, hello: Hello) -> dict[str, Any]:
-        """A program begins; the one before, if there is one, is out. Whoever moves something is stopped first, to see
-        how long that takes."""
-        if self._run and not self.snapshot.lost:
+    async def hello(self, hello: Hello, key: str = "") -> dict[str, Any]:
+        """A program begins with a key; the one before, if there is one, is out. Whoever moves something is stopped
+        first, to see how long that takes.
+
+        Raises `OverError` while another program with this key is heard: each would be back at once after the other. A
+        page is taken over whenever a person asks for it.
+        """
+        if self._run and self.role == "stimulus" and key == self._key:
+            raise OverError(_HEARD.format(name=hello.name, silence=self._table.silence))
+        if self._run:
             self._lose("Another program has taken over what presents.")
-        self._hello, self._run, self._stopped = hello, secrets.token_urlsafe(12), None
+        self._hello, self._run, self._key, self._stopped = hello, secrets.token_urlsafe(12), key, None
         self._see(self.snapshot._replace(lost=f"{hello.name} has joined, and is told to stop, to see that it does."))
         self._give("stop")
         self._heard()
@@ -103,9 +113,9 @@ class StimulusRig:
     async def free(self) -> bool:
         """Whether nobody presents: no program was heard for as long as it may be silent, which is waited for."""
         end = time.monotonic() + min(self._table.silence + _TURN, _WAIT)
-        while not self.snapshot.lost and (left := end - time.monotonic()) > 0:
+        while self._run and (left := end - time.monotonic()) > 0:
             await self._after(self._moved, left)
-        return self.snapshot.lost is not None
+        return not self._run
 
     async def report(self, report: Report) -> dict[str, Any]:
         """What the program says; the newest order, as soon as there is one that it does not know, or it has waited.

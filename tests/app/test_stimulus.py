@@ -244,14 +244,28 @@ def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
         assert [e.data["condition"] for e in live.events("device")] == ["stopped", "ready", "lost", "ready"]
 
 
-def test_a_second_program_takes_over_and_the_first_is_out(live):
-    first = live.by_hand()
-    second = ByHand.__new__(ByHand)
-    second.__dict__.update(first.__dict__)
-    second.hello()
-    second.report("neutral")
-    with refused(409, "say hello first"):
+def test_a_program_with_the_key_of_one_that_is_heard_waits_until_that_is_silent(tmp_path):
+    with LiveStimulus(tmp_path, silence=0.5) as live:
+        first = live.by_hand()
+        second = ByHand.__new__(ByHand)
+        second.__dict__.update(first.__dict__)
+        with refused(409, "A program that joined by this link is still heard; end that one. by hand can begin once"):
+            second.hello()
         first.report("neutral")
+        live.until(lambda v: v["device"]["state"] == "lost", live.whole)
+        second.hello()
+        second.report("neutral")
+        with refused(409, "say hello first"):
+            first.report("neutral")
+        told = ["stopped", "ready", "lost", "ready"]
+        live.until(lambda _: [e.data["condition"] for e in live.events("device")] == told)
+
+
+def test_a_program_with_a_newer_link_takes_over_at_once(live):
+    first, second = live.by_hand(), live.by_hand()
+    with refused(401, "no longer part"):
+        first.report("neutral")
+    second.report("neutral")
     live.until(lambda _: [e.data["condition"] for e in live.events("device")] == ["stopped", "ready", "lost", "ready"])
 
 

@@ -90,6 +90,26 @@ def test_a_program_that_is_started_again_finds_its_session_by_the_key_file(live,
         assert len(all_answered(live)) == 3
 
 
+def test_two_programs_with_one_key_file_do_not_take_over_from_each_other(tmp_path, caplog):
+    """The second says once why it waits, and presents as soon as the first is gone."""
+    with LiveStimulus(tmp_path, blocks=SINGLE, silence=0.5) as live:
+        link, file = live.link(), str(tmp_path / "stimulus.key")
+        first = Presenter(link, key_file=file)
+        live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+        with Presenter(link, key_file=file) as second:
+            with first:
+                live.until(lambda _: caplog.messages, lambda: None)
+                live.begin()
+                live.answer()
+                assert first.shown and not second.shown
+            all_answered(live)
+            assert second.shown
+        conditions = [event.data["condition"] for event in live.events("device")]
+    waits = [words for words in caplog.messages if words.startswith("waiting: ")]
+    assert len(waits) == 1 and "is still heard; end that one" in waits[0]
+    assert conditions == ["stopped", "ready", "lost", "ready"]
+
+
 def test_a_new_link_ends_the_program_that_had_the_old_one(live):
     with Presenter(live.link()) as old:
         live.until(lambda v: v["device"]["state"] == "stopped", live.whole)

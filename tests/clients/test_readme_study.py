@@ -9,6 +9,7 @@ import shlex
 import subprocess
 import sys
 import time
+import urllib.error
 from pathlib import Path
 
 import pytest
@@ -46,8 +47,10 @@ def taken_part(links, hub):
             far = abs(values["hue"] - 140) / 360
             label = "close" if far < 0.1 else "similar" if far < 0.3 else "different"
             answers = {question["name"]: label for question in view["questions"]}
-            person.post("/api/participant/answer", {"trial": view["trial"]["id"], "client": "c", "answers": answers})
-            count += 1
+            message = {"trial": view["trial"]["id"], "client": "c", "answers": answers}
+            with contextlib.suppress(urllib.error.HTTPError):  # on a busy computer the trial may be void by now
+                person.post("/api/participant/answer", message)
+                count += 1
         elif view["phase"] == "done":
             return count
         time.sleep(0.01)

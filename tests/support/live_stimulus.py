@@ -14,7 +14,18 @@ from hilbo.app.stimulus_rig import StimulusRig
 from hilbo.session.records import Block, Planned
 from hilbo.study.config import Study
 
-__all__ = ["CLIENTS", "SETS", "SINGLE", "ByHand", "LiveLevels", "LiveStimulus", "Presenter", "all_answered", "module"]
+__all__ = [
+    "CLIENTS",
+    "SETS",
+    "SINGLE",
+    "TEXT",
+    "ByHand",
+    "LiveLevels",
+    "LiveStimulus",
+    "Presenter",
+    "all_answered",
+    "module",
+]
 
 CLIENTS = Path(__file__).parents[2] / "clients"
 SETS = {
@@ -23,7 +34,7 @@ SETS = {
     "worst": {"hue": 301.987654, "light": 71.123456},
 }
 SINGLE = (Block("warm-up", 3, tuple(Planned(name) for name in SETS)),)
-_TEXT = """schema = 1
+TEXT = """schema = 1
 [study]
 name = "patch"
 responses = ["different", "similar", "close"]
@@ -65,7 +76,7 @@ class LiveStimulus(Live):
     """`with LiveStimulus(folder) as live:` - comparisons of two parameters; a program joins with `live.join()`."""
 
     def __init__(self, folder: Path, within: float = 20.0, silence: float = 20.0, more: str = "", **others):
-        self.text = _TEXT.format(within=within, silence=silence) + more
+        self.text = TEXT.format(within=within, silence=silence) + more
         super().__init__(folder, **others)
 
     def make_study(self, seconds, warm_up):

@@ -98,7 +98,7 @@ async function join() {
 
 async function present() {
   // The program that presents: it does what the newest order says, says so, and waits for the next.
-  let run = null;
+  let run = null, waited = 0;
   while (!state.over) {
     try {
       const said = { name: "hilbo try", version: "1", force: false, neutral_within_s: 1 };
@@ -106,10 +106,13 @@ async function present() {
       const report = { run, order: order.order, state: shows ? "presented" : "neutral", wait_s: 1 };
       if (shows) Object.assign(report, { trial: order.trial, values: order.values });
       const reply = await (run ? ask("/api/stimulus", report, true) : ask("/api/stimulus/hello", said, true));
-      put("hint", HINT);
-      if (reply.ok) { run = reply.said.run || run; obey(reply.said); }
+      if (reply.ok) { run = reply.said.run || run; waited = 0; put("hint", HINT); obey(reply.said); }
       else if (reply.status === 409 && reply.said.order) obey(reply.said);
-      else if (reply.status === 409) run = null;
+      else if (reply.status === 409 && run) run = null;
+      else if (reply.status === 409) {       // another window is heard; or this one before it was loaded again, for a second
+        if (++waited > 10) put("hint", "Another window shows this page already. Close that one, and this one goes on.");
+        await sleep(200);
+      }
       else { end(reply.said.error || "The server does not answer any more."); return; }
     } catch {
       run = null;
