@@ -156,7 +156,7 @@ def page(rows):
         lines.append(f"| {name} | {' | '.join(cells)} | {distance([c for c in came if c['classes']]):.0f} |")
     lines += [
         "",
-        "Predicted, not looked at before (medians over studies; shares of preferences):",
+        "Predicted, and not used to choose the populations (medians over studies; shares of preferences):",
         "",
         "| population | rule | optimum to the truth, quartiles | best to mid, best to worst, mid to worst"
         ' | preferred to individuals\' sets | "close" likeliest for K1, B1, alpha in |',
