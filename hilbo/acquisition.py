@@ -44,7 +44,7 @@ class UCB(eqx.Module):
     def __call__(self, mean, variance):
         return mean + self.weight.astype(mean.dtype) * jnp.sqrt(variance)
 
-    def optimistic(self, mean, prior):
+    def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
         """With all of the prior's variance left; `weight` is not negative."""
         return self(mean, prior)
 
@@ -58,7 +58,7 @@ class LogEI(eqx.Module):
         sd = jnp.sqrt(variance)
         return jnp.log(sd) + _log_improvement((mean - self.best.astype(mean.dtype)) / sd)
 
-    def optimistic(self, mean, prior):
+    def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
         """With all of the prior's variance left: more spread means more improvement."""
         return self(mean, prior)
 
@@ -73,7 +73,7 @@ class TopCategory(eqx.Module):
         spread = jnp.sqrt(self.noise.astype(mean.dtype) ** 2 + variance)
         return jax.scipy.special.log_ndtr((mean - self.threshold.astype(mean.dtype)) / spread)
 
-    def optimistic(self, mean, prior):
+    def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
         """Certain where the mean is above the threshold, as uncertain as the prior below it."""
         return self(mean, jnp.where(mean > self.threshold.astype(mean.dtype), 0.0, prior))
 
@@ -85,8 +85,8 @@ class Mean(eqx.Module):
         del variance
         return mean
 
-    def optimistic(self, mean, prior):
-        """The mean."""
+    def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
+        """The mean (...), whatever the variance."""
         del prior
         return mean
 

@@ -74,7 +74,10 @@ def combine_explained(
     mask: Bool[Array, " M"] | None = None,
     throw: bool = True,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """As [`combine`][], from the variances e_j = k - sigma_j^2 that the answers explain, (M, m)."""
+    """As [`combine`][], with its errors, from the variances e_j = k - sigma_j^2 that the answers explain, (M, m).
+
+    Raises `InputError` for other shapes.
+    """
     means, explained = _people(means, explained, "explained")
     prior = _checked_prior(prior_variance, means)
     evidence = _evidence(means, explained, prior, mask)
@@ -125,7 +128,10 @@ def average(
     means: Float[Array, "M m"], variances: Float[Array, "M m"], *, mask: Bool[Array, " M"] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Plain average of the latent functions, for comparison (paper, section II-C): every person counts the same,
-    however little is known; mean (m,), and the variance (m,) of the mean of independent functions."""
+    however little is known; mean (m,), and the variance (m,) of the mean of independent functions.
+
+    Raises `InputError` for other shapes.
+    """
     means, variances = _people(means, variances, "variances")
     present = jnp.ones(means.shape[0], bool) if mask is None else mask
     present = present.astype(means.dtype)

@@ -273,7 +273,7 @@ class Renderer:
         return self.samples(seconds).table(self.tick_s)
 
     def samples(self, seconds: SupportsFloat = 1.0) -> Samples:
-        """The same as columns of numbers, without pandas.
+        """The same over `seconds` of device time, as columns of numbers, without pandas.
 
         Arrays (n,), in the units of `telemetry`. Raises `DeviceError` if the line is lost or no telemetry comes.
         """

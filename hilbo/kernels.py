@@ -77,7 +77,7 @@ class RBF(eqx.Module):
         return f"RBF({_numbers_shown(self)})"
 
     def with_numbers(self, theta: ArrayLike, variance: ArrayLike) -> "RBF":
-        """The same kind of kernel, of the same levels, with other numbers."""
+        """The same kind of kernel, of the same levels, with another theta, a scalar or (d,), and variance, a scalar."""
         return RBF(theta, variance, self.levels)
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
@@ -98,7 +98,8 @@ class RBF(eqx.Module):
 class Matern32(eqx.Module):
     """Matern covariance of smoothness 3/2, variance * (1 + s) exp(-s) with s^2 = 6 theta |x - x'|^2.
 
-    Arguments and errors as those of `RBF`. Twice differentiable in each point, also where both are the same.
+    Arguments and errors as those of `RBF`, theta a scalar or (d,). Twice differentiable in each point, also where both
+    are the same.
     """
 
     theta: Float[Array, "*d"]
@@ -117,7 +118,7 @@ class Matern32(eqx.Module):
         return f"Matern32({_numbers_shown(self)})"
 
     def with_numbers(self, theta: ArrayLike, variance: ArrayLike) -> "Matern32":
-        """The same kind of kernel, of the same levels, with other numbers."""
+        """The same kind of kernel, of the same levels, with another theta, a scalar or (d,), and variance, a scalar."""
         return Matern32(theta, variance, self.levels)
 
     def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:

@@ -42,7 +42,7 @@ class OrdinalProbit(eqx.Module):
 
     **Arguments:**
 
-    - `thresholds`: C - 1 increasing numbers, in units of the latent f; the outermost categories are unbounded.
+    - `thresholds`: increasing numbers (C - 1,), in units of the latent f; the outermost categories are unbounded.
     - `noise`: standard deviation c_o > 0 of the classification noise, in units of f.
 
     Raises `InputError` for thresholds that do not rise and a noise that is not above 0. What is traced is not checked:

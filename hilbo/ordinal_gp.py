@@ -106,9 +106,10 @@ class Posterior(eqx.Module):
         return jax.tree.map(lambda a: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a, self)
 
     def class_probabilities(self, x: _PointsLike) -> Float[Array, "m categories"]:
-        """Probabilities (m, C) of the answers to be expected at points (m, d).
+        """Probabilities (m, C) of the answers to be expected at points (m, d) of the unit cube.
 
         From mean and variance, f being taken for normal; after `inference="exact"` from the samples themselves.
+        Raises `InputError` for points of another shape.
         """
         if isinstance(self.latent, ExactPosterior):
             return _sampled_probabilities(self, self._points(x))[0]
@@ -118,13 +119,19 @@ class Posterior(eqx.Module):
     def standard_errors(
         self, x: _PointsLike
     ) -> tuple[Float[Array, " m"], Float[Array, " m"], Float[Array, "m categories"]]:
-        """Of mean (m,), variance (m,) and class probabilities (m, C): of an exact posterior, which is sampled."""
+        """Of mean (m,), variance (m,) and class probabilities (m, C): of an exact posterior, which is sampled.
+
+        Raises `InputError` for a posterior of another inference, and for points of another shape than (m, d).
+        """
         latent, x = _sampled(self, "standard_errors"), self._points(x)
         mean, variance = latent.moment_errors(gram(self.gp.kernel, self.trials.x, x))
         return mean, variance, _sampled_probabilities(self, x)[1]
 
     def draw(self, key: PRNGKeyArray, x: _PointsLike, count: int) -> Float[Array, "count m"]:
-        """Independent draws (count, m) of the latent function from the exact posterior, jointly at all points."""
+        """Independent draws (count, m) of the latent function from the exact posterior, jointly at all points (m, d).
+
+        Raises `InputError` for a posterior of another inference, and for points of another shape.
+        """
         return _draw(self, key, self._points(x), count)
 
     def _points(self, x: _PointsLike) -> Float[Array, "m d"]:

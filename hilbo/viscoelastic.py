@@ -149,7 +149,7 @@ def check_ranges(**values: Real[ArrayLike, "..."]) -> None:
             raise InputError(f"{name} is {shown(wrong)}; it must be {words}.")
 
 
-def elementwise(function: Callable, span: Span, *args: Real[ArrayLike, "..."]):
+def elementwise(function: Callable, span: Span, *args: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
     """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once."""
     dtype = jnp.result_type(1.0, *args)
     return _compiled(function, span, *(jnp.asarray(arg, dtype) for arg in args))

@@ -1,6 +1,5 @@
 """The pages of docs/: each is in the site's navigation, and what they link to is there. `make docs` builds the site."""
 
-import ast
 import importlib.util
 import json
 import re
@@ -96,50 +95,6 @@ def test_modules_of_the_reference_and_names_of_pages_in_the_code_are_there():
             for name in re.findall(r"\bdocs/[\w/-]+\.(?:md|svg)", file.read_text(encoding="utf-8")):
                 missing += [] if (ROOT / name).is_file() else [f"{file.relative_to(ROOT)}: {name}"]
     assert missing == []
-
-
-def without_docstring(body: list[ast.stmt], place: str) -> list[str]:
-    """Public functions and classes, and public methods of these, that say nothing of themselves."""
-    kinds = (ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
-    public = [node for node in body if isinstance(node, kinds) and not node.name.startswith("_")]
-    found = [f"{place}.{node.name}" for node in public if not ast.get_docstring(node)]
-    classes = [node for node in public if isinstance(node, ast.ClassDef)]
-    return sum((without_docstring(node.body, f"{place}.{node.name}") for node in classes), found)
-
-
-def test_every_name_of_the_reference_has_a_docstring():
-    found = []
-    for module in " ".join(names for _, names in script("hooks").API.values()).split():
-        text = (ROOT / "hilbo" / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8")
-        found += without_docstring(ast.parse(text).body, module)
-    assert found == []
-
-
-def silent_errors(tree: ast.Module) -> list[str]:
-    """Public functions and methods that raise InputError themselves, where neither they nor their class say so."""
-    silent = []
-    for top in tree.body:
-        functions = [top] if isinstance(top, ast.FunctionDef) else getattr(top, "body", [])
-        for function in functions:
-            if not isinstance(function, ast.FunctionDef) or function.name.startswith("_"):
-                continue
-            raised = {ast.unparse(node.exc) for node in ast.walk(function) if isinstance(node, ast.Raise) and node.exc}
-            said = " ".join(
-                ast.get_docstring(node) or "" for node in {top, function} if not isinstance(node, ast.Module)
-            )
-            if any("InputError(" in text for text in raised) and not re.search(r"[Rr]aise|InputError|[Rr]efuse", said):
-                silent.append(function.name)
-    return silent
-
-
-def test_every_name_of_the_reference_says_its_errors():
-    silent = []
-    for module in " ".join(names for _, names in script("hooks").API.values()).split():
-        tree = ast.parse((ROOT / "hilbo" / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
-        silent += [f"{module}.{name}" for name in silent_errors(tree)]
-    assert silent == []
-    bad = ast.parse('def f(x):\n    """Twice x."""\n    if x < 0:\n        raise InputError("x")\n')
-    assert silent_errors(bad) == ["f"]
 
 
 def test_tables_of_benchmarks_have_their_marks():

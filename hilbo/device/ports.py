@@ -29,7 +29,10 @@ class PortInfo(NamedTuple):
 
 
 class SerialPort:
-    """A serial port, or a pseudo-terminal; nobody else can open it meanwhile."""
+    """A serial port, or a pseudo-terminal; nobody else can open it meanwhile.
+
+    Raises `InputError` if it cannot be opened.
+    """
 
     def __init__(self, name: str, baud: int = BAUD):
         self.name = name

@@ -85,6 +85,8 @@ def maximise_evidence(
     - `weak_priors`: add the log prior above.
     - `inference`: whose evidence, "laplace", "ep" or "ep_corrected"; "exact" has no derivatives.
     - `starts`: the search begins at the model's values with theta and noise scaled by powers of 2; the best end wins.
+
+    Raises `InputError` for names in `learn` that are not learnt, and for an inference without derivatives.
     """
     return _maximise(
         gp, jax.tree.map(lambda leaf: leaf[None], trials), learn, weak_priors, starts, max_steps, inference
@@ -101,7 +103,10 @@ def maximise_shared_evidence(
     max_steps: int = 100,
     inference: str = "laplace",
 ) -> Learned:
-    """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences."""
+    """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences.
+
+    Arguments as those of [`maximise_evidence`][], and it raises the same errors.
+    """
     return _maximise(gp, trials, learn, weak_priors, starts, max_steps, inference)
 
 

@@ -6,7 +6,7 @@ ran to the edge of the search, and *not identifiable* if the data set no end at 
 coordinates; their intervals are quantiles under the normal approximation in those.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -60,7 +60,7 @@ def characterise(
     model: Any,
     seed: int = 0,
     choices: Sequence[int | None] = (),
-    say=lambda text: None,
+    say: Callable[[str], None] = lambda text: None,
 ) -> Characterisation:
     """Fit tests by one parameter set and judge it; `choices` are the memories to compare (none: no comparison)."""
     say("fitting")

@@ -116,7 +116,7 @@ class Model(Protocol):
         ...
 
     def parameters(self, q: Array) -> dict[str, Array]:
-        """Name -> value in physical units."""
+        """Name -> value in physical units, at q (4,)."""
         ...
 
 
@@ -207,7 +207,9 @@ def _polished(current: Fit, start: Float[Array, " p"]) -> Solution:
     )
 
 
-def residuals(model, curves, weights, q) -> Float[Array, " m"]:
+def residuals(
+    model: Any, curves: Sequence["Curve"], weights: Sequence[Float[Array, " _"]], q: Float[Array, " p"]
+) -> Float[Array, " m"]:
     """Residuals of all curves; their sum of squares is the sum over curves of NRMSE².
 
     `q` (p,) -> (m,), all curves one after the other.
@@ -215,7 +217,7 @@ def residuals(model, curves, weights, q) -> Float[Array, " m"]:
     return jnp.concatenate([curve_residuals(model, c, w, q) for c, w in zip(curves, weights, strict=True)])
 
 
-def curve_residuals(model, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
+def curve_residuals(model: Any, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
     """Mean of the weighted repeats less the model's, over the curve's scale and the root of its length.
 
     `weights` (R,), `q` (p,) -> (m,), without unit.
@@ -231,7 +233,14 @@ def nrmse(fitted: Fit) -> dict[str, float]:
 
 
 @program
-def search(model, curves, weights, starts, lower, upper) -> tuple[Solution, Float[Array, " starts"]]:
+def search(
+    model: Any,
+    curves: Sequence["Curve"],
+    weights: Sequence[Float[Array, " _"]],
+    starts: Float[Array, "s p"],
+    lower: Float[Array, " p"],
+    upper: Float[Array, " p"],
+) -> tuple[Solution, Float[Array, " s"]]:
     """All starts for a few steps, the best of them to the end; with the costs that the race ended in.
 
     `starts` (s, p), `lower` and `upper` (p,).

@@ -185,7 +185,9 @@ def _best_of(ends: Float[Array, "s d"], values: Float[Array, " s"], start_values
     return Choice(ends[best], values[best], best_start, start_values[best_start])
 
 
-def spread(values: Float[Array, " m"], candidates: Float[Array, "m d"], count: int, apart: float = 0.1):
+def spread(
+    values: Float[Array, " m"], candidates: Float[Array, "m d"], count: int, apart: float = 0.1
+) -> Int[Array, " count"]:
     """Rows of good candidates from different places: the best, the best further than `apart` from it, and so on.
 
     `values` (m,), `candidates` (m, d) -> (count,) row numbers.

@@ -58,7 +58,7 @@ class Sums(NamedTuple):
 def terms(
     rule: Rule, means: Float[Array, "*s"], explained: Float[Array, "*s"], prior: Float[Array, "..."], share: ArrayLike
 ) -> Sums:
-    """What each person adds to the sums of a rule; `share`: p, 1 for every rule but the hierarchical one.
+    """What each person adds to the sums of a rule; `share`: p, a scalar, 1 for every rule but the hierarchical one.
 
     `means` and `explained` of any shape, and the sums of the same.
     """

@@ -30,7 +30,7 @@ def identification_result(
     notes: tuple[str, ...],
     damping: float | None,
 ) -> dict[str, Any]:
-    """The content of result.json."""
+    """The content of result.json. `unit`: of the curves; `damping`: the device's, N·s/m."""
     model = result.fit.model
     sampled = isinstance(model, Sampled)
     about: dict[str, Any] = {"name": type(model).__name__.lower() if not sampled else "fosls", "unit": unit}
@@ -73,7 +73,10 @@ def _passivity(needed, damping):
 
 
 def renderer_block(result: Characterisation, damping: float | None) -> str:
-    """The [renderer] table of a study file for this material, as text; the identified set as comments."""
+    """The [renderer] table of a study file for this material, as text; the identified set as comments.
+
+    `damping`: the device's, N·s/m; None leaves a line to fill in.
+    """
     model, values = result.fit.model, result.fit.parameters()
     lines = ["[renderer]", 'model = "fosls"', f'memory = "{model.memory}"']
     if model.memory == "short":
@@ -93,7 +96,7 @@ def renderer_block(result: Characterisation, damping: float | None) -> str:
 def write_identification(
     tests: tuple[Test, ...], result: Characterisation, content: dict[str, Any], folder: Path, damping: float | None
 ) -> None:
-    """Write result.json, renderer.toml, curves.csv, the figures and report.html."""
+    """Write result.json, renderer.toml, curves.csv, the figures and report.html. `damping`: the device's, N·s/m."""
     from hilbo.report.figures import mechanics as plotting
 
     (folder / "result.json").write_text(as_json(content))

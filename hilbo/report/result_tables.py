@@ -15,7 +15,10 @@ __all__ = ["convergence_table", "table_1", "tolerance_table"]
 
 def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
     """The population optimum and the mean of the individual optima, beside the reference if there is one (paper,
-    table I): `parameter`, `reference`, `aggregate`, `error_percent`, `mean_of_optima`, `sd_of_optima`, ..."""
+    table I): `parameter`, `reference`, `aggregate`, `error_percent`, `mean_of_optima`, `sd_of_optima`, ...
+
+    `reference` (d,): the parameter set that is known, in the unit cube.
+    """
     study, aggregate = analysis.study, analysis.aggregate
     mean, best = aggregate.mean_of_optima, aggregate.optimum.x
     individual_sets = pd.DataFrame([set_of(study.space, x) for x in np.asarray(aggregate.individuals.x)])

@@ -7,7 +7,7 @@ population map.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +45,7 @@ def write_study(
     folder: StudyFolder,
     out: Path,
     seed: int = 0,
-    say=lambda text: None,
+    say: Callable[[str], None] = lambda text: None,
     analyses: Mapping[str, Analysis] | None = None,
     comparison: bool = True,
 ) -> dict[str, Any]:

@@ -106,7 +106,10 @@ def present(state: LiveSession, trial: int, step: int, on: bool, at: float) -> E
 
 
 def missed(state: LiveSession, trial: int, show: str, reason: str, at: float) -> Event:
-    """What was to be presented was not: too late, too far off, or the program failed. The trial is void, by rule."""
+    """What was to be presented was not: too late, too far off, or the program failed. The trial is void, by rule.
+
+    Raises `RefusedError` where that trial is not the one that is on.
+    """
     _live(state, trial)
     return _event(state, "missed", at, id=trial, show=show, reason=reason)
 
@@ -240,13 +243,14 @@ def resume(state: LiveSession, at: float) -> Event:
 
 
 def abort(state: LiveSession, reason: str, at: float) -> Event:
-    """The end of the session before its time."""
+    """The end of the session before its time. Raises `RefusedError` when it has ended, and for a reason that a
+    spreadsheet would run."""
     _running(state)
     return _event(state, "abort", at, reason=_text(reason))
 
 
 def note(state: LiveSession, text: str, at: float) -> Event:
-    """The experimenter's words."""
+    """The experimenter's words. Raises `RefusedError` for words that a spreadsheet would run."""
     return _event(state, "note", at, text=_text(text))
 
 
@@ -273,7 +277,8 @@ def go_on(state: LiveSession, at: float) -> Event:
 def device(state: LiveSession, condition: str, at: float, *, trial: int | None = None, **facts) -> Event:
     """The device says "ready", "running", "stopped", "hold", "estop" or "lost"; `facts`: its counters and reason.
 
-    With hold, estop or lost the trial (by default the pending one) is void if it had begun.
+    With hold, estop or lost the trial (by default the pending one) is void if it had begun. Raises `RefusedError` for a
+    `trial` that there is not.
     """
     if trial is not None:
         state.trial(trial)

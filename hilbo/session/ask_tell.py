@@ -106,7 +106,10 @@ class Session:
         return thread
 
     def ask(self) -> dict[str, Any]:
-        """The rendering to present next: parameter -> value in physical units, of levels the name of one."""
+        """The rendering to present next: parameter -> value in physical units, of levels the name of one.
+
+        Raises `InputError` where all trials of the study are answered.
+        """
         return self._named(_asked(self))
 
     def tell(self, response: str, at: Mapping[str, Any] | None = None) -> "Session":

@@ -55,7 +55,7 @@ class Answers(NamedTuple):
         return cls(block, points, tuple(map(responses.index, given)), proposed)
 
     def followed_by(self, point: tuple[float, ...], category: int, proposed: tuple[float, ...]) -> "Answers":
-        """With one more."""
+        """With one more: where it was presented and proposed, physical units, and its category from 0."""
         return Answers(self.block, (*self.points, point), (*self.categories, category), (*self.proposed, proposed))
 
 
@@ -75,6 +75,7 @@ class LiveChooser:
     """Finds and remembers the renderings of one session. May be used from several threads.
 
     `fits` counts the fits that were computed, `looked_up` the choices that were there when they were asked for.
+    Raises `InputError` for maps of a warm start that do not fit the session's header.
     """
 
     def __init__(self, state: LiveSession, warm: Mapping[str | None, WarmStart] | None = None) -> None:

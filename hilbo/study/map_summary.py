@@ -73,8 +73,8 @@ def best_mid_worst(
 
     **Arguments:** `candidates`, feasible points (`search_points`); `known`, the largest sd of worst and mid in
     units of the prior's; `apart`, the least distance of mid from both, in the unit cube; `prior`, the map's variance
-    where nobody answered (`RuleMap.map_prior`), one person's if it is not given. Raises InputError if the map knows
-    nothing well enough, or has nothing in between.
+    where nobody answered (`RuleMap.map_prior`), a scalar or (m,), one person's if it is not given. Raises InputError
+    if the map knows nothing well enough, or has nothing in between.
     """
     candidates = jnp.asarray(candidates)
     mean, sd = _mean_and_sd(predict, candidates)

@@ -54,7 +54,8 @@ def read_trials(
 
 
 def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = None) -> pd.DataFrame:
-    """As `read_trials`, from a table in memory: the same columns, the same checks, the same sentences."""
+    """As `read_trials`, from a table in memory: the same columns, the same checks. Raises `InputError` with the same
+    sentences."""
     text = cells_of(frame)
     for column in text.columns.intersection(_KEY):
         text.loc[frame[column].isna().to_numpy(), column] = ""  # a missing participant is nobody called "nan"
