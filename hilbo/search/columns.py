@@ -6,9 +6,11 @@ has all ends). A column whose passive end is below the lowest K1, or with no K1 
 feasible point.
 
 Points that fill the passive part evenly come from uniform numbers by the Rosenblatt map whose density is the column's
-width over (B1, α), from a table; Rosenblatt (1952), Ann. Math. Stat. 23:470.
+width over (B1, α), from a table; Rosenblatt (1952), Ann. Math. Stat. 23:470. So a constraint with another parameter, on
+which a width would depend too, has no part in it (`drawn`): it refuses points instead.
 """
 
+import dataclasses
 import functools
 from dataclasses import dataclass
 
@@ -29,6 +31,7 @@ __all__ = ["COLUMNS", "ROWS", "Columns", "check_volume", "column_ends", "column_
 _CELLS = 256
 ROWS = np.linspace(0, 1, _CELLS + 1) ** 3  # x_B1
 COLUMNS = np.linspace(0, 1, _CELLS + 1)  # x_alpha
+_MODEL = ("K1", "B1", "alpha")
 _Batch = Float[Array, "*batch"]
 
 
@@ -43,6 +46,12 @@ class Columns:
     mechanics: Mechanics
     constraints: tuple[Constraint, ...] = ()
 
+    @property
+    def drawn(self) -> "Columns":
+        """The columns from which even points are drawn: their ends follow from B1 and alpha alone."""
+        alone = (c for c in self.constraints if all(name in _MODEL for name, weight in c.terms if weight))
+        return dataclasses.replace(self, constraints=tuple(alone))
+
     def index(self, name: str) -> int:
         """Which coordinate a parameter is."""
         return next(i for i, parameter in enumerate(self.parameters) if parameter.name == name)
@@ -50,7 +59,7 @@ class Columns:
     def from_shares(self, w: Float[Array, "*batch d"]) -> Float[Array, "*batch d"]:
         """Points of which K1 is a share of its column, as points of the unit cube; x_K1 is 0 in an empty column."""
         K1 = self.index("K1")
-        if not self._between:
+        if not self.between:
             return w.at[..., K1].multiply(self.passive_end(w))
         start, width = self.interval(w)
         return w.at[..., K1].set(start + w[..., K1] * width)
@@ -59,7 +68,7 @@ class Columns:
         """Points `w` with their x_K1 as a share of its column: of the columns of the same points `x` in the unit cube,
         which are feasible."""
         K1 = self.index("K1")
-        if not self._between:
+        if not self.between:
             return w.at[..., K1].divide(self.passive_end(x))
         start, width = self.interval(x)
         return w.at[..., K1].set((x[..., K1] - start) / width)
@@ -80,17 +89,16 @@ class Columns:
         return start, jnp.maximum(end - start, 0)
 
     @property
-    def _between(self) -> bool:
+    def between(self) -> bool:
         """Whether a column has a lower end, and an upper one besides the passive end."""
         return self.mechanics.effective_damping is not None or self.constraints != ()
 
 
 @program
 def column_ends(columns: Columns, x: Float[ArrayLike, "*batch d"]) -> tuple[_Batch, _Batch]:
-    """Both ends (...,) in x_K1 of the columns of points (..., d), as mechanics alone leave them; equal in an empty
-    one."""
+    """Both ends (...,) in x_K1 of the columns of points (..., d); equal in an empty one."""
     x = jnp.asarray(x, jnp.result_type(1.0, x))
-    if columns.mechanics.effective_damping is None:
+    if not columns.between:
         end = columns.passive_end(x)
         return jnp.zeros_like(end), end
     start, width = columns.interval(x)
@@ -120,13 +128,13 @@ def _cumulative_volume(columns: Columns) -> tuple[Float[np.ndarray, " r"], Float
 
 
 def volume(columns: Columns) -> float:
-    """Share of the unit cube that the columns fill: their mean width, on a grid."""
+    """Share of the unit cube that the columns fill: their mean width, on a grid. The columns are `drawn`."""
     return float(_cumulative_volume(columns)[0][-1])
 
 
 def rosenblatt(columns: Columns, uniform: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n d"]:
     """Uniform numbers (n, d) as points of which K1 is a share of its column, where a column is as likely as it is
-    wide."""
+    wide. The columns are `drawn`."""
     rows, within = _cumulative_volume(columns)
     B1, alpha = columns.index("B1"), columns.index("alpha")
     w = uniform.copy()

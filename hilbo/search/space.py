@@ -55,8 +55,8 @@ class SearchSpace(eqx.Module):
 
     def __check_init__(self):
         Box(self.parameters, self.mechanics, self.constraints)  # refuses what is no box
-        if self.columns is not None:
-            check_volume(self.columns)
+        if self.mechanics is not None:
+            check_volume(self._passive)
         if self.constraints:
             linear.check_room(self.parameters, self.constraints)
             if self.mechanics is not None or any(self.discrete):
@@ -103,6 +103,17 @@ class SearchSpace(eqx.Module):
             return None
         on_K1 = (c for c in self.constraints if any(name == "K1" and weight for name, weight in c.terms))
         return Columns(self.parameters, self.mechanics, tuple(on_K1))
+
+    @property
+    def _drawn(self) -> Columns | None:
+        """From which even points are drawn."""
+        return None if self.columns is None else self.columns.drawn
+
+    @property
+    def _passive(self) -> Columns:
+        """Along K1, whatever the constraints."""
+        assert self.mechanics is not None
+        return Columns(self.parameters, self.mechanics)
 
     @property
     def _walls(self) -> linear.Walls:
@@ -186,7 +197,7 @@ class SearchSpace(eqx.Module):
 
     def volume(self) -> float:
         """Share of the unit cube that is passive: the mean width of its columns, on a grid; 1 without mechanics."""
-        return 1.0 if self.columns is None else volume(self.columns)
+        return 1.0 if self.mechanics is None else volume(self._passive)
 
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol').
@@ -195,14 +206,15 @@ class SearchSpace(eqx.Module):
         """
         if self.constraints and self.mechanics is None:
             return _take_between(self, m, seed)
-        return _take_feasible(self, m, sobol_chunks(self.dim, m, seed))
+        return _take_feasible(self, m, sobol_chunks(self.dim, m, seed), self._drawn)
 
     def walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points on the walls, edges and corners of the feasible set, the passive boundary included. -> (m, d)."""
         if self.constraints and self.mechanics is None:
             return self._on_walls(m, seed)
         count = 2 ** max(m - 1, 0).bit_length()
-        return _take_feasible(self, m, sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed))
+        chunks, held = sobol_chunks(self.dim, count, seed), wall_chunks(self.dim, count, seed)
+        return _take_feasible(self, m, chunks, self.columns, held)
 
     def latin_hypercube(self, n: int, seed: int) -> Float[np.ndarray, "n d"]:
         """`n` feasible points of the unit cube: a Latin hypercube in the coordinates in which the set is uniform.
@@ -214,7 +226,7 @@ class SearchSpace(eqx.Module):
         """
         if self.constraints and n:
             return spread_out(self.candidates(_CLUSTERED * n, seed), n, seed)
-        return _take_feasible(self, n, latin_chunks(self.dim, n, seed))
+        return _take_feasible(self, n, latin_chunks(self.dim, n, seed), self._drawn)
 
     def _on_walls(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """Points (m, d) on the walls of the constraints and of the cube, for a space without mechanics."""
@@ -267,17 +279,28 @@ def _from_box(space: SearchSpace, w: Float[ArrayLike, "n d"]) -> tuple[Float[Arr
     return x, space.feasible(x)
 
 
+@program
+def _from_columns(
+    space: SearchSpace, columns: Columns, w: Float[ArrayLike, "n d"]
+) -> tuple[Float[Array, "n d"], Bool[Array, " n"]]:
+    """Points of the unit cube but for K1, which is a share of its column."""
+    x = columns.from_shares(_on_device(w))
+    return x, space.feasible(x)
+
+
 def _take_feasible(
-    space: SearchSpace, count: int, chunks: Chunks, hold: Chunks | None = None
+    space: SearchSpace, count: int, chunks: Chunks, columns: Columns | None, hold: Chunks | None = None
 ) -> Float[np.ndarray, "count d"]:
-    """The first `count` feasible points out of chunks of uniform numbers, some coordinates held at an end."""
+    """The first `count` feasible points out of chunks of uniform numbers, K1 within `columns`, some coordinates held at
+    an end."""
 
     def place(uniform):
-        w = uniform if space.columns is None else rosenblatt(space.columns, uniform)
+        w = uniform if columns is None else rosenblatt(columns.drawn, uniform)
         if hold is not None:
             ends = next(hold)
             w = np.where(np.isnan(ends), w, ends)
-        x, feasible = _from_box(space, steps_of(space.parameters, w))
+        w = steps_of(space.parameters, w)
+        x, feasible = _from_box(space, w) if columns is None else _from_columns(space, columns, w)
         return np.asarray(x), np.asarray(feasible)
 
     return _enough(space, count, *take(count, chunks, place))

@@ -9,6 +9,7 @@ from hilltop import height, highest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
+from scipy.stats import qmc
 
 from hilbo.errors import InputError
 from hilbo.search.box import Box, Constraint, Mechanics, Parameter
@@ -122,6 +123,30 @@ def test_constraints_beside_the_passive_wall():
     choice = highest(PASSIVE, jnp.array([1.0, 0.3, 0.2]), jnp.ones(3))
     K1, B1, _ = np.asarray(PASSIVE.to_physical(choice.x)).tolist()
     assert pytest.approx(12.0, abs=1e-6) == K1 + 0.5 * B1
+
+
+RATIOS = (MECHANICS[0], Parameter("B1", 0.01, 32.0, scale="log"), MECHANICS[2])
+GAIN = (*MECHANICS, Parameter("gain", 0.0, 10.0))
+
+
+@pytest.mark.deep  # it compiles the mechanics
+@pytest.mark.parametrize(
+    ("parameters", "constraint"),
+    [
+        (MECHANICS, Constraint((("K1", 1.0), ("B1", -1.0)), least=2.0)),  # a lower end of the columns
+        (MECHANICS, Constraint((("B1", 1.0), ("alpha", 20.0)), most=20.0)),
+        (RATIOS, Constraint((("B1", 1.0), ("alpha", 20.0)), most=20.0)),  # B1 is linear in the box, logarithmic in x
+        (GAIN, Constraint((("K1", 1.0), ("gain", 1.0)), most=12.0)),  # the columns depend on what is no mechanics
+    ],
+    ids=lambda value: value.words if isinstance(value, Constraint) else "",
+)
+def test_candidates_beside_the_passive_wall_are_even(parameters, constraint):
+    space = SearchSpace(parameters, Mechanics(0.44, 0.95), (constraint,))
+    cube = qmc.Sobol(space.dim, rng=7).random(2**18)
+    usable = cube[np.asarray(space.feasible(cube))]
+    ends = [(0.0, 1.0)] * space.dim
+    shares = [np.histogramdd(x, 4, ends)[0] / len(x) for x in (space.candidates(2**14, 0), usable)]
+    assert np.abs(shares[0] - shares[1]).sum() / 2 < 0.03
 
 
 @pytest.mark.parametrize(
