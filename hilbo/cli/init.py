@@ -1,6 +1,7 @@
 """`hilbo init`: a commented study file to begin with.
 
 hilbo init study.toml --parameter hue=0:360:deg --parameter light=20:80:%
+hilbo init study.toml --parameter a=0:2:mm --parameter b=0:2:mm --constraint "a + 2*b <= 3"
 hilbo init study.toml --device
 """
 
@@ -26,6 +27,12 @@ def init(
             " Once for each."
         ),
     ] = None,
+    constraint: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="What parameters keep together, in their units: 'a + 2*b <= 3', '0 <= a - b <= 1'. Once for each."
+        ),
+    ] = None,
     responses: Annotated[str, typer.Option(help="The answers, lowest first.")] = "different,similar,close",
     trials: Annotated[int, typer.Option(min=1, help="How many trials a participant has.")] = 25,
     device: Annotated[bool, typer.Option("--device", help="Our device renders; else a program presents.")] = False,
@@ -42,7 +49,8 @@ def init(
     if device and by == "person":
         raise InputError("--by person stands beside --device; leave one of them out.")
     answers = tuple(text.strip() for text in responses.split(","))
-    text = study_text(NewStudy(name or study.stem, parameters, answers, trials, device, by))
+    new = NewStudy(name or study.stem, parameters, answers, trials, device, by, tuple(constraint or ()))
+    text = study_text(new)
     with new_file(study) as path:
         path.write_text(text, encoding="utf-8")
     print(f"{study}: written; read it, then hilbo doctor {study}", file=sys.stderr)

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from hilbo.errors import InputError
-from hilbo.search.box import Parameter
+from hilbo.search.box import Constraint, Parameter
+from hilbo.study.constraint_words import constraint_of
 from hilbo.study.study_file import StudyFile, checked
 
 __all__ = ["NewStudy", "parameter_of", "study_text"]
@@ -77,6 +78,8 @@ class NewStudy(NamedTuple):
     trials: int = 25
     device: bool = False
     by: Literal["program", "person"] = "program"
+    constraints: tuple[str, ...] = ()
+    """Such as `a + 2*b <= 3`, in the parameters' units."""
 
 
 def parameter_of(text: str) -> Parameter:
@@ -102,6 +105,7 @@ def parameter_of(text: str) -> Parameter:
 def study_text(new: NewStudy) -> str:
     """The file's text. Raises InputError for what no study file may say."""
     parameters = _parameters(new)
+    constraints = [constraint_of(words, [p.name for p in parameters]) for words in new.constraints]
     text = "\n".join(
         [
             "# A study of hilbo. Change what you like; hilbo doctor FILE says what is missing.",
@@ -112,6 +116,7 @@ def study_text(new: NewStudy) -> str:
             _line(f"responses = [{', '.join(map(_quoted, new.responses))}]", "what people may answer, lowest first"),
             _line(f"attribute = {_quoted(_ATTRIBUTE)}", "what is judged: labels of axes and captions"),
             *(line for p in parameters for line in _table(p)),
+            *(line for constraint in constraints for line in _wall(constraint)),
             _presenting(new, parameters),
             _line("[gp]", "what is believed of people before any answer; rule learnt-2 learns it"),
             _line(f"length = {0.13 if new.device else 0.22}", "over what part of a range answers change"),
@@ -132,10 +137,28 @@ def study_text(new: NewStudy) -> str:
     )
     text += "" if new.device else _TEXTS + _definitions(new.responses)
     try:
-        checked(tomllib.loads(text), "", _checked)
+        file = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"a name or an answer has what no file can hold ({error}); leave it out.") from error
+    try:
+        checked(file, "", _computed if constraints else _checked)
+    except InputError as error:
+        raise InputError(_as_written(str(error), new.constraints)) from None
     return text
+
+
+def _computed(file: StudyFile) -> None:
+    """Refuses constraints that leave nothing."""
+    from hilbo.study.config import Study  # loads what computes, which a file without constraints does not need
+
+    Study.of(file)
+
+
+def _as_written(sentence: str, constraints: Sequence[str]) -> str:
+    """A sentence on the tables of constraints, on what stands on the command line for them."""
+    return re.sub(
+        r"constraints\.(\d+)(\.terms)?", lambda m: f"--constraint {_quoted(constraints[int(m[1]) - 1])}", sentence
+    )
 
 
 def _line(text: str, comment: str) -> str:
@@ -143,8 +166,8 @@ def _line(text: str, comment: str) -> str:
     return f"{text:<36} # {comment}"
 
 
-def _checked(file: StudyFile) -> StudyFile:
-    return file
+def _checked(_file: StudyFile) -> None:
+    """Nothing more than that it is one."""
 
 
 def _parameters(new: NewStudy) -> Sequence[Parameter]:
@@ -162,7 +185,7 @@ def _parameters(new: NewStudy) -> Sequence[Parameter]:
 
 
 def _table(p: Parameter) -> list[str]:
-    key = p.name if re.fullmatch(r"[A-Za-z0-9_-]+", p.name) else _quoted(p.name)
+    key = _key(p.name)
     if p.levels:
         levels = _line(f"levels = [{', '.join(map(_quoted, p.levels))}]", "without an order")
         alike = _line(f"correlation = {p.correlation}", "how alike two of them are taken to be before any answer")
@@ -177,6 +200,17 @@ def _table(p: Parameter) -> list[str]:
         f"unit = {_quoted(p.unit)}",
         *scale,
         *steps,
+    ]
+
+
+def _wall(constraint: Constraint) -> list[str]:
+    terms = ", ".join(f"{_key(name)} = {weight}" for name, weight in constraint.terms)
+    ends = [("least", constraint.least), ("most", constraint.most)]
+    return [
+        "",
+        _line("[[constraints]]", f"{constraint.words}; nothing else is ever presented"),
+        f"terms = {{{terms}}}",
+        *(f"{key} = {end}" for key, end in ends if end is not None),
     ]
 
 
@@ -216,6 +250,10 @@ def _definitions(responses: Sequence[str]) -> str:
     """What the usual answers mean; of others only their authors know that."""
     known = [f"{_quoted(name)} = {_quoted(_DEFINITIONS[name])}" for name in responses if name in _DEFINITIONS]
     return "\n".join(["", "[session.definitions]                # what each answer means", *known, ""])
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else _quoted(name)
 
 
 def _quoted(text: str) -> str:

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 
 from hilbo import Study
 from hilbo.errors import InputError
-from hilbo.search.box import Parameter
+from hilbo.search.box import Constraint, Parameter
+from hilbo.study.constraint_words import constraint_of
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
 from hilbo.study.study_file import StudyFile
 
@@ -61,6 +62,61 @@ def test_what_is_no_parameter_is_refused_with_an_example(text):
         parameter_of(text)
 
 
+TWO = (Parameter("a", 0.0, 2.0, "mm"), Parameter("b c", 0.0, 2.0))
+SENTENCES = {
+    "a + 2*z <= 3": "names z, which is no parameter of the study; those are a, b c.",
+    "a + 2*b c <= -3": '--constraint "a + 2*b c <= -3" leaves nothing of the ranges',
+    "a < 1": 'is "a < 1"; write a sum of parameters and its bound, for example "a + 2*b <= 3"',
+    "a a <= 1": "write a sum of parameters and its bound",
+    "0 <= a >= 1": "write a sum of parameters and its bound",
+    "0 <= a <= b c": "write a sum of parameters and its bound",
+    "1 <= 2": "write a sum of parameters and its bound",
+    "a + <= 2": "write a sum of parameters and its bound",
+    "a <= 1,5": "write a sum of parameters and its bound",
+    "a - a <= 1": '--constraint "a - a <= 1" has no weight but 0',
+    "1e999 a <= 1": '--constraint "1e999 a <= 1".a is inf, it must be a finite number.',
+    "3 <= a <= 1": '--constraint "3 <= a <= 1".least is 3.0, it must be below most = 1.0.',
+}
+
+
+@pytest.mark.parametrize(
+    ("text", "constraint"),
+    [
+        ("a + 2*b c <= 3", Constraint((("a", 1.0), ("b c", 2.0)), None, 3.0)),
+        ("0 <= a - .5b c + 1 <= 2e0", Constraint((("a", 1.0), ("b c", -0.5)), -1.0, 1.0)),
+        ("a >= 2 b c", Constraint((("b c", 2.0), ("a", -1.0)), None, 0.0)),
+        ("1<=-a+3a", Constraint((("a", 2.0),), 1.0, None)),
+    ],
+)
+def test_a_constraint_is_in_the_file_as_it_is_written(tmp_path, text, constraint):
+    (tmp_path / "study.toml").write_text(study_text(NewStudy("x", TWO, constraints=(text,))))
+    assert StudyFile.load(tmp_path / "study.toml").space.constraints == (constraint,)
+
+
+@pytest.mark.parametrize(("text", "sentence"), SENTENCES.items())
+def test_what_is_no_constraint_is_refused_in_a_sentence(text, sentence):
+    with pytest.raises(InputError) as refused:
+        study_text(NewStudy("x", TWO, constraints=(text,)))
+    assert sentence in str(refused.value) and "constraints." not in str(refused.value)
+
+
+@given(
+    weights=st.lists(st.floats(-1e6, 1e6).filter(bool), min_size=2, max_size=2),
+    least=st.none() | st.floats(-1e6, 1e6),
+    over=st.none() | st.floats(1e-3, 1e6),
+)
+def test_a_constraint_s_own_words_are_read_as_it(weights, least, over):
+    """As `Constraint.words` states six digits, from numbers of as many."""
+    most = None if over is None else float(f"{(least or 0.0) + over:g}")
+    least = None if least is None else float(f"{least:g}")
+    if (most is None and least is None) or (None not in (most, least) and not least < most):
+        return
+    terms = tuple(zip(("a", "b c"), (float(f"{weight:g}") for weight in weights), strict=True))
+    stated = Constraint(terms, least, most)
+    found = constraint_of(stated.words, ["a", "b c"])
+    assert found == stated
+
+
 def test_the_file_of_a_device_is_one_that_a_device_renders(tmp_path):
     (tmp_path / "study.toml").write_text(study_text(NewStudy("foam", (), device=True)))
     study = Study.load(tmp_path / "study.toml")
@@ -77,6 +133,9 @@ def test_the_command_writes_once(tmp_path, capsys, monkeypatch):
     assert (code, out) == (2, "") and "exists already" in err and file.read_bytes() == before
     assert run(capsys, monkeypatch, *arguments[:2], "--parameter", "u=0:1", "--force")[0] == 0
     assert StudyFile.load(file).space.names == ("u",)
+    constrained = ("--parameter", "u=0:1", "--parameter", "v=0:1", "--constraint", "u + v <= 1", "--force")
+    assert run(capsys, monkeypatch, *arguments[:2], *constrained)[0] == 0
+    assert StudyFile.load(file).space.constraints == (Constraint((("u", 1.0), ("v", 1.0)), None, 1.0),)
     assert [path.name for path in tmp_path.iterdir()] == ["colour.toml"]
     code, _, err = run(capsys, monkeypatch, "init", tmp_path / "none" / "x.toml", "--parameter", "u=0:1")
     assert code == 2 and "cannot be written" in err

@@ -1,0 +1,73 @@
+"""Linear constraints as people write them on a command line: `a + 2*b <= 3`, `0 <= a - b <= 1`, `a >= 2 b`."""
+
+import json
+import re
+from collections.abc import Sequence
+
+from hilbo.errors import InputError
+from hilbo.search.box import Constraint
+
+__all__ = ["constraint_of"]
+
+_NUMBER = r"(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_EXAMPLE = '"a + 2*b <= 3" or "0 <= a - b <= 1"'
+
+
+def constraint_of(text: str, names: Sequence[str]) -> Constraint:
+    """The constraint that a text states of parameters with these names.
+
+    Sums of them and of numbers, compared by <= or >= once, or twice between two numbers. Raises `InputError`.
+    """
+    by_length = sorted(names, key=len, reverse=True)  # of "a" and "a b" the longer one is meant
+    known = "|".join(re.escape(name) for name in by_length)
+    sides = re.split("(<=|>=)", text)
+    sums = [_sum(text, side, names, known) for side in sides[::2]]
+    if len(sides) not in (3, 5) or len(set(sides[1::2])) > 1 or not any(weights for weights, _ in sums):
+        raise _not_understood(text)
+    low, *middle, high = sums if sides[1] == "<=" else sums[::-1]
+    if middle:
+        weights, number = middle[0]
+        if low[0] or high[0]:
+            raise _not_understood(text)
+        return Constraint(tuple(weights.items()), low[1] - number, high[1] - number)
+    if not low[0]:
+        return Constraint(tuple(high[0].items()), low[1] - high[1], None)
+    both = {name: low[0].get(name, 0.0) - high[0].get(name, 0.0) for name in {**low[0], **high[0]}}
+    return Constraint(tuple(both.items()), None, high[1] - low[1])
+
+
+def _sum(text: str, side: str, names: Sequence[str], known: str) -> tuple[dict[str, float], float]:
+    """The weight of each parameter on one side, and the number that stands there."""
+    term = re.compile(rf"\s*([+-]?)\s*(?:(?:({_NUMBER})\s*\*?\s*)?({known})(?!\w)|({_NUMBER})(?![\w.]))\s*")
+    weights: dict[str, float] = {}
+    number, at = 0.0, 0
+    while at < len(side) or not at:
+        read = term.match(side, at)
+        if read is None or (at and not read[1]):
+            raise _unknown(text, names, known) or _not_understood(text)
+        sign = -1.0 if read[1] == "-" else 1.0
+        if read[3] is None:
+            number += sign * float(read[4])
+        else:
+            weights[read[3]] = weights.get(read[3], 0.0) + sign * float(read[2] or 1)
+        at = read.end()
+    return weights, number
+
+
+def _unknown(text: str, names: Sequence[str], known: str) -> InputError | None:
+    """What is wrong where a word of the text is no parameter."""
+    left = re.sub(rf"(?<!\w)(?:{_NUMBER}\s*)?(?:{known})(?!\w)|(?<![\w.]){_NUMBER}", " ", text)
+    word = re.search(r"[^\W\d][\w.]*", left)
+    if word is None:
+        return None
+    return InputError(
+        f"--constraint {json.dumps(text, ensure_ascii=False)} names {word[0]}, which is no parameter of the study;"
+        f" those are {', '.join(names)}."
+    )
+
+
+def _not_understood(text: str) -> InputError:
+    return InputError(
+        f"--constraint is {json.dumps(text, ensure_ascii=False)}; write a sum of parameters and its bound,"
+        f" for example {_EXAMPLE}."
+    )
