@@ -109,29 +109,34 @@ _SENTENCES: dict[str, Callable[[LiveSession, str, Mapping[str, Any]], str]] = {
 
 
 def table(state: LiveSession) -> dict[str, Any]:
-    """The trials, the newest first: the answer, what is to be known of it, and what was presented."""
+    """The trials, the newest first: the answer, what is to be known of it, and what was presented: the sets' names
+    where all were planned, the parameters where some were chosen."""
     parameters = state.study.space.parameters
     chosen = any(not trial.sets for trial in state.trials)
     heads = [f"{p.name} ({p.unit})" if p.unit else p.name for p in parameters] if chosen else ["sets"]
     return {
         "head": ["trial", "answer", "remark", *heads],
-        "rows": [_row(state, trial, len(heads)) for trial in reversed(state.trials)],
+        "rows": [_row(state, trial, chosen) for trial in reversed(state.trials)],
     }
 
 
-def _row(state: LiveSession, trial: Trial, width: int) -> dict[str, Any]:
+def _row(state: LiveSession, trial: Trial, chosen: bool) -> dict[str, Any]:
     """`kind` is now, voided, repeated or ""; `restore` names a voided answer that may be restored."""
-    if trial.sets:
-        shown = [" / ".join(trial.sets.values()), *[""] * (width - 1)]
-    else:
-        values = trial.presented["a"]
-        shown = [p.shown(values[p.name]) if p.levels else values[p.name] for p in state.study.space.parameters]
+    shown = _values(state, trial) if chosen else [" / ".join(trial.sets.values())]
     answer, remark = " ".join((trial.values or {}).values()), _remark(state, trial)
     discarded = trial.status not in ("pending", "answered")
     kind = "voided" if discarded else "now" if trial.status == "pending" else "repeated" if remark else ""
     row = {"kind": kind, "cells": [place_of(trial), answer, remark, *shown]}
     voided = trial.status == "void" and trial.values is not None
     return row | ({"restore": meant(trial)} if voided and restorable(state, trial.id) else {})
+
+
+def _values(state: LiveSession, trial: Trial) -> list[Any]:
+    """What was presented, a value for each parameter; of two renderings both in one text."""
+    parameters, both = state.study.space.parameters, list(trial.presented.values())
+    if len(both) > 1:
+        return [" / ".join(p.words(values[p.name]) for values in both) for p in parameters]
+    return [p.shown(both[0][p.name]) if p.levels else both[0][p.name] for p in parameters]
 
 
 def _remark(state: LiveSession, trial: Trial) -> str:

@@ -122,7 +122,7 @@ _TABLES: dict[str, dict[str, tuple[str, str]]] = {
     "convergence": _CONVERGENCE,
     "tolerance": _TOLERANCE,
     "people": _PEOPLE,
-    "passivity": {"optimum": ("", "which optimum or set")} | _MAP,
+    "alternatives": {"optimum": ("", "which optimum or set")} | _MAP,
     "comparison": _COMPARISON,
     "confusion": {"set": ("", "set that was shown; the other columns count the answers to it")},
     "preferences": {
@@ -137,17 +137,23 @@ _TABLES: dict[str, dict[str, tuple[str, str]]] = {
     "table_III": _REGRESSION,
     "table_IV": _REGRESSION,
 }
+# What is said otherwise where there is no renderer.
+_BY_OTHERS = {
+    "low_end": ("", "what ends it there: another answer, or the range"),
+    "location": ("", "what is to be known of where it lies: an edge, an extrapolation"),
+}
 
 
 def dictionary(tables: Mapping[str, pd.DataFrame], study: Study) -> pd.DataFrame:
     """A row for each column of the tables: `table`, `column`, `unit`, `meaning`. Raises KeyError for one without."""
     units = {p.name: (p.unit, "value of the parameter") for p in study.space.parameters}
     meanings = units | {"K0": ("N/mm", "stiffness of the spring, derived from the effective stiffness")}
+    others = {} if study.space.mechanics is not None else _BY_OTHERS
     meanings |= {label: ("comparisons", f'in which the answer was "{label}"') for label in study.responses}
     rows = [
         {"table": f"{name}.csv", "column": column, "unit": unit, "meaning": meaning}
         for name, table in tables.items()
         for column in map(str, table.columns)
-        for unit, meaning in [(meanings | _TABLES[name])[column]]
+        for unit, meaning in [(meanings | _TABLES[name] | others)[column]]
     ]
     return pd.DataFrame(rows)

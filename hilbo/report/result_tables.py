@@ -10,7 +10,7 @@ from hilbo.report.results import moved
 from hilbo.search.rendering import margin_of, set_of
 from hilbo.study.analysis import Analysis
 
-__all__ = ["convergence_table", "table_1", "tolerance_table"]
+__all__ = ["alternatives_table", "convergence_table", "table_1", "tolerance_table"]
 
 
 def table_1(analysis: Analysis, reference: np.ndarray | None) -> pd.DataFrame:
@@ -81,9 +81,9 @@ def tolerance_table(analysis: Analysis) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=[*columns, "low_from", "low_to", "high_from", "high_to", "draws_without"])
 
 
-def passivity_table(analysis: Analysis) -> pd.DataFrame:
-    """Everything that could be rendered as an optimum: parameters, score, probability of the highest answer, and how
-    far from the passive boundary (N.s/m; negative is not passive)."""
+def alternatives_table(analysis: Analysis) -> pd.DataFrame:
+    """Everything that could be presented as the optimum: parameters, score, probability of the highest answer, and
+    with a renderer how far from the passive boundary (N.s/m; negative is not passive)."""
     study, aggregate = analysis.study, analysis.aggregate
     claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
     claims |= {f"population, {name}": (other.x, other) for name, other in aggregate.alternatives.items()}
@@ -102,5 +102,5 @@ def passivity_table(analysis: Analysis) -> pd.DataFrame:
             if optimum is None
             else {"f": float(optimum.mean), "sd": float(optimum.sd), "p_top": float(optimum.class_probabilities[-1])}
         )
-        rows.append(row | {"passivity_margin": margin_of(study.space, x)})
+        rows.append(row if study.space.mechanics is None else row | {"passivity_margin": margin_of(study.space, x)})
     return pd.DataFrame(rows)

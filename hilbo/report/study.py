@@ -22,7 +22,7 @@ from hilbo.report.dictionary import dictionary
 from hilbo.report.hypotheses import Results, hypotheses
 from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
 from hilbo.report.participants import people_of
-from hilbo.report.result_tables import convergence_table, passivity_table, table_1, tolerance_table
+from hilbo.report.result_tables import alternatives_table, convergence_table, table_1, tolerance_table
 from hilbo.report.results import as_json, map_dataset, optima_table, result, save_figures, versions
 from hilbo.report.study_figures import comparison_figures, study_figures
 from hilbo.report.validation import Validated, slug, validate
@@ -165,7 +165,7 @@ def _tables(analysis: Analysis, material: Material, content, people) -> dict[str
         "convergence": convergence_table(analysis),
         "tolerance": tolerance_table(analysis),
         "people": analysis.people.assign(left_out=analysis.people["participant"].map(analysis.left_out)),
-        "passivity": passivity_table(analysis),
+        "alternatives": alternatives_table(analysis),
     }
 
 
@@ -198,7 +198,7 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "how": in_place(analysis.aggregate.map),
         "reference": None if material.reference is None else material.reference_name,
         "table_1": _with_units(analysis.study, tables["table_I"]),
-        "alternatives": _alternatives(analysis.study, tables["passivity"]),
+        "alternatives": _alternatives(analysis.study, tables["alternatives"]),
         "tolerance": _tolerances(tables["tolerance"]),
         "people": _shown(tables["people"].drop(columns=["categories", "left_out"]), digits=_DIGITS),
         "moved": content["optimised"]["nrmse"],
@@ -234,7 +234,7 @@ def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
 
 
 def _estimate(label: str, rule: str) -> str:
-    """The words of a row of `passivity_table`."""
+    """The words of a row of `alternatives_table`."""
     if label in ROLES:
         return f"{label} of the sets to compare"
     name = "aggregate" if label == "population" else label.removeprefix("population, ")

@@ -211,6 +211,15 @@ def warm_start_sources(warm: Mapping[str | None, WarmStart]) -> str | None:
     return ",".join(f"{name or ''}={warm[name].source}" for name in sorted(warm, key=str)) or None
 
 
+def _from(sources: str | None) -> str:
+    """In words what a header says of warm starts."""
+    if sources is None:
+        return "without --warm-start"
+    maps = [source.rpartition("=")[::2] for source in sources.split(",")]
+    words = [f"the map whose SHA-256 begins with {digest}{f' for {name}' if name else ''}" for name, digest in maps]
+    return f"from {' and '.join(words)}"
+
+
 def _place(values: Mapping[str, float], names: tuple[str, ...]) -> tuple[float, ...]:
     return tuple(values[name] for name in names)
 
@@ -232,8 +241,7 @@ def _checked_warm(state: LiveSession, warm: Mapping[str | None, WarmStart]) -> d
     """The warm starts, which must be those of the header: the next trial is to be the same after a resume."""
     sources = warm_start_sources(warm)
     if sources != state.header.warm_start:
-        raise InputError(
-            f"the session's warm start is {state.header.warm_start or 'none'}, not {sources or 'none'}; give the maps"
-            " that it was begun with."
-        )
+        begun = state.header.warm_start
+        what = "leave --warm-start out" if begun is None else "give that map with --warm-start"
+        raise InputError(f"the session was begun {_from(begun)}, not {_from(sources)}; {what}.")
     return dict(warm)

@@ -92,3 +92,12 @@ def test_what_was_presented_twice_and_what_repeats_is_marked(driver):
     rows = table(driver.state)["rows"]
     assert rows[0]["cells"][:3] == ["R1", "", "now; repeats O1"]
     assert (rows[1]["kind"], rows[1]["cells"][2]) == ("repeated", "presented 2 times")
+
+
+def test_where_renderings_are_chosen_those_of_the_warm_up_have_their_values_too(driver):
+    seen = table(driver.state)
+    assert seen["head"][3:] == [
+        f"{p.name} ({p.unit})" if p.unit else p.name for p in driver.state.study.space.parameters
+    ]
+    warm_up = seen["rows"][-1]
+    assert warm_up["cells"][0] == "W1" and warm_up["cells"][3:] == list(driver.state.trials[0].renderings["a"].values())

@@ -219,12 +219,13 @@ def test_a_report_of_two_materials(capsys, monkeypatch, tmp_path):
             "convergence.csv",
             "tolerance.csv",
             "people.csv",
-            "passivity.csv",
+            "alternatives.csv",
             "inference.nc",
             "map.nc",
         ):
             assert (out / name / file).stat().st_size
         assert all((out / name / f"classes.{kind}").stat().st_size for kind in ("png", "svg"))
+        assert "passivity" not in (out / name / "dictionary.csv").read_text()  # nothing of a renderer
     page = " ".join((out / "report.html").read_text().split())
     assert page.count("data:image/png;base64,") == 2 * 9 + 1 and "http://" not in page
     assert "Hypothesis 4" in page and "fair, good, excellent" in page

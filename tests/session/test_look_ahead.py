@@ -144,7 +144,9 @@ def test_a_warm_start_chooses_from_the_map_and_is_in_the_header():
     state = asked(told(state, "different"), chooser)
     second = np.array(list(state.pending.renderings["a"].values())[:2])
     assert np.linalg.norm(second - first) > 0.05
-    with pytest.raises(InputError, match="warm start is =a-map, not none"):
+    with pytest.raises(
+        InputError, match="begun from the map whose SHA-256 begins with a-map, not without --warm-start"
+    ):
         LiveChooser(state)
     mu, s = informed(STUDY, warm, Session.start(STUDY).posterior())
     np.testing.assert_allclose(mu, warm.mean, rtol=1e-12)
