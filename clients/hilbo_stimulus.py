@@ -235,6 +235,7 @@ class Stimulus:
     def _begin(self) -> None:
         status, found = self._post("/api/stimulus/hello", self._hello)
         if status == 200:
+            self._hello["run"] = found["run"]  # if it is lost, its own place is taken at once
             self.silence_s, self.parameters = found["silence_s"], found["parameters"]
             self._heard, self._run = time.monotonic(), found["run"]
             self._take(found["run"], found)

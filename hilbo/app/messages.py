@@ -66,12 +66,13 @@ class Command(_Message, frozen=True):
 class Hello(_Message, frozen=True):
     """What who presents says of itself: a program, or the preparer's page. `force`: it moves something that people
     touch. `neutral_within_s`: so soon does it show nothing and push nothing when it is told, and when nobody tells it
-    anything any more."""
+    anything any more. `run`: the one that it had, if it begins again."""
 
     name: Annotated[str, msgspec.Meta(min_length=1, max_length=100)]
     version: Annotated[str, msgspec.Meta(max_length=100)]
     force: bool
     neutral_within_s: Annotated[float, msgspec.Meta(gt=0, le=10)]
+    run: Annotated[str, msgspec.Meta(max_length=200)] = ""
 
 
 class Report(_Message, frozen=True):

@@ -99,7 +99,8 @@ class StimulusRig:
         Raises `OverError` while another program with this key is heard: each would be back at once after the other. A
         page is taken over whenever a person asks for it.
         """
-        if self._run and self.role == "stimulus" and key == self._key:
+        another = self.role == "stimulus" and key == self._key and hello.run != self._run
+        if self._run and another:
             raise OverError(_HEARD.format(name=hello.name, silence=self._table.silence))
         if self._run:
             self._lose("Another program has taken over what presents.")

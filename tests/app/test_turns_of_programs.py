@@ -12,7 +12,7 @@ from hilbo.app.stimulus_rig import OverError, StimulusRig
 from hilbo.study.config import Study
 
 SILENCE = 1.05  # s; no sum of the tenths that pass
-DEEDS = st.tuples(st.integers(0, 2), st.sampled_from(["hello", "report"]), st.integers(0, 12))
+DEEDS = st.tuples(st.integers(0, 2), st.sampled_from(["hello", "again", "report"]), st.integers(0, 12))
 
 
 @pytest.fixture(scope="module")
@@ -44,13 +44,14 @@ def test_who_is_heard_presents_and_nobody_with_the_same_key_takes_it_away(study,
     loop = Paced()
     try:
         rig = StimulusRig(study, "tag")
-        hello = Hello(name="one", version="", force=False, neutral_within_s=10.0)
+        said = {"name": "one", "version": "", "force": False, "neutral_within_s": 10.0}
         runs, holder, heard = ["", "", ""], None, 0.0
         for who, what, tenths in deeds:
             loop.now += tenths / 10
             free = holder is None or loop.now - heard > SILENCE
-            if what == "hello":
-                taken, may = loop.did(rig.hello(hello, "key")), free
+            if what != "report":  # "again": it had a run, and says which
+                own = runs[who] if what == "again" else ""
+                taken, may = loop.did(rig.hello(Hello(**said, run=own), "key")), free or (bool(own) and holder == who)
                 runs[who] = taken["run"] if taken else runs[who]
             else:
                 report = Report(run=runs[who] or "none", order=rig.order.number, state="neutral")

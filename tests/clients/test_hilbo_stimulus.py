@@ -81,13 +81,14 @@ def test_asyncio_presents_beside_other_tasks(live):
     assert [(data["program"], data["version"]) for data in sent] == 3 * [("async", "3")]
 
 
-def test_a_program_that_is_started_again_finds_its_session_by_the_key_file(live, tmp_path):
-    link, file = live.link(), str(tmp_path / "stimulus.key")
-    with Presenter(link, key_file=file):
-        live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
-    assert (tmp_path / "stimulus.key").stat().st_mode & 0o077 == 0
-    with Presenter(link, key_file=file):
-        assert len(all_answered(live)) == 3
+def test_a_program_that_is_started_again_finds_its_session_by_the_key_file(tmp_path):
+    with LiveStimulus(tmp_path, blocks=SINGLE, silence=0.5) as live:
+        link, file = live.link(), str(tmp_path / "stimulus.key")
+        with Presenter(link, key_file=file):
+            live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+        assert (tmp_path / "stimulus.key").stat().st_mode & 0o077 == 0
+        with Presenter(link, key_file=file):
+            assert len(all_answered(live)) == 3
 
 
 def test_two_programs_with_one_key_file_do_not_take_over_from_each_other(tmp_path, caplog):

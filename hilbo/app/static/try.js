@@ -99,18 +99,23 @@ async function join() {
 async function present() {
   // The program that presents: it does what the newest order says, says so, and waits for the next.
   let run = null, waited = 0;
+  let had = sessionStorage.getItem("hilbo.try.run") || "";   // of this window before it was loaded again: its own place
   while (!state.over) {
     try {
-      const said = { name: "hilbo try", version: "1", force: false, neutral_within_s: 1 };
+      const said = { name: "hilbo try", version: "1", force: false, neutral_within_s: 1, run: had };
       const order = state.order, shows = order.do === "present";
       const report = { run, order: order.order, state: shows ? "presented" : "neutral", wait_s: 1 };
       if (shows) Object.assign(report, { trial: order.trial, values: order.values });
       const reply = await (run ? ask("/api/stimulus", report, true) : ask("/api/stimulus/hello", said, true));
-      if (reply.ok) { run = reply.said.run || run; waited = 0; put("hint", HINT); obey(reply.said); }
+      if (reply.ok) {
+        if (reply.said.run) sessionStorage.setItem("hilbo.try.run", had = run = reply.said.run);
+        waited = 0; put("hint", HINT); obey(reply.said);
+        if (state.view) receive(state.view);
+      }
       else if (reply.status === 409 && reply.said.order) obey(reply.said);
       else if (reply.status === 409 && run) run = null;
-      else if (reply.status === 409) {       // another window is heard; or this one before it was loaded again, for a second
-        if (++waited > 10) put("hint", "Another window shows this page already. Close that one, and this one goes on.");
+      else if (reply.status === 409) {                            // until the other window is no longer taken for heard
+        if (++waited > 10) put("hint", "Another window had this session; it goes on here in a few seconds.");
         await sleep(200);
       }
       else { end(reply.said.error || "The server does not answer any more."); return; }
@@ -153,8 +158,9 @@ function receive(view) {
     if (question) b.firstElementChild.textContent = question.options[i].label;
   });
   at("card").hidden = state.begun && !view.may.begin;
-  at("begin").disabled = !view.may.begin;
-  put("begin", view.may.begin ? "Begin" : "Getting ready …");
+  const may = view.may.begin && state.order.order > 0;         // not before this window presents
+  at("begin").disabled = !may;
+  put("begin", may ? "Begin" : "Getting ready …");
 }
 
 async function begin() {
