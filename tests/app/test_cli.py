@@ -148,7 +148,7 @@ def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_p
     assert [data["choice"]["by"] for data in first] == ["map", "map"]
     again = wanted._replace(resume=True, seed=3)
     assert begun(again)[1] == first
-    with pytest.raises(InputError, match="give the maps that it was begun with"):
+    with pytest.raises(InputError, match="give that map with --warm-start"):
         opened(again._replace(warm_start=None), lambda _: None, lambda _: None)
     candidates = read_warm_start(file, study, 7).points
     first_unit = study.space.to_unit(np.array([first[0]["renderings"]["a"][n] for n in study.space.names]))
