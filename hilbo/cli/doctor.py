@@ -170,15 +170,24 @@ def _study(path: Path) -> Iterator[Check]:
     except InputError as error:
         yield Check("feasible set", "bad", str(error), "fix the study file")
         return
-    if study.stimulus is None:
+    if study.stimulus is None or study.space.constraints:
         yield _feasible(study)
     yield _step(study)
 
 
 def _feasible(study: Any) -> Check:
-    share = study.space.volume()
-    words = f"{100 * share:.1f} % of the box can be shown passively"
-    if share < 0.02:
+    """What mechanics and constraints leave."""
+    from hilbo.search.space import share_of_cube
+
+    space, parts = study.space, []
+    if space.mechanics is not None:
+        parts.append(f"{100 * space.volume():.1f} % of the box can be shown passively")
+    if space.constraints:
+        share = share_of_cube(space)
+        shown = f"{100 * share:.1f} %" if share >= 0.001 else "less than 0.1 %"
+        parts.append(f"{shown} of the box is within the constraints{' as well' if parts else ''}")
+    words = ", ".join(parts)
+    if space.mechanics is not None and space.volume() < 0.02:
         return Check("feasible set", "bad", words, "lower K1's range, or use a device with more damping")
     return Check("feasible set", "good", words)
 

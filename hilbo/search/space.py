@@ -36,7 +36,7 @@ from hilbo.search.feasibility import K0_of, allowed, keeps, minimum_damping
 from hilbo.search.space_filling import HELD, Chunks, latin_chunks, sobol_chunks, spread_out, take, wall_chunks
 from hilbo.search.steps import neighbours, steps_of
 
-__all__ = ["SearchSpace"]
+__all__ = ["SearchSpace", "share_of_cube"]
 
 _ROOMY, _PILOT = 0.02, 4096  # share of the cube, of so many points, from which constrained points are drawn in it
 _CLUSTERED = 200  # points for each of a space-filling design between walls
@@ -244,7 +244,7 @@ def _on_device(x: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
 
 
 @functools.lru_cache(maxsize=16)
-def _share_of_cube(space: SearchSpace) -> float:
+def share_of_cube(space: SearchSpace) -> float:
     """The share of even points of the unit cube that is feasible, from some thousand."""
     points = next(sobol_chunks(space.dim, _PILOT, 0))
     return float(np.asarray(_feasible(space, steps_of(space.parameters, points))).mean())
@@ -253,7 +253,7 @@ def _share_of_cube(space: SearchSpace) -> float:
 def _take_between(space: SearchSpace, count: int, seed: int) -> Float[np.ndarray, "count d"]:
     """`count` feasible points of the unit cube, evenly between the walls of constraints without mechanics."""
     chunks = sobol_chunks(space.dim, count, seed)
-    if _share_of_cube(space) < _ROOMY:
+    if share_of_cube(space) < _ROOMY:
         chunks = (np.asarray(_from_box(space, w)[0]) for w in linear.inside(space._walls, count, seed))
 
     def place(uniform):

@@ -4,6 +4,7 @@ import contextlib
 import hashlib
 import json
 import socket
+import tomllib
 
 import jax.numpy as jnp
 import numpy as np
@@ -282,3 +283,9 @@ def test_the_doctor_says_what_to_mend(tmp_path):
 
 def unplugged():
     raise InputError("there is no such port")
+
+
+def test_the_doctor_says_what_constraints_leave():
+    new = NewStudy("x", (parameter_of("a=0:2"), parameter_of("b=0:2")), constraints=("a + b <= 2",))
+    found = doctor._feasible(Study.from_dict(tomllib.loads(study_text(new))))
+    assert (found.level, found.words) == ("good", "50.0 % of the box is within the constraints")
