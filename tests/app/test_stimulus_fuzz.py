@@ -194,4 +194,4 @@ def test_a_program_may_send_anything(tmp_path):
 @pytest.mark.parametrize("seed", range(1, 11))
 def test_a_program_may_send_anything_for_long(tmp_path, seed):
     answers, trials = attacked(tmp_path, seed, MANY)
-    assert answers > 5 and trials > answers
+    assert 0 < answers < trials
