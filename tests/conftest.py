@@ -7,6 +7,10 @@ import os
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # read once, by NumPy's and SciPy's import: as hilbo's commands run
+os.environ.setdefault("MPLBACKEND", "Agg")
+# Compiled functions are kept between runs, and shared by the workers of one run and by the processes that tests begin.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
+os.environ |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1"}
 
 import jax
 import platformdirs
@@ -14,17 +18,10 @@ import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
-os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ.setdefault("HILBO_KEEP_PROGRAMS", "0")  # else what an earlier run traced would be tested
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-
-# Compiled functions are kept between runs, and shared by the workers of one run.
-if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-    jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parents[1] / ".pytest_cache" / "jax"))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 install_import_hook("hilbo", "beartype.beartype")  # stays for the whole run: hilbo is imported by the tests
 

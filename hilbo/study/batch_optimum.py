@@ -9,6 +9,7 @@ under it. Usually one pass is left to do, in which the whole population corrects
 """
 
 import dataclasses
+import functools
 from typing import Any, NoReturn
 
 import equinox as eqx
@@ -20,7 +21,6 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.errors import InputError
 from hilbo.numerics.host import placed
-from hilbo.numerics.newton import TrustRegionNewton
 from hilbo.numerics.tracing import program
 from hilbo.population.hierarchical import Share
 from hilbo.population.maps import share_of
@@ -249,7 +249,12 @@ def optimum_near(
     ]
 
 
-_SOLVER = TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION)
+@functools.cache
+def _solver() -> Any:
+    """Newton's method in the feasible set, a `TrustRegionNewton`."""
+    from hilbo.numerics.newton import TrustRegionNewton  # slow to import, and needed only where a step is traced
+
+    return TrustRegionNewton(atol=_STATIONARY, resolution=_RESOLUTION)
 
 
 def _nowhere(w: Float[Array, " d"], _: None) -> NoReturn:
@@ -265,7 +270,7 @@ def _start_newton(study: Study, starts: Float[ArrayLike, "s d"]) -> tuple[Float[
         w = study.space.to_box(x)
         number = jax.ShapeDtypeStruct((), w.dtype)
         aux = (jax.ShapeDtypeStruct(w.shape, w.dtype), number, number)
-        return w, _SOLVER.init(_nowhere, w, None, {}, number, aux, frozenset())
+        return w, _solver().init(_nowhere, w, None, {}, number, aux, frozenset())
 
     return jax.vmap(one)(jnp.asarray(starts))
 
@@ -307,8 +312,8 @@ def _newton_step(
             )
             return -mean, (x, mean, variance)
 
-        w, state, _ = _SOLVER.step(expanded, w, None, bounds, state, frozenset())
-        done, _ = _SOLVER.terminate(expanded, w, None, bounds, state, frozenset())
+        w, state, _ = _solver().step(expanded, w, None, bounds, state, frozenset())
+        done, _ = _solver().terminate(expanded, w, None, bounds, state, frozenset())
         return w, state, done, expanded(w + state.move, None)[1]
 
     return jax.vmap(one)(w, state, Jets(*jets), points, plain)

@@ -60,9 +60,8 @@ print("jax" in sys.modules)
 
 def process(code, *arguments):
     """What a process of its own says."""
-    kept = {"JAX_COMPILATION_CACHE_DIR": str(ROOT / ".pytest_cache" / "jax")}
     command = [sys.executable, "-c", code, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT | kept)
+    done = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT)
     assert done.returncode == 0, done.stderr
     return done.stdout.splitlines()
 

@@ -98,8 +98,12 @@ def folder(tmp_path):
 
 def start(folder, out, *options, code=MAIN, trials="trials.csv", flags=""):
     """A process of `hilbo aggregate`, not yet waited for."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(folder / "cache"), "XLA_FLAGS": flags}
-    environment |= {"JAX_PLATFORMS": "cpu"}
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT),
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "JAX_PLATFORMS": "cpu",
+    }
+    environment |= {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} {flags}"}
     command = ["aggregate", folder / trials, "--study", folder / "study.toml", "--out", folder / out, *options]
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, command)], env=environment, text=True, stderr=subprocess.PIPE
