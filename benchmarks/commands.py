@@ -56,7 +56,8 @@ def main():
 def table(names, rounds, before, folder):
     """Seconds, seconds to the optimum and MB of every run, by command and way."""
     study = ["simulate", "--participants", "10", "--out", str(folder / "study")]
-    process([*HILBO, *study], ROOT, folder / "warm", True)
+    oldest = before or ROOT  # an older hilbo does not read every study file of a newer one
+    process([*HILBO, *study], oldest, folder / "study's cache", True)
     ways = {"kept": (ROOT, "warm", True), "traced": (ROOT, "warm", False)}
     ways |= {} if before is None else {"before": (before, "before", False)}
     runs = defaultdict(list)
@@ -77,7 +78,9 @@ def command(name, root, cache, keep, folder):
     out = folder / f"out {time.perf_counter_ns()}"
     words = COMMANDS[name].split()
     words = [word.replace("OUT", str(out)).replace("STUDY", str(folder / "study")) for word in words]
-    return process(HILBO + words, root, cache, keep)
+    seconds, first, memory = process(HILBO + words, root, cache, keep)
+    print(f"{name:12} {root.name} {cache.name} {keep:d}: {seconds:.1f} s, {memory:.0f} MB", file=sys.stderr)
+    return seconds, first, memory
 
 
 def process(words, root, cache, keep):
