@@ -177,6 +177,7 @@ def _plan_between(
     stiffness = jnp.where(stiffness > 0, stiffness, 1.0)
     turned = jnp.where(held, 0.0, expansion.gradient) @ vectors
     move = nearest(seen, -vectors @ (turned / stiffness), vectors / jnp.sqrt(stiffness)[None, :]).point
+    move = jnp.where(held, 0.0, move)  # a level stays itself to the last bit; products of the eigenvectors round
     along = move @ vectors
     promised = -(turned @ along + 0.5 * along @ (stiffness * along))
     slow = jnp.abs(eigenvalues) + steepness
