@@ -1,12 +1,12 @@
 """What a person waits for: every command of the README on what is shipped, whole processes, beside `import jax`.
 
-    python benchmarks/commands.py [--before CHECKOUT] [--rounds 5] [--write]
+    python benchmarks/commands.py FILE [--before CHECKOUT] [--rounds 5] [--only NAME,NAME]
+    python benchmarks/commands.py FILE --write
 
---write puts the table into docs/results/run_time.md.
-
-Each round runs every command once with kept programs, once without and, with `--before`, once by another checkout of
-hilbo (in the same environment); `import jax` stands between them. `empty` is one run with empty caches. Memory is
-the process's largest.
+FILE (JSON Lines) collects a row for each command; a run that was stopped goes on at the first command without a row.
+Each round runs the command once with kept programs and, with `--before`, once by another checkout of hilbo (in the same
+environment); `import jax` stands between them. `empty` is one run with empty caches, `traced` one without kept
+programs. Memory is the process's largest. --write puts the table into docs/results/run_time.md.
 """
 
 import argparse
@@ -15,11 +15,11 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import defaultdict
 from pathlib import Path
 from statistics import median
 
 from pages import put
+from rows import Rows
 
 ROOT = Path(__file__).parents[1]
 DATA = "hilbo/data"
@@ -40,38 +40,47 @@ OPTIMUM = b"The population optimum"
 
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    options.add_argument("file", type=Path)
     options.add_argument("--before", type=Path, help="another checkout")
     options.add_argument("--rounds", type=int, default=5)
     options.add_argument("--only", default=",".join(COMMANDS))
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    names = chosen.only.split(",")
-    with tempfile.TemporaryDirectory() as folder:
-        text = document(table(names, chosen.rounds, chosen.before, Path(folder)), chosen.rounds)
-    print(text)
+    rows = Rows(chosen.file)
     if chosen.write:
-        put("results/run_time.md", "commands", text)
+        put("results/run_time.md", "commands", document(rows))
+        return
+    known = {row["command"] for row in rows}
+    with tempfile.TemporaryDirectory() as folder:
+        for name in chosen.only.split(","):
+            if name not in known:
+                rows.add({"command": name} | measured(name, chosen.rounds, chosen.before, Path(folder)))
+    print(document(rows))
 
 
-def table(names, rounds, before, folder):
-    """Seconds, seconds to the optimum and MB of every run, by command and way."""
-    study = ["simulate", "--participants", "10", "--out", str(folder / "study")]
-    oldest = before or ROOT  # an older hilbo does not read every study file of a newer one
-    process([*HILBO, *study], oldest, folder / "study's cache", True)
-    ways = {"kept": (ROOT, "warm", True), "traced": (ROOT, "warm", False)}
-    ways |= {} if before is None else {"before": (before, "before", False)}
-    runs = defaultdict(list)
-    for name in names:
-        for way, (root, cache, keep) in ways.items():
-            if way != "traced":
-                runs[name, f"{way}, empty"].append(command(name, root, folder / f"empty {name} {cache}", keep, folder))
-            for _ in range(1 + (way == "kept")):  # not counted: the caches
-                command(name, root, folder / cache, keep, folder)
-        for _ in range(rounds):
-            for way, (root, cache, keep) in ways.items():
-                runs[IMPORT, ""].append(process([sys.executable, "-c", IMPORT], ROOT, folder / "warm", True))
-                runs[name, way].append(command(name, root, folder / cache, keep, folder))
-    return runs
+def measured(name, rounds, before, folder):
+    """Seconds, seconds to the optimum and MB of every run of a command, by way; seconds of the imports between."""
+    a_study(before or ROOT, folder)
+    ways = {"kept": (ROOT, folder / f"cache {name}", True)}
+    ways |= {} if before is None else {"before": (before, folder / f"cache {name} before", False)}
+    runs = {f"{way}, empty": [command(name, *how, folder)] for way, how in ways.items()}
+    for way, how in ways.items():  # not counted: the caches
+        for _ in range(1 + (way == "kept")):
+            command(name, *how, folder)
+    imports = []
+    for _ in range(rounds):
+        for way, how in ways.items():
+            imports.append(process([sys.executable, "-c", IMPORT], ROOT, folder / "import", True)[0])
+            runs.setdefault(way, []).append(command(name, *how, folder))
+    runs["traced"] = [command(name, ROOT, folder / f"cache {name}", False, folder)]
+    return {"imports": imports, "runs": runs}
+
+
+def a_study(root, folder):
+    """The study that `report` reads, simulated by the older hilbo: it does not read every study file of a newer one."""
+    if not (folder / "study").exists():
+        words = ["simulate", "--participants", "10", "--out", str(folder / "study")]
+        process([*HILBO, *words], root, folder / "study's cache", True)
 
 
 def command(name, root, cache, keep, folder):
@@ -84,20 +93,20 @@ def command(name, root, cache, keep, folder):
 
 
 def process(words, root, cache, keep):
-    """Seconds in all, seconds until the optimum is printed (NaN: it is not), and the largest memory in MB."""
+    """Seconds in all, seconds until the optimum is printed (None: it is not), and the largest memory in MB."""
     environment = os.environ | {
         "XDG_CACHE_HOME": str(cache),
         "HILBO_KEEP_PROGRAMS": str(int(keep)),
         "PYTHONPATH": str(root),
         "PYTHONDONTWRITEBYTECODE": "",  # as a person's Python, which does not parse sources twice
     }
-    begin, first = time.perf_counter(), float("nan")
+    begin, first = time.perf_counter(), None
     ends = subprocess.PIPE
     with subprocess.Popen(words, cwd=root, env=environment, stdout=subprocess.DEVNULL, stderr=ends) as running:
         said = []
         for line in running.stderr:
             said.append(line)
-            if line.startswith(OPTIMUM) and first != first:
+            if line.startswith(OPTIMUM) and first is None:
                 first = time.perf_counter() - begin
         _, status, usage = os.wait4(running.pid, 0)
         running.returncode = os.waitstatus_to_exitcode(status)
@@ -106,25 +115,27 @@ def process(words, root, cache, keep):
     return time.perf_counter() - begin, first, usage.ru_maxrss / 1024
 
 
-def document(runs, rounds):
-    unit = median(seconds for seconds, _, _ in runs[IMPORT, ""])
+def document(rows):
     lines = [
-        f"Made by `python benchmarks/commands.py --write`: whole processes, medians of {rounds}, beside `import jax`,",
-        f"which took {unit:.2f} s in the same run. Programs are kept from one command to the next (docs/design.md);",
-        "*traced* is with HILBO_KEEP_PROGRAMS=0, *empty* the first run of all, *before* another checkout, if one was",
-        "named.",
+        "Made by `python benchmarks/commands.py FILE --write`: whole processes, medians of five (*empty*, *traced*:",
+        "one run), beside `import jax` in the same minutes. Programs are kept from one command to the next",
+        "(docs/design.md). *traced* is with HILBO_KEEP_PROGRAMS=0, *empty* the first run of all, *before* the",
+        "checkout before this was worked on.",
         "",
         "| command | way | s | of `import jax` | optimum printed after, s | of `import jax` | memory, MB |",
         "|---|---|---:|---:|---:|---:|---:|",
     ]
-    for (name, way), values in runs.items():
-        if name == IMPORT:
-            continue
-        seconds, first, memory = (median(column) for column in zip(*values, strict=True))
-        early = ("", "") if first != first else (f"{first:.1f}", f"{first / unit:.1f}")
-        cells = (name, way, f"{seconds:.1f}", f"{seconds / unit:.1f}", *early, f"{memory:.0f}")
-        lines.append(f"| {' | '.join(cells)} |")
+    for row in rows:
+        unit = median(row["imports"])
+        lines += [line(row["command"], way, runs, unit) for way, runs in row["runs"].items()]
     return "\n".join([*lines, ""])
+
+
+def line(name, way, runs, unit):
+    seconds, first, memory = zip(*runs, strict=True)
+    early = ("", "") if None in first else (f"{median(first):.1f}", f"{median(first) / unit:.1f}")
+    cells = (name, way, f"{median(seconds):.1f}", f"{median(seconds) / unit:.1f}", *early, f"{median(memory):.0f}")
+    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":
