@@ -103,7 +103,7 @@ def largest_K1_beside(model: FOSLS, b: float) -> float:
 def _closed(memory: Memory, N: int) -> Span:
     """The memory of a model, where the closed forms hold for it."""
     if memory == "short" and N % 2 == 0:
-        raise InputError(f"N is {N}, it must be odd: the closed passivity bound is too low for an even number of taps.")
+        raise InputError(f"N is {N}; it must be odd: the closed passivity bound is too low for an even number of taps.")
     return span(memory, N)
 
 

@@ -68,8 +68,8 @@ def seed_option(what: str) -> Any:
 
 
 def start(devices: int | None = None) -> None:
-    """Float64, and programs kept in the user's cache folder from one command to the next, as they were traced and as
-    they were compiled. HILBO_KEEP_PROGRAMS=0 traces them anew.
+    """Float64, and compiled programs kept in the user's cache folder from one command to the next.
+    HILBO_KEEP_PROGRAMS=0 traces and compiles them anew.
 
     `devices`: as how many devices the CPU is to count.
     """

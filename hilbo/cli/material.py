@@ -150,7 +150,7 @@ def _renderer(study):
 
 def _order(alpha):
     if not 0 < alpha <= 1:
-        raise InputError(f"alpha is {alpha}, it must be above 0 and at most 1: the order of the fractional element.")
+        raise InputError(f"alpha is {alpha}; it must be above 0 and at most 1: the order of the fractional element.")
 
 
 def _positive(name, value):

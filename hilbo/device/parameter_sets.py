@@ -47,13 +47,13 @@ class ParameterSet:
     def messages(self, set_id: int, tick_rate: int) -> list[SetParams | SetStates]:
         """SET_PARAMS, and with full memory the SET_STATES that follow it; `tick_rate` in Hz. Raises `InputError`."""
         if self.memory not in ("short", "full"):
-            raise InputError(f'memory is "{self.memory}", it must be "short" or "full".')
+            raise InputError(f'memory is "{self.memory}"; it must be "short" or "full".')
         for name in ("K0", "K1", "B1", "alpha", "force_limit"):
             value = getattr(self, name)
             if not math.isfinite(value) or abs(value) > 3e38:
-                raise InputError(f"{name} is {value}, it must be a finite number.")
+                raise InputError(f"{name} is {value}; it must be a finite number.")
         if not 0 <= self.length < 2**16:
-            raise InputError(f"N (or states) is {self.length}, it must be a number of samples (or exponentials).")
+            raise InputError(f"N (or states) is {self.length}; it must be a number of samples (or exponentials).")
         numbers = {wire: getattr(self, name) for name, wire in _WIRE_NAMES.items()}
         head = SetParams(set_id=set_id, memory=int(self.memory == "full"), tick_rate_Hz=tick_rate, **numbers)
         return [head, *(_states(set_id, self.alpha, self.length) if self.memory == "full" else [])]
@@ -131,9 +131,9 @@ def _bits(value: float | int) -> bytes | int:
 def _states(set_id: int, alpha: float, count: int) -> list[SetStates]:
     """The exponentials of full memory, as many to a message as fit."""
     if count not in STATES:
-        raise InputError(f"states is {count}, it must be one of {', '.join(map(str, STATES))}.")
+        raise InputError(f"states is {count}; it must be one of {', '.join(map(str, STATES))}.")
     if not 0 < alpha < 1:
-        raise InputError(f"alpha is {alpha}, it must be above 0 and below 1.")
+        raise InputError(f"alpha is {alpha}; it must be above 0 and below 1.")
     import jax.numpy as jnp
     import numpy as np
 

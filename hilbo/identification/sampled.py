@@ -49,9 +49,9 @@ class Sampled(eqx.Module):
 
     def __check_init__(self):
         if isinstance(self.N, int) and self.N < 1:
-            raise InputError(f"N is {self.N}, it must be at least 1: the number of past samples.")
+            raise InputError(f"N is {self.N}; it must be at least 1: the number of past samples.")
         if not 0 < self.T < np.inf:
-            raise InputError(f"T is {self.T}, it must be a time in s above 0.")
+            raise InputError(f"T is {self.T}; it must be a time in s above 0.")
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of q: stiffness up to 50 times the largest secant, κ up to 1e4, α from 0.01 to 0.99.

@@ -85,7 +85,7 @@ class FOSLS(eqx.Module):
     def __check_init__(self):
         span(self.memory, self.N, self.states)
         if not 0 < self.T < math.inf:
-            raise InputError(f"T is {self.T} s, it must be a number above 0; write for example T = 0.001.")
+            raise InputError(f"T is {self.T} s; it must be a number above 0; write for example T = 0.001.")
         if not any(isinstance(value, Tracer) for value in (self.K0, self.K1, self.B1, self.alpha)):
             _check_values(float(self.K0), float(self.K1), float(self.B1), float(self.alpha), self.memory)
 
@@ -169,7 +169,7 @@ class FOSLS(eqx.Module):
         A scalar. Raises `InputError` for a `fraction` that is not at least 0 and below 1.
         """
         if not 0 <= fraction < 1:
-            raise InputError(f"fraction is {fraction}, it must be at least 0 and below 1; write 0.9 for t90.")
+            raise InputError(f"fraction is {fraction}; it must be at least 0 and below 1; write 0.9 for t90.")
         find = _short_settling if self.memory == "short" else _full_settling
         return find(self, jnp.asarray(fraction, self.K0.dtype))
 
@@ -290,14 +290,14 @@ def _full_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""]
 
 def _check_values(K0: float, K1: float, B1: float, alpha: float, memory: Memory) -> None:
     if not 0 < alpha <= 1:
-        raise InputError(f"alpha is {alpha}, it must be above 0 and at most 1: the order of the fractional element.")
+        raise InputError(f"alpha is {alpha}; it must be above 0 and at most 1: the order of the fractional element.")
     for name, value, most in (("K1", K1, math.inf), ("B1", B1, math.nextafter(math.inf, 0))):
         if not 0 <= value <= most:
-            raise InputError(f"{name} is {value}, it must be 0 or above.")
+            raise InputError(f"{name} is {value}; it must be 0 or above.")
     if not math.isfinite(K0):
-        raise InputError(f"K0 is {K0}, it must be a finite number.")
+        raise InputError(f"K0 is {K0}; it must be a finite number.")
     if memory == "full" and K0 < 0:
         raise InputError(
-            f"K0 is {K0}, it must be 0 or above with full memory, where it is the static stiffness; a set with a "
+            f"K0 is {K0}; it must be 0 or above with full memory, where it is the static stiffness; a set with a "
             'negative K0 was identified with short memory: use memory = "short" and the N it belongs to.'
         )

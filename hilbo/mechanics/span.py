@@ -23,9 +23,9 @@ class Span(NamedTuple):
 def span(memory: Memory, N: int, states: int = 10) -> Span:
     """The memory of a model, checked. The number that does not apply is 0, so that it compiles nothing anew."""
     if memory not in ("short", "full"):
-        raise ValueError(f'memory is {memory!r}, it must be "short" (N taps) or "full" (exponentials).')
+        raise ValueError(f'memory is {memory!r}; it must be "short" (N taps) or "full" (exponentials).')
     if memory == "short" and N < 1:
-        raise ValueError(f"N is {N}, it must be at least 1: the number of past samples in the sum.")
+        raise ValueError(f"N is {N}; it must be at least 1: the number of past samples in the sum.")
     if memory == "full" and states not in STATES:
-        raise ValueError(f"states is {states}, it must be one of {', '.join(map(str, STATES))}.")
+        raise ValueError(f"states is {states}; it must be one of {', '.join(map(str, STATES))}.")
     return Span("short", N, 0) if memory == "short" else Span("full", 0, states)

@@ -34,7 +34,7 @@ def switched_force(
     if not 0 <= staged <= flip < x.shape[0]:
         raise InputError(f"staged is {staged} and flip {flip}, they must be in this order within {x.shape[0]} samples.")
     if not slew > 0:
-        raise InputError(f"slew is {slew} N/s, it must be above 0.")
+        raise InputError(f"slew is {slew} N/s; it must be above 0.")
     if old.T != new.T:
         raise InputError(f"The two sets are for T = {old.T} s and T = {new.T} s, they must be for the same T.")
     before = old.simulate(x)

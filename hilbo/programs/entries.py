@@ -12,16 +12,16 @@ import msgspec
 
 __all__ = ["Entries", "Entry"]
 
-_SIZE = 64 * 2**20  # bytes in all; an entry has 40,000 to 200,000
+_SIZE = 256 * 2**20  # bytes in all; an entry has 10,000 to 3,000,000
 _SUFFIX = ".program"
 
 
 class Entry(msgspec.Struct, forbid_unknown_fields=True):
-    """A program: the words that it was asked by, its results' structure, and what JAX exported."""
+    """A program: the words that it was asked by, the structures of its arguments and results, and its compiled form."""
 
     words: str
     structure: bytes
-    exported: bytes
+    compiled: bytes
 
 
 class Entries:

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax import export
+from jax.experimental import serialize_executable
+from jax.experimental.compilation_cache import compilation_cache
 
 from hilbo.programs.description import NotKeptError, describe
 from hilbo.programs.entries import Entries, Entry
@@ -42,15 +43,15 @@ class _Ready(NamedTuple):
 class Programs:
     """Keeps the programs of a package's functions among `entries`.
 
-    A program that is not there is traced, written, read back and compared with what was traced, byte for byte; what
-    runs, in this process as in every later one, is what was read back. XLA's own cache knows its compiled form.
+    A program that is not there is traced and compiled. What was written of it is read back and has to give the same
+    bits; what runs, in this process as in every later one, is what was read back.
     """
 
     def __init__(self, entries: Entries, package: Path):
         self._entries, self._package = entries, package
         self._code = code_digest(package)
         self._known: dict[Any, _Ready | None] = {}
-        self._finding = threading.RLock()  # calls may come from several threads
+        self._finding: dict[Any, threading.RLock] = {}  # calls may come from several threads
 
     @functools.cached_property
     def _around(self) -> str:
@@ -65,7 +66,7 @@ class Programs:
         try:
             key = (function, tree, tuple(_kind(leaf) for leaf in leaves))
             if key not in self._known:
-                with self._finding:
+                with self._finding.setdefault(key, threading.RLock()):
                     if key not in self._known:
                         self._known[key] = self._find(function, args, kwargs)
         except TypeError:  # something that cannot be hashed; what is wrong with the call itself is met again there
@@ -100,27 +101,65 @@ class Programs:
             )
             return [result for result in results if _is_array(result)]
 
+        arrays = [leaf for leaf in leaves if _is_array(leaf)]
         try:
-            made = export.export(jax.jit(flat))(*(leaf for leaf in leaves if _is_array(leaf)))
-            entry = Entry(words, pickle.dumps(structure[-1]), bytes(made.serialize()))
-        except Exception:  # it cannot be exported; a mistake of its own is met again when it is compiled
-            return None
-        if export.deserialize(bytearray(entry.exported)).mlir_module() != made.mlir_module():
+            with _compiled_here:
+                compiled = jax.jit(flat).lower(*arrays).compile()
+            code, given, returned = serialize_executable.serialize(compiled)
+            entry = Entry(words, pickle.dumps((given, returned, structure[-1])), code)
+            if _bits(_ready(entry).run(*arrays)) != _bits(compiled(*arrays)):
+                return None
+        except Exception:  # it cannot be written; a mistake of its own is met again when it is compiled
             return None
         if code_digest(self._package) == self._code:  # else somebody edits it while this runs
             self._entries.write(entry)
         return entry
 
 
+class _CompiledHere:
+    """Within it nothing comes from JAX's own cache of compiled programs: what was loaded from there and is written
+    again lacks functions when it is loaded (jax 0.10). The setting is one for all threads."""
+
+    def __init__(self):
+        self._lock, self._inside, self._enabled = threading.Lock(), 0, True
+
+    def __enter__(self):
+        with self._lock:
+            if self._inside == 0:
+                self._enabled = jax.config.jax_enable_compilation_cache  # type: ignore[attr-defined]
+                self._set(False)
+            self._inside += 1
+
+    def __exit__(self, *_):
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._set(self._enabled)
+
+    def _set(self, enabled: bool) -> None:
+        jax.config.update("jax_enable_compilation_cache", enabled)
+        compilation_cache.reset_cache()  # JAX asks for the setting once
+
+
+_compiled_here = _CompiledHere()
+
+
 def _ready(entry: Entry) -> _Ready:
-    exported = export.deserialize(bytearray(entry.exported))
-    run = jax.jit(exported.call) if exported.out_avals else _nothing
-    return _Ready(run, pickle.loads(entry.structure))
+    _find_lapack()
+    given, returned, structure = pickle.loads(entry.structure)
+    return _Ready(serialize_executable.deserialize_and_load(entry.compiled, given, returned), structure)
 
 
-def _nothing(*arrays: Any) -> tuple[()]:
-    """What a program computes whose result has no arrays: it is known when it is traced."""
-    return ()
+def _bits(results: Sequence[Any]) -> list[bytes]:
+    keys = jax.dtypes.prng_key
+    plain = (jax.random.key_data(r) if jax.dtypes.issubdtype(r.dtype, keys) else r for r in results)
+    return [np.asarray(result).tobytes() for result in plain]
+
+
+@functools.cache
+def _find_lapack() -> None:
+    """JAX looks for LAPACK when a program that calls it is lowered, which a kept one never is."""
+    jax.jit(jax.lax.linalg.cholesky).lower(np.ones((1, 1)))
 
 
 def _is_array(leaf: Any) -> bool:

@@ -54,12 +54,12 @@ class Parameter:
         if not (math.isfinite(self.low) and math.isfinite(self.high)):
             raise InputError(f"{path} runs from {self.low} to {self.high}, both ends must be finite numbers.")
         if not self.low < self.high:
-            raise InputError(f"{path}.low is {self.low}, it must be below high = {self.high}.")
+            raise InputError(f"{path}.low is {self.low}; it must be below high = {self.high}.")
         if self.scale == "log" and self.low <= 0:
-            raise InputError(f'{path}.low is {self.low}, it must be above 0 on a scale = "log".')
+            raise InputError(f'{path}.low is {self.low}; it must be above 0 on a scale = "log".')
         for key, end in (("low", self.low), ("high", self.high)):
             if self.integer and end != round(end):
-                raise InputError(f"{path}.{key} is {end}, it must be a whole number where integer = true.")
+                raise InputError(f"{path}.{key} is {end}; it must be a whole number where integer = true.")
 
     @classmethod
     def of_levels(cls, name: str, levels: tuple[str, ...], correlation: float = 0.5) -> "Parameter":
@@ -68,7 +68,7 @@ class Parameter:
 
     def _check_levels(self, path: str) -> None:
         if len(self.levels) < 2:
-            raise InputError(f"{path}.levels is {list(self.levels)}, it must have two levels or more.")
+            raise InputError(f"{path}.levels is {list(self.levels)}; it must have two levels or more.")
         twice = next((level for level in self.levels if self.levels.count(level) > 1), None)
         if twice is not None:
             raise InputError(f'{path}.levels has "{twice}" twice, give each level once.')
@@ -82,7 +82,7 @@ class Parameter:
                 " integer = true."
             )
         if not 0 < self.correlation < 1:
-            raise InputError(f"{path}.correlation is {self.correlation}, it must be between 0 and 1.")
+            raise InputError(f"{path}.correlation is {self.correlation}; it must be between 0 and 1.")
 
     @property
     def discrete(self) -> bool:
@@ -200,14 +200,14 @@ class Mechanics:
         for key, least in (("damping", 0.0), ("T", 0.0), ("K_eff", -math.ulp(0.0))):
             value = getattr(self, key)
             if not least < value < math.inf:
-                raise InputError(f"renderer.{key} is {value}, it must be {'0 or' if least else 'a number'} above 0.")
+                raise InputError(f"renderer.{key} is {value}; it must be {'0 or' if least else 'a number'} above 0.")
         if self.memory == "full" and self.states not in STATES:
-            raise InputError(f"renderer.states is {self.states}, it must be one of {', '.join(map(str, STATES))}.")
+            raise InputError(f"renderer.states is {self.states}; it must be one of {', '.join(map(str, STATES))}.")
         if self.memory == "short" and (self.N < 1 or self.N % 2 == 0):
-            raise InputError(f"renderer.N is {self.N}, it must be odd and at least 1; write for example N = 101.")
+            raise InputError(f"renderer.N is {self.N}; it must be odd and at least 1; write for example N = 101.")
         if self.effective_damping is not None and not 0 <= self.effective_damping[0] < self.effective_damping[1]:
             raise InputError(
-                f"renderer.effective_damping is {list(self.effective_damping)}, it must be a lower end, 0 or above, "
+                f"renderer.effective_damping is {list(self.effective_damping)}; it must be a lower end, 0 or above, "
                 "and a higher one; write for example effective_damping = [10, 80]."
             )
 
@@ -245,14 +245,14 @@ class Box:
             if self.parameters[self.names.index(name)].levels:
                 raise InputError(f"{path}.terms names {name}, whose levels are no numbers; leave it out.")
             if not math.isfinite(weight):
-                raise InputError(f"{path}.terms.{name} is {weight}, it must be a finite number.")
+                raise InputError(f"{path}.terms.{name} is {weight}; it must be a finite number.")
         if not any(weight for _, weight in constraint.terms):
             raise InputError(f"{path}.terms has no weight but 0; write for example terms = {{a = 1, b = 2}}.")
         if constraint.least is None and constraint.most is None:
-            raise InputError(f"{path} has no least and no most, it must have one of them, or both.")
+            raise InputError(f"{path} has no least and no most; it must have one of them, or both.")
         least, most = constraint.least, constraint.most
         if least is not None and most is not None and not least < most:
-            raise InputError(f"{path}.least is {least}, it must be below most = {most}.")
+            raise InputError(f"{path}.least is {least}; it must be below most = {most}.")
 
     def _check_model(self) -> None:
         """What the FO-SLS asks of its parameters."""
@@ -262,12 +262,12 @@ class Box:
         for name in ("K1", "B1", "alpha"):
             parameter = self.parameters[self.names.index(name)]
             if parameter.discrete:
-                raise InputError(f"parameters.{name} has steps, it must be continuous for the FO-SLS.")
+                raise InputError(f"parameters.{name} has steps; it must be continuous for the FO-SLS.")
             if parameter.low <= 0:
-                raise InputError(f"parameters.{name}.low is {parameter.low}, it must be above 0 for the FO-SLS.")
+                raise InputError(f"parameters.{name}.low is {parameter.low}; it must be above 0 for the FO-SLS.")
         alpha = self.parameters[self.names.index("alpha")]
         if alpha.high >= 1:
-            raise InputError(f"parameters.alpha.high is {alpha.high}, it must be below 1 for the FO-SLS.")
+            raise InputError(f"parameters.alpha.high is {alpha.high}; it must be below 1 for the FO-SLS.")
 
     @property
     def dim(self) -> int:

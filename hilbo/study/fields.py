@@ -81,7 +81,7 @@ def _read_value(kind: Any, raw: Any, path: str) -> Any:
     notes = [note for note in kind.__metadata__ if isinstance(note, msgspec.Meta)]
     must = next(note.description for note in reversed(notes) if note.description)
     example = next((f"; write for example {path.split('.')[-1]} = {n.examples[0]}" for n in notes if n.examples), "")
-    raise InputError(f"{path} is {shown(raw)}, it must be {must}{example}.")
+    raise InputError(f"{path} is {shown(raw)}; it must be {must}{example}.")
 
 
 def check_keys(raw: Any, path: str, known: Iterable[str]) -> None:
@@ -90,7 +90,7 @@ def check_keys(raw: Any, path: str, known: Iterable[str]) -> None:
     dot = f"{path}." if path else ""
     for key in raw:
         if key not in known:
-            raise InputError(f"{dot}{key} is not a key of a study file, those known here are {', '.join(known)}.")
+            raise InputError(f"{dot}{key} is not a key of a study file; known here are {', '.join(known)}.")
 
 
 def missing_keys(kind: type[Table], raw: Any, path: str) -> Iterator[str]:
@@ -113,7 +113,7 @@ def check_present(missing: Iterable[str], rest: str = "") -> None:
     if keys:
         first, *others = keys
         also = f" and so {'is' if len(others) == 1 else 'are'} {', '.join(others)}" if others else ""
-        raise InputError(f"{first} is missing{also}, add {'them' if others else 'it'}{rest}.")
+        raise InputError(f"{first} is missing{also}; add {'them' if others else 'it'}{rest}.")
 
 
 def check_table(raw: Any, path: str) -> Mapping[str, Any]:
@@ -121,7 +121,7 @@ def check_table(raw: Any, path: str) -> Mapping[str, Any]:
     if runs_in_a_spreadsheet(path.partition(".")[2]):
         raise InputError(f"{path} has a name {FORMULA_WORDS}.")
     if not isinstance(raw, Mapping):
-        raise InputError(f"{path} is {shown(raw)}, it must be a table; write it as [{path}].")
+        raise InputError(f"{path} is {shown(raw)}; it must be a table; write it as [{path}].")
     return raw
 
 

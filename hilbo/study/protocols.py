@@ -144,11 +144,11 @@ def _check_steps(phase: Phase, changed: Protocol) -> None:
     shows = [step.show for step in changed.steps]
     if "a" not in shows or ("b" in shows) != ("preferred" in changed.asks):
         needs = '"a" and "b"' if "preferred" in changed.asks else '"a" and not "b"'
-        raise InputError(f"{path} is {shown(shows)}, it must show {needs}.")
+        raise InputError(f"{path} is {shown(shows)}; it must show {needs}.")
     felt = ""
     for show in shows:
         if show in ("a", "b") and felt in ("a", "b") and show != felt:
-            raise InputError(f'{path} is {shown(shows)}, it must have "neutral" or "reference" between "a" and "b".')
+            raise InputError(f'{path} is {shown(shows)}; it must have "neutral" or "reference" between "a" and "b".')
         felt = show
 
 

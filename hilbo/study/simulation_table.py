@@ -44,25 +44,25 @@ class SimulationTable(Table, frozen=True):
         """Refuse what does not fit these parameters and `count` responses. Raises `InputError`."""
         names = [p.name for p in parameters]
         if self.truth and set(self.truth) != set(names):
-            raise InputError(f"simulation.truth names {', '.join(self.truth)}, it must name {', '.join(names)}.")
+            raise InputError(f"simulation.truth names {', '.join(self.truth)}; it must name {', '.join(names)}.")
         for p in parameters if self.truth else ():
             if not p.low <= p.number(self.truth[p.name]) <= p.high:
                 value = shown(self.truth[p.name])
-                raise InputError(f"simulation.truth.{p.name} is {value}, it must be {p.range_words}.")
+                raise InputError(f"simulation.truth.{p.name} is {value}; it must be {p.range_words}.")
         for name, values in (("spread", self.spread), ("tolerance", self.tolerance)):
             if isinstance(values, tuple) and len(values) != len(names):
                 raise InputError(
-                    f"simulation.{name} has {len(values)} numbers, it must be one number or {len(names)}, one per"
+                    f"simulation.{name} has {len(values)} numbers; it must be one number or {len(names)}, one per"
                     " parameter."
                 )
         if self.criteria and len(self.criteria) != count - 1:
             given = shown(self.criteria)
             raise InputError(
-                f"simulation.criteria is {given}, it must have one number fewer than the {count} responses."
+                f"simulation.criteria is {given}; it must have one number fewer than the {count} responses."
             )
         if any(high <= low for high, low in itertools.pairwise(self.criteria)):
             raise InputError(
-                f"simulation.criteria is {shown(self.criteria)}, it must fall from each number to the next."
+                f"simulation.criteria is {shown(self.criteria)}; it must fall from each number to the next."
             )
 
 

@@ -45,7 +45,7 @@ class StimulusTable(Table, frozen=True):
             if name in levels:
                 raise InputError(f"{path} is of levels, and another level is none that was asked for; leave it out.")
             if not 0 <= value < math.inf:
-                raise InputError(f"{path} is {shown(value)}, it must be a number, 0 or above.")
+                raise InputError(f"{path} is {shown(value)}; it must be a number, 0 or above.")
         for key, least in _PATIENCE.items() if self.by == "person" else ():
             if getattr(self, key) < least:
                 raise InputError(

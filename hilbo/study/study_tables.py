@@ -182,7 +182,7 @@ def read(raw: Mapping[str, Any]) -> Tables:
     check_keys(raw, "", _KEYS)
     _check_complete(raw)
     if raw["schema"] is True or raw["schema"] != 1:
-        raise InputError(f"schema is {shown(raw['schema'])}, it must be 1: this hilbo reads no other.")
+        raise InputError(f"schema is {shown(raw['schema'])}; it must be 1: this hilbo reads no other.")
     tables = {key: read_table(kind, raw[key], key) for key, kind in _TABLES.items() if key in raw}
     parameters = {
         name: read_table(_kind_of(table), table, f"parameters.{name}") for name, table in raw["parameters"].items()
@@ -202,7 +202,7 @@ def read(raw: Mapping[str, Any]) -> Tables:
 def _constraints(raw: Any) -> tuple[_ConstraintTable, ...]:
     """[[constraints]], each called by its number from 1. Raises `InputError`."""
     if not isinstance(raw, list):
-        raise InputError(f"constraints is {shown(raw)}, it must be tables; write each as [[constraints]].")
+        raise InputError(f"constraints is {shown(raw)}; it must be tables; write each as [[constraints]].")
     return tuple(read_table(_ConstraintTable, table, f"constraints.{i}") for i, table in enumerate(raw, 1))
 
 
@@ -245,12 +245,14 @@ def _with_theta(table: GPTable, parameters: Collection[_ParameterTable | _Levels
         if isinstance(values, tuple) and len(values) != dim:
             count, which = len(values), "" if dim == len(parameters) else " without levels"
             raise InputError(
-                f"gp.{name} has {count} numbers, it must be one number or {dim}, one per parameter{which}."
+                f"gp.{name} has {count} numbers; it must be one number or {dim}, one per parameter{which}."
             )
     if table.length is None:
         return table
     if table.theta is not None:
-        raise InputError("gp.length stands beside theta = 1/(2 length^2), they say the same; keep one of them.")
+        raise InputError(
+            "gp.length stands beside theta, which says the same (theta = 1/(2 length^2)); keep one of them."
+        )
     each = table.length if isinstance(table.length, tuple) else (table.length,)
     theta = tuple(1 / (2 * length**2) for length in each)
     return msgspec.structs.replace(table, theta=theta if isinstance(table.length, tuple) else theta[0], length=None)
@@ -266,7 +268,7 @@ def box_of(tables: Tables) -> Box:
         unit = p.unit.replace("·", ".").replace("α", "alpha")
         if p.name in _UNITS and unit not in ("", _UNITS[p.name]):
             raise InputError(
-                f'parameters.{p.name}.unit is "{p.unit}", it must be "{_UNITS[p.name]}" where there is a [renderer].'
+                f'parameters.{p.name}.unit is "{p.unit}"; it must be "{_UNITS[p.name]}" where there is a [renderer].'
             )
     renderer = msgspec.structs.asdict(tables.renderer)
     del renderer["model"]
@@ -283,10 +285,10 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     """Refuse tables that do not fit each other, or the parameters. Raises `InputError`."""
     labels, selection = tables.study.responses, tables.selection
     if len(set(labels)) < len(labels):
-        raise InputError(f"study.responses is {shown(labels)}, it must not have one label twice.")
+        raise InputError(f"study.responses is {shown(labels)}; it must not have one label twice.")
     if selection.space_filling > selection.trials:
         raise InputError(
-            f"selection.space_filling is {selection.space_filling}, it must be at most trials = {selection.trials}."
+            f"selection.space_filling is {selection.space_filling}; it must be at most trials = {selection.trials}."
         )
     tables.session.check(labels)
     if tables.stimulus is not None:
@@ -304,13 +306,13 @@ def _check_gp(table: GPTable, rule: Rule, count: int) -> None:
     if thresholds is not None:
         if len(thresholds) != count - 1:
             raise InputError(
-                f"gp.thresholds is {shown(thresholds)}, it must have one number fewer than the {count} responses."
+                f"gp.thresholds is {shown(thresholds)}; it must have one number fewer than the {count} responses."
             )
         if any(low >= high for low, high in itertools.pairwise(thresholds)):
-            raise InputError(f"gp.thresholds is {shown(thresholds)}, it must rise from each number to the next.")
+            raise InputError(f"gp.thresholds is {shown(thresholds)}; it must rise from each number to the next.")
     if rule in _LEARN:
         if table.inference != "laplace":
-            raise InputError(f'gp.inference is {shown(table.inference)}, it must be "laplace" with rule = "{rule}".')
+            raise InputError(f'gp.inference is {shown(table.inference)}; it must be "laplace" with rule = "{rule}".')
         return
 
 

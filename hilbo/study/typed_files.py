@@ -91,7 +91,7 @@ def check_values(
         if isinstance(value, str):
             if value not in parameter.levels:
                 raise InputError(
-                    f"{source}: {parameter.name} of {what} is {value}, it must be {parameter.range_words};"
+                    f"{source}: {parameter.name} of {what} is {value}; it must be {parameter.range_words};"
                     " make the file again."
                 )
             value = parameter.number(value)
@@ -100,7 +100,7 @@ def check_values(
             raise InputError(f"{source}: {what} has no number for {parameter.name}; make the file again.")
         if not parameter.low - slack <= value <= parameter.high + slack:
             raise InputError(
-                f"{source}: {parameter.name} of {what} is {value:g}, it must be from {parameter.low:g} to"
+                f"{source}: {parameter.name} of {what} is {value:g}; it must be from {parameter.low:g} to"
                 f" {parameter.high:g} {parameter.unit}".rstrip()
                 + ", the study's range; make the file again."
             )

@@ -132,9 +132,9 @@ def no_number(value):
     [
         (no_number(float("nan")), "is no result.json"),
         (no_number(None), "has no number for u"),
-        (no_number(1e308), "u of the optimum is 1e+308, it must be from 0 to 1"),
-        (no_number(-3), "u of the optimum is -3, it must be from 0 to 1"),
-        (no_number("x"), "u of the optimum is x, it must be a number from 0 to 1"),
+        (no_number(1e308), "u of the optimum is 1e+308; it must be from 0 to 1"),
+        (no_number(-3), "u of the optimum is -3; it must be from 0 to 1"),
+        (no_number("x"), "u of the optimum is x; it must be a number from 0 to 1"),
         ({"participants": [{"participant": "P01", "optimum": None}]}, "hold no individuals' optima"),
         ({"participants": [{"participant": "P01", "optimum": {"parameters": {"u": 9, "v": 0}}}]}, "optimum of P01"),
         ({"participants": [{"participant": "P01", "optimum": 7}]}, "is no result.json"),

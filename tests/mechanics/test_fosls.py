@@ -315,15 +315,15 @@ def test_a_record_has_one_dtype_and_transforms():
 @pytest.mark.parametrize(
     ("build", "sentence"),
     [
-        (lambda: FOSLS(1.0, 1.0, 1.0, 0.0), "alpha is 0.0, it must be above 0 and at most 1"),
+        (lambda: FOSLS(1.0, 1.0, 1.0, 0.0), "alpha is 0.0; it must be above 0 and at most 1"),
         (lambda: FOSLS(1.0, 1.0, 1.0, 1.1), "alpha is 1.1"),
         (lambda: FOSLS(1.0, 1.0, 1.0, np.nan), "alpha is nan"),
-        (lambda: FOSLS(1.0, -1.0, 1.0, 0.5), "K1 is -1.0, it must be 0 or above"),
+        (lambda: FOSLS(1.0, -1.0, 1.0, 0.5), "K1 is -1.0; it must be 0 or above"),
         (lambda: FOSLS(1.0, 1.0, -1.0, 0.5), "B1 is -1.0"),
         (lambda: FOSLS(1.0, 1.0, np.inf, 0.5), "B1 is inf"),
         (lambda: FOSLS(np.inf, 1.0, 1.0, 0.5), "K0 is inf"),
         (lambda: FOSLS(1.0, 1.0, 1.0, 0.5, T=0.0), "T is 0.0 s"),
-        (lambda: FOSLS(*PRESETS[SYSID][:4], memory="full"), "K0 is -2.89, it must be 0 or above with full memory"),
+        (lambda: FOSLS(*PRESETS[SYSID][:4], memory="full"), "K0 is -2.89; it must be 0 or above with full memory"),
         (lambda: FOSLS(1.0, 1.0, 1.0, 0.5).settling_time(1.0), "fraction is 1.0"),
     ],
 )

@@ -38,6 +38,12 @@ def drawn(key, count=3):
 
 
 @program
+def cached(x):
+    TRACES.append(jax.config.jax_enable_compilation_cache)
+    return x
+
+
+@program
 def shown(x):
     jax.debug.print("{}", x)
     return x
@@ -180,7 +186,15 @@ def test_within_a_trace_it_is_a_part_of_that_program(kept):
     np.testing.assert_array_equal(rows, 2 * X)
 
 
-def test_what_cannot_be_exported_or_told_runs_as_ever(kept, capfd):
+def test_jaxs_own_cache_is_off_while_a_program_is_made(kept):
+    kept()
+    before = jax.config.jax_enable_compilation_cache
+    cached(jnp.asarray(X))
+    assert TRACES == [False]
+    assert jax.config.jax_enable_compilation_cache == before
+
+
+def test_what_cannot_be_written_or_told_runs_as_ever(kept, capfd):
     entries = kept()
     np.testing.assert_array_equal(shown(jnp.asarray(X)), X)
     jax.effects_barrier()

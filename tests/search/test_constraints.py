@@ -180,7 +180,7 @@ def test_constraints_that_leave_nothing_are_refused(constraints, sentence):
         (Constraint((("a", 0.0),), most=1.0), "has no weight but 0"),
         (Constraint((("a", np.inf),), most=1.0), "must be a finite number"),
         (Constraint((("a", 1.0),)), "has no least and no most"),
-        (Constraint((("a", 1.0),), 3.0, 2.0), "least is 3.0, it must be below most = 2.0"),
+        (Constraint((("a", 1.0),), 3.0, 2.0), "least is 3.0; it must be below most = 2.0"),
     ],
 )
 def test_a_constraint_that_is_none_is_refused(constraint, sentence):

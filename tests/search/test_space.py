@@ -275,13 +275,13 @@ def test_a_damping_range_fills_evenly():
 @pytest.mark.parametrize(
     ("build", "sentence"),
     [
-        (lambda: Parameter("p", 2.0, 1.0), "parameters.p.low is 2.0, it must be below high = 1.0"),
+        (lambda: Parameter("p", 2.0, 1.0), "parameters.p.low is 2.0; it must be below high = 1.0"),
         (lambda: Parameter("p", 1.0, 1.0), "it must be below"),
         (lambda: Parameter("p", 0.0, np.inf), "must be finite"),
         (lambda: Parameter("p", 0.0, 1.0, scale="log"), "must be above 0"),
         (lambda: Mechanics(K_eff=0.44, damping=0.0), "renderer.damping is 0.0"),
-        (lambda: Mechanics(K_eff=-0.1, damping=1.0), "renderer.K_eff is -0.1, it must be 0 or above"),
-        (lambda: Mechanics(K_eff=0.44, damping=1.0, N=100), "renderer.N is 100, it must be odd"),
+        (lambda: Mechanics(K_eff=-0.1, damping=1.0), "renderer.K_eff is -0.1; it must be 0 or above"),
+        (lambda: Mechanics(K_eff=0.44, damping=1.0, N=100), "renderer.N is 100; it must be odd"),
         (lambda: Mechanics(K_eff=0.44, damping=1.0, T=np.nan), "renderer.T is nan"),
         (lambda: Mechanics(K_eff=0.44, damping=1.0, effective_damping=(80.0, 10.0)), "effective_damping is"),
         (lambda: SearchSpace(()), "at least one"),

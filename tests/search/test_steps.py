@@ -47,5 +47,5 @@ def test_neighbours_are_a_step_away():
 
 
 def test_ends_of_whole_numbers_are_whole():
-    with pytest.raises(InputError, match=r"n\.high is 2\.5, it must be a whole number where integer"):
+    with pytest.raises(InputError, match=r"n\.high is 2\.5; it must be a whole number where integer"):
         Parameter("n", 0.0, 2.5, integer=True)

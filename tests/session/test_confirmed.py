@@ -117,12 +117,12 @@ def test_what_is_missed_is_void_by_rule_and_counts_as_a_stop_in_its_rendering():
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        ({"within": 0.0}, "stimulus.within is 0.0, it must be a number of seconds from 0.1 to 600"),
+        ({"within": 0.0}, "stimulus.within is 0.0; it must be a number of seconds from 0.1 to 600"),
         ({"silence": "long"}, "stimulus.silence"),
         ({"tolerance": {"w": 1.0}}, "stimulus.tolerance.w is of no parameter of the study, those are u, v"),
-        ({"tolerance": {"u": -1.0}}, "stimulus.tolerance.u is -1.0, it must be a number, 0 or above"),
+        ({"tolerance": {"u": -1.0}}, "stimulus.tolerance.u is -1.0; it must be a number, 0 or above"),
         ({"tolerance": {"u": float("nan")}}, "stimulus.tolerance.u"),
-        ({"tolerance": 3}, "stimulus.tolerance is 3, it must be a table"),
+        ({"tolerance": 3}, "stimulus.tolerance is 3; it must be a table"),
         ({"late": 3}, "stimulus.late is not a key"),
     ],
 )

@@ -247,7 +247,7 @@ def test_a_study_changes_protocols_and_texts():
         ),
         ({"optimisation": {"steps": [{"show": "a", "seconds": 0}]}}, r"session\.optimisation\.steps is .* must be"),
         ({"optimisation": {"steps": [{"show": "a", "second": 1}]}}, r"session\.optimisation\.steps is .* must be"),
-        ({"warm_up": {"count": 0}}, r"session\.warm_up\.count is 0, it must be a whole number from 1"),
+        ({"warm_up": {"count": 0}}, r"session\.warm_up\.count is 0; it must be a whole number from 1"),
     ],
 )
 def test_a_wrong_session_table_is_one_sentence(session, sentence):

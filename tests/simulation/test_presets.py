@@ -75,25 +75,25 @@ def test_a_study_may_state_its_people():
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("light = 65}", "lightness = 65}", "simulation.truth names hue, lightness, it must name hue, light."),
-        ("hue = 90", "hue = 400", "simulation.truth.hue is 400.0, it must be a number from 0 to 360."),
-        ("[0.02, 0.03]", "[0.02]", "simulation.spread has 1 numbers, it must be one number or 2, one per parameter."),
+        ("light = 65}", "lightness = 65}", "simulation.truth names hue, lightness; it must name hue, light."),
+        ("hue = 90", "hue = 400", "simulation.truth.hue is 400.0; it must be a number from 0 to 360."),
+        ("[0.02, 0.03]", "[0.02]", "simulation.spread has 1 numbers; it must be one number or 2, one per parameter."),
         (
             "[4, 2, 1]",
             "[2, 1]",
-            "simulation.criteria is [2.0, 1.0], it must have one number fewer than the 4 responses.",
+            "simulation.criteria is [2.0, 1.0]; it must have one number fewer than the 4 responses.",
         ),
         (
             "[4, 2, 1]",
             "[4, 4, 1]",
-            "simulation.criteria is [4.0, 4.0, 1.0], it must fall from each number to the next.",
+            "simulation.criteria is [4.0, 4.0, 1.0]; it must fall from each number to the next.",
         ),
         (
             "[0.02, 0.03]",
             "[0.02, 3]",
-            "simulation.spread is [0.02, 3], it must be a number above 0, up to 1, or a list",
+            "simulation.spread is [0.02, 3]; it must be a number above 0, up to 1, or a list",
         ),
-        ("spread = [0.02, 0.03]", "lapse = 2", "simulation.lapse is 2, it must be a number from 0 to 1;"),
+        ("spread = [0.02, 0.03]", "lapse = 2", "simulation.lapse is 2; it must be a number from 0 to 1;"),
     ],
 )
 def test_people_that_do_not_fit_the_study_are_refused(old, new, sentence):

@@ -73,5 +73,5 @@ def test_doctor_says_what_nobody_has_read():
 
 
 def test_another_language_is_refused():
-    with pytest.raises(InputError, match=r'session.language is "nl", it must be one of "en", "de", "fr"; write for'):
+    with pytest.raises(InputError, match=r'session.language is "nl"; it must be one of "en", "de", "fr"; write for'):
         study(FILE.replace('"de"', '"nl"'))

@@ -87,9 +87,9 @@ def test_what_the_file_states_is_kept():
             SOUND.replace("learnt-1", "bcm"),
             "gp.theta is missing and so are gp.variance, gp.thresholds, ",
         ),
-        (SOUND + '[gp]\ninference = "ep"\n', 'gp.inference is "ep", it must be "laplace" with rule = "learnt-1"'),
-        (SOUND + "[gp]\nthresholds = [0.0]\n", "gp.thresholds is [0.0], it must have one number fewer than the 3"),
-        (SOUND.replace("learnt-1", "learnt-0"), 'aggregation.rule is "learnt-0", it must be one of'),
+        (SOUND + '[gp]\ninference = "ep"\n', 'gp.inference is "ep"; it must be "laplace" with rule = "learnt-1"'),
+        (SOUND + "[gp]\nthresholds = [0.0]\n", "gp.thresholds is [0.0]; it must have one number fewer than the 3"),
+        (SOUND.replace("learnt-1", "learnt-0"), 'aggregation.rule is "learnt-0"; it must be one of'),
     ],
 )
 def test_bad_files_get_one_sentence(text, sentence):

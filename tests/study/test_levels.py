@@ -41,9 +41,9 @@ correlations = st.floats(0.02, 0.98)
     ("table", "sentence"),
     [
         ({"levels": ["silk", "wood", "silk"]}, 'parameters.texture.levels has "silk" twice, give each level once.'),
-        ({"levels": ["silk"]}, 'parameters.texture.levels is ["silk"], it must be a list of two or more texts'),
-        ({"levels": "silk"}, 'parameters.texture.levels is "silk", it must be a list of two or more texts'),
-        ({"levels": [1, 2]}, "parameters.texture.levels is [1, 2], it must be a list of two or more texts"),
+        ({"levels": ["silk"]}, 'parameters.texture.levels is ["silk"]; it must be a list of two or more texts'),
+        ({"levels": "silk"}, 'parameters.texture.levels is "silk"; it must be a list of two or more texts'),
+        ({"levels": [1, 2]}, "parameters.texture.levels is [1, 2]; it must be a list of two or more texts"),
         ({"levels": ["a", " b"]}, "parameters.texture.levels has ' b', a level is a text without blanks around it"),
         ({"levels": ["10", "b"]}, 'parameters.texture.levels has "10", which reads as a number; name it otherwise'),
         ({"levels": ["a", "=b"]}, 'parameters.texture.levels is ["a", "=b"], which a spreadsheet would run'),
@@ -53,7 +53,7 @@ correlations = st.floats(0.02, 0.98)
         ({"levels": ["a", "b"], "unit": "N"}, "parameters.texture.unit stands beside levels, which have no order"),
         (
             {"levels": ["a", "b"], "correlation": 1.0},
-            "parameters.texture.correlation is 1.0, it must be a number",
+            "parameters.texture.correlation is 1.0; it must be a number",
         ),
         ({"low": 0, "high": 1, "correlation": 0.5}, "parameters.texture.correlation is of levels, and there are none"),
         ({}, "parameters.texture.low is missing"),
@@ -220,7 +220,7 @@ def test_simulated_people_are_around_a_level():
     crowd = people(study, population_of(study)[1], 500, 0)
     texture = np.asarray(crowd.optimum)[:, 1]
     assert np.mean(texture == 1.0) == pytest.approx(0.8, abs=0.06) and set(texture) == {0.0, 0.5, 1.0}
-    with pytest.raises(InputError, match=r'truth\.texture is "glass", it must be one of silk, wood, stone'):
+    with pytest.raises(InputError, match=r'truth\.texture is "glass"; it must be one of silk, wood, stone'):
         surfaces(simulation={"truth": {"hue": 90.0, "texture": "glass", "light": 40.0}})
 
 

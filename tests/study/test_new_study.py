@@ -74,8 +74,8 @@ SENTENCES = {
     "a + <= 2": "write a sum of parameters and its bound",
     "a <= 1,5": "write a sum of parameters and its bound",
     "a - a <= 1": '--constraint "a - a <= 1" has no weight but 0',
-    "1e999 a <= 1": '--constraint "1e999 a <= 1".a is inf, it must be a finite number.',
-    "3 <= a <= 1": '--constraint "3 <= a <= 1".least is 3.0, it must be below most = 1.0.',
+    "1e999 a <= 1": '--constraint "1e999 a <= 1".a is inf; it must be a finite number.',
+    "3 <= a <= 1": '--constraint "3 <= a <= 1".least is 3.0; it must be below most = 1.0.',
 }
 
 
