@@ -152,7 +152,7 @@ def _ready(entry: Entry) -> _Ready:
 
 def _bits(results: Sequence[Any]) -> list[bytes]:
     keys = jax.dtypes.prng_key
-    plain = (jax.random.key_data(r) if jax.dtypes.issubdtype(r.dtype, keys) else r for r in results)
+    plain = (jax.random.key_data(r) if jax.numpy.issubdtype(r.dtype, keys) else r for r in results)
     return [np.asarray(result).tobytes() for result in plain]
 
 
