@@ -66,6 +66,7 @@ public sealed class Stimulus : IDisposable {
     readonly bool _force;
     readonly Action _goNeutral;
     readonly Action<string> _log;
+    string _again = "";  // its own run, whose place it takes at once where the line broke
     readonly Line _own, _talking;  // the program's connection, and that of the thread that talks
     readonly Thread _talk, _watch;
     readonly object _saying = new object(), _going = new object(), _lock = new object();  // the last: of what follows
@@ -218,7 +219,7 @@ public sealed class Stimulus : IDisposable {
     }
 
     void Begin() {
-        var found = _talking.Post("/api/stimulus/hello", _hello, _key, SilenceS);
+        var found = _talking.Post("/api/stimulus/hello", _hello + _again, _key, SilenceS);
         var status = Field(found, "status");
         if (status == "400" || status == "401" || status == "403") {
             End(Field(found, "error"));
@@ -226,6 +227,7 @@ public sealed class Stimulus : IDisposable {
             throw new StimulusException("the session is not ready");
         } else {
             var run = Field(found, "run");
+            _again = "&run=" + Uri.EscapeDataString(run);
             lock (_lock) {
                 _parameters = Array.ConvertAll(found.FindAll(IsParameter).ToArray(), ParameterOf);
                 _silenceS = Number(Field(found, "silence_s"));

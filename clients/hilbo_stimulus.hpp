@@ -433,7 +433,7 @@ private:
   }
 
   void begin() {
-    const Lines found = talking_.post("/api/stimulus/hello", hello_, key_, silence_s());
+    const Lines found = talking_.post("/api/stimulus/hello", hello_ + again_, key_, silence_s());
     const std::string status = detail::field(found, "status");
     if (status == "400" || status == "401" || status == "403") {
       end(detail::field(found, "error"));
@@ -454,6 +454,7 @@ private:
         run_ = detail::field(found, "run");
         heard_ = Clock::now();
       }
+      again_ = "&run=" + detail::escaped(detail::field(found, "run"));
       take(detail::field(found, "run"), found);
     }
   }
@@ -598,6 +599,7 @@ private:
 
   const Options options_;
   std::string key_, hello_;
+  std::string again_;          // its own run, whose place it takes at once where the line broke
   detail::Line own_, talking_; // the program's connection, and that of the thread that talks
   mutable std::mutex mutex_;   // of all that follows
   std::condition_variable changed_;

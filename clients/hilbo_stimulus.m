@@ -52,6 +52,7 @@ classdef hilbo_stimulus < handle
     force = false;
     limp = [];
     run = '';
+    again = {};               % its own run, whose place it takes at once where the line broke
     order = [];               % the newest
     handed = true;            % whether it was handed out
     done = 'busy';            % what was done about it
@@ -171,7 +172,7 @@ classdef hilbo_stimulus < handle
     end
 
     function begin(s)
-      found = s.post('/api/stimulus/hello', s.hello, s.silence_s);
+      found = s.post('/api/stimulus/hello', [s.hello, s.again], s.silence_s);
       status = hilbo_stimulus.field(found, 'status');
       if any(strcmp(status, {'400', '401', '403'}))
         s.leave(hilbo_stimulus.field(found, 'error'));
@@ -179,6 +180,7 @@ classdef hilbo_stimulus < handle
         s.parameters = hilbo_stimulus.parameters_of(found);
         s.silence_s = str2double(hilbo_stimulus.field(found, 'silence_s'));
         s.run = hilbo_stimulus.field(found, 'run');
+        s.again = {'run', s.run};
         s.order = hilbo_stimulus.silence();
         s.take(found);
       else

@@ -10,9 +10,11 @@ import signal
 import subprocess
 import sys
 import time
+from urllib.parse import urlsplit
 
 import pytest
 from client_programs import each_language, hung, sources
+from cut_line import CutLine
 from killed_session import PATIENCE, Session
 from live_stimulus import CLIENTS, SETS, SINGLE, LiveLevels, LiveStimulus, all_answered
 
@@ -81,6 +83,23 @@ def test_an_example_that_was_killed_while_it_presented_goes_on_by_the_same_link(
         state = live.replayed()
     assert sum(trial.status == "answered" for trial in state.trials) == 3
     assert any("has been silent" in str(trial.voided) for trial in state.trials if trial.status == "void")
+
+
+# MATLAB's tcpclient does not say that its connection is closed: that client waits as long as for a silent server.
+@pytest.mark.parametrize("language", [language for language in each_language.args[1] if language.id != "matlab"])
+def test_after_a_broken_line_it_takes_its_own_place_at_once(language, built, tmp_path):
+    """A program that does not say which run it was would wait until that one has been silent for 20 s."""
+    command = language.build("example_patch", built)
+    with LiveStimulus(tmp_path, silence=20.0, blocks=SINGLE) as live:
+        port = urlsplit(live.link()).port
+        with CutLine(port) as line, Running([*command, live.link().replace(str(port), str(line.port))], tmp_path):
+            live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+            line.cut()
+            at = time.monotonic()
+            all_answered(live)
+            took = time.monotonic() - at
+    print(f"{language.name}: all answered {took:.1f} s after the line broke")
+    assert took < 15.0
 
 
 @each_language
