@@ -23,7 +23,7 @@ TOOLS = ("frama-c", "why3", "z3", "cvc4")
 
 class Plan(NamedTuple):
     """Functions of a file whose contracts are believed (docs/device/firmware.md says why), those with a goal that cvc4
-    does not prove, and those for which WP first takes the goal apart, by a strategy that would cost minutes elsewhere."""
+    does not prove, and those for which WP first takes the goal apart: a strategy that would cost minutes elsewhere."""
 
     believed: tuple[str, ...] = ()
     z3: tuple[str, ...] = ()
