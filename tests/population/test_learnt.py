@@ -35,7 +35,7 @@ def learnt():
 
 def dense_objective(z, trials):
     """The log posterior of [log theta (2), log shared, log own, middle, log gap], by the model of all answers at once
-    and the priors as docs/methods/aggregation.md states them."""
+    and the priors as docs/methods/which_method.md states them."""
     theta, shared, own = np.exp(z[:2]), np.exp(z[2]), np.exp(z[3])
     half = 0.5 * np.exp(z[5])
     gp = OrdinalGP(RBF(tuple(theta), shared + own), OrdinalProbit((z[4] - half, z[4] + half), 1.0))
