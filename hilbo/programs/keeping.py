@@ -32,7 +32,10 @@ class _Ready(NamedTuple):
     structure: Any
 
     def __call__(self, arrays: Sequence[Any]) -> Any:
-        results = self.run(*arrays)
+        return self.around(self.run(*arrays))
+
+    def around(self, results: Sequence[Any]) -> Any:
+        """What the function returns of the arrays computed."""
         return jax.tree.map(
             lambda leaf: results[leaf.number] if isinstance(leaf, _Array) else leaf,
             self.structure,
@@ -68,25 +71,25 @@ class Programs:
             if key not in self._known:
                 with self._finding.setdefault(key, threading.RLock()):
                     if key not in self._known:
-                        self._known[key] = self._find(function, args, kwargs)
+                        self._known[key], computed = self._find(function, args, kwargs)
+                        if computed is not None:  # of this call's arrays: it is not computed once more
+                            return lambda _: computed
         except TypeError:  # something that cannot be hashed; what is wrong with the call itself is met again there
             return None
         return self._known[key]
 
-    def _find(self, function, args, kwargs) -> _Ready | None:
-        """From its entry, or made; None if there is no way to keep it."""
+    def _find(self, function, args, kwargs) -> tuple[_Ready | None, Any]:
+        """From its entry, or made, then with what the call returns; None if there is no way to keep it."""
         if jax.device_count() > 1:
-            return None
+            return None, None
         try:
             words = f"{self._around}\n{describe(function, args, kwargs)}"
         except NotKeptError:
-            return None
+            return None, None
         entry = self._entries.read(words)
-        if entry is None:
-            entry = self._make(words, function, args, kwargs)
-        return None if entry is None else _ready(entry)
+        return self._make(words, function, args, kwargs) if entry is None else (_ready(entry), None)
 
-    def _make(self, words, function, args, kwargs) -> Entry | None:
+    def _make(self, words, function, args, kwargs) -> tuple[_Ready | None, Any]:
         leaves, tree = jax.tree.flatten((args, kwargs))
         structure = []
 
@@ -107,13 +110,15 @@ class Programs:
                 compiled = jax.jit(flat).lower(*arrays).compile()
             code, given, returned = serialize_executable.serialize(compiled)
             entry = Entry(words, pickle.dumps((given, returned, structure[-1])), code)
-            if _bits(_ready(entry).run(*arrays)) != _bits(compiled(*arrays)):
-                return None
+            ready = _ready(entry)
+            results = ready.run(*arrays)
+            if _bits(results) != _bits(compiled(*arrays)):
+                return None, None
         except Exception:  # it cannot be written; a mistake of its own is met again when it is compiled
-            return None
+            return None, None
         if code_digest(self._package) == self._code:  # else somebody edits it while this runs
             self._entries.write(entry)
-        return entry
+        return ready, ready.around(results)
 
 
 class _CompiledHere:
