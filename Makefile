@@ -17,6 +17,7 @@ PATIENTLY = $(PIP) --quiet || { for pause in $(PAUSES); do sleep $$pause; $(PIP)
 $(STAMP): WHAT = .[dev,hardware,live,browser]
 $(DOCS_STAMP): WHAT = .[docs]
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+export PYTHONDONTWRITEBYTECODE :=  # tests begin hundreds of processes: sources are parsed once, whatever the shell says
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo firmware test test-deep lint docs notebooks wheel floors bench clean

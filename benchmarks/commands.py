@@ -119,8 +119,8 @@ def document(rows):
     lines = [
         "Made by `python benchmarks/commands.py FILE --write`: whole processes, medians of five (*empty*, *traced*:",
         "one run), beside `import jax` in the same minutes. Programs are kept from one command to the next",
-        "(docs/design.md). *traced* is with HILBO_KEEP_PROGRAMS=0, *empty* the first run of all, *before* another checkout:",
-        "here the last commit at which every command traced and compiled for itself.",
+        "(docs/design.md). *traced* is with HILBO_KEEP_PROGRAMS=0, *empty* the first run of all, *before* the last",
+        "commit at which every command traced and compiled for itself.",
         "",
         "| command | way | s | of `import jax` | optimum printed after, s | of `import jax` | memory, MB |",
         "|---|---|---:|---:|---:|---:|---:|",

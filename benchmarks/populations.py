@@ -95,10 +95,11 @@ def one_study(name, design, seed):
     median = float(jnp.median(chance_at(scene.chance, candidates[:512])))
     posteriors = fit_cohort(study, cohort)
     individual = jnp.mean(individual_optima(study, posteriors, candidates).x, axis=0)
-    learnt = {recipe: by_recipe(study, cohort, recipe, candidates, seed) for recipe in RECIPES}
-    resolved_study, optimum, region = learnt[RECOMMENDED]
+    learnt = {recipe: by_recipe(study, cohort, recipe, candidates) for recipe in RECIPES}
+    resolved_study, map_, optimum = learnt[RECOMMENDED]
+    region = optimum_region(resolved_study, map_, answers, seed)
     held = region.holds(np.asarray(best), resolved_study.gp.kernel)
-    places = {recipe: optimum.x for recipe, (_, optimum, _) in learnt.items()} | {
+    places = {recipe: each.x for recipe, (_, _, each) in learnt.items()} | {
         "bcm": map_optimum(study, rule_map(study.gp, answers, "bcm", posteriors=posteriors), candidates).x,
         "average": map_optimum(study, rule_map(study.gp, answers, "average", posteriors=posteriors), candidates).x,
         "mean of the individual optima": study.space.from_box(jnp.clip(study.space.to_box(individual), 0, 1)),
@@ -118,11 +119,11 @@ def one_study(name, design, seed):
     }
 
 
-def by_recipe(study, cohort, recipe, candidates, seed):
-    """The study with what a recipe learns of the answers, the optimum, and the region of the best rendering."""
+def by_recipe(study, cohort, recipe, candidates):
+    """The study with what a recipe learns of the answers, its map, and the optimum."""
     learns = resolved(that_learns(study, recipe), cohort)
     map_ = learnt_map(learns.learnt, cohort.trials)
-    return learns, map_optimum(learns, map_, candidates), optimum_region(learns, map_, seed)
+    return learns, map_, map_optimum(learns, map_, candidates)
 
 
 def with_trials(study, trials):

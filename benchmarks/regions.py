@@ -23,6 +23,7 @@ from rows import Rows
 from hilbo.population.recipes import LEARNT_1, RECOMMENDED
 from hilbo.search.candidates import search_points
 from hilbo.study.cohort import Cohort
+from hilbo.study.optimum_region import optimum_region
 
 CATEGORIES, FREEDOM = 3, 3  # Matern 3/2: waves are Student's, with 3 degrees of freedom
 
@@ -55,7 +56,8 @@ def one_study(design, seed):
     answers = by_chance(study, scene.persons, people, trials, seed)
     cohort = Cohort(answers, np.zeros((people, trials, study.space.dim)), tuple(f"P{j}" for j in range(people)))
     candidates = search_points(study.space, seed)
-    learns, optimum, region = by_recipe(study, cohort, RECOMMENDED, candidates, seed)
+    learns, map_, optimum = by_recipe(study, cohort, RECOMMENDED, candidates)
+    region = optimum_region(learns, map_, answers, seed)
     best = highest(study, scene.chance, candidates)
     top, got = (float(scene.chance(x[None, :])[0]) for x in (best, optimum.x))
     return {

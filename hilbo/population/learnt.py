@@ -9,6 +9,7 @@ before the answers is not identified.
 
 import dataclasses
 from collections.abc import Set
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import equinox as eqx
@@ -40,6 +41,7 @@ from hilbo.population.tallies import tallied
 
 __all__ = [
     "Learnt",
+    "drawn_functions",
     "learn",
     "learnt_function",
 ]
@@ -49,6 +51,7 @@ _NEAR = 2e-6  # of the evidence: another choice of features moves it as much as 
 _WORTH = 3.0  # log Bayes factor from which people have widths of their own, about 20 to 1
 _LARGEST = 256  # features: functions that need more are too rugged to be shared by few answers
 _ROUGH = 0.05
+_AT_A_TIME = 2  # draws: much of their arithmetic is of one core
 _WHOLE = 32  # people, up to whom the curvature in all widths is made: a gradient or two each
 
 
@@ -65,6 +68,8 @@ class Learnt(eqx.Module):
     """Logarithms in units of the noise, and the middle of the thresholds, as in the priors."""
     sd: Coordinates
     """Standard deviations of their posterior."""
+    covariance: Float[Array, "k k"]
+    """Of their posterior, without widths: one after the other, as `ravel_pytree` has them."""
     gain_of_widths: Float[Array, ""]
     """What widths of people's own add to the log evidence; they are in the model if it is above 3."""
     steps: Int[Array, ""]
@@ -89,6 +94,30 @@ def learnt_function(learnt: Learnt, trials: Trials) -> Posterior:
     """The posterior of the shared function by learnt hyperparameters, from stacked trials (M, n)."""
     answers = tallied(trials, learnt.model.thresholds.size + 1)
     return shared_function(learnt.model, answers, learnt.weights, rank_for(learnt.model.unit, answers))
+
+
+def drawn_functions(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count: int) -> list[Posterior]:
+    """Posteriors of the shared function by `count` draws of the hyperparameters from their posterior, taken for normal;
+    widths stay as learnt. None where the search ended at no maximum, which that approximation does not describe.
+
+    **Arguments:** `trials` and `stated`: those that were learnt from.
+    """
+    values, vectors = np.linalg.eigh(np.asarray(learnt.covariance + learnt.covariance.T) / 2)
+    if not np.all(values > 0):
+        return []
+    flat, restore = ravel_pytree({name: value for name, value in learnt.coordinates.items() if name != "widths"})
+    widths = {name: value for name, value in learnt.coordinates.items() if name == "widths"}
+    steps = np.random.default_rng([seed, count]).standard_normal((count, flat.size)) * np.sqrt(values) @ vectors.T
+    answers, unit = tallied(trials, learnt.model.thresholds.size + 1), learnt.model.unit
+    rank = rank_for(unit, answers)
+
+    def function(step: Float[np.ndarray, " k"]) -> Posterior:
+        model = model_at(widths | restore(flat + step), answers, stated, type(unit))
+        return jax.block_until_ready(shared_function(model, answers, learnt.weights, rank))
+
+    with ThreadPoolExecutor(_AT_A_TIME) as pool:
+        functions = list(pool.map(function, steps))
+    return [each for each in functions if bool(each.certificate.converged)]
 
 
 def learn(
@@ -120,13 +149,15 @@ def learn(
         if gain > _WORTH:
             chosen, free, problem = different, frozenset(start), wider
     end = cost_at(chosen.coordinates, chosen.weights, problem, chosen.coordinates)
+    sd, covariance = _spread(chosen.coordinates, end, problem, free)
     return Learnt(
         recipe=recipe.name,
         model=model_at(chosen.coordinates, answers, stated, recipe.kernel),
         weights=end.weights,
         log_evidence=end.log_evidence,
         coordinates={name: value for name, value in chosen.coordinates.items() if name in free},
-        sd=_standard_deviations(chosen.coordinates, end, problem, free),
+        sd=sd,
+        covariance=covariance,
         gain_of_widths=jnp.asarray(gain),
         steps=jnp.asarray(chosen.steps),
         rank=jnp.asarray(problem.rank),
@@ -202,9 +233,12 @@ def _gain_of_widths(alike: _Search, different: _Search, problem: Problem) -> flo
     return costs[0] - costs[1] - float(np.sum(np.log(problem.priors["widths"].sd * np.sqrt(curvature))))
 
 
-def _standard_deviations(coordinates: Coordinates, end: Cost, problem: Problem, free: Set[str]) -> Coordinates:
-    """Of the posterior of what is `free`, taken for normal: its curvature from differences of gradients with that at
-    the `end` of the search. Infinite where the curvature says that there is no maximum.
+def _spread(
+    coordinates: Coordinates, end: Cost, problem: Problem, free: Set[str]
+) -> tuple[Coordinates, Float[Array, "k k"]]:
+    """Standard deviations of the posterior of what is `free`, taken for normal, and the covariance without widths: its
+    curvature from differences of gradients with that at the `end` of the search. Standard deviations are infinite where
+    the curvature says that there is no maximum.
 
     Widths of many people are taken for independent given the rest. What stands for each one's curvature is then its row
     of the Hessian added up, which keeps that of all widths together: they may rise where the gaps fall.
@@ -223,7 +257,8 @@ def _standard_deviations(coordinates: Coordinates, end: Cost, problem: Problem, 
     columns = [difference(restore(unit)) for unit in jnp.eye(flat.size, dtype=flat.dtype)]
     hessian = np.stack([of_common(column) for column in columns])
     if "widths" not in free:
-        return restore(jnp.asarray(_root_of_diagonal(np.linalg.inv(hessian))))
+        covariance = np.linalg.inv(hessian)
+        return restore(jnp.asarray(_root_of_diagonal(covariance))), jnp.asarray(covariance)
     mixed = np.stack([np.asarray(column["widths"]) for column in columns])
     widths = coordinates["widths"]
     if widths.size <= _WHOLE:
@@ -233,8 +268,9 @@ def _standard_deviations(coordinates: Coordinates, end: Cost, problem: Problem, 
         curvature = np.stack([np.asarray(row) for row in columns_of_widths])
     else:
         curvature = np.diag(np.asarray(difference({"widths": jnp.ones_like(widths)})["widths"]))
-    sd = _root_of_diagonal(np.linalg.inv(np.block([[hessian, mixed], [mixed.T, curvature]])))
-    return restore(jnp.asarray(sd[: flat.size])) | {"widths": jnp.asarray(sd[flat.size :])}
+    covariance = np.linalg.inv(np.block([[hessian, mixed], [mixed.T, curvature]]))
+    sd, k = _root_of_diagonal(covariance), flat.size
+    return restore(jnp.asarray(sd[:k])) | {"widths": jnp.asarray(sd[k:])}, jnp.asarray(covariance[:k, :k])
 
 
 def _root_of_diagonal(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, " k"]:

@@ -93,7 +93,7 @@ def result(
     """The content of result.json."""
     people = people_of(study, aggregate) if people is None else people
     best, whole = aggregate.optimum, None if isinstance(aggregate, LargeAggregate) else aggregate
-    region = None if whole is None else optimum_region(study, whole.map, seed)
+    region = None if whole is None else optimum_region(study, whole.map, whole.cohort.trials, seed)
     check = None if whole is None else model_check(study, whole)
     content = {
         "optimum": optimum_content(study, best) | {"location": _location(study, aggregate, study.rule, best)},

@@ -113,7 +113,7 @@ def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) ->
     """
     if map_.centred:
         assert map_.shared is not None
-        places = best_places(study.space, map_.shared)
+        places = best_places(study.space, [map_.shared])
         return _centre(study.gp.likelihood, study.space, map_, candidates, places.points, places.share)
     return _map_optimum(study.gp.likelihood, study.space, _nameless(map_), candidates)
 

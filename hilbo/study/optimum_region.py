@@ -1,7 +1,8 @@
 """Where the best rendering lies as far as the answers tell: a region that holds it with 95 %.
 
 Joint draws of the map's shared function say where it is largest; the points that are most often largest, until 95 % of
-the draws are among them, are the region. The points are spread evenly over the feasible set, its walls included.
+the draws are among them, are the region. The points are spread evenly over the feasible set, its walls included. Where
+hyperparameters are learnt they are drawn too: taken as learnt, they leave the region too small.
 """
 
 from typing import Any, NamedTuple
@@ -11,10 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from hilbo.kernels import Stationary, embedded
+from hilbo.ordinal_gp import Trials
+from hilbo.population.learnt import drawn_functions
 from hilbo.population.maps import RuleMap
 from hilbo.search.box import Parameter
 from hilbo.search.rendering import set_of
-from hilbo.study.best_places import POINTS, best_places
+from hilbo.study.best_places import DRAWS, POINTS, best_places
 from hilbo.study.config import Study
 from hilbo.study.hills import Hill, hills_of
 
@@ -23,6 +26,8 @@ __all__ = ["Region", "optimum_region", "region_content", "region_sentences"]
 PROBABILITY = 0.95
 _LOCATED = 0.25  # of the feasible set: a larger region locates nothing
 _RIVAL = 0.2  # of the draws on another hill
+_HYPERPARAMETERS = 16  # draws of them
+_DRAWS = 16 * DRAWS  # fewer scatter over many points, and the region is too small (docs/methods/which_method.md)
 
 
 class Region(NamedTuple):
@@ -49,13 +54,18 @@ class Region(NamedTuple):
         return bool(near <= far)
 
 
-def optimum_region(study: Study, map_: RuleMap, seed: int = 0, count: int = POINTS) -> Region | None:
+def optimum_region(study: Study, map_: RuleMap, trials: Trials, seed: int = 0, count: int = POINTS) -> Region | None:
     """The region, of `count` even points of the feasible set and a quarter as many on its walls; None for maps without
-    a joint posterior (those that are aggregated point by point)."""
+    a joint posterior (those that are aggregated point by point). `trials`: everybody's, stacked, of which the map is.
+    """
     if map_.shared is None:
         return None
-    places = best_places(study.space, map_.shared, seed, count)
-    points, weight, mean, sd = map(np.asarray, places)
+    functions = [map_.shared]
+    if study.learnt is not None:
+        functions = drawn_functions(study.learnt, trials, study.stated, seed, _HYPERPARAMETERS) or functions
+    places = best_places(study.space, functions, seed, count, _DRAWS)
+    mean, variance = map_.predict(places.points)
+    points, weight, mean, sd = map(np.asarray, (*places, mean, np.sqrt(variance)))
     order = np.argsort(-weight, kind="stable")
     held = int(np.searchsorted(np.cumsum(weight[order]), PROBABILITY)) + 1
     inside = np.zeros(len(weight), bool)

@@ -1,5 +1,6 @@
 """learnt-1: a maximum by another way of computing it, what is stated stays, and what cannot be learnt is said."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,8 +10,8 @@ from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.kernels import Matern32
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
-from hilbo.population.learnt import learn, learnt_function
-from hilbo.population.learnt_posterior import Stated, prior_model
+from hilbo.population.learnt import drawn_functions, learn, learnt_function
+from hilbo.population.learnt_posterior import NOTHING, Stated, prior_model
 from hilbo.population.recipes import LEARNT_1, LEARNT_2
 
 PEOPLE, ANSWERS = 4, 12
@@ -88,6 +89,25 @@ def test_curvature_gives_the_standard_deviations(learnt):
     names = ("theta", "shared", "own", "middle", "gaps")
     said = np.concatenate([np.atleast_1d(np.asarray(learnt.sd[k])) for k in names])
     np.testing.assert_allclose(said, by_differences, rtol=0.05)
+
+
+def test_drawn_functions_have_the_hyperparameters_of_the_posterior(learnt):
+    drawn = drawn_functions(learnt, answers(), NOTHING, 0, 100)
+    assert len(drawn) == 100
+    log_theta = np.log([np.asarray(each.gp.kernel.theta) for each in drawn])
+    learnt_theta = np.log(np.asarray(learnt.model.theta))
+    standardised = (log_theta - learnt_theta) / np.asarray(learnt.sd["theta"])
+    np.testing.assert_allclose(standardised.mean(axis=0), 0.0, atol=0.4)  # 4 standard errors
+    np.testing.assert_allclose(standardised.std(axis=0), 1.0, atol=0.3)
+    correlation = learnt.covariance[-2, -1] / np.prod(np.asarray(learnt.sd["theta"]))
+    np.testing.assert_allclose(np.corrcoef(log_theta.T)[0, 1], correlation, atol=0.4)
+    means = np.stack([np.asarray(each.predict(np.full((1, 2), 0.5))[0]) for each in drawn[:2]])
+    assert means[0] != means[1]
+
+
+def test_no_functions_are_drawn_where_the_search_ended_at_no_maximum(learnt):
+    saddle = eqx.tree_at(lambda each: each.covariance, learnt, learnt.covariance.at[0, 0].multiply(-1.0))
+    assert drawn_functions(saddle, answers(), NOTHING, 0, 4) == []
 
 
 def test_the_map_is_that_of_the_dense_model(learnt):

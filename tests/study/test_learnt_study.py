@@ -61,7 +61,7 @@ def test_learnt_2_seeks_its_optimum_where_the_best_is_most_often_near(table):  #
     study = resolved(study, cohort)
     map_, x = learnt_map(study.learnt, cohort.trials), search_points(study.space, 0)
     optimum = map_optimum(study, map_, x)
-    places = best_places(study.space, map_.shared)
+    places = best_places(study.space, [map_.shared])
     theta, away = np.asarray(map_.shared.gp.kernel.theta), np.asarray(x)[:, None] - np.asarray(places.points)
     near = np.exp(-4 * np.sum(theta * away**2, axis=2)) @ np.asarray(places.share)
     chance = np.asarray(map_.class_probabilities(study.gp.likelihood, x))[:, -1]

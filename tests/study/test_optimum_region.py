@@ -12,6 +12,7 @@ from hilbo.study.optimum_region import Region, optimum_region, region_content, r
 
 STUDY = Study.load("hilbo/data/video_quality.toml")
 THETA = np.array([6.0, 6.0])
+NOBODY = Trials.from_arrays(np.zeros((0, 2)), np.zeros(0, int), 4)
 
 
 def region_of(count, seed=0, points=200):
@@ -22,7 +23,9 @@ def region_of(count, seed=0, points=200):
     felt = 2.0 - 12.0 * ((x - [0.3, 0.6]) ** 2).sum(axis=1) + 0.5 * rng.normal(size=count)
     posterior = fit(gp, Trials.from_arrays(x, (felt > -0.5).astype(int) + (felt > 0.5), 64))
     one = jnp.ones(())
-    return optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), seed, points)
+    return optimum_region(
+        STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), posterior.trials, seed, points
+    )
 
 
 def test_more_answers_leave_less_and_hold_the_best():
@@ -48,7 +51,7 @@ def test_an_unlocated_optimum_says_so():
 
 def test_maps_by_points_have_none():
     one = jnp.ones(())
-    assert optimum_region(STUDY, RuleMap("bcm", "by points", None, None, one, one)) is None
+    assert optimum_region(STUDY, RuleMap("bcm", "by points", None, None, one, one), NOBODY) is None
     assert region_content(STUDY, None) is None
 
 
@@ -83,7 +86,9 @@ def test_the_best_is_in_it_as_often_as_it_says():
         z = f[:40] + 0.5 * rng.normal(size=40)
         posterior = fit(gp, Trials.from_arrays(x[:40], (z > -0.5).astype(int) + (z > 0.5), 64))
         one = jnp.ones(())
-        region = optimum_region(STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), seed)
+        region = optimum_region(
+            STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), posterior.trials, seed
+        )
         assert region is not None
         held += region.holds(grid[np.argmax(f[40:])], RBF(THETA))
     assert held >= 0.95 * 25 - 3 * np.sqrt(25 * 0.95 * 0.05)
