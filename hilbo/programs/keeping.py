@@ -32,10 +32,7 @@ class _Ready(NamedTuple):
     structure: Any
 
     def __call__(self, arrays: Sequence[Any]) -> Any:
-        return self.around(self.run(*arrays))
-
-    def around(self, results: Sequence[Any]) -> Any:
-        """What the function returns of the arrays computed."""
+        results = self.run(*arrays)
         return jax.tree.map(
             lambda leaf: results[leaf.number] if isinstance(leaf, _Array) else leaf,
             self.structure,
@@ -71,25 +68,23 @@ class Programs:
             if key not in self._known:
                 with self._finding.setdefault(key, threading.RLock()):
                     if key not in self._known:
-                        self._known[key], computed = self._find(function, args, kwargs)
-                        if computed is not None:  # of this call's arrays: it is not computed once more
-                            return lambda _: computed
+                        self._known[key] = self._find(function, args, kwargs)
         except TypeError:  # something that cannot be hashed; what is wrong with the call itself is met again there
             return None
         return self._known[key]
 
-    def _find(self, function, args, kwargs) -> tuple[_Ready | None, Any]:
-        """From its entry, or made, then with what the call returns; None if there is no way to keep it."""
+    def _find(self, function, args, kwargs) -> _Ready | None:
+        """From its entry, or made; None if there is no way to keep it."""
         if jax.device_count() > 1:
-            return None, None
+            return None
         try:
             words = f"{self._around}\n{describe(function, args, kwargs)}"
         except NotKeptError:
-            return None, None
+            return None
         entry = self._entries.read(words)
-        return self._make(words, function, args, kwargs) if entry is None else (_ready(entry), None)
+        return self._make(words, function, args, kwargs) if entry is None else _ready(entry)
 
-    def _make(self, words, function, args, kwargs) -> tuple[_Ready | None, Any]:
+    def _make(self, words, function, args, kwargs) -> _Ready | None:
         leaves, tree = jax.tree.flatten((args, kwargs))
         structure = []
 
@@ -111,14 +106,13 @@ class Programs:
             code, given, returned = serialize_executable.serialize(compiled)
             entry = Entry(words, pickle.dumps((given, returned, structure[-1])), code)
             ready = _ready(entry)
-            results = ready.run(*arrays)
-            if _bits(results) != _bits(compiled(*arrays)):
-                return None, None
+            if _bits(ready.run(*arrays)) != _bits(compiled(*arrays)):
+                return None
         except Exception:  # it cannot be written; a mistake of its own is met again when it is compiled
-            return None, None
+            return None
         if code_digest(self._package) == self._code:  # else somebody edits it while this runs
             self._entries.write(entry)
-        return ready, ready.around(results)
+        return ready
 
 
 class _CompiledHere:

@@ -49,6 +49,10 @@ def shown(x):
     return x
 
 
+def twice(x):
+    return 2.0 * x
+
+
 @program
 def wrong(x):
     raise ValueError("a mistake of its own")
@@ -102,6 +106,17 @@ def test_the_second_process_traces_nothing_and_gives_the_same(kept):
             np.testing.assert_array_equal(a, b)
             assert getattr(a, "dtype", None) == getattr(b, "dtype", None)
             assert getattr(a, "weak_type", False) == getattr(b, "weak_type", False)
+
+
+@pytest.mark.parametrize("made", [True, False])
+def test_a_program_that_was_prepared_with_some_arrays_is_of_all(kept, made):
+    keeper = Programs(kept(), Path(__file__).parent)
+    if not made:
+        keeper(twice, (X,), {})
+        keeper = Programs(kept(), Path(__file__).parent)
+    of_arrays = keeper(twice, (X,), {})
+    assert of_arrays is not None
+    np.testing.assert_array_equal(of_arrays([X + 1.0]), 2.0 * (X + 1.0))
 
 
 def test_random_keys_go_in_and_out(kept):
