@@ -20,6 +20,7 @@ from hilbo.search.rendering import set_of
 from hilbo.study.best_places import DRAWS, POINTS, best_places
 from hilbo.study.config import Study
 from hilbo.study.hills import Hill, hills_of
+from hilbo.study.optima import predict_map
 
 __all__ = ["Region", "optimum_region", "region_content", "region_sentences"]
 
@@ -64,13 +65,13 @@ def optimum_region(study: Study, map_: RuleMap, trials: Trials, seed: int = 0, c
     if study.learnt is not None:
         functions = drawn_functions(study.learnt, trials, study.stated, seed, _HYPERPARAMETERS) or functions
     places = best_places(study.space, functions, seed, count, _DRAWS)
-    mean, variance = map_.predict(places.points)
-    points, weight, mean, sd = map(np.asarray, (*places, mean, np.sqrt(variance)))
+    points, weight = map(np.asarray, places)
+    mean, variance = map(np.asarray, predict_map(map_, places.points))
     order = np.argsort(-weight, kind="stable")
     held = int(np.searchsorted(np.cumsum(weight[order]), PROBABILITY)) + 1
     inside = np.zeros(len(weight), bool)
     inside[order[:held]] = True
-    hills = hills_of(np.asarray(study.space.to_box(places.points)), mean, sd, weight, study.gp.kernel)
+    hills = hills_of(np.asarray(study.space.to_box(places.points)), mean, np.sqrt(variance), weight, study.gp.kernel)
     return Region(points[inside], points[~inside], float(inside[:count].mean()), hills)
 
 
