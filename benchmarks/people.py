@@ -9,6 +9,9 @@ orientations are rounded to cells of --cell degrees (at most 20 degrees), answer
 middle; the held-out answers are predicted where they were given. No answer is left out and nothing is drawn at random
 but the randomised probability integral transform (seed 0).
 
+Of the clips, learnt-2 also learns a random effect: people who are left out are then predicted in the clips that others
+saw, and beside the table stands how well answers to a clip are predicted that nobody saw.
+
 Hyperparameters maximise the evidence of the hierarchical model on the training people of each fold, noise 1 (the scale
 of f is free), and serve every rule but learnt-1, which learns its own there. Beside the rules stand the training
 people's frequencies of the categories, and an ordinal probit that is quadratic in the two standardised parameters.
@@ -36,8 +39,9 @@ from hilbo.population.hierarchical_evidence import learn_people  # noqa: E402
 from hilbo.population.learnt import learn  # noqa: E402
 from hilbo.population.leave_one_out import clustered, integral_transform  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
+from hilbo.population.newcomer import class_probabilities  # noqa: E402
 from hilbo.population.pointwise import RULES, aggregate  # noqa: E402
-from hilbo.population.recipes import LEARNT_1, RECIPES  # noqa: E402
+from hilbo.population.recipes import LEARNT_1, LEARNT_2, RECIPES  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 WORDS = {
@@ -47,12 +51,13 @@ WORDS = {
     "probit": "*quadratic ordinal probit*",
     "marginal": "*frequencies of the categories*",
 }
+EFFECT = "learnt-2, clips a random effect"
 
 
 class Data:
     """Answers q of persons `who` at points x, and the points `cell` at which they count for a fit; all in [0, 1]."""
 
-    def __init__(self, x, cell, q, who, categories):
+    def __init__(self, x, cell, q, who, categories, context=None):
         low, high = x.min(axis=0), x.max(axis=0)
         self.x, self.q, self.categories = (x - low) / (high - low), q, categories
         self.names, self.who = np.unique(who, return_inverse=True)
@@ -61,20 +66,22 @@ class Data:
         counts = np.zeros((len(self.names), len(self.points), categories))
         np.add.at(counts, (self.who, self.place, q), 1.0)
         self.counts = Counts(jnp.asarray(self.points), jnp.asarray(counts))
+        self.context = None if context is None else np.unique(context, return_inverse=True)[1]
 
-    def trials(self, people):
-        """Stacked answers of some people, at the points at which they count."""
-        each = [np.flatnonzero(self.who == person) for person in people]
-        longest = max(map(len, each))
-        stacked = [Trials.from_arrays(self.points[self.place[rows]], self.q[rows], longest) for rows in each]
-        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *stacked)
+    def trials(self, given, effect=False):
+        """Stacked answers of everybody as far as they are `given` (n,), at the points at which they count."""
+        each = [np.flatnonzero(self.who == person) for person in range(len(self.names))]
+        rows = np.stack([np.resize(own, max(map(len, each))) for own in each])
+        mask = given[rows] & (np.arange(rows.shape[1])[None, :] < np.array(list(map(len, each)))[:, None])
+        context = jnp.asarray(self.context[rows]) if effect else None
+        return jax.vmap(Trials)(jnp.asarray(self.points[self.place[rows]]), jnp.asarray(self.q[rows]), mask, context)
 
 
 def video(path, _):
     table = pd.read_csv(path)
     table = table[table["is_reference"] == 0]
     x = np.log(table[["bitrate_kbps", "height_px"]].to_numpy(float))
-    return Data(x, x, table["rating"].to_numpy() - 1, table["observer"].to_numpy(), 5)
+    return Data(x, x, table["rating"].to_numpy() - 1, table["observer"].to_numpy(), 5, table["content"].to_numpy())
 
 
 def orientation(path, cell):
@@ -141,7 +148,9 @@ def main():
         x = jnp.asarray(data.x[rows])
         found = predicted(learnt.gp, learnt.share, counts, None, jnp.asarray(mask), x)
         found = {rule: np.asarray(p)[: test.sum()] for rule, p in found.items()}
-        by_recipe = {name: by(recipe, data, np.flatnonzero(mask), data.x[test]) for name, recipe in RECIPES.items()}
+        by_recipe = {name: by(recipe, data, test) for name, recipe in RECIPES.items()}
+        if data.context is not None:
+            by_recipe[EFFECT] = by(LEARNT_2, data, test, effect=True)
         found |= {name: chance for name, (chance, _) in by_recipe.items()}
         wide.append(by_recipe[LEARNT_1.name][1])
         found["probit"] = quadratic(data.x, data.q, data.categories, ~test)[test]
@@ -150,18 +159,42 @@ def main():
             chances.setdefault(rule, np.zeros((len(data.q), data.categories)))[test] = p
         print(data.names[left], f"{time.perf_counter() - begun:.0f} s, share {shares[-1]:.3f}", flush=True)
     text = table(chosen, data, chances, everybody, shares, wide)
+    if data.context is not None:
+        text += of_new_contexts(data)
     print(text)
     if chosen.write:
         put("methods/aggregation.md", chosen.data, text)
 
 
-def by(recipe, data, people, x):
-    """Class probabilities (n, C) of a new person at x, and whether people have widths of their own."""
-    trials = data.trials(people)
+def by(recipe, data, test, effect=False):
+    """Class probabilities (n, C) of the answers `test` from all others, and whether people have widths of their own."""
+    trials = data.trials(~test, effect)
     learnt = learn(trials, data.categories, recipe=recipe)
     if not bool(learnt.converged):
         print(f"{recipe.name}: the search did not end well", flush=True)
-    return np.asarray(learnt_map(learnt, trials).class_probabilities(learnt.model.gp.likelihood, x)), learnt.widths
+    context = jnp.asarray(data.context[test]) if effect else None
+    mean, variance = learnt_map(learnt, trials).newcomer(jnp.asarray(data.x[test]), context)
+    return np.asarray(class_probabilities(learnt.model.gp.likelihood, mean, variance, learnt.widths)), learnt.widths
+
+
+def of_new_contexts(data):
+    """Two sentences: answers to each clip, predicted from those to the others, without and with the random effect."""
+    cost, inside = [], []
+    for effect in (False, True):
+        chances = np.zeros((len(data.q), data.categories))
+        for context in np.unique(data.context):
+            test = data.context == context
+            chances[test] = by(LEARNT_2, data, test, effect)[0]
+        cost.append(-np.log(chances[np.arange(len(data.q)), data.q]))
+        u = integral_transform(chances, data.q, 0)
+        inside.append(clustered(((u > 0.025) & (u < 0.975)).astype(float), data.context))
+    gain, error = clustered(cost[0] - cost[1], data.context)
+    (less, less_error), (more, more_error) = inside
+    return (
+        f"\nAnswers to a clip that nobody saw cost {cost[0].mean():.3f} nats without and {cost[1].mean():.3f} with the"
+        f" random effect (gain {gain:+.3f} ± {error:.3f}, errors by clip); {100 * less:.1f} ± {100 * less_error:.1f} %"
+        f" and {100 * more:.1f} ± {100 * more_error:.1f} % of them lie within the central 95 %.\n"
+    )
 
 
 def describe(learnt):

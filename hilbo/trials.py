@@ -33,6 +33,8 @@ class Trials(eqx.Module):
     x: Float[Array, "n d"]
     q: Int[Array, " n"]
     mask: Bool[Array, " n"]
+    context: Int[Array, " n"] | None = None
+    """What else was the case at each answer, such as the clip, as a number from 0: the level of a random effect."""
 
     @classmethod
     def from_arrays(cls, x: ArrayLike, q: ArrayLike, capacity: int | None = None) -> "Trials":
@@ -73,6 +75,7 @@ class Trials(eqx.Module):
 
     def append(self, x: Float[Array, " d"], q: ArrayLike) -> "Trials":
         """With one more answer in the first free row: the shapes stay, nothing recompiles. A full table becomes NaN.
+        Contexts are not kept.
 
         `x` (d,) in the unit cube, `q` a category in 0..C-1.
         """
@@ -87,7 +90,7 @@ class Trials(eqx.Module):
     def first(self, count: ArrayLike) -> "Trials":
         """Only the first `count` rows, with the same capacity. `count`: an int, from 0 to the capacity."""
         keep = jnp.arange(self.capacity) < count
-        return Trials(self.x, self.q, self.mask & keep)
+        return Trials(self.x, self.q, self.mask & keep, self.context)
 
 
 def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:

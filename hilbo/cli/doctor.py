@@ -23,6 +23,7 @@ Level = Literal["good", "note", "bad"]
 _PARTS = ("hilbo", "jax", "jaxlib", "equinox", "numpy", "starlette", "uvicorn", "pyserial")
 _OPTIONAL = {"starlette": "live", "uvicorn": "live", "pyserial": "hardware"}
 _BROWSERS = ("chromium", "google-chrome", "chromium-browser", "firefox", "msedge", "open")
+_SESSION_COLUMNS = ("session", "phase", "material")  # of their tables, which may be random effects
 _ROOM = 200  # MB; a session's log is below one
 _SLOW = 0.5  # s for a step: a participant would notice
 _JOINS = 120.0  # s that the program that presents has to join
@@ -58,6 +59,7 @@ def checks(
         check, file = _study_file(study)
         yield check
     if file is not None:
+        yield from _random_effect(file)
         yield from _language(file)
     yield from _device(connect, file) if file is None or file.stimulus is None else _stimulus(file)
     begin()
@@ -139,6 +141,14 @@ def _study_file(path: Path) -> tuple[Check, Any]:
         return Check("study", "bad", str(error), "fix the study file"), None
     words = f"{file.name}, {file.selection.trials} trials, hash {file.hash}"
     return Check("study", "good", words), file
+
+
+def _random_effect(file: Any) -> Iterator[Check]:
+    """A note where the study names a column that tables of sessions do not have."""
+    name = file.random_effect
+    if name is not None and name not in _SESSION_COLUMNS:
+        fix = "add it to the table of answers before it is aggregated"
+        yield Check("random effect", "note", f'tables of sessions have no column "{name}"', fix)
 
 
 def _precision() -> Check:

@@ -126,10 +126,12 @@ def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior], kerne
         "middle": jnp.asarray(priors["middle"].mean, dtype),
         "gaps": jnp.full(categories - 2, priors["gaps"].mean, dtype),
         "widths": jnp.full(people, priors["widths"].mean, dtype),
+        "effect": jnp.asarray(priors["effect"].mean, dtype),
     }
     kept = {"theta"} if stated.theta is not None else set()
     kept |= {"middle", "gaps"} if stated.thresholds is not None else set()
     kept |= {"widths"} if categories < 3 else set()
+    kept |= {"effect"} if answers.context is None else set()
     return {name: value for name, value in every.items() if name not in kept and value.size}
 
 
@@ -155,7 +157,8 @@ def model_at(coordinates: Coordinates, answers: Tallies, stated: Stated, kernel:
     else:
         thresholds = jnp.asarray(stated.thresholds, dtype)
     widths = coordinates.get("widths", jnp.zeros(people, dtype))
-    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel, stated.counts)
+    effect = noise**2 * jnp.exp(coordinates["effect"]) if "effect" in coordinates else None
+    return PeopleModel(theta, shared, own, thresholds, noise, widths, kernel, stated.counts, effect)
 
 
 def _log_prior(coordinates: Coordinates, problem: Problem) -> Float[Array, ""]:

@@ -136,7 +136,8 @@ def left_out_by(
         gp, map_without = fold(group)
         maps.append(map_without)
         for person in group:
-            for part, values in zip((rows, again), _newcomer(gp, map_without, placed(x[person])), strict=True):
+            context = None if trials.context is None else trials.context[person]
+            for part, values in zip((rows, again), _newcomer(gp, map_without, placed(x[person]), context), strict=True):
                 part.append(np.asarray(values)[mask[person]])
             persons.append(np.full(mask[person].sum(), person))
             categories.append(q[person][mask[person]])
@@ -221,11 +222,11 @@ def _predict(population_map: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Arr
 
 @program
 def _newcomer(
-    gp: OrdinalGP, population_map: RuleMap, x: Float[Array, "m d"]
+    gp: OrdinalGP, population_map: RuleMap, x: Float[Array, "m d"], context: Int[Array, " m"] | None
 ) -> tuple[Float[Array, "m C"], Float[Array, " m"]]:
     """Class probabilities (m, C) of a new person's answers, and the probability (m,) that two of them there agree (with
     the median widths)."""
-    mean, variance = population_map.newcomer(x)
+    mean, variance = population_map.newcomer(x, context)
     levels = mean[:, None] + jnp.sqrt(variance)[:, None] * jnp.asarray(_NODES, mean.dtype)[None, :]
     given = jax.vmap(jax.vmap(gp.likelihood.class_probabilities))(levels, jnp.zeros_like(levels))
     agree = jnp.sum(given**2, axis=2) @ jnp.asarray(_WEIGHTS, mean.dtype)

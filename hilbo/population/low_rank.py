@@ -9,6 +9,8 @@ are approximate. All answers then have the covariance
 
     K = F F' + blockdiag(K_j),   F_j = shared^(1/2) phi(x_j)',   K_j = own k(x_j, x_j) + what F_j F_j' lacks,
 
+a random effect u_c of context c, such as the clip, is one more feature, effect^(1/2) where an answer is of it,
+
 and with W the curvatures, L_j L_j' = I + W_j^(1/2) K_j W_j^(1/2), A_j = L_j^-1 W_j^(1/2) F_j and S = I + sum_j A_j'A_j
 every system is solved by blocks of one person's answers and one of r x r: M n^3 + M n^2 r + M n r^2 + r^3 in place of
 (M n)^3. S is the posterior precision of the weights of g, g(x) = shared^(1/2) phi(x)'w.
@@ -28,20 +30,23 @@ from jax.scipy.linalg import solve_triangular
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
 from hilbo.kernels import gram
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.numerics.linalg import eigh
-from hilbo.numerics.tracing import program
-from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.people_model import PeopleModel
-from hilbo.population.shared_features import TOLERANCE, Pivots, features_of, pivots_of, root_of_pivots
+from hilbo.population.shared_features import TOLERANCE, Pivots, features_of, pivots_of
 from hilbo.population.tallies import Expansion, Tallies, expand_counts
 
 __all__ = [
+    "LowRankPrior",
+    "Mode",
     "SharedEvidence",
+    "System",
+    "evidence_at",
+    "mode_of",
+    "newton_step",
+    "prior_of",
     "shared_evidence",
-    "shared_function",
+    "system_at",
 ]
 
 _STEPS, _HALVINGS = 60, 40
@@ -50,7 +55,7 @@ _STEPS, _HALVINGS = 60, 40
 # --- the prior, and what answers make of it
 
 
-class _Prior(NamedTuple):
+class LowRankPrior(NamedTuple):
     """K = F F' + blockdiag(K_j)."""
 
     features: Float[Array, "M n r"]
@@ -62,7 +67,7 @@ class _Prior(NamedTuple):
         return self.features @ together + jnp.einsum("jnm,jm->jn", self.blocks, weights)
 
 
-class _System(NamedTuple):
+class System(NamedTuple):
     root: Float[Array, "M n"]  # W^(1/2)
     lower: Float[Array, "M n n"]  # L_j
     half: Float[Array, "M n r"]  # A_j
@@ -78,7 +83,7 @@ class _System(NamedTuple):
         return self.root * jax.lax.map(lambda p: solve_triangular(p[0], p[1], lower=True, trans=1), (self.lower, rest))
 
 
-def _prior(model: PeopleModel, answers: Tallies, pivots: Pivots) -> _Prior:
+def prior_of(model: PeopleModel, answers: Tallies, pivots: Pivots) -> LowRankPrior:
     kernel = model.unit
     unit = features_of(kernel, pivots, answers.x)
 
@@ -87,10 +92,14 @@ def _prior(model: PeopleModel, answers: Tallies, pivots: Pivots) -> _Prior:
         covariance = gram(kernel, x, x)
         return model.own * covariance + model.shared * (covariance - own_features @ own_features.T)
 
-    return _Prior(jnp.sqrt(model.shared) * unit, jax.lax.map(block, (answers.x, unit)))
+    features = jnp.sqrt(model.shared) * unit
+    if model.effect is not None:
+        of_context = jax.nn.one_hot(answers.context, answers.contexts, dtype=unit.dtype)
+        features = jnp.concatenate([features, jnp.sqrt(model.effect) * of_context], axis=-1)
+    return LowRankPrior(features, jax.lax.map(block, (answers.x, unit)))
 
 
-def _system(prior: _Prior, curvature: Float[Array, "M n"]) -> _System:
+def system_at(prior: LowRankPrior, curvature: Float[Array, "M n"]) -> System:
     answered = curvature > 0
     root = jnp.where(answered, jnp.sqrt(jnp.where(answered, curvature, 1.0)), 0.0)
     unit = jnp.eye(root.shape[1], dtype=root.dtype)
@@ -104,7 +113,7 @@ def _system(prior: _Prior, curvature: Float[Array, "M n"]) -> _System:
     precision = jnp.eye(half.shape[2], dtype=root.dtype) + flat.T @ flat
     factor = jnp.linalg.cholesky(precision)
     logs = jnp.sum(jnp.log(jnp.diagonal(lower, axis1=1, axis2=2))) + jnp.sum(jnp.log(jnp.diagonal(factor)))
-    return _System(root, lower, half, precision, factor, 2.0 * logs)
+    return System(root, lower, half, precision, factor, 2.0 * logs)
 
 
 def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> Expansion:
@@ -119,19 +128,19 @@ def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> E
 # --- the mode
 
 
-class _Mode(NamedTuple):
+class Mode(NamedTuple):
     weights: Float[Array, "M n"]
     residual: Float[Array, ""]
     tolerance: Float[Array, ""]
     steps: Int[Array, ""]
 
 
-def _newton_step(
-    model: PeopleModel, answers: Tallies, prior: _Prior, weights: Float[Array, "M n"]
-) -> tuple[Float[Array, "M n"], _System]:
+def newton_step(
+    model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]
+) -> tuple[Float[Array, "M n"], System]:
     """a + r - (K + W^-1)^-1 K r, r = slope - a: an error of the step is one of r's size."""
     terms = _expand(model, answers, prior.times(weights))
-    system = _system(prior, terms.curvature)
+    system = system_at(prior, terms.curvature)
     off = terms.slope - weights
     return weights + off - system.solve(prior.times(off)), system
 
@@ -153,7 +162,7 @@ class _Search(NamedTuple):
 
 
 def _height(
-    model: PeopleModel, answers: Tallies, prior: _Prior, sizes: _Prior, weights: Float[Array, "M n"]
+    model: PeopleModel, answers: Tallies, prior: LowRankPrior, sizes: LowRankPrior, weights: Float[Array, "M n"]
 ) -> _Height:
     """`sizes`: of the numbers of the prior, because latent values are sums whose terms may cancel."""
     epsilon = jnp.finfo(weights.dtype).eps
@@ -169,7 +178,7 @@ def _height(
     return _Height(value, size + 0.5 * jnp.abs(jnp.sum(weights * eta)), residual, tolerance)
 
 
-def _mode(model: PeopleModel, answers: Tallies, prior: _Prior, start: Float[Array, "M n"]) -> _Mode:
+def mode_of(model: PeopleModel, answers: Tallies, prior: LowRankPrior, start: Float[Array, "M n"]) -> Mode:
     """Newton's steps on the weights, from `start`; the residual is that of `laplace`."""
     epsilon = jnp.finfo(start.dtype).eps
     height = partial(_height, model, answers, prior, jax.tree.map(jnp.abs, prior))
@@ -180,7 +189,7 @@ def _mode(model: PeopleModel, answers: Tallies, prior: _Prior, start: Float[Arra
 
     def forward(search):
         weights, here = search.weights, search.height
-        full, _ = _newton_step(model, answers, prior, weights)
+        full, _ = newton_step(model, answers, prior, weights)
 
         def not_below(reached):
             return reached.value >= here.value - 8.0 * epsilon * here.size
@@ -200,7 +209,7 @@ def _mode(model: PeopleModel, answers: Tallies, prior: _Prior, start: Float[Arra
         return _Search(kept[0], kept[1], search.steps + 1, risen)
 
     end = jax.lax.while_loop(going, forward, _Search(start, height(start), jnp.asarray(0), jnp.asarray(True)))
-    return _Mode(end.weights, end.height.residual, end.height.tolerance, end.steps)
+    return Mode(end.weights, end.height.residual, end.height.tolerance, end.steps)
 
 
 class SharedEvidence(NamedTuple):
@@ -231,88 +240,34 @@ def shared_evidence(
     still = jax.lax.stop_gradient
     unit = model.unit if lengths is None else model.unit.with_numbers(lengths, jnp.ones_like(model.shared))
     pivots = pivots_of(still(unit), answers, rank, tolerance)
-    prior = _prior(model, answers, pivots)
-    mode = still(_mode(still(model), answers, still(prior), start))
-    weights, _ = still(_newton_step(still(model), answers, still(prior), mode.weights))
+    prior = prior_of(model, answers, pivots)
+    mode = still(mode_of(still(model), answers, still(prior), start))
+    weights, _ = still(newton_step(still(model), answers, still(prior), mode.weights))
     value = _evidence_at_mode(model, answers, prior, weights)
     arrived = (mode.residual <= mode.tolerance) & jnp.isfinite(value)
     return SharedEvidence(value, mode.weights, arrived, pivots.left)
 
 
-@program
-def shared_function(
-    model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
-) -> Posterior:
-    """Posterior of the shared function g, as a GP of its prior that was asked at the pivots; arguments as above.
-
-    What all answers say of g goes through its weights w, of precision S and mean F'a: with L L' = k(Z, Z) the mean is
-    k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Never raises: read
-    `certificate.converged`.
-    """
-    pivots = pivots_of(model.unit, answers, rank, tolerance)
-    prior = _prior(model, answers, pivots)
-    mode = _mode(model, answers, prior, start)
-    value, system = _value(model, answers, prior, mode.weights)
-    # One step more changes the evidence by what is left of the way, or more.
-    further, _ = _newton_step(model, answers, prior, mode.weights)
-    error = jnp.abs(_value(model, answers, prior, further)[0] - value)
-
-    root = jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
-    together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
-    weights = jnp.where(pivots.used, solve_triangular(root, together, lower=True, trans=1), 0.0)
-    factor = jnp.where(pivots.used[None, :], _explained(system.precision, root), 0.0)
-
-    kernel = model.of_variance(model.shared)
-    covariance = gram(kernel, pivots.points, pivots.points)
-    smallest = jnp.min(jnp.diagonal(covariance) - jnp.sum((factor @ covariance) ** 2, axis=0))
-    resolution = jnp.finfo(root.dtype).eps * model.shared * root.shape[0] ** 0.5
-    rounding = _rounding(model, answers, mode.weights, covariance, weights)
-    known_well = evidence_known(value, error, rounding) & (smallest >= resolution)
-    certificate = Certificate(
-        residual=mode.residual,
-        tolerance=mode.tolerance,
-        iterations=mode.steps,
-        jitter=pivots.left,
-        condition=jnp.linalg.norm(system.precision),
-        smallest_variance=smallest,
-        variance_resolution=resolution,
-        evidence_error=error,
-        evidence_tolerance=evidence_tolerance(value),
-        evidence_rounding=rounding,
-        converged=(mode.residual <= mode.tolerance) & known_well,
-    )
-    latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, value, certificate)
-    asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.used)
-    return Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
-
-
-def _explained(precision: Float[Array, "r r"], root: Float[Array, "r r"]) -> Float[Array, "r r"]:
-    """V with V'V = L^-T (I - S^-1) L^-1, of S and L."""
-    excess, vectors = eigh(precision - jnp.eye(root.shape[0], dtype=root.dtype))
-    explained = jnp.sqrt(jnp.where(excess > 0, excess / (1.0 + excess), 0.0))  # below 0 by rounding
-    return explained[:, None] * solve_triangular(root, vectors, lower=True, trans=1).T
-
-
-def _value(
-    model: PeopleModel, answers: Tallies, prior: _Prior, weights: Float[Array, "M n"]
-) -> tuple[Float[Array, ""], _System]:
+def evidence_at(
+    model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]
+) -> tuple[Float[Array, ""], System]:
     """The log evidence at some weights, and the system there."""
     eta = prior.times(weights)
     terms = _expand(model, answers, eta)
-    system = _system(prior, terms.curvature)
+    system = system_at(prior, terms.curvature)
     return jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta) - 0.5 * system.log_determinant, system
 
 
 @jax.custom_vjp
 def _evidence_at_mode(
-    model: PeopleModel, answers: Tallies, prior: _Prior, weights: Float[Array, "M n"]
+    model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]
 ) -> Float[Array, ""]:
-    """`_value` at the mode's weights, which follow model and prior. Differentiable once, in these two."""
-    return _value(model, answers, prior, weights)[0]
+    """`evidence_at` at the mode's weights, which follow model and prior. Differentiable once, in these two."""
+    return evidence_at(model, answers, prior, weights)[0]
 
 
-def _evidence_forward(model: PeopleModel, answers: Tallies, prior: _Prior, weights: Float[Array, "M n"]):
-    value, pull, system = jax.vjp(lambda *at: _value(at[0], answers, *at[1:]), model, prior, weights, has_aux=True)
+def _evidence_forward(model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]):
+    value, pull, system = jax.vjp(lambda *at: evidence_at(at[0], answers, *at[1:]), model, prior, weights, has_aux=True)
     return value, (pull, system, model, answers, prior, weights)
 
 
@@ -328,16 +283,3 @@ def _evidence_backward(kept, slope: Float[Array, ""]):
 
 
 _evidence_at_mode.defvjp(_evidence_forward, _evidence_backward)
-
-
-def _rounding(
-    model: PeopleModel,
-    answers: Tallies,
-    weights: Float[Array, "M n"],
-    covariance: Float[Array, "r r"],
-    of_pivots: Float[Array, " r"],
-) -> Float[Array, ""]:
-    """What the rounding of everybody's own covariances, and of g's, does to the log evidence."""
-    kernel = model.of_variance(model.own)
-    of_people = jax.lax.map(lambda p: evidence_rounding(gram(kernel, p[0], p[0]), p[1][None, :]), (answers.x, weights))
-    return jnp.linalg.norm(of_people) + evidence_rounding(covariance, of_pivots[None, :])

@@ -30,9 +30,10 @@ from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.counts import Counts, counts_of, fit_counts, one_person
 from hilbo.population.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
-from hilbo.population.learnt import Learnt, learnt_function
+from hilbo.population.learnt import Learnt, learnt_effects, learnt_function
 from hilbo.population.newcomer import class_probabilities
 from hilbo.population.recipes import RECIPES
+from hilbo.population.shared_posterior import ContextEffects
 
 __all__ = [
     "ALL_RULES",
@@ -77,6 +78,8 @@ class RuleMap(eqx.Module):
     """Whether people differ in the widths of their middle categories."""
     centred: bool = eqx.field(static=True, default=False)
     """By a recipe whether the optimum is the centre of where joint draws are largest; see `map_optimum`."""
+    effects: ContextEffects | None = None
+    """What contexts add, by a recipe and a study with a random effect."""
 
     def __repr__(self) -> str:
         people = (
@@ -101,8 +104,10 @@ class RuleMap(eqx.Module):
 
     @property
     def apart(self) -> Float[Array, ""]:
-        """Variance of one person's function about the map's: only the hierarchical model says that people differ."""
-        return (1.0 - self.share) * self.prior
+        """Variance of one person's function about the map's: only the hierarchical model says that people differ; in a
+        context that nobody was asked in, if there is a random effect."""
+        own = (1.0 - self.share) * self.prior
+        return own if self.effects is None else own + self.effects.prior
 
     @property
     def map_prior(self) -> Float[Array, ""]:
@@ -111,10 +116,16 @@ class RuleMap(eqx.Module):
             return self.prior / jax.tree.leaves(self.experts)[0].shape[0]
         return self.share * self.prior
 
-    def newcomer(self, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-        """Mean and variance (m,) of a new person's function, from which answers are predicted."""
+    def newcomer(
+        self, x: Float[Array, "m d"], context: Int[Array, " m"] | None = None
+    ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+        """Mean and variance (m,) of a new person's function, from which answers are predicted; in these contexts, or in
+        new ones."""
         mean, variance = self.predict(x)
-        return mean, variance + self.apart
+        if self.effects is None or context is None:
+            return mean, variance + self.apart
+        shift, more = self.effects.added(x, context)
+        return mean + shift, variance + more + (1.0 - self.share) * self.prior
 
     def class_probabilities(self, likelihood: OrdinalProbit, x: Float[Array, "m d"]) -> Float[Array, "m C"]:
         """Probabilities (m, C) of a new person's answers at points (m, d)."""
@@ -138,7 +149,8 @@ def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
     reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
     model = learnt.model
     prior, centred = model.shared + model.own, RECIPES[learnt.recipe].centred
-    return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.widths, centred)
+    effects = learnt_effects(learnt, trials)
+    return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.widths, centred, effects)
 
 
 def rule_map(

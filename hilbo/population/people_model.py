@@ -1,5 +1,5 @@
 """The hyperparameters of the hierarchical model of M people: f_j = g + h_j, with a shared function g and one of each
-person's own, of one kernel."""
+person's own, of one kernel; in context c, such as a clip, f_j + u_c."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -29,6 +29,8 @@ class PeopleModel(eqx.Module):
     """Of g and of each h_j."""
     levels: tuple[int, ...] = eqx.field(static=True, default=())
     """For each coordinate its number of unordered levels, as kernels take it."""
+    effect: Float[Array, ""] | None = None
+    """Prior variance of what each context adds to everybody's function; None without a random effect."""
 
     @property
     def share(self) -> Float[Array, ""]:

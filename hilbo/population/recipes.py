@@ -14,6 +14,7 @@ In units of the classification noise, with d parameters and C categories, people
     middle of the thresholds                     0, 1.5              0, 4
     log distance of neighbouring thresholds      log 0.8, 0.7        log 0.8, 2
     log width_j of a person, if C > 2            0, 0.4              the same
+    log variance of a random effect, if any      0, 2                the same
     largest at the optimum                       P(highest answer)   how often the best is near
 """
 
@@ -23,7 +24,7 @@ from typing import Final, NamedTuple
 
 from hilbo.kernels import RBF, Matern32, Stationary
 
-__all__ = ["LEARNT_1", "LEARNT_2", "RECIPES", "RECOMMENDED", "WIDTHS", "Prior", "Recipe"]
+__all__ = ["EFFECT", "LEARNT_1", "LEARNT_2", "RECIPES", "RECOMMENDED", "WIDTHS", "Prior", "Recipe"]
 
 
 class Prior(NamedTuple):
@@ -49,6 +50,8 @@ class Recipe(NamedTuple):
 
 WIDTHS: Final = Prior(0.0, 0.4)
 """Of the logarithm of a person's distances between thresholds, about their middle."""
+EFFECT: Final = Prior(0.0, 2.0)
+"""Of the logarithm of the variance of what a context adds, as far as a study names a random effect."""
 
 LEARNT_1: Final = Recipe(
     "learnt-1",
@@ -60,6 +63,7 @@ LEARNT_1: Final = Recipe(
         "middle": Prior(0.0, 1.5),
         "gaps": Prior(math.log(0.8), 0.7),
         "widths": WIDTHS,
+        "effect": EFFECT,
     },
     centred=False,
 )
@@ -73,6 +77,7 @@ LEARNT_2: Final = Recipe(
         "middle": Prior(0.0, 4.0),
         "gaps": Prior(math.log(0.8), 2.0),
         "widths": WIDTHS,
+        "effect": EFFECT,
     },
     centred=True,
 )

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.ordinal_gp import Trials
@@ -20,6 +20,9 @@ class Tallies(eqx.Module):
     x: Float[Array, "M n d"]
     counts: Float[Array, "M n C"]
     """All 0 in rows beyond a person's points."""
+    context: Int[Array, "M n"] | None = None
+    """Of each point, of `contexts` in all; None without a random effect."""
+    contexts: int = eqx.field(static=True, default=0)
 
     @property
     def asked(self) -> Bool[Array, "M n"]:
@@ -33,21 +36,28 @@ class Tallies(eqx.Module):
 
 
 def tallied(trials: Trials, categories: int) -> Tallies:
-    """Stacked trials (M, n), each person's points once, in the order in which they were first asked."""
+    """Stacked trials (M, n), each person's points once in each context, in the order in which they were first asked."""
     x, q, mask = (np.asarray(leaf) for leaf in (trials.x, trials.q, trials.mask))
+    context = np.zeros(q.shape, np.int32) if trials.context is None else np.asarray(trials.context)
     people, capacity, _ = x.shape
     points, counts = np.zeros_like(x), np.zeros((people, capacity, categories), x.dtype)
+    contexts = np.zeros((people, capacity), np.int32)
     longest = 1
     for person in range(people):
-        asked, answers = x[person][mask[person]], q[person][mask[person]]
-        _, first, place = np.unique(asked, axis=0, return_index=True, return_inverse=True)
+        asked, answers, of = (each[person][mask[person]] for each in (x, q, context))
+        both = np.concatenate([asked, of[:, None]], axis=1)
+        _, first, place = np.unique(both, axis=0, return_index=True, return_inverse=True)
         order = np.argsort(first)  # of the sorted points, by their first trial
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         points[person, : len(order)] = asked[first[order]]
+        contexts[person, : len(order)] = of[first[order]]
         np.add.at(counts[person], (rank[place.reshape(-1)], answers), 1.0)
         longest = max(longest, len(order))
-    return Tallies(jnp.asarray(points[:, :longest]), jnp.asarray(counts[:, :longest]))
+    held = Tallies(jnp.asarray(points[:, :longest]), jnp.asarray(counts[:, :longest]))
+    if trials.context is None:
+        return held
+    return Tallies(held.x, held.counts, jnp.asarray(contexts[:, :longest]), int(context.max()) + 1)
 
 
 class Expansion(NamedTuple):

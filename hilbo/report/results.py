@@ -29,7 +29,7 @@ from hilbo.study.batch_optimum import LargeAggregate
 from hilbo.study.config import Study
 from hilbo.study.effects import effects_of
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
-from hilbo.study.learnt_study import learnt_content, learnt_sentences
+from hilbo.study.learnt_study import effect_content, learnt_content, learnt_sentences
 from hilbo.study.map_file import map_at_points, on_grid, write_map
 from hilbo.study.model_check import check_sentences, model_check
 from hilbo.study.optima import Optimum
@@ -105,6 +105,7 @@ def result(
         "mean_of_optima": _mean_of_optima(study, aggregate.mean_of_optima),
         "rule": study.rule,
         "learnt": learnt_content(study, people.names),
+        "random_effect": None if whole is None else effect_content(study, whole.cohort, whole.map),
         "heterogeneity": heterogeneity(aggregate),
         "inference": study.inference,
         "study": study.hash,

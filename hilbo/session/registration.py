@@ -126,8 +126,10 @@ def _exclusion(study: StudyFile) -> list[str]:
 def _analysis(study: StudyFile) -> list[str]:
     rule = study.tables.aggregation.rule
     words = _RULES.get(rule, f"the hierarchical model with hyperparameters learnt from all answers, recipe {rule}")
+    effect = study.random_effect
     return [
         f"* Population map: {words} (`{rule}`), by hilbo's documentation of that version.",
+        *([f"* Random effect: `{effect}`, a column of the answers' table, by rules that learn."] if effect else []),
         f"* Model of one person: Gaussian process with an ordinal probit likelihood, {_model(study)}.",
         "* Primary result: the maximum of the population map among the stimuli that may be presented, with its"
         " predicted responses of a new participant.",

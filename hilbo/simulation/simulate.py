@@ -188,7 +188,7 @@ def _simulate(
 def to_table(study: Study, trials: Trials) -> pd.DataFrame:
     """The trial table of a simulated study: participants P01, P02, ..., points in physical units."""
     physical = np.asarray(study.space.to_physical(trials.x))
-    people_count, capacity = trials.mask.shape
+    people_count = len(trials.mask)
     width = max(2, len(str(people_count)))
     rows = np.argwhere(np.asarray(trials.mask))
     table = pd.DataFrame(
@@ -200,7 +200,8 @@ def to_table(study: Study, trials: Trials) -> pd.DataFrame:
     )
     for i, p in enumerate(study.space.parameters):
         table[p.name] = p.column(physical[..., i][tuple(rows.T)])
-    del capacity
+    if study.random_effect is not None:
+        table[study.random_effect] = "simulated"  # all are asked in one context
     return table
 
 

@@ -1,5 +1,6 @@
 """The answers of a study's participants, padded to one capacity: from a trial table to what a batch of fits takes."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -32,6 +33,8 @@ class Cohort(eqx.Module):
     trials: Trials
     physical: np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
+    contexts: tuple[str, ...] = eqx.field(static=True, default=())
+    """Levels of the study's random effect, in the order of `trials.context`."""
 
     def __repr__(self) -> str:
         if not known(self.trials.x, self.trials.mask):
@@ -43,7 +46,7 @@ class Cohort(eqx.Module):
     def first(self, count: int) -> "Cohort":
         """Only everybody's first `count` trials."""
         mask = np.asarray(self.trials.mask) & (np.arange(self.trials.mask.shape[1]) < count)[None, :]
-        return Cohort(eqx.tree_at(lambda t: t.mask, self.trials, placed(mask)), self.physical, self.names)
+        return dataclasses.replace(self, trials=eqx.tree_at(lambda t: t.mask, self.trials, placed(mask)))
 
     def of(self, names: Sequence[str]) -> "Cohort":
         """Only these participants. Raises `InputError` for a name that the table does not have."""
@@ -59,7 +62,7 @@ class Cohort(eqx.Module):
     def rows(self, rows: Int[np.ndarray, " k"]) -> "Cohort":
         """Only the participants in these places. `rows` (k,): numbers from 0."""
         names = tuple(self.names[row] for row in rows)
-        return Cohort(rows_of(self.trials, rows), self.physical[rows], names)
+        return Cohort(rows_of(self.trials, rows), self.physical[rows], names, self.contexts)
 
     def counts(self) -> Int[np.ndarray, " M"]:
         """Answers of each participant. (M,)."""
@@ -91,7 +94,22 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     held = np.arange(capacity)[None, :] < counts[:, None]
     middle = [(p.low + p.high) / 2 for p in study.space.parameters]
     x = _to_unit(study.space, np.where(held[..., None], physical, middle))
-    return Cohort(jax.vmap(Trials)(x, placed(answers), placed(held)), physical, tuple(names))
+    if study.random_effect is None:
+        return Cohort(jax.vmap(Trials)(x, placed(answers), placed(held)), physical, tuple(names))
+    levels, contexts = pd.factorize(_random_effect(table, study.random_effect), sort=True)
+    context = np.zeros((len(counts), capacity), np.int32)
+    context[rows] = levels[order]
+    trials = jax.vmap(Trials)(x, placed(answers), placed(held), placed(context))
+    return Cohort(trials, physical, tuple(names), tuple(contexts))
+
+
+def _random_effect(table: pd.DataFrame, column: str) -> np.ndarray:
+    """The column's texts. Raises InputError where the table, of simulated people for one, has none."""
+    if column not in table:
+        raise InputError(
+            f'the answers have no column "{column}", which random_effect in [aggregation] names; leave it out here.'
+        )
+    return table[column].astype(str).to_numpy(object)
 
 
 @program

@@ -41,6 +41,8 @@ class Study(eqx.Module):
     selection: Selection = eqx.field(static=True)
     inference: Inference = eqx.field(static=True)
     rule: AnyRule = eqx.field(static=True)
+    random_effect: str | None = eqx.field(static=True)
+    """The column of the answers' table whose levels have an effect of their own, by a rule that learns it."""
     source: str = eqx.field(static=True)
     content: str = eqx.field(static=True, repr=False)  # the parsed file as JSON
     session: SessionTable = eqx.field(static=True, repr=False, default=SessionTable())
@@ -81,6 +83,7 @@ class Study(eqx.Module):
             selection=file.selection,
             inference=file.tables.gp.inference,
             rule=file.tables.aggregation.rule,
+            random_effect=file.random_effect,
             source=file.source,
             content=file.content,
             session=file.session,

@@ -10,12 +10,12 @@ import numpy as np
 from hilbo.errors import InputError
 from hilbo.population.learnt import Learnt, learn
 from hilbo.population.learnt_posterior import Stated, prior_model
-from hilbo.population.maps import ALL_RULES
+from hilbo.population.maps import ALL_RULES, RuleMap
 from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 
-__all__ = ["by_rule", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
+__all__ = ["by_rule", "effect_content", "learnt_content", "learnt_sentences", "resolved", "that_learns"]
 
 _UNKNOWN = 0.9  # of the prior's standard deviation: the answers hardly say more
 
@@ -79,6 +79,20 @@ def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
             for name, (width, low, high) in zip(names, ends, strict=True)
         }
     return content
+
+
+def effect_content(study: Study, cohort: Cohort, map_: RuleMap) -> dict[str, Any] | None:
+    """The random effect, for result.json: the variance that was learnt, and what each level adds to everybody's latent
+    score, with its standard deviation. None where the map has none."""
+    effects = map_.effects
+    if effects is None:
+        return None
+    means, sds = np.asarray(effects.mean).tolist(), np.sqrt(np.asarray(effects.variance)).tolist()
+    return {
+        "column": study.random_effect,
+        "variance": float(effects.prior),
+        "levels": {name: {"mean": mean, "sd": sd} for name, mean, sd in zip(cohort.contexts, means, sds, strict=True)},
+    }
 
 
 def _coordinates(study: Study, learnt: Learnt) -> list[tuple[str, tuple[float, float], bool]]:

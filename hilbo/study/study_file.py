@@ -54,6 +54,11 @@ class StudyFile:
         return self.tables.study.responses
 
     @property
+    def random_effect(self) -> str | None:
+        """The column of the answers' table whose levels have an effect of their own."""
+        return self.tables.aggregation.random_effect
+
+    @property
     def selection(self) -> Selection:
         """How trials are chosen."""
         return self.tables.selection
@@ -120,6 +125,9 @@ class AnyStudy(Protocol):
 
     @property
     def space(self) -> _AnySpace: ...
+
+    @property
+    def random_effect(self) -> str | None: ...
 
     @property
     def selection(self) -> Selection: ...

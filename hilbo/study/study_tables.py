@@ -132,7 +132,12 @@ class Selection(_Table, frozen=True):
 
 
 class _AggregationTable(_Table, frozen=True):
+    """`random_effect`: the column of the answers' table, such as the clip, whose levels add something of their own."""
+
     rule: Annotated[Rule, _text("one of " + ", ".join(f'"{name}"' for name in get_args(Rule)), '"bcm"')] = "bcm"
+    random_effect: Annotated[
+        Annotated[str, msgspec.Meta(min_length=1)] | None, _text("the name of a column", '"clip"')
+    ] = None
 
 
 class ReportTable(_Table, frozen=True):
@@ -298,6 +303,12 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     if tables.simulation is not None:
         tables.simulation.check(parameters, len(labels))
     _check_gp(tables.gp, tables.aggregation.rule, len(labels))
+    column = tables.aggregation.random_effect
+    if column in {"participant", "trial", "response", "voided", "unblinded", *(p.name for p in parameters)}:
+        raise InputError(
+            f'aggregation.random_effect is "{column}", which has a meaning of its own; name another column of the'
+            " answers' table, such as the clip or the day."
+        )
 
 
 def _check_gp(table: GPTable, rule: Rule, count: int) -> None:

@@ -93,11 +93,12 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
     for column in text.columns:
         if column in numeric:
             table[column] = np.nan  # its place among the columns
-        elif others or column in _KEY:
+        elif others or column in (*_KEY, study.random_effect):
             table[column] = [texts.setdefault(cell, cell) for cell in text[column]]
     whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
     table["trial"] = whole.astype(int)
     check_people(text, source)
+    _check_random_effect(text, study, source)
     check_texts(text, source, numeric | {"response"})
     for parameter in study.space.parameters:
         table[parameter.name] = parameter_values(text, parameter, source)
@@ -131,6 +132,19 @@ def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
         raise InputError(
             f'{place(source)}column "{missing[0]}" is missing{hint}; a trial table of this study has {wants}.'
         )
+
+
+def _check_random_effect(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
+    """Refuse a table without the column of the study's random effect, and rows that leave it empty."""
+    name = study.random_effect
+    if name is None:
+        return
+    if name not in text.columns:
+        raise InputError(
+            f'{place(source)}column "{name}" is missing, which random_effect in [aggregation] names; add it, or leave'
+            " random_effect out."
+        )
+    refuse(text[name].str.strip() == "", source, lambda row: f"{name} is empty; give each answer one.")
 
 
 def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.Series:

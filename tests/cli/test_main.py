@@ -117,7 +117,8 @@ def test_bad_studies_write_nothing(capsys, monkeypatch, tmp_path, what):
 
 
 def test_a_bad_table_writes_nothing(capsys, monkeypatch, tmp_path):
-    (tmp_path / "t.csv").write_text("participant,trial,response,bitrate_kbps,height_px\nA,1,superb,500,480\n")
+    rows = "participant,trial,response,bitrate_kbps,height_px,content\nA,1,superb,500,480,Sea\n"
+    (tmp_path / "t.csv").write_text(rows)
     code, _, stderr = run(capsys, monkeypatch, "aggregate", tmp_path / "t.csv", *VIDEO[1:], "--out", tmp_path / "out")
     assert code == 2
     assert 't.csv:2: response is "superb"' in stderr

@@ -9,9 +9,10 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.population.counts import counts_of, fit_counts
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
-from hilbo.population.low_rank import shared_evidence, shared_function
+from hilbo.population.low_rank import shared_evidence
 from hilbo.population.people_model import PeopleModel
 from hilbo.population.shared_features import rank_for
+from hilbo.population.shared_posterior import shared_function
 from hilbo.population.tallies import Tallies, tallied
 
 EXACT = 1e-15  # what features may leave where nothing is to be left

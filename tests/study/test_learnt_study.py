@@ -1,6 +1,7 @@
 """A study file without [gp]: what is read, what a session starts from, and what its results say."""
 
 import json
+import re
 import tomllib
 
 import jax
@@ -21,7 +22,7 @@ from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.best_places import best_places, nearness
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
-from hilbo.study.learnt_study import learnt_content, learnt_sentences, resolved, that_learns
+from hilbo.study.learnt_study import effect_content, learnt_content, learnt_sentences, resolved, that_learns
 from hilbo.study.optima import map_optimum
 from hilbo.study.robustness import robustness
 from hilbo.study.trial_table import read_trials
@@ -90,6 +91,7 @@ def test_what_the_file_states_is_kept():
         (SOUND + '[gp]\ninference = "ep"\n', 'gp.inference is "ep"; it must be "laplace" with rule = "learnt-1"'),
         (SOUND + "[gp]\nthresholds = [0.0]\n", "gp.thresholds is [0.0]; it must have one number fewer than the 3"),
         (SOUND.replace("learnt-1", "learnt-0"), 'aggregation.rule is "learnt-0"; it must be one of'),
+        (SOUND + 'random_effect = "level"\n', 'aggregation.random_effect is "level", which has a meaning of its own;'),
     ],
 )
 def test_bad_files_get_one_sentence(text, sentence):
@@ -133,6 +135,41 @@ def test_the_optimum_is_where_a_newcomer_most_often_says_the_highest(table):
     everywhere = np.stack(np.meshgrid(side, side), -1).reshape(-1, 2)
     assert chance(aggregate.optimum.x[None, :])[0] >= chance(everywhere).max()
     np.testing.assert_allclose(aggregate.optimum.class_probabilities[-1], chance(aggregate.optimum.x[None, :])[0])
+
+
+WITH_CLIPS = SOUND.replace('rule = "learnt-1"', 'rule = "learnt-1"\nrandom_effect = "clip"')
+
+
+def test_a_random_effect_is_read_from_its_column_and_stands_in_the_results(table):
+    study = study_of(WITH_CLIPS)
+    answers = read_trials(table, study_of())
+    answers["clip"] = np.where(np.arange(len(answers)) % 2, "Sea", "Fox")
+    cohort = cohort_of(answers, study)
+    assert cohort.contexts == ("Fox", "Sea")
+    np.testing.assert_array_equal(cohort.trials.context[0, :4], [0, 1, 0, 1])
+    np.testing.assert_array_equal(cohort.rows(np.array([2])).first(3).trials.context[0, :3], [0, 1, 0])
+    learnt = resolved(study, cohort)
+    content = effect_content(learnt, cohort, learnt_map(learnt.learnt, cohort.trials))
+    assert content is not None
+    json.dumps(content, allow_nan=False)
+    assert content["column"] == "clip"
+    assert set(content["levels"]) == {"Fox", "Sea"}
+    assert "effect" in learnt_content(learnt, cohort.names)["intervals"]
+
+
+def test_a_table_without_the_column_or_with_an_empty_cell_gets_one_sentence(tmp_path, table):
+    study = study_of(WITH_CLIPS)
+    with pytest.raises(
+        InputError, match=re.escape('column "clip" is missing, which random_effect in [aggregation] names')
+    ):
+        read_trials(table, study)
+    lines = table.read_text().splitlines()
+    path = tmp_path / "trials.csv"
+    path.write_text("\n".join([lines[0] + ",clip", lines[1] + ",Fox", *(line + "," for line in lines[2:])]))
+    with pytest.raises(InputError, match=":3: clip is empty"):
+        read_trials(path, study)
+    path.write_text("\n".join([lines[0] + ",clip", *(line + ",Fox" for line in lines[1:])]))
+    assert set(read_trials(path, study, others=False)["clip"]) == {"Fox"}
 
 
 def test_there_is_nothing_fixed_to_compare_with(table):
