@@ -23,7 +23,6 @@ Level = Literal["good", "note", "bad"]
 _PARTS = ("hilbo", "jax", "jaxlib", "equinox", "numpy", "starlette", "uvicorn", "pyserial")
 _OPTIONAL = {"starlette": "live", "uvicorn": "live", "pyserial": "hardware"}
 _BROWSERS = ("chromium", "google-chrome", "chromium-browser", "firefox", "msedge", "open")
-_SESSION_COLUMNS = ("session", "phase", "material")  # of their tables, which may be random effects
 _ROOM = 200  # MB; a session's log is below one
 _SLOW = 0.5  # s for a step: a participant would notice
 _JOINS = 120.0  # s that the program that presents has to join
@@ -146,8 +145,8 @@ def _study_file(path: Path) -> tuple[Check, Any]:
 def _random_effect(file: Any) -> Iterator[Check]:
     """A note where the study names a column that tables of sessions do not have."""
     name = file.random_effect
-    if name is not None and name not in _SESSION_COLUMNS:
-        fix = "add it to the table of answers before it is aggregated"
+    if name not in (None, "session"):
+        fix = "add it to the table that hilbo export writes, and aggregate that table"
         yield Check("random effect", "note", f'tables of sessions have no column "{name}"', fix)
 
 

@@ -36,14 +36,13 @@ from hilbo.population.learnt_posterior import (
 from hilbo.population.people_model import PeopleModel
 from hilbo.population.recipes import LEARNT_1, Recipe
 from hilbo.population.shared_features import rank_for
-from hilbo.population.shared_posterior import ContextEffects, context_effects, shared_function
+from hilbo.population.shared_posterior import SharedFunction, shared_function
 from hilbo.population.tallies import tallied
 
 __all__ = [
     "Learnt",
     "drawn_functions",
     "learn",
-    "learnt_effects",
     "learnt_function",
 ]
 
@@ -91,18 +90,11 @@ class Learnt(eqx.Module):
         return "widths" in self.coordinates
 
 
-def learnt_function(learnt: Learnt, trials: Trials) -> Posterior:
-    """The posterior of the shared function by learnt hyperparameters, from stacked trials (M, n)."""
+def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
+    """The posterior of the shared function, and of a random effect, by learnt hyperparameters, from stacked trials (M,
+    n)."""
     answers = tallied(trials, learnt.model.thresholds.size + 1)
     return shared_function(learnt.model, answers, learnt.weights, rank_for(learnt.model.unit, answers))
-
-
-def learnt_effects(learnt: Learnt, trials: Trials) -> ContextEffects | None:
-    """What contexts add by learnt hyperparameters, from stacked trials (M, n); None without a random effect."""
-    if learnt.model.effect is None:
-        return None
-    answers = tallied(trials, learnt.model.thresholds.size + 1)
-    return context_effects(learnt.model, answers, learnt.weights, rank_for(learnt.model.unit, answers))
 
 
 def drawn_functions(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count: int) -> list[Posterior]:
@@ -122,7 +114,7 @@ def drawn_functions(learnt: Learnt, trials: Trials, stated: Stated, seed: int, c
 
     def function(step: Float[np.ndarray, " k"]) -> Posterior:
         model = model_at(widths | restore(flat + step), answers, stated, type(unit))
-        return jax.block_until_ready(shared_function(model, answers, learnt.weights, rank))
+        return jax.block_until_ready(shared_function(model, answers, learnt.weights, rank).function)
 
     with ThreadPoolExecutor(_AT_A_TIME) as pool:
         functions = list(pool.map(function, steps))

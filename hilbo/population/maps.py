@@ -30,7 +30,7 @@ from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population import pointwise
 from hilbo.population.counts import Counts, counts_of, fit_counts, one_person
 from hilbo.population.hierarchical import Share, fit_people, learn_share, of_people, share_from, shared_posterior
-from hilbo.population.learnt import Learnt, learnt_effects, learnt_function
+from hilbo.population.learnt import Learnt, learnt_function
 from hilbo.population.newcomer import class_probabilities
 from hilbo.population.recipes import RECIPES
 from hilbo.population.shared_posterior import ContextEffects
@@ -144,12 +144,11 @@ def point_rule(rule: str, share: Float[Array, ""] | None = None) -> tuple[pointw
 
 def learnt_map(learnt: Learnt, trials: Trials) -> RuleMap:
     """The map by learnt hyperparameters, from stacked trials (M, n)."""
-    shared = learnt_function(learnt, trials)
+    shared, effects = learnt_function(learnt, trials)
     _, variances = shared.predict(trials.x.reshape(-1, trials.x.shape[-1]))
     reach = jnp.max(jnp.where(trials.mask.reshape(-1), variances, 0.0))
     model = learnt.model
     prior, centred = model.shared + model.own, RECIPES[learnt.recipe].centred
-    effects = learnt_effects(learnt, trials)
     return RuleMap(learnt.recipe, "exact", None, shared, model.share, prior, reach, learnt.widths, centred, effects)
 
 

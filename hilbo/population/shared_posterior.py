@@ -1,5 +1,7 @@
 """What everybody's answers say of the shared function g, and of the random effect of contexts, by `low_rank`."""
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,12 +15,12 @@ from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
-from hilbo.population.low_rank import evidence_at, mode_of, newton_step, prior_of
+from hilbo.population.low_rank import System, evidence_at, mode_of, newton_step, prior_of
 from hilbo.population.people_model import PeopleModel
 from hilbo.population.shared_features import TOLERANCE, pivots_of, root_of_pivots
 from hilbo.population.tallies import Tallies
 
-__all__ = ["ContextEffects", "context_effects", "shared_function"]
+__all__ = ["ContextEffects", "SharedFunction", "shared_function"]
 
 
 class ContextEffects(eqx.Module):
@@ -40,12 +42,21 @@ class ContextEffects(eqx.Module):
         return self.mean[context], self.variance[context] + 2.0 * together
 
 
+class SharedFunction(NamedTuple):
+    """What everybody's answers say."""
+
+    function: Posterior
+    """Of g; a random effect is integrated out."""
+    effects: ContextEffects | None
+    """Of a model with a random effect."""
+
+
 @program
 def shared_function(
     model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
-) -> Posterior:
-    """Posterior of the shared function g, as a GP of its prior that was asked at the pivots; arguments as those of
-    `shared_evidence`. A random effect is integrated out.
+) -> SharedFunction:
+    """Posterior of the shared function g, as a GP of its prior that was asked at the pivots, and of the random effect;
+    arguments as those of `shared_evidence`.
 
     What all answers say of g goes through its weights w, of precision S and mean F'a: with L L' = k(Z, Z) the mean is
     k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Never raises: read
@@ -60,8 +71,8 @@ def shared_function(
     error = jnp.abs(evidence_at(model, answers, prior, further)[0] - value)
 
     root = jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
-    together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)[:rank]
-    weights = jnp.where(pivots.used, solve_triangular(root, together, lower=True, trans=1), 0.0)
+    together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
+    weights = jnp.where(pivots.used, solve_triangular(root, together[:rank], lower=True, trans=1), 0.0)
     factor = jnp.where(pivots.used[None, :], _explained(_without_effect(system.precision, rank), root), 0.0)
 
     kernel = model.of_variance(model.shared)
@@ -85,31 +96,28 @@ def shared_function(
     )
     latent = GaussianPosterior(covariance @ weights, weights, factor, factor.T @ factor, value, certificate)
     asked = Trials(pivots.points, jnp.zeros(rank, jnp.int32), pivots.used)
-    return Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
+    function = Posterior(OrdinalGP(kernel, OrdinalProbit(model.thresholds, model.noise)), asked, latent)
+    return SharedFunction(function, _effects_of(model, system, together, pivots.points, root))
 
 
-@program
-def context_effects(
-    model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
-) -> ContextEffects:
-    """The random effect of contexts in a model that has one; arguments as those of `shared_evidence`.
-
-    The weights of g and those of the effect are of the covariance S^-1 and the mean F'a.
-    """
-    assert model.effect is not None
-    pivots = pivots_of(model.unit, answers, rank, tolerance)
-    prior = prior_of(model, answers, pivots)
-    mode = mode_of(model, answers, prior, start)
-    _, system = evidence_at(model, answers, prior, mode.weights)
-    sd, root = jnp.sqrt(model.effect), jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
-    together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
+def _effects_of(
+    model: PeopleModel,
+    system: System,
+    together: Float[Array, " p"],
+    points: Float[Array, "r d"],
+    root: Float[Array, "r r"],
+) -> ContextEffects | None:
+    """The weights of g and those of the effect are of the covariance S^-1 and the mean F'a, which is `together`."""
+    if model.effect is None:
+        return None
+    rank, sd = len(points), jnp.sqrt(model.effect)
     covariance = cho_solve((system.factor, True), jnp.eye(len(together), dtype=together.dtype))
     return ContextEffects(
         prior=model.effect,
         mean=sd * together[rank:],
         variance=model.effect * jnp.diagonal(covariance)[rank:],
         kernel=model.of_variance(model.shared),
-        points=pivots.points,
+        points=points,
         cross=sd * solve_triangular(root, covariance[:rank, rank:], lower=True, trans=1),
     )
 

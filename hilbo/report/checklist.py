@@ -67,7 +67,8 @@ def _model(analysis):
     return (
         "Ordinal probit likelihood on a latent Gaussian process with a squared-exponential covariance;"
         f" {values}, {'learnt from these answers by a fixed recipe' if learnt else 'as the study file states'};"
-        f" people aggregated by the rule {analysis.study.rule}."
+        f" people aggregated by the rule {analysis.study.rule}"
+        + (f", with a random effect of {analysis.study.random_effect}." if analysis.aggregate.map.effects else ".")
     )
 
 

@@ -105,7 +105,7 @@ def result(
         "mean_of_optima": _mean_of_optima(study, aggregate.mean_of_optima),
         "rule": study.rule,
         "learnt": learnt_content(study, people.names),
-        "random_effect": None if whole is None else effect_content(study, whole.cohort, whole.map),
+        "random_effect": None if whole is None else _random_effect(study, whole),
         "heterogeneity": heterogeneity(aggregate),
         "inference": study.inference,
         "study": study.hash,
@@ -123,6 +123,13 @@ def result(
     if truth is not None:
         content["truth"] = _truth(study, aggregate, truth)
     return content
+
+
+def _random_effect(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
+    """Of the study's own map, or of the one among the alternatives that has it."""
+    maps = (aggregate.map, *aggregate.maps.values())
+    map_ = next((each for each in maps if each.effects is not None), None)
+    return None if map_ is None else effect_content(study, aggregate.cohort, map_)
 
 
 def _mean_of_optima(study: Study, mean: Float[Array, " d"] | None) -> dict[str, Any] | None:

@@ -129,7 +129,7 @@ def _analysis(study: StudyFile) -> list[str]:
     effect = study.random_effect
     return [
         f"* Population map: {words} (`{rule}`), by hilbo's documentation of that version.",
-        *([f"* Random effect: `{effect}`, a column of the answers' table, by rules that learn."] if effect else []),
+        *([f"* Random effect of each `{effect}`, where a rule learns the hyperparameters."] if effect else []),
         f"* Model of one person: Gaussian process with an ordinal probit likelihood, {_model(study)}.",
         "* Primary result: the maximum of the population map among the stimuli that may be presented, with its"
         " predicted responses of a new participant.",

@@ -201,7 +201,7 @@ def to_table(study: Study, trials: Trials) -> pd.DataFrame:
     for i, p in enumerate(study.space.parameters):
         table[p.name] = p.column(physical[..., i][tuple(rows.T)])
     if study.random_effect is not None:
-        table[study.random_effect] = "simulated"  # all are asked in one context
+        table[study.random_effect] = "simulated"  # one level, and so no effect
     return table
 
 

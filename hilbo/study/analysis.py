@@ -210,6 +210,11 @@ def _aggregated_otherwise(map_: RuleMap) -> Iterator[str]:
             f" those of bootstrap resamples for the ends of tolerance intervals, are aggregated {how}, so that their"
             " last optimum need not be the map's."
         )
+    if map_.effects is not None:
+        yield (
+            "Everybody's own optimum, maps of fewer trials and the ends of tolerance intervals take no account of the"
+            " random effect."
+        )
 
 
 def moved_by_evidence(analysis: Analysis) -> float:

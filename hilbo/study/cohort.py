@@ -17,11 +17,14 @@ from hilbo.numerics.rows import rows_of
 from hilbo.numerics.shown import known
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
+from hilbo.population.recipes import RECIPES
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
 from hilbo.study.trial_table import checked_trials
 
 __all__ = ["Cohort", "cohort_of"]
+
+_LEVELS = 200  # of a random effect
 
 
 class Cohort(eqx.Module):
@@ -94,22 +97,35 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     held = np.arange(capacity)[None, :] < counts[:, None]
     middle = [(p.low + p.high) / 2 for p in study.space.parameters]
     x = _to_unit(study.space, np.where(held[..., None], physical, middle))
-    if study.random_effect is None:
+    texts = _random_effect(table, study)
+    if texts is None:
         return Cohort(jax.vmap(Trials)(x, placed(answers), placed(held)), physical, tuple(names))
-    levels, contexts = pd.factorize(_random_effect(table, study.random_effect), sort=True)
+    levels, contexts = pd.factorize(texts, sort=True)
     context = np.zeros((len(counts), capacity), np.int32)
     context[rows] = levels[order]
     trials = jax.vmap(Trials)(x, placed(answers), placed(held), placed(context))
     return Cohort(trials, physical, tuple(names), tuple(contexts))
 
 
-def _random_effect(table: pd.DataFrame, column: str) -> np.ndarray:
-    """The column's texts. Raises InputError where the table, of simulated people for one, has none."""
+def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:
+    """Each row's level of the study's random effect; None where the study names none or all are of one level. Raises
+    InputError where a rule that learns misses the column, and where there are too many levels to be some."""
+    column = study.random_effect
+    if column is None or (column not in table and study.rule not in RECIPES):
+        return None
     if column not in table:
         raise InputError(
-            f'the answers have no column "{column}", which random_effect in [aggregation] names; leave it out here.'
+            f'the table has no column "{column}", which random_effect in [aggregation] names: add it (hilbo export'
+            " writes the table of sessions), or leave random_effect out."
         )
-    return table[column].astype(str).to_numpy(object)
+    texts = table[column].astype(str).str.strip()
+    count = texts.nunique()
+    if count > _LEVELS:
+        raise InputError(
+            f'column "{column}" has {count:,} different texts; a random effect takes up to {_LEVELS}, such as clips or'
+            " days; leave random_effect out."
+        )
+    return texts.to_numpy(object) if count > 1 else None
 
 
 @program

@@ -82,16 +82,20 @@ def learnt_content(study: Study, names: Sequence[str]) -> dict[str, Any] | None:
 
 
 def effect_content(study: Study, cohort: Cohort, map_: RuleMap) -> dict[str, Any] | None:
-    """The random effect, for result.json: the variance that was learnt, and what each level adds to everybody's latent
-    score, with its standard deviation. None where the map has none."""
-    effects = map_.effects
+    """The random effect, for result.json: the variance that was learnt, and what each level with an answer adds to
+    everybody's latent score, with its standard deviation. None where the map has none."""
+    effects, trials = map_.effects, cohort.trials
     if effects is None:
         return None
-    means, sds = np.asarray(effects.mean).tolist(), np.sqrt(np.asarray(effects.variance)).tolist()
+    present = np.unique(np.asarray(trials.context)[np.asarray(trials.mask)])
+    means, sds = np.asarray(effects.mean)[present], np.sqrt(np.asarray(effects.variance)[present])
     return {
         "column": study.random_effect,
         "variance": float(effects.prior),
-        "levels": {name: {"mean": mean, "sd": sd} for name, mean, sd in zip(cohort.contexts, means, sds, strict=True)},
+        "levels": {
+            cohort.contexts[c]: {"mean": mean, "sd": sd}
+            for c, mean, sd in zip(present, means.tolist(), sds.tolist(), strict=True)
+        },
     }
 
 
@@ -105,6 +109,7 @@ def _coordinates(study: Study, learnt: Learnt) -> list[tuple[str, tuple[float, f
         means, sds = np.atleast_1d(np.asarray(value)), np.atleast_1d(np.asarray(learnt.sd[name]))
         labels = [f"theta.{p}" for p in study.space.names] if name == "theta" else [name]
         labels = [f"gap {i + 1}" for i in range(len(means))] if name == "gaps" else labels
+        labels = ["random effect"] if name == "effect" else labels
         for label, mean, sd in zip(labels, means.tolist(), sds.tolist(), strict=True):
             ends = mean - 1.96 * sd, mean + 1.96 * sd
             ends = ends if name == "middle" else (math.exp(ends[0]), math.exp(ends[1]))

@@ -36,9 +36,10 @@ def model_check(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
     mask = np.asarray(trials.mask)
     order = np.concatenate([np.flatnonzero(mask[p]) * 3 // mask[p].sum() for p in _people(left)])
     x = np.concatenate([np.asarray(trials.x)[p][mask[p]] for p in _people(left)])
-    context = trials.context
-    if context is not None:
-        context = np.concatenate([np.asarray(context)[p][mask[p]] for p in _people(left)])
+    places = x
+    if aggregate.map.effects is not None:
+        context = np.concatenate([np.asarray(trials.context)[p][mask[p]] for p in _people(left)])
+        places = np.concatenate([x, context[:, None]], axis=1)
     chosen = (left.q[:, None] == np.arange(len(study.responses))[None, :]).astype(float)
     content: dict[str, Any] = {
         "hyperparameters": "as stated" if study.learnt is None else "learnt from all answers",
@@ -53,7 +54,7 @@ def model_check(study: Study, aggregate: Aggregate) -> dict[str, Any] | None:
             }
             for p in _people(left)
         },
-        "repeats": _repeats(left, x if context is None else np.concatenate([x, context[:, None]], axis=1)),
+        "repeats": _repeats(left, places),
         "not_converged": left.not_converged,
     }
     return content | {"negative_log_density": _densities(left, x, len(study.responses))}
@@ -134,8 +135,8 @@ def _differs(row: dict[str, Any]) -> bool:
 
 
 def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> dict[str, Any] | None:
-    """Pairs of answers of one person to one rendering (in one context, which is a column of x): how often they agree,
-    and how often they should."""
+    """Pairs of answers of one person to one rendering, with a random effect in one context, a column of x: how often
+    they agree, and how often they should."""
     assert left.agreement is not None
     same, expected, person = [], [], []
     for p in _people(left):

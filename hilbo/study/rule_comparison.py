@@ -85,13 +85,17 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
         rules[rule] = calibration(left[rule], seed) | {"reliability": reliability(left[rule])}
         rules[rule] |= _map_content(study, cohort, posteriors, map_, folds, pooled, candidates, x, seed)
         rules[rule]["hyperparameters"] = "given" if study.learnt is None else "learnt from all answers"
+    recipe = study.rule if study.rule in RECIPES else RECOMMENDED
     if learns:
-        recipe, given = study.rule if study.rule in RECIPES else RECOMMENDED, (cohort, everybody, posteriors, pooled)
+        given = cohort, everybody, posteriors, pooled
         left[recipe], rules[recipe] = _learnt_entry(study, recipe, *given, candidates, x, seed)
     for rule, (difference, error) in differences(left).items():
         rules[rule] |= {"difference": difference, "difference_error": error}
+    words = recommendation(left, rules, share, len(answered))
+    if learns and study.random_effect is not None:
+        words += f" Only {recipe} takes account of the random effect of {study.random_effect}."
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
-    return content | {"rules": rules, "recommendation": recommendation(left, rules, share, len(answered))}
+    return content | {"rules": rules, "recommendation": words}
 
 
 def _learnt_entry(

@@ -187,10 +187,13 @@ def checked(raw: Mapping[str, Any], source: str, make: Callable[[StudyFile], _T]
 
 @lru_cache(maxsize=64)
 def hash_of(content: str) -> str:
-    """First 16 hex digits of the SHA-256 of a study's content, without the people of its simulations: they change
-    nothing that is asked or computed of real ones."""
+    """First 16 hex digits of the SHA-256 of a study's content, without the people of its simulations and the column of
+    a random effect: they change nothing that is asked of people, whose sessions may be over."""
     tables = json.loads(content)
-    if tables.pop("simulation", None) is not None:
+    aggregation = tables.get("aggregation", {})
+    if {tables.pop("simulation", None), aggregation.pop("random_effect", None)} != {None}:
+        if not aggregation:
+            tables.pop("aggregation", None)
         content = json.dumps(tables, ensure_ascii=False, separators=(",", ":"))
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 

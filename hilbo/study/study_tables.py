@@ -177,6 +177,7 @@ _TABLES = {
 _REQUIRED = ("schema", "study", "parameters")
 _KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "constraints", "materials")
 _LEARNT = ("theta", "variance", "thresholds", "noise")
+_COLUMNS = ("participant", "trial", "response", "category", "phase", "material", "voided", "unblinded")
 _OVERRIDES = ("renderer", "parameters")
 _NUMBERS_KEYS = ("low", "high", "unit", "scale", "integer")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
@@ -304,7 +305,7 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
         tables.simulation.check(parameters, len(labels))
     _check_gp(tables.gp, tables.aggregation.rule, len(labels))
     column = tables.aggregation.random_effect
-    if column in {"participant", "trial", "response", "voided", "unblinded", *(p.name for p in parameters)}:
+    if column in _COLUMNS or column in {p.name for p in parameters} or (column or "").startswith("_"):
         raise InputError(
             f'aggregation.random_effect is "{column}", which has a meaning of its own; name another column of the'
             " answers' table, such as the clip or the day."

@@ -33,6 +33,7 @@ NOT_FITTED = ("warm-up", "repeat")
 """Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
 _KEY = ("participant", "session", "phase", "material", "trial")
 _TRUE = {"1", "1.0", "1,0", "true", "yes"}
+_MISSING = {"", "nan", "none", "<na>"}
 _FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
 
 
@@ -135,16 +136,11 @@ def _check_columns(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
 
 
 def _check_random_effect(text: pd.DataFrame, study: AnyStudy, source: str) -> None:
-    """Refuse a table without the column of the study's random effect, and rows that leave it empty."""
+    """Refuse rows that leave the column of the study's random effect empty, where there is one."""
     name = study.random_effect
-    if name is None:
-        return
-    if name not in text.columns:
-        raise InputError(
-            f'{place(source)}column "{name}" is missing, which random_effect in [aggregation] names; add it, or leave'
-            " random_effect out."
-        )
-    refuse(text[name].str.strip() == "", source, lambda row: f"{name} is empty; give each answer one.")
+    if name in text.columns:
+        missing = text[name].str.strip().str.lower().isin(_MISSING)
+        refuse(missing, source, lambda row: f"{name} is empty; random_effect in [aggregation] needs it of each answer.")
 
 
 def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.Series:

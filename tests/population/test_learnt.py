@@ -114,7 +114,7 @@ def test_the_map_is_that_of_the_dense_model(learnt):
     trials, model = answers(), learnt.model
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
     dense = shared_posterior(fit_people(model.gp, of_people(trials), model.share))
-    for by_features, by_all in zip(learnt_function(learnt, trials).predict(x), dense.predict(x), strict=True):
+    for by_features, by_all in zip(learnt_function(learnt, trials).function.predict(x), dense.predict(x), strict=True):
         np.testing.assert_allclose(by_features, by_all, atol=2e-3)
 
 

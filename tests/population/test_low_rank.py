@@ -56,7 +56,7 @@ def test_is_the_dense_model():
     trials, people = stacked(), model()
     dense = fit_people(people.gp, of_people(trials), people.share)
     answers = apart(trials)
-    posterior = shared_function(people, answers, answers.blank, 24, EXACT)
+    posterior = shared_function(people, answers, answers.blank, 24, EXACT).function
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
     np.testing.assert_allclose(evidence(people, trials).value, dense.log_evidence, rtol=1e-10)
     np.testing.assert_allclose(posterior.log_evidence, dense.log_evidence, rtol=1e-10)

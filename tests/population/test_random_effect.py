@@ -10,7 +10,7 @@ from hilbo import OrdinalGP, Trials, fit
 from hilbo.population.hierarchical import NEWCOMER, PersonKernel
 from hilbo.population.low_rank import shared_evidence
 from hilbo.population.people_model import PeopleModel
-from hilbo.population.shared_posterior import context_effects, shared_function
+from hilbo.population.shared_posterior import shared_function
 from hilbo.population.tallies import Tallies, tallied
 
 EXACT, PEOPLE, ANSWERS, CONTEXTS, RANK = 1e-15, 3, 8, 3, 24
@@ -89,7 +89,7 @@ def tallied_apart(trials):
 
 def test_the_shared_function_is_the_dense_models(by_all):
     answers = tallied(stacked(), 3)
-    posterior = shared_function(model(), answers, answers.blank, RANK, EXACT)
+    posterior = shared_function(model(), answers, answers.blank, RANK, EXACT).function
     mean, explained = by_all.predict_explained(at(places(), NOWHERE))
     np.testing.assert_allclose(posterior.log_evidence, by_all.log_evidence, rtol=1e-10)
     np.testing.assert_allclose(posterior.predict(places()), (mean, 0.6 - explained), atol=1e-7)
@@ -98,7 +98,7 @@ def test_the_shared_function_is_the_dense_models(by_all):
 
 def test_contexts_add_what_the_dense_model_says(by_all):
     answers = tallied(stacked(), 3)
-    effects = context_effects(model(), answers, answers.blank, RANK, EXACT)
+    effects = shared_function(model(), answers, answers.blank, RANK, EXACT).effects
     context = jnp.arange(20) % CONTEXTS
     shift, more = effects.added(places(), context)
     mean, explained = by_all.predict_explained(at(places(), NOWHERE))
@@ -117,8 +117,8 @@ def test_the_gradient_in_the_variance_is_that_of_differences():
 def test_an_effect_without_variance_is_none():
     answers = tallied(stacked(), 3)
     none = tallied(eqx.tree_at(lambda t: t.context, stacked(), None), 3)
-    without = shared_function(model(None), none, none.blank, RANK, EXACT)
-    limit = shared_function(model(1e-14), answers, answers.blank, RANK, EXACT)
+    without = shared_function(model(None), none, none.blank, RANK, EXACT).function
+    limit = shared_function(model(1e-14), answers, answers.blank, RANK, EXACT).function
     np.testing.assert_allclose(limit.log_evidence, without.log_evidence, rtol=1e-12)
     np.testing.assert_allclose(limit.predict(places()), without.predict(places()), atol=1e-10)
 

@@ -7,6 +7,7 @@ import tomllib
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 from commands import run
 from studies import SOUND
@@ -137,39 +138,65 @@ def test_the_optimum_is_where_a_newcomer_most_often_says_the_highest(table):
     np.testing.assert_allclose(aggregate.optimum.class_probabilities[-1], chance(aggregate.optimum.x[None, :])[0])
 
 
+PLAIN_GP = "[gp]\ntheta = 30.0\nvariance = 1.0\nthresholds = [-0.5, 0.5]\nnoise = 0.5\n"
 WITH_CLIPS = SOUND.replace('rule = "learnt-1"', 'rule = "learnt-1"\nrandom_effect = "clip"')
+
+
+def with_clips(table):
+    """The same answers, of which only the last person's last one is of the last clip."""
+    answers = read_trials(table, study_of())
+    answers["clip"] = np.where(np.arange(len(answers)) % 2, "Sea ", "Fox")
+    answers.iloc[-1, answers.columns.get_loc("clip")] = "Wolf"
+    return answers
 
 
 def test_a_random_effect_is_read_from_its_column_and_stands_in_the_results(table):
     study = study_of(WITH_CLIPS)
-    answers = read_trials(table, study_of())
-    answers["clip"] = np.where(np.arange(len(answers)) % 2, "Sea", "Fox")
-    cohort = cohort_of(answers, study)
-    assert cohort.contexts == ("Fox", "Sea")
+    cohort = cohort_of(with_clips(table), study)
+    assert cohort.contexts == ("Fox", "Sea", "Wolf")
     np.testing.assert_array_equal(cohort.trials.context[0, :4], [0, 1, 0, 1])
-    np.testing.assert_array_equal(cohort.rows(np.array([2])).first(3).trials.context[0, :3], [0, 1, 0])
     learnt = resolved(study, cohort)
-    content = effect_content(learnt, cohort, learnt_map(learnt.learnt, cohort.trials))
-    assert content is not None
-    json.dumps(content, allow_nan=False)
-    assert content["column"] == "clip"
-    assert set(content["levels"]) == {"Fox", "Sea"}
-    assert "effect" in learnt_content(learnt, cohort.names)["intervals"]
+    map_ = learnt_map(learnt.learnt, cohort.trials)
+    assert "random effect" in learnt_content(learnt, cohort.names)["intervals"]
+
+    def levels(of):
+        content = effect_content(learnt, of, map_)
+        json.dumps(content, allow_nan=False)
+        return list(content["levels"])
+
+    assert levels(cohort) == ["Fox", "Sea", "Wolf"]
+    # A level of nobody whose answers count is none.
+    assert levels(cohort.first(ANSWERS - 1)) == levels(cohort.rows(np.arange(PEOPLE - 1))) == ["Fox", "Sea"]
 
 
-def test_a_table_without_the_column_or_with_an_empty_cell_gets_one_sentence(tmp_path, table):
-    study = study_of(WITH_CLIPS)
-    with pytest.raises(
-        InputError, match=re.escape('column "clip" is missing, which random_effect in [aggregation] names')
-    ):
-        read_trials(table, study)
+def test_one_level_is_no_effect_and_rules_that_do_not_learn_need_no_column(table):
+    answers, study = with_clips(table), study_of(WITH_CLIPS)
+    assert cohort_of(answers.assign(clip="Fox"), study).trials.context is None
+    given = WITH_CLIPS.replace("learnt-1", "bcm") + PLAIN_GP
+    assert cohort_of(answers.drop(columns="clip"), study_of(given)).trials.context is None
+
+
+def test_a_random_effect_is_no_part_of_a_studys_hash():
+    assert study_of(WITH_CLIPS).hash == study_of().hash
+    plain = SOUND.replace('[aggregation]\nrule = "learnt-1"\n', "") + PLAIN_GP
+    assert study_of(plain + '[aggregation]\nrandom_effect = "clip"\n').hash == study_of(plain).hash
+
+
+def test_a_table_without_the_column_with_an_empty_cell_or_too_many_levels_gets_one_sentence(tmp_path, table):
+    study, answers = study_of(WITH_CLIPS), with_clips(table)
+    missing = re.escape('the table has no column "clip", which random_effect in [aggregation] names')
+    with pytest.raises(InputError, match=missing):
+        cohort_of(answers.drop(columns="clip"), study)
     lines = table.read_text().splitlines()
     path = tmp_path / "trials.csv"
-    path.write_text("\n".join([lines[0] + ",clip", lines[1] + ",Fox", *(line + "," for line in lines[2:])]))
+    path.write_text("\n".join([lines[0] + ",clip", lines[1] + ",Fox", *(line + ",nan" for line in lines[2:])]))
     with pytest.raises(InputError, match=":3: clip is empty"):
         read_trials(path, study)
     path.write_text("\n".join([lines[0] + ",clip", *(line + ",Fox" for line in lines[1:])]))
     assert set(read_trials(path, study, others=False)["clip"]) == {"Fox"}
+    many = pd.concat([answers] * 5, ignore_index=True)
+    with pytest.raises(InputError, match="has 240 different texts; a random effect takes up to 200"):
+        cohort_of(many.assign(clip=[f"at {row}" for row in range(len(many))]), study)
 
 
 def test_there_is_nothing_fixed_to_compare_with(table):
