@@ -13,7 +13,7 @@ import urllib.error
 from pathlib import Path
 
 import pytest
-from client_programs import each_language, sources
+from client_programs import of_languages, sources
 from live_server import PATIENCE
 
 from hilbo.app.robot import Client
@@ -58,7 +58,7 @@ def taken_part(links, hub):
         time.sleep(0.01)
 
 
-@each_language
+@pytest.mark.parametrize("language", of_languages(release=("c++", "matlab", "c#")))
 def test_from_init_to_an_optimum_by_the_commands_of_the_readme(language, tmp_path):
     init, doctor, add, session, example, aggregate = commands()
     assert example[:2] == ["python", "clients/example_patch.py"]

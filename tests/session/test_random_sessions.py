@@ -293,6 +293,7 @@ for seed in range(1000, 21000):
 
 
 @pytest.mark.deep
+@pytest.mark.release
 def test_twenty_thousand_random_sessions():
     """In a process that checks no shapes, which take most of the time here: a minute or two."""
     here = Path(__file__).parent

@@ -87,7 +87,7 @@ def test_the_best_is_in_it_as_often_as_it_says():
         posterior = fit(gp, Trials.from_arrays(x[:40], (z > -0.5).astype(int) + (z > 0.5), 64))
         one = jnp.ones(())
         region = optimum_region(
-            STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), posterior.trials, seed
+            STUDY, RuleMap("pooled", "exact", None, posterior, one, 4.0 * one), posterior.trials, seed, count=200
         )
         assert region is not None
         held += region.holds(grid[np.argmax(f[40:])], RBF(THETA))

@@ -3,14 +3,14 @@
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 from live_stimulus import CLIENTS
 
-__all__ = ["LANGUAGES", "Language", "each_language", "hung", "sources"]
+__all__ = ["LANGUAGES", "Language", "each_language", "hung", "of_languages", "sources"]
 
 
 class Language(NamedTuple):
@@ -82,14 +82,16 @@ LANGUAGES = (
     Language("matlab", ("octave-cli",), _matlab, ".m", ""),
     Language("c#", ("mcs", "mono"), _csharp, ".cs", "; Thread.Sleep(600000)"),
 )
-each_language = pytest.mark.parametrize(
-    "language",
-    [
-        pytest.param(
-            language,
-            id=language.name,
-            marks=pytest.mark.skipif(bool(language.missing()), reason=f"{language.missing()} is missing"),
-        )
-        for language in LANGUAGES
-    ],
-)
+
+
+def of_languages(release: Collection[str] = ()) -> list:
+    """Parameters of a test, one for each language; those in `release` are tried before a release only."""
+
+    def marks(language: Language) -> list:
+        missing = pytest.mark.skipif(bool(language.missing()), reason=f"{language.missing()} is missing")
+        return [missing, *([pytest.mark.release] if language.name in release else [])]
+
+    return [pytest.param(language, id=language.name, marks=marks(language)) for language in LANGUAGES]
+
+
+each_language = pytest.mark.parametrize("language", of_languages())
