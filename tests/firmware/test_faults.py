@@ -19,6 +19,7 @@ def test_each_fault_has_a_place_in_the_core():
 
 
 @pytest.mark.deep
+@pytest.mark.release  # each fault compiles the firmware and runs its tests
 @pytest.mark.parametrize("fault", faults.FAULTS, ids=[fault.name for fault in faults.FAULTS])
 def test_a_fault_is_noticed(fault):
     assert faults.is_noticed(fault)
