@@ -191,7 +191,7 @@ def hash_of(content: str) -> str:
     a random effect: they change nothing that is asked of people, whose sessions may be over."""
     tables = json.loads(content)
     aggregation = tables.get("aggregation", {})
-    if {tables.pop("simulation", None), aggregation.pop("random_effect", None)} != {None}:
+    if [tables.pop("simulation", None), aggregation.pop("random_effect", None)] != [None, None]:
         if not aggregation:
             tables.pop("aggregation", None)
         content = json.dumps(tables, ensure_ascii=False, separators=(",", ":"))
