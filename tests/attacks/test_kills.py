@@ -11,6 +11,7 @@ from attacks.support import run
 pytestmark = [pytest.mark.deep, needs_device, pytest.mark.skipif(sys.platform != "linux", reason="/proc")]
 
 
+@pytest.mark.release
 def test_kills_lose_double_and_change_nothing(tmp_path):
     kills = Kills(tmp_path, trials=15)
     try:

@@ -151,6 +151,7 @@ def assert_same(one, other):
 
 
 @pytest.mark.deep
+@pytest.mark.release
 def test_two_and_four_processes_and_four_devices_give_the_map_of_one(folder):
     process = start(folder, "one", "--devices", 1, "--individuals", "--distributed", flags="")
     assert process.communicate(timeout=900) and process.returncode == 2  # nobody to be distributed with
