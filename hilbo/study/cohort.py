@@ -115,15 +115,15 @@ def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:
         return None
     if column not in table:
         raise InputError(
-            f'the table has no column "{column}", which random_effect in [aggregation] names: add it (hilbo export'
-            " writes the table of sessions), or leave random_effect out."
+            f'the table has no column "{column}", which [random_effect] names: add it (hilbo export writes the table'
+            " of sessions), or leave [random_effect] out."
         )
     texts = table[column].astype(str).str.strip()
     count = texts.nunique()
     if count > _LEVELS:
         raise InputError(
             f'column "{column}" has {count:,} different texts; a random effect takes up to {_LEVELS}, such as clips or'
-            " days; leave random_effect out."
+            " days; leave [random_effect] out."
         )
     return texts.to_numpy(object) if count > 1 else None
 

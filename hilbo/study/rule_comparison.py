@@ -92,7 +92,7 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
     for rule, (difference, error) in differences(left).items():
         rules[rule] |= {"difference": difference, "difference_error": error}
     words = recommendation(left, rules, share, len(answered))
-    if learns and study.random_effect is not None:
+    if learns and cohort.contexts:
         words += f" Only {recipe} takes account of the random effect of {study.random_effect}."
     content = {"share": share_content(share), "people": len(answered), "answers": int(cohort.counts().sum())}
     return content | {"rules": rules, "recommendation": words}

@@ -56,7 +56,8 @@ class StudyFile:
     @property
     def random_effect(self) -> str | None:
         """The column of the answers' table whose levels have an effect of their own."""
-        return self.tables.aggregation.random_effect
+        table = self.tables.random_effect
+        return None if table is None else table.column
 
     @property
     def selection(self) -> Selection:
@@ -190,10 +191,7 @@ def hash_of(content: str) -> str:
     """First 16 hex digits of the SHA-256 of a study's content, without the people of its simulations and the column of
     a random effect: they change nothing that is asked of people, whose sessions may be over."""
     tables = json.loads(content)
-    aggregation = tables.get("aggregation", {})
-    if [tables.pop("simulation", None), aggregation.pop("random_effect", None)] != [None, None]:
-        if not aggregation:
-            tables.pop("aggregation", None)
+    if [tables.pop(name, None) for name in ("simulation", "random_effect")] != [None, None]:
         content = json.dumps(tables, ensure_ascii=False, separators=(",", ":"))
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 

@@ -132,12 +132,13 @@ class Selection(_Table, frozen=True):
 
 
 class _AggregationTable(_Table, frozen=True):
-    """`random_effect`: the column of the answers' table, such as the clip, whose levels add something of their own."""
-
     rule: Annotated[Rule, _text("one of " + ", ".join(f'"{name}"' for name in get_args(Rule)), '"bcm"')] = "bcm"
-    random_effect: Annotated[
-        Annotated[str, msgspec.Meta(min_length=1)] | None, _text("the name of a column", '"clip"')
-    ] = None
+
+
+class _RandomEffectTable(_Table, frozen=True):
+    """`column`: of the answers' table, such as the clip, whose levels add something of their own."""
+
+    column: Annotated[str, msgspec.Meta(min_length=1), _text("the name of a column", '"clip"')]
 
 
 class ReportTable(_Table, frozen=True):
@@ -161,6 +162,7 @@ class Tables(_Table, frozen=True):
     report: ReportTable = ReportTable()
     stimulus: StimulusTable | None = None
     simulation: SimulationTable | None = None
+    random_effect: _RandomEffectTable | None = None
     constraints: tuple[_ConstraintTable, ...] = ()
 
 
@@ -173,6 +175,7 @@ _TABLES = {
     "report": ReportTable,
     "stimulus": StimulusTable,
     "simulation": SimulationTable,
+    "random_effect": _RandomEffectTable,
 }
 _REQUIRED = ("schema", "study", "parameters")
 _KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "constraints", "materials")
@@ -304,10 +307,10 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     if tables.simulation is not None:
         tables.simulation.check(parameters, len(labels))
     _check_gp(tables.gp, tables.aggregation.rule, len(labels))
-    column = tables.aggregation.random_effect
-    if column in _COLUMNS or column in {p.name for p in parameters} or (column or "").startswith("_"):
+    column = "" if tables.random_effect is None else tables.random_effect.column
+    if column in _COLUMNS or column in {p.name for p in parameters} or column.startswith("_"):
         raise InputError(
-            f'aggregation.random_effect is "{column}", which has a meaning of its own; name another column of the'
+            f'random_effect.column is "{column}", which has a meaning of its own; name another column of the'
             " answers' table, such as the clip or the day."
         )
 

@@ -140,7 +140,7 @@ def _check_random_effect(text: pd.DataFrame, study: AnyStudy, source: str) -> No
     name = study.random_effect
     if name in text.columns:
         missing = text[name].str.strip().str.lower().isin(_MISSING)
-        refuse(missing, source, lambda row: f"{name} is empty; random_effect in [aggregation] needs it of each answer.")
+        refuse(missing, source, lambda row: f"{name} is empty; [random_effect] needs it of each answer.")
 
 
 def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.Series:

@@ -92,7 +92,10 @@ def test_what_the_file_states_is_kept():
         (SOUND + '[gp]\ninference = "ep"\n', 'gp.inference is "ep"; it must be "laplace" with rule = "learnt-1"'),
         (SOUND + "[gp]\nthresholds = [0.0]\n", "gp.thresholds is [0.0]; it must have one number fewer than the 3"),
         (SOUND.replace("learnt-1", "learnt-0"), 'aggregation.rule is "learnt-0"; it must be one of'),
-        (SOUND + 'random_effect = "level"\n', 'aggregation.random_effect is "level", which has a meaning of its own;'),
+        (
+            SOUND + '[random_effect]\ncolumn = "level"\n',
+            'random_effect.column is "level", which has a',
+        ),
     ],
 )
 def test_bad_files_get_one_sentence(text, sentence):
@@ -139,7 +142,7 @@ def test_the_optimum_is_where_a_newcomer_most_often_says_the_highest(table):
 
 
 PLAIN_GP = "[gp]\ntheta = 30.0\nvariance = 1.0\nthresholds = [-0.5, 0.5]\nnoise = 0.5\n"
-WITH_CLIPS = SOUND.replace('rule = "learnt-1"', 'rule = "learnt-1"\nrandom_effect = "clip"')
+WITH_CLIPS = SOUND + '[random_effect]\ncolumn = "clip"\n'
 
 
 def with_clips(table):
@@ -178,13 +181,14 @@ def test_one_level_is_no_effect_and_rules_that_do_not_learn_need_no_column(table
 
 def test_a_random_effect_is_no_part_of_a_studys_hash():
     assert study_of(WITH_CLIPS).hash == study_of().hash
-    plain = SOUND.replace('[aggregation]\nrule = "learnt-1"\n', "") + PLAIN_GP
-    assert study_of(plain + '[aggregation]\nrandom_effect = "clip"\n').hash == study_of(plain).hash
+    for rule in ("", '[aggregation]\nrule = "bcm"\n'):
+        plain = SOUND.replace('[aggregation]\nrule = "learnt-1"\n', rule) + PLAIN_GP
+        assert study_of(plain + '[random_effect]\ncolumn = "clip"\n').hash == study_of(plain).hash
 
 
 def test_a_table_without_the_column_with_an_empty_cell_or_too_many_levels_gets_one_sentence(tmp_path, table):
     study, answers = study_of(WITH_CLIPS), with_clips(table)
-    missing = re.escape('the table has no column "clip", which random_effect in [aggregation] names')
+    missing = re.escape('the table has no column "clip", which [random_effect] names')
     with pytest.raises(InputError, match=missing):
         cohort_of(answers.drop(columns="clip"), study)
     lines = table.read_text().splitlines()
