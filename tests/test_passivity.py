@@ -163,6 +163,7 @@ def test_the_certificate_agrees_with_the_closed_form(N):
 
 
 @pytest.mark.deep
+@pytest.mark.release
 def test_the_certificate_agrees_with_the_closed_form_on_twenty_thousand_sets():
     undecided = disagreements(20_000)
     print(f"{undecided} of 20,000 sets undecided")

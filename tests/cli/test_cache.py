@@ -30,11 +30,12 @@ def test_it_shows_and_drops_what_is_kept(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.deep
+@pytest.mark.release
 @pytest.mark.parametrize(
     "command",
     [
         "aggregate hilbo/data/video_quality.csv --study hilbo/data/video_quality.toml --first 10",
-        pytest.param("identify hilbo/data/memory_foam_simulated.csv --damping 0.95", marks=pytest.mark.release),
+        "identify hilbo/data/memory_foam_simulated.csv --damping 0.95",
     ],
 )
 def test_results_are_the_same_bits_traced_made_and_kept(command, tmp_path):

@@ -69,6 +69,7 @@ def test_against_quadrature(make):
 
 
 @pytest.mark.deep
+@pytest.mark.release  # 200 samplers
 def test_the_standard_errors_cover_in_95_percent():
     """200 keys: truth within two standard errors for about 95 % of evidence, means, variances and probabilities."""
     data, posterior = repeated(), fitted(repeated)

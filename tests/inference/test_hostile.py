@@ -56,6 +56,7 @@ def test_against_25_digits():
 
 
 @pytest.mark.deep
+@pytest.mark.release  # minutes of mpmath
 def test_all_of_25_answers_against_25_digits():
     for case in WITH_25:
         check_against_digits(case, of_digits(case))

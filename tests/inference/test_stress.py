@@ -33,9 +33,14 @@ def test_a_part_of_the_grid(inference):
     assert list(faults(OF_THREE[::4], inference, np.float64)) == []
 
 
+MINUTES = ("exact",)  # of sampling in each number type
+
+
 @pytest.mark.deep
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.parametrize("inference", INFERENCES)
+@pytest.mark.parametrize(
+    "inference", [pytest.param(i, marks=[pytest.mark.release] if i in MINUTES else []) for i in INFERENCES]
+)
 def test_all_small_cases(inference, dtype):
     assert list(faults(SMALL, inference, dtype)) == []
 

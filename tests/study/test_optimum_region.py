@@ -70,7 +70,8 @@ def test_what_results_say_is_in_physical_units():
     assert content["located"] is False
 
 
-@pytest.mark.deep  # 25 fits
+@pytest.mark.deep
+@pytest.mark.release  # 25 fits; benchmarks/regions.py counts 400 studies
 def test_the_best_is_in_it_as_often_as_it_says():
     """Functions drawn from the model; 95 % of 25, less three standard errors."""
     gp = OrdinalGP(RBF(6.0, 4.0), OrdinalProbit((-0.5, 0.5), 0.5))
