@@ -9,6 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted(ROOT.glob("notebooks/*.py"))
+LONG = ("report",)  # three materials: minutes
 
 
 def test_there_are_notebooks():
@@ -16,7 +17,10 @@ def test_there_are_notebooks():
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=[pytest.mark.release] if path.stem in LONG else []) for path in NOTEBOOKS],
+)
 def test_notebook_runs(path, tmp_path):
     """In an empty folder: a notebook finds what it needs wherever it is opened."""
     env = os.environ | {"HILBO_NOTEBOOK_TRIALS": "7"}

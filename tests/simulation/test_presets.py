@@ -132,7 +132,7 @@ def test_people_of_simulations_are_not_part_of_the_hash():
     assert plain.hash == stated.hash and stated.simulation is not None
 
 
-@pytest.mark.deep  # whole commands: a study of 4 people, and power by two studies
+@pytest.mark.deep  # whole commands: a study of 4 people, and power by two studies of as many
 def test_any_study_is_simulated_and_has_power(tmp_path, capsys, monkeypatch):
     (tmp_path / "s.toml").write_text(VISUAL + "[selection]\nspace_filling = 3\ntrials = 6\n")
     code, _, err = run(
@@ -141,6 +141,6 @@ def test_any_study_is_simulated_and_has_power(tmp_path, capsys, monkeypatch):
     assert code == 0, err
     (row,) = pd.read_csv(tmp_path / "sim" / "truth.csv").query("source == 'population'").to_dict("records")
     assert 0 <= row["hue"] <= 360 and 20 <= row["light"] <= 80
-    options = ("--participants", "2,4", "--trials", "4,6", "--studies", 2, "--jobs", 1)
+    options = ("--participants", 4, "--trials", 6, "--studies", 2, "--jobs", 1)
     code, _, err = run(capsys, monkeypatch, "power", tmp_path / "s.toml", *options, "--out", tmp_path / "power")
     assert code == 0, err
