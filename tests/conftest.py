@@ -27,8 +27,8 @@ PACKAGE = Path(__file__).parents[1] / "hilbo"
 
 
 def modules_that_state_shapes() -> list[str]:
-    """Of these modules every call is checked. In the others Pyright judges the types; to check them here as well took half
-    of the time of the tests of sessions."""
+    """Of these modules every call is checked. In the others Pyright judges the types; to check them here as well took
+    half of the time of the tests of sessions."""
     files = [file for file in sorted(PACKAGE.rglob("*.py")) if "jaxtyping" in file.read_text()]
     return [".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts) for file in files]
 
@@ -60,6 +60,10 @@ def pytest_configure(config):
         os.environ["XLA_FLAGS"] = f"{flags} {QUICKLY}".strip()
     if not hasattr(config, "workerinput"):
         _date_arviz()
+
+
+def pytest_collection_modifyitems(items):
+    items.sort(key=lambda item: item.get_closest_marker("empties_caches") is not None)
 
 
 def _date_arviz():

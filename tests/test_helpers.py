@@ -34,6 +34,7 @@ def test_check_grad_refuses_float32():
         check_grad(jnp.sin, jnp.float32(1))
 
 
+@pytest.mark.empties_caches
 def test_traces_are_counted():
     double = jax.jit(lambda x: 2 * x)
     three, four = jnp.ones(3), jnp.ones(4)

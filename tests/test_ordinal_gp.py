@@ -271,9 +271,7 @@ def test_the_rounding_of_the_log_posterior_stops_no_search(seed, theta, noise):
     assert certificate.residual <= certificate.tolerance and certificate.iterations <= 60
 
 
-# --- last, because it empties JAX's caches
-
-
+@pytest.mark.empties_caches
 def test_growing_data_are_traced_once():
     data = repeated_19()
     gp, trials, whole = model(data), Trials.empty(27, 3), answers(data, 27)

@@ -194,6 +194,7 @@ def test_no_answers_give_exactly_the_prior():
     assert posterior.certificate.converged and posterior.certificate.iterations <= 1
 
 
+@pytest.mark.empties_caches
 @pytest.mark.deep
 def test_growing_data_are_traced_once_and_start_warm():
     data = noisy()

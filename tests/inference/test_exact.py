@@ -245,6 +245,7 @@ def test_one_category_only(category):
     np.testing.assert_allclose(posterior.predict(trials.x[:20])[0], by_ep.predict(trials.x[:20])[0], atol=0.01)
 
 
+@pytest.mark.empties_caches
 @pytest.mark.deep
 def test_growing_data_are_traced_once():
     data = separated()

@@ -15,6 +15,7 @@ from hilbo.programs import surroundings as around
 from hilbo.programs.entries import Entries
 from hilbo.programs.keeping import Programs
 
+pytestmark = pytest.mark.empties_caches
 TRACES = []
 
 

@@ -11,7 +11,7 @@ from hilbo.report.study import write_study
 from hilbo.study.folder import Material, StudyFolder
 from hilbo.study.population_results import analyse_population
 
-pytestmark = pytest.mark.deep
+pytestmark = [pytest.mark.deep, pytest.mark.empties_caches]
 PEOPLE, TRIALS = 3, 6
 
 

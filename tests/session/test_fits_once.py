@@ -15,6 +15,8 @@ from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.records import Block
 from hilbo.session.state import LiveSession
 
+pytestmark = pytest.mark.empties_caches
+
 
 def model(theta=10.0):
     return OrdinalGP(RBF(jnp.asarray(theta), jnp.asarray(1.0)), OrdinalProbit((-0.5, 0.5), noise=0.5))

@@ -68,6 +68,7 @@ def another_process(tmp_path):
     assert remarks == []
 
 
+@pytest.mark.empties_caches
 @pytest.mark.deep  # compiles the step twice
 def test_another_process_traces_no_step_and_finds_the_same_bits(another_process, monkeypatch):
     def found():
