@@ -1,4 +1,4 @@
-"""What every test runs under: float64, strict promotion, shapes checked at every call of hilbo."""
+"""What every test runs under: float64, strict promotion, shapes checked at every call of what states some."""
 
 import datetime
 import gc
@@ -27,13 +27,14 @@ PACKAGE = Path(__file__).parents[1] / "hilbo"
 
 
 def modules_that_state_shapes() -> list[str]:
-    """Of these modules every call is checked. In the others Pyright judges the types; to check them here as well took
-    half of the time of the tests of sessions."""
+    """Of these modules every call is checked, in every run. A run without -m checks the others too; to do so always
+    took half of the time of the tests of sessions, and Pyright judges their types."""
     files = [file for file in sorted(PACKAGE.rglob("*.py")) if "jaxtyping" in file.read_text()]
     return [".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts) for file in files]
 
 
-install_import_hook(modules_that_state_shapes(), "beartype.beartype")  # stays for the whole run: the tests import hilbo
+CHECKER = "beartype.beartype"
+install_import_hook(modules_that_state_shapes(), CHECKER)  # stays for the whole run: the tests import hilbo
 
 from hilbo.numerics.compiling import compiler_options, set_flags  # noqa: E402
 
@@ -58,11 +59,14 @@ def pytest_configure(config):
     quick = config.getoption("markexpr") == "not deep" and "xla_backend_optimization_level" not in flags
     if quick and compiler_options():
         os.environ["XLA_FLAGS"] = f"{flags} {QUICKLY}".strip()
+    if not config.getoption("markexpr"):
+        install_import_hook("hilbo", CHECKER)
     if not hasattr(config, "workerinput"):
         _date_arviz()
 
 
 def pytest_collection_modifyitems(items):
+    """What empties JAX's caches comes last: whatever a worker runs after it is traced anew."""
     items.sort(key=lambda item: item.get_closest_marker("empties_caches") is not None)
 
 
