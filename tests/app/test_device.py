@@ -133,7 +133,7 @@ def test_a_device_that_lost_its_power_voids_the_trial_and_waits_for_begin(tmp_pa
         pending = live.hub.state.pending
         live.hub.rig.device.simulator.tell("restart")
         felt_again(live, pending, "restarted")
-        assert [e.data["condition"] for e in live.events("device")] == ["ready", "lost", "ready"]
+        live.device_did("ready", "lost", "ready")
 
 
 def test_heartbeats_that_ended_void_the_trial_and_the_hold_can_be_cleared(tmp_path):
@@ -175,7 +175,7 @@ def test_a_hold_while_the_disk_is_full_voids_its_trial_as_soon_as_there_is_room(
         live.until(lambda v: v["whole"]["trials"][0]["status"] == "void", live.whole)
         with refused(409):
             live.answer(view)
-        assert [e.data["condition"] for e in live.events("device")] == ["ready", "hold", "ready"]
+        live.device_did("ready", "hold", "ready")
         live.answer()
 
 
@@ -222,13 +222,13 @@ def test_a_killed_server_goes_on_with_the_same_trial_on_a_device_that_held_meanw
         until_held(simulator.port)
         with Live(tmp_path, device=simulator.port) as live:
             assert live.hub.rig.snapshot.state == "HOLD"
-            assert [e.data["condition"] for e in live.events("device")] == ["ready", "stopped"]
+            live.device_did("ready", "stopped")
             assert not live.answer(view)["again"]  # which was kept by the browser
             live.command("clear")
             live.begin()
             live.answer()
             assert [t.status for t in live.hub.state.trials[:2]] == ["answered", "answered"]
-            assert [e.data["condition"] for e in live.events("device")] == ["ready", "stopped", "ready"]
+            live.device_did("ready", "stopped", "ready")
 
 
 def test_a_device_that_held_for_another_reason_voids_the_trial_also_at_the_start(tmp_path):

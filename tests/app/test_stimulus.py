@@ -241,7 +241,7 @@ def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
         program.hello()
         program.report("neutral")
         live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
-        assert [e.data["condition"] for e in live.events("device")] == ["stopped", "ready", "lost", "ready"]
+        live.device_did("stopped", "ready", "lost", "ready")
 
 
 def test_a_program_with_the_key_of_one_that_is_heard_waits_until_that_is_silent(tmp_path):
@@ -257,8 +257,7 @@ def test_a_program_with_the_key_of_one_that_is_heard_waits_until_that_is_silent(
         second.report("neutral")
         with refused(409, "say hello first"):
             first.report("neutral")
-        told = ["stopped", "ready", "lost", "ready"]
-        live.until(lambda _: [e.data["condition"] for e in live.events("device")] == told)
+        live.device_did("stopped", "ready", "lost", "ready")
 
 
 def test_a_program_with_a_newer_link_takes_over_at_once(live):
@@ -266,7 +265,7 @@ def test_a_program_with_a_newer_link_takes_over_at_once(live):
     with refused(401, "no longer part"):
         first.report("neutral")
     second.report("neutral")
-    live.until(lambda _: [e.data["condition"] for e in live.events("device")] == ["stopped", "ready", "lost", "ready"])
+    live.device_did("stopped", "ready", "lost", "ready")
 
 
 def test_nobody_presents_before_the_stop_was_seen(live):
