@@ -196,7 +196,7 @@ def test_a_network_that_goes_silently_is_noticed_though_the_stream_stays_open(tm
         assert view["phase"] == "step"
         live.until(lambda v: not v["participant_here"], live.whole)  # nothing is closed, and nothing comes any more
         live.until(lambda v: v["phase"] == "hello", live.whole)
-        live.until(lambda _: live.events("repeat"))
+        live.until(lambda _: live.events("repeat"), live.whole)
         live.command("pause")
         live.command("resume")  # by the experimenter, with nobody there
         live.until(lambda v: v["phase"] == "hello", live.whole)
