@@ -90,29 +90,29 @@ def damage_case() -> Callable[[random.Random, int], str]:
 
 def _outcome(kind: Kind, target: Path, made: bytes, whole: Any, forged: bool) -> str:
     try:
-        found = kind.read(target)
+        content = kind.read(target)
     except InputError as error:
         good = "\n" not in str(error) and str(error).strip().endswith(".")
         return "refused" if good else f"THROUGH, no sentence: {error}"
     finally:
         if target.read_bytes() != made:
             return "THROUGH, the file was changed"  # noqa: B012 (reading may not write, whatever it said)
-    if found == whole:
+    if content == whole:
         return "the same"
-    kind.check(found)  # raises what counts as a traceback
+    kind.check(content)  # raises what counts as a traceback
     if kind.sealed and not forged:
-        return "the beginning" if _begins(found, whole) else "THROUGH, another content"
+        return "the beginning" if _begins(content, whole) else "THROUGH, another content"
     return "another that could have been written"
 
 
-def _begins(found: Any, whole: Any) -> bool:
+def _begins(content: Any, whole: Any) -> bool:
     """Whether a log's events are the first ones of the whole log."""
-    return isinstance(found, tuple) and found[0] == whole[0] and found[1] == whole[1][: len(found[1])]
+    return isinstance(content, tuple) and content[0] == whole[0] and content[1] == whole[1][: len(content[1])]
 
 
 def _kinds(folder: Path) -> dict[str, Kind]:
     paper = Study.load(Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml")
-    nothing = lambda found: None  # noqa: E731
+    nothing = lambda content: None  # noqa: E731
     kinds = {}
     for name in ("optimisation", "validation"):
         path = _log(folder / f"{name}.session.jsonl", name)
@@ -121,7 +121,7 @@ def _kinds(folder: Path) -> dict[str, Kind]:
         _result(folder / "result.json", paper),
         lambda path: _planned_from(path, paper),
         _forged_result,
-        lambda found: _in_range(found[1], paper),
+        lambda content: _in_range(content[1], paper),
         True,
     )
     kinds["map.nc"] = Kind(
@@ -198,9 +198,9 @@ def _forged_log(rng: random.Random, content: bytes) -> bytes:
     return b"".join(made)
 
 
-def _check_log(found: Any) -> None:
+def _check_log(content: Any) -> None:
     """No trial answered twice, every answer one of the study's, every rendering within its range."""
-    header, events = found
+    header, events = content
     answered = [event["data"]["id"] for event in events if event["kind"] == "answer"]
     assert len(set(answered)) == len(answered)
     for event in events:
@@ -227,8 +227,8 @@ def _result(path: Path, study: Study) -> Path:
     physical = np.asarray(study.space.to_physical(middle)).tolist()
     optima = [{"parameters": dict(zip(study.space.names, row, strict=True))} for row in physical]
     people = [
-        {"participant": name, "trials": 25, "optimum": found, "certificate": {"converged": True}}
-        for name, found in zip(PEOPLE, optima[1:], strict=True)
+        {"participant": name, "trials": 25, "optimum": optimum, "certificate": {"converged": True}}
+        for name, optimum in zip(PEOPLE, optima[1:], strict=True)
     ]
     content = {"optimum": optima[0], "participants": people, "study": study.hash, "seed": 0, "warnings": []}
     path.write_text("".join(sealed(json_lines(content))), encoding="utf-8")
@@ -266,8 +266,8 @@ def _warm(path: Path, study: Study) -> Any:
     return np.asarray(warm.mean).tolist(), np.asarray(warm.variance).tolist()
 
 
-def _check_warm(found: Any) -> None:
-    mean, variance = map(np.asarray, found)
+def _check_warm(content: Any) -> None:
+    mean, variance = map(np.asarray, content)
     assert np.isfinite(mean).all() and np.abs(mean).max() < 1e3
     assert np.isfinite(variance).all() and variance.min() > 0 and variance.max() < 1e2
 

@@ -61,7 +61,7 @@ class Frames:
     """`case` is one batch of frames; `folder` keeps the fuzzer, and what it learns from one case to the next."""
 
     def __init__(self, folder: Path, batch: int = 100_000):
-        self.batch, self.ended, self._found = batch, 0, folder / "fuzz" / "found"
+        self.batch, self.ended, self._inputs = batch, 0, folder / "fuzz" / "found"
         if shutil.which("clang") is None:
             raise SystemExit("This attack needs clang with libFuzzer (on Debian: clang libclang-rt-14-dev).")
         command = ["make", "-s", "-C", FIRMWARE, "fuzzer", f"BUILD={folder}", f"FUZZED={FIRMWARE / 'core'}"]
@@ -86,8 +86,8 @@ class Frames:
 
     def _fuzz(self, seed: int) -> str:
         limits = [f"-seed={seed}", "-runs=2000", "-max_len=600", "-rss_limit_mb=0", "-malloc_limit_mb=512"]
-        command = [str(self._fuzzer), *limits, str(self._found), str(FIRMWARE / "tests" / "corpus")]
-        done = subprocess.run(command, cwd=self._found.parent, capture_output=True)
+        command = [str(self._fuzzer), *limits, str(self._inputs), str(FIRMWARE / "tests" / "corpus")]
+        done = subprocess.run(command, cwd=self._inputs.parent, capture_output=True)
         return done.stderr.decode(errors="replace") if done.returncode == 0 else "broken"
 
 

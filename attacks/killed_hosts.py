@@ -63,12 +63,12 @@ class Killing:
 
     def __call__(self, rng: random.Random, _number: int) -> str:
         """One host; the word under which it counts."""
-        found = self.killed(rng)
-        self.seen.append(found)
-        if found.ticks >= BOUND:
-            return f"THROUGH: {found.last_N:.3g} N, {found.ticks} ticks after the last heartbeat"
+        left = self.killed(rng)
+        self.seen.append(left)
+        if left.ticks >= BOUND:
+            return f"THROUGH: {left.last_N:.3g} N, {left.ticks} ticks after the last heartbeat"
         self.take_over()
-        return "no force within the bound, " + ("pressed" if found.before_N > 0 else "not pressed")
+        return "no force within the bound, " + ("pressed" if left.before_N > 0 else "not pressed")
 
     def killed(self, rng: random.Random) -> Killed:
         """A host that presses, and is killed at a random moment."""
@@ -87,12 +87,12 @@ class Killing:
         silence = threading.Thread(
             target=lambda: words.append(host.stderr.read())
         )  # ends with the helper of heartbeats
-        found = self._watched(silence)
+        left = self._watched(silence)
         host.wait()
         assert words == [b""], words
         host.stdout.close()
         host.stderr.close()
-        return found
+        return left
 
     def _watched(self, silence: threading.Thread) -> Killed:
         """Every tick from the death of a host on, until its heartbeats have ended and force has been zero for long."""
@@ -137,7 +137,7 @@ class Killing:
     def close(self) -> None:
         """End the device."""
         self.device.close()
-        delays, ticks = sorted(found.delay_s for found in self.seen), [found.ticks for found in self.seen]
+        delays, ticks = sorted(left.delay_s for left in self.seen), [left.ticks for left in self.seen]
         if delays:
             print(
                 f"ticks from the last heartbeat to no force: {max(ticks) + 1} at most of {BOUND}; from the kill to the"

@@ -39,12 +39,12 @@ _PROGRAMS = {"device": "hilbo-device", "helper": "heartbeat.py"}
 
 def children(pid: int) -> dict[int, str]:
     """A process's children and their command lines (Linux)."""
-    found = {}
+    commands = {}
     for tasks in Path(f"/proc/{pid}/task").glob("*/children"):
         for child in tasks.read_text().split():
             with contextlib.suppress(OSError):
-                found[int(child)] = Path(f"/proc/{child}/cmdline").read_bytes().replace(b"\0", b" ").decode()
-    return found
+                commands[int(child)] = Path(f"/proc/{child}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+    return commands
 
 
 class Kills:

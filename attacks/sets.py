@@ -146,23 +146,23 @@ def _taps(alpha: float, N: int) -> np.ndarray:
     return np.cumprod(np.r_[1.0, (number - 1 - alpha) / number])
 
 
-def judged(found: dict[str, Any], rows, crc: int) -> str:
+def judged(stated: dict[str, Any], rows, crc: int) -> str:
     """Why a set must not be in force; nothing if it may."""
-    K0, K1, B1, alpha = (found[name] for name in ("K0_N_per_mm", "K1_N_per_mm", "B1_N_s_alpha_per_mm", "alpha"))
+    K0, K1, B1, alpha = (stated[name] for name in ("K0_N_per_mm", "K1_N_per_mm", "B1_N_s_alpha_per_mm", "alpha"))
     ranges = {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha}
     outside = [
         n for n, v in ranges.items() if not np.float32(CONFIG[f"{n}_low"]) <= v <= np.float32(CONFIG[f"{n}_high"])
     ]
     if outside:
         return f"out of range: {outside}"
-    if found["crc"] != crc or not 0 <= found["force_limit_N"] <= CONFIG["force_limit"]:
+    if stated["crc"] != crc or not 0 <= stated["force_limit_N"] <= CONFIG["force_limit"]:
         return "name or force limit"
     beta = B1 * T**-alpha
     if rows:
         p, loss = np.array(rows, np.float32).astype(float).T
         memory, static = sum(w * (1 - 1 / Z) / (1 - (1 - r) / Z) for w, r in zip(p, loss, strict=True)), K0
     else:
-        taps = _taps(alpha, found["length"])
+        taps = _taps(alpha, stated["length"])
         memory = np.polynomial.polynomial.polyval(1 / Z, taps)
         static = K0 + _series(K1, beta * taps.sum())
     H = K0 + _series(K1, beta * memory)

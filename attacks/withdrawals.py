@@ -116,7 +116,7 @@ def _naming(root: Path, person: str) -> list[Path]:
     Bytes are not searched, of binary files or of pictures in a page: in a megabyte of them any three letters come up by
     chance."""
     word = re.compile(rf"(?<![A-Za-z0-9]){person}(?![A-Za-z0-9])")
-    found = []
+    paths = []
     for path in sorted(path for path in root.rglob("*") if path.is_file() and path.suffix != ".png"):
         texts = [path.name.replace("_", " ")]
         if path.suffix == ".nc":
@@ -129,8 +129,8 @@ def _naming(root: Path, person: str) -> list[Path]:
         else:
             texts.append(_PICTURE.sub("", path.read_bytes().decode("utf-8", "replace")))
         if any(word.search(text) for text in texts):
-            found.append(path)
-    return found
+            paths.append(path)
+    return paths
 
 
 # The study before anybody withdraws.

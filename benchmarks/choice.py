@@ -27,11 +27,11 @@ def states(study, count, seed=0):
     from hilbo.simulation.presets import PRESETS
 
     studies = -(-count // 400)
-    found = []
+    sessions = []
     for k in range(studies):
         persons = simulate.people(study, PRESETS["paper-individuals"], 24, seed + k)
-        found.append(simulate.simulate_study(study, persons, seed + k))
-    everybody = jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
+        sessions.append(simulate.simulate_study(study, persons, seed + k))
+    everybody = jax.tree.map(lambda *leaves: np.concatenate(leaves), *sessions)
     rng = np.random.default_rng(seed)
     first = study.selection.space_filling
     cases = rng.permutation(24 * studies * (study.selection.trials - first))[:count]

@@ -30,10 +30,10 @@ def residual(q, alpha, exact):
     rates, logits = jnp.split(q, 2)
     weight, loss = decode(rates, logits, alpha)
     # 1 - λ_1 may pass 1 on the way to the solution, never in it.
-    found = 1 + weight @ jnp.where(
+    approximation = 1 + weight @ jnp.where(
         SAMPLES[None, :] == 0, 0.0, jnp.abs(1 - loss[:, None]) ** SAMPLES[None, :] * jnp.sign(1 - loss[:, None]) - 1
     )
-    return (found - exact) / (alpha * (1 - alpha) * jnp.sqrt(exact))
+    return (approximation - exact) / (alpha * (1 - alpha) * jnp.sqrt(exact))
 
 
 slope = jax.jit(jax.jacfwd(residual))
@@ -43,8 +43,8 @@ def fit(alpha, start, reach=1.0):
     exact = partial_sums(alpha)
     near = (start - reach, start + reach)
     tight = {"xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "max_nfev": 2000}
-    found = least_squares(residual, start, slope, args=(alpha, exact), bounds=near, x_scale="jac", **tight)
-    return found.x, np.abs(found.fun).max()
+    solution = least_squares(residual, start, slope, args=(alpha, exact), bounds=near, x_scale="jac", **tight)
+    return solution.x, np.abs(solution.fun).max()
 
 
 def first(states):

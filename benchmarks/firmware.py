@@ -125,8 +125,8 @@ def measure(cpu: str, folder: Path) -> Measured:
     _, _, sections, stack = emulate(scenes_recording(), folder, cpu)
     rounding, memory = {}, {}
     for name, N, states in MEMORIES:
-        _, bits, found, _ = emulate(memory_recording(name, N, states), folder, cpu)
-        sections |= found
+        _, bits, costs, _ = emulate(memory_recording(name, N, states), folder, cpu)
+        sections |= costs
         force = bits.view("<f4")[-TICKS:]
         x = ENCODER_STEP * PRESS
         kind = {"memory": "full", "states": states} if states else {"N": N}
@@ -178,19 +178,19 @@ def stack_of(cpu: str, folder: Path) -> dict[str, int]:
 
 def tables(folder: Path) -> str:
     """The tables of docs/device/firmware.md."""
-    found = {cpu: measure(cpu, folder) for cpu in MACHINES}
+    by_cpu = {cpu: measure(cpu, folder) for cpu in MACHINES}
     version = subprocess.run(["arm-none-eabi-gcc", "--version"], capture_output=True, text=True).stdout.split("\n")[0]
     text = ["Made by `python benchmarks/firmware.py --write`.", ""]
     text += [f"Instructions, counted in the emulator (Cortex-M4F and M7, -O2, {version})."]
     text += ["", "| a tick (`hb_tick`) | M4 mean | M4 most | M7 mean | M7 most |", "|---|---:|---:|---:|---:|"]
-    ticking = [name for name, cost in found["m4"].sections.items() if cost.ticks]
+    ticking = [name for name, cost in by_cpu["m4"].sections.items() if cost.ticks]
     for name in ticking:
-        costs = [f"{cost.mean:,} | {cost.most:,}" for cost in (found[cpu].sections[name] for cpu in MACHINES)]
-        label = f"contact, {name}" if name in found["m4"].memory else name
+        costs = [f"{cost.mean:,} | {cost.most:,}" for cost in (by_cpu[cpu].sections[name] for cpu in MACHINES)]
+        label = f"contact, {name}" if name in by_cpu["m4"].memory else name
         text.append(f"| {label} | {' | '.join(costs)} |")
     text += ["", "| a message (`hb_receive` of its last byte and all before) | M4 | M7 |", "|---|---:|---:|"]
-    for name in (name for name, cost in found["m4"].sections.items() if cost.frames and not cost.ticks):
-        text.append(f"| {name} | {' | '.join(f'{found[cpu].sections[name].most_of_a_frame:,}' for cpu in MACHINES)} |")
+    for name in (name for name, cost in by_cpu["m4"].sections.items() if cost.frames and not cost.ticks):
+        text.append(f"| {name} | {' | '.join(f'{by_cpu[cpu].sections[name].most_of_a_frame:,}' for cpu in MACHINES)} |")
     text += [
         "",
         f"Cost against error: 5 mm in 50 ms, held for 3 s; K0, K1, B1, α = {', '.join(map(str, SET))}. The device's",
@@ -200,10 +200,10 @@ def tables(folder: Path) -> str:
         "",
     ]
     text += ["| memory | instructions a tick, M4 | error of rounding | and of memory |", "|---|---:|---:|---:|"]
-    m4 = found["m4"]
+    m4 = by_cpu["m4"]
     for name, *_ in MEMORIES:
         text.append(f"| {name} | {m4.sections[name].mean:,} | {m4.rounding[name]:.1e} | {m4.memory[name]:.1e} |")
-    return "\n".join([*text, "", *memory_table(folder, found), ""])
+    return "\n".join([*text, "", *memory_table(folder, by_cpu), ""])
 
 
 def _of(name: str, stack: dict[str, int]) -> int:
@@ -211,7 +211,7 @@ def _of(name: str, stack: dict[str, int]) -> int:
     return next(size for function, size in stack.items() if function == name or function.startswith(f"{name}_2"))
 
 
-def memory_table(folder: Path, found: dict[str, Measured]) -> list[str]:
+def memory_table(folder: Path, by_cpu: dict[str, Measured]) -> list[str]:
     text = ["| bytes | M4 | M7 |", "|---|---:|---:|"]
     rows = {"code and constants of the core": [f"{sizes(cpu)[0]:,}" for cpu in MACHINES]}
     rows["variables of the core"] = [f"{sizes(cpu)[1]:,}" for cpu in MACHINES]
@@ -222,7 +222,7 @@ def memory_table(folder: Path, found: dict[str, Measured]) -> list[str]:
     stacks = [stack_of(cpu, folder) for cpu in MACHINES]
     for name in ("hb_tick", "hb_receive", "hb_transmit", "hb_init"):
         rows[f"stack of `{name}`, at most (from the call graph)"] = [f"{_of(name, stack):,}" for stack in stacks]
-    rows["stack of the measuring image, seen"] = [f"{found[cpu].stack:,}" for cpu in MACHINES]
+    rows["stack of the measuring image, seen"] = [f"{by_cpu[cpu].stack:,}" for cpu in MACHINES]
     return text + [f"| {name} | {' | '.join(values)} |" for name, values in rows.items()]
 
 

@@ -87,8 +87,8 @@ def study():
         key, *outputs = data
         measured = tuple(eqx.tree_at(lambda c: c.output, c, o) for c, o in zip(curves, outputs, strict=True))
         best, costs = fitting.search(model, measured, weights, starts, lower, upper)
-        found = fitting.Fit(model, measured, best, lower, upper, costs, weights)
-        return best.q, intervals.profile_intervals(found), intervals.block_bootstrap(found, key, 1000)
+        fitted = fitting.Fit(model, measured, best, lower, upper, costs, weights)
+        return best.q, intervals.profile_intervals(fitted), intervals.block_bootstrap(fitted, key, 1000)
 
     return jax.jit(lambda data: jax.lax.map(one, data)), tests
 
@@ -242,9 +242,9 @@ def coverage_table(folder):
         "|---|---|---:|---:|---:|---:|---:|---:|",
     ]
     for noise, rho in MEMORY.items():
-        found = summary(folder, noise)
+        shares = summary(folder, noise)
         label = f"white, {100 * NOISE[noise]:g} %" if rho == 0 else f"AR(1), {rho:g}, {100 * NOISE[noise]:g} %"
-        for name, row in found["rows"].items() if found else ():
+        for name, row in shares["rows"].items() if shares else ():
             one = (
                 f"{row['one-sided']} | {100 * row['one-sided holds'] / row['one-sided']:.1f} %"
                 if row["one-sided"]

@@ -72,14 +72,14 @@ def errors(data: Dataset, truth: np.ndarray) -> list[str]:
     evidence, mean, variance, probability = split(truth, points)
     for method in APPROXIMATE:
         posterior = fit(model(data), answers(data), inference=method)
-        found = split(np.asarray(results(posterior, jnp.asarray(data.x_new))), points)
-        off = np.abs(found[1] - mean)
+        approximation = split(np.asarray(results(posterior, jnp.asarray(data.x_new))), points)
+        off = np.abs(approximation[1] - mean)
         figures = (
             f"{np.sqrt(np.mean(off**2)):.4f}",
             f"{np.max(off):.4f}",
-            f"{np.max(np.abs(np.sqrt(found[2]) - np.sqrt(variance))):.4f}",
-            f"{np.max(np.abs(found[3] - probability)):.4f}",
-            f"{found[0] - evidence:+.4f}",
+            f"{np.max(np.abs(np.sqrt(approximation[2]) - np.sqrt(variance))):.4f}",
+            f"{np.max(np.abs(approximation[3] - probability)):.4f}",
+            f"{approximation[0] - evidence:+.4f}",
         )
         name = f"{data.name.replace('_', ' ')} ({data.noise:g})" if method == "laplace" else ""
         rows.append(f"| {name} | {method} | " + " | ".join(figures) + " |")
@@ -111,8 +111,8 @@ def coverage(data: Dataset, truth: np.ndarray) -> tuple[str, list[float]]:
         of_moments = [part.ravel() for part in posterior.standard_errors(x)]
         return results(posterior, x), jnp.concatenate([posterior.certificate.log_evidence_error[None], *of_moments])
 
-    found, stated = map(np.stack, zip(*(once(jax.random.key(seed)) for seed in range(KEYS)), strict=True))
-    covered = np.mean(np.abs(found - truth[None, :]) <= 2 * stated + 1e-12, axis=0)
+    estimates, stated = map(np.stack, zip(*(once(jax.random.key(seed)) for seed in range(KEYS)), strict=True))
+    covered = np.mean(np.abs(estimates - truth[None, :]) <= 2 * stated + 1e-12, axis=0)
     groups = [float(np.mean(part)) for part in split(covered, points)]
     return f"| {data.name.replace('_', ' ')} | " + " | ".join(f"{100 * share:.1f}" for share in groups) + " |", groups
 

@@ -53,7 +53,7 @@ def measure(minutes):
     device = Renderer.open("sim", options={"finger": "all"})
     try:
         before = device.status().tick
-        found = converse(device, 60 * minutes)
+        conversation = converse(device, 60 * minutes)
         status, counts = device.status(), device.counts()
         device.link.request(protocol.Stream(divisor=0, fields=0))
         time.sleep(0.2)
@@ -69,12 +69,12 @@ def measure(minutes):
     assert abs(counts.samples + counts.dropped + counts.missing - ticks) < 200, (counts, ticks)
     assert (status.holds, status.estops) == (0, 0), status
     lost = status.frames_dropped + link.dropped
-    trips = found["trips"]
+    trips = conversation["trips"]
     return [
         ("device time", f"{ticks / rate / 60:.1f} minutes, {ticks:,} ticks"),
         ("telemetry", f"every tick, {counts.samples:,} samples"),
         ("samples dropped by the device / missing", f"{counts.dropped} / {counts.missing}"),
-        ("requests answered, sets changed in contact", f"{len(trips):,}, {found['changes']}"),
+        ("requests answered, sets changed in contact", f"{len(trips):,}, {conversation['changes']}"),
         ("frames damaged, either way", f"{lost}"),
         ("requests sent again, answers that fit none", f"{link.retries}, {link.stray}"),
         ("HOLDs, overruns told by the device", f"{status.holds}, {status.overruns}"),

@@ -85,9 +85,9 @@ def choices(study: Study, seed: int) -> tuple[list[float], list[float]]:
         begun = time.perf_counter()
         bare = bare.tell(label)
         told.append(time.perf_counter() - begun)
-        found = answer(state, trial.id, "c", {"class_a": label}, 0.0)
-        assert found is not None
-        state = state.after(found)
+        answered = answer(state, trial.id, "c", {"class_a": label}, 0.0)
+        assert answered is not None
+        state = state.after(answered)
     fitted = study.selection.space_filling
     return proposed[fitted:], told[fitted - 1 : -1]
 
@@ -104,8 +104,8 @@ def import_times(count: int) -> list[float]:
 
 def quantiles(values) -> str:
     """Median, 99 % and largest, ms."""
-    found = 1000 * np.quantile(np.asarray(values), [0.5, 0.99, 1.0])
-    return " | ".join(f"{value:.1f}" for value in found)
+    milliseconds = 1000 * np.quantile(np.asarray(values), [0.5, 0.99, 1.0])
+    return " | ".join(f"{value:.1f}" for value in milliseconds)
 
 
 def table(delays, ready, imports, proposed, told, fits) -> str:
@@ -141,8 +141,8 @@ def main() -> None:
         study = Study.load(file)
         delays, ready, imports, fits, number = [], [], [], 0, 0
         while len(delays) < options.trials:
-            found, first, waited = one_session(file, study, Path(name) / "logs", number)
-            delays += found
+            session_delays, first, waited = one_session(file, study, Path(name) / "logs", number)
+            delays += session_delays
             ready.append(first)
             imports += import_times(1)
             fits, number = fits + waited, number + 1

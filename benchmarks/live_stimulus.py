@@ -77,7 +77,7 @@ class Presenting:
 def one_session(file: Path, folder: Path, number: int) -> tuple[list[float], int]:
     """s from each answer's acknowledgement to the next parameters, of trials that are chosen; fits waited for."""
     arguments = [str(file), "--participant", f"P{number:03d}", "--logs", str(folder), "--port", "0", "--gap", "0"]
-    found = []
+    delays = []
     with server(*arguments, "--seed", str(number), "--dry-run") as (_, links):
         person, watch, program = (
             Client(links["participant"]),
@@ -88,7 +88,7 @@ def one_session(file: Path, folder: Path, number: int) -> tuple[list[float], int
         while True:
             view = person.get("/api/participant")
             if acknowledged is not None and program.at > acknowledged:
-                found.append(program.at - acknowledged)
+                delays.append(program.at - acknowledged)
                 acknowledged = None
             if view["may"]["begin"]:
                 acknowledged = None
@@ -99,14 +99,14 @@ def one_session(file: Path, folder: Path, number: int) -> tuple[list[float], int
                 person.post("/api/participant/answer", {"trial": view["trial"]["id"], "client": "c", "answers": given})
                 acknowledged = time.perf_counter()
                 if program.at > before:  # it was there before the acknowledgement was
-                    found.append(program.at - acknowledged)
+                    delays.append(program.at - acknowledged)
                     acknowledged = None
             elif view["phase"] == "done":
                 break
             time.sleep(0.002)
         fits = watch.get("/api/experimenter")["fits_after_an_answer"]
         program.close()
-    return found, fits
+    return delays, fits
 
 
 def main() -> None:
@@ -124,8 +124,8 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as name:
             file = study_file(Path(name), options.session, seconds)
             while len(delays) < options.trials:
-                found, waited = one_session(file, Path(name) / "logs", number)
-                delays, fits, number = delays + found, fits + waited, number + 1
+                session_delays, waited = one_session(file, Path(name) / "logs", number)
+                delays, fits, number = delays + session_delays, fits + waited, number + 1
                 print(json.dumps({"trials": len(delays), "fits": fits}), file=sys.stderr, flush=True)
         middle, late, worst = 1000 * np.quantile(delays, [0.5, 0.99, 1.0])
         rows.append(f"| {seconds:g} | {len(delays)} | {middle:.0f} | {late:.0f} | {worst:.0f} | {fits} |")

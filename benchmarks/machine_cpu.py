@@ -58,12 +58,12 @@ def main():
 
 
 def row(data, splits, bins, inference, ard, count):
-    begun, found = time.perf_counter(), []
+    begun, scores = time.perf_counter(), []
     for split in range(count):
         train = splits[f"b{bins}_s{split:02d}"].to_numpy() == 1
-        found.append(score(data, train, bins, inference, ard))
+        scores.append(score(data, train, bins, inference, ard))
     name = f"{inference}, {'a theta per input' if ard else 'one theta'}"
-    return bins, name, np.array(found), time.perf_counter() - begun
+    return bins, name, np.array(scores), time.perf_counter() - begun
 
 
 def score(data, train, bins, inference, ard):
@@ -111,9 +111,9 @@ def table(rows, count):
     for bins in dict.fromkeys(bins for bins, *_ in rows):
         error, absolute = PUBLISHED[bins]
         lines.append(f"| {bins} | published | {error} | {absolute} | | |")
-        for _, name, found, seconds in (each for each in rows if each[0] == bins):
-            e, a, p, _ = found.mean(axis=0)
-            se, sa, sp, _ = found.std(axis=0, ddof=1)
+        for _, name, scores, seconds in (each for each in rows if each[0] == bins):
+            e, a, p, _ = scores.mean(axis=0)
+            se, sa, sp, _ = scores.std(axis=0, ddof=1)
             lines.append(
                 f"| {bins} | {name} | {100 * e:.1f} ± {100 * se:.1f} | {a:.3f} ± {sa:.3f} | {p:.2f} ± {sp:.2f} |"
                 f" {seconds / count:.1f} |"

@@ -121,7 +121,7 @@ def predicted(gp, share, counts, common, mask, x):
     maps["hierarchical, exact"] = mean, variance + (1 - share) * prior
     pooled = Counts(counts.x, jnp.sum(counts.counts, axis=0, keepdims=True))
     maps["pooled"] = fit_counts(gp, jnp.ones(()), pooled).predict(x)
-    return {rule: jax.vmap(gp.likelihood.class_probabilities)(*found) for rule, found in maps.items()}
+    return {rule: jax.vmap(gp.likelihood.class_probabilities)(*moments) for rule, moments in maps.items()}
 
 
 def main():
@@ -146,16 +146,16 @@ def main():
         longest = np.bincount(data.who).max()
         rows = np.resize(np.flatnonzero(test), longest)  # padded, for one compilation
         x = jnp.asarray(data.x[rows])
-        found = predicted(learnt.gp, learnt.share, counts, None, jnp.asarray(mask), x)
-        found = {rule: np.asarray(p)[: test.sum()] for rule, p in found.items()}
+        by_rule = predicted(learnt.gp, learnt.share, counts, None, jnp.asarray(mask), x)
+        by_rule = {rule: np.asarray(p)[: test.sum()] for rule, p in by_rule.items()}
         by_recipe = {name: by(recipe, data, test) for name, recipe in RECIPES.items()}
         if data.context is not None:
             by_recipe[EFFECT] = by(LEARNT_2, data, test, effect=True)
-        found |= {name: chance for name, (chance, _) in by_recipe.items()}
+        by_rule |= {name: chance for name, (chance, _) in by_recipe.items()}
         wide.append(by_recipe[LEARNT_1.name][1])
-        found["probit"] = quadratic(data.x, data.q, data.categories, ~test)[test]
-        found["marginal"] = constant(data.q, data.categories, ~test)[test]
-        for rule, p in found.items():
+        by_rule["probit"] = quadratic(data.x, data.q, data.categories, ~test)[test]
+        by_rule["marginal"] = constant(data.q, data.categories, ~test)[test]
+        for rule, p in by_rule.items():
             chances.setdefault(rule, np.zeros((len(data.q), data.categories)))[test] = p
         print(data.names[left], f"{time.perf_counter() - begun:.0f} s, share {shares[-1]:.3f}", flush=True)
     text = table(chosen, data, chances, everybody, shares, wide)

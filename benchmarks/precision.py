@@ -90,7 +90,7 @@ def inference() -> Iterator[Row]:
     for method in ("laplace", "ep", "ep_corrected", "exact"):
         worst, failed = np.zeros(4), 0
         for make in SIX:
-            data, found = make(), []
+            data, by_dtype = make(), []
             for dtype in TYPES:
                 gp = rounded(model(data), dtype)
                 trials = rounded(answers(data), dtype)
@@ -98,9 +98,9 @@ def inference() -> Iterator[Row]:
                 posterior = fit(gp, trials, inference=method, throw=False)
                 mean, variance = posterior.predict(x)
                 failed += not bool(posterior.certificate.converged)
-                found.append((mean, jnp.sqrt(variance), posterior.log_evidence, posterior.class_probabilities(x)))
+                by_dtype.append((mean, jnp.sqrt(variance), posterior.log_evidence, posterior.class_probabilities(x)))
             scale = np.array([data.variance**0.5, data.variance**0.5, 1.0, 1.0])
-            worst = np.maximum(worst, [apart(b, a) for a, b in zip(*found, strict=True)] / scale)
+            worst = np.maximum(worst, [apart(b, a) for a, b in zip(*by_dtype, strict=True)] / scale)
         for name, error, limit, unit in zip(names, worst, needed, units, strict=True):
             yield Row(f"fit, {method}: {name}", error if not failed else np.nan, limit, unit)
 
@@ -156,18 +156,18 @@ def choices() -> Iterator[Row]:
         "TopCategory": acquisition.TopCategory(0.5, 0.5),
         "Mean": acquisition.Mean(),
     }
-    found = []
+    by_dtype = []
     for dtype in TYPES:
         trials = rounded(type(answers(SIX[0]()))(jnp.asarray(x), jnp.asarray(q), jnp.ones(25, bool)), dtype)
         posterior = fit(rounded(study.gp, dtype), trials)
         at = posterior.predict(jnp.asarray(np.asarray(candidates, np.float32).astype(dtype)))
-        found.append((posterior, {name: np.asarray(score(*at), float) for name, score in scores.items()}))
+        by_dtype.append((posterior, {name: np.asarray(score(*at), float) for name, score in scores.items()}))
     for name in scores:
-        high, low = (values[name] for _, values in found)
+        high, low = (values[name] for _, values in by_dtype)
         yield Row(f"acquisition.{name}: value", apart(low, high), 1e-3, "prior sd, or log")
         loss = float(np.max(high) - high[np.argmax(low)])
         yield Row(f"acquisition.{name}: loss of the chosen candidate", loss, 1e-4, "prior sd, or log")
-    best = [best_point(study.space, posterior.astype(np.float64), candidates).x for posterior, _ in found]
+    best = [best_point(study.space, posterior.astype(np.float64), candidates).x for posterior, _ in by_dtype]
     yield Row("best_point, from a posterior fitted in float32", apart(best[1], best[0]), 1e-2, "of the search range")
 
 

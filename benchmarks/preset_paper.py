@@ -58,8 +58,8 @@ def main():
 
     study = Study.load(ROOT / "hilbo" / "data" / "paper.toml")
     candidates = search_points(study.space, 0)
-    found = [one_study(study, seed, candidates) for seed in range(chosen.seeds)]
-    text = report(found)
+    studies = [one_study(study, seed, candidates) for seed in range(chosen.seeds)]
+    text = report(studies)
     print(text)
     if chosen.write:
         path = ROOT / "docs" / "methods" / "simulation.md"
@@ -67,20 +67,21 @@ def main():
         path.write_text(f"{head}<!-- measured -->\n{text}")
 
 
-def report(found):
-    close = np.mean([f["close"] for f in found], axis=0)
-    own = np.concatenate([f["own"] for f in found])
-    physical = np.concatenate([f["physical"] for f in found])
+def report(studies):
+    close = np.mean([f["close"] for f in studies], axis=0)
+    own = np.concatenate([f["own"] for f in studies])
+    physical = np.concatenate([f["physical"] for f in studies])
     q = 100 * np.percentile(own, [25, 50, 75])
     mean, sd = physical.mean(axis=0), physical.std(axis=0, ddof=1)
-    row = lambda key: 100 * np.percentile([f[key] for f in found], [25, 50, 75])  # noqa: E731
-    bcm = 100 * np.array([f["bcm"] for f in found])
+    row = lambda key: 100 * np.percentile([f[key] for f in studies], [25, 50, 75])  # noqa: E731
+    bcm = 100 * np.array([f["bcm"] for f in studies])
     final = np.percentile(bcm[:, -1], [25, 50, 75])
     mid, average = row("mean_of_optima"), row("average")
-    settling = 100 * np.median([f["settling"] for f in found], axis=0)
-    people = 100 * np.median([f["own_progress"] for f in found], axis=0)
+    settling = 100 * np.median([f["settling"] for f in studies], axis=0)
+    people = 100 * np.median([f["own_progress"] for f in studies], axis=0)
     lines = [
-        f"Made by `python benchmarks/preset_paper.py --seeds {len(found)} --write`: {len(found)} studies of 24 x 25.",
+        f"Made by `python benchmarks/preset_paper.py --seeds {len(studies)} --write`:"
+        f" {len(studies)} studies of 24 x 25.",
         "",
         "| | simulated | paper |",
         "|---|---|---|",

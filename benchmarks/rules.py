@@ -46,8 +46,8 @@ def fitted(trials):
 
 
 @eqx.filter_jit
-def predict(found, x):
-    return found.predict(x)
+def predict(map_, x):
+    return map_.predict(x)
 
 
 @eqx.filter_jit
@@ -105,13 +105,13 @@ def one_study(folder, level, seed, points, truth, chances, share_answers):
         rule = name.partition(",")[0]
         largest = 0 if "by points" in name else 1500
         try:
-            found = rule_map(gp, trials, rule, posteriors=posteriors, share=learnt.mean, largest=largest)
+            map_ = rule_map(gp, trials, rule, posteriors=posteriors, share=learnt.mean, largest=largest)
         except InputError:
             continue
-        best = optimum(lambda x, found=found: predict(found, jnp.asarray(x))[0], points, rng)
+        best = optimum(lambda x, map_=map_: predict(map_, jnp.asarray(x))[0], points, rng)
         row[f"miss {name}"] = np.sqrt(np.mean((best - truth) ** 2))
-        mean, variance = (np.asarray(part) for part in predict(found, jnp.asarray(points)))
-        goal = likeliest(chances, float(1 - found.share) * float(gp.kernel.variance))
+        mean, variance = (np.asarray(part) for part in predict(map_, jnp.asarray(points)))
+        goal = likeliest(chances, float(1 - map_.share) * float(gp.kernel.variance))
         row[f"cover {name}"] = np.mean(np.abs(mean[:300] - goal) < 1.96 * np.sqrt(variance[:300]))
     means = np.asarray(own_means(posteriors, jnp.asarray(points)))
     own = points[means.argmax(axis=1)]
@@ -149,7 +149,7 @@ def main():
 
 
 def table(rows, true_share, chosen):
-    done = min(len(found) for found in rows.values())
+    done = min(len(studies) for studies in rows.values())
     several = done > 1  # one study has no quartiles, and no coverage
     lines = [
         f"Made by `python benchmarks/rules.py FOLDER --seeds {done}"

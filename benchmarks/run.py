@@ -37,8 +37,8 @@ def main():
         put("results/run_time.md", "run", document(runs, chosen.rounds))
         return
     limit_cores(chosen.cores)
-    found = measure(chosen.rounds)
-    print(json.dumps(found) if chosen.json else table(found) + floor_text(found))
+    run = measure(chosen.rounds)
+    print(json.dumps(run) if chosen.json else table(run) + floor_text(run))
 
 
 def limit_cores(cores):
@@ -62,17 +62,17 @@ def measure(rounds):
     from run_tasks import data, once, tasks
 
     scene = data()
-    found = {"tasks": {}, "floors": floors(rounds, scene)}
+    run = {"tasks": {}, "floors": floors(rounds, scene)}
     for name, (ours, theirs) in tasks(scene).items():
         for function in (*ours, theirs):
             once(function)
         count = 40 * rounds if name == "live step" else max(rounds // 5, 3) if name == "hyperparameters" else rounds
-        found["tasks"][name] = quantiles([[once(function) for function in (*ours, theirs)] for _ in range(count)])
+        run["tasks"][name] = quantiles([[once(function) for function in (*ours, theirs)] for _ in range(count)])
         if name in SHORT:
             loops = [[once(function) for _ in range(count)] for function in (*ours, theirs)]
-            found["tasks"][f"{name}, alone"] = quantiles(np.transpose(loops))
-        print(name, found["tasks"][name], file=sys.stderr)
-    return found
+            run["tasks"][f"{name}, alone"] = quantiles(np.transpose(loops))
+        print(name, run["tasks"][name], file=sys.stderr)
+    return run
 
 
 def quantiles(times):

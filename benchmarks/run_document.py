@@ -33,18 +33,18 @@ LIMITS = (
 )
 
 
-def table(found):
+def table(run):
     """The times of one run."""
     lines = [
         "| task | NumPy (ms) | hilbo, Laplace (ms) | ratio (asked) | hilbo, EP (ms) | EP / Laplace |",
         "|---|---:|---:|---:|---:|---:|",
     ]
-    for key, times in found["tasks"].items():
+    for key, times in run["tasks"].items():
         laplace, ep, numpy = (1e3 * t for t in times["median"])
         asked = f" ({ASKED[key]})" if key in ASKED else ""
         ratio = f"{numpy / laplace:.1f} x{asked}"
         lines.append(f"| {NAMES[key]} | {numpy:.2f} | {laplace:.2f} | {ratio} | {ep:.2f} | {ep / laplace:.2f} |")
-    p99 = [1e3 * t for t in found["tasks"]["live step"]["p99"]]
+    p99 = [1e3 * t for t in run["tasks"]["live step"]["p99"]]
     lines += [
         "",
         f"99th percentile of the live step: Laplace {p99[0]:.2f} ms, EP {p99[1]:.2f} ms, NumPy {p99[2]:.2f} ms.",

@@ -85,20 +85,20 @@ def agreement(chosen):
     )
     lines.append("|--:|--:|--:|")
     for count in chosen.processes:
-        found = distributed(chosen.agree, count)
-        maps[count] = np.array(found["map"])
+        result = distributed(chosen.agree, count)
+        maps[count] = np.array(result["map"])
         first = maps[chosen.processes[0]]
         apart = np.abs(maps[count] - first).max() / np.abs(first).max()
-        lines.append(f"| {count} | {apart:.1e} | {found['seconds']:.1f} |")
+        lines.append(f"| {count} | {apart:.1e} | {result['seconds']:.1f} |")
     return lines
 
 
 def measured(device, **settings):
     command = [sys.executable, __file__, "--device", device, "--run", json.dumps(settings)]
     done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    found = json.loads(done.stdout.splitlines()[-1])
-    print(found, file=sys.stderr, flush=True)
-    return found
+    result = json.loads(done.stdout.splitlines()[-1])
+    print(result, file=sys.stderr, flush=True)
+    return result
 
 
 def distributed(people, count):

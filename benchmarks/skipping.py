@@ -39,17 +39,17 @@ def tasks():
     points, score = jnp.asarray(candidates), UCB(0.7)
     posterior = jax.jit(lambda data: fit(study.gp, data, throw=False))(one)
     short, short_points = posterior.astype(jnp.float32), points.astype(jnp.float32)
-    found = lattice_of(study.space, 25)
-    usable = np.concatenate([found.inside, found.present])
-    grid = found.points(*map(jnp.asarray, np.indices(usable.shape)))[jnp.asarray(usable)]
-    grid = jnp.concatenate([grid, found.extra]).astype(jnp.float32)
+    lattice_ = lattice_of(study.space, 25)
+    usable = np.concatenate([lattice_.inside, lattice_.present])
+    grid = lattice_.points(*map(jnp.asarray, np.indices(usable.shape)))[jnp.asarray(usable)]
+    grid = jnp.concatenate([grid, lattice_.extra]).astype(jnp.float32)
 
     def known(p):
         return p.gp.kernel, p.trials.x, p.latent.weights, p.latent.factor
 
     everywhere = jax.jit(lambda p, x: score(*p.predict(x)))
     few = jax.jit(lambda p, x: lattice.screen_points(*known(p), x, score))
-    columns = jax.jit(lambda p: lattice.screen(*known(p), found, score).value)
+    columns = jax.jit(lambda p: lattice.screen(*known(p), lattice_, score).value)
     all_values = everywhere(posterior, points)
     terms = OrdinalTerms(study.gp.likelihood, one.q, one.mask)
     covariance = gram(study.gp.kernel, one.x, one.x)

@@ -124,7 +124,7 @@ def one(name, seed, cut):
     edges = np.quantile(crowd, np.array(cut) / 100)
     chance = space.candidates(2048, 7 + seed)[np.random.default_rng(seed).permutation(2048)]
     others = {"Sobol'": space.candidates(study.selection.trials, seed), "chance": chance}
-    found, outside = {}, 0
+    curves, outside = {}, 0
     for way in WAYS:
         session, curve = Session.start(study, seed), {}
         for trial in range(study.selection.trials):
@@ -139,8 +139,8 @@ def one(name, seed, cut):
             if (trial + 1) % 10 == 0:
                 best = numbers(space, session.best())
                 curve[str(trial + 1)] = float(np.mean(crowd > value(best)[0]))
-        found[way] = curve
-    return {"function": name, "seed": seed, "cut": cut, "better": found, "outside": outside}
+        curves[way] = curve
+    return {"function": name, "seed": seed, "cut": cut, "better": curves, "outside": outside}
 
 
 def step_times(dim, constrained):

@@ -118,12 +118,14 @@ def run(quick: bool, sizes: tuple[str, ...]) -> dict:
                 continue
             truth = of_laplace if inference == "laplace" else of_posterior
             start = time.perf_counter()
-            found = [fit_case(c, size, inference, np.dtype(dtype).type, t) for c, t in zip(cases, truth, strict=True)]
-            for outcome in found:
+            outcomes = [
+                fit_case(c, size, inference, np.dtype(dtype).type, t) for c, t in zip(cases, truth, strict=True)
+            ]
+            for outcome in outcomes:
                 if outcome.wrong or (dtype == "float64" and not outcome.converged):
                     print(f"  {outcome.wrong or 'said no'}: {outcome.case.name}", file=sys.stderr)
             before, seconds = results[inference, dtype]
-            results[inference, dtype] = before + found, seconds + time.perf_counter() - start
+            results[inference, dtype] = before + outcomes, seconds + time.perf_counter() - start
             print(f"{size} {inference} {dtype}: {time.perf_counter() - start:.0f} s", file=sys.stderr)
     return results
 

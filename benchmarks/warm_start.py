@@ -82,13 +82,13 @@ def studied(study, seed, count, fillings, share):
     filling = np.stack([study.space.latin_hypercube(5, 3000 + seed * count + i) for i in range(count)])
     plan = design(study, seed)
     everybody = jnp.broadcast_to(points[jnp.argmax(mean)], (count, 1, study.space.dim))
-    found = {"the map's own best": judged(new, everybody)}
-    found["cold"] = judged(new, sessions(study, new, jnp.asarray(filling), keys, plan, points, None)[1])
+    judgements = {"the map's own best": judged(new, everybody)}
+    judgements["cold"] = judged(new, sessions(study, new, jnp.asarray(filling), keys, plan, points, None)[1])
     warm = warm_start(study, points, mean, variance, "simulated", share)
     for number in fillings:
         best = sessions(study, new, jnp.asarray(filling[:, :number]), keys, plan, points, warm)[1]
-        found[f"map, {number} space-filling trials"] = judged(new, best)
-    return found
+        judgements[f"map, {number} space-filling trials"] = judged(new, best)
+    return judgements
 
 
 def main() -> None:
@@ -123,18 +123,18 @@ def main() -> None:
         "gain there, paired",
     )
     print("| " + " | ".join(heads) + " |\n|" + "---|" * len(heads))
-    for name, found in merged.items():
-        row(name, found, merged["cold"])
+    for name, judgement in merged.items():
+        row(name, judgement, merged["cold"])
 
 
-def row(name, found, cold):
+def row(name, judgement, cold):
     target = cold["close"].mean(0)[-1]
-    curve = found["close"].mean(0)
-    error = found["close"].std(0, ddof=1) / np.sqrt(len(found["close"]))
+    curve = judgement["close"].mean(0)
+    error = judgement["close"].std(0, ddof=1) / np.sqrt(len(judgement["close"]))
     cells = [f"{curve[n - 1]:.3f}" for n in (5, 10, 15)] + [f"{curve[24]:.3f} ± {error[24]:.3f}"]
     when = reached(curve, target)
-    miss = np.median(found["nrmse"][:, -1])
-    gain = found["close"][:, (when or TRIALS) - 1] - cold["close"][:, -1]
+    miss = np.median(judgement["nrmse"][:, -1])
+    gain = judgement["close"][:, (when or TRIALS) - 1] - cold["close"][:, -1]
     paired = f"{gain.mean():+.3f} ± {gain.std(ddof=1) / np.sqrt(len(gain)):.3f}"
     print(f"| {name} | " + " | ".join(cells) + f" | {miss:.3f} | {when or '> 25'} | {paired} |")
 

@@ -113,12 +113,12 @@ REFERENCE = by_exact(32 * 2048, 99)
 def answer(run):
     """Compiled: model, trials, points -> posterior, mean, sd."""
 
-    def found(gp, trials, x):
+    def posterior_and_moments(gp, trials, x):
         posterior = run(gp, trials)
         mean, variance = posterior.predict(x)
         return posterior, mean, jnp.sqrt(variance)
 
-    return jax.jit(found)
+    return jax.jit(posterior_and_moments)
 
 
 def quantities(function, args):
@@ -127,14 +127,15 @@ def quantities(function, args):
     return mean, sd, posterior.class_probabilities(args[2][:8]), posterior.log_evidence
 
 
-def misses(found, truth):
+def misses(approximation, truth):
     """Errors in the order of QUANTITIES; the next point's is the loss of UCB (weight 0.7) by the reference."""
     mean, sd, probability = (
-        np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2)) for a, b in zip(found[:3], truth[:3], strict=True)
+        np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2))
+        for a, b in zip(approximation[:3], truth[:3], strict=True)
     )
-    ucb = [np.asarray(m + 0.7 * s, float) for m, s in (found[:2], truth[:2])]
+    ucb = [np.asarray(m + 0.7 * s, float) for m, s in (approximation[:2], truth[:2])]
     loss = np.max(ucb[1]) - ucb[1][np.argmax(ucb[0])]
-    return [mean, sd, probability, abs(float(found[3]) - float(truth[3])), loss]
+    return [mean, sd, probability, abs(float(approximation[3]) - float(truth[3])), loss]
 
 
 def measure(sizes):
@@ -239,13 +240,13 @@ def draw(results, floors, sizes, path):
     figure.savefig(path, metadata={"Date": None})
 
 
-def _panel(axis, found, quantity):
+def _panel(axis, results, quantity):
     for family, (colour, marker) in STYLE.items():
-        whole = [name for name in found if name.split(",")[0] == family and "steps" not in name]
+        whole = [name for name in results if name.split(",")[0] == family and "steps" not in name]
         for single in (False, True):
             names = [name for name in whole if ("float32" in name) == single]
-            times = [1e3 * found[name][1] for name in names]
-            errors = [np.max(found[name][0][:, quantity]) for name in names]
+            times = [1e3 * results[name][1] for name in names]
+            errors = [np.max(results[name][0][:, quantity]) for name in names]
             fill = {"mfc": "none"} if single else {}
             axis.loglog(times, errors, marker, ls="-" if len(names) > 1 else "", color=colour, ms=7, **fill)
     axis.grid(color="0.93")

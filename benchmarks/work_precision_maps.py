@@ -52,8 +52,8 @@ def committee(reference) -> str:
                 means, explained = jax.vmap(one)(trials)
                 return bcm.combine_explained(means, explained, 1.0, throw=False)
 
-            (found, spread), seconds = clock(jax.jit(merged), trials, rounds=5)
-            errors = (found - mean, jnp.sqrt(spread) - jnp.sqrt(variance))
+            (merged_mean, spread), seconds = clock(jax.jit(merged), trials, rounds=5)
+            errors = (merged_mean - mean, jnp.sqrt(spread) - jnp.sqrt(variance))
             figures = " | ".join(f"{float(jnp.sqrt(jnp.mean(e**2))):.4f}" for e in errors)
             name = f"{people} x {each}" if inference == "laplace" else ""
             rows.append(f"| {name} | {inference} | {1e3 * seconds:.1f} | {figures} |")
@@ -100,14 +100,14 @@ def optimum() -> str:
         choices[f"{count:,} | - | float64"] = _chooser(study, candidates, 0, jnp.float64)
         choices[f"{count:,} | 3 | float64"] = _chooser(study, candidates, 3, jnp.float64)
         choices[f"{count:,} | 3 | float32"] = _chooser(study, candidates, 3, jnp.float32)
-    found = {name: [clock(choose, t, rounds=3) for t in states] for name, choose in choices.items()}
-    values = {name: np.array([float(value) for value, _ in each]) for name, each in found.items()}
+    clocked = {name: [clock(choose, t, rounds=3) for t in states] for name, choose in choices.items()}
+    values = {name: np.array([float(value) for value, _ in each]) for name, each in clocked.items()}
     best = np.max(list(values.values()), axis=0)
     rows = [
         "| candidates | polished | screening | time (ms) | loss, mean | loss, worst |",
         "|---:|---:|---|---:|---:|---:|",
     ]
     for name in list(choices)[1:]:
-        loss, seconds = best - values[name], np.median([s for _, s in found[name]])
+        loss, seconds = best - values[name], np.median([s for _, s in clocked[name]])
         rows.append(f"| {name} | {1e3 * seconds:.2f} | {np.mean(loss):.1e} | {np.max(loss):.1e} |")
     return "\n".join(rows)

@@ -31,9 +31,9 @@ print(f"stroke {said.position_low_mm:.1f} to {said.position_high_mm:.1f} mm in s
 # force, bit for bit what was sent.
 
 # %%
-found = device.send(K0=-3.18, K1=5.58, B1=7.88, alpha=0.176)
-print(found)
-print(f"needs {found.needs:.4f} N.s/m of damping, has {said.damping_N_s_per_m:.4f}")
+confirmed = device.send(K0=-3.18, K1=5.58, B1=7.88, alpha=0.176)
+print(confirmed)
+print(f"needs {confirmed.needs:.4f} N.s/m of damping, has {said.damping_N_s_per_m:.4f}")
 
 # %% [markdown]
 # A set that is not passive on this device is refused, and the one in force stays.
@@ -43,7 +43,7 @@ try:
     device.send(K0=-5.01, K1=8.44, B1=10.28, alpha=0.282)
 except InputError as error:
     print(error)
-print("in force:", device.in_force() == found)
+print("in force:", device.in_force() == confirmed)
 
 # %% [markdown]
 # ## Press
@@ -82,7 +82,7 @@ device.close()
 # The same positions through `viscoelastic`, in double precision. Out of contact the model sees 0 and pushes nothing.
 
 # %%
-model = FOSLS(found.K0, found.K1, found.B1, found.alpha, N=found.length)
+model = FOSLS(confirmed.K0, confirmed.K1, confirmed.B1, confirmed.alpha, N=confirmed.length)
 expected = np.asarray(model.simulate(np.maximum(table["position_mm"].to_numpy(), 0), unilateral=True))
 error = np.abs(table["force_N"].to_numpy() - expected)
 print(f"largest force {expected.max():.3f} N, largest difference {error.max():.2e} N")

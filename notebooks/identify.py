@@ -34,9 +34,9 @@ for test in material.tests:
 # goes through the model, so that the ramp of the test is no problem.
 
 # %%
-found = fit(material.tests, Sampled(N=101, T=1e-3))
-print({name: round(value, 4) for name, value in found.parameters().items()})
-print("NRMSE", {kind: f"{100 * value:.2f} %" for kind, value in nrmse(found).items()})
+fitted = fit(material.tests, Sampled(N=101, T=1e-3))
+print({name: round(value, 4) for name, value in fitted.parameters().items()})
+print("NRMSE", {kind: f"{100 * value:.2f} %" for kind, value in nrmse(fitted).items()})
 
 # %% [markdown]
 # ## What the digits are worth

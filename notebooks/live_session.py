@@ -58,8 +58,8 @@ while log.state.screen not in ("done", "ended"):
     log.append(propose(log.state, chooser, time.time()))
     trial = log.state.pending
     numbers = {name: trial.renderings["a"][name] for name in ("K0", "K1", "B1", "alpha")}
-    found = device.send(**numbers, N=mechanics.N, T=mechanics.T)
-    log.append(sent(log.state, trial.id, "a", time.time(), in_force=found._asdict()))
+    confirmed = device.send(**numbers, N=mechanics.N, T=mechanics.T)
+    log.append(sent(log.state, trial.id, "a", time.time(), in_force=confirmed._asdict()))
     for step, _ in enumerate(log.state.steps_of(trial)):
         log.append(present(log.state, trial.id, step, True, time.time()))
         chooser.lookahead(log.state)  # while somebody feels

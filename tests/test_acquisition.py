@@ -13,13 +13,13 @@ from hilbo import acquisition
 @pytest.mark.parametrize("z", [-300.0, -38.0, -5.0, -1.0, -1e-8, 0.0, 1e-8, 0.7, 3.0, 40.0])
 def test_log_expected_improvement(z):
     sd = 0.3
-    found = acquisition.LogEI(1.0)(jnp.asarray(1.0 + sd * z), jnp.asarray(sd**2))
+    value = acquisition.LogEI(1.0)(jnp.asarray(1.0 + sd * z), jnp.asarray(sd**2))
     with mp.workdps(40):
         # h falls like phi(z) / z^2: as many digits more as the cancellation takes.
         mp.mp.dps += 10
         u = (mp.mpf(1.0 + sd * z) - 1) / mp.sqrt(mp.mpf(sd**2))
         expected = mp.log(mp.sqrt(mp.mpf(sd**2))) + mp.log(mp.npdf(u) + u * mp.ncdf(u))
-    np.testing.assert_allclose(float(found), float(expected), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(float(value), float(expected), rtol=1e-12, atol=1e-14)
 
 
 def test_scores_are_differentiable():

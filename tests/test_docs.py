@@ -47,15 +47,15 @@ def anchors(file: Path) -> set[str]:
 
 def broken(file: Path) -> list[str]:
     """The relative links of a page that lead to no file, or to no heading of it."""
-    found = []
+    links = []
     for link in LINK.findall(text_of(file)):
         if re.match(r"\w+:", link):
             continue
         path, _, anchor = link.partition("#")
         target = (file.parent / path).resolve() if path else file
         if not target.is_file() or (anchor and anchor not in anchors(target)):
-            found.append(link)
-    return found
+            links.append(link)
+    return links
 
 
 def test_navigation_has_every_page_once_and_no_other():
@@ -82,8 +82,8 @@ def test_lists_and_tables_stand_apart(file):
     lines = text_of(file).split("\n")
     mark = re.compile(r"(?:[-*] |\d+\. |\|)")
     ended = re.compile(r"(?:[-*|#> ]|\d+\. |<!--|$)")
-    found = [line for before, line in pairwise(lines) if mark.match(line) and not ended.match(before)]
-    assert found == []
+    unfinished = [line for before, line in pairwise(lines) if mark.match(line) and not ended.match(before)]
+    assert unfinished == []
 
 
 def test_modules_of_the_reference_and_names_of_pages_in_the_code_are_there():

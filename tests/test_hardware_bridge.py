@@ -28,9 +28,9 @@ def send_and_start(device):
 def test_a_set_is_staged_committed_and_read_back():
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        found = device.send(**A)
-        assert (found.set_id, found.memory, found.length) == (1, "short", 101)
-        assert float(np.float32(5.58)) == found.K1
+        confirmed = device.send(**A)
+        assert (confirmed.set_id, confirmed.memory, confirmed.length) == (1, "short", 101)
+        assert float(np.float32(5.58)) == confirmed.K1
         device.start()
         assert device.state() == protocol.State.RUNNING
     assert peer.state == protocol.State.STOPPED
@@ -50,8 +50,8 @@ def test_a_set_that_is_in_force_is_not_sent_again():
 def test_full_memory_sends_its_exponentials():
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        found = device.send(K0=0.4, K1=1.2, B1=3.0, alpha=0.35, memory="full", states=10)
-        assert (found.memory, found.length) == ("full", 10)
+        confirmed = device.send(K0=0.4, K1=1.2, B1=3.0, alpha=0.35, memory="full", states=10)
+        assert (confirmed.memory, confirmed.length) == ("full", 10)
         assert peer.done[protocol.SetStates] == 2
         for wrong in ({"states": 9}, {"alpha": 1.0}, {"memory": "long"}):
             with pytest.raises(InputError):

@@ -102,22 +102,22 @@ def error(value, target) -> float:
 
 @pytest.mark.parametrize("make", SMALL)
 def test_against_textbook_and_50_digits(make):
-    posterior, found = results(*problem(make), make().variance)
+    posterior, quantities = results(*problem(make), make().variance)
     textbook = numpy_laplace(*make().problem())
     for name in QUANTITIES:
-        assert error(found[name], exact(make)[name]) < 1e-12, name
-        assert error(found[name], textbook[name]) < 1e-11, name
+        assert error(quantities[name], exact(make)[name]) < 1e-12, name
+        assert error(quantities[name], textbook[name]) < 1e-11, name
     assert posterior.certificate.converged
     assert posterior.certificate.residual <= 1e-10
 
 
 @pytest.mark.parametrize("make", OF_ONE_SHAPE)
 def test_float32_is_good_for_four_digits(make):
-    posterior, found = results(*problem(make, np.float32), np.float32(make().variance))
+    posterior, quantities = results(*problem(make, np.float32), np.float32(make().variance))
     assert posterior.certificate.converged
     for name in QUANTITIES:
-        assert found[name].dtype == jnp.float32
-        assert error(found[name], exact(make)[name]) < 2e-5, name
+        assert quantities[name].dtype == jnp.float32
+        assert error(quantities[name], exact(make)[name]) < 2e-5, name
 
 
 # --- Gaussian terms, for which Laplace is exact
@@ -153,11 +153,11 @@ def test_gaussian_terms_are_exact_with_their_derivatives():
     np.testing.assert_allclose(*values, rtol=1e-12, atol=1e-12)
     expected = jax.jit(jax.jacrev(by_linear_algebra, argnums=(0, 1)))(KERNEL, TERMS)
     for mode in (jax.jacrev, jax.jacfwd):
-        found = jax.jit(mode(by_laplace, argnums=(0, 1)))(KERNEL, TERMS)
-        for value, target in zip(jax.tree.leaves(found[0]), jax.tree.leaves(expected[0]), strict=True):
+        derivatives = jax.jit(mode(by_laplace, argnums=(0, 1)))(KERNEL, TERMS)
+        for value, target in zip(jax.tree.leaves(derivatives[0]), jax.tree.leaves(expected[0]), strict=True):
             np.testing.assert_allclose(value, target, rtol=1e-12, atol=1e-12)
         for name in ("y", "noise"):
-            value, target = getattr(found[1], name), getattr(expected[1], name)
+            value, target = getattr(derivatives[1], name), getattr(expected[1], name)
             np.testing.assert_allclose(value, target, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
@@ -214,14 +214,14 @@ def test_a_preference_is_a_term_on_a_difference():
         return probit_terms((edges[q] - eta[:6]) / 0.5, (edges[q + 1] - eta[:6]) / 0.5, eta[6:] / noise, noise)
 
     expected, evidence = newton_in_f(prior, design, terms)
-    found = laplace(
+    posterior = laplace(
         jnp.asarray(design @ prior @ design.T),
         Pointwise(OrdinalAndPreference(Ordinal(likelihood, jnp.asarray(q), jnp.ones(6, bool)), jnp.asarray(noise))),
     )
-    assert found.certificate.converged
-    np.testing.assert_allclose(found.mode, design @ expected, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(prior @ design.T @ found.weights, expected, rtol=0, atol=1e-11)
-    np.testing.assert_allclose(found.log_evidence, evidence, rtol=0, atol=1e-11)
+    assert posterior.certificate.converged
+    np.testing.assert_allclose(posterior.mode, design @ expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(prior @ design.T @ posterior.weights, expected, rtol=0, atol=1e-11)
+    np.testing.assert_allclose(posterior.log_evidence, evidence, rtol=0, atol=1e-11)
 
 
 # --- the way to the mode, and the certificate
@@ -283,8 +283,8 @@ def test_slopes_and_curvatures_may_be_given_or_derived():
     """`expand` states what `Pointwise` differentiates; the posteriors are the same, and so are their derivatives."""
     covariance, terms, _ = problem(near_separable)
     derived = Pointwise(LogProb(terms))
-    for found, expected in zip(terms(covariance[0]), derived(covariance[0]), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    for stated, expected in zip(terms(covariance[0]), derived(covariance[0]), strict=True):
+        np.testing.assert_allclose(stated, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(solve(covariance, derived).mode, solve(covariance, terms).mode, rtol=0, atol=1e-10)
 
 

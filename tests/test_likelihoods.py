@@ -73,7 +73,7 @@ def exact(dtype, part):
 
 
 @cache
-def found(dtype, part):
+def evaluated(dtype, part):
     return [np.asarray(v) for v in evaluate(*map(jnp.asarray, grid(dtype, part)))]
 
 
@@ -85,7 +85,7 @@ def distance(value, target) -> float:
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_log_prob_against_mpmath(dtype, part):
     smallest = np.finfo(dtype).tiny
-    for value, (target, _, _, z) in zip(found(dtype, part)[0], exact(dtype, part), strict=True):
+    for value, (target, _, _, z) in zip(evaluated(dtype, part)[0], exact(dtype, part), strict=True):
         if abs(target) >= smallest:
             bound = 1e-12 if dtype is np.float64 else 1e-5 * max(1.0, z**2 / 100)
             assert distance(value, target) <= bound * abs(target)
@@ -95,7 +95,7 @@ def test_log_prob_against_mpmath(dtype, part):
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-4)])
 def test_gradient_against_mpmath(dtype, tolerance, part):
     noise = grid(dtype, part)[3].astype(float)
-    for value, (_, target, *_), c in zip(found(dtype, part)[1], exact(dtype, part), noise, strict=True):
+    for value, (_, target, *_), c in zip(evaluated(dtype, part)[1], exact(dtype, part), noise, strict=True):
         assert distance(value, target) <= tolerance * max(abs(target), 1 / c)
 
 
@@ -103,7 +103,7 @@ def test_gradient_against_mpmath(dtype, tolerance, part):
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-9), (np.float32, 1e-3)])
 def test_curvature_against_mpmath(dtype, tolerance, part):
     noise = grid(dtype, part)[3].astype(float)
-    for value, (_, _, target, _), c in zip(found(dtype, part)[2], exact(dtype, part), noise, strict=True):
+    for value, (_, _, target, _), c in zip(evaluated(dtype, part)[2], exact(dtype, part), noise, strict=True):
         assert distance(value, target) <= tolerance / c**2
 
 
@@ -111,10 +111,10 @@ def test_curvature_against_mpmath(dtype, tolerance, part):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_curvature_is_that_of_a_log_concave_function_and_all_is_finite(dtype, part):
     noise = grid(dtype, part)[3].astype(float)
-    scaled = found(dtype, part)[2] * noise**2
+    scaled = evaluated(dtype, part)[2] * noise**2
     assert scaled.min() >= 0.0
     assert scaled.max() <= 1 + 4 * np.finfo(dtype).eps
-    assert all(np.all(np.isfinite(values)) for values in found(dtype, part))
+    assert all(np.all(np.isfinite(values)) for values in evaluated(dtype, part))
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 1e-4)])
@@ -150,7 +150,7 @@ def exact_slopes(f, q, t, noise):
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-10), (np.float32, 1e-4)])
 def test_gradients_in_thresholds_and_noise_against_mpmath(dtype, tolerance, part):
-    cases = list(zip(*grid(dtype, part), *found(dtype, part)[4:], strict=True))[::7]
+    cases = list(zip(*grid(dtype, part), *evaluated(dtype, part)[4:], strict=True))[::7]
     for f, q, t, noise, by_thresholds, by_noise in cases:
         *slopes, slope = exact_slopes(f, q, t, noise)
         steepest = max(map(abs, slopes))  # a narrow category pulls its edges apart with much more than 1/noise
@@ -162,7 +162,7 @@ def test_gradients_in_thresholds_and_noise_against_mpmath(dtype, tolerance, part
 @pytest.mark.parametrize("part", PARTS)
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-8), (np.float32, 1e-2)])
 def test_third_derivative_against_differences_at_40_digits(dtype, tolerance, part):
-    for f, q, t, noise, value in list(zip(*grid(dtype, part), found(dtype, part)[3], strict=True))[::37]:
+    for f, q, t, noise, value in list(zip(*grid(dtype, part), evaluated(dtype, part)[3], strict=True))[::37]:
         edges, c = [-mp.inf, *t, mp.inf], float(noise)
         with mp.workdps(60):
             step = mp.mpf(c) * mp.mpf(10) ** -12
@@ -288,9 +288,9 @@ def test_mirror_symmetry(z, width, noise, q):
     mirrored = -f, 2 - q, -t[::-1], noise
     values = [evaluate(*(jnp.asarray(v)[None] for v in args)) for args in ((f, q, t, noise), mirrored)]
     (p, g, w, s, by_t, by_c), (p_, g_, w_, s_, by_t_, by_c_) = (list(map(np.asarray, v)) for v in values)
-    found = np.array([p, g * noise, w * noise**2, s * noise**3])
+    original = np.array([p, g * noise, w * noise**2, s * noise**3])
     turned = np.array([p_, -g_ * noise, w_ * noise**2, -s_ * noise**3])
-    np.testing.assert_allclose(found, turned, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(original, turned, rtol=1e-13, atol=1e-13)
     scale = np.max(np.abs(by_t))
     np.testing.assert_allclose(by_t, -by_t_[:, ::-1], rtol=0, atol=1e-13 * scale)
     np.testing.assert_allclose(by_c, by_c_, rtol=1e-13, atol=1e-13 * scale)

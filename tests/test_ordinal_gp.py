@@ -58,9 +58,9 @@ def test_gradients_in_every_hyperparameter(name):
     expected = oracle("laplace_slopes")[name]
     assert np.all(np.max(np.abs(expected), axis=0) > 1e-3)  # no hyperparameter is without effect
     for derivative in (reverse, forward):
-        found = np.asarray(derivative(*arguments(*CASES[name])))
+        slopes = np.asarray(derivative(*arguments(*CASES[name])))
         scale = np.maximum(np.abs(expected), 1e-3 * np.max(np.abs(expected), axis=0))
-        assert np.max(np.abs(found - expected) / scale) < 1e-8
+        assert np.max(np.abs(slopes - expected) / scale) < 1e-8
 
 
 def test_gradients_under_vmap():
@@ -75,7 +75,7 @@ def test_gradients_under_vmap():
 @pytest.mark.parametrize("theta", [SCALAR, pytest.param(PER_DIMENSION, marks=pytest.mark.deep)])
 def test_second_derivatives_of_the_evidence(theta):
     h, trials, x_new = arguments(repeated, theta)
-    found = np.asarray(evidence_hessian(h, trials, x_new))
+    hessian = np.asarray(evidence_hessian(h, trials, x_new))
     steps = 1e-5 * np.asarray(h)
     expected = np.stack(
         [
@@ -84,8 +84,8 @@ def test_second_derivatives_of_the_evidence(theta):
         ],
         axis=1,
     )
-    np.testing.assert_allclose(found, found.T, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(hessian, hessian.T, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(hessian, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_gradients_in_the_asked_point():
@@ -172,9 +172,9 @@ def test_float32_against_float64(make):
     high = fit(model(data), answers(data))
     x = data.x_new.astype(np.float32)
     for method in ("predict", "class_probabilities"):
-        found = getattr(low, method)(jnp.asarray(x))
-        assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(found))
-        np.testing.assert_allclose(found, getattr(high, method)(jnp.asarray(x.astype(float))), rtol=0, atol=5e-5)
+        predicted = getattr(low, method)(jnp.asarray(x))
+        assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(predicted))
+        np.testing.assert_allclose(predicted, getattr(high, method)(jnp.asarray(x.astype(float))), rtol=0, atol=5e-5)
     np.testing.assert_allclose(low.log_evidence, high.log_evidence, rtol=2e-5)
 
 

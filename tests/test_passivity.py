@@ -139,9 +139,14 @@ def certified(K1, B1, alpha, b, N=101, memory="short", angles=0):
 
     def one(q):
         model = model_of(*q[:3], N=N, memory=memory)
-        found = passivity.certify(model, q[3])
+        certificate = passivity.certify(model, q[3])
         grid = jnp.linspace(0, np.pi / model.T, angles) if angles else jnp.zeros(1)
-        return found.lower, found.upper, found.frequency, q[3] - jnp.max(passivity.needed_damping(model, grid))
+        return (
+            certificate.lower,
+            certificate.upper,
+            certificate.frequency,
+            q[3] - jnp.max(passivity.needed_damping(model, grid)),
+        )
 
     return jax.lax.map(one, (K1, B1, alpha, jnp.broadcast_to(b, K1.shape)), batch_size=32)
 
@@ -221,15 +226,17 @@ def test_the_certificate_at_the_limits_of_the_model():
         (viscoelastic.kelvin_voigt(2.0, 0.001), 0.5 * (2 + 2 * 1.0)),
         (viscoelastic.sls(2.0, 5.0, 0.001), 0.5 * (2 + 5 * 2 / 7)),
     ):
-        found = passivity.certify(model, 4.0)
-        assert found.lower <= 4 - damping <= found.upper + 1e-13 and found.status == "passive"
+        certificate = passivity.certify(model, 4.0)
+        assert certificate.lower <= 4 - damping <= certificate.upper + 1e-13 and certificate.status == "passive"
         assert passivity.certify(model, damping * 0.999).status == "violated"
 
 
 def test_a_negative_static_stiffness_is_a_violation_of_its_own():
-    found = passivity.certify(FOSLS(-0.1, 1.0, 0.001, 0.9), 10.0)
+    certificate = passivity.certify(FOSLS(-0.1, 1.0, 0.001, 0.9), 10.0)
     assert (
-        found.lower > 0 and found.status == "violated" and passivity.witness(FOSLS(-0.1, 1.0, 0.001, 0.9), 10.0) is None
+        certificate.lower > 0
+        and certificate.status == "violated"
+        and passivity.witness(FOSLS(-0.1, 1.0, 0.001, 0.9), 10.0) is None
     )
 
 
@@ -253,32 +260,32 @@ def test_a_witness_creates_the_energy_of_the_formula(N, memory):
         model = model_of(K1, B1, alpha, N, memory)
         needed = 0.95 - float(passivity.certify(model, 0.95).upper)
         b = 0.9 * needed
-        found = passivity.witness(model, b)
+        witness = passivity.witness(model, b)
         # Σ Δx² of a cycle is 2·(1 - cos θ)·Σ x², and each Δx²/T takes up b - b(θ).
-        angle = found.frequency * model.T
-        short = b - float(passivity.needed_damping(model, found.frequency))
-        squares = 2 * (1 - np.cos(angle)) * np.sum(found.x[1:] ** 2)
-        assert found.energy < 0 and found.lost > 0
-        assert found.energy == pytest.approx(1e-3 * short * squares / model.T, rel=1e-9)
+        angle = witness.frequency * model.T
+        short = b - float(passivity.needed_damping(model, witness.frequency))
+        squares = 2 * (1 - np.cos(angle)) * np.sum(witness.x[1:] ** 2)
+        assert witness.energy < 0 and witness.lost > 0
+        assert witness.energy == pytest.approx(1e-3 * short * squares / model.T, rel=1e-9)
         assert passivity.witness(model, 1.1 * needed) is None
 
 
 def test_the_witness_is_what_the_recursion_renders():
     """After a warm-up of many cycles, for a fast set."""
     for model, b in ((FOSLS(-2.89, 5.7, 5.89, 0.203), 0.9), (FOSLS(0.44, 5.7, 5.89, 0.203, N=100), 0.5)):
-        found = passivity.witness(model, b)
-        cycles = 2 + 2000 // len(found.force)
-        force = np.asarray(model.simulate(np.tile(found.x[:-1], cycles)))[-len(found.force) :]
-        np.testing.assert_allclose(force, found.force, atol=1e-9)
-        taken = np.sum(force * np.diff(found.x) + b / 1000 / model.T * np.diff(found.x) ** 2)
-        assert taken == pytest.approx(found.energy, rel=1e-9)
+        witness = passivity.witness(model, b)
+        cycles = 2 + 2000 // len(witness.force)
+        force = np.asarray(model.simulate(np.tile(witness.x[:-1], cycles)))[-len(witness.force) :]
+        np.testing.assert_allclose(force, witness.force, atol=1e-9)
+        taken = np.sum(force * np.diff(witness.x) + b / 1000 / model.T * np.diff(witness.x) ** 2)
+        assert taken == pytest.approx(witness.energy, rel=1e-9)
 
 
 def test_needed_damping_at_both_ends():
     model = FOSLS(-2.89, 5.7, 5.89, 0.203)
-    found = passivity.needed_damping(model, np.array([0.0, 1e-3, 1e3 * np.pi]))
-    assert found[0] == pytest.approx(float(found[1]), rel=1e-6)
-    assert found[2] == pytest.approx(0.91664, abs=5e-6)
+    needed = passivity.needed_damping(model, np.array([0.0, 1e-3, 1e3 * np.pi]))
+    assert needed[0] == pytest.approx(float(needed[1]), rel=1e-6)
+    assert needed[2] == pytest.approx(0.91664, abs=5e-6)
 
 
 @pytest.mark.parametrize("numbers", [(-3.19, 5.58, 7.88, 0.176), (0.3, 0.0, 1.0, 0.5), (0.1, math.inf, 0.5, 0.9)])

@@ -78,13 +78,13 @@ def raised(node: ast.AST, helpers: dict[str, ast.AST], seen: frozenset[str] = fr
     """Errors that a function raises, by itself or by private functions of its module; not those that it catches."""
     if isinstance(node, ast.Try) and node.handlers:
         return set().union(*(raised(part, helpers, seen) for part in (*node.handlers, *node.orelse, *node.finalbody)))
-    found = set().union(*(raised(child, helpers, seen) for child in ast.iter_child_nodes(node)))
+    errors = set().union(*(raised(child, helpers, seen) for child in ast.iter_child_nodes(node)))
     if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
-        found.add(ast.unparse(node.exc.func))
+        errors.add(ast.unparse(node.exc.func))
     called = node.func.id if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) else ""
     if called in helpers and called not in seen:
-        found |= raised(helpers[called], helpers, seen | {called})
-    return found
+        errors |= raised(helpers[called], helpers, seen | {called})
+    return errors
 
 
 def unsaid(said: Said) -> bool:

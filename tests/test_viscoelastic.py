@@ -44,8 +44,8 @@ def test_sums_keep_their_digits_at_both_ends(alpha, N):
         at_dc, at_nyquist = mpmath.fsum(c), mpmath.fsum((-1) ** i * x for i, x in enumerate(c))
         exact = [at_dc, at_nyquist, at_nyquist - at_dc, -mpmath.fsum(i * x for i, x in enumerate(c))]
     sums = viscoelastic.gl_sums(alpha, N)
-    found = [sums.at_dc, sums.at_nyquist, sums.spread, sums.moment]
-    np.testing.assert_allclose(found, np.array(exact, float), rtol=1e-13)
+    computed = [sums.at_dc, sums.at_nyquist, sums.spread, sums.moment]
+    np.testing.assert_allclose(computed, np.array(exact, float), rtol=1e-13)
     np.testing.assert_allclose(viscoelastic.gl_sum(alpha, N), sums.at_dc)
     np.testing.assert_allclose(viscoelastic.gl_alternating_sum(alpha, N), sums.at_nyquist)
 

@@ -147,7 +147,7 @@ def on_post_build(config):
 
     loads = re.compile(r'<(?:script|img|iframe|link)\b[^>]*\b(?:src|href)="?((?:https?:)?//[^"\s>]+)')
     for path in sorted(Path(config.site_dir).rglob("*.html")):
-        found = loads.findall(path.read_text(encoding="utf-8"))
-        if found:
+        addresses = loads.findall(path.read_text(encoding="utf-8"))
+        if addresses:
             name = os.path.relpath(path, config.site_dir)
-            raise PluginError(f"{name} loads {found[0]}: the site must be complete by itself.")
+            raise PluginError(f"{name} loads {addresses[0]}: the site must be complete by itself.")

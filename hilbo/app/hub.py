@@ -81,6 +81,7 @@ class Hub:
         rig = await self._loop.run_in_executor(self._disk, lambda: self._connect(self._from_rig, self._noticed))
         self.rig = rig
         self.warm = self._loop.run_in_executor(self.compute, self._warm)
+        self.warm.add_done_callback(self._warmed)
         await self._interruptions.begin(rig.snapshot)
         self.runner.restart()
 
@@ -91,14 +92,21 @@ class Hub:
             maps = self._make_maps(self.chooser)
             maps.warm()
             self._maps = maps
+
+    def _warmed(self, warm: asyncio.Future) -> None:
+        if warm.cancelled():  # the session ends before it
+            return
         gc.collect()
         gc.freeze()  # what is there by now stays: looking through it again takes 0.1 s, in which nobody is heard
-        self._loop.call_soon_threadsafe(self.publish)
+        self.publish()
 
     async def close(self) -> None:
         """Stop the rig, let go of everything."""
         self._interruptions.end()
         self.runner.cancel()
+        if self.warm is not None:
+            self.warm.cancel()
+        gc.unfreeze()  # a program that goes on after the session has its memory looked through again
         self.watchers.end_all()
         if self.rig is not None:
             await self._loop.run_in_executor(None, self.rig.close)

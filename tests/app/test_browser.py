@@ -29,17 +29,17 @@ def test_a_whole_session_by_one_command(tmp_path, kind, trials):
     command += ["--out", str(tmp_path / "out"), "--seconds", "0.3", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["answers"] == 3 + trials
-    assert found["mishaps"] == []
-    assert found["fits_after_an_answer"] == 0
-    assert {name.split("-")[0] for name in found["screens"]} == {"participant", "experimenter"}
-    assert any("800x1280" in name for name in found["screens"])
+    summary = json.loads(done.stdout)
+    assert summary["answers"] == 3 + trials
+    assert summary["mishaps"] == []
+    assert summary["fits_after_an_answer"] == 0
+    assert {name.split("-")[0] for name in summary["screens"]} == {"participant", "experimenter"}
+    assert any("800x1280" in name for name in summary["screens"])
     study = Study.load(tmp_path / "out" / "study.toml")
-    _, events, dropped = read_log(found["log"], study)
+    _, events, dropped = read_log(summary["log"], study)
     assert dropped == ""
     assert sum(event.kind == "answer" for event in events) == 3 + trials
-    with EventLog.resume(found["log"], study) as log:
+    with EventLog.resume(summary["log"], study) as log:
         assert log.state.screen == "done"
 
 
@@ -51,8 +51,8 @@ def test_a_whole_session_of_levels_without_a_device_by_one_command(tmp_path, by)
     command += ["--out", str(tmp_path / "out"), "--seconds", "0.3", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["answers"] == 12 and found["mishaps"] == []
+    summary = json.loads(done.stdout)
+    assert summary["answers"] == 12 and summary["mishaps"] == []
 
 
 @pytest.fixture

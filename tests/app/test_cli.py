@@ -123,15 +123,15 @@ def begun(wanted):
     """Log, first two proposals."""
     hub, log = opened(wanted, lambda _: None, lambda _: None)
     with log:
-        state, found = log.state, []
+        state, proposals = log.state, []
         for number, response in enumerate(("different", "close"), 1):
             event = actions.propose(state, hub.chooser, 0.0)
-            found.append(event.data)
+            proposals.append(event.data)
             state = state.after(event)
             answer = actions.answer(state, number, "c", {"class_a": response}, 1.0, felt=False)
             assert answer is not None
             state = state.after(answer)
-    return log, found
+    return log, proposals
 
 
 def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_path):
@@ -190,8 +190,8 @@ def test_a_device_that_cannot_be_used_is_one_sentence_and_leaves_no_log(tmp_path
             (("--device", tmp_path / "none", "--warm-start", a_map(study, tmp_path / "map.nc")), 2, "none"),
         ]
         for arguments, code, word in cases:
-            found, out, err = run(capsys, monkeypatch, "session", *place, *arguments)
-            assert (found, out) == (code, ""), err
+            status, out, err = run(capsys, monkeypatch, "session", *place, *arguments)
+            assert (status, out) == (code, ""), err
             assert word in err.splitlines()[-1]
             assert err.splitlines()[-1].startswith("hilbo: ")
             assert "Traceback" not in err
@@ -251,13 +251,13 @@ def test_the_doctor_finds_all_well_with_the_simulated_device(tmp_path, capsys):
     def connect(damping):
         return Renderer.open("sim", damping=damping, options={"finger": "none"}, patience=10.0)
 
-    found = {check.name: check for check in doctor.checks(DATA, connect, tmp_path, 0)}
-    assert set(found) >= {
+    checks = {check.name: check for check in doctor.checks(DATA, connect, tmp_path, 0)}
+    assert set(checks) >= {
         "versions", "disk", "server's port", "browser", "serial ports", "study", "precision and cache",
         "feasible set", "time of a step", "device", "device loopback", "damping",
     }  # fmt: skip
-    assert [name for name, check in found.items() if check.level == "bad"] == []
-    assert "0 wrong" in found["device loopback"].words
+    assert [name for name, check in checks.items() if check.level == "bad"] == []
+    assert "0 wrong" in checks["device loopback"].words
 
 
 def test_the_doctor_says_what_to_mend(tmp_path):
@@ -268,17 +268,17 @@ def test_the_doctor_says_what_to_mend(tmp_path):
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        found = {check.name: check for check in doctor.checks(DATA, connect, tmp_path / "no" / "where", port)}
-    assert found["damping"].level == "bad"
-    assert "measure-damping" in found["damping"].fix
-    assert found["server's port"].level == "bad"
-    assert found["disk"].level == "bad"
-    assert all(check.fix for check in found.values() if check.level == "bad")
+        checks = {check.name: check for check in doctor.checks(DATA, connect, tmp_path / "no" / "where", port)}
+    assert checks["damping"].level == "bad"
+    assert "measure-damping" in checks["damping"].fix
+    assert checks["server's port"].level == "bad"
+    assert checks["disk"].level == "bad"
+    assert all(check.fix for check in checks.values() if check.level == "bad")
     (broken := tmp_path / "study.toml").write_text("schema = 2")
     (tmp_path / "out").mkdir()
-    found = {check.name: check for check in doctor.checks(broken, lambda _: unplugged(), tmp_path / "out", 0)}
-    assert found["study"].level == found["device"].level == "bad"
-    assert json.dumps([check._asdict() for check in found.values()])
+    checks = {check.name: check for check in doctor.checks(broken, lambda _: unplugged(), tmp_path / "out", 0)}
+    assert checks["study"].level == checks["device"].level == "bad"
+    assert json.dumps([check._asdict() for check in checks.values()])
 
 
 def unplugged():
@@ -287,5 +287,5 @@ def unplugged():
 
 def test_the_doctor_says_what_constraints_leave():
     new = NewStudy("x", (parameter_of("a=0:2"), parameter_of("b=0:2")), constraints=("a + b <= 2",))
-    found = doctor._feasible(Study.from_dict(tomllib.loads(study_text(new))))
-    assert (found.level, found.words) == ("good", "50.0 % of the box is within the constraints")
+    check = doctor._feasible(Study.from_dict(tomllib.loads(study_text(new))))
+    assert (check.level, check.words) == ("good", "50.0 % of the box is within the constraints")

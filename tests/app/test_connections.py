@@ -20,8 +20,8 @@ HALF = b"GET / HTTP/1.1\r\nHost: "
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory):
-    with Bare(tmp_path_factory.mktemp("bare")) as found:
-        yield found
+    with Bare(tmp_path_factory.mktemp("bare")) as bare:
+        yield bare
 
 
 @pytest.fixture

@@ -18,8 +18,8 @@ from hilbo.session.records import Block, Planned
 
 @pytest.fixture
 def live(tmp_path):
-    with Live(tmp_path) as found:
-        yield found
+    with Live(tmp_path) as session:
+        yield session
 
 
 def test_a_device_that_is_gone_voids_the_trial_and_comes_back(live):
@@ -35,8 +35,8 @@ def test_a_device_that_is_gone_voids_the_trial_and_comes_back(live):
     assert voided["by"] == "rule"
     assert "device" in voided["reason"]
     live.begin()  # nothing goes on by itself
-    found = live.answer(live.question())
-    assert not found["again"]
+    reply = live.answer(live.question())
+    assert not reply["again"]
     assert live.hub.state.trials[pending.id].renderings == pending.renderings
     live.replays()
 

@@ -17,8 +17,8 @@ from hilbo.session.records import Block, Planned
 
 
 def test_a_form_is_read_as_text():
-    found = fields_of(b"order=5&state=presented&value.hue=211.0&value.an+%C3%BC%3D1=x&why=")
-    assert found == {"order": "5", "state": "presented", "why": "", "values": {"hue": "211.0", "an ü=1": "x"}}
+    fields = fields_of(b"order=5&state=presented&value.hue=211.0&value.an+%C3%BC%3D1=x&why=")
+    assert fields == {"order": "5", "state": "presented", "why": "", "values": {"hue": "211.0", "an ü=1": "x"}}
     assert fields_of(b"") == {}
 
 
@@ -114,8 +114,8 @@ def test_a_session_by_forms_and_what_is_refused(tmp_path):
             ("400", "unknown field", {"colour": "3"}),
             ("409", "and for nothing else", {"value.depth": "3"}),
         ):
-            found = report("presented", trial=order["trial"], **values | wrong)
-            assert found["status"] == status and words in found["error"], found
+            reply = report("presented", trial=order["trial"], **values | wrong)
+            assert reply["status"] == status and words in reply["error"], reply
         assert report("presented", trial=order["trial"], **values)["status"] == "200"
         live.until(lambda _: live.events("sent"))
         assert live.events("sent")[0].data["values"] == SETS["best"]

@@ -29,8 +29,8 @@ class Preparer(ByHand):
 
 @pytest.fixture
 def live(tmp_path):
-    with LiveStimulus(tmp_path, more=BY_PERSON, repeats=1, maps=Maps) as found:
-        yield found
+    with LiveStimulus(tmp_path, more=BY_PERSON, repeats=1, maps=Maps) as session:
+        yield session
 
 
 def played(live, preparer):
@@ -59,7 +59,7 @@ def played(live, preparer):
 def test_a_session_by_hand_in_which_only_the_preparer_knows(live):
     preparer = Preparer(live.place.link("preparer"))
     experimenter, participant, own = [], [], live.participant._ask
-    live.participant._ask = lambda request: participant.append(json.dumps(found := own(request))) or found
+    live.participant._ask = lambda request: participant.append(json.dumps(reply := own(request))) or reply
     listening = threading.Thread(target=listen, args=(live, participant))
     listening.start()
 
@@ -180,12 +180,12 @@ def test_the_preparer_s_page_from_ready_to_the_end(tmp_path):
         taken = set()
 
         def phase():
-            found = page.evaluate("document.body.dataset.phase")
-            name = f"{found}-{page.evaluate('order.show || order.do')}"
+            phase_ = page.evaluate("document.body.dataset.phase")
+            name = f"{phase_}-{page.evaluate('order.show || order.do')}"
             if name not in taken:
                 taken.add(name)
                 screenshots(page, pictures, name)
-            return found
+            return phase_
 
         def acted(but=""):
             if participant.phase != "done":
@@ -220,10 +220,10 @@ def test_the_preparer_s_page_from_ready_to_the_end(tmp_path):
         experimenter.wait_for_selector("#log li")
         experimenter.screenshot(path=pictures / "experimenter.png")
         live.experimenter = Client(live.place.link("experimenter"))
-        live.until(lambda found: found == "done", acted)
+        live.until(lambda phase_: phase_ == "done", acted)
         assert {"ready-neutral", "present-reference", "present-test", "stop-stop"} <= taken
         assert len(live.events("answer")) == 3 and errors == []
         confirmed = [event.data["values"] for event in live.events("sent")]
-        for found, asked in zip(confirmed, SETS.values(), strict=True):
-            assert abs(found["hue"] - asked["hue"]) <= 0.05 and found["light"] == round(asked["light"], 5)
+        for values, asked in zip(confirmed, SETS.values(), strict=True):
+            assert abs(values["hue"] - asked["hue"]) <= 0.05 and values["light"] == round(asked["light"], 5)
         live.replays()

@@ -15,10 +15,10 @@ from hilbo.app.hub import PRESSES
 @pytest.fixture(scope="module")
 def quiet(tmp_path_factory):
     """A session in which nobody presses Begin."""
-    with Live(tmp_path_factory.mktemp("quiet")) as found:
-        found.until(lambda view: view["may"]["begin"])
-        found.until(lambda _: found.hub.state.pending.sent)
-        yield found
+    with Live(tmp_path_factory.mktemp("quiet")) as session:
+        session.until(lambda view: view["may"]["begin"])
+        session.until(lambda _: session.hub.state.pending.sent)
+        yield session
 
 
 PATHS = [

@@ -1,5 +1,6 @@
 """Live sessions through the server, its hub and a simulated device: trials, commands, windows, and their log."""
 
+import gc
 import json
 import threading
 
@@ -13,8 +14,8 @@ from hilbo.session.records import Block, Planned
 
 @pytest.fixture
 def live(tmp_path):
-    with Live(tmp_path) as found:
-        yield found
+    with Live(tmp_path) as session:
+        yield session
 
 
 def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
@@ -22,9 +23,9 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
         heard, own = [], live.participant._ask
 
         def ear(request):
-            found = own(request)
-            heard.append(json.dumps(found))
-            return found
+            reply = own(request)
+            heard.append(json.dumps(reply))
+            return reply
 
         live.participant._ask = ear
         listening = threading.Thread(target=listen, args=(live, heard))
@@ -53,6 +54,14 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
     listening.join(PATIENCE)
     assert any(line.startswith("event: view") for line in heard)
     check_blinding("\n".join(heard), state, "K1", "B1", "alpha")
+
+
+def test_memory_is_looked_through_again_after_a_session(tmp_path):
+    with Live(tmp_path) as live:
+        live.begin()
+        live.question()
+        assert gc.get_freeze_count() > 0
+    assert gc.get_freeze_count() == 0
 
 
 def check_order(events):

@@ -21,15 +21,15 @@ ONE = (Block("warm-up", 1, (Planned("best"),)),)
 
 @pytest.fixture
 def live(tmp_path):
-    with LiveStimulus(tmp_path) as found:
-        yield found
+    with LiveStimulus(tmp_path) as session:
+        yield session
 
 
 @pytest.fixture
 def brief(tmp_path):
     """A session that waits a moment for a confirmation."""
-    with LiveStimulus(tmp_path, within=0.3) as found:
-        yield found
+    with LiveStimulus(tmp_path, within=0.3) as session:
+        yield session
 
 
 def voided(live, words, phase="hello"):
@@ -45,7 +45,7 @@ def voided(live, words, phase="hello"):
 def test_a_whole_session_by_the_shipped_client(tmp_path):
     with LiveStimulus(tmp_path, repeats=2) as live, live.present() as program:
         heard, own = [], live.participant._ask
-        live.participant._ask = lambda request: heard.append(json.dumps(found := own(request))) or found
+        live.participant._ask = lambda request: heard.append(json.dumps(reply := own(request))) or reply
         listening = threading.Thread(target=listen, args=(live, heard))
         listening.start()
         live.begin()
@@ -442,7 +442,7 @@ def checked(tmp_path, program):
     """What the doctor finds of a program that is given the link."""
     file = tmp_path / "study.toml"
     file.write_text(study_text(NewStudy("x", (parameter_of("hue=0:360:deg"), parameter_of("light=20:80:%")))))
-    found, links, closing = [], [], contextlib.ExitStack()
+    checks, links, closing = [], [], contextlib.ExitStack()
 
     def join(text, **_):
         links.append(text.split()[-1])
@@ -452,8 +452,8 @@ def checked(tmp_path, program):
 
     with pytest.MonkeyPatch.context() as patch, closing:
         patch.setattr(doctor, "print", join, raising=False)
-        found += doctor.stimulus_checks(file, 0, PATIENCE)
-    return found
+        checks += doctor.stimulus_checks(file, 0, PATIENCE)
+    return checks
 
 
 def test_the_doctor_measures_renderings_and_stops(tmp_path):
@@ -463,10 +463,10 @@ def test_the_doctor_measures_renderings_and_stops(tmp_path):
 
 
 def test_the_doctor_says_what_a_program_does_not_do(tmp_path):
-    (found,) = checked(tmp_path, lambda link: Presenter(link, off=5.0))
-    assert found.level == "bad" and "it may be off by" in found.words
-    (found,) = doctor.stimulus_checks(tmp_path / "study.toml", 0, 0.2)
-    assert found.level == "bad" and "No program that presents has joined yet" in found.words
+    (check,) = checked(tmp_path, lambda link: Presenter(link, off=5.0))
+    assert check.level == "bad" and "it may be off by" in check.words
+    (check,) = doctor.stimulus_checks(tmp_path / "study.toml", 0, 0.2)
+    assert check.level == "bad" and "No program that presents has joined yet" in check.words
 
 
 def test_the_doctor_stops_no_program_where_a_device_renders():

@@ -74,10 +74,10 @@ class Fuzz:
         if kind.startswith("application/x-www") and not body.lstrip().startswith(b"{"):
             assert status == 200 and text.startswith(b"status\t"), text  # lines, with the status in them
             return
-        found = json.loads(text)
-        assert status == 200 or (status in REFUSALS and found["error"].endswith(".")), (status, body, found)
-        self.order = found if "order" in found else self.order
-        self.run = found.get("run", self.run)
+        content = json.loads(text)
+        assert status == 200 or (status in REFUSALS and content["error"].endswith(".")), (status, body, content)
+        self.order = content if "order" in content else self.order
+        self.run = content.get("run", self.run)
 
     def report(self):
         """The right one for the newest order that is known."""
@@ -163,7 +163,7 @@ def attacked(folder, seed, messages):
     block = Block("warm-up", 400, tuple(Planned(name) for name in SETS) * 134)
     with LiveStimulus(folder, within=0.2, silence=0.3, seconds=0.01, blocks=(block,)) as live:
         heard, acknowledged, ended, own = [], [], threading.Event(), live.participant._ask
-        live.participant._ask = lambda request: heard.append(json.dumps(found := own(request))) or found
+        live.participant._ask = lambda request: heard.append(json.dumps(reply := own(request))) or reply
         threads = [threading.Thread(target=listen, args=(live, heard))]
         threads += [threading.Thread(target=take_part, args=(live, ended, acknowledged))]
         for thread in threads:

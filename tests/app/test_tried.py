@@ -30,11 +30,11 @@ def study_in(folder, text=OWN) -> StudyFile:
 
 def test_what_is_hidden_is_the_seed_s_and_inside_the_ranges(tmp_path):
     study = study_in(tmp_path)
-    found = [hidden_reference(study, seed) for seed in range(20)]
-    assert found[3] == hidden_reference(study, 3)
-    unit = np.array([[p.to_unit(np.array(values[p.name])) for p in study.space.parameters] for values in found])
+    references = [hidden_reference(study, seed) for seed in range(20)]
+    assert references[3] == hidden_reference(study, 3)
+    unit = np.array([[p.to_unit(np.array(values[p.name])) for p in study.space.parameters] for values in references])
     assert np.all((unit > 0.19) & (unit < 0.81)) and len(np.unique(unit)) == unit.size
-    assert tuple(found[0]) == NAMES
+    assert tuple(references[0]) == NAMES
 
 
 def test_the_shipped_study_is_presented_as_it_says(tmp_path):
@@ -128,12 +128,12 @@ def test_a_whole_session_its_log_and_its_map(session):
             message = {"trial": view["trial"]["id"], "client": "test", "answers": answers}
             participant.post("/api/participant/answer", message)
             program.report("neutral", order=program.order["order"])
-    found = {}
-    while not found:
-        found = program.get("/api/try/map")
-    assert [len(s["trials"]) for s in found["slices"]] == [15] * 3
-    assert {p["name"]: p["hidden"] for p in found["parameters"]} == reference
-    best = {p["name"]: p["optimum"] for p in found["parameters"]}
+    map_ = {}
+    while not map_:
+        map_ = program.get("/api/try/map")
+    assert [len(s["trials"]) for s in map_["slices"]] == [15] * 3
+    assert {p["name"]: p["hidden"] for p in map_["parameters"]} == reference
+    best = {p["name"]: p["optimum"] for p in map_["parameters"]}
     assert person.distance(best) < 0.5
     header, events, _ = read_log(log.path, study)
     assert header.unblinded == "try" and header.consent is None and header.sets == {"reference": reference}

@@ -44,9 +44,9 @@ def press(page, seconds):
     page.mouse.down()
     page.mouse.move(x, y + 150, steps=5)
     page.wait_for_timeout(1000 * seconds)
-    found = page.evaluate("[state.force, ...state.depths]")
+    force_and_depths = page.evaluate("[state.force, ...state.depths]")
     page.mouse.up()
-    return found
+    return force_and_depths
 
 
 def places(page):

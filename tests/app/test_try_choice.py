@@ -46,8 +46,8 @@ def errors(study: Study, seed: int) -> np.ndarray:
 def test_the_optimum_is_about_half_as_far_as_that_of_points_by_chance(tmp_path, record_property):
     (tmp_path / "study.toml").write_text(study_text(None, TRIALS))
     study = Study.load(tmp_path / "study.toml")
-    found = np.array([errors(study, seed) for seed in range(SEEDS)])  # (seeds, way, measure)
-    mean, error = found.mean(axis=0), found.std(axis=0, ddof=1) / np.sqrt(SEEDS)
+    all_errors = np.array([errors(study, seed) for seed in range(SEEDS)])  # (seeds, way, measure)
+    mean, error = all_errors.mean(axis=0), all_errors.std(axis=0, ddof=1) / np.sqrt(SEEDS)
     for k, measure in enumerate(("curves, natural logarithms", "parameters, of the ranges")):
         words = [f"{way} {mean[i, k]:.4f} ± {error[i, k]:.4f}" for i, way in enumerate(("chosen", "by chance"))]
         record_property(measure, words)

@@ -50,9 +50,9 @@ def sets_of(count: int) -> np.ndarray:
     return (low * (high / low) ** unit).astype(np.float32)
 
 
-def largest_error(found, expected) -> float:
+def largest_error(computed, expected) -> float:
     """Of each row's largest displacement."""
-    return float(np.max(np.max(np.abs(found - expected), axis=1) / np.max(np.abs(expected), axis=1)))
+    return float(np.max(np.max(np.abs(computed - expected), axis=1) / np.max(np.abs(expected), axis=1)))
 
 
 def against_reference(sets, force) -> float:

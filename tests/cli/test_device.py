@@ -64,8 +64,8 @@ def test_hello(device):
 
 def test_set(device, sets):
     code, stdout, _ = device("set", *A, "--json", *FAST)
-    found = json.loads(stdout)
-    assert (code, found["K1"], found["memory"]) == (0, float(np.float32(5.58)), "short")
+    in_force = json.loads(stdout)
+    assert (code, in_force["K1"], in_force["memory"]) == (0, float(np.float32(5.58)), "short")
     code, stdout, _ = device("set", "--sets", sets, "--name", "S", *FAST)
     assert code == 0 and "K1 = 5.7 N/mm" in stdout
     code, stdout, _ = device("set", *A[2:], "--study", STUDY, "--json", *FAST)  # K0 from the study's K_eff
@@ -103,8 +103,8 @@ def test_set(device, sets):
 def test_bad_input_is_one_sentence(device, tmp_path, monkeypatch, arguments, code, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "sets.csv").write_text(SETS)
-    found, stdout, stderr = device(*arguments)
-    assert (found, stdout) == (code, "")
+    status, stdout, stderr = device(*arguments)
+    assert (status, stdout) == (code, "")
     assert words in " ".join(stderr.split())
     assert [path.name for path in tmp_path.iterdir()] == ["sets.csv"]
 
@@ -137,9 +137,9 @@ def test_a_sets_table_may_leave_things_out(sets):
 
 def test_start_renders_and_stops(device):
     code, stdout, stderr = device("start", *A, "--seconds", 1.5, "--json", *FAST)
-    found = json.loads(stdout)
-    assert (code, found["state"]) == (0, "RUNNING")
-    assert found["largest_force_N"] > 0.1 and found["holds"] == 0
+    summary = json.loads(stdout)
+    assert (code, summary["state"]) == (0, "RUNNING")
+    assert summary["largest_force_N"] > 0.1 and summary["holds"] == 0
     assert "in force: K0 = -3.18" in stderr
 
 
@@ -200,10 +200,10 @@ def test_selftest(device):
 def test_feel_with_keys_from_a_pipe(device, sets, monkeypatch):
     monkeypatch.setattr(sys, "stdin", io.StringIO("1 2\n3ec q"))
     code, stdout, stderr = device("feel", sets, "--json", *FAST, "--sim", "finger=sine")
-    found = json.loads(stdout)
-    assert (code, found["felt"], found["state"]) == (0, ["S", "A"], "RUNNING")
-    assert any("The set needs 1.34" in word for word in found["words"])
-    assert found["estops"] == 1
+    summary = json.loads(stdout)
+    assert (code, summary["felt"], summary["state"]) == (0, ["S", "A"], "RUNNING")
+    assert any("The set needs 1.34" in word for word in summary["words"])
+    assert summary["estops"] == 1
     assert "STOPPED" in stderr
 
 
@@ -217,9 +217,9 @@ def test_feel_takes_as_many_sets_as_there_are_keys(device, sets):
 def test_measure_damping(device):
     code, stdout, stderr = device("measure-damping", "--json", "--sim", "damping=0.8")
     assert code == 0, stderr
-    found = json.loads(stdout)
-    assert found["damping"]["lower"] <= 0.8 <= found["damping"]["upper"]
-    assert found["reported"] == pytest.approx(0.8)
+    estimates = json.loads(stdout)
+    assert estimates["damping"]["lower"] <= 0.8 <= estimates["damping"]["upper"]
+    assert estimates["reported"] == pytest.approx(0.8)
 
 
 def test_characterise(device, tmp_path):
@@ -234,19 +234,19 @@ def test_characterise(device, tmp_path):
 @pytest.fixture
 def staying():
     """Options for a simulated device that stays; its time stands still while no heartbeats come."""
-    found, over = Simulator(rate="lockstep"), threading.Event()
+    simulator, over = Simulator(rate="lockstep"), threading.Event()
 
     def pass_time():
         while not over.wait(0.001):
-            late = int(found.ticks(0).split()[3]) >= 150
-            found.ticks(0 if late else 5)
+            late = int(simulator.ticks(0).split()[3]) >= 150
+            simulator.ticks(0 if late else 5)
 
     thread = threading.Thread(target=pass_time)
     thread.start()
-    yield ["--device", found.port, "--patience", 60]
+    yield ["--device", simulator.port, "--patience", 60]
     over.set()
     thread.join()
-    found.close()
+    simulator.close()
 
 
 def test_a_device_that_stays_serves_one_command_after_another(device, staying):

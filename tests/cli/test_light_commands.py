@@ -102,8 +102,8 @@ def test_where_nothing_is_computed_no_jax_is_loaded(folder):
         ("device", "ports"): 0,
     }
     assert loaded(commands, HEAVY + TABLES) == [[code, []] for code in commands.values()]
-    ((code, found),) = loaded([("export", logs, "--study", study, "--out", folder / "tables")], HEAVY + TABLES)
-    assert code == 0 and set(found) <= set(TABLES)
+    ((code, modules),) = loaded([("export", logs, "--study", study, "--out", folder / "tables")], HEAVY + TABLES)
+    assert code == 0 and set(modules) <= set(TABLES)
     assert (folder / "tables" / "trials.nc").exists()
 
 

@@ -14,8 +14,8 @@ from live_stimulus import CLIENTS, SINGLE, LiveStimulus, Presenter, all_answered
 
 @pytest.fixture
 def live(tmp_path):
-    with LiveStimulus(tmp_path, blocks=SINGLE) as found:
-        yield found
+    with LiveStimulus(tmp_path, blocks=SINGLE) as session:
+        yield session
 
 
 @contextlib.contextmanager
@@ -73,9 +73,9 @@ def test_asyncio_presents_beside_other_tasks(live):
     async def both():
         with await asyncio.to_thread(client.Stimulus, live.link(), "async", "3") as stimulus:
             presenting = asyncio.create_task(present(stimulus))
-            found = await asyncio.to_thread(all_answered, live)
+            confirmations = await asyncio.to_thread(all_answered, live)
             presenting.cancel()
-        return found
+        return confirmations
 
     sent = asyncio.run(both())
     assert [(data["program"], data["version"]) for data in sent] == 3 * [("async", "3")]
@@ -175,9 +175,9 @@ def test_an_order_is_handed_over_as_soon_as_the_hand_leaves(tmp_path):
             live.begin()
             live.until(lambda _: stimulus.order.do == "present", lambda: None)
             stimulus.contact = True
-            waiting = threading.Thread(target=lambda: found.append(stimulus.next(PATIENCE)))
-            found = []
+            waiting = threading.Thread(target=lambda: orders.append(stimulus.next(PATIENCE)))
+            orders = []
             waiting.start()
             stimulus.contact = False
             waiting.join(PATIENCE / 2)
-            assert not waiting.is_alive() and found[0] is not None
+            assert not waiting.is_alive() and orders[0] is not None

@@ -137,12 +137,12 @@ def session(tmp_path):
     file = tmp_path / "study.toml"
     file.write_text(study_text(new).replace("seconds = 2", "seconds = 5"))
     assert Study.load(file).stimulus.silence == SILENCE
-    found = Session(tmp_path / "session", [str(file), "--participant", "P01"])
-    found.start()
-    found.until(found.ready)
-    yield found
+    running = Session(tmp_path / "session", [str(file), "--participant", "P01"])
+    running.start()
+    running.until(running.ready)
+    yield running
     with contextlib.suppress(ProcessLookupError):
-        found.kill()
+        running.kill()
 
 
 @each_language

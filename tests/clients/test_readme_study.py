@@ -90,8 +90,8 @@ def test_from_init_to_an_optimum_by_the_commands_of_the_readme(language, tmp_pat
                 program.wait()
             hub.communicate(timeout=PATIENCE)
     hilbo(aggregate)
-    found = json.loads((tmp_path / "results" / "result.json").read_text())
+    result = json.loads((tmp_path / "results" / "result.json").read_text())
     minutes = (time.monotonic() - begun) / 60
     print(f"{language.name}: 6 commands, {count} answers, {minutes:.1f} min with steps of {SECONDS:g} s")
-    assert count == 28 and found["participants"][0]["trials"] == 25
-    assert abs(found["optimum"]["parameters"]["hue"] - 140) < 60
+    assert count == 28 and result["participants"][0]["trials"] == 25
+    assert abs(result["optimum"]["parameters"]["hue"] - 140) < 60

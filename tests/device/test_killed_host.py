@@ -24,8 +24,8 @@ def test_a_killed_host_is_zero_force_within_the_watchdog_and_its_ramp(times):
             killing.take_over()
     finally:
         killing.close()
-    assert max(found.ticks for found in killing.seen) < BOUND
-    assert max(found.before_N for found in killing.seen) > 0.5
+    assert max(killed.ticks for killed in killing.seen) < BOUND
+    assert max(killed.before_N for killed in killing.seen) > 0.5
 
 
 def test_the_simulated_device_ends_with_a_killed_python():

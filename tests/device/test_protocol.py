@@ -75,10 +75,10 @@ def test_a_message_comes_back(drawn, seq):
     message = drawn[0](**drawn[1])
     frame = encode(message, seq)
     assert frame.count(0) == 1 and frame[-1] == 0 and len(frame) <= LONGEST + 1
-    (found,) = Receiver().feed(frame)
-    assert (found.type, found.seq) == (protocol.code_of(type(message)), seq)
-    assert protocol.payload_of(decode(found)) == found.payload == protocol.payload_of(message)
-    assert type(decode(found)) is type(message)
+    (received,) = Receiver().feed(frame)
+    assert (received.type, received.seq) == (protocol.code_of(type(message)), seq)
+    assert protocol.payload_of(decode(received)) == received.payload == protocol.payload_of(message)
+    assert type(decode(received)) is type(message)
 
 
 @given(st.binary(max_size=64), st.integers(0, 255), st.integers(0, 255))
@@ -92,8 +92,8 @@ def test_a_frame_cut_anywhere_is_lost_alone(drawn, after):
     first, second = (encode(kind(**values), seq) for seq, (kind, values) in ((1, drawn), (2, after)))
     for cut in range(len(first)):
         receiver = Receiver()
-        found = receiver.feed(first[:cut] + b"\0" + second)
-        assert [frame.seq for frame in found] == ([1, 2] if cut == len(first) - 1 else [2])
+        received = receiver.feed(first[:cut] + b"\0" + second)
+        assert [frame.seq for frame in received] == ([1, 2] if cut == len(first) - 1 else [2])
         assert receiver.dropped == (0 < cut < len(first) - 1)
 
 
@@ -102,8 +102,8 @@ def test_bytes_may_arrive_in_any_pieces(drawn, cuts):
     whole = b"\0" + 5 * encode(drawn[0](**drawn[1]), 7)
     places = sorted({0, len(whole), *(cut % len(whole) for cut in cuts)})
     receiver = Receiver()
-    found = [frame for a, b in itertools.pairwise(places) for frame in receiver.feed(whole[a:b])]
-    assert len(found) == 5 and receiver.dropped == 0
+    received = [frame for a, b in itertools.pairwise(places) for frame in receiver.feed(whole[a:b])]
+    assert len(received) == 5 and receiver.dropped == 0
 
 
 @pytest.mark.parametrize("rate", [1e-3, 1e-2])
@@ -203,9 +203,9 @@ def test_every_hold_has_words():
 def test_a_capture_is_read_to_its_end():
     good = encode(protocol.Stop(), 1)
     capture = b"\0" + good + b"\x03ab\0" + encode(protocol.Echo(data=b"x"), 2) + good[:3]
-    found = list(protocol.frames_in(capture))
-    assert [place for place, *_ in found] == [1, 1 + len(good), 5 + len(good), len(capture) - 3]
-    assert [type(message).__name__ for _, message, _ in found] == ["Stop", "WireError", "Echo", "WireError"]
+    entries = list(protocol.frames_in(capture))
+    assert [place for place, *_ in entries] == [1, 1 + len(good), 5 + len(good), len(capture) - 3]
+    assert [type(message).__name__ for _, message, _ in entries] == ["Stop", "WireError", "Echo", "WireError"]
 
 
 @pytest.mark.skipif(not VECTORS.exists(), reason="the golden frames come with the firmware")
@@ -216,8 +216,8 @@ def test_golden_frames():
     for name, kind, seq, payload, frame in lines:
         body = Frame(int(kind, 16), int(seq, 16), b"" if payload == "-" else bytes.fromhex(payload))
         assert frames.closed(body).hex() == frame.lower(), name
-        (found,) = Receiver().feed(bytes.fromhex(frame))
-        assert found == body, name
+        (received,) = Receiver().feed(bytes.fromhex(frame))
+        assert received == body, name
         if body.type in MESSAGES:
             message = decode(body)
             seen.add(name_of(type(message)))

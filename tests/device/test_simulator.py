@@ -35,14 +35,14 @@ def quiet(_words):
 @pytest.fixture
 def device():
     """A device whose time passes as fast as it can, pressed by a finger."""
-    with Renderer.open("sim", options=FAST | {"finger": "sine"}) as found:
-        yield found
+    with Renderer.open("sim", options=FAST | {"finger": "sine"}) as renderer:
+        yield renderer
 
 
 @pytest.mark.parametrize("wanted", [A, S, FULL])
 def test_the_device_renders_what_viscoelastic_says(wanted):
     with Renderer.open("sim", options=FAST | {"finger": "none"}) as device:
-        found = device.send(**wanted)
+        confirmed = device.send(**wanted)
         device.start()
         device.simulator.tell("finger sine")
         seen = device.samples(3.0)
@@ -53,7 +53,8 @@ def test_the_device_renders_what_viscoelastic_says(wanted):
     running = (seen.flags & SampleFlag.RUNNING) != 0
     running[: np.argmax(running) + 100] = False  # force begins at 0, under the slew limit
     assert running.sum() > 2000 and force[running].max() > 1
-    bound = 2e-4 if found.memory == "short" else 2e-3  # of the largest force; the sum of exponentials keeps rounding
+    # Of the largest force; the sum of exponentials keeps rounding.
+    bound = 2e-4 if confirmed.memory == "short" else 2e-3
     np.testing.assert_allclose(seen.force_N[running], force[running], rtol=0, atol=bound * force.max())
 
 
@@ -111,10 +112,10 @@ def test_silence_of_the_host_is_hold(device):
 
 def test_self_test_of_a_good_device():
     with Renderer.open("sim", options=FAST | {"finger": "none"}) as device:
-        found = device_tests.selftest(device, quiet, 100)
-    assert (found.asked, found.echoes) == (100, 100)
-    assert 0 < found.watchdog_ticks <= found.watchdog_limit == 250
-    assert found.force_after_N == 0
+        result = device_tests.selftest(device, quiet, 100)
+    assert (result.asked, result.echoes) == (100, 100)
+    assert 0 < result.watchdog_ticks <= result.watchdog_limit == 250
+    assert result.force_after_N == 0
 
 
 def test_a_drive_that_is_out_of_range_is_refused():
@@ -132,10 +133,10 @@ def test_a_drive_that_ends_early_is_not_used():
         samples = device.samples
 
         def stopped(seconds):
-            found = samples(min(seconds, 0.3))
+            telemetry = samples(min(seconds, 0.3))
             if seconds > 1:
                 device.estop()
-            return found
+            return telemetry
 
         device.samples = stopped
         with pytest.raises(DeviceError, match="ended its drive early, now ESTOP"):
@@ -173,14 +174,14 @@ def _send_and_start(device):
 
 @pytest.mark.parametrize("rate", [1e-4, 1e-3])
 def test_a_bad_line_costs_tries_and_never_a_wrong_set(rate):
-    found = Simulator(finger="sine", rate="lockstep")
+    simulator = Simulator(finger="sine", rate="lockstep")
     ports = []
 
     def connect():
-        ports.append(FaultyPort(found.port, rate, len(ports)))
-        return Link(ports[-1], patience=0.15, tries=200, ticks=found.ticks)
+        ports.append(FaultyPort(simulator.port, rate, len(ports)))
+        return Link(ports[-1], patience=0.15, tries=200, ticks=simulator.ticks)
 
-    device = Renderer(connect, simulator=found)
+    device = Renderer(connect, simulator=simulator)
     rng = random.Random(0)
     for n in range(20):
         wanted = {"K0": 0.3, "K1": rng.uniform(0.1, 1), "B1": rng.uniform(0.1, 1), "alpha": rng.uniform(0.1, 0.9)}
@@ -220,11 +221,11 @@ def test_a_real_port_has_no_options():
 def test_measure_damping_finds_the_simulators_own():
     options = {"finger": "none", "damping": 1.3, "coulomb": 0.05, "seed": 3}
     with Renderer.open("sim", options=FAST | options) as device:
-        found = device_tests.measure_damping(device, quiet)
-    for estimate, truth in ((found.damping, 1.3), (found.coulomb, 0.05), (found.constant, 0.0)):
+        estimates = device_tests.measure_damping(device, quiet)
+    for estimate, truth in ((estimates.damping, 1.3), (estimates.coulomb, 0.05), (estimates.constant, 0.0)):
         assert estimate.lower <= truth <= estimate.upper
-    assert found.mass.value == pytest.approx(0.3, rel=0.02)
-    assert found.damping.upper - found.damping.lower < 0.02
+    assert estimates.mass.value == pytest.approx(0.3, rel=0.02)
+    assert estimates.damping.upper - estimates.damping.lower < 0.02
 
 
 def test_measure_damping_needs_a_free_device():
@@ -244,10 +245,10 @@ def characterised(tmp_path, **numbers):
 
 
 def test_characterise_makes_the_table_that_identify_reads(tmp_path):
-    found = characterised(tmp_path, repeats=3, hold=0.5, rest=0.5)
-    assert [(test.kind, test.repeats) for test in found.tests] == [("relaxation", 3), ("creep", 3)]
-    assert found.notes == ()
-    for test, answer in zip(found.tests, (force, position), strict=True):
+    material = characterised(tmp_path, repeats=3, hold=0.5, rest=0.5)
+    assert [(test.kind, test.repeats) for test in material.tests] == [("relaxation", 3), ("creep", 3)]
+    assert material.notes == ()
+    for test, answer in zip(material.tests, (force, position), strict=True):
         # Rows off the material are left out: there the input is 0.
         grid = np.arange(round(test.time[-1] * 1000) + 1) / 1000
         for put, out in zip(test.input, test.output, strict=True):
@@ -268,8 +269,8 @@ def test_a_material_that_is_not_there_is_said():
 def test_characterise_and_identify_return_the_simulators_own_parameters(tmp_path):
     from hilbo.identification.characterise import characterise
 
-    found = characterised(tmp_path)
-    result = characterise(found.tests, Sampled(101), 0, (), quiet)
+    material = characterised(tmp_path)
+    result = characterise(material.tests, Sampled(101), 0, (), quiet)
     for name, truth in zip(("K0", "K1", "B1", "alpha"), FOAM, strict=True):
         estimate = result.estimates[name]
         assert estimate.lower <= truth <= estimate.upper, (name, truth, estimate)

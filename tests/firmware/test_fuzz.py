@@ -37,11 +37,11 @@ def fuzzer(tmp_path_factory):
 
 
 def test_nothing_breaks_the_device(fuzzer, tmp_path):
-    found = tmp_path / "found"
-    found.mkdir()
+    inputs = tmp_path / "found"
+    inputs.mkdir()
     # No limit on resident memory: a process inherits the peak of its parent, which is a test worker of gigabytes.
     limits = [f"-max_total_time={SECONDS}", "-max_len=600", "-rss_limit_mb=0", "-malloc_limit_mb=512"]
-    done = run(fuzzer, *limits, found, CORPUS, folder=tmp_path)
+    done = run(fuzzer, *limits, inputs, CORPUS, folder=tmp_path)
     said = done.stderr.decode(errors="replace")
     broken = [path.read_bytes().hex() for path in tmp_path.glob("crash-*")]
     assert done.returncode == 0, f"{broken}\n{said[-4000:]}"

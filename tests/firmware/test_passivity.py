@@ -20,9 +20,9 @@ def lib():
 
 
 def closed_forms(lib, *set_numbers) -> dict[str, float]:
-    found = (ctypes.c_double * 5)()
-    lib.shim_closed_forms((ctypes.c_double * 7)(*map(float, set_numbers)), found)
-    return dict(zip(("b", "H1", "warm", "beta", "static"), found, strict=True))
+    forms = (ctypes.c_double * 5)()
+    lib.shim_closed_forms((ctypes.c_double * 7)(*map(float, set_numbers)), forms)
+    return dict(zip(("b", "H1", "warm", "beta", "static"), forms, strict=True))
 
 
 @pytest.mark.parametrize("base", [1, 2, 3, 100, 999, 1000, 4096, 10000, 65535])
@@ -71,14 +71,14 @@ def test_closed_forms_against_fifty_digits(lib, full):
         N = int(rng.choice([1, 25, 101, 201, 255]))
         K1, B1, alpha = np.float32([rng.uniform(1, 32), rng.uniform(0.001, 32), rng.uniform(0.01, 0.99)])
         K0 = np.float32(rng.uniform(0, 1)) if full else np.float32(rng.uniform(-1, 1))
-        found = closed_forms(lib, int(full), N, 1000, K0, K1, B1, alpha)
+        forms = closed_forms(lib, int(full), N, 1000, K0, K1, B1, alpha)
         b, H1, warm, beta = exact_forms(K0, K1, B1, alpha, N, full)
         scale = abs(float(K0)) + float(b)
-        assert abs(found["b"] - b) <= 3e-6 * scale
-        assert abs(found["H1"] - H1) <= 2e-5 * scale
-        assert abs(found["beta"] / beta - 1) <= 1.2e-7
-        assert warm is None or abs(found["warm"] - warm) <= 1
-        assert found["static"] == (H1 >= 0) or abs(H1) < 1e-5
+        assert abs(forms["b"] - b) <= 3e-6 * scale
+        assert abs(forms["H1"] - H1) <= 2e-5 * scale
+        assert abs(forms["beta"] / beta - 1) <= 1.2e-7
+        assert warm is None or abs(forms["warm"] - warm) <= 1
+        assert forms["static"] == (H1 >= 0) or abs(H1) < 1e-5
 
 
 def test_golden_numbers(lib):
@@ -88,9 +88,9 @@ def test_golden_numbers(lib):
         ((-3.18, 5.58, 7.88, 0.176), 0.76288, 0.44616),
         ((-5.01, 8.44, 10.28, 0.282), 1.34452, 0.44586),
     ]:
-        found = closed_forms(lib, 0, 101, 1000, *row)
-        assert abs(found["b"] - b) < 1.1e-5
-        assert abs(found["H1"] - H1) < 1.1e-5
+        forms = closed_forms(lib, 0, 101, 1000, *row)
+        assert abs(forms["b"] - b) < 1.1e-5
+        assert abs(forms["H1"] - H1) < 1.1e-5
 
 
 def boundary_sets(count: int, b: float, memory: str, seed: int) -> np.ndarray:
@@ -110,14 +110,14 @@ def boundary_sets(count: int, b: float, memory: str, seed: int) -> np.ndarray:
 
 def verdicts(device: Device, sets: np.ndarray, full: bool) -> list[str]:
     """ACK or the reason, for each set sent in SET_PARAMS."""
-    found = []
+    answers = []
     device.collect()
     for number, (K0, K1, B1, alpha) in enumerate(sets.tolist()):
         model = {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha} | ({"states": [0] * 10} if full else {})
         device.feed(frame("SET_PARAMS", number % 256, parameters(model)))
         kind, _, payload = decode(device.drain()[:-1])
-        found.append("ACK" if NAMES[kind] == "ACK" else REASONS[unpack("NACK", payload)["reason"]])
-    return found
+        answers.append("ACK" if NAMES[kind] == "ACK" else REASONS[unpack("NACK", payload)["reason"]])
+    return answers
 
 
 @pytest.mark.parametrize("count", [500, pytest.param(12_500, marks=pytest.mark.deep)])
@@ -126,8 +126,8 @@ def verdicts(device: Device, sets: np.ndarray, full: bool) -> list[str]:
 def test_every_proposal_on_the_passive_boundary_is_taken(b, memory, count):
     """The host searches with b(1 - 1e-3); eight cases of 12,500 are the 1e5."""
     sets = boundary_sets(count, b * (1 - 1e-3), memory, seed=1)
-    found = verdicts(Device(damping=b, K0_low=-40.0), sets, memory == "full")
-    assert found.count("ACK") == count
+    answers = verdicts(Device(damping=b, K0_low=-40.0), sets, memory == "full")
+    assert answers.count("ACK") == count
 
 
 @pytest.mark.parametrize("count", [300, pytest.param(1_250, marks=pytest.mark.deep)])
@@ -137,8 +137,8 @@ def test_every_set_slightly_beyond_is_refused(b, memory, count):
     """By 1e-3, and by a tenth of that: float32 is far finer."""
     for beyond in (1e-3, 1e-4):
         sets = boundary_sets(count, b * (1 + beyond), memory, seed=2)
-        found = verdicts(Device(damping=b, K0_low=-40.0), sets, memory == "full")
-        assert found.count("NOT_PASSIVE") == count
+        answers = verdicts(Device(damping=b, K0_low=-40.0), sets, memory == "full")
+        assert answers.count("NOT_PASSIVE") == count
 
 
 def test_negative_static_stiffness_is_refused():
@@ -147,8 +147,8 @@ def test_negative_static_stiffness_is_refused():
     K1, B1, alpha = rng.uniform(1, 32, 300), rng.uniform(0.01, 32, 300), rng.uniform(0.01, 0.99, 300)
     for K_eff, verdict in ((-1e-3, "STATIC_STIFFNESS"), (0.0, "ACK")):
         K0 = np.asarray(viscoelastic.K0_from_effective_stiffness(*map(jnp.asarray, (K1, B1, alpha)), K_eff))
-        found = verdicts(device, np.column_stack([K0, K1, B1, alpha]).astype(np.float32), False)
-        assert set(found) == {verdict}
+        answers = verdicts(device, np.column_stack([K0, K1, B1, alpha]).astype(np.float32), False)
+        assert set(answers) == {verdict}
     full = verdicts(device, np.float32([[-1e-6, 2, 3, 0.3]]), True)
     assert full == ["STATIC_STIFFNESS"]
 

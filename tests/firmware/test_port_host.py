@@ -69,11 +69,11 @@ def test_garbage_is_counted_and_changes_no_force():
     def forces(garbage):
         with Port("--boot-id", "1", "--finger", "hold") as port:
             port.run()
-            found = []
+            forces_N = []
             for _ in range(40):
-                found.append(port.live(50))
+                forces_N.append(port.live(50))
                 port.send(garbage.pop() + b"\0" if garbage else b"")
-            return found, port.status().frames_dropped
+            return forces_N, port.status().frames_dropped
 
     rng = np.random.default_rng(0)
     garbage = [rng.bytes(int(size)) for size in rng.integers(1, 300, 40)]
@@ -342,11 +342,11 @@ def press(sets, ticks: int) -> dict[str, np.ndarray]:
 
 
 def none_acts(sets, ticks: int) -> None:
-    found = press(sets, ticks)
-    assert (found["state"] == State.RUNNING).all()
+    counted = press(sets, ticks)
+    assert (counted["state"] == State.RUNNING).all()
     for name in ("nacks", *SAFEGUARDS):
-        assert not found[name].any(), f"{name}: {found[name].max()} at {np.argmax(found[name])}"
-    assert (found["contact"] > ticks / 10).all() and (found["depth"] > 1).all() and (found["force"] > 0.3).all()
+        assert not counted[name].any(), f"{name}: {counted[name].max()} at {np.argmax(counted[name])}"
+    assert (counted["contact"] > ticks / 10).all() and (counted["depth"] > 1).all() and (counted["force"] > 0.3).all()
 
 
 def test_no_safeguard_acts_on_passive_sets_under_a_finger():

@@ -134,15 +134,15 @@ def notice(answer) -> tuple[int, int]:
 @pytest.mark.deep
 @each_cpu
 def test_what_a_tick_costs(cpu, tmp_path):
-    found = measure(cpu, tmp_path)
-    cost = found.sections
+    measured = measure(cpu, tmp_path)
+    cost = measured.sections
     plain = cost["short memory, N = 101"]
     assert 1000 < plain.mean < 2500
     for name, N, states in MEMORIES:
         # The cost depends neither on the force nor on the time since contact.
         assert cost[name].ticks == 3050 and cost[name].most - cost[name].least <= 0.2 * cost[name].most + 400
-        assert found.rounding[name] < 1e-5
-        assert found.memory[name] < (1e-4 if states else 0.2)
+        assert measured.rounding[name] < 1e-5
+        assert measured.memory[name] < (1e-4 if states else 0.2)
         assert (cost[name].mean < plain.mean) == (N < 101)
     # What a scene does not need is skipped: no contact costs as little as no set.
     idle = cost["no contact, forgotten"]
@@ -152,7 +152,7 @@ def test_what_a_tick_costs(cpu, tmp_path):
     assert plain.mean < staged < 2 * plain.mean
     assert cost["contact, the tick of the swap"].most < 1.05 * staged
     assert max(section.most_of_a_frame for section in cost.values()) < 20_000
-    assert found.stack < 2048
+    assert measured.stack < 2048
 
 
 @pytest.mark.deep

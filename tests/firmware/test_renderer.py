@@ -76,8 +76,8 @@ def largest_error(count: int, memory: str, x: np.ndarray | None = None) -> float
         some = sets[first : first + 4]
         exact = np.asarray(_reference(memory)(jnp.asarray(some, float), jnp.asarray(x, float)))
         for row, expected in zip(some, exact, strict=True):
-            found = render(lib, row, x, states_of(row[3], 10) if memory == "full" else None)
-            worst = max(worst, np.max(np.abs(found - expected)) / np.max(np.abs(expected)))
+            forces = render(lib, row, x, states_of(row[3], 10) if memory == "full" else None)
+            worst = max(worst, np.max(np.abs(forces - expected)) / np.max(np.abs(expected)))
     return worst
 
 
@@ -115,9 +115,9 @@ def test_skipping_without_contact_changes_no_bit(tmp_path, states):
     x[:500] = x[3000:9000] = 0
     row = np.float32([-3.18, 5.58, 7.88, 0.176]) if states is None else np.float32([0.44, 1.0, 3.0, 0.3])
     given = None if states is None else states_of(row[3], states)
-    found, unskipped = (render(library(build(core)), row, x, given) for core in (CORE, tmp_path))
-    assert found.tobytes() == unskipped.tobytes()
-    assert np.count_nonzero(found[8900:9000]) == (0 if states is None else 100)
+    skipped, unskipped = (render(library(build(core)), row, x, given) for core in (CORE, tmp_path))
+    assert skipped.tobytes() == unskipped.tobytes()
+    assert np.count_nonzero(skipped[8900:9000]) == (0 if states is None else 100)
 
 
 @pytest.mark.parametrize("N", [1, 3, 25, 201, 255])
@@ -148,9 +148,9 @@ def test_the_exponentials_of_the_protocol_tests_are_the_hosts():
 def test_every_compiler_and_optimisation_gives_the_same_bits():
     x = np.maximum(motion(2.0), 0).astype(np.float32) * STEP
     row, given = np.float32([0.44, 1.0, 3.0, 0.3]), states_of(np.float32(0.3), 10)
-    found = set()
+    renderings = set()
     for cc in filter(shutil.which, ("gcc", "clang")):
         for level in ("-O0", "-O2", "-O3"):
             lib = library(build(extra=(level,), cc=cc))
-            found.add(render(lib, row, x).tobytes() + render(lib, row, x, given).tobytes())
-    assert len(found) == 1
+            renderings.add(render(lib, row, x).tobytes() + render(lib, row, x, given).tobytes())
+    assert len(renderings) == 1

@@ -68,8 +68,8 @@ def test_damping_in_a_refusal_is_that_which_is_needed(device):
 def test_full_memory(device):
     staged = device.stage(full_set())
     assert device.confirm("COMMIT", staged)[0] == "ACK"
-    found = device.must("GET_SET", bank=0)
-    assert (found["memory"], found["length"], found["flags"], found["crc"]) == (1, 10, 1, staged[1])
+    stored = device.must("GET_SET", bank=0)
+    assert (stored["memory"], stored["length"], stored["flags"], stored["crc"]) == (1, 10, 1, staged[1])
 
 
 def first_seven(rows, **changed):

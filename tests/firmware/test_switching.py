@@ -90,8 +90,8 @@ def test_all_pairs_of_passive_sets_on_four_motions(count):
             jump = abs(own[flip] - other[flip])
             assert fading.size <= 2 + jump / (SLEW / 1000 - np.max(np.abs(np.diff(other[flip:]))))
             gone.setdefault(name, []).append((fading.size, jump))
-    for name, found in gone.items():
-        ticks, jumps = np.array(found).T
+    for name, fades in gone.items():
+        ticks, jumps = np.array(fades).T
         late = f"gone after {ticks.max():.0f} ticks, median {np.median(ticks):.0f}"
         print(f"{name}: differences up to {jumps.max():.2f} N, {late}")
 

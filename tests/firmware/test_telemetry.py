@@ -114,10 +114,10 @@ def test_drive_needs_a_heartbeat(device):
 
 
 def test_limits_are_those_of_the_config(device):
-    found = device.must("GET_LIMITS")
+    limits = device.must("GET_LIMITS")
     for name in ("K0", "K1", "B1", "alpha"):
-        assert found[f"{name}_low"] == np.float32(CONFIG[f"{name}_low"])
-        assert found[f"{name}_high"] == np.float32(CONFIG[f"{name}_high"])
+        assert limits[f"{name}_low"] == np.float32(CONFIG[f"{name}_low"])
+        assert limits[f"{name}_high"] == np.float32(CONFIG[f"{name}_high"])
 
 
 def test_a_notice_tells_of_the_start_and_of_every_change_of_state(device):

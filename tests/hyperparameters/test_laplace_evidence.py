@@ -31,11 +31,11 @@ def expanded(gp, trials, coordinates, start):
     return (person_ep_evidence if isinstance(start, tuple) else person_evidence)(gp, coordinates, trials, start)
 
 
-def assert_expansion(found, value, gradient, hessian):
-    assert bool(found.certified)
-    np.testing.assert_allclose(found.value, value, rtol=1e-13)
-    np.testing.assert_allclose(found.gradient, gradient, rtol=0, atol=1e-11 * np.abs(hessian).max())
-    np.testing.assert_allclose(found.hessian, hessian, rtol=0, atol=1e-11 * np.abs(hessian).max())
+def assert_expansion(expansion, value, gradient, hessian):
+    assert bool(expansion.certified)
+    np.testing.assert_allclose(expansion.value, value, rtol=1e-13)
+    np.testing.assert_allclose(expansion.gradient, gradient, rtol=0, atol=1e-11 * np.abs(hessian).max())
+    np.testing.assert_allclose(expansion.hessian, hessian, rtol=0, atol=1e-11 * np.abs(hessian).max())
 
 
 @pytest.fixture(scope="module", params=["laplace", "ep"])
@@ -62,28 +62,28 @@ def test_some_hyperparameters_are_a_part_of_all(inference):
     for learn in (EVERY, ("noise",), ("theta",)):
         coordinates = coordinates_of(gp, learn)
         part = np.isin(names, [of.index(k) for k in coordinates])
-        found = expanded(gp, trials, coordinates, NOTHING[inference])
-        assert_expansion(found, value, gradient[part], hessian[np.ix_(part, part)])
+        expansion = expanded(gp, trials, coordinates, NOTHING[inference])
+        assert_expansion(expansion, value, gradient[part], hessian[np.ix_(part, part)])
 
 
 def test_derivatives_are_differences_of_the_reference(one):
-    inference, gp, trials, coordinates, found, nothing = one
+    inference, gp, trials, coordinates, expansion, nothing = one
     flat, restore = ravel_pytree(coordinates)
     known = oracle("evidence")[inference]["reference"]
     middle, above, below = known["middle"], known["above"], known["below"]
-    np.testing.assert_allclose(found.gradient, (above - below) / (2 * STEP), rtol=0, atol=1e-5)
-    np.testing.assert_allclose(np.diag(found.hessian), (above - 2 * middle + below) / STEP**2, rtol=0, atol=1e-3)
+    np.testing.assert_allclose(expansion.gradient, (above - below) / (2 * STEP), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(np.diag(expansion.hessian), (above - 2 * middle + below) / STEP**2, rtol=0, atol=1e-3)
     place = expanded(gp, trials, restore(flat + STEP), nothing).place
-    for moved, before, slope in zip(*map(jax.tree.leaves, (place, found.place, found.moved)), strict=True):
+    for moved, before, slope in zip(*map(jax.tree.leaves, (place, expansion.place, expansion.moved)), strict=True):
         np.testing.assert_allclose((moved - before) / STEP, slope.sum(axis=1), rtol=0, atol=1e-2)
 
 
 @pytest.mark.parametrize("start", [0.3, -40.0, 1e200, np.nan])
 def test_where_the_search_begins_changes_nothing(one, start):
-    _, gp, trials, coordinates, found, nothing = one
+    _, gp, trials, coordinates, expansion, nothing = one
     again = expanded(gp, trials, coordinates, jax.tree.map(lambda leaf: jnp.full_like(leaf, start), nothing))
     assert bool(again.certified)
-    np.testing.assert_allclose(again.hessian, found.hessian, rtol=1e-9)
+    np.testing.assert_allclose(again.hessian, expansion.hessian, rtol=1e-9)
 
 
 @pytest.mark.parametrize("inference", ["laplace", pytest.param("ep", marks=pytest.mark.deep)])
@@ -122,10 +122,10 @@ def test_haste_leaves_nothing_undone(name):
     data = next(case for case in hostile_cases() if case.name == name)
     gp, trials = model(data), answers(data, len(data.q))
     nothing = jnp.zeros(len(data.q)), jnp.full(len(data.q), -jnp.inf, float)
-    found = expanded(gp, trials, coordinates_of(gp, EVERY), nothing)
-    assert bool(found.certified)
+    expansion = expanded(gp, trials, coordinates_of(gp, EVERY), nothing)
+    assert bool(expansion.certified)
     # the covariance's own rounding
-    np.testing.assert_allclose(found.value, oracle("evidence")["hasty"][name], rtol=1e-7)
+    np.testing.assert_allclose(expansion.value, oracle("evidence")["hasty"][name], rtol=1e-7)
 
 
 @pytest.mark.parametrize("inference", ["laplace", pytest.param("ep", marks=pytest.mark.deep)])
@@ -136,10 +136,14 @@ def test_a_certified_float32_evidence_is_right(inference):
 
     def one(scattered):
         gp = evidence.scattered_gp(scattered, jnp.float32)
-        found = expanded(gp, trials, coordinates_of(gp, ("theta", "noise")), nothing)
+        expansion = expanded(gp, trials, coordinates_of(gp, ("theta", "noise")), nothing)
         fitted = fit(gp, trials, inference=inference, throw=False)
         ended = fitted.certificate.residual <= fitted.certificate.tolerance
-        return jnp.stack([found.value, fitted.log_evidence]), (found.certified, fitted.certificate.converged), ended
+        return (
+            jnp.stack([expansion.value, fitted.log_evidence]),
+            (expansion.certified, fitted.certificate.converged),
+            ended,
+        )
 
     values, certified, ended = jax.jit(lambda models: jax.lax.map(one, models))(jnp.asarray(evidence.SCATTERED))
     stored = oracle("evidence")["scattered"][inference]

@@ -118,30 +118,30 @@ def checked():
 
 @pytest.mark.deep
 def test_robustness_compares_optima(checked):
-    _, _, found = checked
-    assert float(found.nrmse) == pytest.approx(float(np.sqrt(np.mean((found.fixed.x - found.optimised.x) ** 2))))
-    assert found.individual_nrmse.shape == (3,)
-    assert bool(found.flagged) == (float(found.nrmse) >= 0.03)
-    assert found.learned.learn == ("theta", "noise", "thresholds")
+    _, _, result = checked
+    assert float(result.nrmse) == pytest.approx(float(np.sqrt(np.mean((result.fixed.x - result.optimised.x) ** 2))))
+    assert result.individual_nrmse.shape == (3,)
+    assert bool(result.flagged) == (float(result.nrmse) >= 0.03)
+    assert result.learned.learn == ("theta", "noise", "thresholds")
 
 
 @pytest.mark.deep
 def test_robustness_is_that_of_the_studys_rule(checked):
-    study, cohort, found = checked
-    assert found.rule == "bcm" and found.shares == (None, None)
+    study, cohort, result = checked
+    assert result.rule == "bcm" and result.shares == (None, None)
     other = robustness(dataclasses.replace(study, rule="hierarchical"), cohort)
     fixed, learnt = (float(share) for share in other.shares)
     assert 0 < fixed < 1 and 0 < learnt < 1 and fixed != learnt
-    heights = population(found.posteriors, other.fixed.x[None, :], "hierarchical", other.shares[0])[0]
+    heights = population(result.posteriors, other.fixed.x[None, :], "hierarchical", other.shares[0])[0]
     assert float(other.fixed.mean) == pytest.approx(float(heights[0]), rel=1e-10)
-    assert float(jnp.abs(other.fixed.mean - found.fixed.mean)) > 1e-3
+    assert float(jnp.abs(other.fixed.mean - result.fixed.mean)) > 1e-3
     for of, optimum in zip(other.maps(), (other.fixed, other.optimised), strict=True):
         assert float(of(optimum.x[None, :])[0][0]) == pytest.approx(float(optimum.mean), rel=1e-10)
 
 
 @pytest.mark.deep
 def test_the_optimum_moves_as_its_derivative_says(checked):
-    study, cohort, found = checked
+    study, cohort, result = checked
     candidates = jnp.asarray(study.space.candidates(4096, 0))
     step = 0.02
 
@@ -151,7 +151,7 @@ def test_the_optimum_moves_as_its_derivative_says(checked):
 
     middle = float(jnp.log(study.gp.likelihood.noise))
     moved = (optimum(middle + step) - optimum(middle - step)) / (2 * step)
-    np.testing.assert_allclose(found.sensitivity["noise"], moved, atol=1e-3)
+    np.testing.assert_allclose(result.sensitivity["noise"], moved, atol=1e-3)
 
 
 @pytest.mark.deep

@@ -23,8 +23,8 @@ def test_a_curve_is_that_of_the_filter(N, kind):
     parameters = FOAM if N <= 101 else (0.44, *FOAM[1:])
     test = next(t for t in foam_tests(N=N, parameters=parameters) if t.kind == kind)
     model = Sampled(N)
-    found = model.predict(jnp.asarray(model.coordinates(*parameters)), model.prepare(test), ALONE)
-    np.testing.assert_allclose(found, test.output[0], rtol=0, atol=1e-11 * np.ptp(test.output))
+    predicted = model.predict(jnp.asarray(model.coordinates(*parameters)), model.prepare(test), ALONE)
+    np.testing.assert_allclose(predicted, test.output[0], rtol=0, atol=1e-11 * np.ptp(test.output))
 
 
 def test_full_memory_is_the_infinite_sum():
@@ -39,8 +39,8 @@ def test_full_memory_is_the_infinite_sum():
         model = Sampled(memory="full")
         q = jnp.asarray(model.coordinates(*exact))
         assert q[1] == K0
-        found = model.predict(q, model.prepare(Test(kind, time, out[None], put[None])), ALONE)
-        np.testing.assert_allclose(found, out, rtol=0, atol=1e-11 * np.ptp(out))
+        predicted = model.predict(q, model.prepare(Test(kind, time, out[None], put[None])), ALONE)
+        np.testing.assert_allclose(predicted, out, rtol=0, atol=1e-11 * np.ptp(out))
 
 
 def test_an_equilibrium_before_the_first_row():
@@ -48,9 +48,9 @@ def test_an_equilibrium_before_the_first_row():
     preload = x + 1.5
     model = Sampled()
     curve = model.prepare(Test("relaxation", t, force(FOAM, x)[None], preload[None], "equilibrium"))
-    found = model.predict(jnp.asarray(model.coordinates(*FOAM)), curve, ALONE)
+    predicted = model.predict(jnp.asarray(model.coordinates(*FOAM)), curve, ALONE)
     expected = FOSLS(*FOAM).simulate(preload, start="equilibrium")
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(predicted, expected, rtol=0, atol=1e-9)
 
 
 def test_times_between_samples_are_interpolated():
@@ -62,8 +62,8 @@ def test_times_between_samples_are_interpolated():
     knots = np.unique(np.concatenate([times, [0.02]]))
     test = Test("relaxation", knots, np.interp(knots, t, F)[None], np.interp(knots, t, x)[None])
     model = Sampled()
-    found = model.predict(jnp.asarray(model.coordinates(*FOAM)), model.prepare(test), ALONE)
-    np.testing.assert_allclose(found, np.interp(knots, t, F), atol=1e-10)
+    predicted = model.predict(jnp.asarray(model.coordinates(*FOAM)), model.prepare(test), ALONE)
+    np.testing.assert_allclose(predicted, np.interp(knots, t, F), atol=1e-10)
 
 
 def test_derivatives_of_a_curve():
@@ -82,13 +82,13 @@ def test_derivatives_of_a_curve():
 )
 def test_without_noise_the_parameters_come_back(kinds):
     tests = [test for test in foam_tests() if test.kind in kinds]
-    found = fit(tests, Sampled())
-    values = found.parameters()
-    assert found.solution.converged
+    fitted = fit(tests, Sampled())
+    values = fitted.parameters()
+    assert fitted.solution.converged
     assert [values[name] for name in ("K0", "K1", "B1", "alpha")] == pytest.approx(FOAM, rel=1e-6)
     assert values["K_eff"] == pytest.approx(0.44325, abs=5e-6)
-    assert max(nrmse(found).values()) < 1e-9
-    assert not np.any(found.held())
+    assert max(nrmse(fitted).values()) < 1e-9
+    assert not np.any(fitted.held())
 
 
 @pytest.mark.deep
@@ -117,8 +117,8 @@ def test_repeats_with_different_inputs_are_one_fit():
 def test_a_fit_that_runs_away_says_so():
     (t, x), _ = loads()
     spring = Test("relaxation", t, (0.8 * x + 1e-4 * np.sin(40 * t))[None], x[None])
-    found = fit([spring], Sampled())
-    assert np.any(found.held()) or not found.solution.converged or found.parameters()["K_inst"] < 0.81
+    fitted = fit([spring], Sampled())
+    assert np.any(fitted.held()) or not fitted.solution.converged or fitted.parameters()["K_inst"] < 0.81
 
 
 @pytest.mark.deep

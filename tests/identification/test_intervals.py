@@ -19,17 +19,17 @@ from hilbo.viscoelastic import FOSLS
 
 
 @pytest.fixture(scope="module")
-def found():
+def fitted():
     return fit(foam_tests(6, noise=0.004, rho=0.8, seed=1, hold=0.5), Sampled())
 
 
 @pytest.mark.deep
-def test_noise_is_recognised(found):
-    for part in residual_noise.noise(found):
+def test_noise_is_recognised(fitted):
+    for part in residual_noise.noise(fitted):
         assert int(part.order) >= 1
         assert float(part.lag_one) == pytest.approx(0.8, abs=0.1)
-    sizes = [curve.time.size for curve in found.curves]
-    shares = [float(part.effective) / size for part, size in zip(residual_noise.noise(found), sizes, strict=True)]
+    sizes = [curve.time.size for curve in fitted.curves]
+    shares = [float(part.effective) / size for part, size in zip(residual_noise.noise(fitted), sizes, strict=True)]
     assert shares == pytest.approx([1 / 9, 1 / 9], rel=0.5)  # (1 - 0.8)/(1 + 0.8)
 
 
@@ -60,13 +60,13 @@ def test_the_quantile_is_students(freedom):
 
 
 @pytest.mark.deep
-def test_ends_of_a_profile_are_where_scipy_finds_them(found):
-    around, sides = intervals.spread(found), intervals.profile_intervals(found)
+def test_ends_of_a_profile_are_where_scipy_finds_them(fitted):
+    around, sides = intervals.spread(fitted), intervals.profile_intervals(fitted)
     assert np.all(sides.bracketed)
     assert not np.any(sides.open_lower) and not np.any(sides.open_upper)
-    misfit = jax.jit(lambda q: residuals(found.model, found.curves, found.weights, q))
+    misfit = jax.jit(lambda q: residuals(fitted.model, fitted.curves, fitted.weights, q))
     slopes = jax.jit(jax.jacfwd(misfit))
-    j, q = 3, np.asarray(found.q)
+    j, q = 3, np.asarray(fitted.q)
 
     def rise(value):
         whole = lambda p: jnp.asarray(np.insert(p, j, value))  # noqa: E731
@@ -76,28 +76,28 @@ def test_ends_of_a_profile_are_where_scipy_finds_them(found):
             jac=lambda p: np.delete(np.asarray(slopes(whole(p))), j, axis=1),
             x_scale="jac",
         )
-        return 2 * best.cost - float(found.solution.cost) - float(around.cut[j])
+        return 2 * best.cost - float(fitted.solution.cost) - float(around.cut[j])
 
     ends = brentq(rise, q[j] - 2, q[j], xtol=1e-4), brentq(rise, q[j], q[j] + 2, xtol=1e-4)
     width = ends[1] - ends[0]
     assert float(sides.lower[j]) == pytest.approx(ends[0], abs=3e-3 * width)
     assert float(sides.upper[j]) == pytest.approx(ends[1], abs=3e-3 * width)
-    truth = found.model.coordinates(*FOAM)
+    truth = fitted.model.coordinates(*FOAM)
     assert np.all((sides.lower < truth) & (truth < sides.upper))
 
 
 @pytest.mark.deep
-def test_the_bootstrap_is_about_as_wide_as_the_profile(found):
-    sides = intervals.profile_intervals(found)
-    lower, upper = intervals.block_bootstrap(found, jax.random.key(0))
+def test_the_bootstrap_is_about_as_wide_as_the_profile(fitted):
+    sides = intervals.profile_intervals(fitted)
+    lower, upper = intervals.block_bootstrap(fitted, jax.random.key(0))
     ratio = (upper - lower) / (sides.upper - sides.lower)
     assert np.all((ratio > 0.4) & (ratio < 3))
 
 
 @pytest.mark.deep
-def test_influences_are_refits_to_first_order(found):
-    quick = intervals.block_bootstrap(found, jax.random.key(1), 100)
-    exact = intervals.block_bootstrap(found, jax.random.key(1), 100, exact=True)
+def test_influences_are_refits_to_first_order(fitted):
+    quick = intervals.block_bootstrap(fitted, jax.random.key(1), 100)
+    exact = intervals.block_bootstrap(fitted, jax.random.key(1), 100, exact=True)
     width = np.asarray(quick[1] - quick[0])
     np.testing.assert_array_less(np.abs(np.asarray(exact[0] - quick[0])), 0.25 * width)
     np.testing.assert_array_less(np.abs(np.asarray(exact[1] - quick[1])), 0.25 * width)
@@ -105,11 +105,11 @@ def test_influences_are_refits_to_first_order(found):
 
 @pytest.mark.deep
 def test_white_noise_has_the_classical_cut():
-    found = fit(foam_tests(noise=0.01, hold=0.5, seed=3), Sampled())
-    around = intervals.spread(found)
-    m, p = sum(c.time.size for c in found.curves), 4
-    assert [int(part.order) for part in residual_noise.noise(found)] == [0, 0]
-    classical = student.ppf(0.975, m - p) ** 2 * float(found.solution.cost)
+    fitted = fit(foam_tests(noise=0.01, hold=0.5, seed=3), Sampled())
+    around = intervals.spread(fitted)
+    m, p = sum(c.time.size for c in fitted.curves), 4
+    assert [int(part.order) for part in residual_noise.noise(fitted)] == [0, 0]
+    classical = student.ppf(0.975, m - p) ** 2 * float(fitted.solution.cost)
     # Two curves of different length have weights of their own, so that the classical cut is met to first order.
     assert np.asarray(around.cut) == pytest.approx(np.full(4, classical / m), rel=0.6)
 
@@ -122,17 +122,17 @@ def test_what_differs_between_repeats_is_in_the_interval():
     for _ in range(30):
         scales = 1 + 1e-3 * rng.standard_normal((2, 16, 1))
         moved = [Test(t.kind, t.time, t.output * s, t.input) for t, s in zip(tests, scales, strict=True)]
-        found = fit(moved, Sampled())
-        half = 2.04 * np.sqrt(intervals.spread(found).covariance[1, 1])  # Student's, of 30 degrees of freedom
-        inside += abs(float(found.q[1] - truth)) <= half
+        fitted = fit(moved, Sampled())
+        half = 2.04 * np.sqrt(intervals.spread(fitted).covariance[1, 1])  # Student's, of 30 degrees of freedom
+        inside += abs(float(fitted.q[1] - truth)) <= half
     assert inside >= 26
 
 
 @pytest.mark.deep
 def test_what_the_data_do_not_tell_has_an_open_end():
     """Half a second of one slow test: κ and α cannot be told apart from a slower, weaker branch."""
-    found = fit(foam_tests(noise=0.3, hold=0.1, seed=5), Sampled())
-    sides = intervals.profile_intervals(found)
+    fitted = fit(foam_tests(noise=0.3, hold=0.1, seed=5), Sampled())
+    sides = intervals.profile_intervals(fitted)
     assert np.any(sides.open_lower | sides.open_upper | ~sides.bracketed)
 
 
@@ -141,6 +141,6 @@ def test_too_few_repeats_have_no_bootstrap():
     curves, weights = tuple(model.prepare(t) for t in tests), (jnp.ones(4) / 4, jnp.ones(4) / 4)
     q, nothing = jnp.zeros(4), jnp.asarray(0)
     solution = Solution(q, jnp.asarray(0.0), jnp.eye(4), q, nothing, nothing > 0)
-    found = Fit(model, curves, solution, q, q, jnp.zeros(5), weights)
+    fitted = Fit(model, curves, solution, q, q, jnp.zeros(5), weights)
     with pytest.raises(InputError, match="has 4 repeats"):
-        intervals.block_bootstrap(found, jax.random.key(0))
+        intervals.block_bootstrap(fitted, jax.random.key(0))

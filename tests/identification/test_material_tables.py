@@ -30,8 +30,8 @@ def test_units_become_seconds_millimetres_and_newtons(tmp_path):
 )
 def test_moduli_keep_their_own_system(tmp_path, head, unit, factor):
     rows = [(1 + i, 20 - i) for i in range(10)]
-    (test,), found, _ = read_material(table(tmp_path, head, rows))
-    assert (test.kind, found) == ("modulus", unit)
+    (test,), system, _ = read_material(table(tmp_path, head, rows))
+    assert (test.kind, system) == ("modulus", unit)
     np.testing.assert_allclose(test.output[0], factor * (20 - np.arange(10)))
     assert test.time[0] == (60 if "min" in head else 1)
 

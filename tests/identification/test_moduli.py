@@ -53,10 +53,10 @@ def test_fish_muscle_by_the_exact_fosls(longest, limit):
 @pytest.mark.deep
 def test_fish_muscle_by_fractional_maxwell():
     """The published weighted fit: G 22074, V 869958, α .6744, β .1101, weighted sum of squares .01076."""
-    found = fit(fish(), FractionalMaxwell())
-    values = found.parameters()
+    fitted = fit(fish(), FractionalMaxwell())
+    values = fitted.parameters()
     assert values["alpha"] == pytest.approx(0.6744, rel=0.01)
     assert values["beta"] == pytest.approx(0.1101, rel=0.01)
     assert values["G"] == pytest.approx(22074, rel=0.01)
     assert values["V"] == pytest.approx(869958, rel=0.02)
-    assert float(found.solution.cost) * 566 == pytest.approx(0.01076, rel=2e-3)
+    assert float(fitted.solution.cost) * 566 == pytest.approx(0.01076, rel=2e-3)

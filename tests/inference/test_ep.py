@@ -34,9 +34,9 @@ def test_against_the_textbook(make):
     posterior = by_ep(data)
     prior = np.asarray(gram(posterior.gp.kernel, jnp.asarray(data.x), jnp.asarray(data.x)))
     mean, variance, evidence = textbook_ep(prior, *edges_of(data), data.noise)
-    found_mean, found_variance = posterior.predict(jnp.asarray(data.x))
-    np.testing.assert_allclose(found_mean, mean, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(found_variance, variance, rtol=0, atol=1e-7)
+    ep_mean, ep_variance = posterior.predict(jnp.asarray(data.x))
+    np.testing.assert_allclose(ep_mean, mean, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(ep_variance, variance, rtol=0, atol=1e-7)
     np.testing.assert_allclose(posterior.log_evidence, evidence, rtol=0, atol=1e-7)
     np.testing.assert_allclose(posterior.latent.mode[: len(data.q)], mean, rtol=0, atol=1e-7)
 
@@ -75,7 +75,7 @@ def test_gaussian_terms_are_exact_with_their_derivatives():
     y, noise, seen = rng.standard_normal(9), rng.uniform(0.3, 2.0, 9), np.arange(9) != 4
     new = jnp.asarray(rng.random((3, 2)))
 
-    def found(theta, y, noise):
+    def propagated(theta, y, noise):
         kernel = RBF(theta, 1.3)
         posterior = ep(gram(kernel, x, x), Measured(y, noise, jnp.asarray(seen)))
         mean, explained = mean_and_explained(
@@ -98,7 +98,7 @@ def test_gaussian_terms_are_exact_with_their_derivatives():
         slopes = (mode(function, (0, 1, 2))(*args) for mode in (jax.jacfwd, jax.jacrev))
         return jax.tree.leaves((function(*args), *slopes))
 
-    pairs = zip(jax.jit(lambda: everything(found))(), jax.jit(lambda: everything(expected))(), strict=True)
+    pairs = zip(jax.jit(lambda: everything(propagated))(), jax.jit(lambda: everything(expected))(), strict=True)
     for one, other in pairs:
         np.testing.assert_allclose(one, other, rtol=1e-11, atol=1e-11)
 
@@ -144,8 +144,8 @@ def test_gradients_in_every_hyperparameter(make):
     trials, x = answers(data), jnp.asarray(data.x_new)
     expected = differences(lambda h: compiled(h, trials, x), h)
     assert np.all(np.max(np.abs(expected), axis=0) > 1e-3)  # no hyperparameter is without effect
-    for found in (*derivatives(h, trials, x), evidence_slope(h, trials, x)[None, :]):
-        np.testing.assert_allclose(found, expected[: len(found)], rtol=1e-8, atol=1e-9)
+    for derivative in (*derivatives(h, trials, x), evidence_slope(h, trials, x)[None, :]):
+        np.testing.assert_allclose(derivative, expected[: len(derivative)], rtol=1e-8, atol=1e-9)
     hessian = evidence_hessian(h, trials, x)
     slopes = differences(lambda h: evidence_slope(h, trials, x), h)
     np.testing.assert_allclose(hessian, slopes, rtol=1e-7, atol=1e-7 * np.max(np.abs(slopes)))
@@ -226,9 +226,9 @@ def test_float32_against_float64(make):
     low = fit(model(data, np.float32), answers(data, dtype=np.float32), inference="ep")
     high = by_ep(data)
     for method in ("predict", "class_probabilities"):
-        found = getattr(low, method)(jnp.asarray(x))
-        assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(found))
-        np.testing.assert_allclose(found, getattr(high, method)(jnp.asarray(x.astype(float))), rtol=0, atol=1e-4)
+        predicted = getattr(low, method)(jnp.asarray(x))
+        assert all(leaf.dtype == jnp.float32 for leaf in jax.tree.leaves(predicted))
+        np.testing.assert_allclose(predicted, getattr(high, method)(jnp.asarray(x.astype(float))), rtol=0, atol=1e-4)
     np.testing.assert_allclose(low.log_evidence, high.log_evidence, rtol=2e-5)
 
 

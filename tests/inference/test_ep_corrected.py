@@ -50,7 +50,7 @@ def test_against_the_textbook(make):
 def test_nearer_to_the_truth_in_every_respect(make):
     """Within .0006 in the mean (RMS) and .003 in the evidence at noise 0.5 or more; .0015 and .02 at noise 0.1."""
     data, gp, x = make(), model(make()), jnp.asarray(make().x)
-    truth, found, plain = (fit(gp, answers(data), inference=name) for name in ("exact", "ep_corrected", "ep"))
+    truth, corrected_ep, plain = (fit(gp, answers(data), inference=name) for name in ("exact", "ep_corrected", "ep"))
     of_mean, of_sd, of_evidence = (0.0006, 0.002, 0.003) if data.noise >= 0.5 else (0.0015, 0.004, 0.02)
 
     def misses(posterior):
@@ -61,8 +61,8 @@ def test_nearer_to_the_truth_in_every_respect(make):
 
     sure = truth.certificate
     slack = 2 * np.array([sure.mean_error, sure.mean_error, sure.log_evidence_error])
-    assert np.all(misses(found) <= [of_mean, of_sd, of_evidence]), misses(found)
-    assert np.all(misses(found) <= misses(plain) + slack)
+    assert np.all(misses(corrected_ep) <= [of_mean, of_sd, of_evidence]), misses(corrected_ep)
+    assert np.all(misses(corrected_ep) <= misses(plain) + slack)
 
 
 @pytest.mark.deep
@@ -83,9 +83,9 @@ def test_no_answers_and_one_answer_are_expectation_propagation():
     assert nothing.log_evidence == 0.0 and nothing.certificate.converged
     np.testing.assert_array_equal(nothing.predict(x), [np.zeros(len(x)), np.ones(len(x))])
     one = Trials.from_arrays(np.array([[0.3, 0.2, 0.1]]), np.array([2]), 25)
-    found, expected = (fit(gp, one, inference=name) for name in ("ep_corrected", "ep"))
-    np.testing.assert_allclose(found.predict(x), expected.predict(x), rtol=0, atol=1e-14)
-    np.testing.assert_allclose(found.log_evidence, expected.log_evidence, rtol=1e-14)
+    corrected_ep, expected = (fit(gp, one, inference=name) for name in ("ep_corrected", "ep"))
+    np.testing.assert_allclose(corrected_ep.predict(x), expected.predict(x), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(corrected_ep.log_evidence, expected.log_evidence, rtol=1e-14)
 
 
 @pytest.mark.deep
@@ -127,8 +127,8 @@ def difference(along, *data):
 def test_derivative_along_a_direction():
     along, data = jnp.asarray([1.0, -0.5, 0.03, 0.2, -0.1]), near_separable()
     args = answers(data), jnp.asarray(data.x_new)
-    _, found = jax.jit(lambda a: jax.jvp(lambda h: values(h, *args), (HYPERPARAMETERS,), (a,)))(along)
-    np.testing.assert_allclose(found, difference(along, *args), rtol=1e-7, atol=1e-8)
+    _, slope = jax.jit(lambda a: jax.jvp(lambda h: values(h, *args), (HYPERPARAMETERS,), (a,)))(along)
+    np.testing.assert_allclose(slope, difference(along, *args), rtol=1e-7, atol=1e-8)
 
 
 @pytest.mark.deep

@@ -28,9 +28,9 @@ def fitted(make, inference="exact"):
     return fit(model(make()), answers(make()), inference=inference)
 
 
-def errors_apart(found, expected, *errors):
+def errors_apart(value, expected, *errors):
     """Difference over the standard error of both; rounding counts as 1e-12."""
-    return np.abs(np.asarray(found) - expected) / np.sqrt(sum(np.asarray(e) ** 2 for e in errors) + 1e-24)
+    return np.abs(np.asarray(value) - expected) / np.sqrt(sum(np.asarray(e) ** 2 for e in errors) + 1e-24)
 
 
 # --- right, within the stated errors
@@ -62,8 +62,8 @@ def test_against_quadrature(make):
     x = jnp.asarray(data.x_new)
     evidence, *expected = quadrature(data)
     assert errors_apart(posterior.log_evidence, evidence, posterior.certificate.log_evidence_error) < 3
-    found = (*posterior.predict(x), posterior.class_probabilities(x))
-    for value, target, error in zip(found, expected, posterior.standard_errors(x), strict=True):
+    values = (*posterior.predict(x), posterior.class_probabilities(x))
+    for value, target, error in zip(values, expected, posterior.standard_errors(x), strict=True):
         assert np.max(errors_apart(value, target, error)) < 3
         assert np.max(error) < 1e-3
 
@@ -84,17 +84,17 @@ def test_the_standard_errors_cover_in_95_percent():
     def once(key):
         latent = exact(key, covariance, low, high, posterior.gp.likelihood.noise, posterior.trials.mask)
         again = ordinal_gp.Posterior(posterior.gp, posterior.trials, latent)
-        found = (again.log_evidence[None], *again.predict(x), again.class_probabilities(x).ravel())
+        values = (again.log_evidence[None], *again.predict(x), again.class_probabilities(x).ravel())
         m, v, p = again.standard_errors(x)
         errors = (again.certificate.log_evidence_error[None], m, v, p.ravel())
-        return jnp.concatenate(found), jnp.concatenate(errors)
+        return jnp.concatenate(values), jnp.concatenate(errors)
 
     truth = np.concatenate([[evidence], mean[rows], variance[rows], probabilities[rows].ravel()])
-    found, errors = map(np.stack, zip(*(once(jax.random.key(seed)) for seed in range(200)), strict=True))
-    covered = np.mean(np.abs(found - truth) <= 2 * errors + 1e-12, axis=0)
+    estimates, errors = map(np.stack, zip(*(once(jax.random.key(seed)) for seed in range(200)), strict=True))
+    covered = np.mean(np.abs(estimates - truth) <= 2 * errors + 1e-12, axis=0)
     assert np.all(covered >= 0.90), covered  # 95 % of 200 has a standard error of 1.5 %
     assert 0.93 <= np.mean(covered) <= 0.97, covered
-    assert np.all(np.abs(np.mean(found - truth, axis=0)) <= 4 * np.std(found, axis=0) / np.sqrt(200) + 1e-12)
+    assert np.all(np.abs(np.mean(estimates - truth, axis=0)) <= 4 * np.std(estimates, axis=0) / np.sqrt(200) + 1e-12)
 
 
 def test_one_answer_by_hand():
@@ -106,8 +106,8 @@ def test_one_answer_by_hand():
         blurred = OrdinalProbit((-0.5, 0.7), np.sqrt(0.3**2 + 1.7))
         np.testing.assert_allclose(posterior.log_evidence, blurred.log_prob(0.0, category), rtol=1e-12)
         by_ep = fit(gp, trials, inference="ep")
-        found, errors = posterior.predict(trials.x[:1]), posterior.standard_errors(trials.x[:1])
-        for value, expected, error in zip(found, by_ep.predict(trials.x[:1]), errors, strict=False):
+        moments, errors = posterior.predict(trials.x[:1]), posterior.standard_errors(trials.x[:1])
+        for value, expected, error in zip(moments, by_ep.predict(trials.x[:1]), errors, strict=False):
             assert errors_apart(value, expected, error) < 3 and error < 1e-3
 
 
@@ -154,10 +154,10 @@ def test_conflicting_repeats_under_a_wide_prior(noise):
     certificate = posterior.certificate
     assert certificate.iterations < 40
     np.testing.assert_allclose(posterior.log_evidence, evidence, rtol=1e-8, atol=4 * certificate.log_evidence_error)
-    found = posterior.predict(jnp.asarray(x[:1]))
+    moments = posterior.predict(jnp.asarray(x[:1]))
     errors = posterior.standard_errors(jnp.asarray(x[:1]))
-    np.testing.assert_allclose(found[0], mean[:1], atol=4 * errors[0][0] + 1e-9)
-    np.testing.assert_allclose(found[1], variance[:1], rtol=1e-3, atol=4 * errors[1][0] + 1e-11)
+    np.testing.assert_allclose(moments[0], mean[:1], atol=4 * errors[0][0] + 1e-9)
+    np.testing.assert_allclose(moments[1], variance[:1], rtol=1e-3, atol=4 * errors[1][0] + 1e-11)
 
 
 def test_draws_have_the_moments_of_the_posterior():
@@ -207,8 +207,8 @@ def test_the_tilting_is_a_saddle_point():
 def assert_same(one, other, rtol=1e-12):
     x = jnp.asarray(separated().x_new)
     np.testing.assert_allclose(one.log_evidence, other.log_evidence, rtol=rtol, atol=rtol)
-    for found, expected in zip(one.predict(x), other.predict(x), strict=True):
-        np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol)
+    for value, expected in zip(one.predict(x), other.predict(x), strict=True):
+        np.testing.assert_allclose(value, expected, rtol=rtol, atol=rtol)
     np.testing.assert_allclose(one.class_probabilities(x), other.class_probabilities(x), rtol=rtol, atol=rtol)
 
 

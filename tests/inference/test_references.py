@@ -43,19 +43,19 @@ SCALAR_THETA = [make for make in SMALL if np.ndim(make().theta) == 0]
 @pytest.mark.parametrize("make", SMALL)
 def test_numpy_agrees_with_50_digits(make):
     dataset = make()
-    found, exact = numpy_laplace(*dataset.problem()), mpmath_laplace(*dataset.problem())
+    computed, exact = numpy_laplace(*dataset.problem()), mpmath_laplace(*dataset.problem())
     assert exact["residual"] * dataset.noise < 1e-50
-    assert found["residual"] < 1e-12
+    assert computed["residual"] < 1e-12
     for quantity in QUANTITIES:
-        assert _error(found[quantity], exact[quantity]) < 1e-10, quantity
+        assert _error(computed[quantity], exact[quantity]) < 1e-10, quantity
 
 
 def test_hostile_cases_agree_as_far_as_float64_reaches():
     cases = [case for case in hostile_cases() if len(case.q) in (1, 25)][::25]
     for case in cases:
-        found, exact = numpy_laplace(*case.problem()), mpmath_laplace(*case.problem(), digits=30)
-        worst = max(_error(found[quantity], exact[quantity]) for quantity in QUANTITIES)
-        assert worst < max(1e-10, 1e2 * found["rounding"]), case.name
+        computed, exact = numpy_laplace(*case.problem()), mpmath_laplace(*case.problem(), digits=30)
+        worst = max(_error(computed[quantity], exact[quantity]) for quantity in QUANTITIES)
+        assert worst < max(1e-10, 1e2 * computed["rounding"]), case.name
 
 
 def test_the_mode_solves_the_50_digit_equations_in_another_form():
@@ -100,8 +100,8 @@ def test_hostile_grid_is_complete_finite_and_repeatable():
         np.testing.assert_array_equal(first.x, second.x)
         np.testing.assert_array_equal(first.q, second.q)
     for case in cases[::9]:
-        found = numpy_laplace(*case.problem())
-        assert all(np.all(np.isfinite(found[quantity])) for quantity in QUANTITIES), case.name
+        computed = numpy_laplace(*case.problem())
+        assert all(np.all(np.isfinite(computed[quantity])) for quantity in QUANTITIES), case.name
 
 
 def test_repeats_conflict_and_are_exact():

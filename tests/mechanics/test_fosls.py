@@ -147,8 +147,8 @@ def test_short_memory_is_part_of_the_set():
     exact = 5 * viscoelastic.relaxation_modulus(np.arange(1, 3001) * 1e-3, *values)
     assert exact[-1] == pytest.approx(-2.40, abs=5e-3)
     for N, error in ((2, 76), (25, 50), (101, 32.8), (201, 24), (1000, 6.4)):
-        found = FOSLS(*values, N=N).simulate(x)
-        nrmse = 100 * np.sqrt(np.mean((found - exact) ** 2)) / np.ptp(exact)
+        force = FOSLS(*values, N=N).simulate(x)
+        nrmse = 100 * np.sqrt(np.mean((force - exact) ** 2)) / np.ptp(exact)
         assert nrmse == pytest.approx(error, abs=0.5 if error > 33 else 0.4)
 
 
@@ -221,9 +221,9 @@ def test_responses_are_complex_arithmetic(memory, N):
         fractional = np.stack([z**i for i in range(N + 1)], -1) @ np.asarray(viscoelastic.gl_coefficients(0.203, N))
     pot = 5.89 * 1e-3**-0.203 * fractional
     # The exponentials are fitted to 10 s, which the lowest frequency is beyond.
-    found, expected = model.frequency_response(omega), 0.44 + 5.7 * pot / (5.7 + pot)
+    response, expected = model.frequency_response(omega), 0.44 + 5.7 * pot / (5.7 + pot)
     np.testing.assert_allclose(
-        found[1 if memory else 0 :], expected[1 if memory else 0 :], rtol=1e-4 if memory else 1e-12
+        response[1 if memory else 0 :], expected[1 if memory else 0 :], rtol=1e-4 if memory else 1e-12
     )
     assert model.frequency_response(0.0) == pytest.approx(complex(model.dc_gain()), abs=1e-15)
     assert abs(model.frequency_response(1e3 * np.pi) - complex(model.high_frequency_gain())) < 1e-12

@@ -49,10 +49,10 @@ def test_the_quadrature_is_differentiable():
 
 def test_sums_are_those_of_the_response():
     for memory in (span("short", 7), span("full", 101)):
-        found = sums(0.3, memory)
+        summed = sums(0.3, memory)
         at = response(0.3, jnp.array([0.0, 1e-7, jnp.pi]), memory)
-        np.testing.assert_allclose(at[jnp.array([0, 2])], [found.at_dc, found.at_nyquist], atol=1e-14)
-        assert at[1].imag / 1e-7 == pytest.approx(float(found.moment), rel=1e-4 if memory.memory == "full" else 1e-8)
+        np.testing.assert_allclose(at[jnp.array([0, 2])], [summed.at_dc, summed.at_nyquist], atol=1e-14)
+        assert at[1].imag / 1e-7 == pytest.approx(float(summed.moment), rel=1e-4 if memory.memory == "full" else 1e-8)
 
 
 def test_derivatives_of_the_sums_are_those_of_their_polynomials():
@@ -67,8 +67,8 @@ def test_derivatives_of_the_sums_are_those_of_their_polynomials():
             return [float(sum(w(i) * mp.diff(c(i), alpha, order) for i in range(N + 1))) for w in WEIGHTS]
 
     def ours(a):
-        found = gl_sums(a, N)
-        return jnp.stack([found.at_dc, found.at_nyquist, found.spread, found.moment])
+        summed = gl_sums(a, N)
+        return jnp.stack([summed.at_dc, summed.at_nyquist, summed.spread, summed.moment])
 
     for derivative, order in ((jax.jacfwd, 1), (jax.jacrev, 1), (lambda f: jax.jacfwd(jax.jacrev(f)), 2)):
         np.testing.assert_allclose(derivative(ours)(0.203), exact(order), rtol=1e-12)
@@ -103,8 +103,8 @@ def worst_errors(alphas):
     worst = {8: 0.0, 10: 0.0}
     for alpha in alphas:
         exact, *approximations = _responses(alpha)
-        for states, found in zip(worst, approximations, strict=True):
-            for a, b in zip(exact, found, strict=True):
+        for states, approximation in zip(worst, approximations, strict=True):
+            for a, b in zip(exact, approximation, strict=True):
                 a, b = np.asarray(a), np.asarray(b)
                 worst[states] = max(worst[states], np.max(np.abs(a - b).max(axis=1) / np.abs(a).max(axis=1)))
     return worst

@@ -33,7 +33,7 @@ BOXES = {
 def test_it_finds_what_scipy_finds(function, box):
     lower, upper = (jnp.array(end, float) for end in BOXES[box])
     start = jnp.clip(jnp.array([1.2, 1.0, 0.7]), lower + 1e-3, upper - 1e-3)
-    found = jax.jit(lambda s: least_squares(function, s, lower, upper, max_steps=200))(start)
+    solution = jax.jit(lambda s: least_squares(function, s, lower, upper, max_steps=200))(start)
     expected = scipy_least_squares(
         lambda q: np.asarray(function(jnp.asarray(q))),
         start,
@@ -42,26 +42,26 @@ def test_it_finds_what_scipy_finds(function, box):
         ftol=1e-14,
         gtol=1e-14,
     )
-    assert found.converged
-    assert float(found.cost) <= 2 * expected.cost * (1 + 1e-10) + 1e-15
-    np.testing.assert_allclose(found.q, expected.x, atol=1e-5)
+    assert solution.converged
+    assert float(solution.cost) <= 2 * expected.cost * (1 + 1e-10) + 1e-15
+    np.testing.assert_allclose(solution.q, expected.x, atol=1e-5)
 
 
 def test_a_fixed_parameter_stays_and_the_others_follow():
     lower, upper = jnp.array([-10.0, 2.0, -10.0]), jnp.array([10.0, 2.0, 10.0])
-    found = least_squares(decay, jnp.array([1.0, 1.0, 0.0]), lower, upper)
+    solution = least_squares(decay, jnp.array([1.0, 1.0, 0.0]), lower, upper)
     basis = np.stack([np.exp(-2.0 * T), np.ones_like(T)], axis=1)
-    np.testing.assert_allclose(np.delete(found.q, 1), np.linalg.lstsq(basis, DATA)[0], atol=1e-8)
-    assert found.q[1] == 2.0
+    np.testing.assert_allclose(np.delete(solution.q, 1), np.linalg.lstsq(basis, DATA)[0], atol=1e-8)
+    assert solution.q[1] == 2.0
 
 
 def test_many_starts_are_one_function():
     starts = jnp.array([[1.0, 1.0, 0.0], [3.0, 0.2, 1.0], [0.1, 5.0, -1.0]])
     wide = jnp.full(3, 20.0)
-    found = jax.vmap(lambda s: least_squares(decay, s, -wide, wide))(starts)
-    np.testing.assert_allclose(found.q, jnp.tile(found.q[0], (3, 1)), atol=1e-6)
+    solution = jax.vmap(lambda s: least_squares(decay, s, -wide, wide))(starts)
+    np.testing.assert_allclose(solution.q, jnp.tile(solution.q[0], (3, 1)), atol=1e-6)
 
 
 def test_what_cannot_be_computed_has_not_converged():
-    found = least_squares(lambda q: jnp.log(q - 2), jnp.ones(2), jnp.zeros(2), jnp.ones(2))
-    assert not found.converged
+    solution = least_squares(lambda q: jnp.log(q - 2), jnp.ones(2), jnp.zeros(2), jnp.ones(2))
+    assert not solution.converged

@@ -75,8 +75,8 @@ def test_the_oracles_overlap():
 
 def largest_error(orders, arguments):
     a, z = (grid.ravel() for grid in np.meshgrid(orders, arguments))
-    found = np.asarray(mittag_leffler(a, z))
-    return np.max(np.abs(found - [exact(*pair) for pair in zip(a, np.ones_like(a), z, strict=True)]))
+    values = np.asarray(mittag_leffler(a, z))
+    return np.max(np.abs(values - [exact(*pair) for pair in zip(a, np.ones_like(a), z, strict=True)]))
 
 
 def test_E_alpha_at_both_ends_and_between():

@@ -98,8 +98,8 @@ def test_a_step_that_a_wall_turns_uphill_is_refused_and_shortened(seed):
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     matrix = turn @ np.diag([rng.uniform(1, 5), rng.uniform(20, 300)]) @ turn.T
     centre, start = rng.uniform(-0.3, 1.3, 2), rng.uniform(size=2)
-    found, radius = climbed(jnp.asarray(start), jnp.asarray(centre), jnp.asarray(matrix))
-    assert bool(found) and float(radius) < 1e6
+    converged, radius = climbed(jnp.asarray(start), jnp.asarray(centre), jnp.asarray(matrix))
+    assert bool(converged) and float(radius) < 1e6
 
 
 def test_a_search_on_its_way_to_a_known_end_stops():

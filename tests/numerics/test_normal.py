@@ -16,8 +16,8 @@ def exact_excess_hazard(z, digits=40):
         return mp.npdf(z) / (mp.erfc(z / mp.sqrt(2)) / 2) - z
 
 
-def relative_errors(found, points):
-    pairs = zip(map(float, found), map(float, points), strict=True)
+def relative_errors(hazards, points):
+    pairs = zip(map(float, hazards), map(float, points), strict=True)
     return [abs(float(v / exact_excess_hazard(z) - 1)) for v, z in pairs]
 
 
@@ -27,9 +27,9 @@ POINTS = np.concatenate([[0.0, 1e-300, 1e-8, 4.0], np.linspace(0, 50, 301), np.l
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_excess_hazard_against_mpmath(dtype):
     points = POINTS.astype(dtype)
-    found = jax.jit(normal.excess_hazard)(jnp.asarray(points))
-    assert found.dtype == dtype
-    assert max(relative_errors(found, points)) < 4 * np.finfo(dtype).eps
+    hazards = jax.jit(normal.excess_hazard)(jnp.asarray(points))
+    assert hazards.dtype == dtype
+    assert max(relative_errors(hazards, points)) < 4 * np.finfo(dtype).eps
 
 
 def test_at_infinity_it_vanishes():

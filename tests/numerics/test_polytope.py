@@ -9,7 +9,7 @@ import pytest
 from hilbo.numerics.newton import TrustRegionNewton
 from hilbo.numerics.polytope import Polytope, nearest, projector, walls_of_cube
 
-found_nearest = jax.jit(nearest)
+compiled_nearest = jax.jit(nearest)
 
 
 def problem(seed, d):
@@ -31,7 +31,7 @@ def test_the_nearest_point_meets_the_conditions_of_a_minimum(d):
         seen = walls_of_cube(walls, jnp.zeros(d, bool), at)
         root = rng.standard_normal((d, d)) + 2 * np.eye(d)
         spread = np.linalg.inv(root)
-        point, multipliers = map(np.asarray, found_nearest(seen, jnp.asarray(target), jnp.asarray(spread)))
+        point, multipliers = map(np.asarray, compiled_nearest(seen, jnp.asarray(target), jnp.asarray(spread)))
         slack = np.asarray(seen.offsets - seen.normals @ point)
         size = 1 + np.abs(multipliers).max()
         assert slack.min() > -1e-9 and multipliers.min() >= 0
@@ -44,7 +44,7 @@ def test_what_is_held_does_not_move():
     walls, at, target, _ = problem(1, 4)
     held = jnp.array([True, False, True, False])
     seen = walls_of_cube(walls, held, at)
-    point = found_nearest(seen, jnp.where(held, 0.0, target), jnp.eye(4)).point
+    point = compiled_nearest(seen, jnp.where(held, 0.0, target), jnp.eye(4)).point
     np.testing.assert_array_equal(np.asarray(point)[np.asarray(held)], 0.0)
 
 
@@ -61,8 +61,8 @@ def _descended(walls, top, bend, start):
 
     options = {"walls": walls, "held": jnp.zeros(start.shape, bool)}
     solver = TrustRegionNewton(atol=1e-8, resolution=1e-6)
-    found = optx.minimise(bowl, solver, start, options=options, max_steps=60, throw=False)
-    return found.value, found.state.pressing, found.stats["num_steps"]
+    solution = optx.minimise(bowl, solver, start, options=options, max_steps=60, throw=False)
+    return solution.value, solution.state.pressing, solution.stats["num_steps"]
 
 
 def test_newton_between_walls_ends_where_nothing_presses():

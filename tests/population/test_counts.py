@@ -27,24 +27,24 @@ def cohort(people=4, answers=12, points=7, seed=0):
 
 def test_counts_count_every_answer():
     trials = cohort()
-    found = counts_of(trials, 3)
+    counts = counts_of(trials, 3)
     mask = np.asarray(trials.mask)
-    assert float(found.counts.sum()) == mask.sum() and found.x.shape == (7, 2)
+    assert float(counts.counts.sum()) == mask.sum() and counts.x.shape == (7, 2)
     for person, point, category in ((0, 2, 1), (3, 5, 0)):
-        same = (np.asarray(trials.x[person]) == np.asarray(found.x[point])).all(axis=1) & mask[person]
+        same = (np.asarray(trials.x[person]) == np.asarray(counts.x[point])).all(axis=1) & mask[person]
         answered = (np.asarray(trials.q[person])[same] == category).sum()
-        assert float(found.counts[person, point, category]) == answered
+        assert float(counts.counts[person, point, category]) == answered
 
 
 @pytest.mark.parametrize("share", [0.3, pytest.param(1.0, marks=pytest.mark.deep)])
 def test_equals_the_model_of_every_answer(share):
     trials = cohort()
     dense = fit_people(GP, of_people(trials), share)
-    found = fit_counts(GP, jnp.asarray(share), counts_of(trials, 3))
+    posterior = fit_counts(GP, jnp.asarray(share), counts_of(trials, 3))
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(9, 2)))
-    assert bool(found.certificate.converged)
-    np.testing.assert_allclose(found.log_evidence, dense.log_evidence, rtol=1e-12)
-    for a, b, c in zip(found.predict(x), population(dense, x), shared_posterior(dense).predict(x), strict=True):
+    assert bool(posterior.certificate.converged)
+    np.testing.assert_allclose(posterior.log_evidence, dense.log_evidence, rtol=1e-12)
+    for a, b, c in zip(posterior.predict(x), population(dense, x), shared_posterior(dense).predict(x), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-11)
         np.testing.assert_allclose(c, b, atol=1e-13)
 
@@ -55,8 +55,8 @@ def test_the_evidence_has_the_derivatives_of_the_dense_one():
     share = jnp.asarray(0.3)
     of_counts = jax.grad(lambda gp, p: evidence(gp, p, counts)[0], argnums=(0, 1))
     of_answers = jax.grad(lambda gp, p: fit_people(gp, together, p, throw=False).log_evidence, argnums=(0, 1))
-    found, dense = jax.jit(of_counts)(GP, share), jax.jit(of_answers)(GP, share)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(dense), strict=True):
+    by_counts, dense = jax.jit(of_counts)(GP, share), jax.jit(of_answers)(GP, share)
+    for a, b in zip(jax.tree.leaves(by_counts), jax.tree.leaves(dense), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-8)
 
 
@@ -84,12 +84,12 @@ def test_people_who_do_not_differ_are_one_person():
 @pytest.mark.deep
 def test_learning_reaches_a_maximum():
     counts = counts_of(cohort(6, 30, 9, seed=2), 3)
-    found = learn_people(GP, counts, 0.7, tolerance=1e-12, max_steps=200)
-    assert bool(found.converged)
-    slopes = jax.grad(lambda gp, p: evidence(gp, p, counts)[0], argnums=(0, 1))(found.gp, found.share)
+    learnt = learn_people(GP, counts, 0.7, tolerance=1e-12, max_steps=200)
+    assert bool(learnt.converged)
+    slopes = jax.grad(lambda gp, p: evidence(gp, p, counts)[0], argnums=(0, 1))(learnt.gp, learnt.share)
     begin = evidence(GP, jnp.asarray(0.7), counts)[0]
-    assert found.log_evidence > begin
-    assert abs(float(slopes[1])) * float(found.share * (1 - found.share)) < 0.05
+    assert learnt.log_evidence > begin
+    assert abs(float(slopes[1])) * float(learnt.share * (1 - learnt.share)) < 0.05
 
 
 def test_nobody_answered():

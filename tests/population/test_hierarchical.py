@@ -89,32 +89,32 @@ def test_the_shared_function_by_brute_force():
 
 @pytest.mark.parametrize("share", [0.2, pytest.param(0.9, marks=pytest.mark.deep)])
 def test_the_learnt_share_holds_the_true_one(share):
-    found = learn_share(GP, of_people(simulated(12, 25, share, seed=3)))
-    low, high = found.interval
-    assert bool(found.converged)
+    learnt = learn_share(GP, of_people(simulated(12, 25, share, seed=3)))
+    low, high = learnt.interval
+    assert bool(learnt.converged)
     assert 0 <= low < share < high <= 1
     if share < 0.5:  # a tenth of the variance is too little to be seen in 300 answers
-        assert float(found.against_one) > 10
-    assert float(found.interpolation_error) < 0.02
+        assert float(learnt.against_one) > 10
+    assert float(learnt.interpolation_error) < 0.02
 
 
 def test_people_who_do_not_differ():
-    found = learn_share(GP, of_people(simulated(12, 25, 1.0, seed=4)))
-    assert float(found.interval[1]) > 0.99 and float(found.against_one) < 0
+    learnt = learn_share(GP, of_people(simulated(12, 25, 1.0, seed=4)))
+    assert float(learnt.interval[1]) > 0.99 and float(learnt.against_one) < 0
 
 
 def test_one_person_says_nothing_of_the_share():
-    found = learn_share(GP, of_people(simulated(1, 10, 0.5)))
-    np.testing.assert_allclose(found.log_evidence, found.log_evidence[0], rtol=1e-12)
-    np.testing.assert_allclose(found.interval, [0.025, 0.975], atol=1e-3)
+    learnt = learn_share(GP, of_people(simulated(1, 10, 0.5)))
+    np.testing.assert_allclose(learnt.log_evidence, learnt.log_evidence[0], rtol=1e-12)
+    np.testing.assert_allclose(learnt.interval, [0.025, 0.975], atol=1e-3)
 
 
 @pytest.mark.deep
 def test_the_curve_is_the_evidence_between_its_nodes():
     trials = of_people(simulated(6, 10, 0.6))
-    found = learn_share(GP, trials)
+    learnt = learn_share(GP, trials)
     for share in (0.013, 0.31, 0.77, 0.999):
-        at = np.interp(share, found.shares, found.log_evidence)
+        at = np.interp(share, learnt.shares, learnt.log_evidence)
         np.testing.assert_allclose(at, fit_people(GP, trials, share).log_evidence, atol=1e-4)
 
 

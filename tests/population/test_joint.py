@@ -34,7 +34,7 @@ def joint_moments(posterior, x):
 def test_equals_the_formula():
     posteriors = cohort()
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 2)))
-    found = joint_map(posteriors, x)
+    map_ = joint_map(posteriors, x)
     with mpmath.workdps(60):
         prior = mpmath.matrix(np.asarray(gram(GP.kernel, x, x)).tolist())
         precision, weighted = -3 * prior**-1, mpmath.zeros(5, 1)
@@ -46,44 +46,44 @@ def test_equals_the_formula():
         expected = precision**-1
         mean = np.array((expected * weighted).tolist(), float)[:, 0]
         expected = np.array(expected.tolist(), float)
-    np.testing.assert_allclose(found.mean, mean, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(found.root @ found.root.T, expected, rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(map_.mean, mean, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(map_.root @ map_.root.T, expected, rtol=1e-9, atol=1e-11)
 
 
 def test_one_point_is_the_pointwise_committee():
     posteriors = cohort(people=7)
     for x in jnp.asarray(np.random.default_rng(2).uniform(size=(6, 1, 2))):
-        found, (mean, variance) = joint_map(posteriors, x), population(posteriors, x)
-        np.testing.assert_allclose(found.mean, mean, rtol=1e-12, atol=1e-14)
-        np.testing.assert_allclose(found.variance, variance, rtol=1e-12)
+        map_, (mean, variance) = joint_map(posteriors, x), population(posteriors, x)
+        np.testing.assert_allclose(map_.mean, mean, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(map_.variance, variance, rtol=1e-12)
 
 
 def test_one_person_is_that_person():
     posteriors = cohort(people=1)
     x = jnp.asarray(np.random.default_rng(3).uniform(size=(200, 2)))
     mean, covariance = joint_moments(one(posteriors, 0), x)
-    found = joint_map(posteriors, x)
-    np.testing.assert_allclose(found.mean, mean, atol=1e-9)
-    np.testing.assert_allclose(found.root @ found.root.T, covariance, atol=1e-9)
+    map_ = joint_map(posteriors, x)
+    np.testing.assert_allclose(map_.mean, mean, atol=1e-9)
+    np.testing.assert_allclose(map_.root @ map_.root.T, covariance, atol=1e-9)
 
 
 def test_people_who_know_nothing_leave_the_prior():
     empty = jax.tree.map(lambda leaf: leaf[None], fit(GP, Trials.empty(8, 2)))
     x = jnp.asarray(np.random.default_rng(4).uniform(size=(50, 2)))
-    found = joint_map(empty, x)
-    np.testing.assert_array_equal(found.mean, 0.0)
-    np.testing.assert_allclose(found.root @ found.root.T, gram(GP.kernel, x, x), atol=1e-12)
+    map_ = joint_map(empty, x)
+    np.testing.assert_array_equal(map_.mean, 0.0)
+    np.testing.assert_allclose(map_.root @ map_.root.T, gram(GP.kernel, x, x), atol=1e-12)
 
 
 def test_the_many_draws_of_the_map_have_its_moments():
     posteriors = cohort()
     x = jnp.asarray(np.random.default_rng(5).uniform(size=(30, 2)))
-    found = joint_map(posteriors, x)
-    draws = np.asarray(found.draw(jax.random.key(0), 40_000))
-    sd = np.sqrt(np.asarray(found.variance))
-    assert np.abs((draws.mean(axis=0) - np.asarray(found.mean)) / sd).max() < 4.5 / 200  # of 30 standard errors
+    map_ = joint_map(posteriors, x)
+    draws = np.asarray(map_.draw(jax.random.key(0), 40_000))
+    sd = np.sqrt(np.asarray(map_.variance))
+    assert np.abs((draws.mean(axis=0) - np.asarray(map_.mean)) / sd).max() < 4.5 / 200  # of 30 standard errors
     np.testing.assert_allclose(draws.std(axis=0), sd, rtol=4.5 / np.sqrt(2 * 40_000))
-    shares = np.asarray(found.optima(jax.random.key(1), 40_000))
+    shares = np.asarray(map_.optima(jax.random.key(1), 40_000))
     counted = np.bincount(draws.argmax(axis=1), minlength=30) / 40_000
     assert shares.sum() == pytest.approx(1.0)
     assert np.abs(shares - counted).max() < 4.5 * np.sqrt(0.5 / 40_000)

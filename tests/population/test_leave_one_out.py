@@ -31,19 +31,19 @@ def calibrated(n=20_000, seed=0):
 
 
 def test_the_transform_of_a_calibrated_prediction_is_uniform():
-    found = calibrated()
-    u = integral_transform(found.probabilities, found.q, 1)
+    left_out = calibrated()
+    u = integral_transform(left_out.probabilities, left_out.q, 1)
     assert np.abs(np.sort(u) - (np.arange(len(u)) + 0.5) / len(u)).max() < 1.63 / np.sqrt(len(u))  # Kolmogorov, 1 %
-    content = calibration(found)
+    content = calibration(left_out)
     assert content["central_95"] == pytest.approx(0.95, abs=4 * content["central_95_error"])
     assert content["z2"] == pytest.approx(1.0, abs=4 * content["z2_error"])
-    assert max(abs(b["predicted"] - b["observed"]) for b in reliability(found)) < 0.03
+    assert max(abs(b["predicted"] - b["observed"]) for b in reliability(left_out)) < 0.03
 
 
 def test_a_prediction_that_is_too_sure_is_seen():
-    found = calibrated()
-    sharp = found.probabilities**3
-    sharp = LeftOut(found.person, found.q, sharp / sharp.sum(axis=1, keepdims=True))
+    left_out = calibrated()
+    sharp = left_out.probabilities**3
+    sharp = LeftOut(left_out.person, left_out.q, sharp / sharp.sum(axis=1, keepdims=True))
     assert calibration(sharp)["z2"] > 1.3 and calibration(sharp)["central_95"] < 0.93
 
 
@@ -62,13 +62,13 @@ def cohort(people=4):
 
 def test_nobody_predicts_themselves():
     trials = cohort()
-    found, maps = leave_one_out(GP, trials, "bcm")
-    assert found.probabilities.shape == (20, 3) and found.person.tolist() == np.repeat(np.arange(4), 5).tolist()
+    left_out, maps = leave_one_out(GP, trials, "bcm")
+    assert left_out.probabilities.shape == (20, 3) and left_out.person.tolist() == np.repeat(np.arange(4), 5).tolist()
     turned = jax.vmap(Trials)(trials.x, trials.q.at[2].set(2 - trials.q[2]), trials.mask)
     other, _ = leave_one_out(GP, turned, "bcm")
-    mine = found.person == 2
-    np.testing.assert_allclose(other.probabilities[mine], found.probabilities[mine], rtol=1e-12)
-    assert np.abs(other.probabilities[~mine] - found.probabilities[~mine]).max() > 0.01
+    mine = left_out.person == 2
+    np.testing.assert_allclose(other.probabilities[mine], left_out.probabilities[mine], rtol=1e-12)
+    assert np.abs(other.probabilities[~mine] - left_out.probabilities[~mine]).max() > 0.01
     moved = influence(rule_map(GP, trials, "bcm"), maps, trials.x[0])
     assert moved.shape == (4,) and (moved > 0).all()
 
@@ -83,8 +83,8 @@ def test_an_answer_that_was_all_but_excluded_has_a_finite_score_in_both_tails():
     probabilities = np.array([[1e-20, 1.0 - 1e-20], [1.0 - 1e-20, 1e-20]])
     low, high = normal_scores(probabilities, np.array([0, 1]))
     assert -11 < low < -9 < 9 < high < 11
-    found = LeftOut(np.array([0, 1]), np.array([0, 1]), probabilities)
-    assert np.isfinite(calibration(found)["z2"])
+    left_out = LeftOut(np.array([0, 1]), np.array([0, 1]), probabilities)
+    assert np.isfinite(calibration(left_out)["z2"])
     usual = calibrated(2000)
     u = integral_transform(usual.probabilities, usual.q, 1)
     np.testing.assert_allclose(ndtr(normal_scores(usual.probabilities, usual.q, 1)), u, atol=1e-12)

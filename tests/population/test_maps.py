@@ -24,12 +24,12 @@ def cohort(people=3, answers=6, seed=0):
 @pytest.mark.parametrize("rule", [rule for rule in RULES if rule != "hierarchical"])
 def test_rules_by_points_are_the_sums_over_people(rule):
     trials = cohort()
-    found = rule_map(GP, trials, rule)
+    map_ = rule_map(GP, trials, rule)
     each = jax.vmap(lambda t: fit(GP, t, throw=False))(trials)
     means, explained = jax.vmap(lambda p: p.predict_explained(X))(each)
-    for a, b in zip(found.predict(X), aggregate(rule, means, explained, 1.3), strict=True):
+    for a, b in zip(map_.predict(X), aggregate(rule, means, explained, 1.3), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-10)
-    np.testing.assert_array_equal(found.newcomer(X)[1], found.predict(X)[1])
+    np.testing.assert_array_equal(map_.newcomer(X)[1], map_.predict(X)[1])
 
 
 def test_few_answers_are_merged_exactly_and_many_by_points():
@@ -73,5 +73,5 @@ def test_one_category_only_still_gives_a_map():
     for rule in ("bcm", "pooled"):
         mean, variance = rule_map(GP, same, rule).predict(X)
         assert bool(jnp.all(mean > 0)) and bool(jnp.all(variance > 0))
-    found = share_of(GP, same)
-    assert 0 < float(found.mean) < 1 and bool(found.converged)
+    share = share_of(GP, same)
+    assert 0 < float(share.mean) < 1 and bool(share.converged)

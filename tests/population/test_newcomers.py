@@ -61,23 +61,23 @@ def chances(mean, variance):
 @pytest.mark.parametrize("rule", RULES)
 def test_a_map_without_answers_has_its_prior(posteriors, rule):
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(5, 2)))
-    found = of_rule(rule, posteriors[False])
-    np.testing.assert_allclose(found.predict(x)[1], float(found.map_prior), rtol=1e-12)
+    map_ = of_rule(rule, posteriors[False])
+    np.testing.assert_allclose(map_.predict(x)[1], float(map_.map_prior), rtol=1e-12)
 
 
 def test_class_probabilities_of_an_optimum_are_a_new_persons(posteriors):
-    found = of_rule("hierarchical", posteriors[True])
-    best = map_optimum(STUDY, found, jnp.asarray(STUDY.space.candidates(64, 0)))
-    mean, variance = (float(part[0]) for part in found.predict(best.x[None, :]))
+    map_ = of_rule("hierarchical", posteriors[True])
+    best = map_optimum(STUDY, map_, jnp.asarray(STUDY.space.candidates(64, 0)))
+    mean, variance = (float(part[0]) for part in map_.predict(best.x[None, :]))
     np.testing.assert_allclose([best.mean, best.sd], [mean, np.sqrt(variance)], rtol=1e-10)
     np.testing.assert_allclose(best.class_probabilities, chances(mean, variance + 1.0 - SHARE), rtol=1e-9)
 
 
 def test_a_stream_of_people_says_the_same():
     for rule, apart in (("hierarchical", 1.0 - SHARE), ("average", 0.0)):
-        found = _optimum_at(STUDY, np.zeros(2), np.asarray(0.7), np.asarray(0.3), _variance_apart(STUDY, rule, SHARE))
-        np.testing.assert_allclose(found.class_probabilities, chances(0.7, 0.3 + apart), rtol=1e-12)
-        assert float(found.sd) == pytest.approx(np.sqrt(0.3))
+        optimum = _optimum_at(STUDY, np.zeros(2), np.asarray(0.7), np.asarray(0.3), _variance_apart(STUDY, rule, SHARE))
+        np.testing.assert_allclose(optimum.class_probabilities, chances(0.7, 0.3 + apart), rtol=1e-12)
+        assert float(optimum.sd) == pytest.approx(np.sqrt(0.3))
 
 
 def test_draws_of_tolerance_intervals_are_a_new_persons(posteriors):
@@ -134,7 +134,7 @@ def test_readings_are_of_new_people(monkeypatch):
     monkeypatch.setattr(analysis, "tolerance", lambda study, predict, x, name: predict)
     monkeypatch.setattr(analysis, "tolerance_ends", lambda *args, **named: None)
     read = analysis._reading(STUDY, aggregate, 0)
-    assert all(found[0] is aggregate.newcomer for found in read.tolerances.values())
+    assert all(tolerance[0] is aggregate.newcomer for tolerance in read.tolerances.values())
     np.testing.assert_allclose(regions._probabilities(read, jnp.zeros((1, 2)))[0], chances(0.0, 3.0), rtol=1e-12)
 
 

@@ -123,8 +123,8 @@ def test_rules_name_who_and_why():
     )
     table = measure_people(model(CASE), trials, ("A", "B"))
     assert excluded(table, "") == {}
-    found = excluded(table, "trials < 2 or categories <= 1")
-    assert found == {"A": "categories is 1, and the rule leaves out categories <= 1"}
+    reasons = excluded(table, "trials < 2 or categories <= 1")
+    assert reasons == {"A": "categories is 1, and the rule leaves out categories <= 1"}
     assert excluded(table, "consistency < 0.5") == {"B": "consistency is 0, and the rule leaves out consistency < 0.5"}
     for rule, words in (
         ("mood > 1", "is no condition"),

@@ -33,16 +33,16 @@ def test_k0_is_measured_from_the_corner_of_the_box():
 
 @pytest.mark.parametrize(("values", "three", "with_K0"), [(AGGREGATE, 0.0393, 0.0352), (MEAN_OF_OPTIMA, 0.105, 0.112)])
 def test_misses_are_those_of_the_paper(values, three, with_K0):
-    found = results.misses(PAPER, unit(values), unit(SYSTEM_IDENTIFICATION))
-    assert found == pytest.approx((three, with_K0), abs=5e-4)
+    errors = results.misses(PAPER, unit(values), unit(SYSTEM_IDENTIFICATION))
+    assert errors == pytest.approx((three, with_K0), abs=5e-4)
 
 
 def test_errors_by_search_range_are_those_of_the_paper():
     for values, percent in ((AGGREGATE, (1.8, 0.4, 6.2, 2.8)), (MEAN_OF_OPTIMA, (13.1, 8.8, 13.7, 8.1))):
         off = unit(values) - unit(SYSTEM_IDENTIFICATION)
         K0 = [set_of(PAPER.space, unit(v))["K0"] for v in (values, SYSTEM_IDENTIFICATION)]
-        found = 100 * np.abs([(K0[0] - K0[1]) / K0_range(PAPER.space), *off])
-        np.testing.assert_allclose(found, percent, atol=0.06)
+        percents = 100 * np.abs([(K0[0] - K0[1]) / K0_range(PAPER.space), *off])
+        np.testing.assert_allclose(percents, percent, atol=0.06)
 
 
 def test_misses_of_many_points_are_those_of_each():
@@ -78,8 +78,8 @@ def written(request, tmp_path_factory):
 
 def test_the_content_is_what_stands_in_the_file(written):
     study, aggregate, content, folder = written
-    found = json.loads((folder / "result.json").read_text())
-    assert len(found.pop("digest")) == 16 and found == content
+    stored = json.loads((folder / "result.json").read_text())
+    assert len(stored.pop("digest")) == 16 and stored == content
     assert content["optimum"]["unit"] == aggregate.optimum.x.tolist()
     assert set(content["optimum"]["parameters"]) == set(study.space.names)
     assert sum(content["optimum"]["class_probabilities"].values()) == pytest.approx(1, abs=1e-12)
@@ -183,9 +183,9 @@ def test_many_participants_are_written_as_few():
 
 
 def test_a_way_is_said_in_units_and_percent():
-    found = results.moved(PAPER, jnp.asarray(unit(AGGREGATE)), jnp.asarray(unit(SYSTEM_IDENTIFICATION)))
-    assert list(found["moved"]) == ["K0", "K1", "B1", "alpha"]
-    assert found["moved"]["B1"]["by"] == pytest.approx(7.88 - 5.89)
-    percents = [way["percent"] for way in found["moved"].values()]
+    difference = results.moved(PAPER, jnp.asarray(unit(AGGREGATE)), jnp.asarray(unit(SYSTEM_IDENTIFICATION)))
+    assert list(difference["moved"]) == ["K0", "K1", "B1", "alpha"]
+    assert difference["moved"]["B1"]["by"] == pytest.approx(7.88 - 5.89)
+    percents = [way["percent"] for way in difference["moved"].values()]
     np.testing.assert_allclose(np.abs(percents), (1.8, 0.4, 6.2, 2.8), atol=0.06)
-    assert found["nrmse"] == pytest.approx(0.0393, abs=5e-4)
+    assert difference["nrmse"] == pytest.approx(0.0393, abs=5e-4)

@@ -51,10 +51,10 @@ HILL = [(u, v, 2 - (abs(u - 0.4) > 0.2) - (abs(v - 0.5) > 0.25)) for u in (0.1, 
 
 def test_limits_are_named():
     study = plain()
-    found = limits_of(study, crowd([HILL, HILL[:2], [(0.1, 0.1, 0)] * 6]))
-    assert found[0].startswith("Fewer than 5 answers were given by P1")
-    assert "between 2 and 9" in found[1] and 'P2 ("different")' in found[2]
-    assert "plans 25 trials; nobody has given more than 9" in found[3]
+    limits = limits_of(study, crowd([HILL, HILL[:2], [(0.1, 0.1, 0)] * 6]))
+    assert limits[0].startswith("Fewer than 5 answers were given by P1")
+    assert "between 2 and 9" in limits[1] and 'P2 ("different")' in limits[2]
+    assert "plans 25 trials; nobody has given more than 9" in limits[3]
     assert limits_of(study, crowd([HILL]))[0].startswith(
         "P0 is the only participant: the population map is that person's own,"
     )
@@ -94,8 +94,8 @@ def test_convergence_is_judged_by_people_who_are_not_among_them():
         progress = Progress(
             np.arange(1, 7), still[:, 0], still, np.full(3, 6), np.full((6, 4), halves), np.full((6, 3), own), {}
         )
-        found = SimpleNamespace(progress=progress, aggregate=aggregate)
-        (item,) = _convergence(SimpleNamespace(analysis=found, reference=None))
+        analysis = SimpleNamespace(progress=progress, aggregate=aggregate)
+        (item,) = _convergence(SimpleNamespace(analysis=analysis, reference=None))
         assert item.side == side and f"{100 * halves:.0f} % (NRMSE, median of 4" in item.text
     own = np.linspace(0.5, 0.2, 6)[:, None] + np.array([0.0, 0.01, -0.01])
     assert _nearer_to_others(progress._replace(individual_to_half=own)).side == "supports"
@@ -108,8 +108,8 @@ def test_other_materials_are_the_others():
     """H1 to H3 are of the first material, and its figures are no evidence for H4."""
     study, validated = plain(), validate(paper_counts(np.random.default_rng(4), ties=20))
     optimum, own = SimpleNamespace(x=jnp.array([0.5, 0.5])), SimpleNamespace(x=jnp.array([[0.1, 0.5], [0.9, 0.5]]))
-    found = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
-    parts = {"analysis": found, "reference_name": "the truth"}
+    analysis = SimpleNamespace(study=study, aggregate=SimpleNamespace(optimum=optimum, individuals=own))
+    parts = {"analysis": analysis, "reference_name": "the truth"}
     first, second, third = (
         SimpleNamespace(name=name, validated=asked, reference=reference, **parts)
         for name, asked, reference in (("A", None, np.zeros(2)), ("B", validated, np.full(2, 0.5)), ("C", None, None))
@@ -159,13 +159,13 @@ def test_one_persons_tolerance_does_not_depend_on_the_draw():
 def test_groups_are_what_arviz_reads(tmp_path):
     study, cohort = plain(), crowd([HILL, HILL[:4]])
     posteriors = fit_cohort(study, cohort)
-    found = groups(study, cohort, posteriors, draws=4000)
-    f = found["posterior"]["f"].values[0]
+    inference_data = groups(study, cohort, posteriors, draws=4000)
+    f = inference_data["posterior"]["f"].values[0]
     mean, variance = posteriors_at(posteriors)
     np.testing.assert_allclose(f[:, 0].mean(axis=0), mean[0], atol=0.06)
     np.testing.assert_allclose(f[:, 0].var(axis=0), variance[0], atol=0.06)
-    assert np.isnan(f[:, 1, 4:]).all() and (found["observed_data"]["response"].values[1, 4:] == -1).all()
-    given = found["log_likelihood"]["response"]
+    assert np.isnan(f[:, 1, 4:]).all() and (inference_data["observed_data"]["response"].values[1, 4:] == -1).all()
+    given = inference_data["log_likelihood"]["response"]
     expected = jax.vmap(study.gp.likelihood.log_prob)(f[0, 1, :4], np.asarray(cohort.trials.q)[1, :4])
     np.testing.assert_allclose(given.values[0, 0, -4:], expected)
     assert list(given["participant"].values[-5:]) == ["P0", *["P1"] * 4] and list(given["trial"].values[-4:]) == [
@@ -174,9 +174,9 @@ def test_groups_are_what_arviz_reads(tmp_path):
         3,
         4,
     ]
-    observed, predicted = predictive_shares(found, 3)
+    observed, predicted = predictive_shares(inference_data, 3)
     assert observed.sum() == pytest.approx(1.0) and predicted.shape == (4000, 3)
-    write_groups(found, tmp_path / "inference.nc")
+    write_groups(inference_data, tmp_path / "inference.nc")
     read = az.from_netcdf(tmp_path / "inference.nc", engine="h5netcdf")
     assert {"posterior", "posterior_predictive", "observed_data", "log_likelihood", "constant_data"} <= set(
         read.groups()
@@ -243,17 +243,17 @@ def test_the_comparison_of_rules_is_shown():
         "central_95_error": 0.01,
     }
     bins = [{"predicted": 0.1, "observed": 0.2}, {"predicted": 0.8, "observed": 0.7}]
-    found = scores | {
+    best = scores | {
         "method": "by points",
         "z2": 1.2,
         "covered": 0.5,
         "optimum_sd": 0.2,
         "optimum": {"u": 0.4, "v": 12.0},
     }
-    found |= {"influence": {"A": 0.1, "B": 0.3}, "reliability": bins}
-    worse = found | {"negative_log_density": 1.3, "difference": 0.2, "difference_error": 0.05}
+    best |= {"influence": {"A": 0.1, "B": 0.3}, "reliability": bins}
+    worse = best | {"negative_log_density": 1.3, "difference": 0.2, "difference_error": 0.05}
     content = {
-        "rules": {"bcm": worse, "hierarchical": found, "pooled": {"refused": "too many"}},
+        "rules": {"bcm": worse, "hierarchical": best, "pooled": {"refused": "too many"}},
         "recommendation": "Use hierarchical.",
     }
     shown = comparison_section(plain(), content)

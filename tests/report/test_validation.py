@@ -27,8 +27,13 @@ def test_validate_writes_the_papers_tables(capsys, monkeypatch, tmp_path):
     (foam,) = json.loads(stdout)["materials"]
     assert (foam["material"], foam["participants"], foam["comparisons"]) == ("foam", 28, 624)
     assert foam["confusion"]["best"] == {"close": 147, "similar": 11, "different": 2}
-    found = {number: {row["term"]: row["estimate"] for row in t["rows"]} for number, t in foam["tables"].items()}
-    printed = (found["II"]["Intercept"], found["III"]["Best"], found["III"]["Worst"], found["IV"]["Aggregate-Best"])
+    estimates = {number: {row["term"]: row["estimate"] for row in t["rows"]} for number, t in foam["tables"].items()}
+    printed = (
+        estimates["II"]["Intercept"],
+        estimates["III"]["Best"],
+        estimates["III"]["Worst"],
+        estimates["IV"]["Aggregate-Best"],
+    )
     assert [round(v, 4) for v in printed] == [-2.5123, -4.1431, 2.9738, 0.9773]
     page = " ".join((out / "report.html").read_text().split())
     assert page.count("data:image/png;base64,") == 2 and "http" not in page
@@ -50,10 +55,10 @@ def test_validate_refuses_in_one_sentence(capsys, monkeypatch, tmp_path):
 
 def test_what_one_comparison_can_say():
     table = pd.DataFrame([("A", 1, "best", "mid", "close", "different", "a")], columns=COLUMNS)
-    found = validate(table)
-    assert found.overall is None and found.people is None
-    assert any("Table III is missing" in text for text in found.tables.limits)
-    rows = safest(found.regressions()["II"]).set_index("term")
+    validated = validate(table)
+    assert validated.overall is None and validated.people is None
+    assert any("Table III is missing" in text for text in validated.tables.limits)
+    rows = safest(validated.regressions()["II"]).set_index("term")
     assert np.isposinf(rows.at["Best", "estimate"]) and np.isfinite(rows.at["Best", "low"])
 
 
@@ -70,9 +75,9 @@ def test_what_is_shown_is_what_the_warning_says_to_report(people, few):
 
 
 def test_ties_are_kept_apart():
-    found = validate(paper_counts(np.random.default_rng(4), ties=20))
-    assert found.people["ties"].sum() == 20 and found.people["wins"].sum() == 279
-    assert found.overall["rate"].iloc[0] == pytest.approx(279 / 364)
+    validated = validate(paper_counts(np.random.default_rng(4), ties=20))
+    assert validated.people["ties"].sum() == 20 and validated.people["wins"].sum() == 279
+    assert validated.overall["rate"].iloc[0] == pytest.approx(279 / 364)
 
 
 def test_a_pair_that_was_only_tied_is_drawn():
@@ -99,6 +104,6 @@ def test_simulated_judges_prefer_what_is_nearer():
         and code.startswith("s")
         and sets["N"].eq(101).all()
     )
-    found = validate(validation_table(study, PRESETS["paper"], sets, seed=3), sets.set_index("set_id"))
-    rates = found.tables.preferences.drop_duplicates(["set", "over"]).set_index(["set", "over"])["rate"]
-    assert rates["best", "worst"] > 0.8 and rates["mid", "worst"] > 0.8 and found.comparisons == 20 * 12 + 8 * 2
+    validated = validate(validation_table(study, PRESETS["paper"], sets, seed=3), sets.set_index("set_id"))
+    rates = validated.tables.preferences.drop_duplicates(["set", "over"]).set_index(["set", "over"])["rate"]
+    assert rates["best", "worst"] > 0.8 and rates["mid", "worst"] > 0.8 and validated.comparisons == 20 * 12 + 8 * 2

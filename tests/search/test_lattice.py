@@ -52,18 +52,18 @@ def known(posterior):
     return posterior.gp.kernel, posterior.trials.x, posterior.latent.weights, posterior.latent.factor
 
 
-def every_point(found):
+def every_point(lattice_):
     """All points of a lattice that may be chosen."""
-    usable = jnp.concatenate([found.inside, found.present])
-    points = found.points(*map(jnp.asarray, np.indices(usable.shape)))
-    return jnp.concatenate([points[usable], found.extra])
+    usable = jnp.concatenate([lattice_.inside, lattice_.present])
+    points = lattice_.points(*map(jnp.asarray, np.indices(usable.shape)))
+    return jnp.concatenate([points[usable], lattice_.extra])
 
 
 @each_score_and_space
 def test_the_maximum_over_the_lattice_is_found_with_few_variances(space, score):
-    found, fitted = lattice_of(space, 12), posterior(space.dim)
-    highest, hopes, points = screen(*known(fitted), found, score)
-    everything = score(*fitted.predict(every_point(found)))
+    lattice_, fitted = lattice_of(space, 12), posterior(space.dim)
+    highest, hopes, points = screen(*known(fitted), lattice_, score)
+    everything = score(*fitted.predict(every_point(lattice_)))
     assert jnp.argmax(hopes) == 0 and hopes[0] == jnp.inf
     np.testing.assert_allclose(highest, jnp.max(everything), rtol=1e-11)
     mean, variance = fitted.predict(points[:1])
@@ -72,14 +72,14 @@ def test_the_maximum_over_the_lattice_is_found_with_few_variances(space, score):
 
 @each_score_and_space
 def test_a_column_is_known_by_its_most_hopeful_point(space, score):
-    found, fitted = lattice_of(space, 12), posterior(space.dim)
-    _, hopes, points = screen(*known(fitted), found, score)
+    lattice_, fitted = lattice_of(space, 12), posterior(space.dim)
+    _, hopes, points = screen(*known(fitted), lattice_, score)
     mean, variance = fitted.predict(points[1:])
     value, bound = score(mean, variance), score.optimistic(mean, jnp.asarray(1.0))
     searched = hopes[1:] > -jnp.inf
     np.testing.assert_allclose(hopes[1:][searched], (0.8 * value + 0.2 * bound)[searched], rtol=1e-9, atol=1e-12)
-    usable = jnp.concatenate([found.inside, found.present])
-    everywhere = fitted.predict(found.points(*map(jnp.asarray, np.indices(usable.shape))).reshape(-1, space.dim))
+    usable = jnp.concatenate([lattice_.inside, lattice_.present])
+    everywhere = fitted.predict(lattice_.points(*map(jnp.asarray, np.indices(usable.shape))).reshape(-1, space.dim))
     every_hope = 0.8 * score(*everywhere) + 0.2 * score.optimistic(everywhere[0], jnp.asarray(1.0))
     largest = jnp.max(jnp.where(usable, every_hope.reshape(usable.shape), -jnp.inf), axis=0)
     columns = searched[: usable.shape[1]]
@@ -88,9 +88,9 @@ def test_a_column_is_known_by_its_most_hopeful_point(space, score):
 
 def test_most_columns_get_no_variance():
     space = SPACES["mechanics"]
-    found = lattice_of(space, 24)
-    hopes = screen(*known(posterior(3)), found, SCORES[0]).hopes
-    columns = found.inside.shape[1]
+    lattice_ = lattice_of(space, 24)
+    hopes = screen(*known(posterior(3)), lattice_, SCORES[0]).hopes
+    columns = lattice_.inside.shape[1]
     assert jnp.sum(hopes[1 : 1 + columns] > -jnp.inf) <= 96 < columns / 5
 
 
@@ -125,36 +125,36 @@ def test_optimistic_values_bound_the_score_and_rise_with_the_mean(score):
 
 @each_space
 def test_points_of_the_lattice_are_feasible_and_meet_the_wall(space):
-    found = lattice_of(space, 12)
-    points = every_point(found)
+    lattice_ = lattice_of(space, 12)
+    points = every_point(lattice_)
     assert jnp.all(space.feasible(points))
-    outside = jnp.argwhere(~found.inside)
+    outside = jnp.argwhere(~lattice_.inside)
     if space.mechanics is None:
         assert len(outside) == 0 and len(points) == 12**space.dim
         return
-    wrong = found.points(outside[:, 0], outside[:, 1])
+    wrong = lattice_.points(outside[:, 0], outside[:, 1])
     assert not jnp.any(space.feasible(wrong))
-    w = space.to_box(found.extra)[:, space.names.index("K1")]
+    w = space.to_box(lattice_.extra)[:, space.names.index("K1")]
     np.testing.assert_allclose(w, 1.0, rtol=1e-12)
     assert len(w) > 50
-    last = found.present[-1]
-    ends = found.points(jnp.full(last.shape, 11 + len(found.ends)), jnp.arange(last.size))[last]
+    last = lattice_.present[-1]
+    ends = lattice_.points(jnp.full(last.shape, 11 + len(lattice_.ends)), jnp.arange(last.size))[last]
     np.testing.assert_allclose(space.to_box(ends)[:, space.names.index("K1")], 1.0, rtol=1e-12)
 
 
 def test_a_smallest_distance_is_kept():
     space, fitted = SPACES["mechanics"], posterior(3)
-    found = lattice_of(space, 12)
-    best = screen(*known(fitted), found, SCORES[0]).points[0]
+    lattice_ = lattice_of(space, 12)
+    best = screen(*known(fitted), lattice_, SCORES[0]).points[0]
     far = jax.jit(lambda *args: lattice.screen(*args, allowed=lambda x: jnp.sum((x - best) ** 2) >= 0.3**2))
-    _, hopes, points = far(*known(fitted), found, SCORES[0])
+    _, hopes, points = far(*known(fitted), lattice_, SCORES[0])
     assert jnp.all(jnp.linalg.norm(points[hopes > -jnp.inf] - best[None, :], axis=1) >= 0.3)
 
 
 def test_nothing_to_choose_is_no_start():
-    found = lattice_of(SPACES["mechanics"], 12)
+    lattice_ = lattice_of(SPACES["mechanics"], 12)
     none = jax.jit(lambda *args: lattice.screen(*args, allowed=lambda x: jnp.sum(x) < 0))
-    highest, hopes, _ = none(*known(posterior(3)), found, SCORES[0])
+    highest, hopes, _ = none(*known(posterior(3)), lattice_, SCORES[0])
     assert highest == -jnp.inf and jnp.all(hopes == -jnp.inf)
 
 

@@ -61,9 +61,9 @@ def test_what_is_no_confirmation_is_refused(values):
 
 @given(st.floats(-0.01, 1.01), st.floats(-0.01, 1.01))
 def test_what_counts_is_never_outside_the_ranges_and_nothing_else_is_changed(u, v):
-    found = counted(STUDY, {"u": u, "v": v})
-    assert all(0.0 <= x <= 1.0 for x in found.values())
-    assert all(found[n] == x for n, x in (("u", u), ("v", v)) if 0.0 <= x <= 1.0)
+    confirmed = counted(STUDY, {"u": u, "v": v})
+    assert all(0.0 <= x <= 1.0 for x in confirmed.values())
+    assert all(confirmed[n] == x for n, x in (("u", u), ("v", v)) if 0.0 <= x <= 1.0)
 
 
 def test_a_rendering_is_felt_and_answered_only_after_it_was_confirmed():

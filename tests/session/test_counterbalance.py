@@ -50,12 +50,12 @@ def test_orders_are_balanced_at_any_number_of_participants(n, people, seed):
 def test_the_papers_pairs_are_balanced():
     pairs = [("best", "mid"), ("best", "worst"), ("mid", "worst")]
     for seed in range(20):
-        found = comparisons(pairs, 4, seed)
-        assert len(found) == 12
-        assert set(Counter(frozenset(trial[:2]) for trial in found).values()) == {4}
-        assert Counter(name for a, b, _ in found for name in (a, b)) == dict.fromkeys(("best", "mid", "worst"), 8)
-        assert set(Counter(found).values()) == {1}  # every pair in each of the four combinations of side and order
-        repeated = sum(set(x[:2]) == set(y[:2]) for x, y in itertools.pairwise(found))
+        schedule = comparisons(pairs, 4, seed)
+        assert len(schedule) == 12
+        assert set(Counter(frozenset(trial[:2]) for trial in schedule).values()) == {4}
+        assert Counter(name for a, b, _ in schedule for name in (a, b)) == dict.fromkeys(("best", "mid", "worst"), 8)
+        assert set(Counter(schedule).values()) == {1}  # every pair in each of the four combinations of side and order
+        repeated = sum(set(x[:2]) == set(y[:2]) for x, y in itertools.pairwise(schedule))
         assert repeated == 0
     assert comparisons(pairs, 4, 0) == comparisons(pairs, 4, 0) != comparisons(pairs, 4, 1)
 
@@ -63,21 +63,21 @@ def test_the_papers_pairs_are_balanced():
 @given(st.integers(1, 24), st.integers(1, 6), st.integers(0, 10**6))
 def test_sides_and_order_are_balanced_for_any_number_of_rounds(count, repeats, seed):
     pairs = [("aggregate", f"individual:P{i}") for i in range(count)]
-    found = comparisons(pairs, repeats, seed)
-    assert set(Counter(frozenset(trial[:2]) for trial in found).values()) == {repeats}
+    schedule = comparisons(pairs, repeats, seed)
+    assert set(Counter(frozenset(trial[:2]) for trial in schedule).values()) == {repeats}
     for _, name in pairs:
-        own = [trial for trial in found if name in trial[:2]]
+        own = [trial for trial in schedule if name in trial[:2]]
         left = sum(trial[0] == name for trial in own)
         early = sum((trial[2] == "a") == (trial[0] == name) for trial in own)
         for times in (left, early):
             assert abs(2 * times - repeats) <= repeats % 2
-    for total in (sum(trial[0] == "aggregate" for trial in found), sum(trial[2] == "a" for trial in found)):
-        assert abs(2 * total - len(found)) <= 4
+    for total in (sum(trial[0] == "aggregate" for trial in schedule), sum(trial[2] == "a" for trial in schedule)):
+        assert abs(2 * total - len(schedule)) <= 4
 
 
 @pytest.mark.parametrize(("count", "repeats", "trials"), [(24, 2, 48), (8, 3, 24)])
 def test_the_papers_aggregate_best_sessions(count, repeats, trials):
-    found = comparisons([("aggregate", str(i)) for i in range(count)], repeats, 0)
-    assert len(found) == trials
-    assert sum(a == "aggregate" for a, _, _ in found) == trials // 2
-    assert sum(first == "a" for *_, first in found) == trials // 2
+    schedule = comparisons([("aggregate", str(i)) for i in range(count)], repeats, 0)
+    assert len(schedule) == trials
+    assert sum(a == "aggregate" for a, _, _ in schedule) == trials // 2
+    assert sum(first == "a" for *_, first in schedule) == trials // 2

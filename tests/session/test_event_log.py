@@ -53,8 +53,8 @@ def test_a_log_reads_back_and_goes_on(tmp_path, driven):
     path = tmp_path / log_name(driven.header)
     write(path, driven)
     assert log_paths(tmp_path) == [path]
-    found, events, dropped = read_log(path, STUDY)
-    assert (found, events, dropped) == (driven.header, driven.events, "")
+    read_header, events, dropped = read_log(path, STUDY)
+    assert (read_header, events, dropped) == (driven.header, driven.events, "")
     with EventLog.resume(path, STUDY) as log:
         assert log.state == driven.state
         log.append(live.note(log.state, "again: ü, \n, \u2028", 1e9 + 0.1))

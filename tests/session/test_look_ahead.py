@@ -53,8 +53,8 @@ def test_renderings_are_those_of_a_session_and_no_fit_runs_after_an_answer(choos
         events.append(event)
         state = state.after(event)
         assert state.pending.renderings["a"] == session.ask()
-        found = chooser.lookahead(state)
-        assert set(found) == (set(STUDY.responses) if number < 5 else set())
+        ahead = chooser.lookahead(state)
+        assert set(ahead) == (set(STUDY.responses) if number < 5 else set())
         choice = state.pending.data["choice"]
         assert choice["by"] == ("latin hypercube" if number < 2 else "ucb") and choice["certificate"]["converged"]
         if number >= 2:
@@ -181,8 +181,8 @@ def test_pace_and_consistency(chooser):
     assert minutes_left(state) == pytest.approx(2 * 20 / 60)
     assert consistency(state).pairs == 0
     state = asked(state.after(live.repeat(state, 1.0, 3)), chooser)
-    found = trust_of(state, 0, chooser)
-    assert found is not None and found.movement is None  # the answer to a repeat moves nothing
+    trust = trust_of(state, 0, chooser)
+    assert trust is not None and trust.movement is None  # the answer to a repeat moves nothing
     state = told(state, "similar")
     assert consistency(state).__dict__ == {"pairs": 1, "alike": 0, "distance": 1.0}  # "similar" after "close"
 
@@ -213,24 +213,24 @@ def test_a_logged_session_is_a_session_and_resumes(tmp_path):
 def test_trust_in_the_best_rendering(chooser):
     state = begun(chooser)
     assert trust_of(start(), 0, chooser) is None
-    found = trust_of(asked(state, chooser), 0, chooser)
-    assert found is not None and 0 < found.top < 1 and 0 <= found.movement < 1
+    trust = trust_of(asked(state, chooser), 0, chooser)
+    assert trust is not None and 0 < trust.top < 1 and 0 <= trust.movement < 1
     session = Session.start(STUDY)
     for response in ANSWERS[:4]:
         session = session.tell(response)
     best = np.array(list(session.best().values()))
     posterior = session.posterior()
-    found_best = np.array(list(found.best.values()))
-    means = posterior.mean(STUDY.space.to_unit(np.stack([best, found_best])))
+    trust_best = np.array(list(trust.best.values()))
+    means = posterior.mean(STUDY.space.to_unit(np.stack([best, trust_best])))
     np.testing.assert_allclose(means[0], means[1], atol=1e-6)
     p = posterior.class_probabilities(STUDY.space.to_unit(best)[None, :])[0]
-    assert found.top == pytest.approx(float(p[-1]), abs=1e-6)
+    assert trust.top == pytest.approx(float(p[-1]), abs=1e-6)
     asks = asked(state, chooser).pending.renderings["a"]
     chances = posterior.class_probabilities(STUDY.space.to_unit(np.array(list(asks.values())))[None, :])[0]
     moved = [
         np.sqrt(np.mean((np.array(list(session.tell(r).best().values())) - best) ** 2)) for r in STUDY.responses
     ]  # the box is the unit square
-    assert found.movement == pytest.approx(float(np.dot(chances, moved)), abs=1e-3)
+    assert trust.movement == pytest.approx(float(np.dot(chances, moved)), abs=1e-3)
 
 
 def test_several_materials_have_studies_of_their_own():
@@ -306,9 +306,9 @@ def test_a_space_filling_point_that_is_not_shown_again_is_replaced_once(chooser)
 
 def test_numbers_that_are_none_stay_out_of_a_choice_and_of_the_log(monkeypatch, tmp_path):
     def broken(study, posterior, point):
-        found, nan = real(study, posterior, point), jnp.asarray(np.nan)
-        figures = dataclasses.replace(found.certificate, residual=nan, condition=jnp.asarray(np.inf))
-        return found._replace(mean=nan, variance=jnp.asarray(-1e-18), certificate=figures)
+        explained, nan = real(study, posterior, point), jnp.asarray(np.nan)
+        figures = dataclasses.replace(explained.certificate, residual=nan, condition=jnp.asarray(np.inf))
+        return explained._replace(mean=nan, variance=jnp.asarray(-1e-18), certificate=figures)
 
     real = explanation._explanation
     monkeypatch.setattr(explanation, "_explanation", broken)

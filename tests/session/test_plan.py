@@ -199,20 +199,20 @@ def result():
 def test_results_are_checked(tmp_path):
     path = tmp_path / "result.json"
     path.write_text(json.dumps(result()))
-    found = read_result(path, STUDY)
-    assert found == msgspec.convert(result(), Result)
-    assert set(aggregate_best_sets(STUDY, found)) == {"aggregate", "individual:P01", "individual:P02"}
+    aggregate_result = read_result(path, STUDY)
+    assert aggregate_result == msgspec.convert(result(), Result)
+    assert set(aggregate_best_sets(STUDY, aggregate_result)) == {"aggregate", "individual:P01", "individual:P02"}
     with pytest.raises(InputError, match="result of another study"):
         read_result(path, MATERIALS)
     path.write_text("{}")
     with pytest.raises(InputError, match=r"is no result\.json"):
         read_result(path, STUDY)
-    check_participants(found, ["V01"], "aggregate")
-    check_participants(found, ["P01"], "individual")
+    check_participants(aggregate_result, ["V01"], "aggregate")
+    check_participants(aggregate_result, ["P01"], "individual")
     with pytest.raises(InputError, match="invite people who are not"):
-        check_participants(found, ["V01", "P02"], "aggregate")
+        check_participants(aggregate_result, ["V01", "P02"], "aggregate")
     with pytest.raises(InputError, match="no map of their own"):
-        check_participants(found, ["V01"], "individual")
+        check_participants(aggregate_result, ["V01"], "individual")
 
 
 def test_a_study_changes_protocols_and_texts():

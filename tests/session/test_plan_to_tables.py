@@ -102,17 +102,17 @@ def monkeypatch_module():
 def test_a_planned_study_fills_every_table_of_every_material(tables, material, given):
     compared = read_validation(tables / "study-plain_table-validation_data.csv", STUDY.responses, material)
     sets = sets_frame(tables / "study-plain_table-sets_data.csv", ("u", "v")) if given else None
-    found = validate(compared, sets, STUDY.responses, material)
-    assert found.tables.limits == ()
-    assert found.tables.confusion.to_numpy().sum() == len(PEOPLE) * 12 * 2
-    assert [found.tables.confusion.loc[role, "close"] > 24 for role in ROLES] == [True, False, False]
-    assert set(zip(found.tables.preferences["set"], found.tables.preferences["over"], strict=True)) == {
+    validated = validate(compared, sets, STUDY.responses, material)
+    assert validated.tables.limits == ()
+    assert validated.tables.confusion.to_numpy().sum() == len(PEOPLE) * 12 * 2
+    assert [validated.tables.confusion.loc[role, "close"] > 24 for role in ROLES] == [True, False, False]
+    assert set(zip(validated.tables.preferences["set"], validated.tables.preferences["over"], strict=True)) == {
         ("best", "mid"),
         ("best", "worst"),
         ("mid", "worst"),
     }
-    assert found.tables.table_4.answers == len(PEOPLE) * len(PEOPLE) * 2
-    assert set(validation_figures(found)) == {"validation", "aggregate-best"}
+    assert validated.tables.table_4.answers == len(PEOPLE) * len(PEOPLE) * 2
+    assert set(validation_figures(validated)) == {"validation", "aggregate-best"}
 
 
 def test_the_exported_sets_say_what_they_are(tables):
@@ -149,5 +149,5 @@ def test_names_of_sets_resolve_without_a_sets_table():
             [("best", "mid", 3, 2), ("best", "worst", 2, 1), ("mid", "worst", 3, 2), ("best", "mid", 3, 1)], 1
         )
     ]
-    found = paper_tables(pd.DataFrame(rows), responses=STUDY.responses)
-    assert found.table_2 is not None and found.confusion.loc["best"].sum() == 12
+    paper = paper_tables(pd.DataFrame(rows), responses=STUDY.responses)
+    assert paper.table_2 is not None and paper.confusion.loc["best"].sum() == 12

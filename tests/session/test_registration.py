@@ -87,9 +87,9 @@ def test_departures_from_a_plan(tmp_path):
     departs, (nothing,) = departures(path, study, 25, {"P01": [25], "P02": [25]})
     assert departs == ()
     assert nothing.startswith("Nothing departs from the plan") and "2 participants, 25 answers each" in nothing
-    found, nothing = departures(path, "0" * 16, 25, {"P01": [12, 25], "P09": [25]})
-    assert nothing == () and all(sentence.startswith("Departs from the plan") for sentence in found)
-    text = " ".join(found)
+    sentences, nothing = departures(path, "0" * 16, 25, {"P01": [12, 25], "P09": [25]})
+    assert nothing == () and all(sentence.startswith("Departs from the plan") for sentence in sentences)
+    text = " ".join(sentences)
     for part in ("planned with (0000", "without answers here: P02 (1 of 2)", "Not in the plan", "P09.", "P01 (12, 25)"):
         assert part in text
     assert "P09 (25)" not in text

@@ -71,18 +71,18 @@ def another_process(tmp_path):
 @pytest.mark.empties_caches
 @pytest.mark.deep  # compiles the step twice
 def test_another_process_traces_no_step_and_finds_the_same_bits(another_process, monkeypatch):
-    def found():
+    def arrays():
         begun = Session.start(STUDY, seed=2).step
         fitted = begun.fitted(POINTS, ANSWERS)
         return [fitted.point, begun.best(fitted.posterior), *jax.tree.leaves(fitted.posterior)]
 
-    traced = found()
+    traced = arrays()
     another_process()
-    made = found()
+    made = arrays()
     another_process()
     monkeypatch.setattr(step, "_shapes", None)
     monkeypatch.setattr(step, "point_after", None)
-    for results in (made, found()):
+    for results in (made, arrays()):
         for ours, one in zip(results, traced, strict=True):
             np.testing.assert_array_equal(ours, one)
 

@@ -64,18 +64,18 @@ def test_a_damaged_map_is_refused_or_is_what_it_was(tmp_path):
         damaged[at] ^= 1 << rng.randrange(8)
         path.write_bytes(damaged)
         try:
-            found = read_warm_start(path, STUDY)
+            warm = read_warm_start(path, STUDY)
         except InputError:
             refused += 1
             continue
-        np.testing.assert_array_equal(found.mean, whole.mean)
-        np.testing.assert_array_equal(found.variance, whole.variance)
+        np.testing.assert_array_equal(warm.mean, whole.mean)
+        np.testing.assert_array_equal(warm.variance, whole.variance)
     assert 0 < refused < 60
 
 
 def test_a_map_that_was_made_before_digests_were_is_read(tmp_path):
-    found = read_warm_start(write(tmp_path / "map.nc", grid()), STUDY)
-    assert np.isfinite(found.mean).all()
+    warm = read_warm_start(write(tmp_path / "map.nc", grid()), STUDY)
+    assert np.isfinite(warm.mean).all()
 
 
 def test_a_map_says_what_it_said_before_it_was_written(tmp_path):

@@ -184,8 +184,8 @@ def test_a_plan_of_today_leaves_no_id_with_others():
     plan = make_plan(STUDY, ["J01"], 0, "aggregate-best", sets={"": {"aggregate": SETS["best"]} | own})
     header = planned_header(plan, STUDY, "J01")
     assert "P02" not in json.dumps([header.sets, [[t.a, t.b] for b in header.blocks for t in b.trials]])
-    found = sorted(values["u"] for name, values in header.sets.items() if name.startswith("individual:"))
-    np.testing.assert_allclose(found, [0.1, 0.2, 0.3])
+    own_u = sorted(values["u"] for name, values in header.sets.items() if name.startswith("individual:"))
+    np.testing.assert_allclose(own_u, [0.1, 0.2, 0.3])
 
 
 def test_an_id_that_is_a_number_changes_names_alone(tmp_path):

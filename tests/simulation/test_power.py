@@ -44,8 +44,8 @@ def test_the_probability_of_the_highest_answer_is_that_of_many_answers():
         given = jax.vmap(lambda person: jax.vmap(lambda key: person.answer(key, point, half))(keys))(persons)
         return jnp.mean(given == 2)
 
-    found = [float(share(jnp.asarray(point))) for point in x]
-    np.testing.assert_allclose(top_probability(persons, 3, x), found, atol=0.01)
+    shares = [float(share(jnp.asarray(point))) for point in x]
+    np.testing.assert_allclose(top_probability(persons, 3, x), shares, atol=0.01)
 
 
 def test_summaries_of_errors_that_are_known():
@@ -77,8 +77,8 @@ def test_the_page_says_how_sure_a_share_is(tmp_path):
 def test_enough_is_what_larger_numbers_hold_too():
     reached = {2: [0.9, 0.7, 0.8, 0.85], 3: [0.7, 0.9, 0.9, 0.79], 4: [0.8, 0.8, 0.8, 0.8]}
     rows = [(m, 10 + 5 * i, share) for m, shares in reached.items() for i, share in enumerate(shares)]
-    found = enough(pd.DataFrame(rows, columns=["participants", "trials", "reached_surely"]))
-    np.testing.assert_array_equal(found["trials"], [20, np.nan, 10])
+    needed = enough(pd.DataFrame(rows, columns=["participants", "trials", "reached_surely"]))
+    np.testing.assert_array_equal(needed["trials"], [20, np.nan, 10])
 
 
 def test_a_design_that_is_too_short_is_seldom_called_enough():

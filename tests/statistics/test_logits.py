@@ -20,19 +20,19 @@ def paper():
 
 
 def test_table_2_of_the_paper(paper):
-    found = estimates(paper.table_2)
-    assert round(found["Intercept"], 4) == -2.5123 and round(found["Best"], 2) == 4.94
+    coefficients = estimates(paper.table_2)
+    assert round(coefficients["Intercept"], 4) == -2.5123 and round(coefficients["Best"], 2) == 4.94
     exact = logit(24 / 320), logit(147 / 160) - logit(24 / 320)
-    np.testing.assert_allclose(found[["Intercept", "Best"]], exact, rtol=1e-12)
+    np.testing.assert_allclose(coefficients[["Intercept", "Best"]], exact, rtol=1e-12)
     iid = paper.table_2.by("iid")["std_error"]
     np.testing.assert_allclose(iid["Intercept"], np.sqrt(1 / 24 + 1 / 296), rtol=1e-12)
     np.testing.assert_allclose(iid["Best"], np.sqrt(1 / 24 + 1 / 296 + 1 / 147 + 1 / 13), rtol=1e-12)
 
 
 def test_table_3_of_the_paper(paper):
-    found = estimates(paper.table_3)
-    assert round(found["Best"], 4) == -4.1431 and round(found["Worst"], 4) == 2.9738
-    assert list(found.index) == ["Best", "Worst", "close|similar", "similar|different"]
+    coefficients = estimates(paper.table_3)
+    assert round(coefficients["Best"], 4) == -4.1431 and round(coefficients["Worst"], 4) == 2.9738
+    assert list(coefficients.index) == ["Best", "Worst", "close|similar", "similar|different"]
 
 
 def test_table_4_of_the_paper(paper):
@@ -64,12 +64,12 @@ def test_a_pair_without_a_loss_is_answered_and_not_fitted(paper):
 
 def test_rates_against_closed_forms():
     hits = np.arange(80) < 76
-    found = rate(hits, {"participant": np.tile(np.arange(20), 4)}).set_index("errors")
+    intervals = rate(hits, {"participant": np.tile(np.arange(20), 4)}).set_index("errors")
     z, p = stats.norm.ppf(0.975), 0.95
     middle, half = (p + z**2 / 160), z * np.sqrt(p * (1 - p) / 80 + z**2 / 25600)
-    np.testing.assert_allclose(found.loc["Wilson", "low"], (middle - half) / (1 + z**2 / 80))
-    np.testing.assert_allclose(found.loc["exact", "high"], stats.beta.ppf(0.975, 77, 4))
-    clustered = found.loc["clustered by participant"]
+    np.testing.assert_allclose(intervals.loc["Wilson", "low"], (middle - half) / (1 + z**2 / 80))
+    np.testing.assert_allclose(intervals.loc["exact", "high"], stats.beta.ppf(0.975, 77, 4))
+    clustered = intervals.loc["clustered by participant"]
     assert 0 < clustered["low"] < 0.95 < clustered["high"] < 1
 
 
@@ -77,11 +77,11 @@ def test_ties_are_counted_and_modelled():
     """With one pair Rao & Kupper's model is saturated: the shares give strength and tie in closed form."""
     wins, losses, ties = 50, 20, 30
     chosen = np.repeat(["a1", "a2", "tie"], [wins, losses, ties])
-    found = estimates(st.tied_preferences(["a1"] * 100, ["a2"] * 100, chosen))
+    coefficients = estimates(st.tied_preferences(["a1"] * 100, ["a2"] * 100, chosen))
     won, lost = logit(wins / 100), logit(losses / 100)
-    np.testing.assert_allclose(found[["a1", "tie"]], [(won - lost) / 2, -(won + lost) / 2], rtol=1e-10)
+    np.testing.assert_allclose(coefficients[["a1", "tie"]], [(won - lost) / 2, -(won + lost) / 2], rtol=1e-10)
     turned = st.tied_preferences(["a2"] * 100, ["a1"] * 100, chosen, reference="a1")
-    np.testing.assert_allclose(estimates(turned)[["a2", "tie"]], [-found["a1"], found["tie"]], rtol=1e-10)
+    np.testing.assert_allclose(estimates(turned)[["a2", "tie"]], [-coefficients["a1"], coefficients["tie"]], rtol=1e-10)
     tables = paper_tables(paper_counts(np.random.default_rng(4), ties=20))
     assert list(estimates(tables.table_4).index) == ["Aggregate-Best", "tie"]
     np.testing.assert_allclose(estimates(tables.table_4)["Aggregate-Best"], (logit(279 / 384) - logit(85 / 384)) / 2)
@@ -89,18 +89,18 @@ def test_ties_are_counted_and_modelled():
 
 def test_strengths_from_three_sets_and_the_order_shown(paper):
     table = paper_counts(np.random.default_rng(1)).query("session == 'model'")
-    found = st.tied_preferences(
+    fitted = st.tied_preferences(
         table["set_a"], table["set_b"], table["preferred"], table[["participant"]], order=np.ones(len(table))
     )
-    strength = estimates(found)
+    strength = estimates(fitted)
     assert strength["best"] > strength["mid"] > 0 and list(strength.index) == ["best", "mid", "shown first"]
     assert np.isfinite(strength).all()  # 80 of 80 does not separate what the other pairs join
 
 
 def test_a_pair_of_ties_only_has_no_rate():
     table = pd.DataFrame({"participant": ["A", "B"], "set_a": "x", "set_b": "y", "preferred": "tie"})
-    found = preference_rates(table).squeeze()
-    assert found["ties"] == 2 and np.isnan(found["rate"])
+    row = preference_rates(table).squeeze()
+    assert row["ties"] == 2 and np.isnan(row["rate"])
 
 
 # The table, whole
@@ -121,9 +121,9 @@ def test_roles_and_sources_come_from_the_sets_table(paper):
     )
     for column in ("set_a", "set_b", "preferred"):
         table[column] = table[column].replace(ids)
-    found = paper_tables(table, sets.set_index("set_id"))
+    renamed = paper_tables(table, sets.set_index("set_id"))
     for name in ("table_2", "table_3", "table_4"):
-        pd.testing.assert_series_equal(estimates(getattr(found, name)), estimates(getattr(paper, name)))
+        pd.testing.assert_series_equal(estimates(getattr(renamed, name)), estimates(getattr(paper, name)))
     with pytest.raises(InputError, match="is not in the sets table; add it there"):
         paper_tables(table, sets.set_index("set_id").drop("s3"))
 
@@ -162,10 +162,10 @@ def test_bad_input_is_one_sentence(call, sentence):
 
 
 def test_a_category_that_never_occurs_has_no_edge():
-    found = st.ordered_logit([0, 2, 0, 2, 2], {"x": [0.0, 0, 1, 1, 0]}, categories=("low", "mid", "high"))
-    assert list(estimates(found).index) == ["x", "low|high"]
+    fitted = st.ordered_logit([0, 2, 0, 2, 2], {"x": [0.0, 0, 1, 1, 0]}, categories=("low", "mid", "high"))
+    assert list(estimates(fitted).index) == ["x", "low|high"]
     binary = st.binary_logit([0, 1, 0, 1, 1], {"x": [0.0, 0, 1, 1, 0]})
-    np.testing.assert_allclose(estimates(found)["x"], estimates(binary)["x"], rtol=1e-10)
+    np.testing.assert_allclose(estimates(fitted)["x"], estimates(binary)["x"], rtol=1e-10)
 
 
 def in_units(scale, separated):
@@ -174,19 +174,19 @@ def in_units(scale, separated):
     x, z = rng.normal(size=120), rng.normal(size=120)
     chance = x > 0.2 if separated else rng.random(120) < expit(0.3 + 0.8 * x - 0.5 * z)
     clusters = pd.DataFrame({"person": np.arange(120) % 9, "set": np.arange(120) // 9 % 5})
-    found = st.binary_logit(chance.astype(int), {"x": x * scale, "z": z}, clusters)
-    table = found.table.set_index(["term", "errors"])[["estimate", "std_error", "low", "high", "p_value"]]
+    fitted = st.binary_logit(chance.astype(int), {"x": x * scale, "z": z}, clusters)
+    table = fitted.table.set_index(["term", "errors"])[["estimate", "std_error", "low", "high", "p_value"]]
     table.loc["x", ["estimate", "std_error", "low", "high"]] *= scale
-    return table, found
+    return table, fitted
 
 
 @pytest.mark.parametrize("separated", [False, True])
 @pytest.mark.parametrize("scale", [1e-20, 1e-8, 1e-3, 1e4, 1e8, 1e20])
 def test_the_units_of_a_predictor_do_not_matter(scale, separated):
-    table, found = in_units(scale, separated)
+    table, fitted = in_units(scale, separated)
     expected, own = in_units(1.0, separated)
     pd.testing.assert_frame_equal(table, expected, rtol=1e-7, atol=1e-12)
-    assert [words.partition("(")[0] for words in found.warnings] == [words.partition("(")[0] for words in own.warnings]
-    for name, covariance in found.covariances.items():
+    assert [words.partition("(")[0] for words in fitted.warnings] == [words.partition("(")[0] for words in own.warnings]
+    for name, covariance in fitted.covariances.items():
         if "x" in covariance:
             assert covariance.loc["x", "x"] * scale**2 == pytest.approx(own.covariances[name].loc["x", "x"], rel=1e-7)

@@ -127,19 +127,19 @@ def test_an_indefinite_two_way_covariance_is_repaired_and_reported():
     person, item = (index.ravel() for index in np.indices((6, 6)))
     success = (person + item) % 2  # rows and columns agree exactly, cells do not
     x = rng.standard_normal(36)
-    found = st.binary_logit(success, {"x": x}, {"person": person, "item": item})
-    assert np.linalg.eigvalsh(found.covariances["clustered by person and item"])[0] >= -1e-15
-    assert any("indefinite" in sentence for sentence in found.warnings)
+    fitted = st.binary_logit(success, {"x": x}, {"person": person, "item": item})
+    assert np.linalg.eigvalsh(fitted.covariances["clustered by person and item"])[0] >= -1e-15
+    assert any("indefinite" in sentence for sentence in fitted.warnings)
     labels = person.tolist(), item.tolist()
     reference = Reference("binary", success, np.c_[np.ones(36), x])
-    raw = reference.covariance(estimates(found).to_numpy(), *labels)
+    raw = reference.covariance(estimates(fitted).to_numpy(), *labels)
     assert np.linalg.eigvalsh(raw)[0] < 0
 
 
 def test_clusters_that_agree_exactly_give_no_error():
     success = np.tile([1, 1, 0], 12)
-    found = st.binary_logit(success, None, {"person": np.repeat(np.arange(12), 3)})
-    row = found.by("clustered by person").loc["Intercept"]
+    fitted = st.binary_logit(success, None, {"person": np.repeat(np.arange(12), 3)})
+    row = fitted.by("clustered by person").loc["Intercept"]
     assert np.isnan(row["std_error"]) and np.isnan(row["p_value"]) and "nothing is left" in row["assumes"]
 
 
@@ -155,6 +155,6 @@ def test_a_clustered_error_below_the_iid_one_is_warned_about():
 
 
 def test_one_participant_gives_iid_errors_only():
-    found = st.binary_logit([1, 0, 1, 1], None, {"participant": ["P"] * 4})
-    assert list(found.table["errors"]) == ["iid"]
-    assert found.warnings == ("There is one participant only: no error can be clustered by it.",)
+    fitted = st.binary_logit([1, 0, 1, 1], None, {"participant": ["P"] * 4})
+    assert list(fitted.table["errors"]) == ["iid"]
+    assert fitted.warnings == ("There is one participant only: no error can be clustered by it.",)

@@ -35,22 +35,22 @@ def test_separation_agrees_with_the_rays_of_the_cone():
         if not separation.independent(model).all():
             continue
         rays = extreme_rays(cone_of(model))
-        found = separation.separation(model)
+        separated = separation.separation(model)
         k = model.upper.shape[1]
         total = np.sum(rays, axis=0) if rays else np.zeros(k)
-        np.testing.assert_array_equal(found.rises, np.any([ray > 0 for ray in rays] or [np.zeros(k, bool)], axis=0))
-        np.testing.assert_array_equal(found.falls, np.any([ray < 0 for ray in rays] or [np.zeros(k, bool)], axis=0))
+        np.testing.assert_array_equal(separated.rises, np.any([ray > 0 for ray in rays] or [np.zeros(k, bool)], axis=0))
+        np.testing.assert_array_equal(separated.falls, np.any([ray < 0 for ray in rays] or [np.zeros(k, bool)], axis=0))
         up = np.isinf(model.upper_offset) | (model.upper @ total > 0)
         down = np.isinf(model.lower_offset) | (model.lower @ total < 0)
-        np.testing.assert_array_equal(found.upper, up)
-        np.testing.assert_array_equal(found.lower, down)
-        if found.infinite.any() and not found.certain.all():
+        np.testing.assert_array_equal(separated.upper, up)
+        np.testing.assert_array_equal(separated.lower, down)
+        if separated.infinite.any() and not separated.certain.all():
             start = np.concatenate([np.zeros(k - 2), [-1, 1]])
             loss = lambda v, c=category, x=x: -plain_log_likelihood(v, c, x)  # noqa: E731
             far = minimize(loss, start + 50 * total, options={"gtol": 1e-8})
-            assert separation.supremum(model, start, found) == pytest.approx(-far.fun, abs=1e-7)
+            assert separation.supremum(model, start, separated) == pytest.approx(-far.fun, abs=1e-7)
         half_open = bool(np.any(up & ~down & np.isfinite(model.upper_offset)))
-        seen.add((bool(found.infinite.any()), bool(found.certain.all()), half_open))
+        seen.add((bool(separated.infinite.any()), bool(separated.certain.all()), half_open))
     assert {(False, False, False), (True, False, False), (True, False, True), (True, True, False)} <= seen
 
 
@@ -58,15 +58,15 @@ def plain_log_likelihood(theta, category, x):
     cuts = np.concatenate([[-np.inf], theta[-2:], [np.inf]])
     shift = x @ theta[:-2]
     with np.errstate(invalid="ignore", divide="ignore"):
-        found = np.sum(np.log(expit(cuts[category + 1] - shift) - expit(cuts[category] - shift)))
-    return found if np.isfinite(found) else -1e10
+        value = np.sum(np.log(expit(cuts[category + 1] - shift) - expit(cuts[category] - shift)))
+    return value if np.isfinite(value) else -1e10
 
 
 def test_a_cell_of_100_percent_has_a_one_sided_interval():
     category, group, person = counts_to_answers([(160, 0), (24, 296)], 20, np.random.default_rng(0))
-    found = st.binary_logit(category == 0, {"Best": group == 0}, {"participant": person})
-    assert "Best cannot be estimated: 160 answers are separated" in found.warnings[0]
-    best = found.table.query("term == 'Best'").squeeze()
+    fitted = st.binary_logit(category == 0, {"Best": group == 0}, {"participant": person})
+    assert "Best cannot be estimated: 160 answers are separated" in fitted.warnings[0]
+    best = fitted.table.query("term == 'Best'").squeeze()
     assert best["estimate"] == np.inf and best["high"] == np.inf and best["errors"] == "profile likelihood"
     assert best["p_value"] < 1e-80 and np.isnan(best["std_error"])
 
@@ -80,13 +80,13 @@ def test_a_cell_of_100_percent_has_a_one_sided_interval():
     # What is not separated is as if the others had not been asked.
     alone = st.binary_logit(category[group == 1] == 0, None, {"participant": person[group == 1]})
     for kind in ("iid", "clustered by participant"):
-        mine, theirs = (f.by(kind).loc["Intercept"].drop(["errors", "assumes"]).astype(float) for f in (found, alone))
+        mine, theirs = (f.by(kind).loc["Intercept"].drop(["errors", "assumes"]).astype(float) for f in (fitted, alone))
         pd.testing.assert_series_equal(mine, theirs, rtol=1e-8)
 
 
 def test_an_outcome_that_never_changes_has_the_closed_interval():
-    found = st.binary_logit(np.ones(80), None, {"participant": np.arange(80) % 20})
-    row = found.table.squeeze()
+    fitted = st.binary_logit(np.ones(80), None, {"participant": np.arange(80) % 20})
+    row = fitted.table.squeeze()
     exact = stats.binomtest(80, 80)  # Clopper & Pearson
     assert row["estimate"] == np.inf and row["low"] == pytest.approx(logit(exact.proportion_ci().low), abs=1e-9)
     assert row["p_value"] == pytest.approx(exact.pvalue, rel=1e-8)
@@ -96,28 +96,28 @@ def test_an_outcome_that_never_changes_has_the_closed_interval():
 
 def test_a_combination_that_separates_is_found():
     x, y = np.array([0.0, 1, 2, 3]), np.array([0, 0, 1, 1])
-    found = st.binary_logit(y, {"x": x})
-    assert found.by("iid").loc["x", "estimate"] == np.inf
-    assert found.by("iid").loc["Intercept", "estimate"] == -np.inf
+    fitted = st.binary_logit(y, {"x": x})
+    assert fitted.by("iid").loc["x", "estimate"] == np.inf
+    assert fitted.by("iid").loc["Intercept", "estimate"] == -np.inf
     apart = st.binary_logit([1, 1, 0, 0], {"a": [0.0, 1, 0, 0], "b": [1.0, 0, 0, 0]})  # one ray, and more than one
     assert np.all(np.isinf(apart.table["estimate"]))
 
 
 def test_a_sign_that_the_answers_do_not_decide():
-    found = st.binary_logit([1, 1, 1, 1], {"x": [0.0, 1, 0, 1]}).by("iid")
-    assert np.isnan(found.loc["x", "estimate"]) and found.loc["x", "low"] == -np.inf
-    assert found.loc["x", "high"] == np.inf and found.loc["x", "p_value"] == 1
+    rows = st.binary_logit([1, 1, 1, 1], {"x": [0.0, 1, 0, 1]}).by("iid")
+    assert np.isnan(rows.loc["x", "estimate"]) and rows.loc["x", "low"] == -np.inf
+    assert rows.loc["x", "high"] == np.inf and rows.loc["x", "p_value"] == 1
 
 
 def test_separated_ordered_logit_keeps_the_rest():
     category, group, person = counts_to_answers([(40, 0, 0), (12, 20, 8), (3, 9, 28)], 10, np.random.default_rng(1))
     shifts = {"Best": group == 0, "Worst": group == 2}
-    found = st.ordered_logit(category, shifts, {"participant": person})
+    fitted = st.ordered_logit(category, shifts, {"participant": person})
     rest = group > 0
     alone = st.ordered_logit(category[rest], {"Worst": group[rest] == 2}, {"participant": person[rest]})
-    assert estimates(found)["Best"] == -np.inf
+    assert estimates(fitted)["Best"] == -np.inf
     for kind in ("iid", "clustered by participant"):
-        mine, theirs = (f.by(kind).loc["Worst"].drop(["errors", "assumes"]).astype(float) for f in (found, alone))
+        mine, theirs = (f.by(kind).loc["Worst"].drop(["errors", "assumes"]).astype(float) for f in (fitted, alone))
         pd.testing.assert_series_equal(mine, theirs, rtol=1e-8)
 
 
@@ -149,10 +149,10 @@ def random_regression(rng):
 def test_any_table_is_answered(seeds):
     kinds = set()
     for seed in seeds:
-        found = random_regression(np.random.default_rng(seed))
-        if found is None:
+        fitted = random_regression(np.random.default_rng(seed))
+        if fitted is None:
             continue
-        table = found.table
+        table = fitted.table
         gone = table["errors"] == "profile likelihood"
         assert np.isfinite(table.loc[~gone, "estimate"]).all() and not np.isfinite(table.loc[gone, "estimate"]).any()
         outside = (table["low"] > table["estimate"]) | (table["high"] < table["estimate"])

@@ -125,9 +125,9 @@ def test_a_batch_is_its_people(cohort):
         means.append(mean)
         variances.append(variance)
     expected = bcm.combine(jnp.stack(means), jnp.stack(variances), 1.0)
-    found = population(posteriors, x)
-    np.testing.assert_allclose(found[0], expected[0], atol=1e-11)
-    np.testing.assert_allclose(found[1], expected[1], atol=1e-11)
+    moments = population(posteriors, x)
+    np.testing.assert_allclose(moments[0], expected[0], atol=1e-11)
+    np.testing.assert_allclose(moments[1], expected[1], atol=1e-11)
 
 
 def test_prefixes_and_subsets(cohort):
@@ -139,16 +139,16 @@ def test_prefixes_and_subsets(cohort):
 
 @pytest.mark.deep
 def test_the_optimum_is_where_the_map_is_highest(cohort):
-    found = aggregate_cohort(STUDY, cohort)
+    aggregate = aggregate_cohort(STUDY, cohort)
     many = jnp.asarray(STUDY.space.candidates(8192, 9))
-    mean, _ = population(found.posteriors, many)
-    assert float(found.optimum.mean) >= float(mean.max())
-    assert bool(STUDY.space.feasible(found.optimum.x))
-    assert set(found.alternatives) == {"average", "hierarchical", "pooled", "ep"}
-    assert found.share is not None and 0 < float(found.share.mean) < 1
-    progress = follow(STUDY, found, 0, [5, 9])
-    np.testing.assert_array_equal(progress.population[-1], found.optimum.x)
-    np.testing.assert_array_equal(progress.individual[-1], found.individuals.x)
+    mean, _ = population(aggregate.posteriors, many)
+    assert float(aggregate.optimum.mean) >= float(mean.max())
+    assert bool(STUDY.space.feasible(aggregate.optimum.x))
+    assert set(aggregate.alternatives) == {"average", "hierarchical", "pooled", "ep"}
+    assert aggregate.share is not None and 0 < float(aggregate.share.mean) < 1
+    progress = follow(STUDY, aggregate, 0, [5, 9])
+    np.testing.assert_array_equal(progress.population[-1], aggregate.optimum.x)
+    np.testing.assert_array_equal(progress.individual[-1], aggregate.individuals.x)
     after = aggregate_cohort(STUDY, cohort.first(5), alternatives=False)
     np.testing.assert_array_equal(progress.population[0], after.optimum.x)
     np.testing.assert_array_equal(progress.individual[0], after.individuals.x)

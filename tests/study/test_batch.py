@@ -44,10 +44,10 @@ def posteriors(inference="laplace"):
 @pytest.mark.deep
 def test_the_merged_map_is_that_of_the_posteriors_held_at_once():
     for rule in ("bcm", "average"):
-        found = fitted().sums.merge(1.3, PEOPLE, rule)
+        merged = fitted().sums.merge(1.3, PEOPLE, rule)
         expected = population(posteriors(), jnp.asarray(candidates()), rule)
-        np.testing.assert_allclose(found[0], expected[0], atol=1e-12)
-        np.testing.assert_allclose(found[1], expected[1], atol=1e-13)
+        np.testing.assert_allclose(merged[0], expected[0], atol=1e-12)
+        np.testing.assert_allclose(merged[1], expected[1], atol=1e-13)
     certificate = posteriors().certificate
     assert fitted().certificate["converged"].all()
     np.testing.assert_array_equal(fitted().certificate["iterations"], certificate.iterations)
@@ -56,9 +56,9 @@ def test_the_merged_map_is_that_of_the_posteriors_held_at_once():
 @pytest.mark.parametrize(("rule", "share"), [("hierarchical", 0.6), ("rbcm", 1.0)])
 def test_other_rules_are_sums_of_their_own(rule, share):
     streamed = dataclasses.replace(fitted().population, rule=rule, share=share)
-    found = sums(streamed, candidates()).merge(1.3, PEOPLE, rule, share)
+    merged = sums(streamed, candidates()).merge(1.3, PEOPLE, rule, share)
     part = jnp.asarray(share) if rule == "hierarchical" else None
-    for a, b in zip(found, population(posteriors(), jnp.asarray(candidates()), rule, part), strict=True):
+    for a, b in zip(merged, population(posteriors(), jnp.asarray(candidates()), rule, part), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
@@ -76,11 +76,11 @@ def test_posteriors_made_again_from_their_modes_say_the_same():
 
 def test_jets_are_the_derivatives_of_the_sums():
     at, step = np.array([[0.3, 0.6], [0.7, 0.2]]), 1e-4
-    found = jets(fitted().population, at)
+    expansions = jets(fitted().population, at)
     moved = [at + step * np.array(way) for way in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1))]
     around = sums(fitted().population, np.concatenate([at, *moved]))
     for name in Sums._fields:
-        value, gradient, hessian = (getattr(part, name) for part in found)
+        value, gradient, hessian = (getattr(part, name) for part in expansions)
         f = getattr(around, name).reshape(7, 2)
         slope = np.stack([f[1] - f[2], f[3] - f[4]], axis=1) / (2 * step)
         bend = (f[5] + f[6] - f[1] - f[2] - f[3] - f[4] + 2 * f[0]) / (2 * step**2)
@@ -104,30 +104,30 @@ def test_people_without_answers_add_exactly_nothing():
 def test_the_optimum_is_the_highest_point_of_the_map():
     best = optima_from(fitted().population, candidates(), fitted().sums, ("bcm", "average"))
     many = jnp.asarray(search_points(STUDY.space, 5, 4096))
-    for rule, found in best.items():
+    for rule, optimum in best.items():
         heights = population(posteriors(), many, rule)[0]
-        mean, variance = population(posteriors(), found.x[None, :], rule)
-        assert float(found.mean) == pytest.approx(float(mean[0]), abs=1e-12)
-        assert float(found.sd) == pytest.approx(float(jnp.sqrt(variance[0])), abs=1e-12)
-        assert float(found.mean) >= float(heights.max())
-        assert float(jnp.sum(found.class_probabilities)) == pytest.approx(1, abs=1e-12)
+        mean, variance = population(posteriors(), optimum.x[None, :], rule)
+        assert float(optimum.mean) == pytest.approx(float(mean[0]), abs=1e-12)
+        assert float(optimum.sd) == pytest.approx(float(jnp.sqrt(variance[0])), abs=1e-12)
+        assert float(optimum.mean) >= float(heights.max())
+        assert float(jnp.sum(optimum.class_probabilities)) == pytest.approx(1, abs=1e-12)
 
 
 def test_a_search_that_may_end_early_reads_the_map_off_its_last_expansion():
     exact = optima_from(fitted().population, candidates(), fitted().sums)["bcm"]
     near = np.asarray(exact.x)[None, :] + 0.002
-    (found,) = optimum_near(fitted().population, near, ("bcm",), tolerance=0.003)
-    np.testing.assert_allclose(found.x, exact.x, atol=1e-4)
-    assert float(found.mean) == pytest.approx(float(exact.mean), abs=1e-6)
+    (optimum,) = optimum_near(fitted().population, near, ("bcm",), tolerance=0.003)
+    np.testing.assert_allclose(optimum.x, exact.x, atol=1e-4)
+    assert float(optimum.mean) == pytest.approx(float(exact.mean), abs=1e-6)
 
 
 @pytest.mark.deep
 def test_a_streamed_optimum_predicts_a_new_person():
     streamed = dataclasses.replace(fitted().population, rule="hierarchical", share=0.6)
-    found = optima_from(streamed, candidates(), sums(streamed, candidates()), ("hierarchical", "average"))
+    optima = optima_from(streamed, candidates(), sums(streamed, candidates()), ("hierarchical", "average"))
     for rule, share in (("hierarchical", jnp.asarray(0.6)), ("average", None)):
         small = population_optimum(STUDY, posteriors(), jnp.asarray(candidates()), rule, share)
-        np.testing.assert_allclose(found[rule].class_probabilities, small.class_probabilities, atol=1e-6)
+        np.testing.assert_allclose(optima[rule].class_probabilities, small.class_probabilities, atol=1e-6)
 
 
 @pytest.mark.deep
@@ -152,11 +152,11 @@ def test_everything_is_as_for_a_small_cohort():
 @pytest.mark.parametrize("inference", ["ep", "exact"])
 def test_other_inferences_are_fitted_again(inference):
     study = population_study(inference)
-    found = refit(population_of(study, cohort(), distributed.alone()), candidates())
+    refitted = refit(population_of(study, cohort(), distributed.alone()), candidates())
     expected = population(posteriors(inference), jnp.asarray(candidates()))
-    np.testing.assert_allclose(found.sums.merge(1.3, PEOPLE)[0], expected[0], atol=1e-9)
-    again = sums(found.population, candidates())
-    np.testing.assert_allclose(again.weighted, found.sums.weighted, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(refitted.sums.merge(1.3, PEOPLE)[0], expected[0], atol=1e-9)
+    again = sums(refitted.population, candidates())
+    np.testing.assert_allclose(again.weighted, refitted.sums.weighted, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.deep
@@ -166,14 +166,14 @@ def test_a_block_made_at_once_is_one_made_person_by_person(task):
     trials = jax.tree.map(lambda leaf: jnp.asarray(leaf[:32]), fitted().population.trials)
     modes = None if task == "individuals" else jnp.asarray(fitted().population.modes[:32])
     points = jnp.asarray(candidates()[:40])
-    found = [
+    blocks = [
         eqx.filter_jit(_one_block)(STUDY, points, trials, modes, task, "laplace", platform)
         for platform in ("cpu", "gpu")
     ]
-    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9), *[total for total, _ in found])
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=1e-9, atol=1e-9), *[total for total, _ in blocks])
     if task == "individuals":
-        np.testing.assert_allclose(found[1][1]["modes"], found[0][1]["modes"], atol=1e-10)
-        np.testing.assert_allclose(found[1][1]["optima"][0], found[0][1]["optima"][0], atol=1e-7)
+        np.testing.assert_allclose(blocks[1][1]["modes"], blocks[0][1]["modes"], atol=1e-10)
+        np.testing.assert_allclose(blocks[1][1]["optima"][0], blocks[0][1]["optima"][0], atol=1e-7)
 
 
 @pytest.mark.parametrize(("people", "platform", "size"), [(1, "cpu", 1), (24, "cpu", 2), (100_000, "cpu", 256)])

@@ -143,9 +143,9 @@ def assert_same(one, other):
     for name in ("mean", "variance"):
         scale = float(abs(grid[name]).max())
         np.testing.assert_allclose(grid_[name], grid[name], rtol=0, atol=1e-12 * scale)
-    for found, found_ in zip(content["participants"], content_["participants"], strict=True):
-        assert found["participant"] == found_["participant"] and found["trials"] == found_["trials"]
-        np.testing.assert_allclose(found_["optimum"]["unit"], found["optimum"]["unit"], atol=1e-7)
+    for person, person_ in zip(content["participants"], content_["participants"], strict=True):
+        assert person["participant"] == person_["participant"] and person["trials"] == person_["trials"]
+        np.testing.assert_allclose(person_["optimum"]["unit"], person["optimum"]["unit"], atol=1e-7)
     np.testing.assert_allclose(content_["optimum"]["unit"], content["optimum"]["unit"], atol=1e-9)
     assert abs(content_["optimum"]["mean"] - content["optimum"]["mean"]) < 1e-12
 

@@ -84,9 +84,9 @@ def test_materials_have_their_own_references(tmp_path):
     folder = tmp_path / "folder"
     (folder / "study.toml").write_text(text + "[materials.hard]\n")
     (folder / "truth.csv").write_text("source,material,K1,B1,alpha\npopulation,soft,5,6,0.2\npopulation,hard,8,6,0.2\n")
-    found = read_folder(folder)
-    assert [m.name for m in found.materials] == ["soft", "hard"] and len(found.limits) == 1
-    soft, hard = found.materials
+    study_folder = read_folder(folder)
+    assert [m.name for m in study_folder.materials] == ["soft", "hard"] and len(study_folder.limits) == 1
+    soft, hard = study_folder.materials
     assert soft.study.space.mechanics.K_eff == 0.3 and hard.study.space.mechanics.K_eff == 0.44
     np.testing.assert_allclose([m.reference[0] for m in (soft, hard)], [4 / 31, 7 / 31])
     strict = read_folder(folder, "trials < 5").materials[0]
@@ -99,8 +99,8 @@ def test_two_validation_tables_are_read_as_one(tmp_path):
     first, second = (VALIDATION + row.format(*cells) for cells in (("A", "a"), ("B", "b")))
     folder = folder_with(tmp_path, trials__csv=HEAD + ROW, **{"validation-1__csv": first, "validation-2__csv": second})
     (material,) = read_folder(folder).materials
-    found = validate(material.validation)
-    assert found.people["wins"].tolist() == [1, 0] and found.comparisons == 2
+    validated = validate(material.validation)
+    assert validated.people["wins"].tolist() == [1, 0] and validated.comparisons == 2
     twice = aggregate_comparisons(
         pd.concat([material.validation] * 2), {"aggregate": "aggregate", "individual:B": "individual:B"}
     )

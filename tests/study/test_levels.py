@@ -120,21 +120,21 @@ def asked(study):
 @settings(deadline=None, max_examples=6)
 def test_levels_in_another_order_have_the_same_covariances(order):
     first, other = surfaces(), surfaces(order)
-    given_, found = (np.asarray(gram(s.gp.kernel, asked(s), asked(s))) for s in (first, other))
-    np.testing.assert_allclose(found, given_, rtol=1e-14)
+    given_, permuted = (np.asarray(gram(s.gp.kernel, asked(s), asked(s))) for s in (first, other))
+    np.testing.assert_allclose(permuted, given_, rtol=1e-14)
 
 
 @pytest.mark.deep  # it compiles a fit
 @pytest.mark.parametrize("order", list(itertools.permutations(TEXTURES))[1:])
 def test_levels_in_another_order_give_the_same_map_and_optimum(order):
-    table, found = answers(), []
+    table, results = answers(), []
     for study in (surfaces(), surfaces(order)):
         aggregate = aggregate_cohort(study, cohort_of(table, study), alternatives=False)
         best = set_of(study.space, aggregate.optimum.x)
-        found.append(
+        results.append(
             (best.pop("texture"), list(best.values()), [np.asarray(m) for m in aggregate.surface(asked(study))])
         )
-    (texture, best, map_), (other_texture, other_best, other_map) = found
+    (texture, best, map_), (other_texture, other_best, other_map) = results
     assert texture == other_texture
     np.testing.assert_allclose(best, other_best, rtol=1e-4)
     np.testing.assert_allclose(map_, other_map, atol=1e-9)
@@ -249,6 +249,6 @@ def test_a_streamed_optimum_tries_the_other_levels():
     best = aggregate_cohort(study, cohort, alternatives=False).optimum
     elsewhere = points[points[:, 1] != float(best.x[1])]
     fitted = refit(population_of_many(study, cohort, distributed.alone()), elsewhere, False)
-    found = optima_from(fitted.population, elsewhere, fitted.sums)["bcm"]
-    assert float(found.x[1]) == float(best.x[1])
-    assert float(found.mean) == pytest.approx(float(best.mean), abs=1e-6)
+    optimum = optima_from(fitted.population, elsewhere, fitted.sums)["bcm"]
+    assert float(optimum.x[1]) == float(best.x[1])
+    assert float(optimum.mean) == pytest.approx(float(best.mean), abs=1e-6)

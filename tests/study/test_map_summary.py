@@ -76,9 +76,9 @@ def test_tolerance_ends_where_close_stops_being_likeliest():
     middle = norm.cdf((0.5 - grid) / spread) - norm.cdf((-0.5 - grid) / spread)
     border = grid[np.argmax(top > middle)]
     reach = np.sqrt((1.2 - border) / 4.0)
-    found = tolerance(study, hill, hill.top, "u")
-    np.testing.assert_allclose([found.low, found.high], [0.5 - reach, 0.5 + reach], atol=1e-5)
-    assert (found.low_end, found.high_end) == ("other answer", "other answer")
+    interval = tolerance(study, hill, hill.top, "u")
+    np.testing.assert_allclose([interval.low, interval.high], [0.5 - reach, 0.5 + reach], atol=1e-5)
+    assert (interval.low_end, interval.high_end) == ("other answer", "other answer")
     physical = tolerance(study, hill, hill.top, "v")
     np.testing.assert_allclose([physical.low, physical.high], [15 - 10 * reach, 15 + 10 * reach], atol=1e-4)
 
@@ -86,8 +86,8 @@ def test_tolerance_ends_where_close_stops_being_likeliest():
 def test_tolerance_ends_at_the_range_and_is_none_where_another_answer_leads():
     study = plain()
     hill = Hill(jnp.array([0.05, 0.5]), jnp.array([5.0, 5.0]))
-    found = tolerance(study, hill, hill.top, "u")
-    assert (found.low, found.low_end, found.high_end) == (0.0, "range", "other answer")
+    interval = tolerance(study, hill, hill.top, "u")
+    assert (interval.low, interval.low_end, interval.high_end) == (0.0, "range", "other answer")
     assert tolerance(study, hill, jnp.array([0.9, 0.5]), "u") is None
 
 
@@ -106,8 +106,8 @@ def test_tolerance_on_the_passive_boundary():
     np.testing.assert_allclose(K1.high, limit, rtol=1e-9)
     assert (K1.low_end, K1.high_end) == ("range", "passive boundary")
     for name in ("B1", "alpha"):
-        found = tolerance(study, hill, x, name)
-        assert found.low < found.high
+        interval = tolerance(study, hill, x, name)
+        assert interval.low < interval.high
         points, feasible = slice_through(study, x, name, jnp.linspace(0.0, 1.0, 201))
         held = np.asarray(points[:, 0])
         assert np.all(held <= x[0]) and held.min() < 0.9 * x[0]

@@ -107,16 +107,16 @@ def test_the_quadratic_finds_a_hill():
     x = rng.uniform(size=(3000, 2))
     eta = 1.5 - 8.0 * (x[:, 0] - 0.4) ** 2 - 4.0 * (x[:, 1] - 0.7) ** 2
     q = (eta + rng.normal(size=3000) > 0.2).astype(int) + (eta + rng.normal(size=3000) > 9.0)
-    found = quadratic(x, q, 3, np.ones(3000, bool))
-    np.testing.assert_allclose(found[:, 0], norm.cdf(0.2 - eta), atol=0.05)
+    probabilities = quadratic(x, q, 3, np.ones(3000, bool))
+    np.testing.assert_allclose(probabilities[:, 0], norm.cdf(0.2 - eta), atol=0.05)
 
 
 def test_the_quadratic_of_separated_answers_and_of_a_parameter_that_nobody_varied():
     x = np.stack([np.linspace(0, 1, 12), np.full(12, 0.5)], axis=1)
     q = (x[:, 0] > 0.5).astype(int)
-    found = quadratic(x, q, 3, np.ones(12, bool))
-    assert np.isfinite(found).all() and (found > 0).all()
-    assert found[0, 0] > 0.9 and found[-1, 1] > 0.9
+    probabilities = quadratic(x, q, 3, np.ones(12, bool))
+    assert np.isfinite(probabilities).all() and (probabilities > 0).all()
+    assert probabilities[0, 0] > 0.9 and probabilities[-1, 1] > 0.9
 
 
 def test_the_quadratics_masses_and_slopes():

@@ -36,9 +36,9 @@ def test_a_file_that_is_written_says_what_was_asked_for(tmp_path_factory, name, 
         return
     file = tmp_path_factory.mktemp("new") / "study.toml"
     file.write_text(text, encoding="utf-8", newline="")
-    found = StudyFile.load(file)
-    assert (found.name, found.space.parameters, found.responses) == (name, parameters, tuple(responses))
-    assert found.selection.trials == trials and found.stimulus is not None
+    loaded = StudyFile.load(file)
+    assert (loaded.name, loaded.space.parameters, loaded.responses) == (name, parameters, tuple(responses))
+    assert loaded.selection.trials == trials and loaded.stimulus is not None
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ def test_a_constraint_s_own_words_are_read_as_it(weights, least, over):
         return
     terms = tuple(zip(("a", "b c"), (float(f"{weight:g}") for weight in weights), strict=True))
     stated = Constraint(terms, least, most)
-    found = constraint_of(stated.words, ["a", "b c"])
-    assert found == stated
+    constraint = constraint_of(stated.words, ["a", "b c"])
+    assert constraint == stated
 
 
 def test_the_file_of_a_device_is_one_that_a_device_renders(tmp_path):

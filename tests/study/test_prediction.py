@@ -82,12 +82,12 @@ X = np.array([[0.25, (12 - 10) / 10], [1.0, 1.0]])
 
 
 def check_predicted(model, moments, chances):
-    found = predict_table(STUDY, model, ASK)
-    assert list(found.columns) == ["v", "u", "name", "mean", "sd", *(f"P({r})" for r in STUDY.responses)]
-    assert list(found.index) == ["r1", "r2"] and list(ASK.columns) == ["v", "u", "name"]
-    np.testing.assert_allclose(found["mean"], moments[0], rtol=1e-12)
-    np.testing.assert_allclose(found["sd"] ** 2, moments[1], rtol=1e-12)
-    np.testing.assert_allclose(found.iloc[:, 5:], chances, rtol=1e-12)
+    predicted = predict_table(STUDY, model, ASK)
+    assert list(predicted.columns) == ["v", "u", "name", "mean", "sd", *(f"P({r})" for r in STUDY.responses)]
+    assert list(predicted.index) == ["r1", "r2"] and list(ASK.columns) == ["v", "u", "name"]
+    np.testing.assert_allclose(predicted["mean"], moments[0], rtol=1e-12)
+    np.testing.assert_allclose(predicted["sd"] ** 2, moments[1], rtol=1e-12)
+    np.testing.assert_allclose(predicted.iloc[:, 5:], chances, rtol=1e-12)
 
 
 def test_predictions_in_physical_units_are_those_of_the_unit_cube(one):

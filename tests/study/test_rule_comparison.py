@@ -25,10 +25,10 @@ def test_everything_is_compared_and_written(tmp_path):
     assert json.loads((tmp_path / "comparison.json").read_text()) == content
     assert set(content["rules"]) == {*GIVEN_RULES, RECOMMENDED}
     assert content["rules"][RECOMMENDED]["hyperparameters"] == "learnt in each fold"
-    for found in content["rules"].values():
-        assert found["negative_log_density"] > 0 and 0 <= found["central_95"] <= 1 and 0 <= found["covered"] <= 1
-        assert set(found["influence"]) == {"P0", "P1", "P2", "P3"}
-        assert set(found["optimum"]) == {"p0", "p1"}
+    for scores in content["rules"].values():
+        assert scores["negative_log_density"] > 0 and 0 <= scores["central_95"] <= 1 and 0 <= scores["covered"] <= 1
+        assert set(scores["influence"]) == {"P0", "P1", "P2", "P3"}
+        assert set(scores["optimum"]) == {"p0", "p1"}
     assert content["rules"]["pooled"]["agreement_with_pooled"] == pytest.approx(1.0)
     assert content["rules"]["rbcm"]["covered"] < 1 and content["rules"]["average"]["covered"] < 1
     for rule in ("bcm", "hierarchical", "pooled"):
@@ -55,7 +55,7 @@ def share(mean, against):
     return Share(shares, curve, one, one, ends, jnp.zeros(()), jnp.asarray(True))
 
 
-def advice(found, people=12, spread=0.5, paired=0.01, **costs):
+def advice(learnt, people=12, spread=0.5, paired=0.01, **costs):
     """With these mean costs; people differ by `spread` in all rules alike, and by `paired` between rules."""
     rng = np.random.default_rng(0)
     person = np.repeat(np.arange(people), 5)
@@ -69,7 +69,7 @@ def advice(found, people=12, spread=0.5, paired=0.01, **costs):
         cost = (mean + common + (noise(paired) if rule == "hierarchical" else 0.0))[person]
         probabilities = np.stack([np.exp(-cost), 1 - np.exp(-cost)], axis=1)
         left[rule] = LeftOut(person, np.zeros(len(person), int), probabilities)
-    return recommendation(left, {rule: calibration(each) for rule, each in left.items()}, found, people)
+    return recommendation(left, {rule: calibration(each) for rule, each in left.items()}, learnt, people)
 
 
 def test_the_best_is_recommended_where_the_others_are_worse():

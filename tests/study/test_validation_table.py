@@ -19,27 +19,27 @@ def write(tmp_path, *rows, head=HEAD):
 
 
 def test_names_letters_ranks_and_ties_are_read(tmp_path):
-    found = read_validation(write(tmp_path, *GOOD))
-    assert list(found["preferred"]) == ["best", "tie", "i1"] and list(found["first"]) == ["mid", "mid", ""]
-    assert list(found["class_a"]) == ["close", "similar", ""] and list(found["class_b"]) == ["similar", "different", ""]
-    assert list(found["trial"]) == [1, 2, 1]
+    rows = read_validation(write(tmp_path, *GOOD))
+    assert list(rows["preferred"]) == ["best", "tie", "i1"] and list(rows["first"]) == ["mid", "mid", ""]
+    assert list(rows["class_a"]) == ["close", "similar", ""] and list(rows["class_b"]) == ["similar", "different", ""]
+    assert list(rows["trial"]) == [1, 2, 1]
 
 
 def test_a_table_made_in_memory_is_the_same(tmp_path):
-    found = read_validation(write(tmp_path, *GOOD))
+    rows = read_validation(write(tmp_path, *GOOD))
     table = pd.DataFrame([row.split(",") for row in GOOD], columns=HEAD.split(",")).replace("", None)
     table["trial"] = table["trial"].astype(int)
     again = check_validation(table)
-    pd.testing.assert_frame_equal(found.reset_index(drop=True), again, check_dtype=False)
+    pd.testing.assert_frame_equal(rows.reset_index(drop=True), again, check_dtype=False)
     pd.testing.assert_frame_equal(check_validation(again), again)
 
 
 def test_parquet_is_the_same(tmp_path):
-    found = read_validation(write(tmp_path, *GOOD))
-    found.assign(first=float("nan")).to_parquet(tmp_path / "table.parquet")
+    rows = read_validation(write(tmp_path, *GOOD))
+    rows.assign(first=float("nan")).to_parquet(tmp_path / "table.parquet")
     again = read_validation(tmp_path / "table.parquet")
     assert list(again["first"]) == ["", "", ""]
-    pd.testing.assert_frame_equal(again.drop(columns="first"), found.drop(columns="first").set_axis([1, 2, 3]))
+    pd.testing.assert_frame_equal(again.drop(columns="first"), rows.drop(columns="first").set_axis([1, 2, 3]))
 
 
 def test_a_material_is_chosen(tmp_path):
@@ -97,10 +97,10 @@ def test_ranks_are_refused_where_a_label_is_a_number(tmp_path):
 
 
 def test_sets_are_read(tmp_path):
-    found = sets_frame(
+    sets = sets_frame(
         write(tmp_path, "best,aggregate,5.58,101,0.001", "i1,individual:P1,4,101,0.001", head=SETS), ["K1"]
     )
-    assert found.at["best", "K1"] == 5.58 and found.at["i1", "N"] == 101 and found.at["i1", "T"] == 0.001
+    assert sets.at["best", "K1"] == 5.58 and sets.at["i1", "N"] == 101 and sets.at["i1", "T"] == 0.001
 
 
 @pytest.mark.parametrize(

@@ -110,6 +110,6 @@ def emulate(recording: bytes, folder: Path, cpu: str) -> tuple[str, np.ndarray, 
         calls, _, _, longest = map(int, frames.split())
         cost = [round(value / COUNTS_PER_INSTRUCTION) for value in (least, mean, most, longest)]
         sections[name] = Section(count, *cost[:3], calls, cost[3])
-    found = re.search(r"(all .*)\nstack (\d+)", said)
-    assert found, said
-    return found[1], np.fromfile(target, "<u4"), sections, int(found[2])
+    totals = re.search(r"(all .*)\nstack (\d+)", said)
+    assert totals, said
+    return totals[1], np.fromfile(target, "<u4"), sections, int(totals[2])

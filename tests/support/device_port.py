@@ -39,10 +39,10 @@ COMPILERS = ("gcc", "clang")
 
 def program(name: str, compiler: str | None = None) -> Path:
     """A host program, up to date, by this compiler or the first that is here. Skips without one, or without make."""
-    found = [known for known in COMPILERS if shutil.which(known) and compiler in (None, known)]
-    if not found or not shutil.which("make"):
+    compilers = [known for known in COMPILERS if shutil.which(known) and compiler in (None, known)]
+    if not compilers or not shutil.which("make"):
         pytest.skip(f"the device's programs need make and {compiler or 'a C compiler'} (Debian: make, gcc, clang)")
-    return _made(f"{found[0]}/{name}")
+    return _made(f"{compilers[0]}/{name}")
 
 
 def image(name: str, cpu: str) -> Path:
@@ -127,10 +127,10 @@ class Talk:
 
     def listen(self, patience: float = 1.0) -> list[Answer]:
         """The next frames that come, within about `patience` s; none if the line is silent."""
-        found: list[Answer] = []
-        while not found and select.select([self.file], [], [], patience)[0]:
-            found = self._read()
-        return found
+        answers: list[Answer] = []
+        while not answers and select.select([self.file], [], [], patience)[0]:
+            answers = self._read()
+        return answers
 
     def _read(self) -> list[Answer]:
         *frames, self.rest = (self.rest + os.read(self.file, 65536)).split(b"\0")

@@ -31,8 +31,8 @@ def check_grad(fn: Callable, *args, rtol: float = 1e-6, atol: float = 0.0) -> No
     for place, (forward, reverse) in enumerate(derivatives):
         expected = _central_differences(fn, args, place)
         bound = atol + rtol * np.max(np.abs(expected), initial=0.0)
-        for mode, found in (("jacfwd", forward), ("jacrev", reverse)):
-            np.testing.assert_allclose(found, expected, rtol=0, atol=bound, err_msg=f"{mode}, argument {place}")
+        for mode, derivative in (("jacfwd", forward), ("jacrev", reverse)):
+            np.testing.assert_allclose(derivative, expected, rtol=0, atol=bound, err_msg=f"{mode}, argument {place}")
 
 
 def _central_differences(fn: Callable, args: tuple, place: int) -> np.ndarray:

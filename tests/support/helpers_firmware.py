@@ -77,12 +77,12 @@ def unpack(name: str, payload: bytes) -> dict:
     """Fields of a message, and `repeated`, a list of tuples."""
     head, tail, optional = FIELDS[name]
     size = struct.calcsize(_code(head))
-    found = dict(zip((field for field, _ in head), struct.unpack(_code(head), payload[:size]), strict=True))
-    if optional and found["fields"] & 1:
+    fields = dict(zip((field for field, _ in head), struct.unpack(_code(head), payload[:size]), strict=True))
+    if optional and fields["fields"] & 1:
         tail = tail + optional
-    found["repeated"] = list(struct.iter_unpack(_code(tail), payload[size:])) if tail else []
+    fields["repeated"] = list(struct.iter_unpack(_code(tail), payload[size:])) if tail else []
     assert tail or len(payload) == size
-    return found
+    return fields
 
 
 def cobs(body: bytes) -> bytes:
@@ -110,10 +110,10 @@ def decode(encoded: bytes) -> tuple[int, int, bytes]:
 
 def compiler() -> str:
     """The C compiler; without one the test is skipped."""
-    found = os.environ.get("CC") or next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
-    if found is None:
+    path = os.environ.get("CC") or next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
+    if path is None:
         pytest.skip("there is no C compiler: install gcc or clang")
-    return found
+    return path
 
 
 def build(

@@ -35,7 +35,7 @@ def loads(T=1e-3, hold=3.0):
 def foam_tests(repeats=1, N=101, parameters=FOAM, noise=0.0, rho=0.0, seed=0, hold=3.0):
     """Relaxation and creep; `noise` of the range, AR(1) with `rho`, in each repeat."""
     (t, x), (u, F) = loads(hold=hold)
-    rng, found = np.random.default_rng(seed), []
+    rng, tests = np.random.default_rng(seed), []
     for kind, time, put, out in (
         ("relaxation", t, x, force(parameters, x, N)),
         ("creep", u, F, position(parameters, F, N)),
@@ -43,5 +43,5 @@ def foam_tests(repeats=1, N=101, parameters=FOAM, noise=0.0, rho=0.0, seed=0, ho
         fresh = rng.standard_normal((repeats, time.size))
         fresh[:, 1:] *= np.sqrt(1 - rho**2)
         errors = noise * np.ptp(out) * lfilter([1.0], [1.0, -rho], fresh, axis=1)
-        found.append(Test(kind, time, out + errors, np.tile(put, (repeats, 1))))
-    return found
+        tests.append(Test(kind, time, out + errors, np.tile(put, (repeats, 1))))
+    return tests

@@ -115,12 +115,12 @@ def genz(data, replicates=12, seed=0):
     lower, upper = _edges(data)
     matrix = gram(data.x, data.x, data.theta, data.variance) + data.noise**2 * np.eye(len(lower))
     normal = multivariate_normal(np.zeros(len(lower)), matrix)
-    found = [
+    probabilities = [
         multivariate_normal.cdf(
             upper, mean=normal.mean, cov=matrix, lower_limit=lower, maxpts=40000, abseps=0, releps=1e-6,
             rng=np.random.default_rng([seed, r]),
         )
         for r in range(replicates)
     ]  # fmt: skip
-    mean = np.mean(found)
-    return np.log(mean), np.std(found, ddof=1) / np.sqrt(replicates) / mean
+    mean = np.mean(probabilities)
+    return np.log(mean), np.std(probabilities, ddof=1) / np.sqrt(replicates) / mean

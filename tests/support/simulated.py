@@ -54,7 +54,7 @@ class FaultyPort:
         self.port.close()
 
     def _damaged(self, data):
-        found = bytearray()
+        damaged = bytearray()
         for byte in data:
             kind = self.random.random() / self.rate if self.rate else 1.0
             self.faults += kind < 1
@@ -62,7 +62,7 @@ class FaultyPort:
                 continue
             if kind < 2 / 3:
                 byte ^= 1 << self.random.randrange(8)
-            found.append(byte)
+            damaged.append(byte)
             if 2 / 3 <= kind < 1:
-                found.append(self.random.randrange(256))
-        return bytes(found)
+                damaged.append(self.random.randrange(256))
+        return bytes(damaged)

@@ -30,8 +30,8 @@ class Person:
 
     def distance(self, values: Mapping[str, float]) -> float:
         """From the reference, in natural logarithms: 0.1 is a tenth deeper or less deep."""
-        found = _curve(*(values[name] for name in NAMES))
-        return float(jnp.sqrt(jnp.mean((found - self._reference) ** 2)))
+        curve = _curve(*(values[name] for name in NAMES))
+        return float(jnp.sqrt(jnp.mean((curve - self._reference) ** 2)))
 
     def __call__(self, values: Mapping[str, float]) -> str:
         distance = self.distance(values)
