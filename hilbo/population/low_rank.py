@@ -43,7 +43,6 @@ __all__ = [
     "System",
     "evidence_at",
     "mode_of",
-    "newton_step",
     "prior_of",
     "shared_evidence",
     "system_at",
@@ -130,19 +129,20 @@ def _expand(model: PeopleModel, answers: Tallies, eta: Float[Array, "M n"]) -> E
 
 class Mode(NamedTuple):
     weights: Float[Array, "M n"]
+    further: Float[Array, "M n"]
+    """Where one more of Newton's steps ends."""
     residual: Float[Array, ""]
     tolerance: Float[Array, ""]
     steps: Int[Array, ""]
 
 
-def newton_step(
-    model: PeopleModel, answers: Tallies, prior: LowRankPrior, weights: Float[Array, "M n"]
-) -> tuple[Float[Array, "M n"], System]:
-    """a + r - (K + W^-1)^-1 K r, r = slope - a: an error of the step is one of r's size."""
-    terms = _expand(model, answers, prior.times(weights))
-    system = system_at(prior, terms.curvature)
-    off = terms.slope - weights
-    return weights + off - system.solve(prior.times(off)), system
+def _newton_step(
+    prior: LowRankPrior, system: System, slope: Float[Array, "M n"], weights: Float[Array, "M n"]
+) -> Float[Array, "M n"]:
+    """a + r - (K + W^-1)^-1 K r, r = slope - a: an error of the step is one of r's size. `system` and `slope`, of the
+    log-likelihood, are those at the weights."""
+    off = slope - weights
+    return weights + off - system.solve(prior.times(off))
 
 
 class _Height(NamedTuple):
@@ -155,19 +155,20 @@ class _Height(NamedTuple):
 
 
 class _Search(NamedTuple):
+    """The highest weights so far, and what is tried next: a part of the way to where Newton's step ends."""
+
     weights: Float[Array, "M n"]
     height: _Height
     steps: Int[Array, ""]
-    risen: Bool[Array, ""]  # whether the last step did not fall
+    full: Float[Array, "M n"]
+    part: Float[Array, ""]
 
 
 def _height(
-    model: PeopleModel, answers: Tallies, prior: LowRankPrior, sizes: LowRankPrior, weights: Float[Array, "M n"]
+    prior: LowRankPrior, sizes: LowRankPrior, terms: Expansion, eta: Float[Array, "M n"], weights: Float[Array, "M n"]
 ) -> _Height:
     """`sizes`: of the numbers of the prior, because latent values are sums whose terms may cancel."""
     epsilon = jnp.finfo(weights.dtype).eps
-    eta = prior.times(weights)
-    terms = _expand(model, answers, eta)
     value, size = jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta), jnp.sum(jnp.abs(terms.value))
     off = terms.slope - weights
     summed = terms.slopes + terms.curvature * sizes.times(jnp.abs(weights)) + jnp.abs(weights)
@@ -179,37 +180,39 @@ def _height(
 
 
 def mode_of(model: PeopleModel, answers: Tallies, prior: LowRankPrior, start: Float[Array, "M n"]) -> Mode:
-    """Newton's steps on the weights, from `start`; the residual is that of `laplace`."""
-    epsilon = jnp.finfo(start.dtype).eps
-    height = partial(_height, model, answers, prior, jax.tree.map(jnp.abs, prior))
+    """Newton's steps on the weights, from `start`, each halved until the log posterior does not fall; the residual is
+    that of `laplace`. The likelihood is expanded at one place of the program, which compiles so much the sooner: the
+    start is tried as a first step is, from nowhere."""
+    epsilon, sizes = jnp.finfo(start.dtype).eps, jax.tree.map(jnp.abs, prior)
 
     def going(search):
         here = search.height
-        return search.risen & (here.residual > here.tolerance) & (search.steps < _STEPS)
+        return (here.residual > here.tolerance) & (search.steps < _STEPS) & (search.part > 0.5 ** (_HALVINGS + 1))
 
     def forward(search):
-        weights, here = search.weights, search.height
-        full, _ = newton_step(model, answers, prior, weights)
+        weights, here, steps, full, part = search
+        trial = jnp.where(part == 1.0, full, weights + part * (full - weights))
+        eta = prior.times(trial)
+        terms = _expand(model, answers, eta)
+        reached = _height(prior, sizes, terms, eta, trial)
+        not_below = reached.value >= here.value - 8.0 * epsilon * here.size
+        weights, here, part, steps = jax.tree.map(
+            lambda new, old: jnp.where(not_below, new, old),
+            (trial, reached, jnp.ones_like(part), steps + 1),
+            (weights, here, 0.5 * part, steps),
+        )
+        full = jax.lax.cond(
+            not_below,
+            lambda: _newton_step(prior, system_at(prior, terms.curvature), terms.slope, trial),
+            lambda: full,
+        )
+        return _Search(weights, here, steps, full, part)
 
-        def not_below(reached):
-            return reached.value >= here.value - 8.0 * epsilon * here.size
-
-        def lower(trial):
-            scale, reached = trial
-            return ~not_below(reached) & (scale > 0.5**_HALVINGS)
-
-        def shorter(trial):
-            scale = 0.5 * trial[0]
-            return scale, height(weights + scale * (full - weights))
-
-        scale, reached = jax.lax.while_loop(lower, shorter, (jnp.ones_like(here.value), height(full)))
-        risen = not_below(reached)
-        moved = jnp.where(scale == 1.0, full, weights + scale * (full - weights))
-        kept = jax.tree.map(lambda new, old: jnp.where(risen, new, old), (moved, reached), (weights, here))
-        return _Search(kept[0], kept[1], search.steps + 1, risen)
-
-    end = jax.lax.while_loop(going, forward, _Search(start, height(start), jnp.asarray(0), jnp.asarray(True)))
-    return Mode(end.weights, end.height.residual, end.height.tolerance, end.steps)
+    infinite = jnp.full_like(start[0, 0], jnp.inf)
+    nowhere = _Height(-infinite, jnp.zeros_like(infinite), infinite, jnp.zeros_like(infinite))
+    begin = _Search(start, nowhere, jnp.asarray(-1), start, jnp.ones_like(infinite))
+    end = jax.lax.while_loop(going, forward, begin)
+    return Mode(end.weights, end.full, end.height.residual, end.height.tolerance, end.steps)
 
 
 class SharedEvidence(NamedTuple):
@@ -242,8 +245,7 @@ def shared_evidence(
     pivots = pivots_of(still(unit), answers, rank, tolerance)
     prior = prior_of(model, answers, pivots)
     mode = still(mode_of(still(model), answers, still(prior), start))
-    weights, _ = still(newton_step(still(model), answers, still(prior), mode.weights))
-    value = _evidence_at_mode(model, answers, prior, weights)
+    value = _evidence_at_mode(model, answers, prior, mode.further)
     arrived = (mode.residual <= mode.tolerance) & jnp.isfinite(value)
     return SharedEvidence(value, mode.weights, arrived, pivots.left)
 

@@ -15,7 +15,7 @@ from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
-from hilbo.population.low_rank import System, evidence_at, mode_of, newton_step, prior_of
+from hilbo.population.low_rank import System, evidence_at, mode_of, prior_of
 from hilbo.population.people_model import PeopleModel
 from hilbo.population.shared_features import TOLERANCE, pivots_of, root_of_pivots
 from hilbo.population.tallies import Tallies
@@ -67,8 +67,7 @@ def shared_function(
     mode = mode_of(model, answers, prior, start)
     value, system = evidence_at(model, answers, prior, mode.weights)
     # One step more changes the evidence by what is left of the way, or more.
-    further, _ = newton_step(model, answers, prior, mode.weights)
-    error = jnp.abs(evidence_at(model, answers, prior, further)[0] - value)
+    error = jnp.abs(evidence_at(model, answers, prior, mode.further)[0] - value)
 
     root = jnp.sqrt(model.shared) * root_of_pivots(model.unit, pivots)
     together = jnp.einsum("jnr,jn->r", prior.features, mode.weights)
