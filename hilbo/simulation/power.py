@@ -156,11 +156,11 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
     points = candidates[:_POINTS]
     truth = np.asarray(study.space.to_unit(np.array([population_.truth[name] for name in study.space.names])))
     target = top_probability(people(study, population_, _CROWD, 0), len(study.responses), np.asarray(points))
-    rows = []
-    for count in plan.trials:
+    rows = {}
+    for count in _turned(plan.trials, index):
         so_far = cohort.first(count)
         posteriors = None if study.rule in RECIPES else fit_cohort(staged, so_far)
-        for m in plan.participants:
+        for m in _turned(plan.participants, index):
             some, given = jax.tree.map(lambda leaf, m=m: leaf[:m], (posteriors, so_far.trials))
             judged = resolved(study, so_far.rows(np.arange(m)))
             if judged.learnt is None:
@@ -169,8 +169,15 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
                 map_ = learnt_map(judged.learnt, given)
             x = np.asarray(map_optimum(judged, map_, candidates).x)
             probabilities = np.asarray(_map_top_probability(judged, map_, points))
-            rows.append((index, m, count, _rms(differences(persons.levels, x, truth)), _rms(probabilities - target)))
-    return pd.DataFrame(rows, columns=["study", "participants", "trials", "optimum", "map"])
+            rows[m, count] = _rms(differences(persons.levels, x, truth)), _rms(probabilities - target)
+    cells = [(index, m, count, *rows[m, count]) for count in plan.trials for m in plan.participants]
+    return pd.DataFrame(cells, columns=["study", "participants", "trials", "optimum", "map"])
+
+
+def _turned(numbers: tuple[int, ...], index: int) -> tuple[int, ...]:
+    """The other way round in every second study: two processes at work take half of the compiled programs each from
+    the other."""
+    return numbers[:: -1 if index % 2 else 1]
 
 
 def _rms(difference: Float[np.ndarray, "..."]) -> float:
