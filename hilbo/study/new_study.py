@@ -55,6 +55,12 @@ ready = "That was the warm-up. Would you like another one, or shall we begin?"
 again = "Let us do this one again."
 """
 _ATTRIBUTE = "perceived realism"
+_LEARNT = (
+    "# In place of [gp], all of it is learnt from the answers by these lines, and the optimum is nearer to what people",
+    "# like best (docs/methods/which_method.md). As it is, optima are aggregated by the paper's rule, bcm.",
+    "# [aggregation]",
+    '# rule = "learnt-2"',
+)
 _DEFINITIONS = {
     "different": "The test is clearly different from the reference.",
     "similar": "The test is somewhat like the reference.",
@@ -118,11 +124,13 @@ def study_text(new: NewStudy) -> str:
             *(line for p in parameters for line in _table(p)),
             *(line for constraint in constraints for line in _wall(constraint)),
             _presenting(new, parameters),
-            _line("[gp]", "what is believed of people before any answer; rule learnt-2 learns it"),
+            _line("[gp]", "what is believed of people before any answer"),
             _line(f"length = {0.13 if new.device else 0.22}", "over what part of a range answers change"),
             "variance = 1.0",
             _line(f"thresholds = {_thresholds(len(new.responses))}", "between one answer and the next"),
             _line("noise = 0.5", "how much one answer to the same thing differs from another"),
+            "",
+            *_LEARNT,
             "",
             "[selection]",
             _line(f"space_filling = {min(5, new.trials)}", "trials spread over the ranges, before any is chosen"),
