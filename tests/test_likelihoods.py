@@ -301,8 +301,9 @@ def test_two_categories_are_the_probit():
     f = jnp.linspace(-30.0, 30.0, 61)
     for q, sign in ((0, -1.0), (1, 1.0)):
         expected = log_ndtr(sign * (np.asarray(f) - 0.2) / 0.8)
-        # Beyond 37 sd log p is subnormal: its digits end above 1e-12, and a compiler may take it for 0.
-        np.testing.assert_allclose(probit(f, q), expected, rtol=1e-12, atol=np.finfo(float).tiny)
+        computed = np.asarray(probit(f, q))
+        zeroed = (np.abs(expected) < np.finfo(float).tiny) & (computed == 0.0)  # as older XLA does to subnormals
+        np.testing.assert_allclose(computed[~zeroed], expected[~zeroed], rtol=1e-12)
 
 
 @pytest.mark.parametrize(("thresholds", "noise"), [((0.5, -0.5), 0.5), ((-0.5, 0.5), -0.5), ((-0.5, 0.5), 0.0)])

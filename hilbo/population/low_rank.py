@@ -160,8 +160,8 @@ class _Search(NamedTuple):
     weights: Float[Array, "M n"]
     height: _Height
     steps: Int[Array, ""]
-    full: Float[Array, "M n"]
-    part: Float[Array, ""]
+    full: Float[Array, "M n"]  # where Newton's step ends
+    part: Float[Array, ""]  # of the way there
 
 
 def _height(
@@ -181,8 +181,8 @@ def _height(
 
 def mode_of(model: PeopleModel, answers: Tallies, prior: LowRankPrior, start: Float[Array, "M n"]) -> Mode:
     """Newton's steps on the weights, from `start`, each halved until the log posterior does not fall; the residual is
-    that of `laplace`. The likelihood is expanded at one place of the program, which compiles so much the sooner: the
-    start is tried as a first step is, from nowhere."""
+    that of `laplace`. The likelihood is expanded at one place of the program, because each place takes time to compile:
+    the start is evaluated as a first step, from a log posterior of minus infinity."""
     epsilon, sizes = jnp.finfo(start.dtype).eps, jax.tree.map(jnp.abs, prior)
 
     def going(search):

@@ -175,8 +175,8 @@ def one_study(study: Study, population_: Population, plan: Plan, index: int) -> 
 
 
 def _turned(numbers: tuple[int, ...], index: int) -> tuple[int, ...]:
-    """The other way round in every second study: two processes at work take half of the compiled programs each from
-    the other."""
+    """Reversed in every second study: two processes that begin at opposite ends compile half of the programs each, and
+    load the others."""
     return numbers[:: -1 if index % 2 else 1]
 
 

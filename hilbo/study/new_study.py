@@ -56,8 +56,8 @@ again = "Let us do this one again."
 """
 _ATTRIBUTE = "perceived realism"
 _LEARNT = (
-    "# In place of [gp], all of it is learnt from the answers by these lines, and the optimum is nearer to what people",
-    "# like best (docs/methods/which_method.md). As it is, optima are aggregated by the paper's rule, bcm.",
+    "# With these lines in place of [gp] all of it is learnt from the answers: in simulated studies the optimum",
+    "# is then nearer to what people like best (docs/methods/which_method.md). As it is, the rule is the paper's, bcm.",
     "# [aggregation]",
     '# rule = "learnt-2"',
 )

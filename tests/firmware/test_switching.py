@@ -72,7 +72,7 @@ def switch(lib, counts, old, new) -> tuple[np.ndarray, np.ndarray, int]:
 @pytest.mark.parametrize("count", [5, pytest.param(20, marks=pytest.mark.deep)])
 def test_all_pairs_of_passive_sets_on_four_motions(count):
     """Step per tick at most the larger of the two sets' own plus the slew limit; then the new set, to 1e-4."""
-    lib, sets, gone = library(build()), passive_sets(count), {}
+    lib, sets, fades_of = library(build()), passive_sets(count), {}
     x = np.stack([np.maximum(counts, 0) for counts in motions().values()]) * STEP.astype(float)
     first, late = (np.asarray(part) for part in alone(jnp.asarray(sets, float), jnp.asarray(x)))
     largest = 1e-4 * np.max(np.abs(first))
@@ -89,8 +89,8 @@ def test_all_pairs_of_passive_sets_on_four_motions(count):
             np.testing.assert_allclose(forces[end:], other[end:], rtol=0, atol=largest)
             jump = abs(own[flip] - other[flip])
             assert fading.size <= 2 + jump / (SLEW / 1000 - np.max(np.abs(np.diff(other[flip:]))))
-            gone.setdefault(name, []).append((fading.size, jump))
-    for name, fades in gone.items():
+            fades_of.setdefault(name, []).append((fading.size, jump))
+    for name, fades in fades_of.items():
         ticks, jumps = np.array(fades).T
         late = f"gone after {ticks.max():.0f} ticks, median {np.median(ticks):.0f}"
         print(f"{name}: differences up to {jumps.max():.2f} N, {late}")
