@@ -225,6 +225,15 @@ def test_nothing_is_lost_far_outside(dtype, noise):
     np.testing.assert_allclose(scaled[wrong], 1.0, rtol=1e-5)
 
 
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_a_certain_answer_is_finite_without_the_compilers_help(dtype):
+    """Operation by operation: XLA makes one exponential of two factors, which hides that they are 0 and infinite."""
+    likelihood = OrdinalProbit(np.array([-0.3, 0.4], dtype), dtype(1.0))
+    f = -(10 ** np.random.default_rng(4).uniform(2, 7, 50)).astype(dtype)
+    with jax.disable_jit():
+        assert all(np.all(value == 0) for value in jax.vmap(likelihood.expand, in_axes=(0, None))(f, 0))
+
+
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-15), (np.float32, 1e-6)])
 @pytest.mark.parametrize(
     "categories", [pytest.param(count, marks=[pytest.mark.deep] * (count not in (2, 3, 10))) for count in range(2, 11)]

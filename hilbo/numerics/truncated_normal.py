@@ -213,7 +213,8 @@ def _centre(
 ) -> TruncatedNormal:
     """low < 0 <= high, -low <= high: the mass outside is a sum of tails, so log p = log1p(-outside) is precise."""
     short, rest = jnp.abs(low.short), jnp.where(low.short < 0, -low.rest, low.rest)
-    density = jnp.exp(-0.5 * short**2) * jnp.exp(-rest * (short + 0.5 * rest) - HALF_LOG_2PI)
+    # One exponent, not a product of two: far out the first would be 0 and the second infinite.
+    density = jnp.exp(-0.5 * short**2 - rest * (short + 0.5 * rest) - HALF_LOG_2PI)
     bounded = ~jnp.isinf(edges.high)
     hazard = edges.low + excesses.low
     hazard_high = jnp.where(bounded, edges.high, 1.0) + excesses.high

@@ -178,11 +178,11 @@ def test_groups_are_what_arviz_reads(tmp_path):
     assert observed.sum() == pytest.approx(1.0) and predicted.shape == (4000, 3)
     write_groups(inference_data, tmp_path / "inference.nc")
     read = az.from_netcdf(tmp_path / "inference.nc", engine="h5netcdf")
-    assert {"posterior", "posterior_predictive", "observed_data", "log_likelihood", "constant_data"} <= set(
-        read.groups()
-    )
+    names = read.groups() if callable(read.groups) else [path.strip("/") for path in read.groups]  # ArviZ 0 or 1
+    assert {"posterior", "posterior_predictive", "observed_data", "log_likelihood", "constant_data"} <= set(names)
     with pytest.warns(UserWarning, match="Pareto"):  # four answers of somebody: each weighs much
-        assert np.isfinite(az.loo(read).elpd_loo)
+        loo = az.loo(read)
+    assert np.isfinite(getattr(loo, "elpd", None) or loo.elpd_loo)
     tree = xr.open_datatree(tmp_path / "inference.nc", engine="h5netcdf")
     np.testing.assert_array_equal(tree["constant_data"]["u"].values[0], cohort.physical[0, :, 0])
     tree.close()
