@@ -168,8 +168,8 @@ GROUPS = {
     "functions drawn": lambda name: name.startswith("functions"),
     "all": lambda name: True,
 }
-ENOUGH = 10  # studies for a row of a population's own
-EVEN = 3  # studies of each population that a group counts, so that one with more has no greater weight
+ENOUGH, MANY = 10, 100  # studies for a row of a population's own among the regrets, and in the other tables
+EVEN = {"24x25": 10, "12x15": 3}  # studies of each population that a group counts, whatever more one has
 
 
 def interval(values, digits=3):
@@ -182,14 +182,16 @@ def values_of(rows, rule, measure="regret"):
     return np.array([row["rules"][rule][measure] for row in rows])
 
 
-def tables(rows):
+def tables(rows, even):
     """Of the rows of one design: regret by rule, paired differences, and what the recommended recipe says of itself."""
-    even = [row for row in rows if row["seed"] < FIRST + EVEN]
+    even = [row for row in rows if row["seed"] < FIRST + even]
     parts = {group: [row for row in even if belongs(row["population"])] for group, belongs in GROUPS.items()}
     own = {name: [row for row in rows if row["population"] == name] for name in POPULATIONS}
     parts = {name: part for name, part in parts.items() if len(part) > 1}
-    parts |= {f"`{name}`": part for name, part in own.items() if len(part) >= ENOUGH}
-    return "\n\n".join((regrets(parts), differences(parts), itself(parts)))
+    enough, many = (
+        parts | {f"`{name}`": part for name, part in own.items() if len(part) >= count} for count in (ENOUGH, MANY)
+    )
+    return "\n\n".join((regrets(enough), differences(many), itself(many)))
 
 
 def lined(heads, lines):
@@ -198,11 +200,13 @@ def lined(heads, lines):
 
 
 def regrets(parts):
-    heads = ["regret: populations", "studies", *RULES]
-    return lined(
-        heads,
-        ([name, str(len(part)), *(interval(values_of(part, rule)) for rule in RULES)] for name, part in parts.items()),
-    )
+    heads = ["regret: populations", "studies", *RULES, f"{RECOMMENDED} / bcm"]
+    lines = []
+    for name, part in parts.items():
+        mean = {rule: values_of(part, rule).mean() for rule in (RECOMMENDED, "bcm")}
+        of_rules = [interval(values_of(part, rule)) for rule in RULES]
+        lines.append([name, str(len(part)), *of_rules, f"{mean[RECOMMENDED] / mean['bcm']:.2f}"])
+    return lined(heads, lines)
 
 
 def differences(parts):
@@ -243,7 +247,7 @@ def itself(parts):
 
 def write(rows):
     for design in sorted({row["design"] for row in rows}):
-        text = tables([row for row in rows if row["design"] == design])
+        text = tables([row for row in rows if row["design"] == design], EVEN[design])
         put("methods/which_method.md", f"populations {design}", text)
 
 

@@ -1,9 +1,11 @@
 """Does the model fit? What a study's rule predicts of people it has not seen, beside what they answered.
 
 Everybody who answered is left out once, alone or in a group where people are many or folds dear, and predicted from the
-others; the hyperparameters stay. Compared are the shares of the answers (of all, of everybody, and of the thirds of a
-session), how often repeated renderings get the same answer, and the density of the answers beside that of two
-predictions that know nothing of maps (`hilbo.population.baselines`). Errors are clustered by person.
+others' answers and, answer by answer, from their own earlier ones: a session chooses renderings by these, so without
+them a model that fits would seem not to. The hyperparameters stay. Compared are the shares of the answers (of all, of
+everybody, and of the thirds of a session), how often repeated renderings get the same answer, and the density of the
+answers beside that of two predictions that know nothing of maps (`hilbo.population.baselines`). Errors are clustered by
+person.
 """
 
 from typing import Any
@@ -125,8 +127,11 @@ def _shares(study: Study, left: LeftOut, chosen: Float[np.ndarray, "n C"], rows:
 def _compared(
     given: Float[np.ndarray, " n"], predicted: Float[np.ndarray, " n"], person: np.ndarray
 ) -> dict[str, float]:
+    """Means of what happened (0 or 1) and of its probability; the error of their difference is by person, or what the
+    probabilities themselves imply, if that is larger: of few answers, all alike, the former says nothing."""
     _, error = clustered(given - predicted, person)
-    return {"given": float(given.mean()), "predicted": float(predicted.mean()), "error": error}
+    implied = float(np.sqrt(np.sum(predicted * (1.0 - predicted)))) / len(given)
+    return {"given": float(given.mean()), "predicted": float(predicted.mean()), "error": float(np.fmax(error, implied))}
 
 
 def _differs(row: dict[str, Any]) -> bool:
@@ -136,8 +141,7 @@ def _differs(row: dict[str, Any]) -> bool:
 
 def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> dict[str, Any] | None:
     """Pairs of answers of one person to one rendering, with a random effect in one context, a column of x: how often
-    they agree, and how often they should."""
-    assert left.agreement is not None
+    they agree, and how often the later one should be what the earlier one was."""
     same, expected, person = [], [], []
     for p in _people(left):
         rows = np.flatnonzero(left.person == p)
@@ -145,7 +149,7 @@ def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> dict[str, Any] | Non
         first, second = np.triu_indices(len(rows), 1)
         pairs = place.ravel()[first] == place.ravel()[second]
         same += (left.q[rows[first[pairs]]] == left.q[rows[second[pairs]]]).tolist()
-        expected += left.agreement[rows[first[pairs]]].tolist()
+        expected += left.probabilities[rows[second[pairs]], left.q[rows[first[pairs]]]].tolist()
         person += [p] * int(pairs.sum())
     if not same:
         return None

@@ -13,7 +13,7 @@ from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.baselines import constant, quadratic
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import Cohort
-from hilbo.study.model_check import check_sentences, model_check
+from hilbo.study.model_check import _compared, _differs, check_sentences, model_check
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +83,20 @@ def test_a_threshold_that_does_not_fit_is_spoken_of(checked):
     assert content["shares"]["good"]["given"] == 0.0
     (said,) = check_sentences(content)
     assert said.startswith("With the study's hyperparameters the model does not fit")
-    assert '0 % of their answers were "good", and' in said
     assert "the same shares everywhere would predict better" in said
+    wrong = {"good": {"given": 0.0, "predicted": 0.3, "error": 0.04}}
+    (said,) = check_sentences(content | {"shares": wrong})
+    assert '0 % of their answers were "good", and 30 % were predicted' in said
+
+
+def test_few_answers_all_alike_are_no_misfit():
+    """Five pairs that differ, each with probability 0.7, say little; by person their error would be 0.03."""
+    row = _compared(np.zeros(5), np.array([0.2, 0.3, 0.3, 0.3, 0.4]), np.arange(5))
+    assert row["error"] == pytest.approx(np.sqrt(0.16 + 3 * 0.21 + 0.24) / 5)
+    assert not _differs(row)
+    rng = np.random.default_rng(0)
+    given = (rng.uniform(size=20) < 0.5).repeat(10).astype(float)  # of one person all the same
+    assert _compared(given, np.full(200, 0.5), np.arange(200) // 10)["error"] > 0.1
 
 
 def test_two_people_cannot_be_checked(checked):
@@ -132,18 +144,3 @@ def test_the_quadratics_masses_and_slopes():
     )
     moved = [_log_masses(level, edges + np.array([0, s, s, 0]), q)[0] for s in (1e-5, -1e-5)]
     np.testing.assert_allclose(by_low + by_high, (moved[0] - moved[1]) / 2e-5, rtol=1e-6)
-
-
-def test_agreement_is_the_square_of_the_classes():
-    """Where the function is known, two answers agree with the sum of squared probabilities."""
-    from hilbo.population.leave_one_out import _NODES, _WEIGHTS
-
-    likelihood = OrdinalProbit(jnp.array([-0.5, 0.5]), jnp.asarray(0.5))
-    levels = 0.3 + 0.8 * _NODES
-    by_nodes = sum(
-        w * float(jnp.sum(likelihood.class_probabilities(f) ** 2)) for f, w in zip(levels, _WEIGHTS, strict=True)
-    )
-    rng = np.random.default_rng(1)
-    f = 0.3 + 0.8 * rng.normal(size=200_000)
-    first, second = (np.searchsorted([-0.5, 0.5], f + 0.5 * rng.normal(size=f.size)) for _ in range(2))
-    assert by_nodes == pytest.approx(np.mean(first == second), abs=0.005)

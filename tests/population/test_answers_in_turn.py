@@ -1,0 +1,68 @@
+"""A new person's answers one after the other: each is predicted from those before it, whatever chose the renderings."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from hilbo import RBF, OrdinalProbit
+from hilbo.kernels import gram
+from hilbo.population.newcomer import _WEIGHTS, _log_widths, _widened, class_probabilities, probabilities_in_turn
+
+LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.8]), jnp.asarray(0.7))
+N, Q = 4, np.array([0, 2, 1, 2])
+
+
+def boxes(thresholds, mean, covariance):
+    """Probability of the first i answers Q, and of each answer after them, (n, C): boxes of a multivariate normal."""
+    ends = np.array([-np.inf, *thresholds, np.inf])
+
+    def box(answers):
+        k = len(answers)
+        noisy = covariance[:k, :k] + 0.7**2 * np.eye(k)
+        return multivariate_normal(mean[:k], noisy, seed=0).cdf(ends[answers + 1], lower_limit=ends[answers])
+
+    return np.array([[box(np.array([*Q[:i], c])) for c in range(3)] for i in range(N)])
+
+
+@pytest.mark.parametrize("widths", [False, True])
+def test_answers_are_predicted_from_those_before(widths):
+    rng = np.random.default_rng(0)
+    x, mean = jnp.asarray(rng.uniform(size=(N, 2))), rng.normal(size=N)
+    covariance = np.asarray(gram(RBF(3.0, 4.0), x, x))
+    given = [jnp.asarray(Q), jnp.ones(N, bool)]
+    predicted = probabilities_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), *given, widths)
+    people = [_widened(LIKELIHOOD, w) for w in _log_widths(jnp.asarray(mean))] if widths else [LIKELIHOOD.thresholds]
+    weights = _WEIGHTS if widths else [1.0]
+    joint = sum(w * boxes(np.asarray(t), mean, covariance) for w, t in zip(weights, people, strict=True))
+    np.testing.assert_allclose(predicted, joint / joint.sum(axis=1, keepdims=True), atol=0.02)
+    alone = class_probabilities(LIKELIHOOD, jnp.asarray(mean), jnp.diagonal(jnp.asarray(covariance)), widths)
+    np.testing.assert_allclose(predicted[0], alone[0], rtol=1e-12)
+    assert np.abs(predicted[1:] - alone[1:]).max() > 0.1
+
+
+def test_what_was_not_asked_says_nothing():
+    rng = np.random.default_rng(1)
+    root = rng.normal(size=(N, N))
+    mean, covariance, q = jnp.asarray(rng.normal(size=N)), jnp.asarray(root @ root.T), jnp.asarray(Q)
+    last = probabilities_in_turn(LIKELIHOOD, mean, covariance, q, jnp.array([False, False, False, True]))
+    np.testing.assert_allclose(last, class_probabilities(LIKELIHOOD, mean, jnp.diagonal(covariance)), rtol=1e-10)
+
+
+def test_a_choice_by_earlier_answers_looks_like_no_misfit():
+    """2,000 people of the model itself are asked at one place as long as they give the highest answer there."""
+    rng = np.random.default_rng(2)
+    people, n = 2000, 8
+    f, place, q = 1.5 * rng.normal(size=(people, n)), np.zeros((people, n), int), np.zeros((people, n), int)
+    for i in range(n):
+        if i:
+            place[:, i] = place[:, i - 1] + (q[:, i - 1] < 2)
+        felt = f[np.arange(people), place[:, i]] + 0.7 * rng.normal(size=people)
+        q[:, i] = np.searchsorted([-0.5, 0.8], felt)
+    covariance = 1.5**2 * (place[:, :, None] == place[:, None, :])
+    of_person = jax.vmap(lambda c, q: probabilities_in_turn(LIKELIHOOD, jnp.zeros(n), c, q, jnp.ones(n, bool)))
+    in_turn = np.asarray(jax.jit(of_person)(jnp.asarray(covariance), jnp.asarray(q)))[..., 2].mean()
+    alone = float(LIKELIHOOD.class_probabilities(0.0, 1.5**2)[2])
+    assert (q == 2).mean() - alone > 0.1
+    assert (q == 2).mean() == pytest.approx(in_turn, abs=0.01)
