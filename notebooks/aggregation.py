@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Which aggregation when
 # People who agree, and people who do not: the same rules aggregate both, and leaving one person out at a time says
-# which of them may be believed for somebody new.
+# which of them predicts a person's answers.
 
 # %%
 import dataclasses

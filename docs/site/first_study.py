@@ -69,8 +69,8 @@ simulated people answer, so that the truth is known.""",
     Step(
         """## The population map
 
-From the table of answers alone; `--compare` predicts each person from the others by every rule. The page is
-`results/report.html`.""",
+From the table of answers alone; by every rule `--compare` predicts each answer from other people's answers and
+the person's own earlier ones. The page is `results/report.html`.""",
         "hilbo aggregate simulated/trials.csv --study colour.toml --compare --out results",
         figures=(
             (

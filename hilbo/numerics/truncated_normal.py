@@ -34,6 +34,7 @@ __all__ = ["TruncatedNormal", "confined_normal", "truncated_normal"]
 # An interval is narrow below this width, and below this product of width and distance from the middle of the bell.
 _NARROW_WIDTH, _NARROW_PRODUCT = 1.0, 4.0
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
+_GONE = 40.0  # exp(-z^2 / 2) is 0 there in float64
 
 
 def confined_normal(
@@ -213,8 +214,8 @@ def _centre(
 ) -> TruncatedNormal:
     """low < 0 <= high, -low <= high: the mass outside is a sum of tails, so log p = log1p(-outside) is precise."""
     short, rest = jnp.abs(low.short), jnp.where(low.short < 0, -low.rest, low.rest)
-    # One exponent, not a product of two: far out the first would be 0 and the second infinite.
-    density = jnp.exp(-0.5 * short**2 - rest * (short + 0.5 * rest) - HALF_LOG_2PI)
+    rest = jnp.where(short < _GONE, rest, 0.0)  # farther out the density is 0, and the second factor would be infinite
+    density = jnp.exp(-0.5 * short**2) * jnp.exp(-rest * (short + 0.5 * rest) - HALF_LOG_2PI)
     bounded = ~jnp.isinf(edges.high)
     hazard = edges.low + excesses.low
     hazard_high = jnp.where(bounded, edges.high, 1.0) + excesses.high

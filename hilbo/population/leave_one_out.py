@@ -1,4 +1,4 @@
-"""Each person left out in turn: what a rule predicts of somebody it has not seen, and how far that can be trusted.
+"""Each person left out once: what a rule predicts of their answers, and how far that can be trusted.
 
 Each answer is predicted from the others' answers and from the person's own earlier ones. A session chooses renderings
 by these: predicted without them, "close" is given too often where it was asked for again, though the model is right.
@@ -19,7 +19,6 @@ import dataclasses
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -34,7 +33,7 @@ from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.learnt import Learnt, learn
 from hilbo.population.learnt_posterior import Stated
 from hilbo.population.maps import RuleMap, learnt_map, rule_map
-from hilbo.population.newcomer import probabilities_in_turn
+from hilbo.population.newcomer import InTurn, predicted_in_turn
 from hilbo.population.recipes import RECIPES
 
 __all__ = [
@@ -55,18 +54,22 @@ __all__ = [
 @dataclasses.dataclass(frozen=True)
 class LeftOut:
     """Predictions of everybody's answers, each from all others' answers and the person's own earlier ones
-    (`newcomer.probabilities_in_turn`), one row for each answer."""
+    (`newcomer.predicted_in_turn`), one row for each answer."""
 
     person: Int[np.ndarray, " n"]
     q: Int[np.ndarray, " n"]
     probabilities: Float[np.ndarray, "n C"]
     not_converged: int = 0
     """Folds in which a fit did not hold its certificate."""
+    log_given: Float[np.ndarray, " n"] | None = None
+    """Log probability of each answer, finite where the probability is 0 in this precision; None: its logarithm."""
 
     @property
     def cost(self) -> Float[np.ndarray, " n"]:
         """Negative log predictive density of each answer."""
-        return -np.log(self.probabilities[np.arange(len(self.q)), self.q])
+        if self.log_given is None:
+            return -np.log(self.probabilities[np.arange(len(self.q)), self.q])
+        return -self.log_given
 
 
 def without(trials: Trials, left: int | Int[np.ndarray, " k"]) -> Trials:
@@ -85,8 +88,8 @@ def leave_one_out(
     inference: str = "laplace",
     groups: Sequence[Int[np.ndarray, " _"]] | None = None,
 ) -> tuple[LeftOut, list[RuleMap]]:
-    """What a rule predicts of each person's answers from all others' (hyperparameters and share as given); and the
-    maps without them; errors as in [`left_out_by`][]."""
+    """What a rule predicts of each person's answers from all others' and their own earlier ones (hyperparameters and
+    share as given); and the maps without them; errors as in [`left_out_by`][]."""
 
     def fold(left: Int[np.ndarray, " k"]) -> tuple[OrdinalGP, RuleMap]:
         rest = np.delete(np.arange(trials.mask.shape[0]), left)
@@ -131,19 +134,20 @@ def left_out_by(
     if people < 3:
         raise InputError(f"leave_one_out: {people} people; at least three are needed, of whom two are left each time.")
     x, mask, q = np.asarray(trials.x), np.asarray(trials.mask), np.asarray(trials.q)
-    persons, categories, rows, maps = [], [], [], []
+    persons, categories, rows, logs, maps = [], [], [], [], []
     for group in np.arange(people)[:, None] if groups is None else groups:
         gp, map_without = fold(group)
         maps.append(map_without)
         for person in group:
             context = None if trials.context is None else trials.context[person]
-            chances = _newcomer(gp, map_without, placed(x[person]), trials.q[person], trials.mask[person], context)
-            rows.append(np.asarray(chances)[mask[person]])
+            answers = placed(x[person]), trials.q[person], trials.mask[person], context
+            for part, values in zip((rows, logs), _newcomer(gp, map_without, *answers), strict=True):
+                part.append(np.asarray(values)[mask[person]])
             persons.append(np.full(mask[person].sum(), person))
             categories.append(q[person][mask[person]])
-    person, category, chances = (np.concatenate(part) for part in (persons, categories, rows))
+    person, category, chances, log_given = (np.concatenate(part) for part in (persons, categories, rows, logs))
     failed = sum(not _converged(map_) for map_ in maps)
-    return LeftOut(person, category.astype(int), chances, failed), maps
+    return LeftOut(person, category.astype(int), chances, failed, log_given), maps
 
 
 def influence(whole: RuleMap, parts: list[RuleMap], x: Float[Array, "m d"]) -> Float[np.ndarray, " M"]:
@@ -228,13 +232,23 @@ def _newcomer(
     q: Int[Array, " m"],
     mask: Bool[Array, " m"],
     context: Int[Array, " m"] | None,
-) -> Float[Array, "m C"]:
-    """Class probabilities (m, C) of a new person's answers in turn. Their function has the map's mean and variance, and
-    the kernel's correlation."""
+) -> InTurn:
+    """A new person's answers, one after the other. Their function has the map's mean and variance, and the kernel's
+    correlation; answers in one context of a random effect have what it adds in common."""
     mean, variance = population_map.newcomer(x, context)
-    sd, prior = jnp.sqrt(variance), jax.vmap(gp.kernel.diagonal)(x)
-    covariance = gram(gp.kernel, x, x) * jnp.outer(sd / jnp.sqrt(prior), sd / jnp.sqrt(prior))
-    return probabilities_in_turn(gp.likelihood, mean, covariance, q, mask, population_map.widths)
+    correlation, effects = _correlation(gram(gp.kernel, x, x)), population_map.effects
+    if effects is not None and context is not None:
+        apart = (1.0 - population_map.share) * population_map.prior
+        sd, of_context = jnp.sqrt(population_map.predict(x)[1] + apart), jnp.sqrt(effects.variance[context])
+        together = jnp.outer(of_context, of_context) * (context[:, None] == context[None, :])
+        correlation = _correlation(correlation * jnp.outer(sd, sd) + together)
+    covariance = correlation * jnp.outer(jnp.sqrt(variance), jnp.sqrt(variance))
+    return predicted_in_turn(gp.likelihood, mean, covariance, q, mask, population_map.widths)
+
+
+def _correlation(covariance: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    sd = jnp.sqrt(jnp.diagonal(covariance))
+    return covariance / jnp.outer(sd, sd)
 
 
 def _converged(map_: RuleMap) -> bool:

@@ -169,14 +169,16 @@ def _height(
 ) -> _Height:
     """`sizes`: of the numbers of the prior, because latent values are sums whose terms may cancel."""
     epsilon = jnp.finfo(weights.dtype).eps
-    value, size = jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta), jnp.sum(jnp.abs(terms.value))
+    absolute = sizes.times(jnp.abs(weights))
+    value = jnp.sum(terms.value) - 0.5 * jnp.sum(weights * eta)
+    size = jnp.sum(jnp.abs(terms.value)) + 0.5 * jnp.sum(jnp.abs(weights) * absolute)
     off = terms.slope - weights
-    summed = terms.slopes + terms.curvature * sizes.times(jnp.abs(weights)) + jnp.abs(weights)
+    summed = terms.slopes + terms.curvature * absolute + jnp.abs(weights)
     residual, rounding = (
         jnp.sqrt(jnp.linalg.norm(vector) * jnp.linalg.norm(prior.times(vector))) for vector in (off, summed)
     )
     tolerance = jnp.clip(4.0 * epsilon * rounding, epsilon ** (2 / 3), epsilon**0.25)
-    return _Height(value, size + 0.5 * jnp.abs(jnp.sum(weights * eta)), residual, tolerance)
+    return _Height(value, size, residual, tolerance)
 
 
 def mode_of(model: PeopleModel, answers: Tallies, prior: LowRankPrior, start: Float[Array, "M n"]) -> Mode:

@@ -1,5 +1,7 @@
-"""What a population map predicts of a person who gave no answers: that person's own function is integrated out, and the
-width of their middle categories where people differ in it."""
+"""What a population map predicts of a new person, before any answer and from one answer to the next: that person's own
+function is integrated out, and the width of their middle categories where people differ in it."""
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.recipes import WIDTHS
 
-__all__ = ["class_probabilities", "log_highest", "probabilities_in_turn"]
+__all__ = ["InTurn", "class_probabilities", "log_highest", "predicted_in_turn"]
 
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
@@ -46,34 +48,44 @@ def log_highest(
     return logsumexp(each, axis=1, b=jnp.asarray(_WEIGHTS, mean.dtype)[None, :])
 
 
-def probabilities_in_turn(
+class InTurn(NamedTuple):
+    """Predictions of n answers, each from those before it."""
+
+    probabilities: Float[Array, "n C"]
+    log_given: Float[Array, " n"]
+    """Log probability of the answer that was given, finite where the probability is 0 in this precision."""
+
+
+def predicted_in_turn(
     likelihood: OrdinalProbit,
     mean: Float[Array, " n"],
     covariance: Float[Array, "n n"],
     q: Int[Array, " n"],
     mask: Bool[Array, " n"],
     widths: bool = False,
-) -> Float[Array, "n C"]:
-    """Probabilities (n, C) of a new person's answers one after the other, each from those before it too.
+) -> InTurn:
+    """A new person's answers one after the other, each predicted from those before it.
 
-    Where a rendering is chosen by what its participant said before, as a session does, an answer is not a random one
-    of the people who could have been asked there: only a prediction that knows the earlier answers can be right. The
-    person's function at the n renderings is normal with `mean` and `covariance` before any answer; each answer q
-    that was given (`mask`) changes both by the moments of its normal (assumed density filtering), O(n^3) in all.
-    `widths` as above: each width is as probable as it made the answers so far.
-    Reference: Dawid (1984), J. R. Statist. Soc. A 147:278, for predictions in turn; Opper (1998), On-line Learning in
+    A session chooses renderings by what its participant said before. The people who are asked at a rendering are then
+    not a random choice, and only a prediction that knows their earlier answers can be right. The person's function at
+    the n renderings is normal with `mean` and `covariance` before any answer. Each answer q that was given (`mask`)
+    changes both to the moments of what follows from it (assumed density filtering), in O(n^3) for all answers.
+    `widths` as above: they are weighted by how probable they made the answers so far.
+    Reference: Dawid (1984), J. R. Statist. Soc. A 147:278, for such predictions; Opper (1998), On-line Learning in
     Neural Networks, ch. 16, for the filter.
     """
 
-    def given(log_width: Float[Array, ""]) -> Float[Array, "n C"]:
+    def given(log_width: Float[Array, ""]) -> InTurn:
         return _filtered(OrdinalProbit(_widened(likelihood, log_width), likelihood.noise), mean, covariance, q, mask)
 
     if not widths:
         return _filtered(likelihood, mean, covariance, q, mask)
-    each = jax.vmap(given)(_log_widths(mean))
-    logs = jnp.where(mask, jnp.log(jnp.take_along_axis(each, q[None, :, None], axis=2)[..., 0]), 0.0)
-    before = jnp.cumsum(logs, axis=1) - logs + jnp.log(jnp.asarray(_WEIGHTS, mean.dtype))[:, None]
-    return jnp.einsum("kn,knc->nc", jax.nn.softmax(before, axis=0), each)
+    each, weights = jax.vmap(given)(_log_widths(mean)), jnp.log(jnp.asarray(_WEIGHTS, mean.dtype))
+    logs = jnp.cumsum(jnp.where(mask, each.log_given, 0.0), axis=1)
+    before = weights[:, None] + jnp.pad(logs[:, :-1], ((0, 0), (1, 0)))
+    share = jax.nn.log_softmax(before, axis=0)
+    probabilities = jnp.einsum("kn,knc->nc", jnp.exp(share), each.probabilities)
+    return InTurn(probabilities, logsumexp(share + each.log_given, axis=0))
 
 
 def _filtered(
@@ -82,18 +94,18 @@ def _filtered(
     covariance: Float[Array, "n n"],
     q: Int[Array, " n"],
     mask: Bool[Array, " n"],
-) -> Float[Array, "n C"]:
-    """`probabilities_in_turn` by one person's thresholds. What the answers took from the covariance is the sum of the
-    outer products of rows, one for each answer: a matrix times a vector is all that an answer costs."""
+) -> InTurn:
+    """The same with fixed thresholds. The decrease of the covariance is a sum of outer products of rows, one for each
+    answer, so that an answer costs a matrix times a vector."""
 
     def answer(state, i):
         mean, rows = state
         column = covariance[i] - rows[:, i] @ rows
         variance = column[i]
         chances = likelihood.class_probabilities(mean[i], variance)
-        _, slope, precision = likelihood.smoothed(mean[i], variance, q[i])
+        log_given, slope, precision = likelihood.smoothed(mean[i], variance, q[i])
         slope, shrinks = (jnp.where(mask[i], v, 0.0) for v in (slope, precision / (1.0 + variance * precision)))
-        return (mean + slope * column, rows.at[i].set(jnp.sqrt(shrinks) * column)), chances
+        return (mean + slope * column, rows.at[i].set(jnp.sqrt(shrinks) * column)), InTurn(chances, log_given)
 
     return jax.lax.scan(answer, (mean, jnp.zeros_like(covariance)), jnp.arange(q.size))[1]
 

@@ -104,8 +104,8 @@ def _prediction(content, validated):
     costs = check["negative_log_density"]
     again = "Validation sessions asked people again." if validated else "Nobody was asked again."
     return (
-        f"Leave-one-participant-out: {costs['map']:.3f} nats an answer by this map, {costs['constant']['cost']:.3f} by"
-        f" the same shares everywhere. {again}"
+        f"Leave-one-participant-out: {costs['map']:.3f} nats an answer by this map and the participant's earlier"
+        f" answers, {costs['constant']['cost']:.3f} by the same shares everywhere. {again}"
     )
 
 

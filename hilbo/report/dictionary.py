@@ -63,7 +63,7 @@ _COMPARISON = {
     "method": ("", "exact: from all answers at once; by points: person by person at each point"),
     "negative_log_density": (
         "nats",
-        "mean over answers of people left out, each predicted from the others' and from their own earlier ones",
+        "mean over answers of people left out, predicted from other people's answers and the person's own earlier ones",
     ),
     "negative_log_density_error": ("nats", "its standard error, clustered by person"),
     "difference": ("nats", "of that density to the best rule's"),

@@ -1,11 +1,11 @@
-"""Does the model fit? What a study's rule predicts of people it has not seen, beside what they answered.
+"""Does the model fit? What a study's rule predicts of people who are left out, beside what they answered.
 
 Everybody who answered is left out once, alone or in a group where people are many or folds dear, and predicted from the
 others' answers and, answer by answer, from their own earlier ones: a session chooses renderings by these, so without
 them a model that fits would seem not to. The hyperparameters stay. Compared are the shares of the answers (of all, of
 everybody, and of the thirds of a session), how often repeated renderings get the same answer, and the density of the
-answers beside that of two predictions that know nothing of maps (`hilbo.population.baselines`). Errors are clustered by
-person.
+answers beside that of two predictions from the others' answers alone that know nothing of maps
+(`hilbo.population.baselines`). Errors are clustered by person, and not below what the probabilities imply.
 """
 
 from typing import Any
@@ -128,7 +128,7 @@ def _compared(
     given: Float[np.ndarray, " n"], predicted: Float[np.ndarray, " n"], person: np.ndarray
 ) -> dict[str, float]:
     """Means of what happened (0 or 1) and of its probability; the error of their difference is by person, or what the
-    probabilities themselves imply, if that is larger: of few answers, all alike, the former says nothing."""
+    probabilities themselves imply, if that is larger: where few answers are all the same, the former is too small."""
     _, error = clustered(given - predicted, person)
     implied = float(np.sqrt(np.sum(predicted * (1.0 - predicted)))) / len(given)
     return {"given": float(given.mean()), "predicted": float(predicted.mean()), "error": float(np.fmax(error, implied))}
@@ -140,17 +140,18 @@ def _differs(row: dict[str, Any]) -> bool:
 
 
 def _repeats(left: LeftOut, x: Float[np.ndarray, "n d"]) -> dict[str, Any] | None:
-    """Pairs of answers of one person to one rendering, with a random effect in one context, a column of x: how often
-    they agree, and how often the later one should be what the earlier one was."""
+    """Answers of one person to a rendering that they had before (with a random effect in one context, a column of x):
+    how often they are what the last one there was, and how often they should be."""
     same, expected, person = [], [], []
     for p in _people(left):
         rows = np.flatnonzero(left.person == p)
         _, place = np.unique(x[rows], axis=0, return_inverse=True)
-        first, second = np.triu_indices(len(rows), 1)
-        pairs = place.ravel()[first] == place.ravel()[second]
-        same += (left.q[rows[first[pairs]]] == left.q[rows[second[pairs]]]).tolist()
-        expected += left.probabilities[rows[second[pairs]], left.q[rows[first[pairs]]]].tolist()
-        person += [p] * int(pairs.sum())
+        order = np.argsort(place.ravel(), kind="stable")
+        again = np.flatnonzero(np.diff(place.ravel()[order]) == 0)
+        first, second = rows[order[again]], rows[order[again + 1]]
+        same += (left.q[first] == left.q[second]).tolist()
+        expected += left.probabilities[second, left.q[first]].tolist()
+        person += [p] * len(again)
     if not same:
         return None
     return {"pairs": len(same)} | _compared(np.array(same, float), np.array(expected), np.array(person))

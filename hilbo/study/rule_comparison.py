@@ -1,6 +1,6 @@
-"""Every aggregation rule on one cohort, as data: how it predicts people it has not seen, and what its map says.
+"""Every aggregation rule on one cohort, as data: how it predicts people who are left out, and what its map says.
 
-For each rule: the predictive density, calibration and reliability with each person left out (`leave_one_out`); its
+For each rule: the predictive density, calibration and reliability, answer by answer (`leave_one_out`); its
 optimum; how the optimum is spread, by joint draws of the map (of bcm, hierarchical and pooled, whose joint posterior is
 known) and by a bootstrap over people (of the rules that aggregate people point by point); what each person moves; how
 it agrees with one model of all answers; and how much of the space the answers cover, the map's standard deviation over

@@ -7,6 +7,7 @@ table and the log it came from give the same bits. Whatever is wrong is one sent
 """
 
 import os
+import re
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -110,9 +111,11 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
 
 
 def _session_order(names: pd.Series) -> pd.Series:
-    """Sessions follow their numbers where all have one, else the alphabet."""
+    """Sessions follow their numbers where all have one, else the alphabet, in which S2 is before S10."""
     numbers = pd.to_numeric(names, errors="coerce")
-    return names if numbers.isna().any() else numbers
+    if numbers.notna().all():
+        return numbers
+    return names.map({name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), str(name)) for name in names.unique()})
 
 
 def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:

@@ -8,7 +8,7 @@ from scipy.stats import multivariate_normal
 
 from hilbo import RBF, OrdinalProbit
 from hilbo.kernels import gram
-from hilbo.population.newcomer import _WEIGHTS, _log_widths, _widened, class_probabilities, probabilities_in_turn
+from hilbo.population.newcomer import _WEIGHTS, _log_widths, _widened, class_probabilities, predicted_in_turn
 
 LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.8]), jnp.asarray(0.7))
 N, Q = 4, np.array([0, 2, 1, 2])
@@ -32,7 +32,7 @@ def test_answers_are_predicted_from_those_before(widths):
     x, mean = jnp.asarray(rng.uniform(size=(N, 2))), rng.normal(size=N)
     covariance = np.asarray(gram(RBF(3.0, 4.0), x, x))
     given = [jnp.asarray(Q), jnp.ones(N, bool)]
-    predicted = probabilities_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), *given, widths)
+    predicted, log_given = predicted_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), *given, widths)
     people = [_widened(LIKELIHOOD, w) for w in _log_widths(jnp.asarray(mean))] if widths else [LIKELIHOOD.thresholds]
     weights = _WEIGHTS if widths else [1.0]
     joint = sum(w * boxes(np.asarray(t), mean, covariance) for w, t in zip(weights, people, strict=True))
@@ -40,14 +40,25 @@ def test_answers_are_predicted_from_those_before(widths):
     alone = class_probabilities(LIKELIHOOD, jnp.asarray(mean), jnp.diagonal(jnp.asarray(covariance)), widths)
     np.testing.assert_allclose(predicted[0], alone[0], rtol=1e-12)
     assert np.abs(predicted[1:] - alone[1:]).max() > 0.1
+    np.testing.assert_allclose(np.exp(log_given), predicted[np.arange(N), Q], rtol=1e-12)
 
 
 def test_what_was_not_asked_says_nothing():
     rng = np.random.default_rng(1)
     root = rng.normal(size=(N, N))
     mean, covariance, q = jnp.asarray(rng.normal(size=N)), jnp.asarray(root @ root.T), jnp.asarray(Q)
-    last = probabilities_in_turn(LIKELIHOOD, mean, covariance, q, jnp.array([False, False, False, True]))
+    last = predicted_in_turn(LIKELIHOOD, mean, covariance, q, jnp.array([False, False, False, True]))[0]
     np.testing.assert_allclose(last, class_probabilities(LIKELIHOOD, mean, jnp.diagonal(covariance)), rtol=1e-10)
+
+
+@pytest.mark.parametrize("widths", [False, True])
+def test_an_answer_that_was_all_but_excluded_is_a_number(widths):
+    """Of probability exp(-1000) and less, with most widths or with all."""
+    mean, covariance = jnp.array([0.0, 45.0, 0.0, 3.0]), 0.3 * jnp.eye(4)
+    given = jnp.array([1, 0, 1, 2]), jnp.ones(4, bool)
+    predicted, log_given = predicted_in_turn(LIKELIHOOD, mean, covariance, *given, widths)
+    np.testing.assert_allclose(predicted.sum(axis=1), 1.0, rtol=1e-6)
+    assert np.isfinite(log_given).all() and -3000 < log_given[1] < -300 and (log_given[2:] > -3).all()
 
 
 def test_a_choice_by_earlier_answers_looks_like_no_misfit():
@@ -61,7 +72,7 @@ def test_a_choice_by_earlier_answers_looks_like_no_misfit():
         felt = f[np.arange(people), place[:, i]] + 0.7 * rng.normal(size=people)
         q[:, i] = np.searchsorted([-0.5, 0.8], felt)
     covariance = 1.5**2 * (place[:, :, None] == place[:, None, :])
-    of_person = jax.vmap(lambda c, q: probabilities_in_turn(LIKELIHOOD, jnp.zeros(n), c, q, jnp.ones(n, bool)))
+    of_person = jax.vmap(lambda c, q: predicted_in_turn(LIKELIHOOD, jnp.zeros(n), c, q, jnp.ones(n, bool))[0])
     in_turn = np.asarray(jax.jit(of_person)(jnp.asarray(covariance), jnp.asarray(q)))[..., 2].mean()
     alone = float(LIKELIHOOD.class_probabilities(0.0, 1.5**2)[2])
     assert (q == 2).mean() - alone > 0.1

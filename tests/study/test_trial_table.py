@@ -127,8 +127,9 @@ def test_sessions_follow_each_other(tmp_path):
     assert read_trials(written(tmp_path, text), study())["category"].tolist() == [0, 1, 2]
 
 
-def test_numbered_sessions_follow_their_numbers(tmp_path):
-    text = "session," + HEADER + "10,A,1,similar,1,2\n9,A,1,different,1,2\n"
+@pytest.mark.parametrize("name", ["", "S", "day "])
+def test_numbered_sessions_follow_their_numbers(tmp_path, name):
+    text = "session," + HEADER + f"{name}10,A,1,similar,1,2\n{name}9,A,1,different,1,2\n"
     assert read_trials(written(tmp_path, text), study())["category"].tolist() == [0, 1]
 
 
