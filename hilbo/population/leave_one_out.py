@@ -240,7 +240,7 @@ def _newcomer(
     if effects is not None and context is not None:
         apart = (1.0 - population_map.share) * population_map.prior
         sd, of_context = jnp.sqrt(population_map.predict(x)[1] + apart), jnp.sqrt(effects.variance[context])
-        together = jnp.outer(of_context, of_context) * (context[:, None] == context[None, :])
+        together = jnp.where(context[:, None] == context[None, :], jnp.outer(of_context, of_context), 0.0)
         correlation = _correlation(correlation * jnp.outer(sd, sd) + together)
     covariance = correlation * jnp.outer(jnp.sqrt(variance), jnp.sqrt(variance))
     return predicted_in_turn(gp.likelihood, mean, covariance, q, mask, population_map.widths)

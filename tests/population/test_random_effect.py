@@ -8,7 +8,9 @@ import pytest
 
 from hilbo import OrdinalGP, Trials, fit
 from hilbo.population.hierarchical import NEWCOMER, PersonKernel
+from hilbo.population.leave_one_out import _newcomer
 from hilbo.population.low_rank import shared_evidence
+from hilbo.population.maps import RuleMap
 from hilbo.population.people_model import PeopleModel
 from hilbo.population.shared_posterior import shared_function
 from hilbo.population.tallies import Tallies, tallied
@@ -132,3 +134,18 @@ def test_answers_at_one_point_are_added_up_within_a_context_only():
     np.testing.assert_array_equal(answers.context[0], [1, 0, 1])
     np.testing.assert_array_equal(answers.counts[0], [[0, 1, 1], [0, 1, 0], [1, 0, 0]])
     assert answers.contexts == 2
+
+
+def test_what_a_context_adds_is_learnt_from_one_answer_in_it_wherever_that_was():
+    """A new person at two corners of the square, where the kernel hardly correlates; nobody was asked in context 1."""
+    trials = eqx.tree_at(lambda t: t.mask, stacked(), stacked().mask & (stacked().context != 1))
+    answers, people = tallied(trials, 3), model(4.0)
+    function, effects = shared_function(people, answers, answers.blank, RANK, EXACT)
+    of_all = RuleMap("learnt-2", "exact", None, function, people.share, jnp.asarray(1.0), effects=effects)
+
+    def second(first_answer, contexts):
+        said = jnp.array([first_answer, 0]), jnp.ones(2, bool), jnp.array(contexts)
+        return np.asarray(_newcomer(people.gp, of_all, jnp.array([[0.0, 0.0], [1.0, 1.0]]), *said).probabilities[1])
+
+    assert second(2, [1, 1])[2] - second(0, [1, 1])[2] > 0.5
+    np.testing.assert_allclose(second(2, [1, 0]), second(0, [1, 0]), atol=1e-3)

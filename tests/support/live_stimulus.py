@@ -75,7 +75,7 @@ def module(name):
 class LiveStimulus(Live):
     """`with LiveStimulus(folder) as live:` - comparisons of two parameters; a program joins with `live.join()`."""
 
-    def __init__(self, folder: Path, within: float = 20.0, silence: float = 20.0, more: str = "", **others):
+    def __init__(self, folder: Path, within: float = 60.0, silence: float = 60.0, more: str = "", **others):
         self.text = TEXT.format(within=within, silence=silence) + more
         super().__init__(folder, **others)
 
