@@ -104,9 +104,9 @@ def people(study: Study, population: Population, count: int, seed: int) -> Perso
             break
         drawn = truth + np.array(population.spread) * rng.standard_normal((64, study.space.dim))
         drawn = _with_levels(drawn, levels, truth, population.spread, rng) if levels else drawn
-        inside = np.all((drawn >= 0) & (drawn <= 1), axis=1)
-        drawn = drawn[inside]
-        optima = np.concatenate([optima, drawn[np.asarray(study.space.feasible(drawn))]])
+        within = np.clip(drawn, 0, 1)
+        liked = np.all(drawn == within, axis=1) & np.asarray(study.space.feasible(within))
+        optima = np.concatenate([optima, drawn[liked]])
     if len(optima) < count:
         raise InputError(
             f"simulate: of {64 * _MOST_DRAWS:,} people drawn around the truth only {len(optima)} like a rendering of"

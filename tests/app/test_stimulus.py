@@ -276,7 +276,7 @@ def test_nobody_presents_before_the_stop_was_seen(live):
     with refused(409, "is stop; there is nothing to present"):
         program.report("presented", trial="tag:1.1")
     program.report("neutral")
-    live.until(lambda v: "stopped within" in v["device"]["words"] and v["device"]["state"] == "stopped", live.whole)
+    program.asked(live, "reference")
     live.until(lambda _: len(live.events("device")) > 1)
     ready = live.events("device")[-1].data
     assert (ready["condition"], ready["program"], ready["force"]) == ("ready", "by hand", True) and ready["stop_s"] >= 0
