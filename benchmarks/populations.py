@@ -9,7 +9,7 @@ All rules have the same answers.
 FILE (JSON Lines) collects a row for each study and design; a run that was stopped goes on where it was. What has been
 run with this recipe is in benchmarks/populations.jsonl. *Regret* is how much less often a new person of the population
 gives the highest answer at the optimum found than at the best feasible rendering. Choices of method were made on seeds
-0 to 99; what is reported begins at 1000. --regions: of how many studies of each population the optimum's region is made,
+0 to 99; what is reported begins at 1000. --regions: of how many studies of each population the region is made,
 which is half of the work. --chance: points by chance in place of sessions. --write puts the tables into
 docs/methods/which_method.md.
 """

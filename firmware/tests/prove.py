@@ -2,10 +2,14 @@
 
     python3 firmware/tests/prove.py [FILE.c...]
 
-Prints the number of goals of each file; exit status 1 if one of them is not proved, 2 if a tool is missing. Needs
-frama-c, why3, z3 and cvc4 (on Debian: frama-c-base why3 z3 cvc4). docs/device/firmware.md says what the contracts say.
+Prints the number of goals of each file; exit status 1 if one of them is not proved, 2 if a tool is missing. What was
+proved is written into proved.json beside this file, with a fingerprint of the sources, so that minutes of proofs are
+done when the sources change. Needs frama-c, why3, z3 and cvc4 (on Debian: frama-c-base why3 z3 cvc4).
+docs/device/firmware.md says what the contracts say.
 """
 
+import hashlib
+import json
 import os
 import re
 import shutil
@@ -15,9 +19,10 @@ import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["FILES", "TOOLS", "Outcome", "missing", "prove"]
+__all__ = ["FILES", "TOOLS", "Outcome", "Proved", "missing", "prove", "recorded", "to_record"]
 
 CORE = Path(os.environ.get("HILBO_FIRMWARE_CORE", Path(__file__).parents[1] / "core"))
+RECORD = Path(__file__).with_name("proved.json")
 TOOLS = ("frama-c", "why3", "z3", "cvc4")
 
 
@@ -57,6 +62,25 @@ class Outcome(NamedTuple):
     proved: int
     goals: int
     report: str
+
+
+class Proved(NamedTuple):
+    """What was proved of a file: all of so many goals, of sources with this fingerprint."""
+
+    goals: int
+    sources: str
+
+
+def recorded() -> dict[str, Proved]:
+    """By file what stands in proved.json."""
+    return {file: Proved(**proved) for file, proved in json.loads(RECORD.read_text(encoding="utf-8")).items()}
+
+
+def to_record(file: str, goals: int) -> Proved:
+    """`goals` of a file, with SHA-256 of what its proof is of: the file, the core's headers, and this program, which
+    says what is believed."""
+    parts = [CORE / file, *sorted(CORE.glob("*.h")), Path(__file__)]
+    return Proved(goals, hashlib.sha256(b"\0".join(part.read_bytes() for part in parts)).hexdigest())
 
 
 def missing() -> list[str]:
@@ -100,16 +124,25 @@ def main(files: list[str]) -> int:
     if missing():
         print("The proofs need " + ", ".join(missing()) + ": on Debian, apt install frama-c-base why3 z3 cvc4.")
         return 2
-    total, good = 0, True
+    total, good = 0, {}
     for file in files or FILES:
         outcome = prove(file)
         print(f"{file:16} {outcome.proved:4} of {outcome.goals:4} goals proved", flush=True)
-        if outcome.proved != outcome.goals or outcome.goals == 0:
+        if outcome.proved == outcome.goals > 0:
+            good[file] = to_record(file, outcome.goals)
+        else:
             print(outcome.report)
-            good = False
         total += outcome.proved
     print(f"{total} goals proved")
-    return 0 if good else 1
+    _record(good)
+    return 0 if len(good) == len(files or FILES) else 1
+
+
+def _record(good: dict[str, Proved]) -> None:
+    """Writes what was proved beside what stood there of other files."""
+    known = recorded() if RECORD.exists() else {}
+    content = {file: proved._asdict() for file, proved in sorted((known | good).items())}
+    RECORD.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

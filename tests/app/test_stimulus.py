@@ -28,7 +28,7 @@ def live(tmp_path):
 @pytest.fixture
 def brief(tmp_path):
     """A session that waits a moment for a confirmation."""
-    with LiveStimulus(tmp_path, within=0.3) as session:
+    with LiveStimulus(tmp_path, within=1.0) as session:
         yield session
 
 
@@ -115,7 +115,7 @@ def test_a_late_confirmation_voids_the_trial_and_is_refused(brief):
     program = brief.by_hand()
     brief.begin()
     late = program.asked(brief)
-    trial = voided(brief, "late: nothing was confirmed within 0.3 s")
+    trial = voided(brief, "late: nothing was confirmed within 1 s")
     with refused(409, "comes too late"):
         program.report("presented", order=late["order"], trial=late["trial"], values=late["values"])
     program.report("busy", order=late["order"])
@@ -228,14 +228,14 @@ def test_a_flood_takes_nothing_from_others(live):
 
 
 def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
-    with LiveStimulus(tmp_path, silence=0.8, seconds=2.0) as live:
+    with LiveStimulus(tmp_path, silence=1.5, seconds=2.0) as live:
         program = live.by_hand()
         live.begin()
         order = live.until(lambda o: o["do"] == "present", lambda: program.report("neutral"))
         program.report("presented")
         live.until(lambda view: view["step"])
         live.until(lambda v: v["device"]["state"] == "lost", live.whole)
-        voided(live, "device: lost (by hand has been silent for 0.8 s.)", "trouble")
+        voided(live, "device: lost (by hand has been silent for 1.5 s.)", "trouble")
         with refused(409, "say hello first"):
             program.report("presented", order=order["order"])
         program.hello()
