@@ -141,7 +141,8 @@ def by_chance(study, persons, people, trials, seed):
     pool = np.asarray(study.space.candidates(4096, seed % 97))
     x = jnp.asarray(pool[rng.integers(len(pool), size=(people, trials))])
     keys = jax.random.split(jax.random.key(seed), (people, trials))
-    each = jax.vmap(lambda p, ks, xs: jax.vmap(lambda k, x: p.answer(k, x, jnp.zeros(())))(ks, xs))
+    progress = jnp.arange(trials) / trials
+    each = jax.vmap(lambda p, ks, xs: jax.vmap(p.answer)(ks, xs, progress))
     return Trials(x, each(persons, keys, x).astype(jnp.int32), jnp.ones((people, trials), bool))
 
 

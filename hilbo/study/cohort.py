@@ -73,9 +73,8 @@ class Cohort(eqx.Module):
 
 
 def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
-    """Participants from a trial table, in order of their first appearance: one that `trial_table.read_trials` made, or
-    a DataFrame of yours with the same columns, which is checked as a file is. Rows that `read_trials` made stay in
-    their order, which should be that of the answers.
+    """Participants from a trial table: one that `trial_table.read_trials` made, whose rows stay in their order, that of
+    the answers; or a DataFrame of yours with the same columns, which is checked and put in order as a file is.
 
     `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
     Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's answers exceed.

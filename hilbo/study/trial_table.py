@@ -2,8 +2,9 @@
 
 Columns: `participant`, `trial`, `response` and one per parameter in physical units; optional `session`, `phase`,
 `material`, `voided`, `unblinded`; others are kept. A number means what its decimals say (correctly rounded), so that a
-table and the log it came from give the same bits. Whatever is wrong is one sentence with the file and the line
-(Parquet: row). A table is read piece by piece, and a piece's text is gone when its numbers are known.
+table and the log it came from give the same bits. People come in the order of their names, whatever the order of the
+rows: the last digits of sums, and where a search ends, depend on it. Whatever is wrong is one sentence with the file
+and the line (Parquet: row). A table is read piece by piece, and a piece's text is gone when its numbers are known.
 """
 
 import os
@@ -82,9 +83,9 @@ def _read(
     if table.empty:
         raise InputError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
     table = of_material(table, material, source)
-    ranks = pd.factorize(table["participant"])[0]
-    sessions = _session_order(table["session"]) if "session" in table else 0
-    order = table.assign(_person=ranks, _session=sessions).sort_values(["_person", "_session", "trial"], kind="stable")
+    people = _numbered(table["participant"])
+    sessions = _numbered(table["session"]) if "session" in table else 0
+    order = table.assign(_person=people, _session=sessions).sort_values(["_person", "_session", "trial"], kind="stable")
     return order.drop(columns=["_person", "_session"])
 
 
@@ -110,12 +111,15 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
     return table
 
 
-def _session_order(names: pd.Series) -> pd.Series:
-    """Sessions follow their numbers where all have one, else the alphabet, in which S2 is before S10."""
-    numbers = pd.to_numeric(names, errors="coerce")
-    if numbers.notna().all():
-        return numbers
-    return names.map({name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), str(name)) for name in names.unique()})
+def _numbered(names: pd.Series) -> pd.Series:
+    """Of people or sessions the place of each row's in their order: by their numbers where all are numbers, else by the
+    alphabet, in which S2 is before S10. What is computed of a table then does not depend on the order of its rows."""
+    known = pd.Series(names.unique())
+    numbers = pd.to_numeric(known, errors="coerce")
+    padded = known.map(lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), str(name)))
+    keys = pd.DataFrame({"number": numbers if numbers.notna().all() else 0, "padded": padded, "name": known})
+    places = keys.sort_values(["number", "padded", "name"]).index
+    return names.map(dict(zip(known[places], range(len(known)), strict=True)))
 
 
 def write_trials(table: pd.DataFrame, path: str | os.PathLike) -> None:

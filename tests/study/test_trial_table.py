@@ -59,12 +59,23 @@ def test_a_file_that_is_no_table_is_told_what_it_is(tmp_path, name, content, wor
     assert str(refused.value).replace(f"{tmp_path}/", "").removeprefix(f"{name}:").strip().startswith(words)
 
 
-def test_rows_come_by_participant_in_the_order_of_the_table_and_of_their_trials(tmp_path):
+def test_rows_come_by_participant_and_in_the_order_of_their_trials(tmp_path):
     text = HEADER + "B,2,close,1,2\nA,10,similar,1,3\nB,1,different,1,4\nA,9,close,1,5\n"
     table = read_trials(written(tmp_path, text), study())
-    assert table["participant"].tolist() == ["B", "B", "A", "A"]
-    assert table["trial"].tolist() == [1, 2, 9, 10]  # as numbers: as text 10 would stand before 9
-    assert table["category"].tolist() == [0, 2, 2, 1]
+    assert table["participant"].tolist() == ["A", "A", "B", "B"]
+    assert table["trial"].tolist() == [9, 10, 1, 2]  # as numbers: as text 10 would stand before 9
+    assert table["category"].tolist() == [2, 1, 0, 2]
+
+
+@pytest.mark.parametrize("names", [["P2", "P10", "P10b"], ["9", "010", "10", "1e3"], ["Ada", "Ben", "ada"]])
+def test_the_order_of_the_rows_makes_no_difference(tmp_path, names):
+    rows = [f"{n},{t},{'close' if t % 2 else 'similar'},1,{2 + t}\n" for n in names for t in range(1, 4)]
+    orders = [np.random.default_rng(seed).permutation(len(rows)) for seed in range(5)]
+    texts = [HEADER + "".join(rows), *(HEADER + "".join(rows[i] for i in order) for order in orders)]
+    first, *others = (read_trials(written(tmp_path, text), study()).reset_index(drop=True) for text in texts)
+    assert list(dict.fromkeys(first["participant"])) == names
+    for other in others:
+        pd.testing.assert_frame_equal(other, first)
 
 
 def test_other_columns_are_kept_as_text(tmp_path):
@@ -74,7 +85,7 @@ def test_other_columns_are_kept_as_text(tmp_path):
 
 def test_participants_named_like_missing_values_or_numbers_are_people(tmp_path):
     text = HEADER + "NA,1,close,1,2\n01,1,close,1,2\n1,1,close,1,2\nnull,1,close,1,2\n"
-    assert read_trials(written(tmp_path, text), study())["participant"].tolist() == ["NA", "01", "1", "null"]
+    assert read_trials(written(tmp_path, text), study())["participant"].tolist() == ["01", "1", "NA", "null"]
 
 
 def test_a_file_of_a_spreadsheet_is_read(tmp_path):
@@ -83,8 +94,8 @@ def test_a_file_of_a_spreadsheet_is_read(tmp_path):
         ("\ufeff" + HEADER + 'Z1, 1, close, 1.0, 2\n"A-1",1.0,similar,5e-1,2\n').replace("\n", "\r\n").encode()
     )
     table = read_trials(path, study())
-    assert table["participant"].tolist() == ["Z1", "A-1"]
-    assert table["gain"].tolist() == [1.0, 0.5]
+    assert table["participant"].tolist() == ["A-1", "Z1"]
+    assert table["gain"].tolist() == [0.5, 1.0]
 
 
 @pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
