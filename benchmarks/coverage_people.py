@@ -28,12 +28,8 @@ from hilbo.study.config import Study  # noqa: E402
 
 THETA = 5.0
 CASES = [
-    (25, 0.0, 0.0),
-    (25, 0.1, 0.0),
-    (25, 0.3, 0.0),
-    (25, 0.5, 0.0),
-    (25, 0.0, -1.0),
-    (25, 0.1, -1.0),
+    *((25, lapse, 0.0) for lapse in (0.0, 0.1, 0.3, 0.5)),
+    *((25, lapse, drift) for lapse in (0.0, 0.1) for drift in (-1.0, -3.0, 2.0)),
     (100, 0.1, -1.0),
 ]
 CHOICES = {
@@ -72,7 +68,7 @@ def study_of(trials):
 
 def crowd(study, people, lapse, drift, seed):
     """Functions by random waves, with the prior's covariance up to their number."""
-    rng = np.random.default_rng([seed, int(100 * lapse), int(-10 * drift)])
+    rng = np.random.default_rng([seed, int(100 * lapse), int(10 * (6 + drift))])
     thresholds = np.asarray(study.gp.likelihood.thresholds)
     arrays = (
         np.sqrt(2.0 / FEATURES) * rng.standard_normal((people, FEATURES)),

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import log_ndtr, logsumexp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.recipes import WIDTHS
 
-__all__ = ["InTurn", "class_probabilities", "log_highest", "predicted_in_turn"]
+__all__ = ["InTurn", "class_probabilities", "in_turn", "log_highest", "predicted_in_turn"]
 
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
@@ -76,10 +77,10 @@ def predicted_in_turn(
     """
 
     def given(log_width: Float[Array, ""]) -> InTurn:
-        return _filtered(OrdinalProbit(_widened(likelihood, log_width), likelihood.noise), mean, covariance, q, mask)
+        return in_turn(OrdinalProbit(_widened(likelihood, log_width), likelihood.noise), mean, covariance, q, mask)
 
     if not widths:
-        return _filtered(likelihood, mean, covariance, q, mask)
+        return in_turn(likelihood, mean, covariance, q, mask)
     each, weights = jax.vmap(given)(_log_widths(mean)), jnp.log(jnp.asarray(_WEIGHTS, mean.dtype))
     logs = jnp.cumsum(jnp.where(mask, each.log_given, 0.0), axis=1)
     before = weights[:, None] + jnp.pad(logs[:, :-1], ((0, 0), (1, 0)))
@@ -88,26 +89,38 @@ def predicted_in_turn(
     return InTurn(probabilities, logsumexp(share + each.log_given, axis=0))
 
 
-def _filtered(
+def in_turn(
     likelihood: OrdinalProbit,
     mean: Float[Array, " n"],
     covariance: Float[Array, "n n"],
     q: Int[Array, " n"],
     mask: Bool[Array, " n"],
+    lapse: ArrayLike = 0.0,
 ) -> InTurn:
-    """The same with fixed thresholds. The decrease of the covariance is a sum of outer products of rows, one for each
-    answer, so that an answer costs a matrix times a vector."""
+    """The same with fixed thresholds, where the share `lapse` of the answers is any category at random. Both are then
+    the moments of a mixture, of the functions that made the answer and of all; one that nobody expects says little.
+
+    The change of the covariance is a sum of outer products of rows, one for each answer, so that an answer costs a
+    matrix times a vector.
+    """
+    lapse, categories = jnp.asarray(lapse, mean.dtype), likelihood.categories
+    attentive, guess = jnp.log1p(-lapse), jnp.log(lapse / categories)
 
     def answer(state, i):
-        mean, rows = state
-        column = covariance[i] - rows[:, i] @ rows
+        mean, rows, shrinks = state
+        column = covariance[i] - (shrinks * rows[:, i]) @ rows
         variance = column[i]
-        chances = likelihood.class_probabilities(mean[i], variance)
-        log_given, slope, precision = likelihood.smoothed(mean[i], variance, q[i])
-        slope, shrinks = (jnp.where(mask[i], v, 0.0) for v in (slope, precision / (1.0 + variance * precision)))
-        return (mean + slope * column, rows.at[i].set(jnp.sqrt(shrinks) * column)), InTurn(chances, log_given)
+        chances = (1.0 - lapse) * likelihood.class_probabilities(mean[i], variance) + lapse / categories
+        log_judged, slope, precision = likelihood.smoothed(mean[i], variance, q[i])
+        log_given = jnp.logaddexp(attentive + log_judged, guess)
+        judged = jnp.exp(attentive + log_judged - log_given)
+        bent = judged * (precision / (1.0 + variance * precision) - (1.0 - judged) * slope**2)
+        slope, bent = (jnp.where(mask[i], v, 0.0) for v in (judged * slope, bent))
+        after = mean + slope * column, rows.at[i].set(column), shrinks.at[i].set(bent)
+        return after, InTurn(chances, log_given)
 
-    return jax.lax.scan(answer, (mean, jnp.zeros_like(covariance)), jnp.arange(q.size))[1]
+    start = mean, jnp.zeros_like(covariance), jnp.zeros_like(mean)
+    return jax.lax.scan(answer, start, jnp.arange(q.size))[1]
 
 
 def _log_widths(like: Array) -> Float[Array, " nodes"]:

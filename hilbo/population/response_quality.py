@@ -4,20 +4,18 @@ Consistency needs no model: a person's answers to (nearly) the same rendering ar
 share of pairs that agree has an exact interval. Beside it stands the agreement by chance that the shares of the paired
 answers would give. A session that chooses its own trials returns to promising places only, not to clear ones.
 
-The other two ask a person's model for the answer i that it was not told. With the Gaussian posterior N(m, V) of
-expectation propagation, C = (K + 1/W)^-1 and a = C's weights, leaving answer i out gives
+The other two are from the likelihood of a person's answers in turn: each is predicted from those before it, by a model
+of that person alone (`newcomer.in_turn`). A session asks again where an answer was "close". An answer and those after
+it then depend on each other through what was asked, and only the order in which they were given makes a likelihood. The
+lapse rate l is the share of answers that are any category at random; drift d is a shift of the latent score from the
+first trial to the last, in prior standard deviations (negative: stricter): d (s - 1/2) where the share s of the session
+is over. The model's prior has a constant of variance 4 k added: the level of a person's answers is their own affair,
+and an answer far from all others is expected to be like them, not like the prior's mean. Noise beyond the model's looks
+like lapses: a rate says how much of the answers the person's own model cannot tell from chance.
 
-    v_i = (C K)_ii / C_ii,   m_i = m_i - v_i a_i,   p_i(q) = P(q | N(m_i, v_i)),
-
-so that no fit is repeated. Here the model's prior has a constant of variance 4 k added: the level of a person's answers
-is their own affair, and an answer far from all others is expected to be like them, not like the prior's mean. The lapse
-rate l is the share of answers that are any category at random, P(q_i) = (1 - l) p_i(q_i) + l / C; drift d is a shift of
-the latent score from the first trial to the last, in prior standard deviations (negative: stricter), p_i(q) with
-m_i + d (s_i - 1/2), s_i being the share of the session that is over, at whatever lapse rate is likeliest then. Noise
-beyond the model's looks like lapses: a rate says how much of the answers the person's own model cannot tell from
-chance. Both are maximum likelihood over these left-out probabilities, with intervals where twice the log likelihood
-falls by less than 3.84. Those are approximate, since answers left out one at a time are not independent;
-`benchmarks/coverage_people.py` measures how often they hold.
+The likelihood is known on a grid of rates and drifts. Each estimate is where it is largest, the other being the
+likeliest then, and intervals are where twice its logarithm falls by less than 3.84. The filter and that quantile are
+approximate; `benchmarks/coverage_people.py` measures how often intervals hold.
 
 An exclusion rule, "trials < 10 or lapse_low > 0.3", speaks of a person's own answers only, and is applied before
 anything is aggregated.
@@ -25,6 +23,7 @@ anything is aggregated.
 
 import re
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -32,16 +31,17 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float, Int
+from scipy.interpolate import Akima1DInterpolator
 from scipy.optimize import brentq, minimize_scalar
 from scipy.stats import binomtest, chi2
 
 from hilbo.errors import InputError
 from hilbo.kernels import Kernel, gram
-from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.tracing import program
-from hilbo.ordinal_gp import OrdinalGP, Trials, fit
+from hilbo.ordinal_gp import OrdinalGP, Trials
+from hilbo.population.newcomer import in_turn
 
-__all__ = ["MEASURES", "drift", "excluded", "lapse", "left_out", "measure_people", "repeats"]
+__all__ = ["MEASURES", "excluded", "measure_people", "repeats"]
 
 MEASURES = (
     "trials",
@@ -63,8 +63,9 @@ MEASURES = (
 
 _NEAR = 0.02  # of the search ranges (NRMSE): the same rendering to a finger
 _LEVEL = 4.0  # prior variances
-_DRIFT = 6.0  # prior standard deviations: further the search does not go
-_RATES = np.geomspace(1e-3, 0.999, 100)  # lapse rates under which a drift is judged
+_MOST = 200  # answers of a person that are filtered, at the price of their cube
+_RATES = np.linspace(0.0, 1.0, 15) ** 2
+_DRIFTS = np.array([6.0 * part * abs(part) for part in np.linspace(-1.0, 1.0, 21)])  # prior standard deviations
 _RULE = re.compile(r"^\s*(\w+)\s*(<=|>=|<|>)\s*([-+0-9.eE]+)\s*$")
 
 
@@ -81,48 +82,59 @@ class _Levelled(eqx.Module):
 
 
 def measure_people(gp: OrdinalGP, trials: Trials, names: tuple[str, ...], *, near: float = _NEAR) -> pd.DataFrame:
-    """One row for each person of stacked trials (M, n): `participant` and `MEASURES`.
+    """One row for each person of stacked trials (M, n) in the order in which they were answered: `participant` and
+    `MEASURES`.
 
-    `surprise` is the mean of -log p_i, in nats, the person's own model being asked; what cannot be said is NaN.
+    `surprise` is the mean of -log p of an answer, in nats, p being the person's own model's that was told of the
+    earlier ones; what cannot be said is NaN. Of more than 200 answers of a person so many are chosen, evenly, for
+    lapse, drift and surprise.
     """
     model = OrdinalGP(_Levelled(gp.kernel), gp.likelihood)
-    mean, variance, probabilities = (np.asarray(leaf) for leaf in _left_out(model, trials))
-    scale, rows = float(np.sqrt(gp.kernel.variance)), []
-    scaled = OrdinalProbit(gp.likelihood.thresholds / scale, gp.likelihood.noise / scale)
+    scale = jnp.sqrt(jnp.asarray(gp.kernel.variance))
+    log_likelihoods = np.asarray(_log_likelihoods(model, _evenly(trials), scale * jnp.asarray(_DRIFTS, scale.dtype)))
+    attentive = log_likelihoods[:, 0, np.flatnonzero(_DRIFTS == 0.0)[0]]
+    rows = []
     for j, name in enumerate(names):
         mask = np.asarray(trials.mask[j])
         x, q = np.asarray(trials.x[j])[mask], np.asarray(trials.q[j])[mask]
         row = {"participant": name, "trials": len(q), "categories": len(np.unique(q))}
         row |= _consistency(x, q, near)
-        given = probabilities[j][mask][np.arange(len(q)), q]
-        row |= _estimate_columns("lapse", lapse(given, probabilities.shape[-1]))
-        row |= _estimate_columns("drift", drift(scaled, mean[j][mask] / scale, variance[j][mask] / scale**2, q))
-        rows.append(row | {"surprise": float(-np.log(given).mean()) if len(q) else np.nan})
+        row |= _estimate_columns("lapse", _lapse(log_likelihoods[j], len(q)))
+        row |= _estimate_columns("drift", _drift(log_likelihoods[j], len(q)))
+        rows.append(row | {"surprise": float(-attentive[j] / min(len(q), _MOST)) if len(q) else np.nan})
     return pd.DataFrame(rows, columns=["participant", *MEASURES])
 
 
-def left_out(
-    gp: OrdinalGP, trials: Trials
-) -> tuple[Float[Array, " n"], Float[Array, " n"], Float[Array, "n categories"]]:
-    """Mean and variance (n,) of f at each answer's point without that answer, and class probabilities (n, C).
-
-    Rows without an answer hold the prediction from all answers.
-    """
-    posterior = fit(gp, trials, inference="ep", throw=False)
-    covariance, latent = gram(gp.kernel, trials.x, trials.x), posterior.latent
-    inverse = jnp.diagonal(latent.inverse)
-    shared = jnp.sum(latent.inverse * covariance, axis=1)
-    answered = trials.mask & (inverse > 0)
-    mean, explained = posterior.predict_explained(trials.x)
-    full = jax.vmap(gp.kernel.diagonal)(trials.x) - explained
-    variance = jnp.where(answered, shared / jnp.where(answered, inverse, jnp.ones_like(inverse)), full)
-    mean = mean - jnp.where(answered, variance * latent.weights, jnp.zeros_like(mean))
-    return mean, variance, jax.vmap(gp.likelihood.class_probabilities)(mean, variance)
+def _evenly(trials: Trials) -> Trials:
+    """At most `_MOST` answers of each person, evenly chosen, in their order."""
+    mask = np.asarray(trials.mask)
+    if mask.shape[1] <= _MOST:
+        return trials
+    rows = np.zeros((len(mask), _MOST), int)
+    held = np.arange(_MOST)[None, :] < np.minimum(mask.sum(axis=1), _MOST)[:, None]
+    for j, (given, part) in enumerate(zip(map(np.flatnonzero, mask), held, strict=True)):
+        rows[j, part] = given[np.linspace(0, len(given) - 1, part.sum()).round().astype(int)]
+    x, q = (np.take_along_axis(a, i, axis=1) for a, i in ((trials.x, rows[..., None]), (trials.q, rows)))
+    return jax.vmap(Trials)(jnp.asarray(x), jnp.asarray(q), jnp.asarray(held))
 
 
 @program
-def _left_out(gp: OrdinalGP, trials: Trials) -> tuple[Float[Array, "M n"], Float[Array, "M n"], Float[Array, "M n C"]]:
-    return jax.lax.map(lambda t: left_out(gp, t), trials)
+def _log_likelihoods(gp: OrdinalGP, trials: Trials, drifts: Float[Array, " shifts"]) -> Float[Array, "M rates shifts"]:
+    """Of everybody's answers, at each lapse rate and drift, which is in the unit of the latent score."""
+
+    def person(trials: Trials) -> Float[Array, "rates shifts"]:
+        covariance = gram(gp.kernel, trials.x, trials.x)
+        last = jnp.maximum(jnp.sum(trials.mask) - 1, 1)
+        progress = (jnp.cumsum(trials.mask) - 1) / last - 0.5
+
+        def at(rate: Float[Array, ""], drift: Float[Array, ""]) -> Float[Array, ""]:
+            shift = (drift * progress).astype(covariance.dtype)
+            told = in_turn(gp.likelihood, shift, covariance, trials.q, trials.mask, rate)
+            return jnp.sum(jnp.where(trials.mask, told.log_given, 0.0))
+
+        return jax.lax.map(lambda rate: jax.vmap(partial(at, rate))(drifts), jnp.asarray(_RATES, drifts.dtype))
+
+    return jax.lax.map(person, trials)
 
 
 def repeats(x: Float[np.ndarray, "n d"], near: float = _NEAR) -> np.ndarray:
@@ -138,40 +150,17 @@ def repeats(x: Float[np.ndarray, "n d"], near: float = _NEAR) -> np.ndarray:
     return np.array(pairs, int).reshape(-1, 2)
 
 
-def lapse(given: Float[np.ndarray, " n"], categories: int) -> tuple[float, float, float]:
-    """Lapse rate and its 95 % interval from the probabilities (n,) of the answers given, each left out."""
-    if not len(given):
-        return np.nan, 0.0, 1.0
-
-    def likelihood(rate):
-        return float(np.sum(np.log((1 - rate) * given + rate / categories)))
-
-    return _profile(likelihood, 0.0, 1.0)
+def _lapse(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> tuple[float, float, float]:
+    """Lapse rate and its 95 % interval."""
+    return _profile(_RATES, log_likelihood.max(axis=1)) if answers else (np.nan, 0.0, 1.0)
 
 
-def drift(
-    likelihood: OrdinalProbit,
-    mean: Float[np.ndarray, " n"],
-    variance: Float[np.ndarray, " n"],
-    q: np.ndarray,
-) -> tuple[float, float, float]:
-    """Shift of the latent score from the first trial to the last, and its 95 % interval; from left-out moments (n,), in
-    their unit and the likelihood's; sought within 6 of them. At each shift the likeliest of a hundred lapse rates
-    counts, since guesses are no sign of a firm criterion."""
-    if len(q) < 2:
+def _drift(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> tuple[float, float, float]:
+    """Drift in prior standard deviations and its 95 % interval, open where the grid ends."""
+    if answers < 2:
         return np.nan, -np.inf, np.inf
-    progress = np.linspace(-0.5, 0.5, len(q))
-    edges = np.concatenate([[-np.inf], np.asarray(likelihood.thresholds, float), [np.inf]])
-    width = np.sqrt(float(likelihood.noise) ** 2 + variance)
-    attentive, guess = np.log1p(-_RATES)[:, None], np.log(_RATES / likelihood.categories)[:, None]
-
-    def log_likelihood(shift):
-        centre = mean + shift * progress
-        log_chances = _log_between((edges[q] - centre) / width, (edges[q + 1] - centre) / width)
-        return float(np.sum(np.logaddexp(attentive + log_chances, guess), axis=1).max())
-
-    best, low, high = _profile(log_likelihood, -_DRIFT, _DRIFT)
-    return best, -np.inf if low <= -_DRIFT else low, np.inf if high >= _DRIFT else high
+    best, low, high = _profile(_DRIFTS, log_likelihood.max(axis=0))
+    return best, -np.inf if low <= _DRIFTS[0] else low, np.inf if high >= _DRIFTS[-1] else high
 
 
 def excluded(table: pd.DataFrame, rule: str) -> dict[str, str]:
@@ -229,25 +218,23 @@ def _estimate_columns(name: str, estimate: tuple[float, float, float]) -> dict[s
     return dict(zip((name, f"{name}_low", f"{name}_high"), map(float, estimate), strict=True))
 
 
-def _profile(log_likelihood: Callable[[float], float], low: float, high: float) -> tuple[float, float, float]:
-    """Maximum of a concave function within bounds, and where twice it has fallen by the 95 % point of chi^2."""
-    best = minimize_scalar(lambda v: -log_likelihood(v), bounds=(low, high), method="bounded").x
-    best = max((low, float(best), high), key=log_likelihood)
-    bar = log_likelihood(best) - chi2.ppf(0.95, 1) / 2
+def _profile(grid: Float[np.ndarray, " k"], values: Float[np.ndarray, " k"]) -> tuple[float, float, float]:
+    """Where a log likelihood that is known on a grid is largest, and the ends of where twice it is not below by the
+    95 % point of chi^2."""
+    between = Akima1DInterpolator(grid, values, method="makima")
+    highest = int(values.argmax())
+    sides = grid[max(highest - 1, 0)], grid[min(highest + 1, len(grid) - 1)]
+    best = minimize_scalar(lambda v: -between(v), bounds=sides, method="bounded").x
+    best = max((float(grid[highest]), float(best)), key=between)
+    bar = between(best) - chi2.ppf(0.95, 1) / 2
 
-    def end(bound):
-        if log_likelihood(bound) >= bar:
-            return bound
-        return brentq(lambda v: log_likelihood(v) - bar, best, bound)
+    def end(bound: float, beyond: np.ndarray) -> float:
+        """The nearest end of the interval: between the last point of the grid above the bar, and the next."""
+        inner = best
+        for outer in beyond:
+            if between(outer) < bar:
+                return brentq(lambda v: between(v) - bar, inner, outer)
+            inner = outer
+        return bound
 
-    return best, end(low), end(high)
-
-
-def _log_between(a: Float[np.ndarray, "*s"], b: Float[np.ndarray, "*s"]) -> Float[np.ndarray, "*s"]:
-    """log(Phi(b) - Phi(a)), in whichever tail keeps its digits."""
-    from scipy.special import log_ndtr
-
-    flip = a > 0
-    a, b = np.where(flip, -b, a), np.where(flip, -a, b)
-    top = log_ndtr(b)
-    return top + np.log1p(-np.exp(log_ndtr(a) - top))
+    return best, end(grid[0], grid[grid < best][::-1]), end(grid[-1], grid[grid > best])

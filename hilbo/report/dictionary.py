@@ -48,12 +48,12 @@ _PEOPLE = {
     "categories": ("answers", "how many different ones the participant used"),
     "pairs": ("pairs", "disjoint pairs of answers to renderings within 2 %"),
     "chance": ("share", "agreement of such pairs expected by chance"),
-    "surprise": ("nats", "mean negative log density of each answer, from the participant's others"),
+    "surprise": ("nats", "mean of minus the log probability of each answer, from the participant's earlier ones"),
     "left_out": ("", "why the study's rule leaves the participant out; empty: kept"),
 }
 for _name, _words, _unit in (
     ("consistency", "share of pairs with the same answer", "share"),
-    ("lapse", "share of answers that the participant's own map cannot tell from a guess", "share"),
+    ("lapse", "share of answers that the participant's own earlier answers cannot tell from a guess", "share"),
     ("drift", "shift of the latent score from the first to the last trial", "prior sd"),
 ):
     _ends = {f"{_name}_{end}": (_unit, f"{end} end of its 95 % interval") for end in ("low", "high")}

@@ -1,17 +1,20 @@
 """A new person's answers one after the other: each is predicted from those before it, whatever chose the renderings."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from hilbo import RBF, OrdinalProbit
 from hilbo.kernels import gram
-from hilbo.population.newcomer import _WEIGHTS, _log_widths, _widened, class_probabilities, predicted_in_turn
+from hilbo.population.newcomer import _WEIGHTS, _log_widths, _widened, class_probabilities, in_turn, predicted_in_turn
 
 LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.8]), jnp.asarray(0.7))
 N, Q = 4, np.array([0, 2, 1, 2])
+ALL = jnp.ones(N, bool)
 
 
 def boxes(thresholds, mean, covariance):
@@ -61,6 +64,33 @@ def test_an_answer_that_was_all_but_excluded_is_a_number(widths):
     assert np.isfinite(log_given).all() and -3000 < log_given[1] < -300 and (log_given[2:] > -3).all()
 
 
+@pytest.mark.parametrize("lapse", [0.0, 0.3, 1.0])
+def test_guesses_leave_the_moments_of_a_mixture(lapse):
+    """The first answer by quadrature over the function where it was given; and all answers there are add up to 1."""
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(N, N))
+    mean, covariance = rng.normal(size=N), root @ root.T
+    of = jax.jit(jax.vmap(lambda q: in_turn(LIKELIHOOD, *map(jnp.asarray, (mean, covariance)), q, ALL, lapse)))
+    every = jnp.asarray(np.array(list(itertools.product(range(3), repeat=N))))
+    told = of(every)
+    assert float(jnp.sum(jnp.exp(jnp.sum(told.log_given, axis=1)))) == pytest.approx(1.0, rel=1e-12)
+    sd = np.sqrt(covariance[0, 0])
+    f = mean[0] + sd * np.linspace(-12, 12, 40_001)
+    edges = np.array([-np.inf, -0.5, 0.8, np.inf])
+    for q in range(3):
+        chance = (1 - lapse) * (norm.cdf((edges[q + 1] - f) / 0.7) - norm.cdf((edges[q] - f) / 0.7)) + lapse / 3
+        tilted = norm.pdf(f, mean[0], sd) * chance
+        first = np.trapezoid(tilted, f)
+        moved = np.trapezoid(tilted * (f - mean[0]), f) / first
+        variance = np.trapezoid(tilted * (f - mean[0]) ** 2, f) / first - moved**2
+        slope = covariance[1, 0] / covariance[0, 0]
+        after = mean[1] + slope * moved, covariance[1, 1] + slope**2 * (variance - covariance[0, 0])
+        second = (1 - lapse) * np.asarray(LIKELIHOOD.class_probabilities(*after)) + lapse / 3
+        place = int(np.argmax(np.asarray(every)[:, 0] == q))
+        assert np.exp(told.log_given[place, 0]) == pytest.approx(first, rel=1e-9)
+        np.testing.assert_allclose(told.probabilities[place, 1], second, rtol=1e-8)
+
+
 def test_a_choice_by_earlier_answers_looks_like_no_misfit():
     """2,000 people of the model itself are asked at one place as long as they give the highest answer there."""
     rng = np.random.default_rng(2)
@@ -73,7 +103,7 @@ def test_a_choice_by_earlier_answers_looks_like_no_misfit():
         q[:, i] = np.searchsorted([-0.5, 0.8], felt)
     covariance = 1.5**2 * (place[:, :, None] == place[:, None, :])
     of_person = jax.vmap(lambda c, q: predicted_in_turn(LIKELIHOOD, jnp.zeros(n), c, q, jnp.ones(n, bool))[0])
-    in_turn = np.asarray(jax.jit(of_person)(jnp.asarray(covariance), jnp.asarray(q)))[..., 2].mean()
+    predicted = np.asarray(jax.jit(of_person)(jnp.asarray(covariance), jnp.asarray(q)))[..., 2].mean()
     alone = float(LIKELIHOOD.class_probabilities(0.0, 1.5**2)[2])
     assert (q == 2).mean() - alone > 0.1
-    assert (q == 2).mean() == pytest.approx(in_turn, abs=0.01)
+    assert (q == 2).mean() == pytest.approx(predicted, abs=0.01)

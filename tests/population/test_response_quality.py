@@ -1,46 +1,20 @@
 """Consistency, lapses and drift of people whose answers are known, and the rule that leaves people out."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from datasets import SMALL
-from helpers import answers, model
-from scipy.stats import binomtest, norm
+from helpers import model
+from scipy.stats import binomtest
 
-from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
+from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
-from hilbo.kernels import gram
-from hilbo.population.response_quality import drift, excluded, lapse, left_out, measure_people, repeats
+from hilbo.population import response_quality
+from hilbo.population.response_quality import excluded, measure_people, repeats
 
 CASE = SMALL[0]()
-
-
-@pytest.mark.deep
-def test_leaving_an_answer_out_is_dropping_its_site():
-    """The Gaussian of all sites but one, by dense algebra; and nearly EP's own fit without that answer."""
-    data = CASE
-    gp, trials = model(data), answers(data)
-    mean, variance, chances = left_out(gp, trials)
-    latent = fit(gp, trials, inference="ep").latent
-    n = len(data.q)
-    covariance = np.asarray(gram(gp.kernel, trials.x, trials.x))[:n, :n]
-    inverse, weights, mode = (np.asarray(part)[:n] for part in (latent.inverse, latent.weights, latent.mode))
-    precision = np.diagonal(inverse[:, :n]) / (1 - np.sum(inverse[:, :n] * covariance, axis=1))
-    natural = weights + precision * mode
-    for i in range(n):
-        others = np.arange(n) != i
-        kept = np.diag(1 / precision[others]) + covariance[np.ix_(others, others)]
-        cross = np.linalg.solve(kept, covariance[others, i])
-        expected = cross @ (natural[others] / precision[others]), covariance[i, i] - cross @ covariance[others, i]
-        np.testing.assert_allclose([mean[i], variance[i]], expected, atol=1e-9)
-        rest = Trials(trials.x, trials.q, trials.mask.at[i].set(False))
-        np.testing.assert_allclose(
-            expected, np.ravel(fit(gp, rest, inference="ep").predict(trials.x[i : i + 1])), atol=0.05
-        )
-        edges = np.concatenate([[-np.inf], data.thresholds, [np.inf]])
-        z = (edges - float(mean[i])) / np.sqrt(data.noise**2 + float(variance[i]))
-        np.testing.assert_allclose(chances[i], np.diff(norm.cdf(z)), atol=1e-12)
 
 
 def test_repeats_are_disjoint_and_nearest_first():
@@ -78,43 +52,43 @@ def test_measures_do_not_depend_on_the_unit_of_the_score():
     np.testing.assert_allclose(rows[1], rows[0], atol=1e-4)
 
 
-def test_the_lapse_rate_of_a_known_mixture():
-    """Answers that a perfect model gives 0.9 to, but for the share that is guessed; its maximum is in closed form."""
-    given = np.repeat([0.9, 0.05], [80, 20])
-    best, low, high = lapse(given, 3)
-    slopes = (1 / 3 - given) / ((1 - best) * given + best / 3)
-    assert slopes.sum() == pytest.approx(0.0, abs=1e-3)
-    assert low < best < high
-    assert lapse(np.full(10, 0.95), 3)[0] == pytest.approx(0.0, abs=1e-5)
-    assert lapse(np.full(10, 0.01), 3) == pytest.approx((1.0, lapse(np.full(10, 0.01), 3)[1], 1.0), abs=1e-5)
-    assert np.isnan(lapse(np.zeros(0), 3)[0])
+def person(count, lapse, drift, seed=0):
+    """Answers of one person at five renderings in turn, whose scores are 2, 1, ... -2."""
+    rng, gp = np.random.default_rng(seed), model(CASE)
+    places = np.arange(count) % 5
+    score = 2.0 - places + drift * np.linspace(-0.5, 0.5, count) + 0.3 * rng.standard_normal(count)
+    told = np.searchsorted(np.asarray(gp.likelihood.thresholds), score)
+    q = np.where(rng.permutation(count) < lapse * count, rng.integers(gp.likelihood.categories, size=count), told)
+    x = np.stack([places / 4, np.zeros(count), np.zeros(count)], axis=1)
+    return gp, jax.tree.map(lambda leaf: leaf[None], Trials.from_arrays(x, q))
 
 
-def test_drift_finds_the_shift_that_was_put_in():
-    rng = np.random.default_rng(0)
-    likelihood = model(CASE).likelihood
-    count, shift = 4000, -1.5
-    mean = rng.normal(size=count)
-    noise = float(likelihood.noise) * rng.standard_normal(count)
-    z = mean + shift * np.linspace(-0.5, 0.5, count) + noise
-    q = np.searchsorted(np.asarray(likelihood.thresholds), z)
-    best, low, high = drift(likelihood, mean, np.zeros(count), q)
-    assert low < shift < high and high - low < 0.4
-    assert abs(best - shift) < 0.2
-    assert drift(likelihood, mean[:1], np.zeros(1), q[:1])[1:] == (-np.inf, np.inf)
+@pytest.mark.parametrize(("lapse", "drift"), [(0.0, -3.0), (0.0, 2.0), (0.4, 0.0)])
+def test_guesses_and_a_drift_are_told_apart(lapse, drift):
+    (row,) = measure_people(*person(120, lapse, drift), ("A",)).to_dict("records")
+    assert row["lapse_low"] <= lapse <= row["lapse_high"] < 0.7 and (row["lapse_low"] > 0.1) == (lapse > 0)
+    assert row["drift_low"] <= drift <= row["drift_high"]
+    assert (row["drift_high"] < -1.0, row["drift_low"] > 0.5) == (drift < 0, drift > 0)
 
 
-def test_guesses_do_not_make_a_drift_sure():
-    likelihood, held = model(CASE).likelihood, 0
-    for seed in range(60):
-        rng = np.random.default_rng(seed)
-        mean = rng.normal(size=40)
-        z = mean + np.linspace(-0.5, 0.5, 40) + float(likelihood.noise) * rng.standard_normal(40)
-        told = np.searchsorted(np.asarray(likelihood.thresholds), z)
-        q = np.where(rng.random(40) < 0.3, rng.integers(likelihood.categories, size=40), told)
-        _, low, high = drift(likelihood, mean, np.zeros(40), q)
-        held += low < 1.0 < high
-    assert held >= 53  # of 60; taken for attentive, these people's intervals hold the truth less often
+def test_of_many_answers_an_even_part_is_measured(monkeypatch):
+    gp, trials = person(26, 0.0, 0.0)
+    monkeypatch.setattr(response_quality, "_MOST", 16)
+    (row,) = measure_people(gp, trials, ("A",)).to_dict("records")
+    part = np.linspace(0, 25, 16).round().astype(int)
+    (few,) = measure_people(gp, jax.tree.map(lambda leaf: leaf[:, part], trials), ("A",)).to_dict("records")
+    assert (row["trials"], few["trials"]) == (26, 16)
+    for name in ("lapse_high", "drift", "surprise"):
+        assert row[name] == pytest.approx(few[name], rel=1e-6)
+
+
+def test_of_nobody_nothing_is_said():
+    gp, trials = person(5, 0.0, 0.0)
+    nobody = eqx.tree_at(lambda t: t.mask, trials, jnp.zeros_like(trials.mask))
+    (row,) = measure_people(gp, nobody, ("A",)).to_dict("records")
+    assert np.isnan([row["lapse"], row["drift"], row["surprise"]]).all()
+    assert (row["lapse_low"], row["lapse_high"]) == (0.0, 1.0)
+    assert (row["drift_low"], row["drift_high"]) == (-np.inf, np.inf)
 
 
 def test_rules_name_who_and_why():
