@@ -37,6 +37,7 @@ from scipy.stats import binomtest, chi2
 
 from hilbo.errors import InputError
 from hilbo.kernels import Kernel, gram
+from hilbo.numerics.host import placed
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Trials
 from hilbo.population.newcomer import in_turn
@@ -114,8 +115,9 @@ def _evenly(trials: Trials) -> Trials:
     held = np.arange(_MOST)[None, :] < np.minimum(mask.sum(axis=1), _MOST)[:, None]
     for j, (given, part) in enumerate(zip(map(np.flatnonzero, mask), held, strict=True)):
         rows[j, part] = given[np.linspace(0, len(given) - 1, part.sum()).round().astype(int)]
-    x, q = (np.take_along_axis(a, i, axis=1) for a, i in ((trials.x, rows[..., None]), (trials.q, rows)))
-    return jax.vmap(Trials)(jnp.asarray(x), jnp.asarray(q), jnp.asarray(held))
+    person = np.arange(len(mask))[:, None]
+    x, q = (placed(np.asarray(leaf)[person, rows]) for leaf in (trials.x, trials.q))
+    return jax.vmap(Trials)(x, q, placed(held))
 
 
 @program
