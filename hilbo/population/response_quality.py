@@ -65,7 +65,7 @@ MEASURES = (
 _NEAR = 0.02  # of the search ranges (NRMSE): the same rendering to a finger
 _LEVEL = 4.0  # prior variances
 _MOST = 200  # answers of a person that are filtered, at the price of their cube
-_RATES = np.linspace(0.0, 1.0, 15) ** 2
+_RATES = np.linspace(0.0, 1.0, 18) ** 3  # an answer that is all but excluded takes small ones
 _DRIFTS = np.array([6.0 * part * abs(part) for part in np.linspace(-1.0, 1.0, 21)])  # prior standard deviations
 _RULE = re.compile(r"^\s*(\w+)\s*(<=|>=|<|>)\s*([-+0-9.eE]+)\s*$")
 
@@ -222,9 +222,9 @@ def _estimate_columns(name: str, estimate: tuple[float, float, float]) -> dict[s
 
 def _profile(grid: Float[np.ndarray, " k"], values: Float[np.ndarray, " k"]) -> tuple[float, float, float]:
     """Where a log likelihood that is known on a grid is largest, and the ends of where twice it is not below by the
-    95 % point of chi^2."""
+    95 % point of chi^2. Of answers that are all guessed nothing is known of a drift: the profile is then flat."""
     between = Akima1DInterpolator(grid, values, method="makima")
-    highest = int(values.argmax())
+    highest = max(range(len(grid)), key=lambda place: (values[place], -abs(grid[place])))  # of a plateau nearest to 0
     sides = grid[max(highest - 1, 0)], grid[min(highest + 1, len(grid) - 1)]
     best = minimize_scalar(lambda v: -between(v), bounds=sides, method="bounded").x
     best = max((float(grid[highest]), float(best)), key=between)

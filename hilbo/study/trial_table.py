@@ -83,10 +83,9 @@ def _read(
     if table.empty:
         raise InputError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
     table = of_material(table, material, source)
-    people = _numbered(table["participant"])
-    sessions = _numbered(table["session"]) if "session" in table else 0
-    order = table.assign(_person=people, _session=sessions).sort_values(["_person", "_session", "trial"], kind="stable")
-    return order.drop(columns=["_person", "_session"])
+    keys = [name for name in ("participant", "session", "phase") if name in table]
+    places = [table["trial"], *(_numbered(table[name]) for name in reversed(keys))]
+    return table.iloc[np.lexsort(places)]
 
 
 def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
@@ -112,8 +111,9 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
 
 
 def _numbered(names: pd.Series) -> pd.Series:
-    """Of people or sessions the place of each row's in their order: by their numbers where all are numbers, else by the
-    alphabet, in which S2 is before S10. What is computed of a table then does not depend on the order of its rows."""
+    """Of people, sessions or phases the place of each row's in their order: by numbers where all are numbers, else by
+    the alphabet, in which S2 is before S10. What is computed of a table then does not depend on the order of its rows.
+    """
     known = pd.Series(names.unique())
     numbers = pd.to_numeric(known, errors="coerce")
     padded = known.map(lambda name: re.sub(r"\d+", lambda digits: digits[0].zfill(20), str(name)))

@@ -82,6 +82,11 @@ def test_of_many_answers_an_even_part_is_measured(monkeypatch):
         assert row[name] == pytest.approx(few[name], rel=1e-6)
 
 
+def test_who_only_guesses_has_no_drift():
+    """Drifts make no difference to answers that are all guessed."""
+    assert response_quality._drift(np.full((18, 21), -30.0), 5) == (0.0, -np.inf, np.inf)
+
+
 def test_of_nobody_nothing_is_said():
     gp, trials = person(5, 0.0, 0.0)
     nobody = eqx.tree_at(lambda t: t.mask, trials, jnp.zeros_like(trials.mask))

@@ -69,11 +69,14 @@ def test_rows_come_by_participant_and_in_the_order_of_their_trials(tmp_path):
 
 @pytest.mark.parametrize("names", [["P2", "P10", "P10b"], ["9", "010", "10", "1e3"], ["Ada", "Ben", "ada"]])
 def test_the_order_of_the_rows_makes_no_difference(tmp_path, names):
-    rows = [f"{n},{t},{'close' if t % 2 else 'similar'},1,{2 + t}\n" for n in names for t in range(1, 4)]
-    orders = [np.random.default_rng(seed).permutation(len(rows)) for seed in range(5)]
-    texts = [HEADER + "".join(rows), *(HEADER + "".join(rows[i] for i in order) for order in orders)]
+    phases, trials = ("first", "second"), range(1, 4)
+    rows = [f"{p},{n},{t},{'close' if t % 2 else 'similar'},1,{2 + t}\n" for n in names for p in phases for t in trials]
+    orders = [np.arange(len(rows)), *(np.random.default_rng(seed).permutation(len(rows)) for seed in range(5))]
+    texts = ["phase," + HEADER + "".join(rows[i] for i in order) for order in orders]
     first, *others = (read_trials(written(tmp_path, text), study()).reset_index(drop=True) for text in texts)
-    assert list(dict.fromkeys(first["participant"])) == names
+    assert list(dict.fromkeys(first["participant"])) == names and first["phase"].tolist()[:4] == ["first"] * 3 + [
+        "second"
+    ]
     for other in others:
         pd.testing.assert_frame_equal(other, first)
 
