@@ -131,8 +131,8 @@ def _log_likelihoods(gp: OrdinalGP, trials: Trials, drifts: Float[Array, " shift
 
         def at(rate: Float[Array, ""], drift: Float[Array, ""]) -> Float[Array, ""]:
             shift = (drift * progress).astype(covariance.dtype)
-            told = in_turn(gp.likelihood, shift, covariance, trials.q, trials.mask, rate)
-            return jnp.sum(jnp.where(trials.mask, told.log_given, 0.0))
+            predicted = in_turn(gp.likelihood, shift, covariance, trials.q, trials.mask, rate)
+            return jnp.sum(jnp.where(trials.mask, predicted.log_given, 0.0))
 
         return jax.lax.map(lambda rate: jax.vmap(partial(at, rate))(drifts), jnp.asarray(_RATES, drifts.dtype))
 

@@ -50,10 +50,10 @@ def aggregate(cohort):
 def test_ones_own_table_is_a_cohort_with_the_bits_of_a_file(table, cohort, tmp_path):
     table.to_csv(tmp_path / "t.csv", index=False)
     read = cohort_of(read_trials(tmp_path / "t.csv", STUDY), STUDY)
-    assert cohort.names == read.names == ("7", "3")
+    assert cohort.names == read.names == ("3", "7")
     np.testing.assert_array_equal(cohort.physical, read.physical)
     np.testing.assert_array_equal(cohort.trials.q, read.trials.q)
-    assert repr(cohort) == "Cohort(2 participants (7, 3), 12 answers, 2 parameters)"
+    assert repr(cohort) == "Cohort(2 participants (3, 7), 12 answers, 2 parameters)"
 
 
 @pytest.mark.parametrize(
