@@ -98,25 +98,25 @@ def in_turn(
     lapse: ArrayLike = 0.0,
 ) -> InTurn:
     """The same with fixed thresholds, where the share `lapse` of the answers is any category at random. Both are then
-    the moments of a mixture, of the functions that made the answer and of all; one that nobody expects says little.
+    the moments of a mixture, of what the answer says and of what was known before; an unlikely answer changes little.
 
     The change of the covariance is a sum of outer products of rows, one for each answer, so that an answer costs a
     matrix times a vector.
     """
     lapse, categories = jnp.asarray(lapse, mean.dtype), likelihood.categories
-    attentive, guess = jnp.log1p(-lapse), jnp.log(lapse / categories)
+    log_attentive, log_guess = jnp.log1p(-lapse), jnp.log(lapse / categories)
 
     def answer(state, i):
-        mean, rows, shrinks = state
-        column = covariance[i] - (shrinks * rows[:, i]) @ rows
+        mean, rows, curvatures = state
+        column = covariance[i] - (curvatures * rows[:, i]) @ rows
         variance = column[i]
         chances = (1.0 - lapse) * likelihood.class_probabilities(mean[i], variance) + lapse / categories
         log_judged, slope, precision = likelihood.smoothed(mean[i], variance, q[i])
-        log_given = jnp.logaddexp(attentive + log_judged, guess)
-        judged = jnp.exp(attentive + log_judged - log_given)
-        bent = judged * (precision / (1.0 + variance * precision) - (1.0 - judged) * slope**2)
-        slope, bent = (jnp.where(mask[i], v, 0.0) for v in (judged * slope, bent))
-        after = mean + slope * column, rows.at[i].set(column), shrinks.at[i].set(bent)
+        log_given = jnp.logaddexp(log_attentive + log_judged, log_guess)
+        attentive = jnp.exp(log_attentive + log_judged - log_given)  # probability that this answer is no guess
+        curvature = attentive * (precision / (1.0 + variance * precision) - (1.0 - attentive) * slope**2)
+        slope, curvature = (jnp.where(mask[i], v, 0.0) for v in (attentive * slope, curvature))
+        after = mean + slope * column, rows.at[i].set(column), curvatures.at[i].set(curvature)
         return after, InTurn(chances, log_given)
 
     start = mean, jnp.zeros_like(covariance), jnp.zeros_like(mean)

@@ -245,7 +245,7 @@ def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
 
 
 def test_a_program_with_the_key_of_one_that_is_heard_waits_until_that_is_silent(tmp_path):
-    with LiveStimulus(tmp_path, silence=0.5) as live:
+    with LiveStimulus(tmp_path, silence=1.5) as live:
         first = live.by_hand()
         second = ByHand.__new__(ByHand)
         second.__dict__.update(first.__dict__)
@@ -276,10 +276,10 @@ def test_nobody_presents_before_the_stop_was_seen(live):
     with refused(409, "is stop; there is nothing to present"):
         program.report("presented", trial="tag:1.1")
     program.report("neutral")
-    program.asked(live, "reference")
     live.until(lambda _: len(live.events("device")) > 1)
     ready = live.events("device")[-1].data
     assert (ready["condition"], ready["program"], ready["force"]) == ("ready", "by hand", True) and ready["stop_s"] >= 0
+    program.asked(live, "reference")
 
 
 def test_a_program_that_does_not_go_neutral_when_told_is_lost(tmp_path):

@@ -177,12 +177,8 @@ class Live:
         return [event for event in read_log(self.path, self.study)[1] if kind in (None, event.kind)]
 
     def device_did(self, *conditions: str) -> None:
-        """Waits until the log says so: the pages show what a device did before the log holds it. More may follow when
-        the test looks late."""
-        count = len(conditions)
-        self.until(
-            lambda told: told[:count] == list(conditions), lambda: [e.data["condition"] for e in self.events("device")]
-        )
+        """Waits until the log says so: the pages show what a device did before the log holds it."""
+        self.until(lambda told: told == list(conditions), lambda: [e.data["condition"] for e in self.events("device")])
 
     def replayed(self) -> LiveSession:
         """The state that the log alone gives."""
