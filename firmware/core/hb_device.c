@@ -71,14 +71,18 @@ static void fade(struct hb_device *device, float felt_N, float gap_N)
     device->offset_N = gap_N > 0.0F ? hb_clamp(offset_N, 0.0F, gap_N) : hb_clamp(offset_N, gap_N, 0.0F);
 }
 
-/* From beyond the limit of the new set the force only falls. */
-static void keep_below_limit(struct hb_device *device, float felt_N)
+/* The force with what is left of the offset. From beyond the limit of the new set it only falls; a sum of rounded terms
+ * may be more than its largest value by a last place, therefore that value itself is taken. */
+static float below_limit(struct hb_device *device, float felt_N)
 {
     float most_N = limit(device, device->active);
     most_N = device->safety.force_N > most_N ? device->safety.force_N : most_N;
-    if (felt_N + device->offset_N > most_N) {
+    float force_N = felt_N + device->offset_N;
+    if (force_N > most_N) {
         device->offset_N = most_N - felt_N;
+        force_N = most_N;
     }
+    return force_N;
 }
 
 /* The force while RUNNING and in contact, up to and with the slew limit. `old_N`: of the set that was in force before,
@@ -95,8 +99,7 @@ static float run(struct hb_device *device, float model_N, float old_N)
     if (device->starting || device->flipped) {
         device->offset_N = gap_N;
     }
-    keep_below_limit(device, felt_N);
-    float before_N = felt_N + device->offset_N;
+    float before_N = below_limit(device, felt_N);
     bool switching = device->offset_N != 0.0F;
     if (switching) {
         safety->flags |= (uint16_t)HB_FLAG_SWITCHING;
@@ -104,7 +107,7 @@ static float run(struct hb_device *device, float model_N, float old_N)
             fade(device, felt_N, gap_N);
         }
     }
-    float force_N = felt_N + device->offset_N;
+    float force_N = below_limit(device, felt_N);
     if ((config->capabilities & (uint8_t)HB_CAN_CONTROL_PASSIVITY) != 0U) {
         float most_N = limit(device, device->active);
         force_N = hb_clamp(hb_control(safety, config, force_N), 0.0F, force_N > most_N ? force_N : most_N);
