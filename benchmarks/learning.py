@@ -1,7 +1,7 @@
 """What a recipe costs, and how much it depends on its priors.
 
-    python benchmarks/learning.py [--write]           times on one core, warm, and the error of the low rank
-    python benchmarks/learning.py --priors [--seeds 10] [--write]
+    python benchmarks/learning.py [--people 24 100 1000] [--write]   times on one core, warm, and the low rank's error
+    python benchmarks/learning.py --priors [--recipe learnt-2] [--seeds 10] [--write]
 
 Studies of the population `paper-individuals` (benchmarks/populations_people.py), sessions of 25 trials. --priors: every
 prior's standard deviation halved and doubled, seeds from 0; how far the optimum moves (NRMSE), and what that does to
@@ -10,6 +10,7 @@ how often new people give the highest answer there. --write puts the tables into
 
 import argparse
 import dataclasses
+import itertools
 import os
 import resource
 import time
@@ -32,9 +33,11 @@ from populations import chance_at  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
 
 from hilbo.population.learnt import learn  # noqa: E402
+from hilbo.population.learnt_posterior import LEFT  # noqa: E402
 from hilbo.population.low_rank import shared_evidence  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.population.recipes import LEARNT_1, RECIPES  # noqa: E402
+from hilbo.population.tallies import tallied  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
 from hilbo.study.config import Study  # noqa: E402
@@ -43,19 +46,22 @@ from hilbo.study.optima import map_optimum  # noqa: E402
 
 PAGE = Path(__file__).parents[1] / "docs" / "methods" / "which_method.md"
 POPULATION = POPULATIONS["paper-individuals"]
-SIZES = (24, 100, 1000)  # people
-EXACT = 1000  # features, of which all but the rounding is left
+EXACT = 2500  # features: one for each point of 100 people
+CATEGORIES = 3
 
 
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--priors", action="store_true")
+    options.add_argument("--people", type=int, nargs="+", default=[24, 100, 1000])
     options.add_argument("--seeds", type=int, default=10)
     options.add_argument("--recipe", choices=RECIPES, default=LEARNT_1.name)
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
-    recipe = RECIPES[chosen.recipe]
-    name, lines = ("priors", sensitivity(recipe, chosen.seeds)) if chosen.priors else ("times", times(recipe))
+    if chosen.priors:
+        name, lines = "priors", sensitivity(RECIPES[chosen.recipe], chosen.seeds)
+    else:
+        name, lines = "times", times(chosen.people)
     print("\n".join(lines))
     if chosen.write:
         before, _, rest = PAGE.read_text().partition(f"<!-- {name} -->")
@@ -70,27 +76,31 @@ def answers(people, seed):
     return simulate_study(study, scene.persons, seed), scene.chance
 
 
-def times(recipe):
+def times(sizes):
     lines = [
-        "| people × trials | seconds | L-BFGS steps | features | error of the log evidence by the low rank |",
-        "|---|---:|---:|---:|---:|",
+        "| recipe | people × trials | seconds | L-BFGS steps | features | error of the log evidence by the low rank |",
+        "|---|---|---:|---:|---:|---:|",
     ]
-    for people in SIZES:
+    for recipe, people in itertools.product(RECIPES.values(), sizes):
         trials, _ = answers(people, 1)
-        learn(trials, 3, recipe=recipe)  # compiles what it needs
+        learn(trials, CATEGORIES, recipe=recipe)  # compiles what it needs
         begun = time.perf_counter()
-        learnt = jax.block_until_ready(learn(trials, 3, recipe=recipe))
+        learnt = jax.block_until_ready(learn(trials, CATEGORIES, recipe=recipe))
         seconds = time.perf_counter() - begun
-        given = learnt.model, trials, learnt.weights
-        error = abs(evidence(*given, int(learnt.rank), 1e-4) - evidence(*given, min(EXACT, 25 * people), 1e-12))
-        lines.append(f"| {people} × 25 | {seconds:.1f} | {int(learnt.steps)} | {int(learnt.rank)} | {error:.1e} |")
+        error = abs(evidence(learnt, trials, int(learnt.rank), LEFT) - evidence(learnt, trials, EXACT, 1e-12))
+        cells = recipe.name, f"{people} × 25", f"{seconds:.1f}", int(learnt.steps), int(learnt.rank), f"{error:.1e}"
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
         print(lines[-1], flush=True)
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    return [*lines, "", f"One core, one BLAS thread, in 64 bits, second call; peak memory of all {peak:.1f} GB."]
+    how = f"One core, one BLAS thread, in 64 bits, second call; peak memory of all {peak:.1f} GB. The error is against"
+    return [*lines, "", f"{how}\n{EXACT} features, or one for each point where there are fewer."]
 
 
-def evidence(model, trials, weights, rank, tolerance):
-    return float(eqx.filter_jit(shared_evidence)(model, trials, weights, rank, tolerance).value)
+def evidence(learnt, trials, rank, tolerance):
+    """The log evidence by so many features at most, of which the last leave this share of the prior variance."""
+    given = tallied(trials, CATEGORIES)
+    rank = min(rank, int(given.asked.sum()))
+    return float(eqx.filter_jit(shared_evidence)(learnt.model, given, learnt.weights, rank, tolerance).value)
 
 
 def sensitivity(recipe, seeds):
@@ -102,7 +112,7 @@ def sensitivity(recipe, seeds):
 
         def best(priors, near=None, trials=trials, candidates=candidates, chance=chance):
             traced = jax.tree.map(jnp.asarray, priors)  # numbers, not constants: one compilation for all
-            learnt = learn(trials, 3, recipe=recipe._replace(priors=traced), near=near)
+            learnt = learn(trials, CATEGORIES, recipe=recipe._replace(priors=traced), near=near)
             x = _optimum(study, learnt, trials, candidates)
             return learnt, np.asarray(x), float(chance_at(chance, x[None, :])[0])
 
