@@ -71,8 +71,8 @@ static void fade(struct hb_device *device, float felt_N, float gap_N)
     device->offset_N = gap_N > 0.0F ? hb_clamp(offset_N, 0.0F, gap_N) : hb_clamp(offset_N, gap_N, 0.0F);
 }
 
-/* The force with what is left of the offset. From beyond the limit of the new set it only falls; a sum of rounded terms
- * may be more than its largest value by a last place, therefore that value itself is taken. */
+/* The force with what is left of the offset. From beyond the limit of the new set it only falls: there the largest value
+ * itself is returned, because the offset is a rounded difference and the sum may be above that value by a last place. */
 static float below_limit(struct hb_device *device, float felt_N)
 {
     float most_N = limit(device, device->active);

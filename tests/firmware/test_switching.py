@@ -96,6 +96,22 @@ def test_all_pairs_of_passive_sets_on_four_motions(count):
         print(f"{name}: differences up to {jumps.max():.2f} N, {late}")
 
 
+def test_from_above_the_limit_of_the_new_set_no_tick_rises_by_a_last_place():
+    """The offset is a difference of rounded numbers, and its sum with the new force may be above the force before."""
+    rng, lib = np.random.default_rng(0), library(build())
+    springless = {"K0": 0.0, "K1": 1.5, "B1": 2.0, "alpha": 0.2}  # whose forces use all the bits of a float
+    for limit in rng.uniform(0.5, 0.8, 100).astype(np.float32):
+        device, deep = Device(lib=lib), int(rng.integers(100, 200))
+        device.go(springless)
+        device.run(np.linspace(0, deep, 200))
+        staged = device.stage(springless | {"force_limit": float(limit)}, 2)
+        still, _ = device.run(np.full(device.status()["ticks_until_ready"], deep))
+        assert device.confirm("COMMIT", staged)[0] == "ACK"
+        after, _ = device.run(deep + 5 * np.arange(1, 6))
+        forces = np.r_[still[-1], after]
+        assert np.all(forces[1:] <= np.maximum(forces[:-1], limit))
+
+
 @pytest.mark.parametrize("pressed", [False, True], ids=["staged off the surface", "staged in contact"])
 def test_out_of_contact_a_set_is_in_force_at_once_and_its_history_clear(pressed):
     device = Device()
