@@ -92,7 +92,7 @@ def one_study(name, design, seed, with_region=True):
         answers = by_chance(study, scene.persons, people, trials, seed)
     else:
         answers = simulate_study(study, scene.persons, seed)
-    cohort = Cohort(answers, np.zeros((people, trials, study.space.dim)), tuple(f"P{j}" for j in range(people)))
+    cohort = cohort_from(answers)
     candidates = search_points(study.space, seed)
     best = highest(study, scene.chance, candidates)
     top = float(chance_at(scene.chance, best[None, :])[0])
@@ -120,6 +120,11 @@ def one_study(name, design, seed, with_region=True):
         held = region.holds(np.asarray(best), resolved_study.gp.kernel)
         content["region"] = {"holds": held, "volume": region.volume}
     return content | {"converged": bool(resolved_study.learnt.converged)}
+
+
+def cohort_from(trials):
+    """The cohort P0, P1, ... of stacked trials."""
+    return Cohort(trials, np.zeros(trials.x.shape), tuple(f"P{j}" for j in range(len(trials.x))))
 
 
 def by_recipe(study, cohort, recipe, candidates):

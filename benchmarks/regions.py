@@ -16,13 +16,12 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 from pages import put
-from populations import by_chance, by_recipe, highest, rounded, with_trials
+from populations import by_chance, by_recipe, cohort_from, highest, rounded, with_trials
 from populations_people import FEATURES, PAPER, ChanceOfFunctions, Drawn, Scene
 from rows import Rows
 
 from hilbo.population.recipes import LEARNT_1, RECOMMENDED
 from hilbo.search.candidates import search_points
-from hilbo.study.cohort import Cohort
 from hilbo.study.optimum_region import optimum_region
 
 CATEGORIES, FREEDOM = 3, 3  # Matern 3/2: waves are Student's, with 3 degrees of freedom
@@ -54,7 +53,7 @@ def one_study(design, seed):
     study = with_trials(PAPER, trials)
     scene = drawn_scene(study, people, seed)
     answers = by_chance(study, scene.persons, people, trials, seed)
-    cohort = Cohort(answers, np.zeros((people, trials, study.space.dim)), tuple(f"P{j}" for j in range(people)))
+    cohort = cohort_from(answers)
     candidates = search_points(study.space, seed)
     learns, map_, optimum = by_recipe(study, cohort, RECOMMENDED, candidates)
     region = optimum_region(learns, map_, answers, seed)

@@ -1,12 +1,14 @@
 """Is the population's optimum better where later people begin from the map of the earlier ones? Simulated studies.
 
     python benchmarks/warm_waves.py FILE [--studies 4] [--first 1000]
-    python benchmarks/warm_waves.py FILE --table
+    python benchmarks/warm_waves.py FILE --write      into docs/guides/sessions.md
 
 24 people with 25 trials each, by learnt-2. *cold*: everybody's session begins without a map. *waves*: so do those of
 the first eight; their map chooses for the next eight, as `hilbo session --warm-start` does, and that of sixteen for the
 last. *Regret* is that of benchmarks/populations.py: how much less often a new person gives the highest answer at the
-optimum than at the best feasible rendering. FILE (JSON Lines) collects a row for each study.
+optimum than at the best feasible rendering. The table has a third way beside these, from benchmarks/populations.jsonl:
+learnt-2 of sessions whose renderings the model of paper.toml chose. FILE (JSON Lines) collects a row for each study;
+what has been run is in benchmarks/warm_waves.jsonl.
 """
 
 import argparse
@@ -22,7 +24,8 @@ jax.config.update("jax_enable_x64", True)
 import equinox as eqx  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
-from populations import by_recipe, chance_at, highest, interval, lined, rounded, with_trials  # noqa: E402
+from pages import put  # noqa: E402
+from populations import by_recipe, chance_at, cohort_from, highest, interval, lined, rounded, with_trials  # noqa: E402
 from populations_people import POPULATIONS  # noqa: E402
 from rows import Rows  # noqa: E402
 
@@ -32,7 +35,6 @@ from hilbo.population.recipes import RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.session.warm_start import warm_point, warm_start  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
-from hilbo.study.cohort import Cohort  # noqa: E402
 from hilbo.study.learnt_study import resolved, that_learns  # noqa: E402
 from hilbo.study.optima import predict_map  # noqa: E402
 
@@ -52,11 +54,11 @@ def main():
     options.add_argument("file", type=Path)
     options.add_argument("--studies", type=int, default=4)
     options.add_argument("--first", type=int, default=1000)
-    options.add_argument("--table", action="store_true")
+    options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
     rows = Rows(chosen.file)
-    if chosen.table:
-        print(table(list(rows)))
+    if chosen.write:
+        put("guides/sessions.md", "warm waves", table(list(rows)))
         return
     known = {(row["population"], row["seed"]) for row in rows}
     for seed in range(chosen.first, chosen.first + chosen.studies):
@@ -110,18 +112,22 @@ def from_map(learns, persons, keys, warm):
     return jax.lax.map(lambda args: one(*args), (persons, keys))
 
 
-def cohort_from(trials):
-    count = trials.x.shape[0]
-    return Cohort(trials, np.zeros(trials.x.shape), tuple(f"P{j}" for j in range(count)))
-
-
 def table(rows):
+    fixed = {
+        (row["population"], row["seed"]): row["rules"][RECOMMENDED]["regret"]
+        for row in Rows(Path(__file__).with_name("populations.jsonl"))
+        if row["design"] == f"{PEOPLE}x{TRIALS}"
+    }
+    rows = [row | {"fixed": fixed[row["population"], row["seed"]]} for row in rows]
     lines = []
     for name in (*NAMES, "all"):
         part = [row for row in rows if name in (row["population"], "all")]
-        cold, waves = (np.array([row[way] for row in part]) for way in ("cold", "waves"))
-        lines.append([name, str(len(part)), interval(cold), interval(waves), interval(waves - cold)])
-    return lined(["regret: populations", "studies", "cold", "waves", "waves less cold"], lines)
+        given, cold, waves = (np.array([row[way] for row in part]) for way in ("fixed", "cold", "waves"))
+        cells = map(interval, (given, cold, waves, waves - given, waves - cold))
+        lines.append([name if name == "all" else f"`{name}`", str(len(part)), *cells])
+    return lined(
+        ["regret: populations", "studies", "fixed", "cold", "waves", "waves less fixed", "waves less cold"], lines
+    )
 
 
 if __name__ == "__main__":
