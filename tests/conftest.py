@@ -85,7 +85,15 @@ def _few_mappings():
     maps = Path("/proc/self/maps")
     if maps.exists() and maps.read_bytes().count(b"\n") > MANY_MAPPINGS:
         jax.clear_caches()
+        gc.unfreeze()
         gc.collect()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _frozen_memory():
+    """What earlier files left is not looked through by the collections that each session, and the end of the run, ask
+    for: of a worker that has traced thousands of programs one takes seconds."""
+    gc.freeze()
 
 
 @pytest.fixture
