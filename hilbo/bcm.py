@@ -11,12 +11,14 @@ M x m does not fit in memory, [`stream`][] makes it in blocks.
 Reference: Tresp (2000), Neural Computation 12:2719.
 """
 
+import functools
 from collections.abc import Callable
 
 import equinox as eqx
 import jax
 import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
@@ -27,6 +29,9 @@ __all__ = ["Evidence", "average", "combine", "combine_explained", "stream"]
 
 def __dir__() -> list[str]:
     return __all__
+
+
+_Map = tuple[Float[Array, " m"], Float[Array, " m"]]
 
 
 class Evidence(eqx.Module):
@@ -80,12 +85,8 @@ def combine_explained(
     """
     means, explained = _people(means, explained, "explained")
     prior = _checked_prior(prior_variance, means)
-    evidence = _evidence(means, explained, prior, mask)
-    invalid = _invalid(explained, prior, mask) | ~(1.0 + prior * evidence.added > 0.0)
-    if throw:
-        evidence = _raise_if(invalid, evidence)
-    mean, variance = evidence.merge(prior)
-    return jnp.where(invalid, jnp.nan, mean), jnp.where(invalid, jnp.nan, variance)
+    merged, invalid = _merged(means, explained, prior, mask)
+    return _raise_if(invalid, merged) if throw else merged
 
 
 def stream(
@@ -133,10 +134,29 @@ def average(
     Raises `InputError` for other shapes.
     """
     means, variances = _people(means, variances, "variances")
+    return _averaged(means, variances, mask)
+
+
+@functools.partial(jax.jit, inline=True)
+def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], mask: Bool[Array, " M"] | None) -> _Map:
     present = jnp.ones(means.shape[0], bool) if mask is None else mask
     present = present.astype(means.dtype)
     share = present / jnp.sum(present)
     return share @ means, share**2 @ variances
+
+
+@functools.partial(jax.jit, inline=True)  # one program, not one for each operation
+def _merged(
+    means: Float[Array, "M m"],
+    explained: Float[Array, "M m"],
+    prior: Float[Array, " m"],
+    mask: Bool[Array, " M"] | None,
+) -> tuple[_Map, Bool[Array, " m"]]:
+    """Mean and variance of the population map, NaN where they cannot be; and where that is."""
+    evidence = _evidence(means, explained, prior, mask)
+    invalid = _invalid(explained, prior, mask) | ~(1.0 + prior * evidence.added > 0.0)
+    mean, variance = evidence.merge(prior)
+    return (jnp.where(invalid, jnp.nan, mean), jnp.where(invalid, jnp.nan, variance)), invalid
 
 
 def _evidence(
@@ -188,13 +208,13 @@ def _invalid(
     return jnp.any(wrong if mask is None else wrong & mask[:, None], axis=0)
 
 
-def _raise_if(invalid: Bool[Array, " m"], evidence: Evidence) -> Evidence:
+def _raise_if(invalid: Bool[Array, " m"], merged: _Map) -> _Map:
     message = (
         "bcm: an expert's variance is not positive, or the experts' variances exceed the prior's so far that no"
         " positive precision is left; check that prior_variance is the one all experts were fitted with"
     )
     if isinstance(invalid, jax.core.Tracer):
-        return eqx.error_if(evidence, invalid, message)
-    if bool(jnp.any(invalid)):
-        raise InputError(f"{message} (first at point {int(jnp.argmax(invalid))}).")
-    return evidence
+        return eqx.error_if(merged, invalid, message)
+    if np.any(invalid):
+        raise InputError(f"{message} (first at point {int(np.argmax(invalid))}).")
+    return merged

@@ -20,8 +20,10 @@ References: Tresp (2000) bcm; Deisenroth & Ng (2015) rbcm. Products of experts a
 won nowhere (docs/methods/aggregation.md).
 """
 
+import functools
 from typing import Any, Literal, NamedTuple, get_args
 
+import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
@@ -93,10 +95,24 @@ def aggregate(
         raise InputError(
             f'aggregate: a share belongs to the rule "hierarchical" and to no other; the rule is "{rule}".'
         )
-    prior = jnp.broadcast_to(jnp.asarray(prior_variance, means.dtype), means.shape[1:])
+    if share is not None:
+        share = jnp.asarray(share, means.dtype)
+    return _aggregated(rule, means, explained, jnp.asarray(prior_variance, means.dtype), share, mask)
+
+
+@functools.partial(jax.jit, static_argnames="rule", inline=True)  # one program, not one for each operation
+def _aggregated(
+    rule: Rule,
+    means: Float[Array, "M m"],
+    explained: Float[Array, "M m"],
+    prior_variance: Float[Array, "..."],
+    share: Float[Array, ""] | None,
+    mask: Bool[Array, " M"] | None,
+) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    prior = jnp.broadcast_to(prior_variance, means.shape[1:])
     if rule == "average":
         return bcm.average(means, prior[None, :] - explained, mask=mask)
-    common_share = jnp.ones((), means.dtype) if share is None else jnp.asarray(share, means.dtype)
+    common_share = jnp.ones((), means.dtype) if share is None else share
     each = terms(rule, means, explained, prior[None, :], common_share)
     present = jnp.ones(means.shape[0], bool) if mask is None else mask
     sums = Sums(*(jnp.sum(jnp.where(present[:, None], leaf, 0.0), axis=0) for leaf in each))
