@@ -29,7 +29,7 @@ def test_equals_the_papers_formulas(count):
 
 def test_a_hundred_thousand_weak_experts_keep_their_digits():
     rng = np.random.default_rng(1)
-    explained = 10 ** rng.uniform(-9, -5, (100_000, 2))
+    explained = 10 ** rng.uniform(-9, -5, (100_000, 1))
     means = rng.normal(size=explained.shape) * 1e-3
     variances = 1.3 - explained
     mean, variance = bcm.combine(jnp.asarray(means), jnp.asarray(variances), 1.3)

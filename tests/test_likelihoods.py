@@ -77,6 +77,12 @@ def evaluated(dtype, part):
     return [np.asarray(v) for v in evaluate(*map(jnp.asarray, grid(dtype, part)))]
 
 
+def evaluate_few(f, q, t, noise):
+    """`evaluate` of up to 12 cases by one program: they are repeated."""
+    repeated = (np.resize(values, (12, *np.shape(values)[1:])) for values in (f, q, t, noise))
+    return [np.asarray(values)[: len(f)] for values in evaluate(*repeated)]
+
+
 def distance(value, target) -> float:
     return float(abs(mp.mpf(float(value)) - target))
 
@@ -125,7 +131,7 @@ def test_a_certain_answer_keeps_the_digits_of_its_small_slope(dtype, tolerance, 
     for t in (np.array([-0.5, 0.5], dtype), np.array([-40, 0], dtype) * c):
         for q, edge, side in ((2, t[1], 1), (0, t[0], -1), (1, t[1], -1)):
             f = (edge + side * c * np.array([1.5, 3, 5, 8, 12])).astype(dtype)
-            columns = evaluate(f, np.full(5, q), np.tile(t, (5, 1)), np.full(5, c))
+            columns = evaluate_few(f, np.full(5, q), np.tile(t, (5, 1)), np.full(5, c))
             for s, slope, curvature in zip(f, columns[1], columns[2], strict=True):
                 _, *targets = ordinal_log_prob_mp(s, *np.array([-np.inf, *t, np.inf])[q : q + 2], c, 60)
                 for value, target in zip((slope, curvature), targets, strict=True):
@@ -213,7 +219,7 @@ def test_nothing_is_lost_far_outside(dtype, noise):
     t, c = np.array([0.3, 0.3 + 2 * noise], dtype), dtype(noise)
     f = np.concatenate([t[0] - c * np.array([1e3, 1e5]), t[1] + c * np.array([1e3, 1e5])]).astype(dtype)
     f, q = (v.ravel() for v in np.meshgrid(f, np.arange(3)))
-    values = [np.asarray(v) for v in evaluate(f, q, np.tile(t, (len(f), 1)), np.full(len(f), c))]
+    values = evaluate_few(f, q, np.tile(t, (len(f), 1)), np.full(len(f), c))
     assert all(np.all(np.isfinite(v)) for v in values)
     assert np.all(values[0] <= 0.0)
     scaled = values[2].astype(float) * noise**2
@@ -292,11 +298,10 @@ def test_log_concave(f1, f2, share, width, noise, q):
 @given(small, st.floats(1e-3, 1e3), st.floats(1e-3, 10), st.integers(0, 2))
 def test_mirror_symmetry(z, width, noise, q):
     """Turning the sign of f and of the thresholds turns the order of the categories and the sign of odd derivatives."""
-    t = jnp.array([0.3, 0.3 + width * noise])
-    f = jnp.asarray(0.3 + z * noise)
+    t, f = np.array([0.3, 0.3 + width * noise]), 0.3 + z * noise
     mirrored = -f, 2 - q, -t[::-1], noise
-    values = [evaluate(*(jnp.asarray(v)[None] for v in args)) for args in ((f, q, t, noise), mirrored)]
-    (p, g, w, s, by_t, by_c), (p_, g_, w_, s_, by_t_, by_c_) = (list(map(np.asarray, v)) for v in values)
+    values = [evaluate_few(*(np.asarray(v)[None] for v in args)) for args in ((f, q, t, noise), mirrored)]
+    (p, g, w, s, by_t, by_c), (p_, g_, w_, s_, by_t_, by_c_) = values
     original = np.array([p, g * noise, w * noise**2, s * noise**3])
     turned = np.array([p_, -g_ * noise, w_ * noise**2, -s_ * noise**3])
     np.testing.assert_allclose(original, turned, rtol=1e-13, atol=1e-13)

@@ -179,13 +179,13 @@ def test_only_the_rounding_of_the_boundary_is_undecided():
     _, B1, alpha = random_sets(256, 1)
     K1 = np.asarray(passivity.largest_K1(B1, alpha))
     limited = np.isfinite(K1) & (K1 > 0)
-    K1, B1, alpha = K1[limited], B1[limited], alpha[limited]
-    below = certified(K1 * (1 - 1e-10), B1, alpha, 0.95)
-    above = certified(K1 * (1 + 1e-10), B1, alpha, 0.95)
-    decided = np.asarray((below[0] > 0) & (above[1] <= 0))
+    K1 = np.where(limited, K1, 1.0)
+    below = certified(K1 * (1 - 1e-10), B1, alpha, 0.95, 101)
+    above = certified(K1 * (1 + 1e-10), B1, alpha, 0.95, 101)
+    decided = (np.asarray(below[0]) > 0) & (np.asarray(above[1]) <= 0)
     # b hardly depends on K1 where the pot is much the softer: there 1e-10 of K1 is less than rounding.
     soft = B1 * 1e-3**-alpha < 0.1 * K1
-    assert np.all(decided | soft) and np.mean(decided) > 0.9
+    assert np.all((decided | soft)[limited]) and np.mean(decided[limited]) > 0.9
 
 
 def test_a_cell_is_bounded_from_below_and_closely():
@@ -258,6 +258,8 @@ def test_full_memory_binds_at_nyquist(b):
 def test_a_witness_creates_the_energy_of_the_formula(N, memory):
     for K1, B1, alpha in random_sets(3, 4).T:
         model = model_of(K1, B1, alpha, N, memory)
+        if memory == "short":  # of NumPy's numbers, which need no programs
+            model = FOSLS(np.float64(model.K0), K1, B1, alpha, N=N)
         needed = 0.95 - float(passivity.certify(model, 0.95).upper)
         b = 0.9 * needed
         witness = passivity.witness(model, b)

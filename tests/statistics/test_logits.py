@@ -1,5 +1,7 @@
 """Tables II to IV, preferences and ties: printed figures of the paper, closed forms, and bad input."""
 
+import functools
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -168,6 +170,7 @@ def test_a_category_that_never_occurs_has_no_edge():
     np.testing.assert_allclose(estimates(fitted)["x"], estimates(binary)["x"], rtol=1e-10)
 
 
+@functools.cache
 def in_units(scale, separated):
     """A logit of two predictors, the first one in other units, back in its own; clustered both ways."""
     rng = np.random.default_rng(4)

@@ -27,9 +27,10 @@ def check_grad(fn: Callable, *args, rtol: float = 1e-6, atol: float = 0.0) -> No
     wrong = {str(arg.dtype) for arg in (*args, jax.eval_shape(fn, *args))} - {"float64"}
     assert not wrong, f"finite differences need float64, not {', '.join(sorted(wrong))}"
     places = tuple(range(len(args)))
-    derivatives = zip(jax.jacfwd(fn, places)(*args), jax.jacrev(fn, places)(*args), strict=True)
-    for place, (forward, reverse) in enumerate(derivatives):
-        expected = _central_differences(fn, args, place)
+    modes = jax.jit(lambda *args: (jax.jacfwd(fn, places)(*args), jax.jacrev(fn, places)(*args)))(*args)
+    compiled = jax.jit(fn)
+    for place, (forward, reverse) in enumerate(zip(*modes, strict=True)):
+        expected = _central_differences(compiled, args, place)
         bound = atol + rtol * np.max(np.abs(expected), initial=0.0)
         for mode, derivative in (("jacfwd", forward), ("jacrev", reverse)):
             np.testing.assert_allclose(derivative, expected, rtol=0, atol=bound, err_msg=f"{mode}, argument {place}")
