@@ -144,6 +144,7 @@ def test_a_search_ends_on_a_plateau_but_not_on_a_slope_that_a_kink_makes_long():
 
 
 def test_an_expansion_of_ones_own_replaces_differentiation():
+    @jax.jit
     def expand(y, aux):
         derivatives = jax.grad(rosenbrock)(y, None), jax.hessian(rosenbrock)(y, None)
         return Expansion(rosenbrock(y, None), *derivatives, aux + 1)

@@ -3,6 +3,7 @@
 import itertools
 import tomllib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -80,7 +81,7 @@ def test_levels_are_in_no_linear_constraint_and_have_no_length():
 def test_any_two_levels_have_the_stated_correlation(kind, correlation, count):
     kernel = kind((3.0, theta_of(kind, correlation)), 2.0, (0, count))
     x = jnp.array([[0.25, k / (count - 1)] for k in range(count)])
-    covariance = np.asarray(gram(kernel, x, x))
+    covariance = np.asarray(jax.jit(gram)(kernel, x, x))
     expected = 2.0 * np.where(np.eye(count, dtype=bool), 1.0, correlation)
     np.testing.assert_allclose(covariance, expected, rtol=1e-12)
     places = embedded(kernel, np.asarray(x))
