@@ -1,7 +1,7 @@
 """The Laplace engine against two oracles, against exact Gaussians, and against the meaning of its certificate."""
 
 import math
-from functools import cache
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -75,7 +75,7 @@ def problem(make, dtype=np.float64):
     likelihood = OrdinalProbit(np.asarray(data.thresholds, dtype), dtype(data.noise))
     terms = Ordinal(likelihood, jnp.asarray(np.pad(data.q, (0, 25 - n))), jnp.arange(25) < n)
     x, x_new = jnp.asarray(np.pad(data.x, ((0, 25 - n), (0, 0))).astype(dtype)), jnp.asarray(data.x_new.astype(dtype))
-    return gram(kernel, x, x), terms, gram(kernel, x_new, x)
+    return covariances(kernel, x, x), terms, covariances(kernel, x_new, x)
 
 
 @cache
@@ -83,11 +83,17 @@ def exact(make):
     return mpmath_laplace(*make().problem(), digits=30)
 
 
-solve = jax.jit(laplace, static_argnames="max_steps")
+covariances = jax.jit(gram)
+program = jax.jit(laplace, static_argnames="max_steps")
 
 
-def results(covariance, terms, cross, variance, **options):
-    posterior = solve(covariance, terms, **options)
+def solve(covariance, terms, **options):
+    """Each search has a start, so that one program serves them all."""
+    return program(covariance, terms, **({"start": jnp.asarray(np.zeros_like(covariance[0]))} | options))
+
+
+def results(covariance, terms, cross, variance):
+    posterior = solve(covariance, terms)
     count = int(terms.answered.sum())
     explained = mean_and_explained(posterior.weights, posterior.factor, posterior.inverse, cross.T)[1]
     values = posterior.mode[:count], cross @ posterior.weights, variance - explained, posterior.log_evidence
@@ -162,7 +168,7 @@ def test_gaussian_terms_are_exact_with_their_derivatives():
 
 
 def test_gaussian_terms_take_one_step():
-    assert solve(gram(KERNEL, X, X), Pointwise(TERMS)).certificate.iterations <= 2
+    assert solve(covariances(KERNEL, X, X), Pointwise(TERMS)).certificate.iterations <= 2
 
 
 # --- a preference between two stimuli, beside ordinal answers
@@ -263,13 +269,19 @@ def test_the_residual_bounds_the_distance_to_the_mode(noise, sharp):
         assert sharp * certificate.residual < distance <= certificate.residual * (1 + 1e-9)
 
 
+@jax.jit
+@partial(jax.vmap, in_axes=(None, 0, 0))
+def second_derivatives(likelihood, eta, q):
+    return jax.grad(jax.grad(lambda eta: likelihood.log_prob(eta, q)))(eta)
+
+
 @pytest.mark.parametrize("make", OF_ONE_SHAPE)
 def test_the_other_figures_of_the_certificate(make):
     covariance, terms, _ = problem(make)
     posterior = solve(covariance, terms)
     certificate = posterior.certificate
     variance = np.diagonal(covariance) - np.diagonal(covariance @ posterior.inverse @ covariance)
-    curvature = -jax.vmap(jax.grad(jax.grad(terms.likelihood.log_prob)))(posterior.mode, terms.q)
+    curvature = -np.asarray(second_derivatives(terms.likelihood, posterior.mode, terms.q))
     root = np.sqrt(curvature) * np.asarray(terms.answered)
     matrix = np.eye(len(root)) + root[:, None] * np.asarray(covariance) * root
     assert certificate.jitter <= 1e-13
@@ -283,7 +295,7 @@ def test_slopes_and_curvatures_may_be_given_or_derived():
     """`expand` states what `Pointwise` differentiates; the posteriors are the same, and so are their derivatives."""
     covariance, terms, _ = problem(near_separable)
     derived = Pointwise(LogProb(terms))
-    for stated, expected in zip(terms(covariance[0]), derived(covariance[0]), strict=True):
+    for stated, expected in zip(*jax.jit(lambda eta: (terms(eta), derived(eta)))(covariance[0]), strict=True):
         np.testing.assert_allclose(stated, expected, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(solve(covariance, derived).mode, solve(covariance, terms).mode, rtol=0, atol=1e-10)
 
@@ -306,10 +318,8 @@ def test_terms_that_are_nothing_leave_the_prior():
 
 
 def test_both_searches_find_the_same_mode(monkeypatch):
-    data = separated()
-    covariance = gram(RBF(data.theta, data.variance), jnp.asarray(data.x), jnp.asarray(data.x))
-    terms = Ordinal(OrdinalProbit(data.thresholds, data.noise), jnp.asarray(data.q), jnp.ones(len(data.q), bool))
-    plain = jax.jit(lambda: laplace(covariance, terms))()
+    covariance, terms, _ = problem(separated)
+    plain = solve(covariance, terms)
     monkeypatch.setattr("hilbo.laplace._PLAIN_STEPS", 0)
     safe = jax.jit(lambda: laplace(covariance, terms))()
     assert bool(plain.certificate.converged) and bool(safe.certificate.converged)

@@ -1,7 +1,9 @@
 """A new person's answers one after the other: each is predicted from those before it, whatever chose the renderings."""
 
 import itertools
+from functools import partial
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,11 +12,19 @@ from scipy.stats import multivariate_normal, norm
 
 from hilbo import RBF, OrdinalProbit
 from hilbo.kernels import gram
-from hilbo.population.newcomer import _WEIGHTS, _log_widths, _widened, class_probabilities, in_turn, predicted_in_turn
+from hilbo.population import newcomer
+from hilbo.population.newcomer import _WEIGHTS, _log_widths, _widened
 
 LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.8]), jnp.asarray(0.7))
 N, Q = 4, np.array([0, 2, 1, 2])
 ALL = jnp.ones(N, bool)
+class_probabilities, predicted_in_turn = map(eqx.filter_jit, (newcomer.class_probabilities, newcomer.predicted_in_turn))
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(None, None, 0, None))
+def with_guesses(mean, covariance, q, lapse):
+    return newcomer.in_turn(LIKELIHOOD, mean, covariance, q, ALL, lapse)
 
 
 def boxes(thresholds, mean, covariance):
@@ -34,13 +44,15 @@ def test_answers_are_predicted_from_those_before(widths):
     rng = np.random.default_rng(0)
     x, mean = jnp.asarray(rng.uniform(size=(N, 2))), rng.normal(size=N)
     covariance = np.asarray(gram(RBF(3.0, 4.0), x, x))
-    given = [jnp.asarray(Q), jnp.ones(N, bool)]
-    predicted, log_given = predicted_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), *given, widths)
+    predicted, log_given = map(
+        np.asarray,
+        predicted_in_turn(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(Q), ALL, widths),
+    )
     people = [_widened(LIKELIHOOD, w) for w in _log_widths(jnp.asarray(mean))] if widths else [LIKELIHOOD.thresholds]
     weights = _WEIGHTS if widths else [1.0]
     joint = sum(w * boxes(np.asarray(t), mean, covariance) for w, t in zip(weights, people, strict=True))
     np.testing.assert_allclose(predicted, joint / joint.sum(axis=1, keepdims=True), atol=0.02)
-    alone = class_probabilities(LIKELIHOOD, jnp.asarray(mean), jnp.diagonal(jnp.asarray(covariance)), widths)
+    alone = np.asarray(class_probabilities(LIKELIHOOD, jnp.asarray(mean), jnp.asarray(np.diagonal(covariance)), widths))
     np.testing.assert_allclose(predicted[0], alone[0], rtol=1e-12)
     assert np.abs(predicted[1:] - alone[1:]).max() > 0.1
     np.testing.assert_allclose(np.exp(log_given), predicted[np.arange(N), Q], rtol=1e-12)
@@ -58,8 +70,8 @@ def test_what_was_not_asked_says_nothing():
 def test_an_answer_that_was_all_but_excluded_is_a_number(widths):
     """Of probability exp(-1000) and less, with most widths or with all."""
     mean, covariance = jnp.array([0.0, 45.0, 0.0, 3.0]), 0.3 * jnp.eye(4)
-    given = jnp.array([1, 0, 1, 2]), jnp.ones(4, bool)
-    predicted, log_given = predicted_in_turn(LIKELIHOOD, mean, covariance, *given, widths)
+    given = jnp.array([1, 0, 1, 2]), ALL
+    predicted, log_given = map(np.asarray, predicted_in_turn(LIKELIHOOD, mean, covariance, *given, widths))
     np.testing.assert_allclose(predicted.sum(axis=1), 1.0, rtol=1e-6)
     assert np.isfinite(log_given).all() and -3000 < log_given[1] < -300 and (log_given[2:] > -3).all()
 
@@ -70,10 +82,9 @@ def test_guesses_leave_the_moments_of_a_mixture(lapse):
     rng = np.random.default_rng(3)
     root = rng.normal(size=(N, N))
     mean, covariance = rng.normal(size=N), root @ root.T
-    of = jax.jit(jax.vmap(lambda q: in_turn(LIKELIHOOD, *map(jnp.asarray, (mean, covariance)), q, ALL, lapse)))
-    every = jnp.asarray(np.array(list(itertools.product(range(3), repeat=N))))
-    told = of(every)
-    assert float(jnp.sum(jnp.exp(jnp.sum(told.log_given, axis=1)))) == pytest.approx(1.0, rel=1e-12)
+    every = np.array(list(itertools.product(range(3), repeat=N)))
+    told = jax.tree.map(np.asarray, with_guesses(*map(jnp.asarray, (mean, covariance, every, lapse))))
+    assert np.exp(told.log_given.sum(axis=1)).sum() == pytest.approx(1.0, rel=1e-12)
     sd = np.sqrt(covariance[0, 0])
     f = mean[0] + sd * np.linspace(-12, 12, 40_001)
     edges = np.array([-np.inf, -0.5, 0.8, np.inf])
@@ -86,7 +97,7 @@ def test_guesses_leave_the_moments_of_a_mixture(lapse):
         slope = covariance[1, 0] / covariance[0, 0]
         after = mean[1] + slope * moved, covariance[1, 1] + slope**2 * (variance - covariance[0, 0])
         second = (1 - lapse) * np.asarray(LIKELIHOOD.class_probabilities(*after)) + lapse / 3
-        place = int(np.argmax(np.asarray(every)[:, 0] == q))
+        place = int(np.argmax(every[:, 0] == q))
         assert np.exp(told.log_given[place, 0]) == pytest.approx(first, rel=1e-9)
         np.testing.assert_allclose(told.probabilities[place, 1], second, rtol=1e-8)
 

@@ -22,7 +22,7 @@ def cohort(people=4, answers=12, points=7, seed=0):
         Trials.from_arrays(x[rng.integers(0, points, answers)], rng.integers(0, 3, answers), answers + 1)
         for _ in range(people)
     ]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each)
 
 
 def test_counts_count_every_answer():
@@ -60,17 +60,18 @@ def test_the_evidence_has_the_derivatives_of_the_dense_one():
         np.testing.assert_allclose(a, b, rtol=1e-8)
 
 
-def test_points_at_which_nobody_answered_change_nothing():
+def test_points_and_people_without_answers_change_nothing():
+    """So that one program fits the share of a few, everybody's map and the pooled one."""
     counts = counts_of(cohort(), 3)
-    more = Counts(
-        jnp.concatenate([counts.x, jnp.array([[0.5, 0.5], [0.1, 0.9]])]),
-        jnp.concatenate([counts.counts, jnp.zeros((4, 2, 3))], axis=1),
-    )
+    points, rows = np.concatenate([counts.x, [[0.5, 0.5], [0.1, 0.9]]]), np.zeros((9, 9, 3))
+    rows[2:6, :7] = counts.counts
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(9, 2)))
-    one, other = (fit_counts(GP, jnp.asarray(0.6), c) for c in (counts, more))
-    np.testing.assert_allclose(other.log_evidence, one.log_evidence, rtol=1e-12)
-    for a, b in zip(other.predict(x), one.predict(x), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-12)
+    more = Counts(jnp.asarray(points), jnp.asarray(rows))
+    alone, among = (fit_counts(GP, jnp.asarray(0.6), c) for c in (counts, more))
+    np.testing.assert_allclose(among.log_evidence, alone.log_evidence, rtol=1e-12)
+    np.testing.assert_allclose(np.asarray(among.latent.weights)[:7], alone.latent.weights, atol=1e-11)
+    np.testing.assert_allclose(among.predict(x), alone.predict(x), atol=1e-12)
+    assert bool(among.certificate.converged)
 
 
 @pytest.mark.deep
@@ -94,15 +95,4 @@ def test_learning_reaches_a_maximum():
 
 def test_nobody_answered():
     with pytest.raises(InputError, match="nobody gave an answer"):
-        counts_of(jax.tree.map(lambda leaf: leaf[None], Trials.empty(8, 2)), 3)
-
-
-def test_people_without_answers_change_nothing():
-    """So that one program fits the share of a few, everybody's map and the pooled one."""
-    counts = counts_of(cohort(), 3)
-    rows = np.zeros((9, *counts.counts.shape[1:]))
-    rows[2:6] = np.asarray(counts.counts)
-    alone, among = (fit_counts(GP, jnp.asarray(0.6), c) for c in (counts, Counts(counts.x, jnp.asarray(rows))))
-    np.testing.assert_allclose(among.log_evidence, alone.log_evidence, rtol=1e-12)
-    np.testing.assert_allclose(among.latent.weights, alone.latent.weights, atol=1e-11)
-    assert bool(among.certificate.converged)
+        counts_of(jax.tree.map(lambda leaf: np.asarray(leaf)[None], Trials.empty(8, 2)), 3)

@@ -26,7 +26,7 @@ def answers(seed=0, rule=None):
         felt = np.hypot(*(x - 0.4 - 0.05 * j).T) + 0.1 * rng.normal(size=ANSWERS)
         q = (felt < 0.5).astype(int) + (felt < 0.25) if rule is None else rule(x)
         each.append(Trials.from_arrays(x, q, ANSWERS))
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each)
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +186,7 @@ def test_widths_are_found_where_people_have_them():
         felt = 2.0 * np.sin(4.0 * x[:, 0]) + x[:, 1] + rng.normal(size=60)
         half = 2.2 if j % 2 else 0.25
         each.append(Trials.from_arrays(x, (felt > 0.5 - half).astype(int) + (felt > 0.5 + half), 60))
-    end = learn(jax.tree.map(lambda *leaves: jnp.stack(leaves), *each), 3)
+    end = learn(jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *each), 3)
     assert end.gain_of_widths > 3
     widths = np.asarray(end.coordinates["widths"])
     assert widths[1::2].min() > widths[::2].max() + 0.5

@@ -5,6 +5,7 @@ import dataclasses
 from functools import partial
 from types import SimpleNamespace
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,8 +16,8 @@ from studies import plain
 
 from hilbo import Trials
 from hilbo.likelihoods import OrdinalProbit
+from hilbo.population import newcomer
 from hilbo.population.maps import RuleMap, point_rule
-from hilbo.population.newcomer import class_probabilities, log_highest
 from hilbo.population.pointwise import RULES
 from hilbo.report.figures import regions
 from hilbo.report.figures import study as plotting_study
@@ -101,7 +102,7 @@ def test_what_stands_in_place_of_a_map_is_said(posteriors):
         assert in_place(of_rule(rule, posteriors[True])) == "" and not list(
             analysis._aggregated_otherwise(of_rule(rule, None))
         )
-    one = jax.tree.map(lambda leaf: leaf[0], posteriors[True])  # any posterior will do
+    one = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[0]), posteriors[True])  # any posterior will do
     for rule, how in (("hierarchical", "by the rule hierarchical point by point"), ("pooled", "by bcm")):
         whole = RuleMap(rule, "exact", None, one, jnp.asarray(SHARE), jnp.asarray(1.0))
         (words,) = analysis._aggregated_otherwise(whole)
@@ -151,6 +152,7 @@ def test_what_a_map_does_not_know_is_hatched(prior, hatched):
 
 LIKELIHOOD = OrdinalProbit(jnp.array([-0.5, 0.2, 1.3]), jnp.asarray(0.8))
 MEAN, VARIANCE = jnp.array([0.3, -1.0, 4.0]), jnp.array([0.2, 0.5, 2.0])
+class_probabilities, log_highest = map(eqx.filter_jit, (newcomer.class_probabilities, newcomer.log_highest))
 
 
 def by_quadrature(mean, variance, category):
@@ -167,24 +169,25 @@ def by_quadrature(mean, variance, category):
 
 
 def test_widths_are_integrated_out():
-    expected = [[by_quadrature(m, v, c) for c in range(4)] for m, v in zip(MEAN, VARIANCE, strict=True)]
+    pairs = zip(*map(np.asarray, (MEAN, VARIANCE)), strict=True)
+    expected = [[by_quadrature(*pair, c) for c in range(4)] for pair in pairs]
     np.testing.assert_allclose(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, True), expected, atol=2e-5)
 
 
 @pytest.mark.parametrize("widths", [False, True])
 def test_the_highest_category_is_the_last_one(widths):
-    chances = class_probabilities(LIKELIHOOD, MEAN, VARIANCE, widths)
-    np.testing.assert_allclose(jnp.exp(log_highest(LIKELIHOOD, MEAN, VARIANCE, widths)), chances[:, -1], rtol=1e-12)
+    chances = np.asarray(class_probabilities(LIKELIHOOD, MEAN, VARIANCE, widths))
+    np.testing.assert_allclose(np.exp(log_highest(LIKELIHOOD, MEAN, VARIANCE, widths)), chances[:, -1], rtol=1e-12)
 
 
 def test_the_highest_category_far_below():
     """Its logarithm stays finite, and so does its slope, where the probability is 0 in double precision."""
-    far = jnp.array([-60.0])
-    value, slope = jax.value_and_grad(lambda m: log_highest(LIKELIHOOD, m, jnp.zeros(1))[0])(far)
+    height = jax.jit(jax.value_and_grad(lambda m: newcomer.log_highest(LIKELIHOOD, m, jnp.zeros(1))[0]))
+    value, slope = height(jnp.array([-60.0]))
     np.testing.assert_allclose(value, norm.logcdf((-60.0 - 1.3) / 0.8), rtol=1e-12)
     assert np.isfinite(slope).all() and slope[0] > 0
 
 
 def test_without_widths_it_is_one_model():
-    expected = jax.vmap(LIKELIHOOD.class_probabilities)(MEAN, VARIANCE)
+    expected = jax.jit(jax.vmap(LIKELIHOOD.class_probabilities))(MEAN, VARIANCE)
     np.testing.assert_array_equal(class_probabilities(LIKELIHOOD, MEAN, VARIANCE), expected)

@@ -83,12 +83,14 @@ def test_enough_is_what_larger_numbers_hold_too():
 
 def test_a_design_that_is_too_short_is_seldom_called_enough():
     """40 studies each of four designs, of which the first two are within the error too seldom."""
-    rng, shares, studies, runs = np.random.default_rng(3), [0.70, 0.75, 0.80, 0.90], 40, 400
-    within = rng.binomial(studies, shares, (runs, 4)).ravel()
-    errors = np.repeat(np.arange(studies)[:, None], len(within), axis=1) >= within
-    keys = {"participants": np.repeat(np.arange(runs), 4), "trials": np.tile([10, 15, 20, 25], runs)}
-    rows = {name: np.tile(values, studies) for name, values in keys.items()}
-    summary = summarise(pd.DataFrame(rows | {"optimum": errors.ravel().astype(float), "map": 0.0}), 0.5)
+    shares, studies, runs = [0.70, 0.75, 0.80, 0.90], 40, 400
+    # What is said of a design in which k of the 40 studies are within the error, for every k.
+    within, study = np.divmod(np.arange((studies + 1) * studies), studies)
+    errors = pd.DataFrame({"study": study, "participants": within, "trials": 1, "optimum": study >= within, "map": 0.0})
+    said = summarise(errors.astype({"optimum": float}), 0.5)
+    drawn = np.random.default_rng(3).binomial(studies, shares, (runs, 4)).ravel()
+    designs = {"participants": np.repeat(np.arange(runs), 4), "trials": np.tile([10, 15, 20, 25], runs)}
+    summary = said.iloc[drawn].reset_index(drop=True).assign(**designs)
     assert (enough(summary)["trials"] < 20).mean() < 0.05
     assert (enough(summary.assign(reached_surely=summary["reached"]))["trials"] < 20).mean() > 0.2
 

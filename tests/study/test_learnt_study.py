@@ -4,6 +4,7 @@ import json
 import re
 import tomllib
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -49,6 +50,27 @@ def table(tmp_path_factory):
     return path
 
 
+PLAIN_GP = "[gp]\ntheta = 30.0\nvariance = 1.0\nthresholds = [-0.5, 0.5]\nnoise = 0.5\n"
+WITH_CLIPS = SOUND + '[random_effect]\ncolumn = "clip"\n'
+
+
+def with_clips(table):
+    """The same answers, of which only the last person's last one is of the last clip."""
+    answers = read_trials(table, study_of())
+    answers["clip"] = np.where(np.arange(len(answers)) % 2, "Sea ", "Fox")
+    answers.iloc[-1, answers.columns.get_loc("clip")] = "Wolf"
+    return answers
+
+
+@pytest.fixture(scope="module")
+def learnt_2(table):
+    """The study by learnt-2, with a random effect, its cohort and its map: one search, 5 s."""
+    study = study_of(WITH_CLIPS.replace("learnt-1", "learnt-2"))
+    cohort = cohort_of(with_clips(table), study)
+    study = resolved(study, cohort)
+    return study, cohort, learnt_map(study.learnt, cohort.trials)
+
+
 def test_a_session_starts_from_the_medians():
     study = study_of()
     np.testing.assert_allclose(study.gp.kernel.theta, 12.0)
@@ -57,17 +79,15 @@ def test_a_session_starts_from_the_medians():
     assert set(session.ask()) == {"level", "tone"}
 
 
-def test_learnt_2_seeks_its_optimum_where_the_best_is_most_often_near(table):  # one search: 5 s
-    study = study_of(SOUND.replace("learnt-1", "learnt-2"))
-    cohort = cohort_of(read_trials(table, study), study)
-    study = resolved(study, cohort)
-    map_, x = learnt_map(study.learnt, cohort.trials), search_points(study.space, 0)
+def test_learnt_2_seeks_its_optimum_where_the_best_is_most_often_near(learnt_2):
+    study, cohort, map_ = learnt_2
+    x = search_points(study.space, 0)
     optimum = map_optimum(study, map_, x)
     places = best_places(study.space, [map_.shared])
     theta, away = np.asarray(map_.shared.gp.kernel.theta), np.asarray(x)[:, None] - np.asarray(places.points)
     near = np.exp(-4 * np.sum(theta * away**2, axis=2)) @ np.asarray(places.share)
-    chance = np.asarray(map_.class_probabilities(study.gp.likelihood, x))[:, -1]
-    known = np.asarray(map_.predict(x)[1] <= map_.reach)
+    chance = np.asarray(eqx.filter_jit(map_.class_probabilities)(study.gp.likelihood, x))[:, -1]
+    known = np.asarray(map_.predict(x)[1]) <= np.asarray(map_.reach)
     known = known & (chance >= chance[known].max() - 0.05)
     assert learnt_content(study, cohort.names)["recipe"] == "learnt-2"
     assert float(nearness(map_.shared.gp.kernel, places.points, places.share, optimum.x)) >= near[known].max() - 1e-12
@@ -141,25 +161,10 @@ def test_the_optimum_is_where_a_newcomer_most_often_says_the_highest(table):
     np.testing.assert_allclose(aggregate.optimum.class_probabilities[-1], chance(aggregate.optimum.x[None, :])[0])
 
 
-PLAIN_GP = "[gp]\ntheta = 30.0\nvariance = 1.0\nthresholds = [-0.5, 0.5]\nnoise = 0.5\n"
-WITH_CLIPS = SOUND + '[random_effect]\ncolumn = "clip"\n'
-
-
-def with_clips(table):
-    """The same answers, of which only the last person's last one is of the last clip."""
-    answers = read_trials(table, study_of())
-    answers["clip"] = np.where(np.arange(len(answers)) % 2, "Sea ", "Fox")
-    answers.iloc[-1, answers.columns.get_loc("clip")] = "Wolf"
-    return answers
-
-
-def test_a_random_effect_is_read_from_its_column_and_stands_in_the_results(table):
-    study = study_of(WITH_CLIPS)
-    cohort = cohort_of(with_clips(table), study)
+def test_a_random_effect_is_read_from_its_column_and_stands_in_the_results(learnt_2):
+    learnt, cohort, map_ = learnt_2
     assert cohort.contexts == ("Fox", "Sea", "Wolf")
     np.testing.assert_array_equal(cohort.trials.context[0, :4], [0, 1, 0, 1])
-    learnt = resolved(study, cohort)
-    map_ = learnt_map(learnt.learnt, cohort.trials)
     assert "random effect" in learnt_content(learnt, cohort.names)["intervals"]
 
     def levels(of):

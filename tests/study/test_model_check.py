@@ -9,18 +9,20 @@ import pytest
 from scipy.stats import norm
 from studies import answered, plain_study
 
+from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.baselines import constant, quadratic
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.model_check import _compared, _differs, check_sentences, model_check
+from hilbo.study.rule_comparison import compare
 
 
 @pytest.fixture(scope="module")
 def checked():
     """Everybody's first rendering comes twice."""
     study = plain_study(2)
-    cohort = answered(study, people=5)
+    cohort = answered(study, people=3)
     trials = eqx.tree_at(lambda t: t.x, cohort.trials, cohort.trials.x.at[:, 1].set(cohort.trials.x[:, 0]))
     cohort = Cohort(trials, cohort.physical, cohort.names)
     return study, cohort, model_check(study, aggregate_cohort(study, cohort, alternatives=False))
@@ -44,12 +46,12 @@ def test_repeats_are_pairs_of_one_person(checked):
     mask = np.asarray(cohort.trials.mask)
     agree = [
         q[p, i] == q[p, j]
-        for p in range(5)
+        for p in range(3)
         for i in range(mask.shape[1])
         for j in range(i)
         if mask[p, i] and mask[p, j] and (x[p, i] == x[p, j]).all()
     ]
-    assert content["repeats"]["pairs"] == len(agree) == 5
+    assert content["repeats"]["pairs"] == len(agree) == 3
     assert content["repeats"]["given"] == pytest.approx(np.mean(agree))
     assert 0.5 < content["repeats"]["predicted"] < 1.0  # of two classes
 
@@ -75,10 +77,9 @@ def test_a_model_that_does_not_fit_is_spoken_of(checked):
     """All say "bad", and by the study's noise and threshold every second answer should be "good"."""
     study, cohort, _ = checked
     trials = eqx.tree_at(lambda t: t.q, cohort.trials, jnp.zeros_like(cohort.trials.q))
-    noisy = eqx.tree_at(
-        lambda gp: (gp.likelihood.thresholds, gp.likelihood.noise), study.gp, (jnp.array([-2.0]), jnp.asarray(10.0))
-    )
-    shifted = dataclasses.replace(study, gp=noisy)
+    noisy = jnp.array([-2.0]), jnp.asarray(10.0, float)  # of the types of the study's own, whose programs serve
+    gp = eqx.tree_at(lambda gp: (gp.likelihood.thresholds, gp.likelihood.noise), study.gp, noisy)
+    shifted = dataclasses.replace(study, gp=gp)
     aggregate = aggregate_cohort(shifted, Cohort(trials, cohort.physical, cohort.names), alternatives=False)
     content = model_check(shifted, aggregate)
     assert content["shares"]["good"]["given"] == 0.0
@@ -98,13 +99,15 @@ def test_few_answers_all_alike_are_no_misfit():
     assert _compared(given, np.full(200, 0.5), np.arange(200) // 10)["error"] > 0.1
 
 
-def test_two_people_cannot_be_checked(checked):
-    """Of five, three said nothing."""
+def test_two_people_can_be_neither_checked_nor_compared(checked):
+    """Of three, one said nothing."""
     study, cohort, _ = checked
     trials = eqx.tree_at(lambda t: t.mask, cohort.trials, cohort.trials.mask.at[2:].set(False))
     aggregate = aggregate_cohort(study, Cohort(trials, cohort.physical, cohort.names), alternatives=False)
     assert model_check(study, aggregate) is None
     assert check_sentences(None) == []
+    with pytest.raises(InputError, match="2 people gave answers; at least three are needed"):
+        compare(study, aggregate)
 
 
 def test_the_constant_is_the_others_shares():

@@ -15,7 +15,7 @@ THETA = np.array([6.0, 6.0])
 NOBODY = Trials.from_arrays(np.zeros((0, 2)), np.zeros(0, int), 4)
 
 
-def region_of(count, seed=0, points=200):
+def region_of(count, seed=0, points=80):
     """The region after `count` answers about a function that is known: its best place is (0.3, 0.6)."""
     gp = OrdinalGP(RBF(6.0, 4.0), OrdinalProbit((-0.5, 0.5), 0.5))
     rng = np.random.default_rng(seed)
@@ -32,7 +32,7 @@ def test_more_answers_leave_less_and_hold_the_best():
     few, many = region_of(4), region_of(60)
     assert few is not None and many is not None
     assert 0 < many.volume < 0.5 * few.volume
-    assert len(many.points) + len(many.others) == 250
+    assert len(many.points) + len(many.others) == 100
     assert many.holds(np.array([0.3, 0.6]), RBF(THETA))
     assert not many.holds(np.array([0.95, 0.05]), RBF(THETA))
 

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 from studies import answered, plain_study
 
-from hilbo.errors import InputError
 from hilbo.population.hierarchical import Share
 from hilbo.population.leave_one_out import LeftOut, calibration
 from hilbo.population.maps import GIVEN_RULES
 from hilbo.population.recipes import RECOMMENDED
 from hilbo.report.comparison import write_comparison
 from hilbo.study.aggregate import aggregate_cohort
-from hilbo.study.rule_comparison import compare, recommendation
+from hilbo.study.rule_comparison import recommendation
 
 
 @pytest.mark.deep
@@ -40,19 +39,12 @@ def test_everything_is_compared_and_written(tmp_path):
     }
 
 
-def test_two_people_cannot_be_compared():
-    study = plain_study(2)
-    with pytest.raises(InputError, match="at least three are needed"):
-        compare(study, aggregate_cohort(study, answered(study, people=2), alternatives=False))
-
-
 def share(mean, against):
     """A posterior of the share with this Bayes factor against 1."""
-    shares = jnp.linspace(0.0, 1.0, 101)
-    curve = jnp.where(shares < 1, float(against), 0.0)
-    ends = jnp.asarray([mean - 0.1, mean + 0.1])
-    one = jnp.asarray(mean)
-    return Share(shares, curve, one, one, ends, jnp.zeros(()), jnp.asarray(True))
+    shares = np.linspace(0.0, 1.0, 101)
+    curve = np.where(shares < 1, float(against), 0.0)
+    ends, one = np.array([mean - 0.1, mean + 0.1]), np.array(mean)
+    return Share(*map(jnp.asarray, (shares, curve, one, one, ends, np.zeros(()), np.array(True))))
 
 
 def advice(learnt, people=12, spread=0.5, paired=0.01, **costs):

@@ -39,6 +39,7 @@ def count_fits() -> Iterator[Counter[str]]:
     lock, solve = threading.Lock(), ordinal_gp._fit
 
     def record(inference, kind, model, x, q, mask):
+        x, q, mask = map(np.asarray, (x, q, mask))
         if np.any(mask):
             key = _key(inference, kind, model, x[mask], q[mask])
             with lock:
