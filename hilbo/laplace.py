@@ -175,7 +175,7 @@ def plain_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[Array
     last = jax.lax.while_loop(
         lambda state: state.risen & (state.residual > tolerance) & (state.steps < max_steps),
         step,
-        _PlainState(start, start, -infinite, infinite, jnp.asarray(0), jnp.asarray(True)),
+        _PlainState(start, start, -infinite, infinite, jnp.zeros((), jnp.int32), jnp.asarray(True)),
     )
     return Mode(last.eta, last.residual, tolerance, last.steps, jnp.zeros_like(tolerance))
 
@@ -197,7 +197,7 @@ def _whitened_mode(terms: Terms, covariance: Float[Array, "n n"], start: Float[A
         throw=False,
     )
     state = solution.state
-    steps = jnp.asarray(solution.stats["num_steps"])
+    steps = jnp.asarray(solution.stats["num_steps"], jnp.int32)  # as EP counts them: one program serves both posteriors
     return Mode(solution.value, state.residual, state.tolerance, steps, changed)
 
 
