@@ -61,7 +61,7 @@ def test_against_quadrature(make):
     """On three stimuli everything is an integral over three numbers: mean, variance, class probabilities, evidence."""
     data, posterior = make(), fitted(make)
     x = jnp.asarray(data.x_new)
-    evidence, *expected = quadrature(data, cells=61)  # right to 1e-9
+    evidence, *expected = quadrature(data)
     assert errors_apart(posterior.log_evidence, evidence, posterior.certificate.log_evidence_error) < 3
     values = (*posterior.predict(x), posterior.class_probabilities(x))
     for value, target, error in zip(values, expected, posterior.standard_errors(x), strict=True):
