@@ -32,6 +32,10 @@ def __dir__() -> list[str]:
 
 
 _Map = tuple[Float[Array, " m"], Float[Array, " m"]]
+"""Mean and variance (m,) of the population map."""
+
+_one_program = functools.partial(jax.jit, inline=True)
+"""Decorator: called outside of any program it is one program, not one for each operation."""
 
 
 class Evidence(eqx.Module):
@@ -137,22 +141,23 @@ def average(
     return _averaged(means, variances, mask)
 
 
-@functools.partial(jax.jit, inline=True)
+@_one_program
 def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], mask: Bool[Array, " M"] | None) -> _Map:
+    """Of `average`, with arrays that were checked."""
     present = jnp.ones(means.shape[0], bool) if mask is None else mask
     present = present.astype(means.dtype)
     share = present / jnp.sum(present)
     return share @ means, share**2 @ variances
 
 
-@functools.partial(jax.jit, inline=True)  # one program, not one for each operation
+@_one_program
 def _merged(
     means: Float[Array, "M m"],
     explained: Float[Array, "M m"],
     prior: Float[Array, " m"],
     mask: Bool[Array, " M"] | None,
 ) -> tuple[_Map, Bool[Array, " m"]]:
-    """Mean and variance of the population map, NaN where they cannot be; and where that is."""
+    """The map by the committee machine, NaN where it cannot be; and where that is."""
     evidence = _evidence(means, explained, prior, mask)
     invalid = _invalid(explained, prior, mask) | ~(1.0 + prior * evidence.added > 0.0)
     mean, variance = evidence.merge(prior)

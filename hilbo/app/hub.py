@@ -64,7 +64,7 @@ class Hub:
         self.invite: Callable[[Role], dict[str, str]] | None = None
         self._connect, self._make_maps, self._maps = connect, maps, None
         self.warm: asyncio.Future | None = None
-        self._thaws = False
+        self._froze = False
         self.watchers = Watchers(lambda: self.text("moved"))
         self._disk = ThreadPoolExecutor(1, "hilbo-disk")
         self.compute = ThreadPoolExecutor(1, "hilbo-choice")
@@ -98,7 +98,7 @@ class Hub:
         if warm.cancelled():  # the session ends before it
             return
         gc.collect()
-        self._thaws = gc.get_freeze_count() == 0  # else the program has memory of its own that it keeps frozen
+        self._froze = gc.get_freeze_count() == 0  # else the program froze its memory itself, and keeps it so
         gc.freeze()  # what is there by now stays: looking through it again takes 0.1 s, in which nobody is heard
         self.publish()
 
@@ -108,7 +108,7 @@ class Hub:
         self.runner.cancel()
         if self.warm is not None:
             self.warm.cancel()
-        if self._thaws:
+        if self._froze:
             gc.unfreeze()  # a program that goes on after the session has its memory looked through again
         self.watchers.end_all()
         if self.rig is not None:

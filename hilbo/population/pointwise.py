@@ -23,13 +23,13 @@ won nowhere (docs/methods/aggregation.md).
 import functools
 from typing import Any, Literal, NamedTuple, get_args
 
-import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from hilbo import bcm
 from hilbo.errors import InputError
+from hilbo.numerics.tracing import traced_once
 
 __all__ = ["RULES", "Rule", "Sums", "aggregate", "terms"]
 
@@ -100,7 +100,7 @@ def aggregate(
     return _aggregated(rule, means, explained, jnp.asarray(prior_variance, means.dtype), share, mask)
 
 
-@functools.partial(jax.jit, static_argnames="rule", inline=True)  # one program, not one for each operation
+@functools.partial(traced_once, static_argnames="rule")  # one program, not one for each operation
 def _aggregated(
     rule: Rule,
     means: Float[Array, "M m"],
@@ -109,6 +109,7 @@ def _aggregated(
     share: Float[Array, ""] | None,
     mask: Bool[Array, " M"] | None,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Of `aggregate`, with arguments that were checked."""
     prior = jnp.broadcast_to(prior_variance, means.shape[1:])
     if rule == "average":
         return bcm.average(means, prior[None, :] - explained, mask=mask)

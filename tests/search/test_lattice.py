@@ -95,7 +95,7 @@ def test_most_columns_get_no_variance():
     lattice_ = lattice_of(space, 24)
     hopes = np.asarray(screen(*known(posterior(3)), lattice_, SCORES[0]).hopes)
     columns = lattice_.inside.shape[1]
-    assert np.sum(hopes[1 : 1 + columns] > -jnp.inf) <= 96 < columns / 5
+    assert np.sum(hopes[1 : 1 + columns] > -np.inf) <= 96 < columns / 5
 
 
 @pytest.mark.parametrize("score", SCORES, ids=lambda s: type(s).__name__)

@@ -173,21 +173,29 @@ def test_a_smallest_distance_keeps_trials_apart(study):
         assert np.linalg.norm(x[:n] - x[n], axis=1).min() >= 0.2 - 1e-12
 
 
-@pytest.mark.parametrize("kind", ["ucb", "thompson"])
-def test_a_distance_is_kept_and_where_no_point_keeps_it_the_farthest_is_asked(kind):
-    """All are close, so that one place pulls; the third point can be 0.65 from the others, and then none can."""
-    distance, first = 0.65, SMALL.selection.space_filling
+def liked_everywhere(kind, distance, count):
+    """A study with a smallest distance, and the points of a session in which all are close."""
     changed = RAW["selection"] | {"acquisition": kind, "minimum_distance": distance}
     small = Study.from_dict(RAW | {"selection": changed})
-    x = np.asarray(small.space.to_unit(Session.replay(small, ["close"] * 6).points))
+    return small, np.asarray(small.space.to_unit(Session.replay(small, ["close"] * count).points))
+
+
+@pytest.mark.parametrize("kind", ["ucb", "thompson"])
+def test_where_no_point_keeps_the_distance_the_farthest_is_asked(kind):
+    """After the first trial nothing is 0.9 away any more: each is as far from the others as a point can be."""
+    small, x = liked_everywhere(kind, 0.9, 5)
     everywhere = np.asarray(small.space.candidates(2000, 1))
-    kept = np.array([np.linalg.norm(x[:n] - x[n], axis=1).min() for n in range(first, 6)])
-    farthest = np.array(
-        [np.linalg.norm(everywhere[:, None] - x[None, :n], axis=2).min(axis=1).max() for n in range(first, 6)]
-    )
-    assert farthest[0] > distance > farthest[-1]
-    assert np.all(kept[farthest > distance] >= distance - 1e-9)
-    assert np.all(kept > np.minimum(distance, farthest) - 0.06)
+    for n in range(small.selection.space_filling, 5):
+        gaps = np.linalg.norm(everywhere[:, None, :] - x[None, :n], axis=2).min(axis=1)
+        assert np.linalg.norm(x[:n] - x[n], axis=1).min() > min(0.9, gaps.max()) - 0.06
+
+
+@pytest.mark.parametrize("kind", ["ucb", "thompson"])
+def test_a_distance_is_kept(kind):
+    """Answers that pull to one place do not bring trials nearer to each other."""
+    small, x = liked_everywhere(kind, 0.15, 6)
+    for n in range(small.selection.space_filling, 6):
+        assert np.linalg.norm(x[:n] - x[n], axis=1).min() >= 0.15 - 1e-9
 
 
 def test_the_study_is_a_pytree_of_its_model_alone(study):
