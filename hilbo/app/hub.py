@@ -8,7 +8,6 @@ choosing's, and the server's own. What a participant does next is in `runner`, w
 """
 
 import asyncio
-import gc
 import time
 from collections import deque
 from collections.abc import Callable
@@ -39,8 +38,9 @@ class Hub:
     (given what is to be told of each new snapshot, and of what it says unasked), `maps` makes what draws the slices of
     the chooser's posterior.
 
-    `invite`, once set, makes a new link for a role; `gap` (s) is the pause between two trials, `tag` is what
-    trials of this session are known by in browsers.
+    `invite`, once set, makes a new link for a role; `settle`, once set, is called when all that is needed is compiled,
+    before anything is rendered; `gap` (s) is the pause between two trials, `tag` is what trials of this session are
+    known by in browsers.
     """
 
     def __init__(
@@ -62,9 +62,9 @@ class Hub:
         self.recent: deque = deque(reversed(log.before[-_RECENT:]), maxlen=_RECENT)
         self.delays: list[dict[str, float]] = []  # s, from each answer on
         self.invite: Callable[[Role], dict[str, str]] | None = None
+        self.settle: Callable[[], Any] = lambda: None
         self._connect, self._make_maps, self._maps = connect, maps, None
         self.warm: asyncio.Future | None = None
-        self._froze = False
         self.watchers = Watchers(lambda: self.text("moved"))
         self._disk = ThreadPoolExecutor(1, "hilbo-disk")
         self.compute = ThreadPoolExecutor(1, "hilbo-choice")
@@ -97,9 +97,7 @@ class Hub:
     def _warmed(self, warm: asyncio.Future) -> None:
         if warm.cancelled():  # the session ends before it
             return
-        gc.collect()
-        self._froze = gc.get_freeze_count() == 0  # else the program froze its memory itself, and keeps it so
-        gc.freeze()  # what is there by now stays: looking through it again takes 0.1 s, in which nobody is heard
+        self.settle()
         self.publish()
 
     async def close(self) -> None:
@@ -108,8 +106,6 @@ class Hub:
         self.runner.cancel()
         if self.warm is not None:
             self.warm.cancel()
-        if self._froze:
-            gc.unfreeze()  # a program that goes on after the session has its memory looked through again
         self.watchers.end_all()
         if self.rig is not None:
             await self._loop.run_in_executor(None, self.rig.close)

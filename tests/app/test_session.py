@@ -7,6 +7,7 @@ import threading
 import pytest
 from live_server import PATIENCE, Live, check_blinding, listen, refused
 
+from hilbo.app.opening import Wanted, opened
 from hilbo.app.views import choice_rows
 from hilbo.session.export import validation_table
 from hilbo.session.records import Block, Planned
@@ -56,16 +57,19 @@ def test_a_session_of_comparisons_from_begin_to_end(tmp_path):
     check_blinding("\n".join(heard), state, "K1", "B1", "alpha")
 
 
-@pytest.mark.parametrize("frozen", [False, True])
-def test_after_a_session_memory_is_looked_through_again_unless_the_program_had_frozen_it(tmp_path, frozen):
-    gc.unfreeze()
-    if frozen:
-        gc.freeze()
-    with Live(tmp_path) as live:
+def test_memory_is_set_aside_once_before_anything_is_felt_by_a_command_alone(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(gc, "freeze", lambda: done.append("frozen"))
+    with Live(tmp_path, warm=False) as live:  # a hub of a program of one's own
+        live.hub.settle = lambda: done.append(live.hub.begun)
+        live.warmed.set()
         live.begin()
         live.question()
-        assert gc.get_freeze_count() > 0
-    assert (gc.get_freeze_count() > 0) == frozen
+    assert done == [False]
+    hub, log = opened(Wanted(live.folder / "study.toml", "P02", logs=tmp_path, dry_run=True), None, lambda _: None)
+    log.close()
+    hub.settle()
+    assert done == [False, "frozen"]
 
 
 def check_order(events):
@@ -217,7 +221,7 @@ def test_a_trial_that_the_device_always_stops_may_be_left_out(tmp_path):
         for _ in range(2):
             live.until(lambda view: view["step"] and view["step"]["show"] == "a")
             live.command("estop")
-            live.until(lambda view: "clear" in view["may"], live.whole)
+            live.until(lambda view: "clear" in view["may"] and view["phase"] == "trouble", live.whole)
             live.command("clear")
         view = live.until(lambda view: "skip" in view["may"], live.whole)
         assert "1 put off to the end: stopped twice by the device" in view["trial"][0][1]
