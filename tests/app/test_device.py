@@ -4,7 +4,7 @@ import contextlib
 import os
 import time
 
-from live_server import Live, refused, until_held
+from live_server import PUSHED, Live, refused, until_held
 
 from hilbo.app.device_rig import DeviceRig
 from hilbo.device.simulator import Simulator
@@ -51,14 +51,14 @@ def test_a_pressed_device_rests_until_begin_and_again_in_a_break(tmp_path):
         seen = watched(live)
         live.until(lambda view: view["may"]["begin"])
         pressed(live)
-        time.sleep(2.0)  # twice as long as it waits before it pushes a handle back
+        time.sleep(3 * PUSHED)
         assert set(seen) <= {"STOPPED"}
         live.begin()
         live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
         live.participant.post("/api/participant/break", {})
         live.until(lambda _: live.hub.rig.snapshot.state == "STOPPED")
         del seen[:]
-        time.sleep(1.5)
+        time.sleep(2 * PUSHED)
         assert "RUNNING" not in seen
 
 
@@ -86,7 +86,7 @@ def test_a_pressed_device_rests_while_something_is_still_compiled(tmp_path):
             seen = watched(live)
             live.participant.post("/api/participant/begin", {})
             pressed(live)
-            time.sleep(2.0)
+            time.sleep(3 * PUSHED)
             assert set(seen) <= {"STOPPED"}
             live.warmed.set()
             live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")

@@ -296,7 +296,7 @@ def test_a_program_that_does_not_go_neutral_when_told_is_lost(tmp_path):
 
 
 def test_an_emergency_stop_is_acknowledged_voids_and_holds_until_it_is_cleared(tmp_path):
-    with LiveStimulus(tmp_path, seconds=2.0) as live, live.present():
+    with LiveStimulus(tmp_path, seconds=1.0) as live, live.present():
         live.begin()
         live.until(lambda view: view["step"] and view["step"]["show"] == "a")
         live.command("estop")

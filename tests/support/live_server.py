@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from hilbo.app import serve
+from hilbo.app import device_rig, interruptions, runner, serve
 from hilbo.app.device_rig import DeviceRig
 from hilbo.app.hub import Hub
 from hilbo.app.rehearsal import example_sets, fast_study
@@ -28,10 +28,18 @@ from hilbo.session.state import LiveSession
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 
-__all__ = ["DATA", "PATIENCE", "Live", "ask", "check_blinding", "listen", "refused", "study_of", "until_held"]
+__all__ = ["DATA", "PATIENCE", "PUSHED", "Live", "ask", "check_blinding", "listen", "refused", "study_of", "until_held"]
 
 DATA = Path(__file__).parents[2] / "hilbo" / "data" / "paper.toml"
 PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts a time
+PUSHED = 0.2  # s until a handle that was left pressed may be pushed back
+SOONER = (
+    (device_rig, "_POLL", 0.03),
+    (device_rig, "_RETRY", 0.1),
+    (device_rig, "_PUSHED", PUSHED),
+    (runner, "_LATER", 0.1),
+    (interruptions, "_LATER", 0.1),
+)
 PAIRS = (Planned("best", "mid"), Planned("worst", "best", "b"), Planned("mid", "worst"))
 
 
@@ -70,6 +78,7 @@ class Live:
         self.blocks = blocks or (Block("validation", 3 * repeats, PAIRS * repeats),)
         self.path = folder / "P01_1.session.jsonl"
         self.failed: list[BaseException] = []
+        self._sooner = pytest.MonkeyPatch()
 
     def make_study(self, seconds: float, warm_up: str) -> Study:
         """What is asked."""
@@ -94,6 +103,8 @@ class Live:
         return Renderer.open(self.device, options=options, patience=10.0)
 
     def __enter__(self) -> "Live":
+        for module, name, seconds in SOONER:  # what a session waits for a second at a time
+            self._sooner.setattr(module, name, seconds)
         resumed = self.path.exists()
         self.log = (
             EventLog.resume(self.path, self.study) if resumed else EventLog.create(self.path, self.study, self.header())
@@ -128,6 +139,7 @@ class Live:
         self.stop()
         self.thread.join(PATIENCE)
         self.log.close()
+        self._sooner.undo()
         assert not self.thread.is_alive()
 
     # What participants and experimenters do.
