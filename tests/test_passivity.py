@@ -207,7 +207,7 @@ def test_a_cell_is_bounded_from_below_and_closely():
         assert np.all(bound <= ends + 1e-12) and np.max(ends - bound) < 1e-4
 
 
-@pytest.mark.parametrize("N", [2, 100])
+@pytest.mark.parametrize("N", [2, pytest.param(100, marks=pytest.mark.deep)])
 def test_even_N_is_decided_by_the_certificate(N):
     K1, B1, alpha = random_sets(128, 2)
     lower, upper, _, on_grid = map(np.asarray, certified(K1, B1, alpha, 0.95, N, angles=4097))

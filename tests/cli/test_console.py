@@ -44,7 +44,9 @@ def test_a_folder_is_whole_or_absent(tmp_path):
         pass
 
 
-@pytest.mark.parametrize(("given", "holds"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+@pytest.mark.parametrize(
+    ("given", "holds"), [({}, "1"), pytest.param({"OPENBLAS_NUM_THREADS": "3"}, "3", marks=pytest.mark.deep)]
+)
 def test_openblas_has_one_thread_unless_it_was_told_otherwise(given, holds):
     """In a process of its own, since it is told before NumPy is loaded: `import jax` takes the test's time."""
     code = (

@@ -44,7 +44,7 @@ def test_the_encoder_rounds_and_the_stops_stop():
     assert v[x == 20][1:-1].max() == 0
 
 
-@pytest.mark.parametrize("taps", [1, 25, 101])
+@pytest.mark.parametrize("taps", [101, *(pytest.param(taps, marks=pytest.mark.deep) for taps in (1, 25))])
 def test_a_material_is_the_sampled_model_at_the_ticks(taps):
     force = np.r_[np.full(300, 3.0), np.full(300, 0.5), np.zeros(200), 2 + 2 * np.sin(np.arange(600) / 30)]
     options = ("--start", "-0.2", "--material", ",".join(map(str, (*FOAM, taps))))

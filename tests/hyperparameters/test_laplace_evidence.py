@@ -128,7 +128,8 @@ def test_haste_leaves_nothing_undone(name):
     np.testing.assert_allclose(expansion.value, oracle("evidence")["hasty"][name], rtol=1e-7)
 
 
-@pytest.mark.parametrize("inference", ["laplace", pytest.param("ep", marks=pytest.mark.deep)])
+@pytest.mark.deep
+@pytest.mark.parametrize("inference", ["laplace", "ep"])
 def test_a_certified_float32_evidence_is_right(inference):
     """Over 200 models from harmless to hopeless; a search that ended well is not enough (14 of them were wrong)."""
     trials = evidence.scattered_trials(jnp.float32)

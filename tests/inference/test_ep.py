@@ -238,7 +238,7 @@ def test_float32_against_float64(make):
 HOSTILE = [case for case in hostile_cases() if len(case.q) <= 25]
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.deep)])
 def test_a_part_of_the_hostile_grid(dtype):
     assert [(case.name, wrong) for case in HOSTILE[::4] if (wrong := complaint(case, dtype, "ep"))] == []
 

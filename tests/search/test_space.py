@@ -29,6 +29,11 @@ DRAWN = 20_000  # points, everywhere: each count is a program of its own
 units = st.floats(0, 1, allow_subnormal=False)  # XLA flushes these to 0
 
 
+def _deep(*cases):
+    """These cases of a test in deep runs only."""
+    return [pytest.param(*case, marks=pytest.mark.deep) for case in cases]
+
+
 @functools.cache
 def fosls(damping=0.95, order="usual", **mechanics):
     return SearchSpace(ORDERS[order], Mechanics(K_eff=0.44, damping=damping, **mechanics))
@@ -98,7 +103,7 @@ def test_box_coordinates_are_inverted_inside_the_feasible_set(w, damping):
             np.testing.assert_allclose(space.to_box(x), w, rtol=1e-12)
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [*_deep((np.float32,)), np.float64])
 def test_the_whole_box_is_feasible_up_to_its_wall_and_not_beyond(dtype):
     space = fosls()
     w = np.random.default_rng(0).random((2000, 3)).astype(dtype)
@@ -143,7 +148,9 @@ def minimum_damping(space, x):
 
 
 @pytest.mark.parametrize("draw", ["candidates", "latin_hypercube"])
-@pytest.mark.parametrize(("damping", "order"), [(0.95, "usual"), (0.5, "usual"), (0.25, "usual"), (0.95, "other")])
+@pytest.mark.parametrize(
+    ("damping", "order"), [(0.95, "usual"), *_deep((0.5, "usual"), (0.25, "usual")), (0.95, "other")]
+)
 def test_drawn_points_are_feasible_and_repeat(draw, damping, order):
     space, count = fosls(damping, order), 1000 if damping < 0.5 else DRAWN
     x = getattr(space, draw)(count, seed=1)
@@ -157,7 +164,7 @@ def test_drawn_points_are_feasible_and_repeat(draw, damping, order):
 
 
 @pytest.mark.parametrize("draw", ["candidates", "latin_hypercube"])
-@pytest.mark.parametrize(("damping", "order"), [(0.95, "usual"), (0.5, "usual"), (0.95, "other")])
+@pytest.mark.parametrize(("damping", "order"), [(0.95, "usual"), *_deep((0.5, "usual")), (0.95, "other")])
 def test_drawn_points_fill_the_feasible_set_evenly(draw, damping, order):
     space = fosls(damping, order)
     uniform = qmc.Sobol(space.dim, rng=7).random(2**18)
