@@ -138,8 +138,8 @@ class Live:
         self.warmed.set()
         self.stop()
         self.thread.join(PATIENCE)
-        self.log.close()
         self._sooner.undo()
+        self.log.close()
         assert not self.thread.is_alive()
 
     # What participants and experimenters do.
