@@ -47,6 +47,7 @@ def test_traces_are_counted():
         pass
 
 
+@pytest.mark.deep  # a run of pytest each; it is deep runs that allow no skip
 @pytest.mark.parametrize(
     ("value", "outcome"), [("", "1 passed, 2 skipped, 1 xfailed"), ("1", "1 failed, 1 passed, 1 xfailed, 1 error")]
 )

@@ -174,7 +174,7 @@ def test_a_warm_start_that_is_refused_leaves_no_log(tmp_path):
 
 def test_a_device_that_cannot_be_used_is_one_sentence_and_leaves_no_log(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
-    monkeypatch.setattr("hilbo.device.handshake._BOOT", 1.0)  # s that a silent line is waited for
+    monkeypatch.setattr("hilbo.device.handshake._BOOT", 0.3)  # s that a silent line is waited for
     study = study_of(tmp_path)
     logs = tmp_path / "logs"
     place = (tmp_path / "study.toml", "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run")

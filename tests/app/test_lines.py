@@ -90,7 +90,7 @@ class Form:
 
 
 def test_a_session_by_forms_and_what_is_refused(tmp_path):
-    with LiveStimulus(tmp_path, blocks=(Block("warm-up", 1, (Planned("best"),)),), seconds=1.0) as live:
+    with LiveStimulus(tmp_path, blocks=(Block("warm-up", 1, (Planned("best"),)),), felt=60.0) as live:
         program = Form(live.link())
         assert program.post("/api/join", token="x")["status"] == "401"
         refused = program.post("/api/stimulus/hello", name="form", version="1", force="perhaps", neutral_within_s="0.5")

@@ -193,7 +193,7 @@ def test_another_one_and_begin_at_the_end_of_the_warm_up(tmp_path):
 
 
 def test_a_voided_answer_is_restored_from_its_row(tmp_path):
-    with Live(tmp_path, seconds=0.5) as live:
+    with Live(tmp_path, seconds=0.25) as live:
         live.begin()
         live.answer()
         live.until(lambda view: view["phase"] != "answer")

@@ -28,7 +28,7 @@ def live(tmp_path):
 @pytest.fixture
 def brief(tmp_path):
     """A session that waits a moment for a confirmation."""
-    with LiveStimulus(tmp_path, within=1.0) as session:
+    with LiveStimulus(tmp_path, within=0.5) as session:
         yield session
 
 
@@ -115,7 +115,7 @@ def test_a_late_confirmation_voids_the_trial_and_is_refused(brief):
     program = brief.by_hand()
     brief.begin()
     late = program.asked(brief)
-    trial = voided(brief, "late: nothing was confirmed within 1 s")
+    trial = voided(brief, "late: nothing was confirmed within 0.5 s")
     with refused(409, "comes too late"):
         program.report("presented", order=late["order"], trial=late["trial"], values=late["values"])
     program.report("busy", order=late["order"])
@@ -185,7 +185,7 @@ def raw(program, body):
 
 
 def test_a_confirmation_that_comes_twice_counts_once(tmp_path):
-    with LiveStimulus(tmp_path, seconds=1.0) as live:
+    with LiveStimulus(tmp_path, felt=60.0) as live:
         program = live.by_hand()
         live.begin()
         order = program.asked(live)
@@ -220,7 +220,7 @@ def test_a_key_opens_its_own_role_in_its_own_session_and_a_browser_takes_no_link
 
 def test_a_flood_takes_nothing_from_others(live):
     program = live.by_hand()
-    for _ in range(200):
+    for _ in range(60):
         program.report("neutral", wait_s=0)
     live.begin()
     program.asked(live)
@@ -228,14 +228,14 @@ def test_a_flood_takes_nothing_from_others(live):
 
 
 def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
-    with LiveStimulus(tmp_path, silence=1.5, seconds=2.0) as live:
+    with LiveStimulus(tmp_path, silence=0.6, seconds=60.0) as live:
         program = live.by_hand()
         live.begin()
         order = live.until(lambda o: o["do"] == "present", lambda: program.report("neutral"))
         program.report("presented")
         live.until(lambda view: view["step"])
         live.until(lambda v: v["device"]["state"] == "lost", live.whole)
-        voided(live, "device: lost (by hand has been silent for 1.5 s.)", "trouble")
+        voided(live, "device: lost (by hand has been silent for 0.6 s.)", "trouble")
         with refused(409, "say hello first"):
             program.report("presented", order=order["order"])
         program.hello()
@@ -245,7 +245,7 @@ def test_a_silent_program_is_lost_and_comes_back_by_hello(tmp_path):
 
 
 def test_a_program_with_the_key_of_one_that_is_heard_waits_until_that_is_silent(tmp_path):
-    with LiveStimulus(tmp_path, silence=1.5) as live:
+    with LiveStimulus(tmp_path, silence=0.6) as live:
         first = live.by_hand()
         second = ByHand.__new__(ByHand)
         second.__dict__.update(first.__dict__)
@@ -296,7 +296,7 @@ def test_a_program_that_does_not_go_neutral_when_told_is_lost(tmp_path):
 
 
 def test_an_emergency_stop_is_acknowledged_voids_and_holds_until_it_is_cleared(tmp_path):
-    with LiveStimulus(tmp_path, seconds=1.0) as live, live.present():
+    with LiveStimulus(tmp_path, felt=60.0) as live, live.present():
         live.begin()
         live.until(lambda view: view["step"] and view["step"]["show"] == "a")
         live.command("estop")

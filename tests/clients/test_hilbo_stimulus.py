@@ -129,7 +129,7 @@ def test_no_order_to_present_is_handed_over_while_somebody_touches(tmp_path):
             live.begin()
             live.until(lambda _: stimulus.order.do == "present", lambda: None)
             stimulus.contact = True
-            handed = stimulus.next(0.3)
+            handed = stimulus.next(0.15)
             assert handed is None or handed.do != "present"
             stimulus.contact = False
             live.until(lambda order: order is not None and order.do == "present", lambda: stimulus.next(0.1))

@@ -15,7 +15,7 @@ from attacks.killed_hosts import BOUND, Killing
 pytestmark = needs_device
 
 
-@pytest.mark.parametrize("times", [5, pytest.param(100, marks=[pytest.mark.deep, pytest.mark.release])])
+@pytest.mark.parametrize("times", [2, pytest.param(100, marks=[pytest.mark.deep, pytest.mark.release])])
 def test_a_killed_host_is_zero_force_within_the_watchdog_and_its_ramp(times):
     killing, rng = Killing(), random.Random(times)
     try:

@@ -57,7 +57,7 @@ def silent(peer) -> bool:
     """Whether no heartbeat comes any more: one may be on its way."""
     time.sleep(2 * BEAT)
     before = peer.heartbeats
-    time.sleep(6 * BEAT)
+    time.sleep(3 * BEAT)
     return peer.heartbeats == before
 
 
@@ -98,7 +98,7 @@ def test_a_capture_that_fails_ends_the_heartbeats(capsys):
 
 def test_estop_waits_for_no_other_request():
     peer = Peer()
-    with peer.open(patience=0.8) as device:
+    with peer.open(patience=0.4) as device:
         peer.swallow = 1
         asking = threading.Thread(target=device.state)
         asking.start()
@@ -107,7 +107,7 @@ def test_estop_waits_for_no_other_request():
         stopping = threading.Thread(target=device.estop)
         stopping.start()
         until(lambda: peer.done[protocol.Estop])
-        assert asking.is_alive(), time.monotonic() - begun  # it waits 0.8 s for its answer
+        assert asking.is_alive(), time.monotonic() - begun  # it waits 0.4 s for its answer
         stopping.join()
         asking.join()
         assert device.link.stray == 0

@@ -179,7 +179,7 @@ def test_a_bad_line_costs_tries_and_never_a_wrong_set(rate):
 
     def connect():
         ports.append(FaultyPort(simulator.port, rate, len(ports)))
-        return Link(ports[-1], patience=0.15, tries=200, ticks=simulator.ticks)
+        return Link(ports[-1], patience=0.08, tries=200, ticks=simulator.ticks)
 
     device = Renderer(connect, simulator=simulator)
     rng = random.Random(0)

@@ -86,7 +86,8 @@ def test_where_the_search_begins_changes_nothing(one, start):
     np.testing.assert_allclose(again.hessian, expansion.hessian, rtol=1e-9)
 
 
-@pytest.mark.parametrize("inference", ["laplace", pytest.param("ep", marks=pytest.mark.deep)])
+@pytest.mark.deep  # searches over many people expand each so, and their ends are judged by default tests
+@pytest.mark.parametrize("inference", ["laplace", "ep"])
 def test_people_are_expanded_as_if_alone(inference):
     gp, trials, nothing = model(evidence.three()), answers(evidence.three()), NOTHING[inference]
     coordinates = coordinates_of(gp, EVERY)

@@ -40,7 +40,9 @@ def _hyper(dataset, log_theta: float = 0.0, log_noise: float = 0.0):
 SCALAR_THETA = [make for make in SMALL if np.ndim(make().theta) == 0]
 
 
-@pytest.mark.parametrize("make", SMALL)
+@pytest.mark.parametrize(
+    "make", [pytest.param(make, marks=[pytest.mark.deep] * (make not in (repeated, repeated_19))) for make in SMALL]
+)
 def test_numpy_agrees_with_50_digits(make):
     dataset = make()
     computed, exact = numpy_laplace(*dataset.problem()), mpmath_laplace(*dataset.problem())

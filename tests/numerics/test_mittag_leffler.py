@@ -97,7 +97,13 @@ def test_half_order_is_an_error_function():
 
 
 @pytest.mark.parametrize(
-    ("a", "b"), [(0.05, 0.5), (0.5644, 0.8899), (0.8, 0.95), (0.01, 0.99), (0.97, 0.99), (0.5, 0.5)]
+    ("a", "b"),
+    [
+        (0.05, 0.5),
+        (0.5644, 0.8899),
+        (0.97, 0.99),
+        *(pytest.param(*orders, marks=pytest.mark.deep) for orders in ((0.8, 0.95), (0.01, 0.99), (0.5, 0.5))),
+    ],
 )
 def test_two_parameters(a, b):
     z = np.array([1e-3, 0.1, 1.0, 30.0, 1e5])

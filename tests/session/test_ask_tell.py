@@ -180,7 +180,7 @@ def liked_everywhere(kind, distance, count):
     return small, np.asarray(small.space.to_unit(Session.replay(small, ["close"] * count).points))
 
 
-@pytest.mark.parametrize("kind", ["ucb", "thompson"])
+@pytest.mark.parametrize("kind", ["ucb", pytest.param("thompson", marks=deep)])
 def test_where_no_point_keeps_the_distance_the_farthest_is_asked(kind):
     """After the first trial nothing is 0.9 away any more: each is as far from the others as a point can be."""
     small, x = liked_everywhere(kind, 0.9, 5)
@@ -190,7 +190,7 @@ def test_where_no_point_keeps_the_distance_the_farthest_is_asked(kind):
         assert np.linalg.norm(x[:n] - x[n], axis=1).min() > min(0.9, gaps.max()) - 0.06
 
 
-@pytest.mark.parametrize("kind", ["ucb", "thompson"])
+@pytest.mark.parametrize("kind", [pytest.param("ucb", marks=deep), "thompson"])
 def test_a_distance_is_kept(kind):
     """Answers that pull to one place do not bring trials nearer to each other."""
     small, x = liked_everywhere(kind, 0.15, 6)

@@ -129,9 +129,6 @@ def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driv
     with EventLog.resume(path, STUDY):
         with pytest.raises(InputError, match="written by another hilbo"):
             EventLog.resume(path, STUDY)
-        code = CHILD + f"EventLog.resume({str(path)!r}, STUDY)"
-        run = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
-        assert "written by another hilbo" in run.stderr
     EventLog.resume(path, STUDY).close()  # and is free again
     with pytest.raises(InputError, match="no such session was begun"):
         EventLog.resume(tmp_path / "none.jsonl", STUDY)
@@ -139,6 +136,16 @@ def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driv
         path.write_bytes(content)
         with pytest.raises(InputError, match=sentence):
             read_log(path)
+
+
+@pytest.mark.deep  # a process that imports all
+def test_a_writer_in_another_process_is_refused_too(tmp_path, driven):
+    path = tmp_path / "log.jsonl"
+    write(path, driven)
+    with EventLog.resume(path, STUDY):
+        code = CHILD + f"EventLog.resume({str(path)!r}, STUDY)"
+        run = subprocess.run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+        assert "written by another hilbo" in run.stderr
 
 
 def test_an_event_that_does_not_follow_is_not_written(tmp_path, driven):

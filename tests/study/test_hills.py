@@ -37,7 +37,7 @@ def test_two_hills_share_the_draws_by_where_they_fell():
 def test_probabilities_add_up_to_the_draws_but_for_rare_hills():
     """Rugged maps: hills are disjoint, and every point belongs to one."""
     rng = np.random.default_rng(0)
-    for _ in range(20):
+    for _ in range(6):
         weight = rng.dirichlet(np.full(len(POINTS), 0.05))
         hills = hills_of(POINTS, rng.normal(size=len(POINTS)), SURE, weight, RBF(THETA))
         total = sum(hill.probability for hill in hills)

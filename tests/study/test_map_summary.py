@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.stats import norm
 from studies import plain
 
@@ -83,10 +84,8 @@ def test_tolerance_ends_where_close_stops_being_likeliest():
     study = plain()
     hill = Hill([0.47, 0.5], [5.0, 5.0])
     spread = np.hypot(0.5, 0.2)
-    grid = np.linspace(-1, 2, 3_000_001)
-    top = 1 - norm.cdf((0.5 - grid) / spread)
-    middle = norm.cdf((0.5 - grid) / spread) - norm.cdf((-0.5 - grid) / spread)
-    border = grid[np.argmax(top > middle)]
+    top = lambda mean: 1 - norm.cdf((0.5 - mean) / spread)  # noqa: E731
+    border = brentq(lambda mean: 2 * top(mean) - 1 + norm.cdf((-0.5 - mean) / spread), -1.0, 2.0, xtol=1e-12)
     reach = np.sqrt((1.2 - border) / 4.0)
     interval = tolerance(study, hill, jnp.asarray(hill.top), "u")
     np.testing.assert_allclose([interval.low, interval.high], [0.47 - reach, 0.47 + reach], atol=1e-5)

@@ -1,5 +1,6 @@
 """A live session for tests: the real server in a thread, on a simulated device, with planned trials of short steps."""
 
+import asyncio
 import contextlib
 import functools
 import http.client
@@ -10,6 +11,7 @@ import urllib.request
 from pathlib import Path
 
 import pytest
+import uvicorn.server
 
 from hilbo.app import device_rig, interruptions, runner, serve
 from hilbo.app.device_rig import DeviceRig
@@ -32,8 +34,21 @@ __all__ = ["DATA", "PATIENCE", "PUSHED", "Live", "ask", "check_blinding", "liste
 
 DATA = Path(__file__).parents[2] / "hilbo" / "data" / "paper.toml"
 PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts a time
-PUSHED = 0.2  # s until a handle that was left pressed may be pushed back
+PUSHED = 0.1  # s until a handle that was left pressed may be pushed back
+
+
+class _Hasty:
+    """asyncio for uvicorn, which looks every 0.1 s whether it is to end and then waits as long: a tenth of that."""
+
+    def __getattr__(self, name):
+        return getattr(asyncio, name)
+
+    async def sleep(self, seconds):
+        await asyncio.sleep(seconds / 10)
+
+
 SOONER = (
+    (uvicorn.server, "asyncio", _Hasty()),
     (device_rig, "_POLL", 0.03),
     (device_rig, "_RETRY", 0.1),
     (device_rig, "_PUSHED", PUSHED),
@@ -103,8 +118,8 @@ class Live:
         return Renderer.open(self.device, options=options, patience=10.0)
 
     def __enter__(self) -> "Live":
-        for module, name, seconds in SOONER:  # what a session waits for a second at a time
-            self._sooner.setattr(module, name, seconds)
+        for module, name, value in SOONER:  # what a session waits for a second, or a tenth of one, at a time
+            self._sooner.setattr(module, name, value)
         resumed = self.path.exists()
         self.log = (
             EventLog.resume(self.path, self.study) if resumed else EventLog.create(self.path, self.study, self.header())

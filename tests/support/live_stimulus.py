@@ -73,10 +73,21 @@ def module(name):
 
 
 class LiveStimulus(Live):
-    """`with LiveStimulus(folder) as live:` - comparisons of two parameters; a program joins with `live.join()`."""
+    """`with LiveStimulus(folder) as live:` - comparisons of two parameters; a program joins with `live.join()`.
 
-    def __init__(self, folder: Path, within: float = 60.0, silence: float = 60.0, more: str = "", **others):
-        self.text = TEXT.format(within=within, silence=silence) + more
+    `felt` is how long a test rendering may be felt in s, if that is another time than the other steps take.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        within: float = 60.0,
+        silence: float = 60.0,
+        more: str = "",
+        felt: float | None = None,
+        **others,
+    ):
+        self.text, self.felt = TEXT.format(within=within, silence=silence) + more, felt
         super().__init__(folder, **others)
 
     def make_study(self, seconds, warm_up):
@@ -86,7 +97,10 @@ class LiveStimulus(Live):
             "validation": ("reference", "a", "neutral", "b"),
         }
         for name, steps in shows.items():
-            listed = ", ".join(f'{{show = "{show}", seconds = {seconds}}}' for show in steps)
+            felt = seconds if self.felt is None else self.felt
+            listed = ", ".join(
+                f'{{show = "{show}", seconds = {felt if show in ("a", "b") else seconds}}}' for show in steps
+            )
             self.text += f"[session.{name}]\nsteps = [{listed}]\n"
         file = self.folder / "study.toml"
         file.write_text(self.text)
