@@ -126,9 +126,8 @@ def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driv
         EventLog.resume(path, other)
     with pytest.raises(InputError, match="exists already"):
         EventLog.create(path, STUDY, driven.header)
-    with EventLog.resume(path, STUDY):
-        with pytest.raises(InputError, match="written by another hilbo"):
-            EventLog.resume(path, STUDY)
+    with EventLog.resume(path, STUDY), pytest.raises(InputError, match="written by another hilbo"):
+        EventLog.resume(path, STUDY)
     EventLog.resume(path, STUDY).close()  # and is free again
     with pytest.raises(InputError, match="no such session was begun"):
         EventLog.resume(tmp_path / "none.jsonl", STUDY)
