@@ -53,7 +53,8 @@ class Trials(eqx.Module):
         padded = np.zeros((capacity, points.shape[1]), jax.dtypes.canonicalize_dtype(dtype))
         categories = np.zeros(capacity, np.int32)
         padded[:count], categories[:count] = points, answers
-        return cls(jnp.asarray(padded), jnp.asarray(categories), jnp.arange(capacity) < count)
+        # Of NumPy's arrays, which need no program; jnp.asarray compiles one for each shape (jax 0.10).
+        return cls(*jax.device_put((padded, categories, np.arange(capacity) < count)))
 
     def __repr__(self) -> str:
         if not known(self.x, self.mask):

@@ -162,7 +162,8 @@ def assert_same(one, other, rtol=1e-12):
     np.testing.assert_allclose(one.predict(x), other.predict(x), rtol=rtol, atol=rtol)
 
 
-@pytest.mark.parametrize("make", [repeated, pytest.param(near_separable, marks=pytest.mark.deep)])
+@pytest.mark.deep  # by default those of Laplace, and people of unequal numbers of answers (test_aggregate.py)
+@pytest.mark.parametrize("make", [repeated, near_separable])
 def test_padded_equals_unpadded(make):
     data = make()
     bare = by_ep(data, len(data.q))

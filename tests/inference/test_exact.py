@@ -164,10 +164,10 @@ def test_conflicting_repeats_under_a_wide_prior(noise):
 def test_draws_have_the_moments_of_the_posterior():
     data, posterior = near_separable(), fitted(near_separable)
     x = data.x_new[[0, *range(len(data.x_new))]]
-    draws = np.asarray(posterior.draw(jax.random.key(3), x, 20_000))
+    draws = np.asarray(posterior.draw(jax.random.key(3), x, 10_000))
     mean, variance = posterior.predict(x)
-    assert draws.shape == (20_000, len(x)) and np.all(np.isfinite(draws))
-    assert np.max(errors_apart(np.mean(draws, axis=0), mean, np.std(draws, axis=0) / np.sqrt(20_000))) < 3
+    assert draws.shape == (10_000, len(x)) and np.all(np.isfinite(draws))
+    assert np.max(errors_apart(np.mean(draws, axis=0), mean, np.std(draws, axis=0) / np.sqrt(10_000))) < 3
     np.testing.assert_allclose(np.var(draws, axis=0), variance, rtol=0.05)
     # asked twice at one point, a draw gives one value: it is a function
     np.testing.assert_allclose(draws[:, 0], draws[:, 1], rtol=0, atol=1e-7)

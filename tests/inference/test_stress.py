@@ -27,8 +27,10 @@ def faults(cases, inference, dtype):
             yield f"{case.name}: {outcome.wrong}"
 
 
-# A few seconds each; the corrected one compiles for longer than both others, and is deep, as the exact one.
-@pytest.mark.parametrize("inference", ["laplace", "ep", pytest.param("ep_corrected", marks=pytest.mark.deep)])
+# A few seconds each; that of EP has its part of the hostile grid by default (test_ep.py).
+@pytest.mark.parametrize(
+    "inference", ["laplace", *(pytest.param(i, marks=pytest.mark.deep) for i in ("ep", "ep_corrected"))]
+)
 def test_a_part_of_the_grid(inference):
     assert list(faults(OF_THREE[::4], inference, np.float64)) == []
 

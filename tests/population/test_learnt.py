@@ -1,4 +1,4 @@
-"""learnt-2 and learnt-1: a maximum by another way of computing it; what is stated stays, what cannot be learnt is said."""
+"""learnt-2 and learnt-1: a maximum by another way of computing it; what is stated stays, what is not learnt is said."""
 
 import equinox as eqx
 import jax

@@ -82,6 +82,7 @@ def test_replay_gives_the_same_points_bit_for_bit(study, finished):
     assert halfway.ask() == asked[12]
 
 
+@deep  # which imports and traces all
 def test_replay_in_another_process_gives_the_same_points_bit_for_bit():
     responses = ["similar", "different", "close", "close", "similar"]
     code = (
