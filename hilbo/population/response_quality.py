@@ -14,8 +14,9 @@ and an answer far from all others is expected to be like them, not like the prio
 like lapses: a rate says how much of the answers the person's own model cannot tell from chance.
 
 The likelihood is known on a grid of rates and drifts. Each estimate is where it is largest, the other being the
-likeliest then, and intervals are where twice its logarithm falls by less than 3.84. The filter and that quantile are
-approximate; `benchmarks/coverage_people.py` measures how often intervals hold.
+likeliest then, and intervals are where twice its logarithm falls by less than 3.84. Where an interval has no end the
+answers do not tell, and there is no estimate. The filter and that quantile are approximate;
+`benchmarks/coverage_people.py` measures how often intervals hold.
 
 An exclusion rule, "trials < 10 or lapse_low > 0.3", speaks of a person's own answers only, and is applied before
 anything is aggregated.
@@ -153,16 +154,20 @@ def repeats(x: Float[np.ndarray, "n d"], near: float = _NEAR) -> np.ndarray:
 
 
 def _lapse(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> tuple[float, float, float]:
-    """Lapse rate and its 95 % interval."""
-    return _profile(_RATES, log_likelihood.max(axis=1)) if answers else (np.nan, 0.0, 1.0)
+    """Lapse rate and its 95 % interval; NaN where any rate is in it."""
+    if not answers:
+        return np.nan, 0.0, 1.0
+    best, low, high = _profile(_RATES, log_likelihood.max(axis=1))
+    return np.nan if (low, high) == (0.0, 1.0) else best, low, high
 
 
 def _drift(log_likelihood: Float[np.ndarray, "rates shifts"], answers: int) -> tuple[float, float, float]:
-    """Drift in prior standard deviations and its 95 % interval, open where the grid ends."""
+    """Drift in prior standard deviations and its 95 % interval, open where the grid ends; NaN where it has no end."""
     if answers < 2:
         return np.nan, -np.inf, np.inf
     best, low, high = _profile(_DRIFTS, log_likelihood.max(axis=0))
-    return best, -np.inf if low <= _DRIFTS[0] else low, np.inf if high >= _DRIFTS[-1] else high
+    below, above = low <= _DRIFTS[0], high >= _DRIFTS[-1]
+    return np.nan if below and above else best, -np.inf if below else low, np.inf if above else high
 
 
 def excluded(table: pd.DataFrame, rule: str) -> dict[str, str]:
@@ -222,9 +227,9 @@ def _estimate_columns(name: str, estimate: tuple[float, float, float]) -> dict[s
 
 def _profile(grid: Float[np.ndarray, " k"], values: Float[np.ndarray, " k"]) -> tuple[float, float, float]:
     """Where a log likelihood that is known on a grid is largest, and the ends of where twice it is not below by the
-    95 % point of chi^2. Of answers that are all guessed nothing is known of a drift: the profile is then flat."""
+    95 % point of chi^2."""
     between = Akima1DInterpolator(grid, values, method="makima")
-    highest = max(range(len(grid)), key=lambda place: (values[place], -abs(grid[place])))  # of a plateau nearest to 0
+    highest = int(np.argmax(values))
     sides = grid[max(highest - 1, 0)], grid[min(highest + 1, len(grid) - 1)]
     best = minimize_scalar(lambda v: -between(v), bounds=sides, method="bounded").x
     best = max((float(grid[highest]), float(best)), key=between)

@@ -36,10 +36,8 @@ def test_consistency_counts_pairs(getkey):
 
 def test_measures_do_not_depend_on_the_unit_of_the_score():
     """The same answers under a model in which the latent score is three times as large."""
-    x, q = np.array([[0.2] * 3, [0.3] * 3, [0.2] * 3, [0.5] * 3]), np.array([2, 1, 1, 0])
-    trials = jax.tree.map(lambda leaf: leaf[None], Trials.from_arrays(x, q))
+    one, trials = person(120, 0.4, -2.0)
     square, wide = jnp.asarray(9.0), jnp.asarray(3.0)
-    one = model(CASE)
     other = OrdinalGP(
         RBF(one.kernel.theta, square * one.kernel.variance),
         OrdinalProbit(wide * one.likelihood.thresholds, wide * one.likelihood.noise),
@@ -48,7 +46,7 @@ def test_measures_do_not_depend_on_the_unit_of_the_score():
         measure_people(gp, trials, ("A",))[["lapse", "surprise", "drift", "drift_low", "drift_high"]]
         for gp in (one, other)
     ]
-    assert -6 < rows[0]["drift"][0] < 0
+    assert -6 < rows[0]["drift"][0] < 0 < rows[0]["lapse"][0]
     np.testing.assert_allclose(rows[1], rows[0], atol=1e-4)
 
 
@@ -82,9 +80,14 @@ def test_of_many_answers_an_even_part_is_measured(monkeypatch):
         assert row[name] == pytest.approx(few[name], rel=1e-6)
 
 
-def test_who_only_guesses_has_no_drift():
-    """Drifts make no difference to answers that are all guessed."""
-    assert response_quality._drift(np.full((18, 21), -30.0), 5) == (0.0, -np.inf, np.inf)
+def test_what_the_answers_do_not_tell_is_no_number():
+    """Drifts make no difference to answers that are all guessed; and a lapse rate that may be any is none."""
+    flat = np.full((18, 21), -30.0)
+    assert response_quality._drift(flat, 5) == pytest.approx((np.nan, -np.inf, np.inf), nan_ok=True)
+    assert response_quality._lapse(flat, 5) == pytest.approx((np.nan, 0.0, 1.0), nan_ok=True)
+    falls = flat - np.linspace(0.0, 4.0, 18)[:, None]  # from the lowest rate to the highest
+    best, low, high = response_quality._lapse(falls, 5)
+    assert 0 <= best < 0.01 and low == 0 and high < 1
 
 
 def test_of_nobody_nothing_is_said():
