@@ -57,7 +57,7 @@ for _name, _words, _unit in (
     ("drift", "shift of the latent score from the first to the last trial", "prior sd"),
 ):
     _ends = {f"{_name}_{end}": (_unit, f"{end} end of its 95 % interval") for end in ("low", "high")}
-    _PEOPLE |= {_name: (_unit, _words)} | _ends
+    _PEOPLE |= {_name: (_unit, f"{_words}; empty: the answers do not tell")} | _ends
 _COMPARISON = {
     "rule": ("", "rule of aggregation"),
     "method": ("", "exact: from all answers at once; by points: person by person at each point"),

@@ -19,6 +19,7 @@ from studies import paper_counts, plain
 from hilbo import Trials
 from hilbo.population.maps import ALL_RULES, RuleMap
 from hilbo.report.comparison import comparison_section
+from hilbo.report.figures.people import people_figure
 from hilbo.report.figures.progress import individual_convergence
 from hilbo.report.hypotheses import _convergence, _materials, _nearer_to_others
 from hilbo.report.study import _alternatives, _shown, _tolerances
@@ -132,6 +133,24 @@ def test_measures_have_the_digits_that_answers_give():
     row |= dict(low=1.0, high=12.346, low_from=1.0, low_to=1.2346, high_from=1.1, high_to=12.346)
     ((*_, low, ends, _),) = _tolerances(pd.DataFrame([row]))
     assert (low, ends) == ("12.35 (range)", "1.1 to 12")
+
+
+def test_what_is_not_known_of_somebody_is_a_line_without_a_mark():
+    people = pd.DataFrame(
+        {
+            "participant": ["left out", "kept"],
+            **{"consistency": [0.5, np.nan], "consistency_low": [0.1, 0.0], "consistency_high": [0.9, 1.0]},
+            **{"lapse": [np.nan, 0.0], "lapse_low": [0.0, 0.0], "lapse_high": [1.0, 0.4]},
+            **{"drift": [np.nan, 0.0], "drift_low": [-np.inf, -1.0], "drift_high": [np.inf, 2.0]},
+        }
+    )
+    panels = people_figure(people, {"left out": "lapse > 0.3"}).axes
+    for axes, marks in zip(panels, ((0, 1), (1, 0), (1, 0)), strict=True):
+        kept, dots, out, crosses = axes.collections[:4]
+        (line,), (of_left_out,) = kept.get_segments(), out.get_segments()
+        assert np.ptp(line[:, 0]) > 0.3 and np.ptp(of_left_out[:, 0]) > 0.3
+        assert (len(dots.get_offsets()), len(crosses.get_offsets())) == marks
+    assert np.ptp(of_left_out[:, 0]) == np.ptp(panels[2].get_xlim())  # from one side of the panel to the other
 
 
 class Population(eqx.Module):

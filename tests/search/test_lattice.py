@@ -28,8 +28,8 @@ each_space = pytest.mark.parametrize("space", SPACES.values(), ids=SPACES)
 
 
 def _case(score, name):
-    """Every score with the mechanics, and another space with one: every pair is a program of its own."""
-    deep = name != "mechanics" and (name, type(score)) != ("plane", acquisition.UCB)
+    """By default every score with the mechanics, and one score with the plane: every pair is a program of its own."""
+    deep = name != "mechanics" and not (name == "plane" and isinstance(score, acquisition.UCB))
     return pytest.param(SPACES[name], score, id=f"{type(score).__name__}-{name}", marks=[pytest.mark.deep] * deep)
 
 

@@ -84,8 +84,13 @@ def test_tolerance_ends_where_close_stops_being_likeliest():
     study = plain()
     hill = Hill([0.47, 0.5], [5.0, 5.0])
     spread = np.hypot(0.5, 0.2)
-    top = lambda mean: 1 - norm.cdf((0.5 - mean) / spread)  # noqa: E731
-    border = brentq(lambda mean: 2 * top(mean) - 1 + norm.cdf((-0.5 - mean) / spread), -1.0, 2.0, xtol=1e-12)
+
+    def lead(mean):
+        """P(close) - P(similar)."""
+        different, not_close = norm.cdf((np.array([-0.5, 0.5]) - mean) / spread)
+        return (1 - not_close) - (not_close - different)
+
+    border = brentq(lead, -1.0, 2.0, xtol=1e-12)
     reach = np.sqrt((1.2 - border) / 4.0)
     interval = tolerance(study, hill, jnp.asarray(hill.top), "u")
     np.testing.assert_allclose([interval.low, interval.high], [0.47 - reach, 0.47 + reach], atol=1e-5)

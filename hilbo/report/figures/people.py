@@ -22,7 +22,8 @@ __all__ = ["people_figure", "predictive_check"]
 
 
 def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
-    """Consistency, lapse rate and drift of every participant, each with its 95 % interval; crosses: left out."""
+    """Consistency, lapse rate and drift of every participant: a line for the 95 % interval, a mark for the estimate if
+    there is one; red crosses: left out."""
     rows = np.arange(len(people))[::-1]
     out = people["participant"].isin(list(left_out)).to_numpy()
     with mpl.rc_context(STYLE):
@@ -31,17 +32,12 @@ def people_figure(people: pd.DataFrame, left_out: Mapping[str, str]) -> Figure:
         words = ("agreement of repeats", "lapse rate", "drift (prior standard deviations)")
         for axes, measure, label in zip(panels, ("consistency", "lapse", "drift"), words, strict=True):
             value, low, high = (people[f"{measure}{end}"].to_numpy(float) for end in ("", "_low", "_high"))
-            finite = np.isfinite(value)
             limits = (-3.5, 3.5) if measure == "drift" else (-0.03, 1.03)
-            axes.hlines(
-                rows[finite],
-                np.maximum(low, limits[0])[finite],
-                np.minimum(high, limits[1])[finite],
-                color=BLUE,
-                linewidth=1,
-            )
-            axes.scatter(value[finite & ~out], rows[finite & ~out], s=16, color=BLUE, zorder=3)
-            axes.scatter(value[finite & out], rows[finite & out], s=26, marker="x", color=RED, zorder=3)
+            for part, color, mark in ((~out, BLUE, {"s": 16}), (out, RED, {"s": 26, "marker": "x"})):
+                ends = np.maximum(low[part], limits[0]), np.minimum(high[part], limits[1])
+                axes.hlines(rows[part], *ends, color=color, linewidth=1)
+                known = part & np.isfinite(value)
+                axes.scatter(value[known], rows[known], color=color, zorder=3, **mark)
             axes.set(xlabel=label, xlim=limits)
         panels[2].axvline(0, color=GREY, linestyle="--", linewidth=1)
         panels[0].set_yticks(rows, list(people["participant"]), fontsize=6)
