@@ -406,7 +406,7 @@ static void move(struct rig *rig, struct input *input)
     uint8_t many = next(input);
     int32_t step = (int32_t)(int8_t)next(input) / 4;
     for (uint32_t i = 0U; i <= (many & 63U); i += 1U) {
-        rig->position += rig->position + step > -1500 && rig->position + step < 4700 ? step : 0;
+        rig->position += rig->position > -1500 - step && rig->position < 4700 - step ? step : 0;
         tick(rig, 0U);
         if ((many & 64U) != 0U && i % 16U == 0U) {
             send(rig, HB_HEARTBEAT, input, 0U);
