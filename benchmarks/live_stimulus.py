@@ -29,7 +29,7 @@ sys.path.insert(0, str(ROOT / "clients"))
 
 from hilbo_stimulus import Stimulus  # noqa: E402  (as its users have it: a file beside their program)
 
-PARAMETERS = ("hue=0:360:deg", "light=20:80:%")
+PARAMETERS = ("hue=140:260:deg", "light=20:80:%")
 BEST = {"hue": 140.0, "light": 45.0}
 
 

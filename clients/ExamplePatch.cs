@@ -1,6 +1,6 @@
 // A patch of colour in the terminal, whose hue (degrees) and light (%) a hilbo session chooses.
 //
-//     hilbo init colour.toml --name colour --parameter hue=0:360:deg --parameter light=20:80:%
+//     hilbo init colour.toml --name colour --parameter hue=140:260:deg --parameter light=20:80:%
 //     hilbo session colour.toml --participant P01 --dry-run      # in another terminal: prints the links
 //     mcs ExamplePatch.cs HilboStimulus.cs -out:ExamplePatch.exe && mono ExamplePatch.exe LINK-OF-THE-STIMULUS
 //

@@ -1,6 +1,6 @@
 // A cube in a Unity scene, whose hue (degrees) and light (%) a hilbo session chooses.
 //
-//     hilbo init colour.toml --name colour --parameter hue=0:360:deg --parameter light=20:80:%
+//     hilbo init colour.toml --name colour --parameter hue=140:260:deg --parameter light=20:80:%
 //     hilbo session colour.toml --participant P01 --dry-run      # prints the links
 //
 // Copy this file and HilboStimulus.cs into Assets, add this script to a cube, give it the link of the stimulus in the

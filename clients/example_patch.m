@@ -1,7 +1,7 @@
 function example_patch(link)
 % EXAMPLE_PATCH  A patch of colour, whose hue (degrees) and light (%) a hilbo session chooses; in MATLAB or Octave.
 %
-%   hilbo init colour.toml --name colour --parameter hue=0:360:deg --parameter light=20:80:%
+%   hilbo init colour.toml --name colour --parameter hue=140:260:deg --parameter light=20:80:%
 %   hilbo session colour.toml --participant P01 --dry-run          % in a terminal: prints the links
 %   example_patch('LINK-OF-THE-STIMULUS')                          % here; Ctrl-C ends
 %

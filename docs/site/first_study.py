@@ -34,8 +34,9 @@ STEPS = (
         """## A study file
 
 Two parameters of a patch of colour, which a program of yours presents. `hilbo init` writes a commented file;
-read it, and change what is asked.""",
-        "hilbo init colour.toml --parameter hue=0:360:deg --parameter light=20:80:% --trials 20",
+read it, and change what is asked. Hues are a circle, and hilbo has no parameter that is one: cut it where nobody
+has to be asked.""",
+        "hilbo init colour.toml --parameter hue=140:260:deg --parameter light=20:80:% --trials 20",
         files=("colour.toml",),
     ),
     Step(
@@ -62,15 +63,17 @@ The plan, and the same as one page for a registry. What only you know stands the
     Step(
         """## Answers
 
-Real ones come from `hilbo session` and `hilbo export` ([running a session](running-a-session.md)). Here eight
-simulated people answer, so that the truth is known.""",
+Real ones come from `hilbo session` ([running a session](running-a-session.md)). Here eight simulated people answer,
+so that the truth is known: the last line but one compares it with the optimum that was found.""",
         "hilbo simulate --study colour.toml --participants 8 --out simulated",
     ),
     Step(
         """## The population map
 
-From the table of answers alone; by every rule `--compare` predicts each answer from other people's answers and
-the person's own earlier ones. The page is `results/report.html`.""",
+`hilbo simulate` did this already. Of real people's answers this command does it, from their table or the folder of
+the sessions' logs. `--compare` tests every rule: it predicts each answer from other people's answers and from the
+person's own earlier ones. The page is `results/report.html`; what was learnt of the model stands in
+`results/result.json`, with intervals.""",
         "hilbo aggregate simulated/trials.csv --study colour.toml --compare --out results",
         figures=(
             (
@@ -81,19 +84,20 @@ the person's own earlier ones. The page is `results/report.html`.""",
         ),
     ),
     Step(
-        """A warning is a result: read it, and say in the paper what you did about it. Does the optimum stay where it is
-under hyperparameters that the answers choose? The page of the next command has them as a `[gp]` table to
-copy.""",
-        "hilbo robustness simulated/trials.csv --study colour.toml --out robustness",
-        figures=(("robustness/maps.png", "The map under the study's hyperparameters, and under learnt ones."),),
-    ),
-    Step(
         """## The results section
 
 A folder with the study file, the answers and the plan becomes one page with figures, tables, a checklist of
-Bayesian reporting, and what departs from the plan. Here `study` holds `colour.toml` as `study.toml`,
-`simulated/trials.csv` and `plan.json`. Eight people are few: two halves of them need not agree on the optimum, and
-the dashed line of the first figure says how far they are apart.""",
+Bayesian reporting, and what departs from the plan. Of real sessions `hilbo export logs --study colour.toml --plan
+plan.json --out study` makes this folder. Here three files are put together:
+
+```
+mkdir study
+cp colour.toml study/study.toml
+cp simulated/trials.csv plan.json study
+```
+
+Eight people are few: two halves of them need not agree on the optimum, and the dashed line of the first figure
+says how far they are apart.""",
         "hilbo report study --out report",
         figures=(
             (

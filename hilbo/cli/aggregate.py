@@ -73,11 +73,12 @@ def aggregate(
             folder = held.enter_context(results(out, force)) if team.writes else None
             chosen, cohort = read_cohort(trials, study, material, say)
             chosen = chosen if rule is None else by_rule(chosen, rule)
-            cohort = cohort.of(participants.split(",")) if participants else cohort
+            cohort = cohort.of([name.strip() for name in participants.split(",")]) if participants else cohort
+            cohort, left_out = _included(chosen, cohort)
             cohort = cohort.first(first) if first else cohort
             agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
         if team.devices == 1 and len(cohort.names) <= _LARGE and individuals:
-            content = aggregate_cohort(chosen, cohort, folder, seed, say, compare=compare)
+            content = aggregate_cohort(chosen, cohort, folder, seed, say, compare=compare, left_out=left_out)
         elif compare:
             raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
         else:
@@ -103,7 +104,8 @@ def robustness(
 ) -> None:
     """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
     with results(out, force) as folder, progress() as say:
-        chosen, cohort = read_cohort(trials, study, material, say)
+        chosen, everybody = read_cohort(trials, study, material, say)
+        cohort, _ = _included(chosen, everybody)
         from hilbo.report.robustness import write_robustness
         from hilbo.study.robustness import robustness as check
 
@@ -123,6 +125,7 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
     from hilbo.study.trial_table import read_trials
 
     whole = Study.load(study)
+    material = material or _only_material(trials, whole)
     chosen = whole.material(material) if material and whole.materials else whole
     if trials.is_dir():
         from hilbo.session.export import read_log_trials
@@ -133,7 +136,38 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
     return chosen, cohort_of(table, chosen)
 
 
-def aggregate_cohort(study, cohort, folder, seed, say, truth=None, compare=False, selection="") -> dict[str, Any]:
+def _only_material(trials: Path, study: Any) -> str | None:
+    """The material that a table or the logs are of, where the study has several; None where they name none."""
+    if not study.materials:
+        return None
+    from hilbo.session.export import read_sessions, trials_table
+    from hilbo.study.cells import read_cells
+
+    table = trials_table(read_sessions(trials, study)) if trials.is_dir() else read_cells(trials)
+    named = list(dict.fromkeys(table["material"])) if "material" in table else []
+    if len(named) > 1:
+        raise InputError(f"{trials}: holds {len(named)} materials ({', '.join(named)}); choose one with --material.")
+    if not named:
+        remark(f"{trials}: names no material; it is read by the study's own tables, and none of [materials].")
+    return named[0] if named else None
+
+
+def _included(study, everybody) -> tuple[Any, list[str]]:
+    """The cohort without those whom the study's rule leaves out, which is said; and the sentences."""
+    if not study.exclude:
+        return everybody, []
+    from hilbo.study.exclusion import exclusion_sentences, included
+
+    cohort, _, left_out = included(study, everybody)
+    sentences = exclusion_sentences(study, left_out)
+    for sentence in sentences:
+        remark(sentence)
+    return cohort, sentences
+
+
+def aggregate_cohort(
+    study, cohort, folder, seed, say, truth=None, compare=False, selection="", left_out=()
+) -> dict[str, Any]:
     """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
     from hilbo.study.population_results import analyse_population
 
@@ -153,7 +187,7 @@ def aggregate_cohort(study, cohort, folder, seed, say, truth=None, compare=False
         say("every rule, with each person left out")
         compared = write_comparison(study, population.aggregate, folder, seed)
         beside = {"comparison": compared.section, "pictures": compared.pictures}
-    return write_results(population, folder, truth, say, selection=selection, **beside)
+    return write_results(population, folder, truth, say, left_out=left_out, selection=selection, **beside)
 
 
 def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -> dict[str, Any]:

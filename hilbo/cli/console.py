@@ -6,6 +6,7 @@ and nothing is overwritten without `--force`. Progress goes to stderr, results w
 
 import contextlib
 import gc
+import itertools
 import json
 import math
 import os
@@ -125,11 +126,23 @@ def results(out: Path, force: bool) -> Iterator[Path]:
         yield made
         made.chmod(0o755)
         list_files(made, shlex.join(["hilbo", *sys.argv[1:]]), os.getcwd())
-        if out.exists():
-            shutil.rmtree(out)
-        made.rename(out)
+        _publish(made, out, force)
     finally:
         shutil.rmtree(made, ignore_errors=True)
+
+
+def _publish(made: Path, out: Path, force: bool) -> None:
+    """The complete folder `made` becomes `out`. What somebody put there meanwhile stays, and so does what was made,
+    under another name."""
+    try:
+        _check_free(out, force)
+    except InputError as error:
+        beside = next(path for n in itertools.count(2) if not (path := out.with_name(f"{out.name}-{n}")).exists())
+        made.rename(beside)
+        raise InputError(f"{error} It came while this was computed; these results are in {beside}.") from None
+    if out.exists():
+        shutil.rmtree(out)
+    made.rename(out)
 
 
 def _check_free(out: Path, force: bool) -> None:

@@ -1,6 +1,6 @@
 """`hilbo init`: a commented study file to begin with.
 
-hilbo init study.toml --parameter hue=0:360:deg --parameter light=20:80:%
+hilbo init study.toml --parameter hue=140:260:deg --parameter light=20:80:%
 hilbo init study.toml --parameter a=0:2:mm --parameter b=0:2:mm --constraint "a + 2*b <= 3"
 hilbo init study.toml --device
 """

@@ -4,6 +4,7 @@ What they write is whole or absent, and nothing is replaced without `--force`.
 """
 
 import json
+import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,14 +72,21 @@ def export(
     logs: Annotated[Path, typer.Argument(help="Folder of session logs.", show_default=False)],
     study: Annotated[Path, typer.Option("--study", help="Study file (TOML).")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the tables.")],
+    plan: Annotated[
+        Path | None, typer.Option("--plan", help="The plan, which is put there too: the report says what departs.")
+    ] = None,
     force: Force = False,
 ) -> None:
-    """Tables of a folder of session logs: trials, validation and sets (Psych-DS), and netCDF for xarray and ArviZ."""
+    """Tables of a folder of session logs, as hilbo report reads them: trials, validation and sets (Psych-DS), the study
+    file, and netCDF for xarray and ArviZ."""
     from hilbo.session import export as log_tables
     from hilbo.session.netcdf import netcdf
+    from hilbo.session.plan import check_plan, read_plan
     from hilbo.study.study_file import StudyFile
 
     chosen = StudyFile.load(study)
+    if plan is not None:
+        check_plan(read_plan(plan), chosen)
     with results(out, force) as folder, progress() as say:
         say("reading logs")
         sessions = log_tables.read_sessions(logs, chosen, remark)
@@ -86,6 +94,9 @@ def export(
         if log_tables.computes_sets(sessions):
             start()
         log_tables.psych_ds(sessions, folder, chosen)
+        shutil.copyfile(study, folder / "study.toml")
+        if plan is not None:
+            shutil.copyfile(plan, folder / "plan.json")
         singles = netcdf(sessions, folder / "trials.nc", chosen)
         if not singles and log_tables.validation_table(sessions).empty:
             raise InputError(f"{logs}: its sessions hold no answers that count yet; there is nothing to export.")

@@ -40,15 +40,20 @@ def simulate(
     finish(content, out, as_json, say.printed)
 
 
-def _simulate(preset, study, count, seed, folder, say) -> dict[str, Any]:
+def _simulate(preset, source, count, seed, folder, say) -> dict[str, Any]:
     say("simulating")
     start()
     from hilbo.session.registration import selection_words
     from hilbo.simulation.folder import simulate_folder
 
-    simulated = simulate_folder(folder, preset, count, seed, study)
+    simulated = simulate_folder(folder, preset, count, seed, source)
     chosen = selection_words(simulated.study.selection)
-    return aggregate_cohort(simulated.study, simulated.cohort, folder, seed, say, simulated.truth, selection=chosen)
+    study, truth = simulated.study, simulated.truth
+    content = aggregate_cohort(study, simulated.cohort, folder, seed, say, truth, selection=chosen)
+    from hilbo.study.optimum_location import truth_sentence
+
+    say.tell([truth_sentence(study, truth, content["truth"]["nrmse"]["aggregate"]["nrmse"])])
+    return content
 
 
 def _simulate_live(preset, study, out, phase, seconds, seed, as_json) -> None:

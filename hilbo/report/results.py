@@ -8,7 +8,7 @@ import base64
 import importlib.metadata
 import json
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -89,8 +89,9 @@ def result(
     seed: int,
     truth: Float[np.ndarray, " d"] | None = None,
     people: People | None = None,
+    left_out: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The content of result.json."""
+    """The content of result.json. `left_out`: sentences on who is not in it."""
     people = people_of(study, aggregate) if people is None else people
     best, whole = aggregate.optimum, None if isinstance(aggregate, LargeAggregate) else aggregate
     region = None if whole is None else optimum_region(study, whole.map, whole.cohort.trials, seed)
@@ -115,7 +116,7 @@ def result(
     other = other_inference(study)
     if other in aggregate.alternatives:
         content["other_inference"] = {"inference": other} | moved(study, aggregate.alternatives[other].x, best.x)
-    warnings = _not_converged(people) + rule_warnings(study, aggregate) + learnt_sentences(study)
+    warnings = [*left_out, *_not_converged(people), *rule_warnings(study, aggregate), *learnt_sentences(study)]
     warnings += location_sentences(study, best.x, best.sd, None if whole is None else whole.asked_variance)
     content["warnings"] = warnings + region_sentences(region) + check_sentences(check)
     content["optimum_region"] = region_content(study, region)
@@ -224,18 +225,19 @@ def write_results(
     truth: Float[np.ndarray, " d"] | None = None,
     say=lambda text: None,
     *,
+    left_out: Sequence[str] = (),
     selection: str = "",
     comparison: dict[str, Any] | None = None,
     pictures: Pictures | None = None,
 ) -> dict[str, Any]:
     """Write the results folder; returns the content of result.json.
 
-    **Arguments:** `say` is told what is being done; `selection`, `comparison`: as `page.results_page`, whose further
-    `pictures` are those of the comparison.
+    **Arguments:** `say` is told what is being done; `left_out`: sentences on who is not in it; `selection`,
+    `comparison`: as `page.results_page`, whose further `pictures` are those of the comparison.
     """
     study, aggregate = population.study, population.aggregate
     people = people_of(study, aggregate)
-    content = result(study, aggregate, population.seed, truth, people)
+    content = result(study, aggregate, population.seed, truth, people, left_out)
     (folder / "result.json").write_text("".join(sealed(json_lines(content))), encoding="utf-8")
     optima_table(content, people).to_csv(folder / "optima.csv", index=False)
     say("the population map on a grid")

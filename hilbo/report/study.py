@@ -25,7 +25,7 @@ from hilbo.report.participants import people_of
 from hilbo.report.result_tables import alternatives_table, convergence_table, table_1, tolerance_table
 from hilbo.report.results import as_json, map_dataset, optima_table, result, save_figures, versions
 from hilbo.report.study_figures import comparison_figures, study_figures
-from hilbo.report.validation import Validated, slug, validate
+from hilbo.report.validation import Validated, folder_names, validate
 from hilbo.study.analysis import Analysis, analyse, moved_by_evidence
 from hilbo.study.config import Study
 from hilbo.study.folder import Material, StudyFolder
@@ -56,6 +56,7 @@ def write_study(
     """
     results, contents, sections = [], {}, []
     analyses = {} if analyses is None else analyses
+    folders = folder_names([material.name for material in folder.materials])
     for material in folder.materials:
         words = f" ({material.name})" if material.name else ""
 
@@ -65,7 +66,7 @@ def write_study(
         analysis = analyses.get(material.name) or analyse(material.study, material.cohort, seed, tell)
         validated = _validated(material, folder, tell)
         results.append(Results(material.name, analysis, validated, material.reference, material.reference_name))
-        material_folder = out / slug(material.name) if len(folder.materials) > 1 else out
+        material_folder = out / folders[material.name] if len(folder.materials) > 1 else out
         material_folder.mkdir(exist_ok=True)
         comparison_content = _compared(analysis, seed, tell) if comparison else None
         tell("figures and tables")

@@ -7,6 +7,7 @@ Of every coefficient the page shows the widest of the iid and clustered interval
 finds the safest; all kinds of error are in the CSV tables.
 """
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,10 +27,10 @@ from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_ma
 
 __all__ = [
     "Validated",
+    "folder_names",
     "materials_of",
     "p_words",
     "safest",
-    "slug",
     "validate",
     "validation_content",
     "validation_csv",
@@ -205,10 +206,11 @@ def write_validation(
     sets_by_id = None if sets is None else sets_frame(sets, study.space.names, study.space.parameters)
     contents, sections = [], []
     names = materials_of(table)
+    folders = folder_names(names)
     for name in names:
         say(f"validation sessions{'' if name is None else f' of {name}'}")
         validated = validate(table, sets_by_id, study.responses, name)
-        material_folder = folder if len(names) == 1 else folder / slug(str(name))
+        material_folder = folder if len(names) == 1 else folder / folders[name]
         material_folder.mkdir(exist_ok=True)
         for file, frame in validation_csv(validated).items():
             frame.to_csv(material_folder / f"{file}.csv", index=False)
@@ -231,7 +233,17 @@ def _read(path: Path, study: Study, material: str | None) -> pd.DataFrame:
     return check_validation(cells, study.responses, str(path))
 
 
-def slug(name: str) -> str:
+def folder_names(names: Sequence[str | None]) -> dict[str | None, str]:
+    """A folder for each material; two names that differ in signs or capitals alone get a number."""
+    folders: dict[str | None, str] = {}
+    for name in names:
+        plain = _slug(str(name))
+        numbered = itertools.chain([plain], (f"{plain}-{n}" for n in itertools.count(2)))
+        folders[name] = next(folder for folder in numbered if folder not in folders.values())
+    return folders
+
+
+def _slug(name: str) -> str:
     """A name as part of a file's name."""
     kept = "".join(c if c.isalnum() else "-" for c in name.lower())
     return "-".join(word for word in kept.split("-") if word) or "material"

@@ -18,6 +18,7 @@ from hilbo.session.plan import Source
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.learnt_study import resolved
 from hilbo.study.map_summary import best_mid_worst
 from hilbo.study.result_file import FoundOptimum, Result
 from hilbo.study.typed_files import check_values
@@ -47,6 +48,8 @@ def validation_sets(
     study: Study, result: Result, cohort: Cohort, source: Source, participants: Sequence[str]
 ) -> NamedSets:
     """Best, mid and worst of the map, or of each participant's own (`PARTICIPANT best`): name -> parameters."""
+    cohort = cohort.of([person.participant for person in result.participants])
+    study = resolved(study, cohort)
     aggregated = aggregate_cohort(study, cohort, result.seed, alternatives=False)
     _check_same(study, result, np.asarray(aggregated.optimum.x))
     points = search_points(study.space, result.seed)

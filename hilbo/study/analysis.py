@@ -19,12 +19,12 @@ from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maxi
 from hilbo.hyperparameters.maximum_evidence import Learned
 from hilbo.population.maps import RuleMap, learnt_map, point_rule
 from hilbo.population.recipes import RECIPES, RECOMMENDED
-from hilbo.population.response_quality import excluded, measure_people
 from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, aggregate_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.exclusion import included
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.learnt_study import learnt_sentences, resolved, that_learns
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
@@ -85,13 +85,7 @@ class Analysis(NamedTuple):
 def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda text: None) -> Analysis:
     """Results of one material from all its participants' answers. Raises `InputError` if the rule leaves nobody."""
     say("consistency, lapses and drift of everybody")
-    people = measure_people(study.gp, everybody.trials, everybody.names)
-    left_out = excluded(people, study.exclude)
-    if len(left_out) == len(everybody.names):
-        raise InputError(
-            f'the rule "{study.exclude}" leaves out all {len(left_out)} participants; there is nothing to aggregate.'
-        )
-    cohort = everybody.of([name for name in everybody.names if name not in left_out]) if left_out else everybody
+    cohort, people, left_out = included(study, everybody)
     population = _with_learnt(analyse_population(study, cohort, seed, say), seed, say)
     study, aggregate = population.study, population.aggregate
     say("hyperparameters by maximum evidence")
@@ -170,7 +164,8 @@ def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, 
     """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
     judged = maximise_judged(study.gp, cohort.trials, _LEARN, inference=study.inference)
     learned = judged.learned
-    rule = "hierarchical" if study.rule in RECIPES else study.rule
+    answered = int((cohort.counts() > 0).sum())
+    rule = study.rule if study.rule not in RECIPES else "hierarchical" if answered > 1 else "bcm"
     learned_study = dataclasses.replace(study, gp=learned.gp, rule=rule, learnt=None)
     return judged, learned_study, aggregate_cohort(learned_study, cohort, seed, alternatives=False)
 

@@ -6,8 +6,9 @@ piece. Whatever is wrong is one sentence with the file and the line (Parquet: ro
 """
 
 import csv
+import math
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,17 @@ from hilbo.errors import InputError
 from hilbo.search.box import Parameter
 from hilbo.study.text_cells import csv_rows, is_decimal, say_delimiter, without_decimal_comma
 
-__all__ = ["FRAME", "cell_pieces", "cells_of", "numbers", "parameter_values", "place", "read_cells", "refuse"]
+__all__ = [
+    "FRAME",
+    "answer_forms",
+    "cell_pieces",
+    "cells_of",
+    "numbers",
+    "parameter_values",
+    "place",
+    "read_cells",
+    "refuse",
+]
 
 FRAME = "DataFrame"
 """What a table that is in memory is called in sentences."""
@@ -164,6 +175,19 @@ def numbers(text: pd.DataFrame, column: str, source: str, words: str, valid) -> 
 
     refuse(wrong, source, sentence)
     return values
+
+
+def answer_forms(responses: Sequence[str]) -> tuple[dict[str, int], str]:
+    """How an answer may be written -> its category from 0, and the words for what else than a label may be written.
+
+    Labels are compared as text. Ranks from 1 are understood only if no label reads as a number: of a scale with the
+    labels "1.0", "1.5", "2.0" a rank would be another answer.
+    """
+    forms = {label: i for i, label in enumerate(responses)}
+    if any(math.isfinite(_number(without_decimal_comma(label))) for label in responses):
+        return forms, ""
+    ranks = {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0", f"{i + 1},0")}
+    return ranks | forms, f"a rank from 1 to {len(responses)}"
 
 
 def parameter_values(text: pd.DataFrame, parameter: Parameter, source: str) -> pd.Series:

@@ -19,6 +19,7 @@ from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.population.recipes import RECIPES
 from hilbo.search.space import SearchSpace
+from hilbo.study.cells import answer_forms
 from hilbo.study.config import Study
 from hilbo.study.trial_table import checked_trials
 
@@ -52,7 +53,10 @@ class Cohort(eqx.Module):
         return dataclasses.replace(self, trials=eqx.tree_at(lambda t: t.mask, self.trials, placed(mask)))
 
     def of(self, names: Sequence[str]) -> "Cohort":
-        """Only these participants. Raises `InputError` for a name that the table does not have."""
+        """Only these participants. Raises `InputError` for a name that the table does not have, or that comes twice."""
+        if len(set(names)) < len(names):
+            twice = next(name for name in names if list(names).count(name) > 1)
+            raise InputError(f'participant "{twice}" is named twice; name each person once.')
         present = set(self.names)
         unknown = [name for name in names if name not in present]
         if unknown:
@@ -79,7 +83,7 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
     Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's answers exceed.
     """
-    if not isinstance(table, pd.DataFrame) or "category" not in table:
+    if not _was_read(table, study):
         table = checked_trials(table, study)
     person, names = pd.factorize(table["participant"])
     counts = np.bincount(person)
@@ -105,6 +109,17 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     context[rows] = levels[order]
     trials = jax.vmap(Trials)(x, placed(answers), placed(held), placed(context))
     return Cohort(trials, physical, tuple(names), tuple(contexts))
+
+
+def _was_read(table: pd.DataFrame, study: Study) -> bool:
+    """Whether a table is one that `read_trials` made: its column `category` says what the answers do, and is no column
+    of somebody's own that happens to have this name."""
+    if not isinstance(table, pd.DataFrame) or not {"category", "participant", *study.space.names} <= {*table.columns}:
+        return False
+    category = table["category"]
+    if not pd.api.types.is_integer_dtype(category) or not category.between(0, len(study.responses) - 1).all():
+        return False
+    return "response" not in table or bool((table["response"].map(answer_forms(study.responses)[0]) == category).all())
 
 
 def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:

@@ -3,14 +3,16 @@
     study.toml        the study file
     trials*.csv       one or several trial tables (or .parquet); a column `material` tells materials apart
     validation*.csv   optional: validation tables
-    sets.csv          optional: sets table; a set of source "sysid" is what tables and figures are held against
+    sets*.csv         optional: sets tables; a set of source "sysid" is what tables and figures are held against
     truth.csv         optional, of a simulated study: `source` "population" and the parameters that are the truth
     plan.json         optional: the plan of `hilbo plan`, from which the answers may depart
-A study of several materials names them in [materials.NAME] (which overrides the renderer or parameters) or in the
-tables' column `material` alone, when they share everything. Whatever is wrong is one sentence with its file.
+The folder of `hilbo export` is one: its data/ holds trials, validation and sets by the names of a Psych-DS. A study of
+several materials names them in [materials.NAME] (which overrides the renderer or parameters) or in the tables' column
+`material` alone, when they share everything. Whatever is wrong is one sentence with its file.
 """
 
 import json
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -19,12 +21,12 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from hilbo.errors import InputError
+from hilbo.errors import InputError, InputRemark
 from hilbo.study.cells import numbers, parameter_values, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.departures import departures
-from hilbo.study.trial_table import check_texts, read_trials
+from hilbo.study.trial_table import NothingToFitError, check_texts, read_trials
 from hilbo.study.validation_table import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]
@@ -65,16 +67,19 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     study = _with_exclusion(Study.load(folder / "study.toml"), exclude)
     trials = _table_paths(folder, "trials")
     if not trials:
-        raise InputError(f"{folder}: holds no trials.csv (nor .parquet, nor trials-*.csv); put the trial table there.")
+        raise InputError(
+            f"{folder}: holds no trials.csv (nor .parquet, nor trials-*.csv, nor an export's data/); put the trial"
+            " table there."
+        )
     validation = [_validation(path, study) for path in _table_paths(folder, "validation")]
-    sets_path, truth_path = folder / "sets.csv", folder / "truth.csv"
-    sets = sets_frame(sets_path, study.space.names, study.space.parameters) if sets_path.exists() else None
+    truth_path = folder / "truth.csv"
+    sets = _sets(_table_paths(folder, "sets"), study)
     truth = _read_truth(truth_path, study) if truth_path.exists() else None
     compared = pd.concat(validation, ignore_index=True) if validation else None
     names = _material_names(study, trials)
     tables = {
         folder / "validation.csv": compared,
-        sets_path: _rows_of_source(sets, "sysid"),
+        folder / "sets.csv": _rows_of_source(sets, "sysid"),
         truth_path: _rows_of_source(truth, "population"),
     }
     _check_materials_named(names, tables)
@@ -94,13 +99,25 @@ def _with_exclusion(study: Study, exclude: str | None) -> Study:
 
 
 def _table_paths(folder: Path, stem: str) -> list[Path]:
-    """Files STEM.csv and STEM-*.csv, or .parquet."""
+    """Files STEM.csv and STEM-*.csv, or .parquet, and the table of an export."""
     paths = [
         p
         for p in folder.iterdir()
         if p.suffix in (".csv", ".parquet") and (p.stem == stem or p.stem.startswith(f"{stem}-"))
     ]
-    return sorted(paths)
+    return sorted(paths) + sorted((folder / "data").glob(f"*_table-{stem}_data.csv"))
+
+
+def _sets(paths: list[Path], study: Study) -> pd.DataFrame | None:
+    """All sets tables as one: to those of an export somebody adds what was identified."""
+    if not paths:
+        return None
+    whole = pd.concat([sets_frame(path, study.space.names, study.space.parameters) for path in paths])
+    again = whole.index[whole.index.duplicated()]
+    if len(again):
+        raise InputError(f'{paths[0].parent}: the set "{again[0]}" is in two sets tables; keep one.')
+    text = whole.select_dtypes(exclude="number").columns
+    return whole.fillna(dict.fromkeys(text, ""))
 
 
 def _validation(path: Path, study: Study) -> pd.DataFrame:
@@ -152,19 +169,30 @@ def _material(
 ) -> Material:
     """One material's rows of all tables, and its reference."""
     material_study = study.material(name) if name in study.materials else study
-    tables = []
-    for path in paths:
-        cells = read_cells(path)
-        here = set(cells["material"]) if "material" in cells else {""}
-        if name in here:
-            tables.append(read_trials(path, material_study, name or None, others=False))
-    table = pd.concat(tables, ignore_index=True)
+    table = _answers(name, material_study, paths)
     _check_answers_once(table, paths[0])
     if compared is not None and name and "material" in compared:
         compared = compared[compared["material"] == name]
     reference, words = _reference(material_study, name, sets, truth)
     validation = None if compared is None or compared.empty else compared
     return Material(name, material_study, cohort_of(table, material_study), validation, reference, words)
+
+
+def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:
+    """A material's answers in all tables. Somebody who stopped in the warm-up may have a table without any."""
+    tables, empty = [], []
+    for path in paths:
+        cells = read_cells(path)
+        if name in (set(cells["material"]) if "material" in cells else {""}):
+            try:
+                tables.append(read_trials(path, study, name or None, others=False))
+            except NothingToFitError as error:
+                empty.append(error)
+    if not tables:
+        raise empty[0]
+    for error in empty:
+        warnings.warn(InputRemark(f"{error} It is left out."), stacklevel=2)
+    return pd.concat(tables, ignore_index=True)
 
 
 def _check_answers_once(table: pd.DataFrame, path: Path) -> None:

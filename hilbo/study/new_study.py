@@ -55,12 +55,6 @@ ready = "That was the warm-up. Would you like another one, or shall we begin?"
 again = "Let us do this one again."
 """
 _ATTRIBUTE = "perceived realism"
-_LEARNT = (
-    "# With these lines in place of [gp] all of it is learnt from the answers: in simulated studies the optimum",
-    "# is then nearer to what people like best (docs/methods/which_method.md). As it is, the rule is the paper's, bcm.",
-    "# [aggregation]",
-    '# rule = "learnt-2"',
-)
 _DEFINITIONS = {
     "different": "The test is clearly different from the reference.",
     "similar": "The test is somewhat like the reference.",
@@ -101,7 +95,7 @@ def parameter_of(text: str) -> Parameter:
     scale = others[2] if len(others) > 2 else "linear"
     named = bool(equals and name.strip()) and name.isprintable()
     if not named or ends is None or len(others) > 3 or scale not in ("linear", "log", "integer"):
-        raise InputError(f"--parameter is {_quoted(text)}; write {_FORM}, for example hue=0:360:deg.")
+        raise InputError(f"--parameter is {_quoted(text)}; write {_FORM}, for example hue=140:260:deg.")
     unit = others[1].strip() if len(others) > 1 else ""
     if scale == "integer":
         return Parameter(name.strip(), *ends, unit, integer=True)
@@ -124,13 +118,7 @@ def study_text(new: NewStudy) -> str:
             *(line for p in parameters for line in _table(p)),
             *(line for constraint in constraints for line in _wall(constraint)),
             _presenting(new, parameters),
-            _line("[gp]", "what is believed of people before any answer"),
-            _line(f"length = {0.13 if new.device else 0.22}", "over what part of a range answers change"),
-            "variance = 1.0",
-            _line(f"thresholds = {_thresholds(len(new.responses))}", "between one answer and the next"),
-            _line("noise = 0.5", "how much one answer to the same thing differs from another"),
-            "",
-            *_LEARNT,
+            *_rule(new),
             "",
             "[selection]",
             _line(f"space_filling = {min(5, new.trials)}", "trials spread over the ranges, before any is chosen"),
@@ -184,7 +172,7 @@ def _parameters(new: NewStudy) -> Sequence[Parameter]:
             raise InputError("--parameter: the device renders K1, B1 and alpha; leave it out, or --device.")
         return _DEVICE
     if not new.parameters:
-        raise InputError(f"--parameter: a study needs at least one; write {_FORM}, for example hue=0:360:deg.")
+        raise InputError(f"--parameter: a study needs at least one; write {_FORM}, for example hue=140:260:deg.")
     names = [p.name for p in new.parameters]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -234,6 +222,23 @@ def _tolerance(parameters: Sequence[Parameter], part: int) -> str:
     return (
         "{" + ", ".join(f"{_quoted(p.name)} = {(p.high - p.low) / part:.2g}" for p in parameters if not p.levels) + "}"
     )
+
+
+def _rule(new: NewStudy) -> list[str]:
+    """The recommended rule; the paper's stands beside it, because it wants numbers that nobody knows before answers."""
+    return [
+        _line("[aggregation]", "everybody's answers -> one population map"),
+        _line('rule = "learnt-2"', "recommended; its model is learnt from the answers (docs/methods/which_method.md)"),
+        "",
+        "# To use the paper's rule, replace the two lines above by these, whose numbers you state before any answer.",
+        "# [aggregation]",
+        '# rule = "bcm"',
+        "# [gp]",
+        _line(f"# length = {0.13 if new.device else 0.22}", "over what part of a range answers change"),
+        "# variance = 1.0",
+        _line(f"# thresholds = {_thresholds(len(new.responses))}", "between one answer and the next"),
+        _line("# noise = 0.5", "how much one answer to the same thing differs from another"),
+    ]
 
 
 def _thresholds(count: int) -> list[float]:

@@ -4,11 +4,12 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from hilbo.study.config import Study
 
-__all__ = ["location_notes", "location_sentences", "optimum_sentence"]
+__all__ = ["location_notes", "location_sentences", "optimum_sentence", "truth_sentence"]
 
 _AT = 1e-6  # of a range
 
@@ -22,12 +23,21 @@ class _Edges(NamedTuple):
 
 def optimum_sentence(study: Study, x: Float[Array, " d"]) -> str:
     """The optimum x (d,) of the unit cube in the study's units."""
+    return f"The population optimum is {_rendering(study, x)}."
+
+
+def truth_sentence(study: Study, truth: Float[np.ndarray, " d"], nrmse: float) -> str:
+    """A simulated study's true optimum (d,) of the unit cube, and how far from it the one that was found is."""
+    far = f"the optimum found is {100 * nrmse:.1f} % of the search ranges away (NRMSE)"
+    return f"The true optimum of these simulated people is {_rendering(study, truth)}; {far}."
+
+
+def _rendering(study: Study, x: Float[ArrayLike, " d"]) -> str:
     values = np.asarray(study.space.to_physical(np.asarray(x)))
-    sets = (
+    return ", ".join(
         f"{parameter.name} = {parameter.words(value)}{f' {parameter.unit}' if parameter.unit else ''}"
         for parameter, value in zip(study.space.parameters, values, strict=True)
     )
-    return f"The population optimum is {', '.join(sets)}."
 
 
 def location_sentences(

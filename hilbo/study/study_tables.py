@@ -181,6 +181,12 @@ _REQUIRED = ("schema", "study", "parameters")
 _KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "constraints", "materials")
 _LEARNT = ("theta", "variance", "thresholds", "noise")
 _COLUMNS = ("participant", "trial", "response", "category", "phase", "material", "voided", "unblinded")
+_RESERVED = (
+    *_COLUMNS,
+    *("session", "status", "response_time", "answered_at", "presentations", "proposed_at", "set_id", "source", "role"),
+    *("location", "mean", "variance", "sd", "point"),
+)
+"""What columns of tables, and variables of map.nc, are called; a parameter of that name would be taken for one."""
 _OVERRIDES = ("renderer", "parameters")
 _NUMBERS_KEYS = ("low", "high", "unit", "scale", "integer")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
@@ -205,6 +211,7 @@ def read(raw: Mapping[str, Any]) -> Tables:
     materials = check_table(raw.get("materials", {}), "materials")
     for name, table in materials.items():
         check_keys(table, f"materials.{name}", _OVERRIDES)
+        check_keys(table.get("parameters", {}), f"materials.{name}.parameters", tuple(raw["parameters"]))
     return Tables(parameters=parameters, materials=dict(materials), **tables)
 
 
@@ -298,6 +305,12 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
     if selection.space_filling > selection.trials:
         raise InputError(
             f"selection.space_filling is {selection.space_filling}; it must be at most trials = {selection.trials}."
+        )
+    reserved = next((p.name for p in parameters if p.name in _RESERVED), None)
+    if reserved is not None:
+        raise InputError(
+            f"parameters.{reserved}: tables have a column {reserved} already; call the parameter otherwise, for example"
+            f" {reserved}_1."
         )
     tables.session.check(labels)
     if tables.stimulus is not None:

@@ -17,12 +17,13 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
-from hilbo.study.cells import FRAME, cell_pieces, cells_of, numbers, parameter_values, place, refuse
+from hilbo.study.cells import FRAME, answer_forms, cell_pieces, cells_of, numbers, parameter_values, place, refuse
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, check_text, formulas, no_ids
 
 __all__ = [
     "NOT_FITTED",
+    "NothingToFitError",
     "check_people",
     "check_texts",
     "checked_trials",
@@ -30,6 +31,11 @@ __all__ = [
     "read_trials",
     "write_trials",
 ]
+
+
+class NothingToFitError(InputError):
+    """A table that is in order, and has no answer that counts."""
+
 
 NOT_FITTED = ("warm-up", "repeat")
 """Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
@@ -81,7 +87,7 @@ def _read(
     table = table[table.pop("_fitted")]
     _check_blinded(table.pop("_blinded"), study, source)
     if table.empty:
-        raise InputError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
+        raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
     table = of_material(table, material, source)
     keys = [name for name in ("participant", "session", "phase") if name in table]
     places = [table["trial"], *(_numbered(table[name]) for name in reversed(keys))]
@@ -97,7 +103,7 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
             table[column] = np.nan  # its place among the columns
         elif others or column in (*_KEY, study.random_effect):
             table[column] = [texts.setdefault(cell, cell) for cell in text[column]]
-    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
+    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0) & (v < 2**53))
     table["trial"] = whole.astype(int)
     check_people(text, source)
     _check_random_effect(text, study, source)
@@ -106,7 +112,7 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
         table[parameter.name] = parameter_values(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
     table["_blinded"] = text["unblinded"].str.strip().str.lower().isin(_FALSE) if "unblinded" in text else True
-    table["_fitted"] = ~_flags(text, "voided", source) & (~text["phase"].isin(NOT_FITTED) if "phase" in text else True)
+    table["_fitted"] = ~_flags(text, "voided", source) & (_is_fitted(text["phase"]) if "phase" in text else True)
     return table
 
 
@@ -151,19 +157,18 @@ def _check_random_effect(text: pd.DataFrame, study: AnyStudy, source: str) -> No
 
 
 def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.Series:
-    """Categories from 0: labels compared as text; ranks from 1 only if no label of the study reads as an integer."""
-    ranks_allowed = not any(label.strip().lstrip("+-").isdigit() for label in responses)
-    lookup = {label: i for i, label in enumerate(responses)}
-    if ranks_allowed:
-        lookup |= {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0", f"{i + 1},0")}
-    categories = cells.map(lookup)
-    ranks = f", or a rank from 1 to {len(responses)}" if ranks_allowed else ""
-    refuse(
-        categories.isna(),
-        source,
-        lambda row: f'response is "{cells.at[row]}"; it must be one of {", ".join(responses)}{ranks}.',
-    )
+    """Categories from 0."""
+    forms, ranks = answer_forms(responses)
+    categories = cells.map(forms)
+    allowed = ", ".join(responses) + (ranks and f", or {ranks}")
+    refuse(categories.isna(), source, lambda row: f'response is "{cells.at[row]}"; it must be one of {allowed}.')
     return categories.astype(int)
+
+
+def _is_fitted(phases: pd.Series) -> pd.Series:
+    """Whether answers of these phases are fitted, however somebody writes "warm-up": "Warm up" is one too."""
+    plain = phases.str.lower().str.replace(r"[\s_-]", "", regex=True)
+    return ~plain.isin([phase.replace("-", "") for phase in NOT_FITTED])
 
 
 def _flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:

@@ -14,7 +14,7 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
-from hilbo.study.cells import numbers, read_cells, refuse
+from hilbo.study.cells import answer_forms, numbers, read_cells, refuse
 from hilbo.study.set_table import read_sets
 from hilbo.study.trial_table import check_people, check_texts
 
@@ -52,7 +52,7 @@ def check_validation(
     _check_columns(table, source)
     text = _as_text(table)
     out = text.copy()
-    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0))
+    whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0) & (v < 2**53))
     out["trial"] = whole.astype(int)
     check_people(text, source)
     check_texts(text, source, ("trial",))
@@ -139,17 +139,10 @@ def sets_frame(
 
 def _classes(text: pd.DataFrame, column: str, responses: Sequence[str], source: str) -> pd.Series:
     """Labels of the responses, from labels or ranks; `NONE` where nothing was asked."""
-    lookup = {label: label for label in responses} | {"": NONE}
-    ranks = ""
-    if not any(label.strip().lstrip("+-").isdigit() for label in responses):
-        lookup = {form: label for i, label in enumerate(responses, 1) for form in (str(i), f"{i}.0")} | lookup
-        ranks = f", a rank from 1 to {len(responses)}"
-    labels = text[column].map(lookup)
-    refuse(
-        labels.isna(),
-        source,
-        lambda row: f'{column} is "{text.at[row, column]}"; it must be one of {", ".join(responses)}{ranks}, or empty.',
-    )
+    forms, ranks = answer_forms(responses)
+    labels = text[column].map({form: responses[i] for form, i in forms.items()} | {"": NONE})
+    allowed = ", ".join(responses) + (ranks and f", {ranks}") + ", or empty"
+    refuse(labels.isna(), source, lambda row: f'{column} is "{text.at[row, column]}"; it must be one of {allowed}.')
     return labels
 
 

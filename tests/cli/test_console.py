@@ -44,6 +44,23 @@ def test_a_folder_is_whole_or_absent(tmp_path):
         pass
 
 
+@pytest.mark.parametrize("force", [False, True])
+def test_what_came_meanwhile_stays(tmp_path, force):
+    """And what was computed stays too, beside it."""
+    out = tmp_path / "out"
+
+    def run():
+        with results(out, force) as folder:
+            (folder / "result.json").write_text("{}")
+            out.mkdir()
+            (out / "notes.txt").write_text("precious")
+
+    with pytest.raises(InputError, match=r"these results are in .*out-2\.$"):
+        run()
+    assert (out / "notes.txt").read_text() == "precious" and (tmp_path / "out-2" / "result.json").exists()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "out-2"]
+
+
 @pytest.mark.parametrize(
     ("given", "holds"), [({}, "1"), pytest.param({"OPENBLAS_NUM_THREADS": "3"}, "3", marks=pytest.mark.deep)]
 )

@@ -159,7 +159,8 @@ def test_simulate_keeps_what_it_simulated(capsys, monkeypatch, tmp_path):
     (tmp_path / "short.toml").write_text(text)
     out = tmp_path / "out"
     arguments = ["simulate", "--participants", "2", "--study", tmp_path / "short.toml", "--out", out]
-    assert run(capsys, monkeypatch, *arguments)[0] == 0
+    code, _, stderr = run(capsys, monkeypatch, *arguments)
+    assert code == 0 and stderr.count("The true optimum of these simulated people is K1 = ") == 1
     assert (out / "study.toml").read_text() == text
     assert pd.read_csv(out / "truth.csv")["source"].tolist() == ["population", "individual:P01", "individual:P02"]
     content = json.loads((out / "result.json").read_text())

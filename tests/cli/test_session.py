@@ -9,9 +9,11 @@ from live import Driver
 
 from hilbo import Study
 from hilbo.cli import main
+from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.plan import planned_header
 from hilbo.session.records import Block
+from hilbo.study.folder import read_folder
 from hilbo.study.validation_table import read_validation, sets_frame
 
 TOML = """\
@@ -234,6 +236,30 @@ def test_a_folder_of_comparisons_alone_is_exported(hilbo, tmp_path):
     validation_log(tmp_path / "begun", study, answered=False)
     code, _, err = hilbo("export", "begun", "--study", "study.toml", "--out", "none")
     assert code == 2 and "no answers that count" in err and not (tmp_path / "none").exists()
+
+
+def test_a_report_reads_the_folder_of_an_export(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=3))
+    study = Study.load("study.toml")
+    validation_log(tmp_path / "logs", study)
+    logs_of(tmp_path / "more", study, ["P02"], 3)
+    for path in (tmp_path / "more").iterdir():
+        path.rename(tmp_path / "logs" / path.name)
+    assert hilbo("plan", "study.toml", "--names", "P01,P02", "--out", "fixed.json")[0] == 0
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--plan", "fixed.json", "--out", "tables")
+    assert code == 0, err
+    (tmp_path / "tables" / "sets.csv").write_text("set_id,source,u,v\nmeasured,sysid,0.3,0.6\n")
+    folder = read_folder(tmp_path / "tables")
+    (material,) = folder.materials
+    assert material.cohort.names == ("P02",) and len(material.validation) == 6
+    assert set(folder.sets.index) == {*"DEF", "measured"} and material.reference_name == "system identification"
+    assert any("P01" in sentence for sentence in folder.limits)  # the plan is looked at
+    (tmp_path / "tables" / "sets.csv").write_text("set_id,source,u,v\nD,sysid,0.3,0.6\n")
+    with pytest.raises(InputError, match='the set "D" is in two sets tables; keep one'):
+        read_folder(tmp_path / "tables")
+    (tmp_path / "fixed.json").write_text("{}")
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--plan", "fixed.json", "--out", "again")
+    assert code == 2 and "plan" in err and not (tmp_path / "again").exists()
 
 
 @pytest.mark.deep

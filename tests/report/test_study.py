@@ -25,11 +25,13 @@ from hilbo.report.hypotheses import _convergence, _materials, _nearer_to_others
 from hilbo.report.study import _alternatives, _shown, _tolerances
 from hilbo.report.study_figures import comparison_figures
 from hilbo.report.validation import validate
+from hilbo.search.box import Parameter
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.analysis import limits_of
 from hilbo.study.cohort import Cohort
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.map_summary import tolerance
+from hilbo.study.new_study import NewStudy, study_text
 from hilbo.study.optima import population
 from hilbo.study.progress import Progress, _counts, _splits, _to_other_half
 from hilbo.study.tolerance_intervals import tolerance_ends
@@ -212,6 +214,21 @@ def posteriors_at(posteriors):
         return posterior.predict(posterior.trials.x)
 
     return tuple(np.asarray(part) for part in jax.lax.map(one, posteriors))
+
+
+@pytest.mark.deep
+def test_a_report_of_one_person(capsys, monkeypatch, tmp_path):
+    """By the rule that new studies have."""
+    folder, out = tmp_path / "folder", tmp_path / "out"
+    folder.mkdir()
+    parameters = Parameter("u", 0.0, 1.0), Parameter("v", 0.0, 1.0)
+    (folder / "study.toml").write_text(study_text(NewStudy("plain", parameters)))
+    rows = {"participant": "P1", "trial": range(1, 10), "response": [plain().responses[q] for _, _, q in HILL]}
+    table = pd.DataFrame(rows).assign(u=[u for u, _, _ in HILL], v=[v for _, v, _ in HILL])
+    table.to_csv(folder / "trials.csv", index=False)
+    code, _, err = run(capsys, monkeypatch, "report", folder, "--out", out, "--no-compare")
+    assert code == 0, err
+    assert "P1 is the only participant" in (out / "report.html").read_text()
 
 
 @pytest.mark.deep

@@ -10,7 +10,7 @@ from commands import run
 from studies import paper_counts
 
 from hilbo import Study
-from hilbo.report.validation import p_words, safest, slug, validate, validation_figures
+from hilbo.report.validation import folder_names, p_words, safest, validate, validation_figures
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.validation_sessions import sets_table, validation_table
 from hilbo.study.map_summary import Sets
@@ -89,7 +89,12 @@ def test_a_pair_that_was_only_tied_is_drawn():
 
 def test_words():
     assert [p_words(p) for p in (0.0004, 0.0312, np.nan)] == ["< 0.001", "0.031", "–"]
-    assert slug("Medium (soft) silicone") == "medium-soft-silicone"
+
+
+def test_each_material_has_a_folder_of_its_own():
+    names = ["Medium (soft) silicone", "gel", "foam A", "foam-a", "Gel", "…", "foam a 2"]
+    folders = ["medium-soft-silicone", "gel", "foam-a", "foam-a-2", "gel-2", "material", "foam-a-2-2"]
+    assert list(folder_names(names).values()) == folders
 
 
 def test_simulated_judges_prefer_what_is_nearer():

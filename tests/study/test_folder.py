@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from commands import run
 
-from hilbo.errors import InputError
+from hilbo.errors import InputError, InputRemark
 from hilbo.report.validation import validate
 from hilbo.statistics.paper_tables import aggregate_comparisons
 from hilbo.study.analysis import analyse
@@ -52,6 +52,19 @@ def test_bad_folders_are_refused_in_one_sentence(capsys, monkeypatch, tmp_path, 
     code, _, stderr = run(capsys, monkeypatch, "report", folder_with(tmp_path, **files), "--out", tmp_path / "out")
     assert code == 2 and words in stderr
     assert [path.name for path in tmp_path.iterdir()] == ["folder"]
+
+
+def test_somebody_who_stopped_in_the_warm_up_blocks_nobody(tmp_path):
+    head = HEAD.replace("\n", ",phase\n")
+    folder = folder_with(
+        tmp_path,
+        **{"trials-A__csv": head + "A,1,close,5,6,0.2,main\n", "trials-B__csv": head + "B,1,close,5,6,0.2,warm-up\n"},
+    )
+    with pytest.warns(InputRemark, match=r"trials-B.csv: has no rows to fit; .* It is left out."):
+        assert read_folder(folder).materials[0].cohort.names == ("A",)
+    (folder / "trials-A.csv").unlink()
+    with pytest.raises(InputError, match="has no rows to fit"):
+        read_folder(folder)
 
 
 def test_the_report_never_replaces_what_it_reads(capsys, monkeypatch, tmp_path):

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 
 from hilbo import Study
 from hilbo.errors import InputError
+from hilbo.population.recipes import RECOMMENDED
 from hilbo.search.box import Constraint, Parameter
 from hilbo.study.constraint_words import constraint_of
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
@@ -58,7 +59,7 @@ def test_a_parameter_is_read_as_it_is_written(text, parameter):
     "text", ["", "hue", "hue=", "hue=1", "hue=a:b", "=0:1", "hue=0:1:u:cubic", "hue=0:1:u:log:x", "h\nue=0:1"]
 )
 def test_what_is_no_parameter_is_refused_with_an_example(text):
-    with pytest.raises(InputError, match=r"write NAME=LOW:HIGH.* for example hue=0:360:deg"):
+    with pytest.raises(InputError, match=r"write NAME=LOW:HIGH.* for example hue=140:260:deg"):
         parameter_of(text)
 
 
@@ -115,6 +116,22 @@ def test_a_constraint_s_own_words_are_read_as_it(weights, least, over):
     stated = Constraint(terms, least, most)
     constraint = constraint_of(stated.words, ["a", "b c"])
     assert constraint == stated
+
+
+@pytest.mark.parametrize("name", ["phase", "response", "material", "session", "mean", "set_id"])
+def test_a_parameter_is_not_called_as_a_column_of_the_tables(name):
+    with pytest.raises(InputError, match=f"parameters.{name}: tables have a column {name} already; call the parameter"):
+        study_text(NewStudy("x", (Parameter(name, 0.0, 1.0),)))
+
+
+def test_the_recommended_rule_is_the_one_that_is_written(tmp_path):
+    (tmp_path / "study.toml").write_text(text := study_text(NewStudy("x", TWO)))
+    assert Study.load(tmp_path / "study.toml").rule == RECOMMENDED
+    beside = text.partition("replace the two lines above by these")[2].partition("[selection]")[0]
+    lines = [line.removeprefix("# ") for line in beside.splitlines()[1:]]
+    kept = "\n".join(line for line in text.splitlines() if line[:13] not in ("[aggregation]", 'rule = "learn'))
+    (tmp_path / "paper.toml").write_text("\n".join([kept, *lines]))
+    assert Study.load(tmp_path / "paper.toml").rule == "bcm"
 
 
 def test_the_file_of_a_device_is_one_that_a_device_renders(tmp_path):

@@ -1,9 +1,10 @@
 """An optimum at an edge, at the border of what may be rendered, or where nobody was asked says so."""
 
 import jax.numpy as jnp
+import numpy as np
 
 from hilbo.study.config import Study
-from hilbo.study.optimum_location import location_notes, location_sentences
+from hilbo.study.optimum_location import location_notes, location_sentences, truth_sentence
 
 STUDY = Study.load("hilbo/data/paper.toml")
 SD, ASKED = jnp.asarray(0.3), jnp.asarray(0.25)
@@ -38,3 +39,9 @@ def test_a_row_of_a_table_has_the_same_in_a_few_words():
     edge, beyond = location_notes(STUDY, jnp.array([0.1, 0.2, 0.0]), jnp.asarray(0.9), ASKED)
     assert edge == "at the lowest alpha that was searched (0.01)"
     assert "less is known there than wherever somebody answered" in beyond
+
+
+def test_a_simulated_study_says_how_far_its_truth_is():
+    sentence = truth_sentence(STUDY, np.asarray(STUDY.space.to_unit(np.array([8.0, 4.0, 0.25]))), 0.0844)
+    assert sentence.startswith("The true optimum of these simulated people is K1 = 8 N/mm, B1 = 4 N.s^alpha/mm, alpha")
+    assert sentence.endswith("= 0.25; the optimum found is 8.4 % of the search ranges away (NRMSE).")

@@ -50,6 +50,7 @@ def test_a_file_says_what_the_study_says(path):
         ("K_eff = 0.2", "K_eff = -0.2"),
         ("high = 16.0", "high = 0.5"),
         ('rule = "bcm"', 'rule = "median"'),
+        ("materials.gel.parameters.K1", "materials.gel.parameters.k1"),
     ],
 )
 def test_both_refuse_the_same_in_the_same_words(path, was, wrong):

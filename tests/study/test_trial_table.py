@@ -6,6 +6,7 @@ import pytest
 
 from hilbo.errors import InputError, InputRemark
 from hilbo.study import cells
+from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
 from hilbo.study.trial_table import read_trials, write_trials
 
@@ -158,6 +159,42 @@ def test_labels_that_read_as_integers_are_labels(tmp_path):
     assert table["category"].tolist() == [0, 2]
     mixed = study(("none", "1", "2"))
     assert 'response is "3"; it must be one of none, 1, 2.' in refusal(tmp_path, HEADER + "A,1,3,1,2\n", of=mixed)
+
+
+@pytest.mark.parametrize("labels", [("1.0", "1.5", "2.0"), ("0,0", "1,0", "2,0"), ("+1", "2e0", "three")])
+def test_labels_that_read_as_any_number_are_labels(tmp_path, labels):
+    table = pd.DataFrame({"participant": "A", "trial": [1, 2, 3], "response": labels, "gain": 1.0, "delay": 2.0})
+    table.to_csv(tmp_path / "t.csv", index=False)
+    assert read_trials(tmp_path / "t.csv", study(labels))["category"].tolist() == [0, 1, 2]
+    assert "must be one of" in refusal(tmp_path, HEADER + "A,1,3,1,2\n", of=study(labels))
+
+
+@pytest.mark.parametrize("phase", ["Warm-up", "warm up ", "WARMUP", "warm_up", "Repeat"])
+def test_a_warm_up_is_one_however_it_is_written(tmp_path, phase):
+    text = HEADER.replace("\n", ",phase\n") + f"A,1,close,1,2,{phase}\nA,2,close,1,2,main\n"
+    assert read_trials(written(tmp_path, text), study())["trial"].tolist() == [2]
+
+
+@pytest.mark.parametrize("trial", ["1e300", "9007199254740993"])
+def test_a_number_of_a_trial_is_one_that_is_kept(tmp_path, trial):
+    assert "it must be a whole number from 1" in refusal(tmp_path, HEADER + f"A,{trial},close,1,2\n")
+
+
+@pytest.mark.parametrize("category", [[2, 0, 0], [5, 9, 0], [0.5, 0.0, 1.0]])
+def test_a_column_of_one_s_own_called_category_is_no_answer(category):
+    frame = pd.DataFrame({"participant": "A", "trial": [1, 2, 3], "gain": 1.0, "delay": 2.0, "category": category})
+    frame["response"] = ["different", "close", "similar"]
+    cohort = cohort_of(frame, study())
+    assert np.asarray(cohort.trials.q)[0, :3].tolist() == [0, 2, 1]
+    with pytest.raises(InputError, match='column "participant" is missing'):
+        cohort_of(frame.drop(columns="participant"), study())
+
+
+def test_nobody_is_chosen_twice(tmp_path):
+    cohort = cohort_of(read_trials(written(tmp_path, HEADER + "A,1,close,1,2\nB,1,close,1,2\n"), study()), study())
+    assert cohort.of(["B"]).names == ("B",)
+    with pytest.raises(InputError, match='participant "A" is named twice'):
+        cohort.of(["A", "B", "A"])
 
 
 def test_one_material_is_chosen(tmp_path):

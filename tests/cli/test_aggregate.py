@@ -1,0 +1,67 @@
+"""Whose answers, and which material's, `hilbo aggregate` takes from a table."""
+
+import pandas as pd
+import pytest
+from studies import PLAIN, plain
+
+from hilbo.cli.aggregate import _included, read_cohort
+from hilbo.errors import InputError
+from hilbo.study.cohort import cohort_of
+from hilbo.study.config import Study
+
+STUDY = """schema = 1
+[study]
+name = "two"
+responses = ["no", "yes"]
+[parameters.u]
+low = 0.0
+high = 2.0
+[gp]
+theta = 3.0
+variance = 1.0
+thresholds = [0.0]
+noise = 0.5
+[materials.gel.parameters.u]
+high = 8.0
+[materials.foam]
+"""
+
+
+@pytest.fixture
+def read(tmp_path):
+    """Reads a table of answers by the study."""
+    (tmp_path / "study.toml").write_text(STUDY)
+
+    def of(text):
+        (tmp_path / "t.csv").write_text(text)
+        return read_cohort(tmp_path / "t.csv", tmp_path / "study.toml", None, lambda *said: None)
+
+    return of
+
+
+def test_a_table_of_one_material_is_read_as_that_material(read):
+    study, cohort = read("participant,trial,response,u,material\nA,1,yes,4.0,gel\n")
+    assert study.space.parameters[0].high == 8.0 and float(cohort.trials.x[0, 0, 0]) == 0.5
+
+
+def test_a_table_of_two_materials_or_of_an_unknown_one_is_refused(read):
+    with pytest.raises(InputError, match=r"holds 2 materials \(gel, foam\); choose one with --material"):
+        read("participant,trial,response,u,material\nA,1,yes,1,gel\nA,1,no,1,foam\n")
+    with pytest.raises(InputError, match=r"materials\.silk is not in the study, its materials: gel, foam"):
+        read("participant,trial,response,u,material\nA,1,yes,1,silk\n")
+
+
+def test_a_table_of_no_material_says_so(read, capsys):
+    study, _ = read("participant,trial,response,u\nA,1,yes,1\n")
+    assert study.space.parameters[0].high == 2.0
+    assert "t.csv: names no material; it is read by" in capsys.readouterr().err
+
+
+def test_whom_the_study_leaves_out_is_not_aggregated(capsys):
+    study = Study.from_dict(PLAIN | {"study": PLAIN["study"] | {"exclude": "trials < 2"}})
+    rows = {"participant": ["A", "B", "B", "B"], "trial": [1, 1, 2, 3], "response": "similar", "u": 0.5, "v": 15.0}
+    cohort = cohort_of(pd.DataFrame(rows), study)
+    kept, sentences = _included(study, cohort)
+    assert kept.names == ("B",) and sentences == ['[study] exclude = "trials < 2" leaves out 1: A (trials is 1).']
+    assert sentences[0] in capsys.readouterr().err
+    assert _included(plain(), cohort) == (cohort, [])
