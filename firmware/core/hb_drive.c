@@ -4,9 +4,12 @@
 
 static bool crosses(float number, float low, float high, float *value, float *limit)
 {
-    *value = number;
-    *limit = number < low ? low : high;
-    return number < low || number > high;
+    bool outside = number < low || number > high;
+    if (outside) {
+        *value = number;
+        *limit = number < low ? low : high;
+    }
+    return outside;
 }
 
 bool hb_drive_is_named(const struct hb_drive_request *request)

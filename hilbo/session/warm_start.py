@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hilbo.ordinal_gp import Posterior
+from hilbo.search.apart import differences
 from hilbo.search.candidates import search_points
 from hilbo.study.config import Study
 from hilbo.study.typed_files import digest_of, read_bytes
@@ -78,7 +79,8 @@ def warm_point(
     mean, variance = informed(study, warm, posterior)
     score = mean + study.selection.weight * jnp.sqrt(variance)
     if excluded is not None:
-        distance = jnp.sum((warm.points[:, None, :] - excluded[None, :, :]) ** 2, axis=2)
+        away = differences(study.gp.kernel.levels, warm.points[:, None, :], excluded[None, :, :])
+        distance = jnp.sum(away**2, axis=2)
         score = jnp.where(jnp.all(distance >= apart**2, axis=1), score, -jnp.inf)
     return warm.points[jnp.argmax(score)]
 

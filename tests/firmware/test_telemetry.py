@@ -110,7 +110,9 @@ def test_drive_out_of_range(device, change, reason, value, limit):
 
 
 def test_drive_needs_a_heartbeat(device):
-    assert device.refusal("DRIVE", offset=1.0, duration_ticks=100, boot_id=7) == "NO_HEARTBEAT"
+    kind, message = device.ask("DRIVE", offset=1.0, duration_ticks=100, boot_id=7)
+    assert (kind, message["reason"]) == ("NACK", "NO_HEARTBEAT")
+    assert (message["value"], message["limit"]) == (0.0, 0.0)  # of numbers that are right nothing is said
 
 
 def test_limits_are_those_of_the_config(device):
