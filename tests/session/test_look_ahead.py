@@ -21,7 +21,7 @@ from hilbo.session.pace import minutes_left
 from hilbo.session.progress import consistency, trust_of
 from hilbo.session.records import Block
 from hilbo.session.state import LiveSession
-from hilbo.session.warm_start import informed, warm_start
+from hilbo.session.warm_start import informed, warm_point, warm_start
 
 ANSWERS = ("similar", "different", "close", "close", "similar", "close")
 
@@ -151,6 +151,20 @@ def test_a_warm_start_chooses_from_the_map_and_is_in_the_header():
     mu, s = informed(STUDY, warm, Session.start(STUDY).posterior())
     np.testing.assert_allclose(mu, warm.mean, rtol=1e-12)
     np.testing.assert_allclose(s, 0.05 + 0.5, rtol=1e-12)
+
+
+def test_a_warm_start_keeps_apart_from_one_level_and_not_from_its_neighbour():
+    """Levels have no order: of 30 the next in the list is as far away as any other."""
+    raw = RAW | {"parameters": {"sound": {"levels": [f"s{i}" for i in range(30)]}}}
+    study = Study.from_dict(raw)
+    points = jnp.linspace(0.0, 1.0, 30)[:, None]
+    warm = warm_start(study, points, -jnp.abs(jnp.arange(30.0) - 4.0), jnp.full(30, 0.1))
+    posterior = Session.start(study).posterior()
+    assert float(warm_point(study, warm, posterior, points[3:4], APART)[0]) == float(points[4, 0])
+    assert float(warm_point(study, warm, posterior, points[4:5], APART)[0]) in (
+        float(points[3, 0]),
+        float(points[5, 0]),
+    )
 
 
 def test_the_informed_posterior_is_the_committee_of_map_and_answers():
