@@ -1,4 +1,5 @@
-"""What sessions choose, against exhaustive searches, in random states of simulated sessions of the preset `paper`.
+"""What sessions choose, against exhaustive searches, in random states of simulated sessions of the preset
+`paper-individuals`.
 
     python benchmarks/choice.py --states 1000 --write      into docs/results/accuracy.md
 
@@ -85,7 +86,8 @@ def report(values, count):
     own = values[:, 0]
     lines = [
         f"Made by `python benchmarks/choice.py --states {count} --write`: {count} random states of simulated sessions",
-        "of the preset `paper` (after 5 to 24 answers); differences of UCB, whose scale is the prior's sd, 1.",
+        "of the preset `paper-individuals` (after 5 to 24 answers); differences of UCB, whose scale is the prior's sd,"
+        " 1.",
         "",
         "| the session's choice against | states where lower by more than 1e-6 | lower by at most |"
         " higher on average | higher by at most |",

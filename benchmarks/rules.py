@@ -154,7 +154,7 @@ def table(rows, true_share, chosen):
     lines = [
         f"Made by `python benchmarks/rules.py FOLDER --seeds {done}"
         f" --share-answers {chosen.share_answers} --write`: {done} {'studies' if several else 'study'} of {PEOPLE} x 25"
-        " at each level of differences between people (0: all the same, 1: the preset `paper`).",
+        " at each level of differences between people (0: all the same, 1: the preset `paper-individuals`).",
         "",
         f"| NRMSE to the truth in %{', median [quartiles]' if several else ''} | "
         + " | ".join(f"{level:g}" for level in LEVELS)

@@ -34,7 +34,7 @@ SHOWN = ["rule", "negative_log_density", "difference", "difference_error", "cent
 
 # %% [markdown]
 # ## Simulated people whose optima scatter, more or less
-# The preset `paper` scatters people's optima by a third of the range of K1; `alike` hardly scatters them at all.
+# The preset `paper` scatters people's optima by a quarter of the range of K1; `alike` hardly scatters them at all.
 
 # %%
 raw = tomllib.loads((DATA / "paper.toml").read_text())

@@ -118,7 +118,8 @@ def opened(line: Line, **simulated: Any) -> Iterator[Any]:
                 options=(simulated if line.device == "sim" else {}) | sim_options(line.sim),
             )
         )
-        for note in device.notes:
+        simulator = ["this is the simulated device; --device PORT is a real one."] if line.device == "sim" else []
+        for note in [*simulator, *device.notes]:
             print(f"hilbo: {note}", file=sys.stderr)
         yield device
 

@@ -9,7 +9,7 @@ from hilbo.numerics.host import placed
 from hilbo.population.hierarchical import Share
 from hilbo.population.maps import RuleMap
 from hilbo.population.pointwise import RULES
-from hilbo.population.recipes import RECIPES
+from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.study.config import Study
 from hilbo.study.optima import predict_map
 
@@ -52,16 +52,17 @@ def rule_warnings(study: Study, aggregate: Any) -> list[str]:
         return []
     low, high = np.asarray(share.interval).tolist()
     words = (
-        f"People differ: of the prior variance they share {float(share.mean):.2f} (95 % from {low:.2f} to {high:.2f}),"
-        f' and the rule "{study.rule}" takes that to be 1'
+        f"People differ: of the prior variance they have about {100 * float(share.mean):.0f} % in common (95 %:"
+        f' {100 * low:.0f} to {100 * high:.0f} %), and the rule "{study.rule}" takes that to be 100 %. Its intervals'
+        " are too narrow"
     )
     ratio = _sd_ratio(aggregate)
     if ratio is not None and ratio >= _TOO_SURE:
         words += (
-            f"; at its optimum the map says a standard deviation of {float(aggregate.optimum.sd):.2f}, the hierarchical"
-            f" one {ratio:.1f} times as much"
+            f": at its optimum its standard deviation is {float(aggregate.optimum.sd):.2f}, that of the rule"
+            f' "hierarchical" {ratio:.1f} times as much'
         )
-    return [words + '. Its intervals are too narrow; those of the rule "hierarchical" allow for differences.']
+    return [words + f'. The rules "{RECOMMENDED}" and "hierarchical" allow for differences.']
 
 
 def _sd_ratio(aggregate: Any) -> float | None:

@@ -54,7 +54,8 @@ def test_ports(device):
 
 
 def test_hello(device):
-    code, stdout, _ = device("hello", "--json", *FAST)
+    code, stdout, stderr = device("hello", "--json", *FAST)
+    assert "this is the simulated device; --device PORT is a real one." in stderr
     said = json.loads(stdout)
     assert (code, said["version"], said["in_force"]) == (0, 1, None)
     assert said["damping_N_s_per_m"] == pytest.approx(0.95)
