@@ -4,10 +4,10 @@
 
 Each of some earlier studies makes a map from 24 simulated participants of the preset `paper-individuals`; new people,
 drawn from the same population and dealt among the studies, then answer 25 trials, chosen cold (5 space-filling trials,
-then UCB) or from the map (after some space-filling trials or none). After every trial each person's best rendering is read from
-their own answers under the study's prior, as aggregation does: the candidate with the highest posterior mean. It is
-judged by the truth that was simulated: the probability that this person would answer "close" to it, and its distance
-from their optimum.
+then UCB) or from the map (after some space-filling trials or none). After every trial each person's best rendering is
+read from their own answers under the study's prior, as aggregation does: the candidate with the highest posterior mean.
+It is judged by the truth that was simulated: the probability that this person would answer "close" to it, and its
+distance from their optimum.
 """
 
 import argparse
