@@ -31,11 +31,11 @@ from scipy.stats import norm
 jax.config.update("jax_enable_x64", True)
 
 from pages import put  # noqa: E402
+from people_evidence import learn_people  # noqa: E402
 
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials  # noqa: E402
 from hilbo.population.baselines import constant, quadratic  # noqa: E402
 from hilbo.population.counts import Counts, fit_counts  # noqa: E402
-from hilbo.population.hierarchical_evidence import learn_people  # noqa: E402
 from hilbo.population.learnt import learn  # noqa: E402
 from hilbo.population.leave_one_out import clustered, integral_transform  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402

@@ -7,7 +7,7 @@ Paper, section V, for one latent score with prior variance k and participants' p
 It is computed as 1 / sigma^2 = 1 / k + sum_j s_j with s_j = e_j / (k (k - e_j)): the precision that person j *adds*,
 from the variance e_j = k - sigma_j^2 that the answers explain. A person without data adds exactly 0, and 100,000 weak
 experts keep the digits that a difference of two large sums would lose. The sum over people is one reduction; when
-M x m does not fit in memory, [`stream`][] makes it in blocks.
+M x m does not fit in memory, [`stream`][] makes it one expert at a time.
 Reference: Tresp (2000), Neural Computation 12:2719.
 """
 
@@ -97,36 +97,20 @@ def stream(
     expert: Callable[[PyTree], tuple[Float[Array, " m"], Float[Array, " m"]]],
     experts: PyTree,
     prior_variance: Float[Array, ""] | Float[Array, " m"],
-    *,
-    block: int = 1,
 ) -> Evidence:
-    """The evidence of many experts, never holding more than `block` of their predictions at a time.
+    """The evidence of many experts, one after the other: a CPU's caches hold one expert's predictions.
 
-    **Arguments:**
-
-    - `expert`: gives mean and explained variance (m,) of one expert.
-    - `experts`: what `expert` is called with, stacked along a leading axis of length M.
-    - `block`: experts evaluated together. One at a time is quickest on a CPU, whose caches hold one expert's
-      predictions; a GPU wants dozens.
+    **Arguments:** `expert`: gives mean and explained variance (m,) of one expert; `experts`: what it is called with,
+    stacked along a leading axis of length M.
     """
-    count = jax.tree.leaves(experts)[0].shape[0]
-    if block == 1:
-        whole, remaining = count, 0
-        head, tail = experts, None
-    else:
-        whole, remaining = divmod(count, block)
-        head = jax.tree.map(lambda leaf: leaf[: whole * block].reshape(whole, block, *leaf.shape[1:]), experts)
-        tail = jax.tree.map(lambda leaf: leaf[whole * block :], experts)
 
-    def evidence_of(experts):
-        means, explained = ([row[None] for row in expert(experts)]) if block == 1 else jax.vmap(expert)(experts)
+    def evidence_of(one):
+        means, explained = (row[None] for row in expert(one))
         return _evidence(means, explained, jnp.broadcast_to(prior_variance, means.shape[1:]), None)
 
-    shape = jax.eval_shape(evidence_of, tail if remaining else jax.tree.map(lambda leaf: leaf[0], head))
+    shape = jax.eval_shape(evidence_of, jax.tree.map(lambda leaf: leaf[0], experts))
     total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
-    if whole:
-        total, _ = jax.lax.scan(lambda sums, experts: (_add(sums, evidence_of(experts)), None), total, head)
-    return _add(total, evidence_of(tail)) if remaining else total
+    return jax.lax.scan(lambda sums, one: (_add(sums, evidence_of(one)), None), total, experts)[0]
 
 
 def average(

@@ -90,14 +90,12 @@ def test_more_experts_mean_less_variance(seed):
     assert jnp.all(more > 0)
 
 
-@pytest.mark.parametrize("count", [1, 63, 64, 65, 200])
+@pytest.mark.parametrize("count", [1, 65])
 def test_streamed_equals_at_once(count):
     means, variances = map(jnp.asarray, experts(count, 7))
     whole = bcm.combine(means, variances, 1.3)
     prior = jnp.full(7, 1.3)
-    evidence = jax.jit(lambda e: bcm.stream(lambda pair: (pair[0], prior - pair[1]), e, prior, block=64))(
-        (means, variances)
-    )
+    evidence = jax.jit(lambda e: bcm.stream(lambda pair: (pair[0], prior - pair[1]), e, prior))((means, variances))
     np.testing.assert_allclose(evidence.merge(prior)[0], whole[0], rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(evidence.merge(prior)[1], whole[1], rtol=1e-13)
 

@@ -107,14 +107,13 @@ def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
             f"There are {periods.size} periods of sweeps; at least {_FEWEST}, at two speeds or more, tell damping from"
             " friction."
         )
-    ways = np.stack([values[:, 2] / 1e6, values[:, 1] / 1e3, np.sign(values[:, 1]), np.ones(len(values))], axis=1)
-    # Mass in kg from mm/s² needs 1e-3; the column is kept small and scaled below.
-    ways[:, 0] *= 1e3
-    products, sides = ways[:, :, None] * ways[:, None, :], ways * values[:, :1]
+    # N = kg m/s^2 + (N s/m) m/s + N + N, from mm/s^2 and mm/s
+    terms = np.stack([values[:, 2] / 1e3, values[:, 1] / 1e3, np.sign(values[:, 1]), np.ones(len(values))], axis=1)
+    products, sides = terms[:, :, None] * terms[:, None, :], terms * values[:, :1]
     blocks = np.zeros((periods.size, 4, 4)), np.zeros((periods.size, 4))
     np.add.at(blocks[0], period, products)
     np.add.at(blocks[1], period, sides)
-    best = np.linalg.lstsq(ways, values[:, 0], rcond=None)[0]
+    best = np.linalg.lstsq(terms, values[:, 0], rcond=None)[0]
     drawn = np.random.default_rng(seed).multinomial(periods.size, np.full(periods.size, 1 / periods.size), _DRAWS)
     normal, right = np.tensordot(drawn, blocks[0], 1), drawn @ blocks[1]
     estimates = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
@@ -122,5 +121,5 @@ def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
     wide = np.sqrt(periods.size / (periods.size - 4))
     lower, upper = best - wide * (np.quantile(estimates, [0.975, 0.025], axis=0) - best)
     mass, damping, coulomb, constant = (Interval(*map(float, row)) for row in zip(best, lower, upper, strict=True))
-    left = values[:, 0] - ways @ best
+    left = values[:, 0] - terms @ best
     return Friction(damping, coulomb, mass, constant, float(left.std(ddof=4)), len(sweeps), int(periods.size))

@@ -9,7 +9,7 @@ certificate are those of `ordinal_gp`. A person nobody has met has covariance p 
 a number of its own is the prediction for a new person; the variance of g is (1 - p) k less.
 
 The pooled fit costs the cube of the number of answers. At the committee's cost, point by point from everybody's own
-posterior, stands `aggregation.aggregate("hierarchical", ...)`, with the p learnt here.
+posterior, stands `pointwise.aggregate("hierarchical", ...)`, with the p learnt here.
 """
 
 from collections.abc import Callable

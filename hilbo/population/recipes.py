@@ -4,7 +4,7 @@ Each has a name, and never changes: a study that names one gets the same numbers
 gets another name.
 
 In units of the classification noise, with d parameters and C categories, people's functions and answers are those of
-`low_rank.PeopleModel`. The priors of the hyperparameters:
+`people_model.PeopleModel`. The priors of the hyperparameters:
 
     coordinate                                   learnt-1            learnt-2
     kernel                                       RBF                 Matern 3/2

@@ -212,9 +212,11 @@ def _filled(state: LiveSession, trial: Trial) -> bool:
         waits = trial.repeats in state.wanted or (pending is not None and pending.repeats == trial.repeats)
         return bool(trial.voided and trial.voided.get("asked_again")) and not waits
     others = state.answers(trial.block)
-    if trial.planned is not None:
-        return len(others) >= state.quota(trial.block) or any(t.planned == trial.planned for t in others)
-    return len(others) >= state.quota(trial.block) or any(t.renderings == trial.renderings for t in others)
+    if trial.planned is None:
+        same = any(other.renderings == trial.renderings for other in others)
+    else:
+        same = any(other.planned == trial.planned for other in others)
+    return same or len(others) >= state.quota(trial.block)
 
 
 def restorable(state: LiveSession, trial: int) -> bool:

@@ -1,7 +1,8 @@
 """The state of a live session as the fold of its events: pure, without files, clock or device.
 
-`LiveSession.fold(study, header, events)` is the state after a log, so that resuming is replaying. Renderings are in the
-events themselves: a fold computes no fit. `hilbo.session.transitions` has what each event does.
+`LiveSession.fold(study, header, events)` is the state after a log. A session that is resumed is folded event by event,
+each checked against the state before it (`replay.replayed`). Renderings are in the events: a fold computes no fit.
+`hilbo.session.transitions` has what each event does.
 
 Twice: the device's stops count while a rendering is on, of that rendering alone; what a person voids never counts. In
 a block that chooses, a rendering in which the device stopped twice is not proposed again: another one takes its place.

@@ -114,9 +114,10 @@ def block_size(people: int, platform: str = "cpu") -> int:
 def refit(population: Population, points: Float[np.ndarray, "m d"], individuals: bool = False) -> Fitted:
     """Fit everybody and add up what they say at points (m, d); `individuals`: and find everybody's own optimum, the
     points being its candidates."""
-    progress_words = "participants fitted, each with an optimum of their own (--no-individuals leaves these out)"
-    progress_words = progress_words if individuals else "participants fitted"
-    total, per_person = _sum_over_people(population, "individuals" if individuals else "first", points, progress_words)
+    words = "participants fitted"
+    if individuals:
+        words += ", each with an optimum of their own (--no-individuals leaves these out)"
+    total, per_person = _sum_over_people(population, "individuals" if individuals else "first", points, words)
     fitted = dataclasses.replace(population, modes=per_person.get("modes"))
     optima = Optimum(*map(jnp.asarray, per_person["optima"])) if individuals else None
     return Fitted(fitted, total, per_person["certificate"], optima)

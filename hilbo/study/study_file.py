@@ -191,8 +191,9 @@ def hash_of(content: str) -> str:
     """First 16 hex digits of the SHA-256 of a study's content, without the people of its simulations and the column of
     a random effect: they change nothing that is asked of people, whose sessions may be over."""
     tables = json.loads(content)
-    if [tables.pop(name, None) for name in ("simulation", "random_effect")] != [None, None]:
-        content = json.dumps(tables, ensure_ascii=False, separators=(",", ":"))
+    hashed = {name: table for name, table in tables.items() if name not in ("simulation", "random_effect")}
+    if len(hashed) < len(tables):
+        content = json.dumps(hashed, ensure_ascii=False, separators=(",", ":"))
     return hashlib.sha256(content.encode()).hexdigest()[:16]
 
 

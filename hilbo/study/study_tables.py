@@ -338,10 +338,8 @@ def _check_gp(table: GPTable, rule: Rule, count: int) -> None:
             )
         if any(low >= high for low, high in itertools.pairwise(thresholds)):
             raise InputError(f"gp.thresholds is {shown(thresholds)}; it must rise from each number to the next.")
-    if rule in _LEARN:
-        if table.inference != "laplace":
-            raise InputError(f'gp.inference is {shown(table.inference)}; it must be "laplace" with rule = "{rule}".')
-        return
+    if rule in _LEARN and table.inference != "laplace":
+        raise InputError(f'gp.inference is {shown(table.inference)}; it must be "laplace" with rule = "{rule}".')
 
 
 def of_material(raw: Mapping[str, Any], name: str) -> dict[str, Any]:

@@ -1,5 +1,7 @@
 """Hyperparameters of the hierarchical model by maximum evidence: length scales, variance, thresholds and the share.
 
+For benchmarks/people.py, where rules without a recipe are to have the best hyperparameters that there are for them.
+
 All people's answers count together (`counts.evidence`): the prior variance of one person's function, of which the
 share p is common to all, the inverse squared lengths theta and the thresholds are learnt, in units of the
 classification noise, which stays as it is (the scale of f is free). With the share held at 1 this is the pooled
@@ -18,7 +20,6 @@ from jaxtyping import Array, Bool, Float
 from scipy.optimize import minimize
 
 from hilbo.likelihoods import OrdinalProbit
-from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP
 from hilbo.population.counts import Counts, evidence
 
@@ -76,7 +77,7 @@ def learn_people(
     )
 
 
-@program
+@eqx.filter_jit
 def _cost(
     z: Float[Array, " z"],
     rebuild: Callable[[Array], dict[str, Array]],
@@ -88,8 +89,8 @@ def _cost(
 
     def value(z):
         model, learnt_share = _model(rebuild(z), gp, share)
-        negative_evidence, arrived = evidence(model, learnt_share, answers)
-        return -negative_evidence, arrived
+        log_evidence, arrived = evidence(model, learnt_share, answers)
+        return -log_evidence, arrived
 
     (negative_evidence, arrived), slope = jax.value_and_grad(value, has_aux=True)(z)
     return negative_evidence, slope, arrived & jnp.isfinite(negative_evidence) & jnp.all(jnp.isfinite(slope))
