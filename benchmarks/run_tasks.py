@@ -20,7 +20,7 @@ from hilbo.search.lattice import screen_points
 from hilbo.session.ask_tell import Session
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.config import Study
-from hilbo.study.optima import population
+from hilbo.study.optima import predict_people
 
 PAPER = Path(__file__).parents[1] / "hilbo" / "data" / "paper.toml"
 
@@ -89,7 +89,7 @@ def hilbo_tasks(study, candidates, answer, people, trials):
     begun = Session.start(study)
     pooled = Trials.from_arrays(*(np.concatenate(part) for part in zip(*people, strict=True)), 600)
     cohort = Cohort(trials)
-    merge = jax.jit(lambda posteriors, points: population(posteriors.astype(points.dtype), points))
+    merge = jax.jit(lambda posteriors, points: predict_people(posteriors.astype(points.dtype), points))
     learn = eqx.filter_jit(
         jax.vmap(lambda gp, one: maximise_evidence(gp, one, starts=4, inference=study.inference), in_axes=(None, 0))
     )

@@ -26,7 +26,7 @@ from hilbo.session.selection import design, point_after
 from hilbo.session.warm_start import warm_point, warm_start
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.simulate import Person, people, simulate_study
-from hilbo.study.optima import population
+from hilbo.study.optima import predict_people
 
 TRIALS = 25
 
@@ -76,7 +76,7 @@ def studied(study, seed, count, fillings, share):
     preset, points = PRESETS["paper-individuals"], search_points(study.space, seed)
     earlier = simulate_study(study, people(study, preset, 24, seed), seed)
     posteriors = jax.vmap(lambda t: fit(study.gp, t, inference=study.inference, throw=False))(earlier)
-    mean, variance = population(posteriors, points)
+    mean, variance = predict_people(posteriors, points)
     new = people(study, preset, count, 1000 + seed)
     keys = jax.random.split(jax.random.key(2000 + seed), count)
     filling = np.stack([study.space.latin_hypercube(5, 3000 + seed * count + i) for i in range(count)])

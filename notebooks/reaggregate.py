@@ -20,7 +20,7 @@ from hilbo import Study
 from hilbo.report.figures.maps import map_slices
 from hilbo.study.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.cohort import cohort_of
-from hilbo.study.optima import population, population_optimum
+from hilbo.study.optima import population_optimum, predict_people
 from hilbo.study.trial_table import read_trials
 
 DATA = Path(hilbo.__file__).parent / "data"  # studies and tables that are shipped
@@ -61,5 +61,5 @@ for words, part in (("first eight people", cohort.of(cohort.names[:8])), ("first
 # %%
 points = candidates[:5]
 for count in (1, 4, 17):
-    _, variance = population(fit_cohort(study, cohort.of(cohort.names[:count])), points)
+    _, variance = predict_people(fit_cohort(study, cohort.of(cohort.names[:count])), points)
     print(count, "people: sd", np.round(np.sqrt(variance), 3))

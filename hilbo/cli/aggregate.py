@@ -169,7 +169,7 @@ def aggregate_cohort(
     study, cohort, folder, seed, say, truth=None, compare=False, selection="", left_out=()
 ) -> dict[str, Any]:
     """The results folder of one cohort; with `compare` every rule beside, each person left out in turn."""
-    from hilbo.study.population_results import analyse_population
+    from hilbo.study.cohort_results import analyse_cohort
 
     with ThreadPoolExecutor(1) as other_core:
 
@@ -177,7 +177,7 @@ def aggregate_cohort(
             say.tell(sentences)
             other_core.submit(list, map(importlib.import_module, _DRAW_AND_WRITE))
 
-        population = analyse_population(study, cohort, seed, say, report_early)
+        population = analyse_cohort(study, cohort, seed, say, report_early)
     from hilbo.report.results import write_results
 
     beside: dict[str, Any] = {}

@@ -35,7 +35,7 @@ __all__ = [
     "fit_people",
     "learn_share",
     "of_people",
-    "population",
+    "predict_shared",
     "share_from",
     "shared_posterior",
 ]
@@ -119,7 +119,7 @@ def fit_people(
     return fit(model, trials, inference=inference, throw=throw)
 
 
-def population(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+def predict_shared(posterior: Posterior, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Mean and variance (m,) of the shared function g, from a posterior of `fit_people`."""
     points = jnp.concatenate([x, jnp.full((x.shape[0], 1), NEWCOMER, x.dtype)], axis=1)
     mean, explained = posterior.predict_explained(points)

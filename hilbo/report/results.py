@@ -26,6 +26,7 @@ from hilbo.search.apart import differences, nrmse
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import Aggregate, asked_variance, other_inference
 from hilbo.study.batch_optimum import LargeAggregate
+from hilbo.study.cohort_results import CohortResults
 from hilbo.study.config import Study
 from hilbo.study.effects import effects_of
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
@@ -35,7 +36,6 @@ from hilbo.study.model_check import check_sentences, model_check
 from hilbo.study.optima import Optimum
 from hilbo.study.optimum_location import location_notes, location_sentences
 from hilbo.study.optimum_region import optimum_region, region_content, region_sentences
-from hilbo.study.population_results import Population
 from hilbo.study.typed_files import sealed
 
 __all__ = [
@@ -220,7 +220,7 @@ def _truth(study, aggregate, truth):
 
 
 def write_results(
-    population: Population,
+    population: CohortResults,
     folder: Path,
     truth: Float[np.ndarray, " d"] | None = None,
     say=lambda text: None,
@@ -302,7 +302,7 @@ def map_dataset(study: Study, surface: Callable[..., Any], cells: int = MAP_CELL
     )
 
 
-def _figures(population: Population, truth: Float[np.ndarray, " d"] | None) -> dict[str, Any]:
+def _figures(population: CohortResults, truth: Float[np.ndarray, " d"] | None) -> dict[str, Any]:
     """Name -> figure."""
     from hilbo.report.figures import maps
     from hilbo.report.figures.effects import effects_figure

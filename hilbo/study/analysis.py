@@ -23,6 +23,7 @@ from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import Aggregate, aggregate_cohort
 from hilbo.study.cohort import Cohort
+from hilbo.study.cohort_results import CohortResults, Say, analyse_cohort
 from hilbo.study.config import Study
 from hilbo.study.exclusion import included
 from hilbo.study.heterogeneity import in_place
@@ -30,7 +31,6 @@ from hilbo.study.learnt_study import learnt_sentences, resolved, that_learns
 from hilbo.study.map_summary import Sets, Tolerance, best_mid_worst, tolerance
 from hilbo.study.optima import map_optimum
 from hilbo.study.optimum_location import location_sentences
-from hilbo.study.population_results import Population, Say, analyse_population
 from hilbo.study.progress import Progress
 from hilbo.study.tolerance_intervals import Ends, tolerance_ends
 
@@ -50,7 +50,7 @@ class Reading(NamedTuple):
 class Analysis(NamedTuple):
     """All results of one material."""
 
-    population: Population
+    population: CohortResults
     fixed: Reading
     optimised: Reading
     learned: Learned
@@ -86,7 +86,7 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     """Results of one material from all its participants' answers. Raises `InputError` if the rule leaves nobody."""
     say("consistency, lapses and drift of everybody")
     cohort, people, left_out = included(study, everybody)
-    population = _with_learnt(analyse_population(study, cohort, seed, say), seed, say)
+    population = _with_learnt(analyse_cohort(study, cohort, seed, say), seed, say)
     study, aggregate = population.study, population.aggregate
     say("hyperparameters by maximum evidence")
     judged, learned_study, optimised = _optimised(study, cohort, seed)
@@ -142,7 +142,7 @@ def limits_of(study: Study, cohort: Cohort) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def _with_learnt(population: Population, seed: int, say: Say) -> Population:
+def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResults:
     """With the optimum by the recommended recipe among the alternatives, where the study's rule learns nothing."""
     study, aggregate = population.study, population.aggregate
     if study.rule in RECIPES:

@@ -32,13 +32,13 @@ from hilbo.study.config import Inference, Study
 from hilbo.study.distributed import AXIS, Crew
 from hilbo.study.optima import Optimum, individual_optima
 
-__all__ = ["Fitted", "Jets", "Population", "Say", "block_size", "jets", "population_of", "refit", "sums"]
+__all__ = ["Fitted", "Jets", "SayCount", "StreamedCohort", "block_size", "jets", "refit", "streamed_cohort", "sums"]
 
 _TOGETHER = 64  # people whose predictions are made at once, except on CPUs: those hold one person's in their caches
 
 _LARGEST = {True: 256, False: 1024}  # people of a block, on CPUs and elsewhere
 
-Say = Callable[[str, int, int], None]
+SayCount = Callable[[str, int, int], None]
 """What is being done, to how many people so far, of how many."""
 
 
@@ -54,7 +54,7 @@ class Jets(NamedTuple):
     hessian: Sums
 
 
-class Population(eqx.Module):
+class StreamedCohort(eqx.Module):
     """Everybody's answers (host arrays), the devices that work on them, and what is known of the posteriors."""
 
     study: Study
@@ -66,7 +66,7 @@ class Population(eqx.Module):
     group: int = eqx.field(static=True)
     """Blocks that a device makes in one round."""
     inference: Inference = eqx.field(static=True)
-    say: Say = eqx.field(static=True)
+    say: SayCount = eqx.field(static=True)
     rule: Rule = eqx.field(static=True, default="bcm")
     share: float = eqx.field(static=True, default=1.0)
     """Of the hierarchical rule; 1 otherwise."""
@@ -76,14 +76,14 @@ class Population(eqx.Module):
         """M."""
         return self.trials.q.shape[0]
 
-    def every(self, count: int) -> "Population":
+    def every(self, count: int) -> "StreamedCohort":
         """About `count` of the people, evenly chosen, and nobody watching."""
         rows = np.unique(np.linspace(0, self.people - 1, min(max(count, 1), self.people)).round().astype(int))
         trials = jax.tree.map(lambda leaf: leaf[rows], self.trials)
         modes = None if self.modes is None else self.modes[rows]
         return dataclasses.replace(self, trials=trials, modes=modes, say=_silent)
 
-    def by(self, inference: Inference) -> "Population":
+    def by(self, inference: Inference) -> "StreamedCohort":
         """The same people's answers for another inference."""
         return dataclasses.replace(self, modes=None, inference=inference)
 
@@ -91,19 +91,19 @@ class Population(eqx.Module):
 class Fitted(NamedTuple):
     """What a first pass finds: certificates (M,) by field, individual optima if asked for, and sums at the points."""
 
-    population: Population
+    population: StreamedCohort
     sums: Sums
     certificate: dict[str, np.ndarray]
     individuals: Optimum | None
 
 
-def population_of(study: Study, cohort: Cohort, crew: Crew, say: Say = _silent) -> Population:
+def streamed_cohort(study: Study, cohort: Cohort, crew: Crew, say: SayCount = _silent) -> StreamedCohort:
     """The people of a cohort, not yet fitted; by the study's inference."""
     trials = jax.tree.map(np.asarray, cohort.trials)
     people = len(cohort.names)
     block = block_size(people, crew.platform)
     group = min(_LARGEST[crew.platform == "cpu"] // block, -(-people // (block * crew.devices)))
-    return Population(study, trials, None, crew, block, group, study.inference, say)
+    return StreamedCohort(study, trials, None, crew, block, group, study.inference, say)
 
 
 def block_size(people: int, platform: str = "cpu") -> int:
@@ -111,7 +111,7 @@ def block_size(people: int, platform: str = "cpu") -> int:
     return min(_LARGEST[platform == "cpu"], 2 ** math.ceil(math.log2(max(1.0, people / 16))))
 
 
-def refit(population: Population, points: Float[np.ndarray, "m d"], individuals: bool = False) -> Fitted:
+def refit(population: StreamedCohort, points: Float[np.ndarray, "m d"], individuals: bool = False) -> Fitted:
     """Fit everybody and add up what they say at points (m, d); `individuals`: and find everybody's own optimum, the
     points being its candidates."""
     words = "participants fitted"
@@ -123,12 +123,12 @@ def refit(population: Population, points: Float[np.ndarray, "m d"], individuals:
     return Fitted(fitted, total, per_person["certificate"], optima)
 
 
-def sums(population: Population, points: Float[np.ndarray, "m d"], words: str = "participants aggregated") -> Sums:
+def sums(population: StreamedCohort, points: Float[np.ndarray, "m d"], words: str = "participants aggregated") -> Sums:
     """The sums over people at points (m, d)."""
     return _sum_over_people(population, "sums", points, words)[0]
 
 
-def jets(population: Population, points: Float[np.ndarray, "s d"], words: str = "participants aggregated") -> Jets:
+def jets(population: StreamedCohort, points: Float[np.ndarray, "s d"], words: str = "participants aggregated") -> Jets:
     """The sums over people at points (s, d), with two derivatives."""
     return _sum_over_people(population, "jets", points, words)[0]
 
@@ -139,7 +139,7 @@ _Task = Literal["first", "individuals", "sums", "jets"]
 
 
 def _sum_over_people(
-    population: Population, task: _Task, points: Float[np.ndarray, "m d"], words: str
+    population: StreamedCohort, task: _Task, points: Float[np.ndarray, "m d"], words: str
 ) -> tuple[Any, Any]:
     """Block sums added in the order of the blocks, and what is kept of everybody in the order of people."""
     crew, people, size = population.crew, population.people, population.block
@@ -162,7 +162,7 @@ def _sum_over_people(
     return total, jax.tree.map(lambda *leaves: np.concatenate(leaves), *kept)
 
 
-def _padded_blocks(population: Population, rows: slice) -> tuple[Trials, np.ndarray | None]:
+def _padded_blocks(population: StreamedCohort, rows: slice) -> tuple[Trials, np.ndarray | None]:
     """Trials and modes of some rows as (devices, group, block, ...), filled up with people who gave no answer."""
     shape = population.crew.devices, population.group, population.block
 

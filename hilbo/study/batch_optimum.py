@@ -28,7 +28,7 @@ from hilbo.population.pointwise import RULES, Rule, Sums
 from hilbo.search.apart import middle_of
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import other_inference
-from hilbo.study.batch import Jets, Population, Say, jets, population_of, refit, sums
+from hilbo.study.batch import Jets, SayCount, StreamedCohort, jets, refit, streamed_cohort, sums
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.distributed import Crew
@@ -49,7 +49,7 @@ class LargeAggregate(eqx.Module):
     """What `aggregate.Aggregate` is for a cohort whose posteriors are not kept."""
 
     cohort: Cohort
-    population: Population
+    population: StreamedCohort
     certificates: dict[str, np.ndarray]
     optimum: Optimum
     individuals: Optimum | None
@@ -84,7 +84,7 @@ def aggregate_population(
     *,
     individuals: bool = True,
     alternatives: bool = True,
-    say: Say | None = None,
+    say: SayCount | None = None,
 ) -> LargeAggregate:
     """As `aggregate.aggregate_cohort`, in bounded memory and by all devices of the crew.
 
@@ -94,7 +94,7 @@ def aggregate_population(
     candidates = np.asarray(search_points(study.space, seed))
     rule = _streamed(study.rule, len(cohort.names))
     share = share_of(study.gp, cohort.trials, study.inference) if rule == "hierarchical" else None
-    population = population_of(study, cohort, crew) if say is None else population_of(study, cohort, crew, say)
+    population = streamed_cohort(study, cohort, crew) if say is None else streamed_cohort(study, cohort, crew, say)
     population = dataclasses.replace(population, rule=rule, share=1.0 if share is None else float(share.mean))
     fitted = refit(population, candidates, individuals)
     rules: tuple[Rule, ...] = tuple(dict.fromkeys((rule, "average"))) if alternatives else (rule,)
@@ -116,7 +116,7 @@ def _streamed(rule: str, people: int) -> Rule:
 
 
 def optima_from(
-    population: Population, candidates: Float[np.ndarray, "m d"], totals: Sums, rules: tuple[Rule, ...] = ("bcm",)
+    population: StreamedCohort, candidates: Float[np.ndarray, "m d"], totals: Sums, rules: tuple[Rule, ...] = ("bcm",)
 ) -> dict[str, Optimum]:
     """The maximum of the map by each rule in the feasible set, from the sums at candidates (m, d)."""
     prior = np.asarray(jax.vmap(population.study.gp.kernel.diagonal)(jnp.asarray(candidates)))
@@ -142,7 +142,7 @@ def _height(optimum: Optimum) -> float:
     return float(optimum.mean)
 
 
-def _by_steps(population: Population, best: Optimum, rule: Rule) -> Optimum:
+def _by_steps(population: StreamedCohort, best: Optimum, rule: Rule) -> Optimum:
     """From an optimum the highest of those a step of whole numbers or levels away, polished, until none is higher."""
     study, neighbours = population.study, population.study.space.searched.get("neighbours")
     if neighbours is None:
@@ -197,7 +197,7 @@ def _separate_rows(values: Float[np.ndarray, " m"], candidates: Float[np.ndarray
     return rows
 
 
-def _by_other_inference(population: Population, best: Optimum) -> Optimum:
+def _by_other_inference(population: StreamedCohort, best: Optimum) -> Optimum:
     """The optimum nearby under the other inference."""
     study, starts = population.study, np.asarray(best.x)[None, :]
     other = other_inference(study)
@@ -215,7 +215,7 @@ def _by_other_inference(population: Population, best: Optimum) -> Optimum:
 
 
 def optimum_near(
-    population: Population,
+    population: StreamedCohort,
     starts: Float[np.ndarray, "s d"],
     rules: tuple[Rule, ...],
     *,

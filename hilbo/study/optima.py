@@ -33,9 +33,9 @@ __all__ = [
     "best_point",
     "individual_optima",
     "map_optimum",
-    "population",
     "population_optimum",
     "predict_map",
+    "predict_people",
 ]
 
 Rule = pointwise.Rule
@@ -59,7 +59,7 @@ class Optimum(eqx.Module):
 
 
 @program
-def population(
+def predict_people(
     posteriors: Posterior, x: Float[Array, "m d"], rule: Rule = "bcm", share: Float[Array, ""] | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Mean and variance (m,) of the population map at points of the unit cube, aggregated point by point.
@@ -81,7 +81,7 @@ def predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m
 
 @program
 def _predict_map(map_: RuleMap, x: Float[Array, "m d"]) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    return population(map_.experts, x) if map_.rule == "bcm" and map_.experts is not None else map_.predict(x)
+    return predict_people(map_.experts, x) if map_.rule == "bcm" and map_.experts is not None else map_.predict(x)
 
 
 def population_optimum(
@@ -101,8 +101,10 @@ def population_optimum(
 @program
 def _population_optimum(gp: OrdinalGP, space: SearchSpace, posteriors, candidates, rule, share) -> Optimum:
     apart = 0.0 if share is None else (1.0 - share) * gp.kernel.variance
-    values = population(posteriors, candidates, rule, share)[0]
-    return _optimum(gp.likelihood, space, lambda x: population(posteriors, x, rule, share), candidates, values, apart)
+    values = predict_people(posteriors, candidates, rule, share)[0]
+    return _optimum(
+        gp.likelihood, space, lambda x: predict_people(posteriors, x, rule, share), candidates, values, apart
+    )
 
 
 def map_optimum(study: Study, map_: RuleMap, candidates: Float[Array, "m d"]) -> Optimum:

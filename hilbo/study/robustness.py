@@ -29,7 +29,7 @@ from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.optima import Optimum, individual_optima, population, population_optimum
+from hilbo.study.optima import Optimum, individual_optima, population_optimum, predict_people
 from hilbo.study.resampled_optimum import resampled_tops
 
 __all__ = ["LIMIT", "Robustness", "robustness"]
@@ -73,7 +73,7 @@ class Robustness(eqx.Module):
     def maps(self) -> tuple[partial, partial]:
         """The population maps under the fixed and under the learnt hyperparameters: functions of points (m, d)."""
         both = zip((self.posteriors, self.posteriors_learnt), self.shares, strict=True)
-        fixed, learnt = (partial(population, posteriors, rule=self.rule, share=share) for posteriors, share in both)
+        fixed, learnt = (partial(predict_people, posteriors, rule=self.rule, share=share) for posteriors, share in both)
         return fixed, learnt
 
     @property
@@ -189,7 +189,7 @@ def _sensitivity(
         return jax.vmap(lambda t: fit(gp, t, inference=study.inference, throw=False))(trials)
 
     def height(w, posteriors):
-        return population(posteriors, study.space.from_box(w)[None, :], rule, share)[0][0]
+        return predict_people(posteriors, study.space.from_box(w)[None, :], rule, share)[0][0]
 
     box, searched = study.space.to_box(x), study.space.searched
     between = {name: searched.get(name) for name in ("walls", "held")}

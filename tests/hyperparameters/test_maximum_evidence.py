@@ -19,7 +19,7 @@ from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
-from hilbo.study.optima import population, population_optimum
+from hilbo.study.optima import population_optimum, predict_people
 from hilbo.study.robustness import robustness
 from tests.vectors.evidence import three
 
@@ -132,7 +132,7 @@ def test_robustness_is_that_of_the_studys_rule(checked):
     other = robustness(dataclasses.replace(study, rule="hierarchical"), cohort)
     fixed, learnt = (float(share) for share in other.shares)
     assert 0 < fixed < 1 and 0 < learnt < 1 and fixed != learnt
-    heights = population(result.posteriors, other.fixed.x[None, :], "hierarchical", other.shares[0])[0]
+    heights = predict_people(result.posteriors, other.fixed.x[None, :], "hierarchical", other.shares[0])[0]
     assert float(other.fixed.mean) == pytest.approx(float(heights[0]), rel=1e-10)
     assert float(jnp.abs(other.fixed.mean - result.fixed.mean)) > 1e-3
     for of, optimum in zip(other.maps(), (other.fixed, other.optimised), strict=True):

@@ -10,7 +10,7 @@ from benchmarks.people_evidence import learn_people
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials
 from hilbo.errors import InputError
 from hilbo.population.counts import Counts, counts_of, evidence, fit_counts, one_person
-from hilbo.population.hierarchical import fit_people, of_people, population, shared_posterior
+from hilbo.population.hierarchical import fit_people, of_people, predict_shared, shared_posterior
 
 GP = OrdinalGP(RBF(jnp.array([4.0, 2.0]), 1.5), OrdinalProbit((-0.5, 0.5), 0.5))
 
@@ -45,7 +45,7 @@ def test_equals_the_model_of_every_answer(share):
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(9, 2)))
     assert bool(posterior.certificate.converged)
     np.testing.assert_allclose(posterior.log_evidence, dense.log_evidence, rtol=1e-12)
-    for a, b, c in zip(posterior.predict(x), population(dense, x), shared_posterior(dense).predict(x), strict=True):
+    for a, b, c in zip(posterior.predict(x), predict_shared(dense, x), shared_posterior(dense).predict(x), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-11)
         np.testing.assert_allclose(c, b, atol=1e-13)
 

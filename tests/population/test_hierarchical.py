@@ -7,7 +7,7 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.errors import InputError
-from hilbo.population.hierarchical import NEWCOMER, fit_people, learn_share, of_people, population
+from hilbo.population.hierarchical import NEWCOMER, fit_people, learn_share, of_people, predict_shared
 
 GP = OrdinalGP(RBF(4.0, 1.0), OrdinalProbit((-0.5, 0.5), 0.5))
 
@@ -33,7 +33,7 @@ def test_share_one_is_the_pooled_model():
     together = fit_people(GP, of_people(trials), 1.0)
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
     np.testing.assert_allclose(together.log_evidence, pooled.log_evidence, rtol=1e-12)
-    for a, b in zip(population(together, x), pooled.predict(x), strict=True):
+    for a, b in zip(predict_shared(together, x), pooled.predict(x), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-11)
 
 
@@ -48,7 +48,7 @@ def test_share_zero_is_everybody_alone():
         as_one = together.predict(jnp.asarray(np.insert(x, 2, j, axis=1)))
         for a, b in zip(as_one, posterior.predict(x), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-11)
-    mean, variance = population(together, x)
+    mean, variance = predict_shared(together, x)
     np.testing.assert_allclose(mean, 0.0, atol=1e-14)
     np.testing.assert_allclose(variance, 0.0, atol=1e-14)  # of g, which is then nothing
 
@@ -57,7 +57,7 @@ def test_a_newcomer_differs_from_the_population_by_their_own_function():
     trials = of_people(simulated(4, 6, 0.5))
     posterior = fit_people(GP, trials, 0.3)
     x = jnp.asarray(np.random.default_rng(2).uniform(size=(9, 2)))
-    mean, variance = population(posterior, x)
+    mean, variance = predict_shared(posterior, x)
     new_mean, new_variance = posterior.predict(jnp.concatenate([x, jnp.full((9, 1), NEWCOMER)], axis=1))
     np.testing.assert_allclose(new_mean, mean, rtol=1e-14)
     np.testing.assert_allclose(new_variance, variance + 0.7, rtol=1e-13)
@@ -79,7 +79,7 @@ def test_the_shared_function_by_brute_force():
     _, slope, weight = map(np.asarray, jax.jit(jax.vmap(GP.likelihood.expand))(mode, q))
     target = mode + slope / weight
     solve = np.linalg.solve(prior + np.diag(1 / weight), np.c_[target, 0.4 * k(x, new)])
-    mean, variance = population(posterior, jnp.asarray(new))
+    mean, variance = predict_shared(posterior, jnp.asarray(new))
     np.testing.assert_allclose(mean, 0.4 * k(new, x) @ solve[:, 0], rtol=1e-9)
     np.testing.assert_allclose(variance, 0.4 - np.sum(0.4 * k(new, x) * solve[:, 1:].T, axis=1), rtol=1e-9)
 

@@ -11,7 +11,7 @@ import pytest
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.kernels import gram
 from hilbo.population.joint import joint_map
-from hilbo.study.optima import population
+from hilbo.study.optima import predict_people
 
 GP = OrdinalGP(RBF(8.0, 1.7), OrdinalProbit((-0.5, 0.5), 0.5))
 
@@ -62,7 +62,7 @@ def test_equals_the_formula():
 def test_one_point_is_the_pointwise_committee():
     posteriors = cohort(slice(0, 7))
     for x in jnp.asarray(np.random.default_rng(2).uniform(size=(6, 1, 2))):
-        map_, (mean, variance) = joint_map(posteriors, x), population(posteriors, x)
+        map_, (mean, variance) = joint_map(posteriors, x), predict_people(posteriors, x)
         np.testing.assert_allclose(map_.mean, mean, rtol=1e-12, atol=1e-14)
         np.testing.assert_allclose(map_.variance, variance, rtol=1e-12)
 

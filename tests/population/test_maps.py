@@ -7,7 +7,7 @@ import pytest
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 from hilbo.errors import InputError
-from hilbo.population.hierarchical import fit_people, of_people, population
+from hilbo.population.hierarchical import fit_people, of_people, predict_shared
 from hilbo.population.maps import even_rows, rule_map, share_of
 from hilbo.population.pointwise import RULES, aggregate
 
@@ -37,7 +37,7 @@ def test_few_answers_are_merged_exactly_and_many_by_points():
     share = jnp.asarray(0.6)
     exact = rule_map(GP, trials, "hierarchical", share=share)
     dense = fit_people(GP, of_people(trials), 0.6)
-    for a, b in zip(exact.predict(X), population(dense, X), strict=True):
+    for a, b in zip(exact.predict(X), predict_shared(dense, X), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
     np.testing.assert_allclose(exact.newcomer(X)[1] - exact.predict(X)[1], 0.4 * 1.3, rtol=1e-12)
     points = rule_map(GP, trials, "hierarchical", share=share, largest=5)

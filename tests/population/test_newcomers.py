@@ -27,7 +27,7 @@ from hilbo.study.aggregate import Aggregate, fit_cohort
 from hilbo.study.batch_optimum import _optimum_at, _variance_apart
 from hilbo.study.cohort import Cohort
 from hilbo.study.heterogeneity import in_place
-from hilbo.study.optima import map_optimum, population
+from hilbo.study.optima import map_optimum, predict_people
 from hilbo.study.progress import _map_by_points
 from hilbo.study.tolerance_intervals import _dominant_in_draws
 
@@ -87,7 +87,7 @@ def test_draws_of_tolerance_intervals_are_a_new_persons(posteriors):
     means, explained = jax.vmap(lambda p: p.predict_explained(x))(posteriors[True])
     rows, share = jnp.arange(PEOPLE)[None, :], jnp.asarray(SHARE)
     inside = np.asarray(_dominant_in_draws(STUDY, 3 * means, explained, jnp.ones(400), rows, "hierarchical", share))[0]
-    mean, variance = population(posteriors[True], x, "hierarchical", share)
+    mean, variance = predict_people(posteriors[True], x, "hierarchical", share)
     expected, sure = (
         np.array([chances(m, v + more).argmax() == 2 for m, v in zip(3 * mean, variance, strict=True)])
         for more in (1.0 - SHARE, 0.0)
@@ -117,7 +117,7 @@ def test_maps_of_fewer_trials_are_merged_as_their_stars(posteriors):
     share = jnp.asarray(SHARE)
     merged = _map_by_points(dataclasses.replace(STUDY, rule="hierarchical"), share, posteriors[True])
     x = jnp.asarray(np.random.default_rng(2).uniform(size=(5, 2)))
-    expected = population(posteriors[True], x, "hierarchical", jnp.asarray(SHARE))
+    expected = predict_people(posteriors[True], x, "hierarchical", jnp.asarray(SHARE))
     np.testing.assert_allclose(np.stack(merged.predict(x)), np.stack(expected), rtol=1e-12)
     by_bcm = _map_by_points(dataclasses.replace(STUDY, rule="pooled"), share, posteriors[True])
     assert (by_bcm.rule, by_bcm.method) == ("bcm", "by points")

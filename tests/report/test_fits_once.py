@@ -8,8 +8,8 @@ from studies import answered, plain_study
 
 from hilbo.report.results import write_results
 from hilbo.report.study import write_study
+from hilbo.study.cohort_results import analyse_cohort
 from hilbo.study.folder import Material, StudyFolder
-from hilbo.study.population_results import analyse_population
 
 pytestmark = [pytest.mark.deep, pytest.mark.empties_caches]
 PEOPLE, TRIALS = 3, 6
@@ -18,7 +18,7 @@ PEOPLE, TRIALS = 3, 6
 def test_aggregate_fits_each_model_to_each_data_once(tmp_path):
     study = plain_study(2)
     with count_fits() as fits:
-        write_results(analyse_population(study, answered(study, PEOPLE, TRIALS)), tmp_path)
+        write_results(analyse_cohort(study, answered(study, PEOPLE, TRIALS)), tmp_path)
     assert {key: count for key, count in fits.items() if count > 1} == {}
     for trials in (TRIALS, TRIALS - 1):  # everybody's own, in each prefix
         assert sum(key.startswith(f"{trials} answers, laplace") for key in fits) == PEOPLE

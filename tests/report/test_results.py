@@ -13,9 +13,9 @@ from studies import answered, plain_study
 from hilbo.report import participants, results
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import aggregate_cohort
+from hilbo.study.cohort_results import analyse_cohort
 from hilbo.study.config import Study
-from hilbo.study.optima import population
-from hilbo.study.population_results import analyse_population
+from hilbo.study.optima import predict_people
 
 PAPER = Study.load("hilbo/data/paper.toml")
 SYSTEM_IDENTIFICATION = (5.70, 5.89, 0.203)
@@ -69,7 +69,7 @@ def test_what_is_not_finite_is_null():
 def written(request, tmp_path_factory):
     """Study, aggregate, content and folder of a small study in one, two and four dimensions."""
     study = plain_study(request.param)
-    population = analyse_population(study, answered(study))
+    population = analyse_cohort(study, answered(study))
     folder = tmp_path_factory.mktemp(f"d{request.param}")
     truth = np.full(request.param, 0.5) if request.param == 2 else None
     content = results.write_results(population, folder, truth=truth)
@@ -95,7 +95,7 @@ def test_the_map_is_the_population_s(written):
     assert dims == (["point"] if study.space.dim > 3 else names)
     first = data.isel(dict.fromkeys(dims, 0))
     at = study.space.to_unit(np.array([float(first[name]) for name in names]))
-    mean, variance = population(aggregate.posteriors, at[None])
+    mean, variance = predict_people(aggregate.posteriors, at[None])
     assert float(first["mean"]) == pytest.approx(float(mean[0]), abs=1e-12)
     assert float(first["variance"]) == pytest.approx(float(variance[0]), abs=1e-12)
     assert all(data[name].attrs["units"] == "mm" for name in names)

@@ -32,7 +32,7 @@ from hilbo.study.cohort import Cohort
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.map_summary import tolerance
 from hilbo.study.new_study import NewStudy, study_text
-from hilbo.study.optima import population
+from hilbo.study.optima import predict_people
 from hilbo.study.progress import Progress, _counts, _splits, _to_other_half
 from hilbo.study.tolerance_intervals import tolerance_ends
 
@@ -159,7 +159,7 @@ class Population(eqx.Module):
     posteriors: object
 
     def __call__(self, x):
-        return population(self.posteriors, x)
+        return predict_people(self.posteriors, x)
 
 
 @pytest.mark.deep

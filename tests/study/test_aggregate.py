@@ -18,7 +18,7 @@ from hilbo.session.ask_tell import physical_trials
 from hilbo.study.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
-from hilbo.study.optima import population
+from hilbo.study.optima import predict_people
 from hilbo.study.progress import follow
 from hilbo.study.trial_table import read_trials, write_trials
 
@@ -126,7 +126,7 @@ def test_a_batch_is_its_people(cohort):
         means.append(np.asarray(mean))
         variances.append(np.asarray(variance))
     expected = bcm.combine(jnp.asarray(np.stack(means)), jnp.asarray(np.stack(variances)), 1.0)
-    moments = population(posteriors, x)
+    moments = predict_people(posteriors, x)
     np.testing.assert_allclose(moments[0], expected[0], atol=1e-11)
     np.testing.assert_allclose(moments[1], expected[1], atol=1e-11)
 
@@ -142,7 +142,7 @@ def test_prefixes_and_subsets(cohort):
 def test_the_optimum_is_where_the_map_is_highest(cohort):
     aggregate = aggregate_cohort(STUDY, cohort)
     many = jnp.asarray(STUDY.space.candidates(8192, 9))
-    mean, _ = population(aggregate.posteriors, many)
+    mean, _ = predict_people(aggregate.posteriors, many)
     assert float(aggregate.optimum.mean) >= float(mean.max())
     assert bool(STUDY.space.feasible(aggregate.optimum.x))
     assert set(aggregate.alternatives) == {"average", "hierarchical", "pooled", "ep"}
@@ -165,7 +165,7 @@ def test_a_study_may_ask_for_another_inference(cohort, inference):
     others = fit_cohort(STUDY, cohort, inference="ep"), fit_cohort(STUDY, cohort)
     kinds = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(fits)] for fits in others]
     assert kinds[0] == kinds[1]  # so that one program serves both
-    here, by_ep, by_laplace = (np.asarray(population(fits, x)[0]) for fits in (posteriors, *others))
+    here, by_ep, by_laplace = (np.asarray(predict_people(fits, x)[0]) for fits in (posteriors, *others))
     assert np.max(np.abs(here - by_ep)) < 0.1 * np.max(np.abs(here - by_laplace))
 
 

@@ -15,10 +15,10 @@ from hilbo.population.pointwise import Sums
 from hilbo.search.candidates import search_points
 from hilbo.study import distributed
 from hilbo.study.aggregate import aggregate_cohort, fit_cohort
-from hilbo.study.batch import _one_block, block_size, jets, population_of, refit, sums
+from hilbo.study.batch import _one_block, block_size, jets, refit, streamed_cohort, sums
 from hilbo.study.batch_optimum import aggregate_population, optima_from, optimum_near
 from hilbo.study.cohort import cohort_of
-from hilbo.study.optima import population, population_optimum
+from hilbo.study.optima import population_optimum, predict_people
 
 
 @functools.cache
@@ -33,7 +33,7 @@ def candidates():
 
 @functools.cache
 def fitted(individuals=False):
-    return refit(population_of(STUDY, cohort(), distributed.alone()), candidates(), individuals)
+    return refit(streamed_cohort(STUDY, cohort(), distributed.alone()), candidates(), individuals)
 
 
 @functools.cache
@@ -50,7 +50,7 @@ def posteriors(inference="laplace"):
 def test_the_merged_map_is_that_of_the_posteriors_held_at_once():
     for rule in ("bcm", "average"):
         merged = fitted().sums.merge(1.3, PEOPLE, rule)
-        expected = population(posteriors(), jnp.asarray(candidates()), rule)
+        expected = predict_people(posteriors(), jnp.asarray(candidates()), rule)
         np.testing.assert_allclose(merged[0], expected[0], atol=1e-12)
         np.testing.assert_allclose(merged[1], expected[1], atol=1e-13)
     certificate = posteriors().certificate
@@ -63,7 +63,7 @@ def test_other_rules_are_sums_of_their_own(rule, share):
     streamed = dataclasses.replace(fitted().population, rule=rule, share=share)
     merged = sums(streamed, candidates()).merge(1.3, PEOPLE, rule, share)
     part = jnp.asarray(share) if rule == "hierarchical" else None
-    for a, b in zip(merged, population(posteriors(), jnp.asarray(candidates()), rule, part), strict=True):
+    for a, b in zip(merged, predict_people(posteriors(), jnp.asarray(candidates()), rule, part), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
@@ -99,7 +99,7 @@ def test_people_without_answers_add_exactly_nothing():
     whole, few, crew = cohort(), cohort().rows(np.arange(4)), distributed.alone()
     answering = np.asarray(whole.trials.mask) & (np.arange(PEOPLE) < 4)[:, None]
     padded = eqx.tree_at(lambda cohort: cohort.trials.mask, whole, jnp.asarray(answering))
-    one, other = (refit(population_of(STUDY, people, crew), candidates()) for people in (few, padded))
+    one, other = (refit(streamed_cohort(STUDY, people, crew), candidates()) for people in (few, padded))
     for of_few, of_padded in zip(one.sums, other.sums, strict=True):
         np.testing.assert_allclose(of_few, of_padded, rtol=1e-14, atol=0)
     assert not other.population.modes[4:].any()
@@ -109,7 +109,7 @@ def test_the_optimum_is_the_highest_point_of_the_map():
     many = np.asarray(search_points(STUDY.space, 5, 4096))
     for rule, optimum in best().items():
         there_and_elsewhere = jnp.asarray(np.concatenate([np.asarray(optimum.x)[None], many]))
-        mean, variance = map(np.asarray, population(posteriors(), there_and_elsewhere, rule))
+        mean, variance = map(np.asarray, predict_people(posteriors(), there_and_elsewhere, rule))
         assert float(optimum.mean) == pytest.approx(mean[0], abs=1e-12)
         assert float(optimum.sd) == pytest.approx(np.sqrt(variance[0]), abs=1e-12)
         assert float(optimum.mean) >= mean[1:].max()
@@ -156,8 +156,8 @@ def test_everything_is_as_for_a_small_cohort():
 @pytest.mark.parametrize("inference", ["ep", "exact"])
 def test_other_inferences_are_fitted_again(inference):
     study = population_study(inference)
-    refitted = refit(population_of(study, cohort(), distributed.alone()), candidates())
-    expected = population(posteriors(inference), jnp.asarray(candidates()))
+    refitted = refit(streamed_cohort(study, cohort(), distributed.alone()), candidates())
+    expected = predict_people(posteriors(inference), jnp.asarray(candidates()))
     np.testing.assert_allclose(refitted.sums.merge(1.3, PEOPLE)[0], expected[0], atol=1e-9)
     again = sums(refitted.population, candidates())
     np.testing.assert_allclose(again.weighted, refitted.sums.weighted, rtol=1e-9, atol=1e-9)

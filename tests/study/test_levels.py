@@ -22,8 +22,7 @@ from hilbo.simulation.presets import population_of
 from hilbo.simulation.simulate import people
 from hilbo.study import distributed
 from hilbo.study.aggregate import aggregate_cohort
-from hilbo.study.batch import population_of as population_of_many
-from hilbo.study.batch import refit
+from hilbo.study.batch import refit, streamed_cohort
 from hilbo.study.batch_optimum import optima_from
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
@@ -249,7 +248,7 @@ def test_a_streamed_optimum_tries_the_other_levels():
     points = np.asarray(study.space.candidates(300, 0))
     best = aggregate_cohort(study, cohort, alternatives=False).optimum
     elsewhere = points[points[:, 1] != float(best.x[1])]
-    fitted = refit(population_of_many(study, cohort, distributed.alone()), elsewhere, False)
+    fitted = refit(streamed_cohort(study, cohort, distributed.alone()), elsewhere, False)
     optimum = optima_from(fitted.population, elsewhere, fitted.sums)["bcm"]
     assert float(optimum.x[1]) == float(best.x[1])
     assert float(optimum.mean) == pytest.approx(float(best.mean), abs=1e-6)

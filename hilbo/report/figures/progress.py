@@ -21,8 +21,8 @@ from hilbo.report.figures.style import (
 )
 from hilbo.search.apart import nrmse
 from hilbo.study.cohort import Cohort
+from hilbo.study.cohort_results import CohortResults
 from hilbo.study.config import Study
-from hilbo.study.population_results import Population
 from hilbo.study.progress import Progress
 
 __all__ = ["individual_convergence", "population_convergence", "progress_figure"]
@@ -76,7 +76,7 @@ def population_convergence(progress: Progress, references: Mapping[str, Float[np
     return figure
 
 
-def progress_figure(study: Study, population: Population, truth: Float[np.ndarray, " d"] | None = None) -> Figure:
+def progress_figure(study: Study, population: CohortResults, truth: Float[np.ndarray, " d"] | None = None) -> Figure:
     """How the optima settle (left, NRMSE to the last trial's, or to the truth), and answers in the top category."""
     progress, cohort = population.progress, population.cohort
     trials = progress.counts

@@ -15,12 +15,12 @@ from hilbo.study.learnt_study import resolved
 from hilbo.study.optimum_location import location_sentences, optimum_sentence
 from hilbo.study.progress import Progress, follow
 
-__all__ = ["Population", "Say", "analyse_population"]
+__all__ = ["CohortResults", "Say", "analyse_cohort"]
 
 Say = Callable[[str], None]
 
 
-class Population(NamedTuple):
+class CohortResults(NamedTuple):
     """What the answers of one cohort say, and how it came about over the trials: what `hilbo aggregate` writes."""
 
     study: Study
@@ -40,13 +40,13 @@ class Population(NamedTuple):
         return self.following.result()
 
 
-def analyse_population(
+def analyse_cohort(
     study: Study,
     cohort: Cohort,
     seed: int = 0,
     say: Say = lambda text: None,
     tell: Callable[[list[str]], None] = lambda sentences: None,
-) -> Population:
+) -> CohortResults:
     """The aggregate of a cohort, and its optima after fewer trials, which a thread goes on to compute; everything is
     fitted once. `tell` is given the optimum in sentences as soon as it is known."""
     if study.rule in RECIPES:
@@ -63,4 +63,4 @@ def analyse_population(
     beside = ThreadPoolExecutor(1, "progress")
     following = beside.submit(follow, study, aggregate, seed)
     beside.shutdown(wait=False)
-    return Population(study, aggregate, following, seed)
+    return CohortResults(study, aggregate, following, seed)
