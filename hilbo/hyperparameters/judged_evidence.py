@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hilbo.hyperparameters.maximum_evidence import Learned, maximise_evidence, maximise_shared_evidence
+from hilbo.hyperparameters.maximum_evidence import MaximumEvidence, maximise_evidence, maximise_shared_evidence
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Trials, fit
 
@@ -26,9 +26,9 @@ TRUSTED = 0.05
 
 
 class Judged(eqx.Module):
-    """What was learnt, and how far Laplace's evidence was off; leading axes as of `Learned`."""
+    """What was learnt, and how far Laplace's evidence was off; leading axes as of `MaximumEvidence`."""
 
-    learned: Learned
+    maximum: MaximumEvidence
     error: Float[Array, "*M"]
     """Nats an answer, Laplace's less the other's, where the search by Laplace's evidence ended; 0 of other searches."""
     again: Bool[Array, "*M"]
@@ -47,15 +47,15 @@ def maximise_judged(
     """Hyperparameters of stacked trials (M, n), the same for all, or (not `shared`) everybody's own; by `inference`'s
     evidence, Laplace's judged. Not under `jit`: what is learnt again depends on what was learnt."""
     settings = (tuple(learn), shared, weak_priors)
-    learned = _learnt(gp, trials, *settings, inference)
+    maximum = _learnt(gp, trials, *settings, inference)
     if inference != "laplace":
-        return Judged(learned, jnp.zeros_like(learned.log_evidence), jnp.zeros(learned.log_evidence.shape, bool))
-    error = _error(learned, trials, shared)
+        return Judged(maximum, jnp.zeros_like(maximum.log_evidence), jnp.zeros(maximum.log_evidence.shape, bool))
+    error = _error(maximum, trials, shared)
     again = ~(jnp.abs(error) <= TRUSTED)
     if bool(again.any()):
         other = _learnt(gp, trials, *settings, "ep")
-        learned = jax.tree.map(lambda a, b: jnp.where(_like(again, a), a, b), other, learned)
-    return Judged(learned, error, again)
+        maximum = jax.tree.map(lambda a, b: jnp.where(_like(again, a), a, b), other, maximum)
+    return Judged(maximum, error, again)
 
 
 def judged_sentences(judged: Judged) -> list[str]:
@@ -77,14 +77,14 @@ def _like(flags: Bool[Array, "*M"], leaf: Array) -> Bool[Array, "..."]:
 @program
 def _learnt(
     gp: OrdinalGP, trials: Trials, learn: tuple[str, ...], shared: bool, weak_priors: bool, inference: str
-) -> Learned:
+) -> MaximumEvidence:
     if shared:
         return maximise_shared_evidence(gp, trials, learn, weak_priors=weak_priors, inference=inference)
     return jax.lax.map(lambda t: maximise_evidence(gp, t, learn, weak_priors=weak_priors, inference=inference), trials)
 
 
 @program
-def _error(learned: Learned, trials: Trials, shared: bool) -> Float[Array, "*M"]:
+def _error(maximum: MaximumEvidence, trials: Trials, shared: bool) -> Float[Array, "*M"]:
     """Laplace's log evidence less that of expectation propagation, an answer: of all, or (not `shared`) of each."""
 
     def by_ep(gp, trials):
@@ -92,7 +92,7 @@ def _error(learned: Learned, trials: Trials, shared: bool) -> Float[Array, "*M"]
 
     counts = jnp.sum(trials.mask, axis=1, dtype=trials.x.dtype)
     if shared:
-        together = jnp.sum(jax.lax.map(lambda t: by_ep(learned.gp, t), trials))
-        return (learned.log_evidence - together) / jnp.sum(counts)
-    errors = learned.log_evidence - jax.lax.map(lambda pair: by_ep(*pair), (learned.gp, trials))
+        together = jnp.sum(jax.lax.map(lambda t: by_ep(maximum.gp, t), trials))
+        return (maximum.log_evidence - together) / jnp.sum(counts)
+    errors = maximum.log_evidence - jax.lax.map(lambda pair: by_ep(*pair), (maximum.gp, trials))
     return jnp.where(counts > 0, errors / jnp.where(counts > 0, counts, 1.0), 0.0)  # no answers, nothing to err in

@@ -36,14 +36,14 @@ from hilbo.numerics.polytope import Polytope, projector, walls_of_cube
 from hilbo.numerics.shown import known, shown
 from hilbo.ordinal_gp import OrdinalGP, Trials
 
-__all__ = ["Learned", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
+__all__ = ["MaximumEvidence", "maximise_evidence", "maximise_shared_evidence", "optimum_sensitivity"]
 
 _RUNAWAY = 6.9  # a factor of 1000: that far from where the search began there is no maximum to speak of
 _AT_A_WALL = 1e-6  # of a coordinate's range
 _FLAT = 1e-3  # curvature of the log evidence: less leaves a hyperparameter open by a factor exp(30) either way
 
 
-class Learned(eqx.Module):
+class MaximumEvidence(eqx.Module):
     """A model with learnt hyperparameters, and how the search for it ended; leading axes for several people."""
 
     gp: OrdinalGP
@@ -63,7 +63,7 @@ class Learned(eqx.Module):
         ended = "a hyperparameter ran away" if np.any(self.runaway) else "converged"
         ended = ended if np.all(self.converged) else "NOT converged"
         learnt, evidence = ", ".join(self.learn), shown(self.log_evidence)
-        return f"Learned({self.gp!r}; learnt {learnt}; log evidence {evidence}, {ended})"
+        return f"MaximumEvidence({self.gp!r}; learnt {learnt}; log evidence {evidence}, {ended})"
 
 
 def maximise_evidence(
@@ -75,7 +75,7 @@ def maximise_evidence(
     starts: int = 4,
     max_steps: int = 100,
     inference: str = "laplace",
-) -> Learned:
+) -> MaximumEvidence:
     """The hyperparameters under which one person's answers are most probable; under `jax.vmap`, each person's own.
 
     **Arguments:**
@@ -102,7 +102,7 @@ def maximise_shared_evidence(
     starts: int = 4,
     max_steps: int = 100,
     inference: str = "laplace",
-) -> Learned:
+) -> MaximumEvidence:
     """One set of hyperparameters for all participants (`trials` stacked): maximises the sum of their log evidences.
 
     Arguments as those of [`maximise_evidence`][], and it raises the same errors.
@@ -118,7 +118,7 @@ def _maximise(
     starts: int,
     max_steps: int,
     inference: str,
-) -> Learned:
+) -> MaximumEvidence:
     learn = _checked(learn)
     if inference == "exact":
         raise InputError(
@@ -139,7 +139,7 @@ class _Options(NamedTuple):
     inference: str
 
 
-def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> Learned:
+def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> MaximumEvidence:
     """The best end of searches from several starts; `trials` are stacked."""
     expand, nothing = evidence_cost(gp, trials, options.learn, options.weak_priors, options.inference)
 
@@ -180,7 +180,7 @@ def _search(gp: OrdinalGP, trials: Trials, options: _Options) -> Learned:
     runaway = end.flat
     for name in sorted(initial.keys() - {"first"}):  # in one order, so that every process makes the same program
         runaway |= jnp.any(jnp.abs(end.coordinates[name] - initial[name]) > _RUNAWAY)
-    return Learned(model_at(end.coordinates, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
+    return MaximumEvidence(model_at(end.coordinates, gp), end.log_evidence, end.steps, end.done, runaway, options.learn)
 
 
 class _End(NamedTuple):

@@ -72,8 +72,8 @@ def _figures(study, cohort, check):
 
 def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int) -> dict[str, Any]:
     """The content of result.json of `hilbo robustness`: both optima, their distance, what was learnt, derivatives."""
-    learned, people = check.learned, len(cohort.names)
-    stacked = [np.broadcast_to(np.asarray(flags), (people,)) for flags in (learned.converged, learned.runaway)]
+    maximum, people = check.maximum, len(cohort.names)
+    stacked = [np.broadcast_to(np.asarray(flags), (people,)) for flags in (maximum.converged, maximum.runaway)]
     rows = [
         {
             "participant": name,
@@ -84,7 +84,7 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
         }
         for j, name in enumerate(cohort.names)
     ]
-    model = learned.gp
+    model = maximum.gp
     return {
         "warnings": _warnings(check, stacked),
         "fixed": optimum_content(study, check.fixed),
@@ -95,7 +95,7 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
         "rule": check.rule,
         "participants": rows,
         "learned": {
-            "parameters": list(learned.learn),
+            "parameters": list(maximum.learn),
             "laplace_error": np.asarray(check.judged.error).tolist(),
             "learnt_again": np.asarray(check.judged.again).tolist(),
             "shared": check.shared,
@@ -114,7 +114,7 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
 def _warnings(check, stacked):
     """What the learnt hyperparameters themselves say against the comparison, in sentences."""
     converged, runaway = stacked
-    kernel = check.learned.gp.kernel
+    kernel = check.maximum.gp.kernel
     of_numbers = np.array(kernel.levels) == 0 if kernel.levels else ...
     theta = float(np.median(np.asarray(kernel.theta)[of_numbers]))
     alike = float(np.exp(-theta * _TENTH**2))

@@ -172,7 +172,7 @@ def _tables(analysis: Analysis, material: Material, content, people) -> dict[str
 
 def _optimised(analysis: Analysis) -> dict[str, Any]:
     """The hyperparameters of maximum evidence, and how far the optimum moves by them."""
-    gp = analysis.learned.gp
+    gp = analysis.maximum.gp
     return {
         "theta": np.asarray(gp.kernel.theta).tolist(),
         "noise": float(gp.likelihood.noise),

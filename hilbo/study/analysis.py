@@ -16,7 +16,7 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maximise_judged
-from hilbo.hyperparameters.maximum_evidence import Learned
+from hilbo.hyperparameters.maximum_evidence import MaximumEvidence
 from hilbo.population.maps import RuleMap, learnt_map, point_rule
 from hilbo.population.recipes import RECIPES, RECOMMENDED
 from hilbo.search.apart import nrmse
@@ -53,7 +53,7 @@ class Analysis(NamedTuple):
     population: CohortResults
     fixed: Reading
     optimised: Reading
-    learned: Learned
+    maximum: MaximumEvidence
     sets: Sets | None
     people: pd.DataFrame
     """Everybody's measures, those left out too."""
@@ -89,21 +89,21 @@ def analyse(study: Study, everybody: Cohort, seed: int = 0, say: Say = lambda te
     population = _with_learnt(analyse_cohort(study, cohort, seed, say), seed, say)
     study, aggregate = population.study, population.aggregate
     say("hyperparameters by maximum evidence")
-    judged, learned_study, optimised = _optimised(study, cohort, seed)
-    learned = judged.learned
+    judged, optimised_study, optimised = _optimised(study, cohort, seed)
+    maximum = judged.maximum
     say("reading the maps")
     sets, sentences = _best_mid_worst(study, aggregate, seed)
     best = aggregate.optimum
     location = location_sentences(study, best.x, best.sd, aggregate.asked_variance)
     limits = (*location, *learnt_sentences(study), *limits_of(study, cohort), *sentences)
     limits += (*_aggregated_otherwise(aggregate.map), *judged_sentences(judged))
-    if bool(learned.runaway) or not bool(learned.converged):
+    if bool(maximum.runaway) or not bool(maximum.converged):
         limits += ("The evidence has no maximum in reach: the optimised hyperparameters rest on their weak priors.",)
     return Analysis(
         population,
         _reading(study, aggregate, seed),
-        _reading(learned_study, optimised, seed),
-        learned,
+        _reading(optimised_study, optimised, seed),
+        maximum,
         sets,
         people,
         left_out,
@@ -163,11 +163,11 @@ def _with_learnt(population: CohortResults, seed: int, say: Say) -> CohortResult
 def _optimised(study: Study, cohort: Cohort, seed: int) -> tuple[Judged, Study, Aggregate]:
     """The hyperparameters of maximum evidence, the study with them, and its aggregate."""
     judged = maximise_judged(study.gp, cohort.trials, _LEARN, inference=study.inference)
-    learned = judged.learned
+    maximum = judged.maximum
     answered = int((cohort.counts() > 0).sum())
     rule = study.rule if study.rule not in RECIPES else "hierarchical" if answered > 1 else "bcm"
-    learned_study = dataclasses.replace(study, gp=learned.gp, rule=rule, learnt=None)
-    return judged, learned_study, aggregate_cohort(learned_study, cohort, seed, alternatives=False)
+    optimised_study = dataclasses.replace(study, gp=maximum.gp, rule=rule, learnt=None)
+    return judged, optimised_study, aggregate_cohort(optimised_study, cohort, seed, alternatives=False)
 
 
 def _reading(study: Study, aggregate: Any, seed: int) -> Reading:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from hilbo.errors import InputError
 from hilbo.hyperparameters.judged_evidence import Judged, maximise_judged
-from hilbo.hyperparameters.maximum_evidence import Learned, optimum_sensitivity
+from hilbo.hyperparameters.maximum_evidence import MaximumEvidence, optimum_sensitivity
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population.maps import point_rule, share_of
@@ -50,7 +50,7 @@ class Robustness(eqx.Module):
     optimised_individuals: Optimum
     posteriors: Posterior
     """Of all participants, under the fixed hyperparameters,"""
-    posteriors_learnt: Posterior
+    optimised_posteriors: Posterior
     """and under the learnt ones."""
     nrmse: Float[Array, ""]
     """Between the population optima."""
@@ -66,13 +66,13 @@ class Robustness(eqx.Module):
     """Of the hierarchical rule, under the fixed and under the learnt hyperparameters."""
 
     @property
-    def learned(self) -> Learned:
+    def maximum(self) -> MaximumEvidence:
         """The hyperparameters."""
-        return self.judged.learned
+        return self.judged.maximum
 
     def maps(self) -> tuple[partial, partial]:
         """The population maps under the fixed and under the learnt hyperparameters: functions of points (m, d)."""
-        both = zip((self.posteriors, self.posteriors_learnt), self.shares, strict=True)
+        both = zip((self.posteriors, self.optimised_posteriors), self.shares, strict=True)
         fixed, learnt = (partial(predict_people, posteriors, rule=self.rule, share=share) for posteriors, share in both)
         return fixed, learnt
 
@@ -99,7 +99,7 @@ def robustness(
     """Repeat the paper's check for a cohort.
 
     `shared`: one set of hyperparameters for all, else each participant's own. `weak_priors` keep the learnt values
-    finite where 25 ordinal answers do not (`learned.runaway` says where even they ran away).
+    finite where 25 ordinal answers do not (`maximum.runaway` says where even they ran away).
     """
     _check(study, learn)
     candidates = search_points(study.space, seed)
@@ -107,15 +107,15 @@ def robustness(
     judged = maximise_judged(
         study.gp, cohort.trials, learn, shared=shared, weak_priors=weak_priors, inference=study.inference
     )
-    study_learnt, again = _refitted(study, cohort, judged.learned.gp, shared)
+    optimised_study, again = _refitted(study, cohort, judged.maximum.gp, shared)
     rule, share = point_rule(study.rule, _share(study, cohort))
-    shares = share, None if share is None else _share(study_learnt, cohort)
+    shares = share, None if share is None else _share(optimised_study, cohort)
     fixed, optimised = (
         population_optimum(s, p, candidates, rule, share)
-        for s, p, share in zip((study, study_learnt), (posteriors, again), shares, strict=True)
+        for s, p, share in zip((study, optimised_study), (posteriors, again), shares, strict=True)
     )
     levels = study.gp.kernel.levels
-    before, after = (individual_optima(s, p, candidates) for s, p in ((study, posteriors), (study_learnt, again)))
+    before, after = (individual_optima(s, p, candidates) for s, p in ((study, posteriors), (optimised_study, again)))
     return Robustness(
         judged=judged,
         fixed=fixed,
@@ -123,7 +123,7 @@ def robustness(
         fixed_individuals=before,
         optimised_individuals=after,
         posteriors=posteriors,
-        posteriors_learnt=again,
+        optimised_posteriors=again,
         nrmse=nrmse(optimised.x, fixed.x, levels),
         individual_nrmse=jnp.sqrt(jnp.mean(differences(levels, after.x, before.x) ** 2, axis=1)),
         resampled=_resampled(study, posteriors, candidates, fixed.x, rule, share, seed),

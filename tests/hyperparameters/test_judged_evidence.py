@@ -7,7 +7,7 @@ import pytest
 
 from hilbo.hyperparameters import judged_evidence
 from hilbo.hyperparameters.judged_evidence import Judged, judged_sentences, maximise_judged
-from hilbo.hyperparameters.maximum_evidence import Learned
+from hilbo.hyperparameters.maximum_evidence import MaximumEvidence
 from hilbo.ordinal_gp import RBF, OrdinalGP, OrdinalProbit, Trials, fit
 
 PEOPLE, ANSWERS = 2, 12
@@ -36,7 +36,7 @@ def test_the_error_is_that_of_the_exact_evidence(noise):
     laplace = sum(
         float(fit(model(noise), jax.tree.map(lambda leaf, j=j: leaf[j], trials())).log_evidence) for j in range(PEOPLE)
     )
-    there = Learned(model(noise), jnp.asarray(laplace), jnp.asarray(1), *2 * [jnp.asarray(True)], ("noise",))
+    there = MaximumEvidence(model(noise), jnp.asarray(laplace), jnp.asarray(1), *2 * [jnp.asarray(True)], ("noise",))
     said = float(judged_evidence._error(there, trials(), True)) * PEOPLE * ANSWERS
     assert said == pytest.approx(laplace - exact, abs=0.1, rel=0.1)
     assert (said > 1.0) == (noise < 0.1)
@@ -49,7 +49,7 @@ def test_what_laplace_misjudges_is_learnt_again_and_said(monkeypatch):
     assert not bool(held.again) and judged_sentences(held) == []
     people = [jax.tree.map(lambda leaf, j=j: leaf[j], trials()) for j in range(PEOPLE)]
     laplace, ep = (
-        sum(float(fit(held.learned.gp, one, inference=name).log_evidence) for one in people)
+        sum(float(fit(held.maximum.gp, one, inference=name).log_evidence) for one in people)
         for name in ("laplace", "ep")
     )
     assert float(held.error) * PEOPLE * ANSWERS == pytest.approx(laplace - ep, abs=1e-6)
@@ -57,13 +57,13 @@ def test_what_laplace_misjudges_is_learnt_again_and_said(monkeypatch):
     again = maximise_judged(model(0.7), trials(), ("noise",))
     by_ep = maximise_judged(model(0.7), trials(), ("noise",), inference="ep")
     assert bool(again.again) and not bool(by_ep.again)
-    np.testing.assert_array_equal(again.learned.gp.likelihood.noise, by_ep.learned.gp.likelihood.noise)
+    np.testing.assert_array_equal(again.maximum.gp.likelihood.noise, by_ep.maximum.gp.likelihood.noise)
     (sentence,) = judged_sentences(again)
     assert "they were learnt by expectation propagation instead" in sentence
 
 
 def test_only_those_who_were_misjudged_are_named():
     error, again = jnp.array([0.01, -0.2, 0.09]), jnp.array([False, True, True])
-    everybody = Learned(model(0.7), error, error.astype(int), again, again, ("noise",))
+    everybody = MaximumEvidence(model(0.7), error, error.astype(int), again, again, ("noise",))
     (sentence,) = judged_sentences(Judged(everybody, error, again))
     assert sentence.startswith("Laplace's evidence of 2 people was off by 0.2 nats an answer")

@@ -31,21 +31,21 @@ def problem(make=noisy):
 
 
 @jax.jit
-def learned_by_laplace(gp, trials):
+def maximum_by_laplace(gp, trials):
     """Compiled once for several tests."""
     return hyper.maximise_evidence(gp, trials, ("theta", "noise"))
 
 
 def test_the_maximum_is_scipys():
     d, gp, trials = problem(three)
-    learned = learned_by_laplace(gp, trials)
+    maximum = maximum_by_laplace(gp, trials)
 
     def cost(log):
         return -numpy_laplace(d.x, d.q, np.exp(log[0]), d.variance, d.thresholds, np.exp(log[1]), d.x)["log_evidence"]
 
     best = minimize(cost, np.log([float(gp.kernel.theta), d.noise]), method="Nelder-Mead", options={"fatol": 1e-9})
-    assert bool(learned.converged) and not bool(learned.runaway)
-    assert float(learned.log_evidence) == pytest.approx(-best.fun, abs=1e-4)
+    assert bool(maximum.converged) and not bool(maximum.runaway)
+    assert float(maximum.log_evidence) == pytest.approx(-best.fun, abs=1e-4)
 
 
 def test_coordinates_keep_thresholds_ordered_and_the_rest():
@@ -60,10 +60,10 @@ def test_coordinates_keep_thresholds_ordered_and_the_rest():
 @pytest.mark.deep
 def test_learnt_thresholds_stay_ordered_and_the_rest_stays():
     _, gp, trials = problem(separated)
-    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("thresholds",), weak_priors=True, starts=1))(trials)
-    assert bool(jnp.all(jnp.diff(learned.gp.likelihood.thresholds) > 0))
-    assert learned.gp.kernel.theta == gp.kernel.theta
-    assert float(learned.log_evidence) >= float(fit(gp, trials).log_evidence) - 1e-9
+    maximum = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("thresholds",), weak_priors=True, starts=1))(trials)
+    assert bool(jnp.all(jnp.diff(maximum.gp.likelihood.thresholds) > 0))
+    assert maximum.gp.kernel.theta == gp.kernel.theta
+    assert float(maximum.log_evidence) >= float(fit(gp, trials).log_evidence) - 1e-9
 
 
 def test_the_scale_freedom_is_real_and_refused():
@@ -78,15 +78,15 @@ def test_the_scale_freedom_is_real_and_refused():
     del d
 
 
-def assert_unmoved(learned, gp):
-    assert float(learned.log_evidence) == 0.0 and bool(learned.runaway)
-    assert learned.gp.kernel.theta == pytest.approx(float(gp.kernel.theta), rel=1e-12)
-    assert learned.gp.likelihood.noise == pytest.approx(float(gp.likelihood.noise), rel=1e-12)
+def assert_unmoved(maximum, gp):
+    assert float(maximum.log_evidence) == 0.0 and bool(maximum.runaway)
+    assert maximum.gp.kernel.theta == pytest.approx(float(gp.kernel.theta), rel=1e-12)
+    assert maximum.gp.likelihood.noise == pytest.approx(float(gp.likelihood.noise), rel=1e-12)
 
 
 def test_without_answers_the_model_stays():
     _, gp, trials = problem(three)
-    assert_unmoved(learned_by_laplace(gp, trials.first(0)), gp)
+    assert_unmoved(maximum_by_laplace(gp, trials.first(0)), gp)
 
 
 @pytest.mark.deep
@@ -122,7 +122,7 @@ def test_robustness_compares_optima(checked):
     assert float(result.nrmse) == pytest.approx(float(np.sqrt(np.mean((result.fixed.x - result.optimised.x) ** 2))))
     assert result.individual_nrmse.shape == (3,)
     assert bool(result.flagged) == (float(result.nrmse) >= 0.03)
-    assert result.learned.learn == ("theta", "noise", "thresholds")
+    assert result.maximum.learn == ("theta", "noise", "thresholds")
 
 
 @pytest.mark.deep
@@ -157,13 +157,13 @@ def test_the_optimum_moves_as_its_derivative_says(checked):
 @pytest.mark.deep
 def test_evidence_may_be_that_of_expectation_propagation():
     _, gp, trials = problem()
-    learned = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("noise",), starts=1, inference="ep"))(trials)
-    assert bool(learned.converged)
+    maximum = jax.jit(lambda t: hyper.maximise_evidence(gp, t, ("noise",), starts=1, inference="ep"))(trials)
+    assert bool(maximum.converged)
     nearby = [
-        eqx.tree_at(lambda g: g.likelihood.noise, learned.gp, learned.gp.likelihood.noise * f) for f in (0.9, 1.1)
+        eqx.tree_at(lambda g: g.likelihood.noise, maximum.gp, maximum.gp.likelihood.noise * f) for f in (0.9, 1.1)
     ]
     for other in nearby:
-        assert float(fit(other, trials, inference="ep").log_evidence) < float(learned.log_evidence)
+        assert float(fit(other, trials, inference="ep").log_evidence) < float(maximum.log_evidence)
     with pytest.raises(InputError, match="has no derivatives"):
         hyper.maximise_evidence(gp, trials, inference="exact")
 
@@ -172,10 +172,10 @@ def test_a_hyperparameter_without_influence_is_said_to_run_away():
     """Where all was asked at one point theta says nothing, while the noise has its best value."""
     _, gp, _ = problem(three)
     q = np.array([0, 1, 1, 1, 2, 1, 0, 2])
-    learned = learned_by_laplace(gp, Trials.from_arrays(np.full((8, 3), 0.4), q, 25))
-    assert bool(learned.converged)
-    assert bool(learned.runaway)
-    assert 0.1 < float(learned.gp.likelihood.noise) < 10.0
+    maximum = maximum_by_laplace(gp, Trials.from_arrays(np.full((8, 3), 0.4), q, 25))
+    assert bool(maximum.converged)
+    assert bool(maximum.runaway)
+    assert 0.1 < float(maximum.gp.likelihood.noise) < 10.0
 
 
 @pytest.mark.deep  # another model to compile the search for
@@ -184,9 +184,9 @@ def test_one_threshold_alone_is_learnt():
     gp = OrdinalGP(RBF(4.0, 1.0), OrdinalProbit((0.0,), 0.5))
     rng = np.random.default_rng(0)
     trials = Trials.from_arrays(rng.uniform(size=(20, 2)), (rng.uniform(size=20) < 0.8).astype(int), 25)
-    learned = hyper.maximise_evidence(gp, trials, ("thresholds",), weak_priors=True, starts=1)
-    assert bool(learned.converged)
-    assert -2.0 < float(learned.gp.likelihood.thresholds[0]) < -0.1
+    maximum = hyper.maximise_evidence(gp, trials, ("thresholds",), weak_priors=True, starts=1)
+    assert bool(maximum.converged)
+    assert -2.0 < float(maximum.gp.likelihood.thresholds[0]) < -0.1
 
 
 WALL = Polytope(np.array([[0.6, 0.8, 0.0]]), np.array([1.0]))
