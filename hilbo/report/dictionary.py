@@ -92,7 +92,7 @@ for _name, _words, _unit in (
     for _end, _side in (("low", "lower quartile"), ("median", "median"), ("high", "upper quartile")):
         _CONVERGENCE[f"{_name}_{_end}"] = (_unit, f"{_words}, {_side} over people")
 _TOLERANCE = {
-    "hyperparameters": ("", "fixed: the study's; optimised: by maximum evidence"),
+    "hyperparameters": ("", "fixed: the study's, or what its rule learnt; optimised: by maximum evidence"),
     "parameter": ("", "name of the parameter, whose unit the ends have"),
     "low": ("parameter's", "lower end of the tolerance interval"),
     "high": ("parameter's", "upper end"),

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 
+from hilbo.population.recipes import RECIPES
 from hilbo.study.analysis import Analysis
 from hilbo.study.effects import effects_of
 from hilbo.study.folder import Material
@@ -27,7 +28,8 @@ def study_figures(
     chosen, cohort, aggregate, progress = analysis.study, analysis.cohort, analysis.aggregate, analysis.progress
     best, prior = np.asarray(aggregate.optimum.x), aggregate.map.map_prior
     references = {} if material.reference is None else {material.reference_name: material.reference}
-    regions = {"fixed hyperparameters": analysis.fixed, "optimised hyperparameters": analysis.optimised}
+    own = f"learnt by {chosen.rule}" if chosen.rule in RECIPES else "fixed hyperparameters"
+    regions = {own: analysis.fixed, "optimised hyperparameters": analysis.optimised}
     map_, hatched = study.sets_on_map(chosen, aggregate.surface, analysis.sets, best, cohort, prior)
     figures = {
         "progression": study.posterior_progress(chosen, cohort, progress, study.typical_person(analysis)),
