@@ -204,8 +204,8 @@ def page(rows):
     first, last = (sum(row[0] == end(row) for row in ranks) for end in (min, max))
     lines += [
         "",
-        f"In {first} of {len(ranks)} rows hilbo's median is the lowest of the three, in {last} the highest; sessions are"
-        " few.",
+        f"In {first} of {len(ranks)} rows hilbo's median is the lowest of three, in {last} the highest; there are"
+        " few sessions.",
         "",
         "Within the highest category all answers are alike: once it is found a session stays there, and no answer",
         "tells a good rendering from a better one. Even points go on to show the slopes around it. Where nearly all",
