@@ -105,10 +105,26 @@ def _resumed(wanted, study) -> tuple[EventLog, LiveChooser]:
             raise InputError(
                 f"{log.path}: was begun with a participant; leave --dry-run out, or choose another --session."
             )
+        _check_asked_for(wanted, header, log)
         return log, LiveChooser(log.state, _warm_starts(wanted, study, log.state.header))
     except BaseException:
         log.close()
         raise
+
+
+def _check_asked_for(wanted, header: Header, log: EventLog) -> None:
+    """Refuse a log that is of somebody else, or was begun with another material or plan, than the command says."""
+    begun = log.state.header
+    if (begun.participant, begun.session) != (header.participant, header.session):
+        raise InputError(
+            f"{log.path}: is session {begun.session} of participant {begun.participant}; choose another --session."
+        )
+    materials = [list(dict.fromkeys(block.material for block in one.blocks)) for one in (begun, header)]
+    if wanted.material is not None and materials[0] != materials[1]:
+        with_ = ", ".join(name or "none" for name in materials[0])
+        raise InputError(f"{log.path}: was begun with the material {with_}; choose another --session, or --material.")
+    if wanted.plan is not None and begun.plan != header.plan:
+        raise InputError(f"{log.path}: was begun by another plan, or without one; give that one, or another --session.")
 
 
 def _header(wanted, study) -> Header:

@@ -89,7 +89,8 @@ def read_material(
         for kind in ("relaxation", "creep", "modulus", "compliance")
         if (kinds == kind).any() and only in (None, kind)
     ]
-    lengths = {units[q] in _OF_LENGTH for q in columns if q in ("modulus", "compliance")}
+    fitted = {test.kind for test in tests}
+    lengths = {units[q] in _OF_LENGTH for q in columns if q in fitted & {"modulus", "compliance"}}
     if len(lengths) > 1:
         raise InputError(
             f"{place(source)}has a modulus and a compliance that belong to different units; use one system."
@@ -164,8 +165,10 @@ def _test(kind, values, repeats, source, start, longest, notes):
     times, tables = _shortened(times, tables, longest)
     time, resampled = _common(times)
     if resampled:
+        last = max(t[-1] for t in times)
+        cut = f", up to {time[-1]:g} s, where the shortest ends (the longest: {last:g} s)" if time[-1] < last else ""
         notes.append(
-            f"The repeats of the {kind} test have different times; they were interpolated to those of the first."
+            f"The repeats of the {kind} test have different times; they were interpolated to those of the first{cut}."
         )
     columns = [output] + ([put] if put else [])
     stacked = {c: np.stack([np.interp(time, t, p[c]) for t, p in zip(times, tables, strict=True)]) for c in columns}

@@ -72,7 +72,7 @@ def validate(
     """The statistics of one material's comparisons. Raises `InputError` for a bad table."""
     chosen = of_material(check_validation(table, responses), material)
     tables = paper_tables(chosen, sets, responses=responses)
-    rows = aggregate_comparisons(chosen, set_sources(chosen, sets)[0])
+    rows = aggregate_comparisons(chosen, *set_sources(chosen, sets))
     decided = rows[rows["preferred"] != TIE]
     won = (decided["preferred"] != "individual").to_numpy()
     overall = rate(won, decided[["participant", "set"]]) if len(won) else None

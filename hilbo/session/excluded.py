@@ -21,6 +21,7 @@ APART = 0.05
 """Least distance in the unit cube from a rendering in which the device stopped twice."""
 _ROOM, _FAR = 8, 9.0  # so many excluded points at least, those that are none far from the unit cube
 _SPREAD = 256  # candidates
+_SAME = 1e-9  # in the unit cube: one rendering
 
 
 def is_near(study: Study, point: Float[np.ndarray, " d"], excluded: Float[np.ndarray, "k d"]) -> bool:
@@ -34,11 +35,20 @@ def is_near(study: Study, point: Float[np.ndarray, " d"], excluded: Float[np.nda
 def spread_point(
     study: Study, excluded: Float[np.ndarray, "k d"], others: Float[np.ndarray, "m d"], seed: int
 ) -> Float[np.ndarray, " d"]:
-    """A space-filling point in place of an excluded one: the candidate farthest from all points, physical units."""
-    candidates = study.space.candidates(_SPREAD, seed)
-    taken = _to_unit(study, np.concatenate([others, excluded]))
-    distance = np.linalg.norm(differences(study.gp.kernel.levels, candidates[:, None], taken[None]), axis=2)
-    return np.asarray(study.space.to_physical(candidates[int(distance.min(axis=1).argmax())]))
+    """A space-filling point in place of an excluded one, in physical units: of the candidates that are `APART` from all
+    excluded ones the farthest from all points; where every value has been asked, one that was asked least often."""
+    candidates, levels = np.asarray(study.space.candidates(_SPREAD, seed)), study.gp.kernel.levels
+
+    def distances(points: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "c k"]:
+        return np.linalg.norm(differences(levels, candidates[:, None], _to_unit(study, points)[None]), axis=2)
+
+    allowed = np.all(distances(excluded) >= APART, axis=1)
+    if allowed.any():
+        candidates = candidates[allowed]
+    away = distances(np.concatenate([others, excluded]))
+    asked = np.sum(away < _SAME, axis=1)
+    farthest = np.lexsort((asked, -away.min(axis=1)))[0]
+    return np.asarray(study.space.to_physical(candidates[int(farthest)]))
 
 
 def point_kept_apart(

@@ -9,6 +9,7 @@ space-filling point without an answer that counts comes before all others. With 
 """
 
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -29,6 +30,9 @@ from hilbo.study.config import Study
 
 __all__ = ["Answers", "LiveChooser", "warm_start_sources"]
 
+Places = tuple[tuple[float, ...], ...]
+"""Renderings in physical units."""
+
 _KEPT = 64  # posteriors, the newest: those of the present, of what may follow, and of what undo leads back to
 
 
@@ -42,7 +46,7 @@ class Answers(NamedTuple):
     block: int
     points: tuple[tuple[float, ...], ...] = ()
     categories: tuple[int, ...] = ()
-    proposed: tuple[tuple[float, ...], ...] = ()
+    proposed: Places = ()
 
     @classmethod
     def of(cls, state: LiveSession, block: int) -> "Answers":
@@ -194,8 +198,8 @@ class LiveChooser:
         excluded = _rows(situation.excluded, study)
         if warm is not None:
             return Choice(apart.point_from_map(study, warm, fitted.posterior, excluded), "map")
-        initial, shown = session.step.initial, {*answers.proposed, *situation.excluded}
-        missing = [point for point in initial if tuple(point.tolist()) not in shown]
+        initial = session.step.initial
+        missing = _missing(initial, answers.proposed, situation.excluded)
         if missing:  # in their order; one whose answer was voided comes again
             return Choice(missing[0], "latin hypercube")
         if len(answers.points) < len(initial):
@@ -204,6 +208,20 @@ class LiveChooser:
         if apart.is_near(study, fitted.point, excluded):
             return Choice(apart.point_kept_apart(study, session.plan, fitted.posterior, excluded), "ucb, apart")
         return Choice(fitted.point, study.selection.acquisition)
+
+
+def _missing(initial: Float[np.ndarray, "k d"], proposed: Places, excluded: Places) -> list[Float[np.ndarray, " d"]]:
+    """Points of the initial design that no answer stands for yet; of levels and whole numbers it may hold one twice."""
+    answered, missing = Counter(proposed), []
+    for point in initial:
+        place = tuple(point.tolist())
+        if place in excluded:
+            continue
+        if answered[place]:
+            answered[place] -= 1
+        else:
+            missing.append(point)
+    return missing
 
 
 def warm_start_sources(warm: Mapping[str | None, WarmStart]) -> str | None:

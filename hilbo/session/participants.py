@@ -34,6 +34,9 @@ def read_people(path: str | os.PathLike) -> People:
         raise InputError(f"{path}: cannot be read ({error.strerror}); check the path.") from error
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: is no table that can be read ({error}); save it as CSV in UTF-8.") from error
+    twice = next((name for name in columns if columns.count(name) > 1), None)
+    if twice is not None:
+        raise InputError(f'{path}:1: column "{twice}" stands there twice; give each column a name of its own.')
     missing = [name for name in _NEEDED if name not in columns]
     if missing:
         raise InputError(

@@ -8,6 +8,7 @@ Ties in IV are modelled (`logits.tied_preferences`): 0 is still "neither is pref
 """
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import equinox as eqx
 import numpy as np
@@ -62,7 +63,7 @@ def paper_tables(
     makers = {
         "II": lambda: _table_2(answers, responses, level),
         "III": lambda: _table_3(answers, responses, level),
-        "IV": lambda: _table_4(table, sources, level),
+        "IV": lambda: _table_4(table, sources, roles, level),
     }
     tables = {}
     for number, make in makers.items():
@@ -105,8 +106,8 @@ def _table_3(answers: pd.DataFrame, responses: Sequence[str], level: float) -> R
     return ordered_logit(ranks, shifts, answers[["participant"]], categories=names, level=level)
 
 
-def _table_4(table: pd.DataFrame, sources: Mapping[str, str], level: float) -> Regression:
-    rows = aggregate_comparisons(table, sources)
+def _table_4(table: pd.DataFrame, sources: Mapping[str, str], roles: Mapping[str, str], level: float) -> Regression:
+    rows = aggregate_comparisons(table, sources, roles)
     if rows.empty:
         raise InputError("no comparison of an aggregate's set with an individual's holds a preference.")
     clusters, preferred = rows[["participant", "set"]], rows["preferred"].to_numpy()
@@ -116,12 +117,16 @@ def _table_4(table: pd.DataFrame, sources: Mapping[str, str], level: float) -> R
     return tied_preferences(one, other, preferred, clusters, reference=_THEIRS, level=level)
 
 
-def aggregate_comparisons(table: pd.DataFrame, sources: Mapping[str, str]) -> pd.DataFrame:
+def aggregate_comparisons(
+    table: pd.DataFrame, sources: Mapping[str, str], roles: Mapping[str, str] = MappingProxyType({})
+) -> pd.DataFrame:
     """Preferences between an aggregate's set and an individual's: `participant`, `set` (the individual's) and
-    `preferred` ("Aggregate-Best", "individual" or "tie"). `sources`: set -> source, as in a sets table."""
+    `preferred` ("Aggregate-Best", "individual" or "tie"). `sources` and `roles`: of each set, as in a sets table; a
+    comparison with somebody's mid or worst, such as a catch trial, is none of these."""
     left, right = (table[side].map(lambda name: source_kind(sources[name])) for side in ("set_a", "set_b"))
     mixed = ((left == "aggregate") & (right == "individual")) | ((left == "individual") & (right == "aggregate"))
-    keep = mixed & (table["preferred"] != NONE)
+    best = [~table[side].map(lambda name: roles.get(name, "")).isin(ROLES[1:]) for side in ("set_a", "set_b")]
+    keep = mixed & best[0] & best[1] & (table["preferred"] != NONE)
     rows, first = table[keep], (left[keep] == "aggregate").to_numpy()
     ours, theirs = (np.where(first == swap, rows["set_a"], rows["set_b"]) for swap in (True, False))
     preferred = rows["preferred"].to_numpy()

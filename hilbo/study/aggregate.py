@@ -65,6 +65,11 @@ class Aggregate(eqx.Module):
         return f"Aggregate({self.cohort!r}; {self.map!r}; {self.optimum!r})"
 
     @property
+    def likelihood(self) -> OrdinalProbit:
+        """The likelihood that the posteriors were fitted by: the study's, or what its rule learnt."""
+        return jax.tree.map(lambda leaf: leaf[0], self.posteriors.gp).likelihood
+
+    @property
     def hierarchical(self) -> RuleMap | None:
         """The map by the hierarchical rule, beside which the study's is judged."""
         return self.maps.get("hierarchical")

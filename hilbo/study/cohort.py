@@ -19,9 +19,9 @@ from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.population.recipes import RECIPES
 from hilbo.search.space import SearchSpace
-from hilbo.study.cells import answer_forms
+from hilbo.study.cells import FRAME, answer_forms, cells_of
 from hilbo.study.config import Study
-from hilbo.study.trial_table import checked_trials
+from hilbo.study.trial_table import checked_trials, flags, is_fitted
 
 __all__ = ["Cohort", "cohort_of"]
 
@@ -119,7 +119,11 @@ def _was_read(table: pd.DataFrame, study: Study) -> bool:
     category = table["category"]
     if not pd.api.types.is_integer_dtype(category) or not category.between(0, len(study.responses) - 1).all():
         return False
-    return "response" not in table or bool((table["response"].map(answer_forms(study.responses)[0]) == category).all())
+    if "response" not in table:
+        return True
+    left = flags(cells_of(table[["voided"]]), "voided", FRAME).any() if "voided" in table else False
+    left |= (~is_fitted(table["phase"].astype(str))).any() if "phase" in table else False
+    return not left and bool((table["response"].map(answer_forms(study.responses)[0]) == category).all())
 
 
 def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:

@@ -196,8 +196,9 @@ def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:
 
 
 def _check_answers_once(table: pd.DataFrame, path: Path) -> None:
-    """Several tables must not hold the same answer twice."""
-    key = [column for column in ("participant", "session", "phase", "trial") if column in table]
+    """Several tables must not hold the same answer twice. A column that one of them lacks tells no answers apart."""
+    known = table.notna().all()
+    key = [column for column in ("participant", "session", "phase", "trial") if column in table and known[column]]
     again = table.duplicated(key)
     if again.any():
         row = table[again].iloc[0]

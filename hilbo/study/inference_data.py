@@ -48,7 +48,7 @@ def groups(
         p.name: (("participant", "trial"), np.where(mask, cohort.physical[..., i], np.nan), _of(p))
         for i, p in enumerate(study.space.parameters)
     }
-    likelihood = study.gp.likelihood
+    likelihood = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).likelihood  # what a rule learnt, where it learns
     constants["thresholds"] = ("edge", np.asarray(likelihood.thresholds))
     constants["noise"] = ((), np.asarray(likelihood.noise))
     names = ", ".join(f"{k} = {label}" for k, label in enumerate(study.responses))

@@ -37,7 +37,7 @@ def predict_table(study: Study, model: Posterior | Aggregate, table: pd.DataFram
         chances = model.class_probabilities(x)
     elif isinstance(model, Aggregate):
         mean, variance = model.surface(x)
-        chances = model.class_probabilities(study.gp.likelihood, x)
+        chances = model.class_probabilities(model.likelihood, x)
     else:
         raise InputError(f"predict_table: model is a {type(model).__name__}; give a Posterior or an Aggregate.")
     predicted = {"mean": np.asarray(mean), "sd": np.sqrt(np.asarray(variance))}

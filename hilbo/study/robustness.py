@@ -24,7 +24,7 @@ from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials, fit
 from hilbo.population.maps import point_rule, share_of
 from hilbo.population.pointwise import Rule
 from hilbo.population.recipes import RECIPES
-from hilbo.search.apart import differences, nrmse
+from hilbo.search.apart import nrmse
 from hilbo.search.candidates import search_points
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
@@ -125,7 +125,7 @@ def robustness(
         posteriors=posteriors,
         optimised_posteriors=again,
         nrmse=nrmse(optimised.x, fixed.x, levels),
-        individual_nrmse=jnp.sqrt(jnp.mean(differences(levels, after.x, before.x) ** 2, axis=1)),
+        individual_nrmse=nrmse(after.x, before.x, levels),
         resampled=_resampled(study, posteriors, candidates, fixed.x, rule, share, seed),
         sensitivity=_sensitivity(study, cohort.trials, fixed.x, tuple(learn), rule, share),
         shared=shared,
@@ -166,7 +166,7 @@ def _resampled(
     """How far the optimum of resampled people is from x, sought among x and some of the candidates."""
     points = jnp.concatenate([x[None, :], candidates[:_POINTS]])
     tops = resampled_tops(posteriors, points, rule, share, study.gp.kernel.variance, seed)
-    return jnp.sqrt(jnp.mean(differences(study.gp.kernel.levels, points[tops], x[None, :]) ** 2, axis=1))
+    return nrmse(points[tops], x[None, :], study.gp.kernel.levels)
 
 
 def _share(study: Study, cohort: Cohort) -> Float[Array, ""] | None:

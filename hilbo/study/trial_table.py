@@ -27,6 +27,8 @@ __all__ = [
     "check_people",
     "check_texts",
     "checked_trials",
+    "flags",
+    "is_fitted",
     "of_material",
     "read_trials",
     "write_trials",
@@ -74,13 +76,18 @@ def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = 
 def _read(
     whole: Iterable[pd.DataFrame], study: AnyStudy, material: str | None, source: str, others: bool, say: Any
 ) -> pd.DataFrame:
-    texts, pieces, rows = {}, [], 0
+    texts, pieces, rows, named = {}, [], 0, {}
     for text in whole:
         _check_columns(text, study, source)
-        pieces.append(_checked(text, study, source, others, texts))
         say(rows := rows + len(text))
+        if material is not None and "material" in text:  # each material has ranges of its own
+            named |= dict.fromkeys(text["material"])
+            text = text[text["material"] == material]
+        pieces.append(_checked(text, study, source, others, texts))
     if not rows:
         raise InputError(f"{source}: has no rows; a trial table needs at least one answer.")
+    if named and material not in named:
+        raise InputError(f'{source}: holds no material "{material}"; it has {", ".join(named)}.')
     table = pd.concat(pieces)
     del pieces
     _check_duplicates(table, source)
@@ -112,7 +119,7 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
         table[parameter.name] = parameter_values(text, parameter, source)
     table["category"] = _categories(text["response"], study.responses, source)
     table["_blinded"] = text["unblinded"].str.strip().str.lower().isin(_FALSE) if "unblinded" in text else True
-    table["_fitted"] = ~_flags(text, "voided", source) & (_is_fitted(text["phase"]) if "phase" in text else True)
+    table["_fitted"] = ~flags(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
     return table
 
 
@@ -165,13 +172,13 @@ def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.S
     return categories.astype(int)
 
 
-def _is_fitted(phases: pd.Series) -> pd.Series:
+def is_fitted(phases: pd.Series) -> pd.Series:
     """Whether answers of these phases are fitted, however somebody writes "warm-up": "Warm up" is one too."""
     plain = phases.str.lower().str.replace(r"[\s_-]", "", regex=True)
     return ~plain.isin([phase.replace("-", "") for phase in NOT_FITTED])
 
 
-def _flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:
+def flags(text: pd.DataFrame, column: str, source: str) -> pd.Series:
     """A column of 1 and 0; all 0 where there is none."""
     if column not in text:
         return pd.Series(False, text.index)

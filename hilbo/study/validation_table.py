@@ -2,7 +2,8 @@
 
 Validation: `participant, trial, set_a, set_b, class_a, class_b, preferred`, optional `material, session, first`; others
 are kept. `class_a`, `class_b` are labels of the study's responses (or ranks from 1, if no label reads as an integer),
-`preferred` and `first` one of the two sets, or "a" or "b"; `preferred` may be "tie". What was not asked is empty.
+`preferred` and `first` one of the two sets, or "a" or "b"; `preferred` may be "tie". Rows whose `voided` is 1, or whose
+`phase` is warm-up or repeat, are left out. What was not asked is empty.
 Sets: `set_id, source` (aggregate, sysid or individual:PARTICIPANT), and the parameters that the caller names.
 Whatever is wrong is one sentence with the file and the line.
 """
@@ -16,7 +17,7 @@ from hilbo.errors import InputError
 from hilbo.search.box import Parameter
 from hilbo.study.cells import answer_forms, numbers, read_cells, refuse
 from hilbo.study.set_table import read_sets
-from hilbo.study.trial_table import check_people, check_texts
+from hilbo.study.trial_table import check_people, check_texts, flags, is_fitted
 
 __all__ = ["NONE", "RESPONSES", "TIE", "check_validation", "of_material", "read_validation", "sets_frame"]
 
@@ -65,7 +66,10 @@ def check_validation(
     nothing = (out["class_a"] == NONE) & (out["class_b"] == NONE) & (out["preferred"] == NONE)
     refuse(nothing, source, lambda row: "holds no answer; fill in class_a and class_b, or preferred, or leave it out.")
     _check_duplicates(out, source)
-    return out
+    counts = ~flags(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
+    if not counts.any():
+        raise InputError(f"{source}: has no comparison that counts; all are warm-up, repeated or voided.")
+    return out[counts]
 
 
 def _check_columns(table: pd.DataFrame, source: str) -> None:
@@ -83,7 +87,7 @@ def _check_columns(table: pd.DataFrame, source: str) -> None:
 def _as_text(table: pd.DataFrame) -> pd.DataFrame:
     """The table with its own columns as text without blanks around it, empty where nothing is."""
     text = table.copy()
-    for column in (*_NEEDED, *(name for name in _OPTIONAL if name in text)):
+    for column in (*_NEEDED, *(name for name in (*_OPTIONAL, "voided", "phase") if name in text)):
         cells = ["" if pd.isna(cell) else str(cell).strip() for cell in text[column]]
         text[column] = ["" if cell == "nan" else cell for cell in cells]  # a column of nothing, read from Parquet
     return text

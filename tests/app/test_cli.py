@@ -211,6 +211,22 @@ def test_a_session_that_was_begun_keeps_its_log_when_the_device_is_not_there(tmp
     assert log.path.read_bytes() == before
 
 
+def test_a_log_of_somebody_else_or_of_another_material_is_not_resumed(tmp_path):
+    """P_1's session x and P's session 1_x would have files of one name."""
+    study_of(tmp_path)
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    file.write_text(file.read_text() + "\n[materials.foam]\n[materials.gel]\n")
+    wanted = Wanted(file, "P_1", "x", logs=logs, material="foam", dry_run=True)
+    opened(wanted, lambda _: None, lambda _: None)[1].close()
+    for change, words in (
+        ({"participant": "P", "session": "1_x"}, "is session x of participant P_1; choose another --session"),
+        ({"material": "gel"}, "was begun with the material foam; choose another --session, or --material"),
+    ):
+        with pytest.raises(InputError, match=words):
+            opened(wanted._replace(resume=True, **change), lambda _: None, lambda _: None)
+    opened(wanted._replace(resume=True), lambda _: None, lambda _: None)[1].close()
+
+
 def test_a_dry_run_stays_one_and_a_session_with_a_person_too(tmp_path, monkeypatch):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
     study_of(tmp_path)

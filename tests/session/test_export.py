@@ -252,6 +252,10 @@ def test_consent_comes_before_the_first_trial(tmp_path):
     path.write_text("participant,age\nP01,3\n")
     with pytest.raises(InputError, match='1: column "consent_time" is missing'):
         read_people(path)
+    path.write_text("participant,consent_time,protocol_number,note,note\nP1,2026-01-03T10:00,1,room 3,paid\n")
+    with pytest.raises(InputError, match='1: column "note" stands there twice'):
+        add_person(path, row)
+    assert "room 3" in path.read_text()
 
 
 @pytest.mark.parametrize("mark", [",", ";"])

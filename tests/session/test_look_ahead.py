@@ -14,9 +14,9 @@ from hilbo.search.candidates import search_points
 from hilbo.session import actions as live
 from hilbo.session import explanation
 from hilbo.session.event_log import EventLog, log_name, read_log
-from hilbo.session.excluded import APART
+from hilbo.session.excluded import APART, spread_point
 from hilbo.session.logged_session import LoggedSession
-from hilbo.session.look_ahead import Answers, LiveChooser
+from hilbo.session.look_ahead import Answers, LiveChooser, _missing
 from hilbo.session.pace import minutes_left
 from hilbo.session.progress import consistency, trust_of
 from hilbo.session.records import Block
@@ -151,6 +151,22 @@ def test_a_warm_start_chooses_from_the_map_and_is_in_the_header():
     mu, s = informed(STUDY, warm, Session.start(STUDY).posterior())
     np.testing.assert_allclose(mu, warm.mean, rtol=1e-12)
     np.testing.assert_allclose(s, 0.05 + 0.5, rtol=1e-12)
+
+
+def test_a_value_that_the_first_design_has_twice_is_asked_twice():
+    design = np.array([[1.0], [0.0], [0.0], [1.0], [1.0]])
+    left = _missing(design, ((1.0,), (0.0,)), ())
+    assert [row.tolist() for row in left] == [[0.0], [1.0], [1.0]]
+    assert [row.tolist() for row in _missing(design, ((0.0,),), ((1.0,),))] == [[0.0]]
+
+
+def test_where_every_value_was_asked_the_one_asked_least_comes_and_no_excluded_one():
+    raw = RAW | {"parameters": {"n": {"low": 0.0, "high": 4.0, "integer": True}}}
+    study, asked_for = Study.from_dict(raw), [[float(n)] for n in range(5)]
+    for _ in range(8):
+        asked_for.append(spread_point(study, np.array([[2.0]]), np.array(asked_for), 0).tolist())
+    counts = [asked_for.count([float(n)]) for n in range(5)]
+    assert counts == [3, 3, 1, 3, 3]
 
 
 def test_a_warm_start_keeps_apart_from_one_level_and_not_from_its_neighbour():

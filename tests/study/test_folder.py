@@ -120,6 +120,20 @@ def test_two_validation_tables_are_read_as_one(tmp_path):
     assert len(twice) == 4
 
 
+def test_a_catch_trial_with_the_map_s_worst_is_no_comparison_of_its_best():
+    table = pd.DataFrame({"participant": "A", "set_a": ["best", "worst"], "set_b": "own", "preferred": "own"})
+    sources = {"best": "aggregate", "worst": "aggregate", "own": "individual:B"}
+    assert len(aggregate_comparisons(table, sources)) == 2
+    assert len(aggregate_comparisons(table, sources, {"best": "best", "worst": "worst", "own": ""})) == 1
+
+
+def test_the_same_answers_with_and_without_a_session_are_the_same(tmp_path):
+    second = "session," + HEAD + "1," + ROW
+    folder = folder_with(tmp_path, trials__csv=HEAD + ROW, **{"trials-2__csv": second})
+    with pytest.raises(InputError, match="is in two trial tables; keep one"):
+        read_folder(folder)
+
+
 @pytest.mark.parametrize(
     ("file", "text"),
     [

@@ -1,5 +1,6 @@
 """From a DataFrame of one's own to a cohort, and to predictions in physical units; and a map on axes of one's own."""
 
+import equinox as eqx
 import jax
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ from hilbo import InputError, Study
 from hilbo.report.figures.on_axes import draw_map
 from hilbo.study.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.cohort import cohort_of
-from hilbo.study.inference_data import inference_data
+from hilbo.study.inference_data import groups, inference_data
 from hilbo.study.prediction import predict_table
 from hilbo.study.trial_table import checked_trials, read_trials
 
@@ -92,6 +93,17 @@ def check_predicted(model, moments, chances):
 
 def test_predictions_in_physical_units_are_those_of_the_unit_cube(one):
     check_predicted(one, one.predict(X), one.class_probabilities(X))
+
+
+@pytest.mark.deep
+def test_predictions_are_by_the_likelihood_that_was_fitted(aggregate, table):
+    """Not by that of the study file, which a rule that learns does not use."""
+    fitted = aggregate.posteriors.gp.likelihood.thresholds
+    learnt = eqx.tree_at(lambda a: a.posteriors.gp.likelihood.thresholds, aggregate, fitted + 1.5)
+    likelihood = eqx.tree_at(lambda one: one.thresholds, STUDY.gp.likelihood, STUDY.gp.likelihood.thresholds + 1.5)
+    check_predicted(learnt, learnt.surface(X), learnt.class_probabilities(likelihood, X))
+    constants = groups(STUDY, learnt.cohort, learnt.posteriors, 2)["constant_data"]
+    np.testing.assert_allclose(constants["thresholds"], likelihood.thresholds, rtol=1e-12)
 
 
 @pytest.mark.deep

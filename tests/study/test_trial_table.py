@@ -190,11 +190,24 @@ def test_a_column_of_one_s_own_called_category_is_no_answer(category):
         cohort_of(frame.drop(columns="participant"), study())
 
 
+@pytest.mark.parametrize("column", [{"voided": [1, 0, 0]}, {"phase": ["Warm-up", "main", "main"]}])
+def test_a_frame_with_right_categories_is_still_checked(column):
+    frame = pd.DataFrame({"participant": "A", "trial": [1, 2, 3], "gain": 1.0, "delay": 2.0, "category": [0, 2, 1]})
+    frame["response"] = ["different", "close", "similar"]
+    assert cohort_of(frame.assign(**column), study()).counts().tolist() == [2]
+
+
 def test_nobody_is_chosen_twice(tmp_path):
     cohort = cohort_of(read_trials(written(tmp_path, HEADER + "A,1,close,1,2\nB,1,close,1,2\n"), study()), study())
     assert cohort.of(["B"]).names == ("B",)
     with pytest.raises(InputError, match='participant "A" is named twice'):
         cohort.of(["A", "B", "A"])
+
+
+def test_rows_of_other_materials_have_ranges_of_their_own(tmp_path):
+    text = "material," + HEADER + "foam,A,1,close,1,2\ngel,A,1,close,7,2\n"
+    assert read_trials(written(tmp_path, text), study(), "foam")["gain"].tolist() == [1.0]
+    assert 'gain is "7"' in refusal(tmp_path, text, material="gel")
 
 
 def test_one_material_is_chosen(tmp_path):

@@ -42,6 +42,14 @@ def test_parquet_is_the_same(tmp_path):
     pd.testing.assert_frame_equal(again.drop(columns="first"), rows.drop(columns="first").set_axis([1, 2, 3]))
 
 
+def test_what_was_voided_or_a_warm_up_is_left_out(tmp_path):
+    rows = pd.DataFrame([row.split(",") for row in GOOD], columns=HEAD.split(","))
+    rows = rows.assign(voided=["1", "0", ""], phase=["validation", "validation", "Warm-up"])
+    assert check_validation(rows).index.tolist() == [1]
+    with pytest.raises(InputError, match="has no comparison that counts"):
+        check_validation(rows.assign(voided="1"))
+
+
 def test_a_material_is_chosen(tmp_path):
     path = write(tmp_path, *GOOD, "P1,silicone,1,1,best,mid,a,close,close,a")
     with pytest.raises(InputError, match=r"holds 2 materials \(foam, silicone\); choose one of them"):
