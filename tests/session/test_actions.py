@@ -141,7 +141,8 @@ def test_a_hold_voids_what_has_begun_and_the_second_one_excludes_it():
     driver.do("hold early", 0)
     assert driver.state.pending.status == "pending" and driver.state.pending.renderings["a"] == point
     driver.do("hold", 0)
-    assert driver.state.trials[-2].voided == {"by": "rule", "reason": "device: hold (speed)", "sides": ["a"]}
+    voided = {"by": "rule", "reason": "device: hold (speed)", "sides": ["a"], "before": 3}
+    assert driver.state.trials[-2].voided == voided
     assert driver.state.pending.renderings["a"] == point
     driver.do("hold", 0)
     assert driver.state.pending.renderings["a"] != point
@@ -247,6 +248,18 @@ def test_a_voided_answer_can_be_restored_until_its_place_is_filled():
     driver.finish()
     with pytest.raises(RefusedError, match="has been filled"):
         live.restore(driver.state, trial, 1.0)
+
+
+def test_an_earlier_answer_to_the_same_level_does_not_fill_the_place_of_a_voided_one():
+    driver = to_first_answerable()
+    first = driver.state.pending
+    driver.do("answer", 0)
+    voided = driver.state.pending.id
+    driver.state = driver.state.with_trial(voided, data=first.data)  # as where a parameter has two levels
+    driver.do("answer", 0)
+    driver.log(live.void(driver.state, voided, "a misclick", 1.0))
+    driver.log(live.restore(driver.state, voided, 1.0))
+    assert driver.state.trial(voided).status == "answered"
 
 
 def test_a_pause_in_mid_trial_begins_the_trial_again():
