@@ -58,11 +58,12 @@ def comparisons(pairs: Sequence[tuple[str, str]], repeats: int, seed: int) -> li
     """Each pair `repeats` times, in rounds of all pairs, each round in a random order.
 
     Within each pair, the sides of its sets and which of them is felt first are balanced over every two rounds, and
-    over every four which side is felt first; what fewer rounds leave over is balanced between pairs. No round begins
-    with the pair that ended the last.
+    over every four which side is felt first; what fewer rounds leave over is balanced between pairs, and over people,
+    because where a session begins in this cycle is drawn. No round begins with the pair that ended the last.
     """
     rng = np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 2]))
-    ways = [_ways(repeats, offset, rng) for offset in rng.permutation(len(pairs))]
+    begin = int(np.random.default_rng(np.random.SeedSequence([seed, len(pairs), repeats, 3])).integers(4))
+    ways = [_ways(repeats, begin + offset, rng) for offset in rng.permutation(len(pairs))]
     planned: list[Comparison] = []
     last = -1
     for turn in range(repeats):

@@ -109,8 +109,8 @@ def stop_key(trial: Trial, side: str) -> Any:
 
 
 def _made_void(state, trial, by, reason, sides=()):
-    """`sides`: the one that was on when the device stopped. `asked_again`: whether a repetition is. `before`: the newest
-    trial at that time; what comes later may take the place of this one."""
+    """`sides`: the one that was on when the device stopped. `asked_again`: whether a repetition is. `before`: the
+    newest trial at that time; what comes later may take the place of this one."""
     voided = {"by": by, "reason": reason, "sides": list(sides), "before": len(state.trials)}
     state = _taken_out(state, trial, status="void", voided=voided)
     if not trial.repeats:

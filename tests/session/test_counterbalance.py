@@ -81,3 +81,17 @@ def test_the_papers_aggregate_best_sessions(count, repeats, trials):
     assert len(schedule) == trials
     assert sum(a == "aggregate" for a, _, _ in schedule) == trials // 2
     assert sum(first == "a" for *_, first in schedule) == trials // 2
+
+
+@pytest.mark.parametrize(("pairs", "repeats"), [(3, 1), (3, 2), (6, 3), (2, 3)])
+def test_what_few_rounds_leave_over_is_balanced_between_people(pairs, repeats):
+    """Four standard errors from a half, over 400 people."""
+    names = [(f"best{i}", f"other{i}") for i in range(pairs)]
+    people = [comparisons(names, repeats, seed) for seed in range(400)]
+    side = np.array([np.mean([a.startswith("best") for a, _, _ in person]) for person in people])
+    first = np.array([np.mean([way == "a" for _, _, way in person]) for person in people])
+    felt = np.array(
+        [np.mean([(a if way == "a" else b).startswith("best") for a, b, way in person]) for person in people]
+    )
+    for share in (side, first, felt):
+        assert abs(share.mean() - 0.5) <= 4 * share.std() / 20
