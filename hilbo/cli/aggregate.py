@@ -72,9 +72,9 @@ def aggregate(
         with team.agreement() as agree:
             folder = held.enter_context(results(out, force)) if team.writes else None
             chosen, cohort = read_cohort(trials, study, material, say)
-            chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.of([name.strip() for name in participants.split(",")]) if participants else cohort
-            cohort, left_out = _included(chosen, cohort)
+            cohort, left_out = _included(chosen, cohort)  # by the study's own model, whatever --rule aggregates
+            chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.first(first) if first else cohort
             agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
         if team.devices == 1 and len(cohort.names) <= _LARGE and individuals:
@@ -82,7 +82,7 @@ def aggregate(
         elif compare:
             raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
         else:
-            content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say)
+            content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say, left_out)
     if team.writes:
         finish(content, out, as_json, say.printed)
 
@@ -105,14 +105,14 @@ def robustness(
     """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
     with results(out, force) as folder, progress() as say:
         chosen, everybody = read_cohort(trials, study, material, say)
-        cohort, _ = _included(chosen, everybody)
+        cohort, left_out = _included(chosen, everybody)
         from hilbo.report.robustness import write_robustness
         from hilbo.study.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
         comparison = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
         say("maps, figures and report")
-        content = write_robustness(chosen, cohort, comparison, folder, seed)
+        content = write_robustness(chosen, cohort, comparison, folder, seed, left_out)
     finish(content, out, as_json)
 
 
@@ -190,11 +190,11 @@ def aggregate_cohort(
     return write_results(population, folder, truth, say, left_out=left_out, selection=selection, **beside)
 
 
-def _aggregate_population(study, cohort, team, folder, seed, individuals, say) -> dict[str, Any]:
+def _aggregate_population(study, cohort, team, folder, seed, individuals, say, left_out=()) -> dict[str, Any]:
     """As `aggregate_cohort` for a large cohort or several devices: by the whole crew, of which one process writes."""
     from hilbo.report.large_population import population_map, write_population
     from hilbo.study.batch_optimum import aggregate_population
 
     large = aggregate_population(study, cohort, team, seed, individuals=individuals, say=say)
     grid = population_map(study, large)
-    return {} if folder is None else write_population(study, large, grid, folder, seed, say)
+    return {} if folder is None else write_population(study, large, grid, folder, seed, say, left_out)

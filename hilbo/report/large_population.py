@@ -4,6 +4,7 @@ The map's grid is coarser, and the figures of progress are left out: each of the
 """
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,18 @@ def population_map(study: Study, large: LargeAggregate) -> xr.Dataset:
 
 
 def write_population(
-    study: Study, large: LargeAggregate, grid: xr.Dataset, folder: Path, seed: int = 0, say=lambda text: None
+    study: Study,
+    large: LargeAggregate,
+    grid: xr.Dataset,
+    folder: Path,
+    seed: int = 0,
+    say=lambda text: None,
+    left_out: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Write result.json, optima.csv, map.nc, figures and report.html; returns the content of result.json."""
+    """Write result.json, optima.csv, map.nc, figures and report.html; returns the content of result.json. `left_out`:
+    sentences on who is not in it."""
     people = people_of(study, large)
-    content = result(study, large, seed, None, people)
+    content = result(study, large, seed, None, people, left_out)
     say("writing results")
     with (folder / "result.json").open("w", encoding="utf-8") as file:
         file.writelines(sealed(json_lines(content)))

@@ -1,5 +1,6 @@
 """Results of the robustness check: result.json, both population maps, figures, and a page that explains itself."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +21,13 @@ _TENTH = 0.1  # of every search range: two renderings that a person would hardly
 _UNRELATED = 0.1
 
 
-def write_robustness(study: Study, cohort: Cohort, check: Robustness, folder: Path, seed: int = 0) -> dict[str, Any]:
-    """Write the folder of `hilbo robustness`; returns the content of result.json."""
+def write_robustness(
+    study: Study, cohort: Cohort, check: Robustness, folder: Path, seed: int = 0, left_out: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Write the folder of `hilbo robustness`; returns the content of result.json. `left_out`: sentences on who is not
+    in it."""
     content = robustness_result(study, cohort, check, seed)
+    content["warnings"] = [*left_out, *content["warnings"]]
     (folder / "result.json").write_text(as_json(content))
     maps = [map_dataset(study, lambda x, of=of: of(jnp.asarray(x))) for of in check.maps()]
     both = xr.concat(maps, xr.DataArray(["fixed", "by evidence"], dims="hyperparameters", name="hyperparameters"))

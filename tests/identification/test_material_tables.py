@@ -36,6 +36,13 @@ def test_moduli_keep_their_own_system(tmp_path, head, unit, factor):
     assert test.time[0] == (60 if "min" in head else 1)
 
 
+def test_what_was_not_fitted_has_no_say_in_the_unit(tmp_path):
+    columns = "test,repeat,time_s,position_mm,force_N,modulus_Pa"
+    rows = [("relaxation", 1, i / 100, min(i, 5), 1 + 1 / (i + 2), 5.0) for i in range(12)]
+    (test,), unit, _ = read_material(table(tmp_path, columns, rows))
+    assert (test.kind, unit) == ("relaxation", "N/mm")
+
+
 def test_repeats_with_other_times_are_interpolated(tmp_path):
     rows = [(*row[:2], row[2] + (3 if row[1] == 2 and row[2] else 0), *row[3:]) for row in ROWS]
     (test,), _, notes = read_material(table(tmp_path, rows=rows))
