@@ -27,7 +27,7 @@ from hilbo.device.messages import Status
 from hilbo.device.parameter_sets import InForce, in_force, wanted_for
 from hilbo.device.ports import BAUD, list_ports, open_port
 from hilbo.device.reasons import Capability, NackReason, State, held_because, meaning
-from hilbo.device.staging import put_in_force
+from hilbo.device.staging import patiently, put_in_force
 from hilbo.device.telemetry import Counts, Samples, TelemetryBuffer
 from hilbo.errors import InputError
 
@@ -42,6 +42,7 @@ _ANSWER = 0.1  # s
 _SIMULATED = 1.0  # s for an answer; the simulator shares this computer's processors
 _LOCKSTEP = 30.0  # s, where no time passes meanwhile
 _POLL = 0.1  # s
+_SINKS = 1.0  # s for a force to sink to zero, of which the protocol allows 0.1
 _STALLED = 20  # polls without telemetry
 _SHAPES = {"hold": 0, "triangle": 1, "step": 2}
 
@@ -196,8 +197,9 @@ class Renderer:
         self._link.request(protocol.Estop())
 
     def clear(self) -> None:
-        """Leave HOLD or ESTOP, once the reason is understood."""
-        self._link.request(protocol.Clear(boot_id=self.device.boot_id))
+        """Leave HOLD or ESTOP, once the reason is understood; the device first lets its force sink to zero."""
+        clear = protocol.Clear(boot_id=self.device.boot_id)
+        patiently(self._link, self.device, clear, self._link.now() + _SINKS)
 
     def status(self) -> Status:
         """State and counters."""

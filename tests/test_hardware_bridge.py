@@ -262,6 +262,14 @@ def test_a_device_in_hold_says_why():
         assert peer.done[protocol.Clear] == 1
 
 
+def test_a_hold_whose_force_still_sinks_is_cleared_as_soon_as_it_is_gone():
+    peer = Peer()
+    with peer.open(**PATIENT) as device:
+        peer.refuse[protocol.Clear] = {"reason": NackReason.BUSY, "ticks": 20, "times": 2}
+        device.clear()
+        assert peer.done[protocol.Clear] == 3
+
+
 def test_an_error_in_the_block_is_not_hidden_by_a_dead_line():
     peer = Peer()
 

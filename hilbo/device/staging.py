@@ -9,7 +9,7 @@ from hilbo.device.messages import Ack, HelloReply, Message, SetParams, SetStates
 from hilbo.device.parameter_sets import InForce, ParameterSet, crc_of, differences, in_force
 from hilbo.device.reasons import NackReason
 
-__all__ = ["put_in_force"]
+__all__ = ["patiently", "put_in_force"]
 
 _LATER = (NackReason.NOT_READY, NackReason.BUSY)
 _NAP = 0.1  # s at most between two tries
@@ -28,20 +28,21 @@ def put_in_force(link: Link, device: HelloReply, wanted: ParameterSet, wait: flo
         give_up = link.now() + wait
         _stage(link, device, messages, give_up)
         commit = protocol.Commit(set_id=set_id, crc=crc_of(messages), boot_id=device.boot_id)
-        _patiently(link, device, commit, give_up)
+        patiently(link, device, commit, give_up)
     return _confirmed(link, messages)
 
 
 def _stage(link: Link, device: HelloReply, messages: Sequence[SetParams | SetStates], give_up: float) -> None:
     """Send every message, with the CRC that each answer must have. BUSY while an earlier change is being taken back."""
     for count, message in enumerate(messages, 1):
-        answer = _patiently(link, device, message, give_up)
+        answer = patiently(link, device, message, give_up)
         if answer.crc != crc_of(messages[:count]):
             raise DeviceError(f"{link.name}: the device has received another set than was sent; send it again.")
 
 
-def _patiently(link: Link, device: HelloReply, message: Message, give_up: float) -> Ack:
-    """The answer to a request that is repeated while the device says that it needs more ticks."""
+def patiently(link: Link, device: HelloReply, message: Message, give_up: float) -> Ack:
+    """The answer to a request that is repeated while the device says that it needs more ticks; `give_up`: a time of the
+    link, after which its last NACK is the error."""
     while True:
         try:
             return link.request(message)
