@@ -15,7 +15,7 @@ from hilbo.app.hub import Hub
 from hilbo.app.slices import Maps
 from hilbo.app.stimulus_rig import StimulusRig
 from hilbo.errors import InputError
-from hilbo.session.event_log import EventLog, log_name
+from hilbo.session.event_log import EventLog, begun, log_name
 from hilbo.session.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.participants import check_consent, read_people
 from hilbo.session.plan import header_for, planned_header, read_plan
@@ -85,7 +85,7 @@ def _begun(wanted, study) -> tuple[EventLog, LiveChooser]:
     """A new log, last of all: what is refused leaves none behind."""
     header = _header(wanted, study)
     path = wanted.logs / log_name(header)
-    if path.exists():
+    if begun(path):
         raise InputError(
             f"{path}: this session has been begun; add --resume to go on with it, or choose another --session."
         )

@@ -5,9 +5,10 @@ The first line is the header, every other an event:
     {"seq":1,"kind":"propose","time":…,"data":{…},"previous":"…","crc":"…"}
 
 `previous` is the start of the SHA-256 of the line before, `crc` the CRC-32 of this line up to it. A last line without
-its end was never acknowledged: it is dropped, and said so. Any other damage is refused with its line. Neither digest
-has a secret, so that events are checked for what they say too (`hilbo.session.replay`). One writer at a time, by a lock
-of the operating system on the file, which goes with the process that holds it. A log is its owner's alone to read.
+its end was never acknowledged: it is dropped, and said so; a file without a whole first line is no log yet. Any other
+damage is refused with its line. Neither digest has a secret, so that events are checked for what they say too
+(`hilbo.session.replay`). One writer at a time, by a lock of the operating system on the file, which goes with the
+process that holds it. A log is its owner's alone to read.
 """
 
 import hashlib
@@ -29,7 +30,7 @@ from hilbo.session.state import LiveSession
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.typed_files import converted, decoded, read_bytes
 
-__all__ = ["EventLog", "LogError", "in_use", "log_name", "log_paths", "read_log", "read_session"]
+__all__ = ["EventLog", "LogError", "begun", "in_use", "log_name", "log_paths", "read_log", "read_session"]
 
 _SUFFIX = ".session.jsonl"
 _MODE = 0o600
@@ -80,18 +81,18 @@ class EventLog:
         check_new_header(study, header)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), _MODE)
-        except FileExistsError:
-            raise InputError(f"{path}: exists already; resume it, or choose another session.") from None
+            file = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), _MODE)
         except OSError as error:
             raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder.") from error
         log = cls(path, file, state, b"", 0, "")
         try:
             _lock(file, path)
+            if not _unbegun(_content(file)):
+                raise InputError(f"{path}: exists already; resume it, or choose another session.")
+            _cut(file, 0)
             log._write(_line(0, "header", time.time(), msgspec.to_builtins(header), b""))
         except (LogError, InputError):
             log.close()
-            path.unlink(missing_ok=True)
             raise
         _sync_folder(path.parent)
         return log
@@ -171,6 +172,15 @@ def read_session(path: str | os.PathLike, study: AnyStudy) -> LiveSession:
     return _folded(path, study, header, events)
 
 
+def begun(path: str | os.PathLike) -> bool:
+    """Whether there is a session at this path, or another file: not where a log was killed within its first line."""
+    try:
+        with open(path, "rb") as file:
+            return not _unbegun(file.readline())
+    except FileNotFoundError:
+        return False
+
+
 def in_use(path: str | os.PathLike) -> bool:
     """Whether somebody is writing this log."""
     file = os.open(path, os.O_RDWR)
@@ -190,8 +200,8 @@ def log_name(header: Header) -> str:
 
 
 def log_paths(folder: str | os.PathLike) -> list[Path]:
-    """The logs in a folder, in the order of their names."""
-    return sorted(Path(folder).glob("*" + _SUFFIX))
+    """The logs in a folder that were begun, in the order of their names."""
+    return [path for path in sorted(Path(folder).glob("*" + _SUFFIX)) if begun(path)]
 
 
 def _line(seq, kind, at, data, previous) -> bytes:
@@ -202,6 +212,14 @@ def _line(seq, kind, at, data, previous) -> bytes:
 
 def _hash(line) -> str:
     return hashlib.sha256(line).hexdigest()[:16] if line else ""
+
+
+_FIRST = b'{"seq":0,"kind":"header",'
+
+
+def _unbegun(content) -> bool:
+    """Whether this is the beginning of a log's first line, without its end."""
+    return b"\n" not in content and content[: len(_FIRST)] == _FIRST[: len(content)]
 
 
 _CRC = re.compile(rb',"crc":"([0-9a-f]{8})"\}\n\Z')
@@ -222,7 +240,7 @@ def _parsed(content, path):
             events.append(Event(seq=raw.seq, kind=raw.kind, time=raw.time, data=raw.data))
         previous, whole = line, whole + len(line)
     if header is None:
-        raise InputError(f"{path}: holds no session; it has no whole first line.")
+        raise InputError(f"{path}: holds no session, it has no whole first line; begin it without --resume.")
     return header, events, whole, dropped
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session import actions as live
-from hilbo.session.event_log import EventLog, log_name
+from hilbo.session.event_log import EventLog, begun, log_name
 from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.records import Header
 from hilbo.session.state import LiveSession
@@ -33,7 +33,7 @@ class LoggedSession:
     def open(cls, folder: str | os.PathLike, study: Study, header: Header) -> "LoggedSession":
         """Begin a session, or go on with the one of this participant and label. Raises InputError."""
         path = Path(folder) / log_name(header)
-        if not path.exists():
+        if not begun(path):
             log = EventLog.create(path, study, header)
             return cls(log, LiveChooser(log.state))
         log = EventLog.resume(path, study)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilbo.errors import InputError
-from hilbo.session.event_log import in_use, log_paths, read_log
+from hilbo.session.event_log import in_use, read_log
 from hilbo.session.withdrawn_names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
@@ -98,12 +98,11 @@ def delete_participant(folder: str | os.PathLike, participant: str) -> Withdrawa
 def _logs(root: Path) -> tuple[dict[Path, str], list[Path]]:
     """Whose each log is, and the logs that cannot be read."""
     whose, damaged = {}, []
-    for sub in sorted({root, *(path.parent for path in root.rglob("*.session.jsonl"))}):
-        for path in log_paths(sub):
-            try:
-                whose[path] = read_log(path)[0].participant
-            except InputError:
-                damaged.append(path)
+    for path in sorted(root.rglob("*.session.jsonl")):
+        try:
+            whose[path] = read_log(path)[0].participant
+        except InputError:
+            damaged.append(path)
     return whose, damaged
 
 

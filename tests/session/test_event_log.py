@@ -15,7 +15,7 @@ from live import CHOOSER, RAW, STUDY, Driver, header
 from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session import actions as live
-from hilbo.session.event_log import EventLog, LogError, log_name, log_paths, read_log
+from hilbo.session.event_log import EventLog, LogError, begun, log_name, log_paths, read_log
 from hilbo.session.records import Event
 from hilbo.session.state import LiveSession
 
@@ -135,6 +135,29 @@ def test_another_study_another_writer_and_other_files_are_refused(tmp_path, driv
         path.write_bytes(content)
         with pytest.raises(InputError, match=sentence):
             read_log(path)
+
+
+@given(st.integers(0, 10**9))
+@settings(max_examples=20)
+def test_a_log_that_was_killed_within_its_first_line_is_begun_again(tmp_path_factory, driven, number):
+    folder = tmp_path_factory.mktemp("killed")
+    whole = write(folder / log_name(driven.header), driven)
+    path = folder / "P09_1.session.jsonl"
+    path.write_bytes(whole[: number % (whole.index(b"\n") + 1)])
+    assert not begun(path)
+    assert log_paths(folder) == [folder / log_name(driven.header)]  # nobody's table waits for it
+    EventLog.create(path, STUDY, driven.header).close()
+    assert begun(path)
+    assert read_log(path, STUDY) == (driven.header, [], "")
+
+
+@pytest.mark.parametrize("content", [b"my notes", b"my notes\n", b'{"seq":0,"kind":"note"}'])
+def test_what_is_no_beginning_of_a_log_is_not_written_over(tmp_path, driven, content):
+    path = tmp_path / "log.jsonl"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="exists already"):
+        EventLog.create(path, STUDY, driven.header)
+    assert path.read_bytes() == content
 
 
 @pytest.mark.deep  # a process that imports all
