@@ -85,7 +85,7 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     _check_materials_named(names, tables)
     materials = [_material(name, study, trials, compared, sets, truth) for name in names]
     departs, as_planned = _departures(folder / "plan.json", study, materials)
-    limits = (*departs, *_missing_tables(materials, compared, sets))
+    limits = (*departs, *_missing_tables(study, materials, compared, sets))
     return StudyFolder(study, materials, sets, limits, as_planned)
 
 
@@ -257,10 +257,12 @@ def _departures(path: Path, study: Study, materials: list[Material]) -> tuple[tu
 
 
 def _missing_tables(
-    materials: list[Material], compared: pd.DataFrame | None, sets: pd.DataFrame | None
+    study: Study, materials: list[Material], compared: pd.DataFrame | None, sets: pd.DataFrame | None
 ) -> tuple[str, ...]:
     """What the folder's tables cannot say, in sentences."""
     sentences = []
+    if study.materials and materials[0].name == "":
+        sentences.append("The tables name no material; they are read by the study's own, and none of [materials].")
     if compared is None:
         sentences.append(
             "There is no validation table: nothing here says whether people agree with the map when asked again."

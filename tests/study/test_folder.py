@@ -107,6 +107,11 @@ def test_materials_have_their_own_references(tmp_path):
         analyse(strict.study, strict.cohort)
 
 
+def test_tables_without_a_material_are_read_by_the_study_s_own_and_the_report_says_so(tmp_path):
+    folder = folder_with(tmp_path, study__toml=STUDY + "\n[materials.soft]\n", trials__csv=HEAD + ROW)
+    assert "name no material" in read_folder(folder).limits[0]
+
+
 def test_two_validation_tables_are_read_as_one(tmp_path):
     row = "{},1,aggregate,individual:B,close,different,{}\n"
     first, second = (VALIDATION + row.format(*cells) for cells in (("A", "a"), ("B", "b")))
