@@ -4,7 +4,9 @@ from collections.abc import Callable
 from typing import Any
 
 from hilbo.app import views
+from hilbo.app.held import Held
 from hilbo.app.messages import Command
+from hilbo.app.rig import Rig
 from hilbo.errors import InputError
 from hilbo.session import actions
 from hilbo.session.records import Event, RefusedError
@@ -27,7 +29,7 @@ def others_present(title: str) -> str:
     return f"In this session {who.get(title, 'a device renders, and no program presents')}."
 
 
-async def carry_out(hub: Any, what: str, message: Command) -> dict[str, Any]:
+async def carry_out(hub: Held, what: str, message: Command) -> dict[str, Any]:
     """One of `COMMANDS`, in the session of a `Hub`. Raises `NotNowError`, and `InputError` for a message that lacks
     what the command needs."""
     if what == "estop":
@@ -65,7 +67,7 @@ def _event_of(what: str, message: Command) -> Callable[[LiveSession, float], Eve
     return actions.repeat
 
 
-def _goes_on(hub: Any) -> Callable[[LiveSession, float], Event]:
+def _goes_on(hub: Held) -> Callable[[LiveSession, float], Event]:
     """From a break, or from the end of a block, as whoever is there by then."""
 
     def make(state, at):
@@ -88,7 +90,7 @@ def _taken(state: LiveSession, what: str, message: Command, at: float) -> Event:
     return actions.undo(state, at, message.reason)
 
 
-def _invitation(hub: Any, message: Command) -> dict[str, str]:
+def _invitation(hub: Held, message: Command) -> dict[str, str]:
     """A new link for a role that this session has."""
     if hub.invite is None:
         raise NotNowError("This session gives no links.")
@@ -98,7 +100,7 @@ def _invitation(hub: Any, message: Command) -> dict[str, str]:
     return hub.invite(message.role)
 
 
-async def _estop(rig: Any) -> dict[str, str]:
+async def _estop(rig: Rig) -> dict[str, str]:
     try:
         await rig.estop()
     except (RuntimeError, ValueError) as error:
@@ -106,7 +108,7 @@ async def _estop(rig: Any) -> dict[str, str]:
     return {"done": "estop"}
 
 
-async def _clear(rig: Any) -> dict[str, str]:
+async def _clear(rig: Rig) -> dict[str, str]:
     try:
         await rig.clear()
     except (RuntimeError, ValueError) as error:

@@ -55,7 +55,7 @@ class Hub:
     ):
         self.log, self.chooser, self.tag, self.gap = log, chooser, tag, gap
         self.state: LiveSession = log.state
-        self.rig: Rig | None = None
+        self._rig: Rig | None = None
         self.begun = False  # whether the participant has said so, since the server started or the page came back
         self.alert: str | None = None
         self.trust: list[list[str]] = []
@@ -64,7 +64,7 @@ class Hub:
         self.invite: Callable[[Role], dict[str, str]] | None = None
         self.settle: Callable[[], Any] = lambda: None
         self._connect, self._make_maps, self._maps = connect, maps, None
-        self.warm: asyncio.Future | None = None
+        self._warming: asyncio.Future | None = None
         self.watchers = Watchers(lambda: self.text("moved"))
         self._disk = ThreadPoolExecutor(1, "hilbo-disk")
         self.compute = ThreadPoolExecutor(1, "hilbo-choice")
@@ -80,9 +80,9 @@ class Hub:
         """Connect to the rig, and begin. Raises `InputError` or `DeviceError`."""
         self._lock, self._loop = asyncio.Lock(), asyncio.get_running_loop()
         rig = await self._loop.run_in_executor(self._disk, lambda: self._connect(self._from_rig, self._noticed))
-        self.rig = rig
-        self.warm = self._loop.run_in_executor(self.compute, self._warm)
-        self.warm.add_done_callback(self._warmed)
+        self._rig = rig
+        self._warming = self._loop.run_in_executor(self.compute, self._warm)
+        self._warming.add_done_callback(self._warmed)
         await self._interruptions.begin(rig.snapshot)
         self.runner.restart()
 
@@ -104,14 +104,26 @@ class Hub:
         """Stop the rig, let go of everything."""
         self._interruptions.end()
         self.runner.cancel()
-        if self.warm is not None:
-            self.warm.cancel()
+        if self._warming is not None:
+            self._warming.cancel()
         self.watchers.end_all()
-        if self.rig is not None:
-            await self._loop.run_in_executor(None, self.rig.close)
+        if self._rig is not None:
+            await self._loop.run_in_executor(None, self._rig.close)
         self._disk.shutdown()
         for pool in (self.compute, self._drawing):
             pool.shutdown(wait=False, cancel_futures=True)
+
+    @property
+    def rig(self) -> Rig:
+        """What shows renderings, from `open` on."""
+        assert self._rig is not None
+        return self._rig
+
+    @property
+    def warm(self) -> asyncio.Future:
+        """Done when all that is needed is compiled; from `open` on."""
+        assert self._warming is not None
+        return self._warming
 
     # Events.
 
@@ -153,8 +165,8 @@ class Hub:
     def hang_up(self) -> None:
         """The server ends: nobody waits for news."""
         self.watchers.end_all()
-        if self.rig is not None:
-            self.rig.hang_up()
+        if self._rig is not None:
+            self._rig.hang_up()
 
     def publish(self) -> None:
         """Tell everybody who looks that there is news."""

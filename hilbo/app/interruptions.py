@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from hilbo.app.held import Held
 from hilbo.app.rig import Snapshot
 from hilbo.errors import InputError
 from hilbo.session import actions
@@ -30,7 +31,7 @@ _GONE = 3.0  # s without a participant's page until a trial that is being felt i
 class Interruptions:
     """Those of a `Hub`, from `begin` to `end`."""
 
-    def __init__(self, hub: Any):
+    def __init__(self, hub: Held):
         self.hub = hub
         self._condition = ""  # the device's, when it was last seen
         self._unsaid: deque[Callable[[LiveSession, float], Any]] = deque()  # what it did, not yet on the disk

@@ -14,6 +14,7 @@ import time
 from concurrent.futures import Future
 from typing import Any
 
+from hilbo.app.held import Held
 from hilbo.app.rig import Loaded, MissedError, Showing
 from hilbo.session import actions
 from hilbo.session.records import Event, RefusedError, Trial
@@ -28,7 +29,7 @@ _HAND = 0.15  # s that a hand may keep a rendering from being shown before it is
 class Runner:
     """Leads a `Hub` on: `stage` says what it is at, for the views; `ends` when the present step does (monotonic)."""
 
-    def __init__(self, hub: Any):
+    def __init__(self, hub: Held):
         self.hub = hub
         self.stage, self.trouble = "idle", ""
         self.step: int | None = None
@@ -97,7 +98,9 @@ class Runner:
                 self._at("choosing")
                 await self._propose()
             else:
-                await self._present(hub.state.pending, stop)
+                trial = hub.state.pending
+                assert trial is not None  # as the screen says
+                await self._present(trial, stop)
                 return
         self._at("idle")
 

@@ -9,6 +9,7 @@ import time
 from datetime import datetime
 from typing import Any
 
+from hilbo.app.held import Held
 from hilbo.app.log_words import line, meant, place_of, table
 from hilbo.session.pace import minutes_left
 from hilbo.session.state import LiveSession
@@ -37,13 +38,13 @@ _SCREEN_WORDS = {
 }
 
 
-def trial_name(hub: Any) -> str | None:
+def trial_name(hub: Held) -> str | None:
     """What the pending trial is called in browsers: another one whenever it is begun again."""
     trial = hub.state.pending
     return None if trial is None else f"{hub.tag}:{trial.id}.{trial.presentation}"
 
 
-def participant(hub: Any) -> dict[str, Any]:
+def participant(hub: Held) -> dict[str, Any]:
     """The participant's view; docs/guides/live.md describes it."""
     seen, session, stage = participant_view(hub.state), hub.state.study.session, hub.runner.stage
     trial, screen = seen["trial"], seen["screen"]
@@ -110,7 +111,7 @@ def _progress(progress, text):
     return {"done": progress["done"], "of": progress["of"], "text": words}
 
 
-def experimenter(hub: Any) -> dict[str, Any]:
+def experimenter(hub: Held) -> dict[str, Any]:
     """Everything, in the order of the page; `whole` is the session's own view, for programs."""
     state, runner = hub.state, hub.runner
     header, trial = state.header, state.pending

@@ -10,7 +10,7 @@ what it is without answers. And, once, how people differ, with a recommendation 
 import dataclasses
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,13 +66,11 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
         )
     everybody = len(answered) == len(aggregate.cohort.names)
     cohort = aggregate.cohort if everybody else aggregate.cohort.rows(answered)
-    candidates = search_points(study.space, seed)
-    x = candidates[: min(_POINTS, len(candidates))]
     posteriors = jax.tree.map(lambda leaf: leaf[answered], aggregate.posteriors)
     share = aggregate.share or share_of(study.gp, cohort.trials, study.inference)
     fitted = aggregate.maps if everybody else {}
     maps = {rule: fitted.get(rule) or _map(study, cohort, rule, posteriors, share) for rule in GIVEN_RULES}
-    pooled = maps["pooled"]
+    ground = _ground(study, cohort, posteriors, maps["pooled"], seed)
     rules: dict[str, Any] = {}
     left: dict[str, LeftOut] = {}
     for rule, map_ in maps.items():
@@ -82,13 +80,11 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
         left[rule], folds = leave_one_out(
             study.gp, cohort.trials, rule, share=share.mean, posteriors=posteriors, inference=study.inference
         )
-        rules[rule] = calibration(left[rule], seed) | {"reliability": reliability(left[rule])}
-        rules[rule] |= _map_content(study, cohort, posteriors, map_, folds, pooled, candidates, x, seed)
+        rules[rule] = _entry(study, ground, map_, left[rule], folds)
         rules[rule]["hyperparameters"] = "given" if study.learnt is None else "learnt from all answers"
     recipe = study.rule if study.rule in RECIPES else RECOMMENDED
     if learns:
-        given = cohort, everybody, posteriors, pooled
-        left[recipe], rules[recipe] = _learnt_entry(study, recipe, *given, candidates, x, seed)
+        left[recipe], rules[recipe] = _learnt_entry(_that_learns(study, recipe, cohort, everybody), ground)
     for rule, (difference, error) in differences(left).items():
         rules[rule] |= {"difference": difference, "difference_error": error}
     words = recommendation(left, rules, share, len(answered))
@@ -98,26 +94,40 @@ def compare(study: Study, aggregate: Aggregate, seed: int = 0, *, learns: bool =
     return content | {"rules": rules, "recommendation": words}
 
 
-def _learnt_entry(
-    study: Study,
-    recipe: str,
-    cohort: Cohort,
-    everybody: bool,
-    posteriors: Posterior,
-    pooled: RuleMap | str,
-    candidates: Float[Array, "m d"],
-    x: Float[Array, "p d"],
-    seed: int,
-) -> tuple[LeftOut, dict[str, Any]]:
-    """A recipe, whose hyperparameters are learnt again without each person; beside it, with those of all answers."""
+class _Ground(NamedTuple):
+    """What all rules are compared on: the people with answers, and the points at which maps are."""
+
+    cohort: Cohort
+    posteriors: Posterior
+    candidates: Float[Array, "m d"]
+    """Where optima are searched."""
+    x: Float[Array, "p d"]
+    """Where maps are compared, drawn and resampled."""
+    pooled: tuple[Float[Array, " p"], Float[Array, " d"]] | None
+    """One model of all answers: its mean at `x`, and its optimum; None where it was refused."""
+    seed: int
+
+
+def _ground(study: Study, cohort: Cohort, posteriors: Posterior, pooled: RuleMap | str, seed: int) -> _Ground:
+    candidates = search_points(study.space, seed)
+    x = candidates[: min(_POINTS, len(candidates))]
+    one = None if isinstance(pooled, str) else (pooled.predict(x)[0], map_optimum(study, pooled, candidates).x)
+    return _Ground(cohort, posteriors, candidates, x, one, seed)
+
+
+def _that_learns(study: Study, recipe: str, cohort: Cohort, everybody: bool) -> Study:
+    """The study with what a recipe learns of these people, which is there already if they are everybody."""
     learns = study if study.rule == recipe else that_learns(study, recipe)
-    learns = resolved(learns if everybody else dataclasses.replace(learns, learnt=None), cohort)
+    return resolved(learns if everybody else dataclasses.replace(learns, learnt=None), cohort)
+
+
+def _learnt_entry(learns: Study, ground: _Ground) -> tuple[LeftOut, dict[str, Any]]:
+    """A recipe, whose hyperparameters are learnt again without each person; beside it, with those of all answers."""
     assert learns.learnt is not None
-    left, folds = leave_one_out_learnt(learns.learnt, cohort.trials, learns.stated)
-    kept, _ = leave_one_out_learnt(learns.learnt, cohort.trials, learns.stated, again=False)
-    map_ = learnt_map(learns.learnt, cohort.trials)
-    entry: dict[str, Any] = calibration(left, seed) | {"reliability": reliability(left)}
-    entry |= _map_content(learns, cohort, posteriors, map_, folds, pooled, candidates, x, seed)
+    trials = ground.cohort.trials
+    left, folds = leave_one_out_learnt(learns.learnt, trials, learns.stated)
+    kept, _ = leave_one_out_learnt(learns.learnt, trials, learns.stated, again=False)
+    entry = _entry(learns, ground, learnt_map(learns.learnt, trials), left, folds)
     entry["hyperparameters"] = "learnt in each fold"
     entry["negative_log_density_kept"] = float(kept.cost.mean())
     return left, entry
@@ -133,33 +143,27 @@ def _map(study: Study, cohort: Cohort, rule: str, posteriors: Posterior, share: 
         return str(error)
 
 
-def _map_content(
-    study: Study,
-    cohort: Cohort,
-    posteriors: Posterior,
-    map_: RuleMap,
-    folds: list[RuleMap],
-    pooled: RuleMap | str,
-    candidates: Float[Array, "m d"],
-    x: Float[Array, "p d"],
-    seed: int,
-) -> dict[str, Any]:
-    """What one rule's map says; `folds`: its maps without each person, `x`: points at which maps are compared."""
-    best = map_optimum(study, map_, candidates)
-    mean, variance = map_.predict(x)
-    moved = influence(map_, folds, x)
-    return {
+def _entry(study: Study, ground: _Ground, map_: RuleMap, left: LeftOut, folds: list[RuleMap]) -> dict[str, Any]:
+    """How a rule predicts people who are `left` out, and what its map says; `folds`: its maps without each person."""
+    best = map_optimum(study, map_, ground.candidates)
+    mean, variance = map_.predict(ground.x)
+    moved = influence(map_, folds, ground.x)
+    agreement = from_pooled = None
+    if ground.pooled is not None:
+        other, other_best = ground.pooled
+        agreement = _agreement(mean, other)
+        from_pooled = float(nrmse(best.x, other_best, study.gp.kernel.levels))
+    return calibration(left, ground.seed) | {
+        "reliability": reliability(left),
         "method": map_.method,
         "optimum": _parameters(study, best.x),
         "optimum_sd": float(best.sd),
         "covered": float(jnp.mean(jnp.sqrt(variance / map_.map_prior) < KNOWN)),
-        "influence": dict(zip(cohort.names, moved.tolist(), strict=True)),
-        "agreement_with_pooled": None if isinstance(pooled, str) else _agreement(mean, pooled.predict(x)[0]),
-        "from_pooled": None
-        if isinstance(pooled, str)
-        else float(nrmse(best.x, map_optimum(study, pooled, candidates).x, study.gp.kernel.levels)),
-        "optimum_by_draws": _by_draws(study, map_, posteriors, x, seed),
-        "optimum_by_bootstrap": _by_bootstrap(study, map_, posteriors, x, seed),
+        "influence": dict(zip(ground.cohort.names, moved.tolist(), strict=True)),
+        "agreement_with_pooled": agreement,
+        "from_pooled": from_pooled,
+        "optimum_by_draws": _by_draws(study, ground, map_),
+        "optimum_by_bootstrap": _by_bootstrap(study, ground, map_),
     }
 
 
@@ -168,27 +172,25 @@ def _agreement(mean: Float[Array, " p"], other: Float[Array, " p"]) -> float:
     return float(jnp.corrcoef(mean, other)[0, 1])
 
 
-def _by_draws(
-    study: Study, map_: RuleMap, posteriors: Posterior, x: Float[Array, "p d"], seed: int
-) -> dict[str, list[float]] | None:
+def _by_draws(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
     """Quantiles of where joint draws of the map are largest; None where the map has no joint posterior."""
+    x = ground.x
     if map_.method == "exact" and map_.shared is not None:
         joint = posterior_map(map_.shared, x)
     elif map_.rule == "bcm":
-        joint = joint_map(posteriors, x)
+        joint = joint_map(ground.posteriors, x)
     else:
         return None
-    return _quantiles(study, x, np.asarray(joint.optima(jax.random.key(seed), _DRAWS)))
+    return _quantiles(study, x, np.asarray(joint.optima(jax.random.key(ground.seed), _DRAWS)))
 
 
-def _by_bootstrap(
-    study: Study, map_: RuleMap, posteriors: Posterior, x: Float[Array, "p d"], seed: int
-) -> dict[str, list[float]] | None:
+def _by_bootstrap(study: Study, ground: _Ground, map_: RuleMap) -> dict[str, list[float]] | None:
     """Quantiles of where the map of people drawn with replacement is largest; None for rules that take all at once."""
     if map_.rule not in RULES:
         return None
     share = map_.share if map_.rule == "hierarchical" else None
-    tops = resampled_tops(posteriors, x, map_.rule, share, map_.prior, seed, _DRAWS // 4)
+    x = ground.x
+    tops = resampled_tops(ground.posteriors, x, map_.rule, share, map_.prior, ground.seed, _DRAWS // 4)
     return _quantiles(study, x, np.bincount(tops, minlength=x.shape[0]) / len(tops))
 
 

@@ -20,7 +20,7 @@ class Nothing(Hub):
     """A hub that has no session; it says yes to every command."""
 
     def __init__(self):
-        self.watchers, self.rig = Watchers(lambda: ""), None
+        self.watchers, self._rig = Watchers(lambda: ""), None
 
     async def open(self) -> None:
         """Nothing to open."""
