@@ -8,7 +8,7 @@ import base64
 import importlib.metadata
 import json
 import platform
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
-import xarray as xr
 from jaxtyping import Array, Float
 
 from hilbo.report.figures.painter import write_figures
@@ -31,7 +30,7 @@ from hilbo.study.config import Study
 from hilbo.study.effects import effects_of
 from hilbo.study.heterogeneity import heterogeneity, in_place, rule_warnings
 from hilbo.study.learnt_study import effect_content, learnt_content, learnt_sentences
-from hilbo.study.map_file import map_at_points, on_grid, write_map
+from hilbo.study.map_file import map_dataset, on_grid, write_map
 from hilbo.study.model_check import check_sentences, model_check
 from hilbo.study.optima import Optimum
 from hilbo.study.optimum_location import location_notes, location_sentences
@@ -39,9 +38,7 @@ from hilbo.study.optimum_region import optimum_region, region_content, region_se
 from hilbo.study.typed_files import sealed
 
 __all__ = [
-    "MAP_CELLS",
     "as_json",
-    "map_dataset",
     "misses",
     "moved",
     "optima_table",
@@ -51,9 +48,6 @@ __all__ = [
     "versions",
     "write_results",
 ]
-
-MAP_CELLS = 41
-"""Points of the map's grid along each parameter."""
 
 _PIXELS = 130  # of the page for an inch of a figure, so that all have letters of one size
 
@@ -269,37 +263,6 @@ def optima_table(content: dict[str, Any], people: People) -> pd.DataFrame:
         for name, claim in claims.items()
     ]
     return pd.concat([pd.DataFrame(rows), people.table()])
-
-
-def map_dataset(study: Study, surface: Callable[..., Any], cells: int = MAP_CELLS) -> xr.Dataset:
-    """The population map on a grid of all dimensions, or at points where there is none (`map_file.on_grid`).
-    `surface`: points (m, d) of the unit cube -> mean and variance, (m,) each."""
-    if not on_grid(study.space):
-        return map_at_points(study, surface)
-    shown = parameters = study.space.parameters
-    side = np.linspace(0.0, 1.0, cells)
-    x = np.stack(np.meshgrid(*(side,) * len(shown), indexing="ij"), axis=-1)
-    flat = x.reshape(-1, len(parameters))
-    mean, variance = surface(flat)
-    names = [p.name for p in shown]
-    shape = x.shape[:-1]
-    return xr.Dataset(
-        {
-            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": f"{study.attribute}, posterior mean"}),
-            "variance": (
-                names,
-                np.asarray(variance).reshape(shape),
-                {"long_name": f"{study.attribute}, posterior variance"},
-            ),
-            "feasible": (
-                names,
-                np.asarray(study.space.feasible(flat)).reshape(shape),
-                {"long_name": "may be rendered"},
-            ),
-        },
-        coords={p.name: (p.name, p.to_physical(side), {"units": p.unit}) for p in shown},
-        attrs={"study": study.hash},
-    )
 
 
 def _figures(population: CohortResults, truth: Float[np.ndarray, " d"] | None) -> dict[str, Any]:

@@ -10,9 +10,10 @@ import xarray as xr
 
 from hilbo.hyperparameters.judged_evidence import judged_sentences
 from hilbo.report.page import Pictures, rendered
-from hilbo.report.results import as_json, map_dataset, optimum_content, save_figures, versions
+from hilbo.report.results import as_json, optimum_content, save_figures, versions
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
+from hilbo.study.map_file import map_dataset
 from hilbo.study.robustness import LIMIT, Robustness
 
 __all__ = ["robustness_page", "robustness_result", "write_robustness"]

@@ -23,7 +23,7 @@ from hilbo.report.hypotheses import Results, hypotheses
 from hilbo.report.page import Pictures, estimate_words, heads, number, percent, rendered
 from hilbo.report.participants import people_of
 from hilbo.report.result_tables import alternatives_table, convergence_table, table_1, tolerance_table
-from hilbo.report.results import as_json, map_dataset, optima_table, result, save_figures, versions
+from hilbo.report.results import as_json, optima_table, result, save_figures, versions
 from hilbo.report.study_figures import comparison_figures, study_figures
 from hilbo.report.validation import Validated, folder_names, validate
 from hilbo.study.analysis import Analysis, analyse, moved_by_evidence
@@ -31,7 +31,7 @@ from hilbo.study.config import Study
 from hilbo.study.folder import Material, StudyFolder
 from hilbo.study.heterogeneity import in_place
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
-from hilbo.study.map_file import write_map
+from hilbo.study.map_file import map_dataset, write_map
 from hilbo.study.rule_comparison import compare
 from hilbo.study.set_table import ROLES
 

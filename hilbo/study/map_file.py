@@ -22,7 +22,10 @@ from hilbo.search.candidates import search_points
 from hilbo.search.space import SearchSpace
 from hilbo.study.config import Study
 
-__all__ = ["map_at_points", "on_grid", "read_map", "write_map"]
+__all__ = ["CELLS", "map_dataset", "on_grid", "read_map", "write_map"]
+
+CELLS = 41
+"""Points of the map's grid along each parameter."""
 
 _LARGEST = 10_000_000  # numbers in a variable: a damaged size is not to ask for all the memory
 _FARTHEST = 100.0  # prior standard deviations from 0 that a map's mean may be
@@ -34,7 +37,38 @@ def on_grid(space: SearchSpace) -> bool:
     return space.dim <= 3 and not any(space.discrete)
 
 
-def map_at_points(study: Study, surface: Callable[..., Any], seed: int = 0) -> xr.Dataset:
+def map_dataset(study: Study, surface: Callable[..., Any], cells: int = CELLS) -> xr.Dataset:
+    """The population map on a grid of all dimensions, or at points where there is none (`on_grid`).
+    `surface`: points (m, d) of the unit cube -> mean and variance, (m,) each."""
+    if not on_grid(study.space):
+        return _map_at_points(study, surface)
+    shown = parameters = study.space.parameters
+    side = np.linspace(0.0, 1.0, cells)
+    x = np.stack(np.meshgrid(*(side,) * len(shown), indexing="ij"), axis=-1)
+    flat = x.reshape(-1, len(parameters))
+    mean, variance = surface(flat)
+    names = [p.name for p in shown]
+    shape = x.shape[:-1]
+    return xr.Dataset(
+        {
+            "mean": (names, np.asarray(mean).reshape(shape), {"long_name": f"{study.attribute}, posterior mean"}),
+            "variance": (
+                names,
+                np.asarray(variance).reshape(shape),
+                {"long_name": f"{study.attribute}, posterior variance"},
+            ),
+            "feasible": (
+                names,
+                np.asarray(study.space.feasible(flat)).reshape(shape),
+                {"long_name": "may be rendered"},
+            ),
+        },
+        coords={p.name: (p.name, p.to_physical(side), {"units": p.unit}) for p in shown},
+        attrs={"study": study.hash},
+    )
+
+
+def _map_at_points(study: Study, surface: Callable[..., Any], seed: int = 0) -> xr.Dataset:
     """The map at points that fill the feasible set. `surface`: points (m, d) of the unit cube -> mean and variance."""
     x = search_points(study.space, seed)
     mean, variance = (np.asarray(moment) for moment in surface(np.asarray(x)))

@@ -8,8 +8,8 @@ import xarray as xr
 from live import STUDY
 
 from hilbo.errors import InputError
-from hilbo.report.results import map_dataset
 from hilbo.session.warm_start import read_warm_start
+from hilbo.study.map_file import map_dataset
 
 
 def grid():
