@@ -1,5 +1,6 @@
 """What a notebook meets: mistakes in one sentence, and records whose words are short."""
 
+import importlib
 import os
 import re
 import subprocess
@@ -10,9 +11,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
+from matplotlib.figure import Figure
 from studies import PLAIN
 
+import hilbo
 from hilbo import (
     RBF,
     InputError,
@@ -207,3 +211,22 @@ def test_trees_of_something_else_have_words_too(posterior):
     shapes = eqx.filter_eval_shape(lambda p: p, posterior)
     assert "Posterior" in repr(shapes) and "Certificate" in repr(shapes.certificate)
     assert "converged=True" in repr(posterior.certificate)
+
+
+@pytest.mark.deep  # fits, and draws a map: 20 s
+def test_the_guide_s_calls_can_be_made():
+    page = (Path(__file__).parents[1] / "docs" / "guides" / "in-python.md").read_text(encoding="utf-8")
+    study = Study.load(Path(hilbo.__file__).parent / "data" / "paper.toml")
+    rng = np.random.default_rng(0)
+    x = np.asarray(study.space.candidates(64, 0))[:24]
+    frame = pd.DataFrame(np.asarray(study.space.to_physical(x)), columns=list(study.space.names))
+    answers = {"participant": np.repeat(["A", "B", "C"], 8), "trial": np.tile(np.arange(1, 9), 3)}
+    table = frame.assign(**answers, response=np.array(study.responses)[rng.integers(0, 3, 24)])
+    names = {"table": table, "study": study, "frame": frame, "axes": Figure().subplots(), "hilbo": hilbo, "jax": jax}
+    block = page.split("```python\n")[1].split("```")[0]
+    exec(block.replace('study = Study.load("study.toml")\n', ""), names)
+    calls = re.findall(r"\| `((?:hilbo|jax)\.[^`]*)`", page)
+    assert len(calls) == 4
+    for call in calls:
+        importlib.import_module(call.split("(")[0].rpartition(".")[0])
+        assert eval(call, names) is not None
