@@ -14,6 +14,7 @@ Units: K N/mm, B1 N·s^α/mm, T s, mm, N, damping N·s/m.
 """
 
 import contextlib
+import math
 import time
 from collections.abc import Callable
 from functools import partial
@@ -28,7 +29,7 @@ from hilbo.device.parameter_sets import InForce, in_force, wanted_for
 from hilbo.device.ports import BAUD, list_ports, open_port
 from hilbo.device.reasons import Capability, NackReason, State, held_because, meaning
 from hilbo.device.staging import patiently, put_in_force
-from hilbo.device.telemetry import Counts, Samples, TelemetryBuffer
+from hilbo.device.telemetry import Counts, Samples, TelemetryBuffer, joined
 from hilbo.errors import InputError
 
 __all__ = ["Capability", "DeviceError", "InForce", "RefusalError", "Renderer", "State", "list_ports"]
@@ -254,10 +255,7 @@ class Renderer:
             )
         if mode not in ("force", "position") or shape not in _SHAPES:
             raise InputError(f'The drive is "{mode}", "{shape}"; it is force or position, and {", ".join(_SHAPES)}.')
-        ticks = {
-            "period_ticks": round(float(period) / self.tick_s),
-            "duration_ticks": round(float(duration) / self.tick_s),
-        }
+        ticks = {"period_ticks": self._ticks("period", period), "duration_ticks": self._ticks("duration", duration)}
         numbers = {"offset": float(offset), "amplitude": float(amplitude)}
         self._link.heartbeat()
         self._link.request(
@@ -265,6 +263,13 @@ class Renderer:
                 mode=int(mode == "position"), shape=_SHAPES[shape], **numbers, **ticks, boot_id=self.device.boot_id
             )
         )
+
+    def _ticks(self, what: str, seconds: SupportsFloat) -> int:
+        """A time of a drive in ticks; whether the device takes so many is its own to say."""
+        ticks = float(seconds) / self.tick_s
+        if not 0 <= ticks < 2**32 - 1:  # NaN too
+            raise InputError(f"The drive's {what} is {seconds} s; give a number from 0 to {2**32 * self.tick_s:.0f}.")
+        return round(ticks)
 
     def telemetry(self, seconds: SupportsFloat = 1.0) -> Any:
         """A pandas table of everything since `start` or the last call, after `seconds` more of the device's time.
@@ -279,17 +284,20 @@ class Renderer:
 
         Arrays (n,), in the units of `telemetry`. Raises `DeviceError` if the line is lost or no telemetry comes.
         """
+        if not math.isfinite(float(seconds)):
+            raise InputError(f"The time is {seconds} s; give a number.")
         buffer, quiet, ticks = self._buffer, 0, float(seconds) / self.tick_s
-        first = buffer.tick
+        first, pieces = buffer.tick, []
         while buffer.tick - first < ticks:
             if self._more():
                 quiet, first = 0, first or buffer.tick
+                pieces += [buffer.take()] if buffer.much else []
             elif self._link.lost:
                 raise DeviceError(self._link.lost)
             elif self._link.restarted or (quiet := quiet + 1) > _STALLED:
                 self.limits()  # says it better if device or line have a problem
                 raise DeviceError(f"{self._link.name}: no telemetry comes; switch it on with stream().")
-        return buffer.take()
+        return joined([*pieces, buffer.take()])
 
     def _more(self) -> bool:
         """Whether telemetry comes soon."""

@@ -14,7 +14,7 @@ from hilbo.device import protocol
 from hilbo.device.protocol import NackReason, Sample
 from hilbo.device.telemetry import TelemetryBuffer
 from hilbo.errors import InputError
-from hilbo.hardware_bridge import DeviceError, RefusalError
+from hilbo.hardware_bridge import DeviceError, RefusalError, Renderer
 
 A = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
 PATIENT = {"patience": 60.0}  # where a test is not about time
@@ -321,9 +321,43 @@ def test_lost_samples_are_counted():
     buffer = TelemetryBuffer(0.0127)
     for message in (frame(0), frame(3), frame(9, lost=65_535), frame(12, lost=1), frame(12, count=0)):
         buffer.add(message)
-    assert buffer.counts() == (12, 65_535 + 2, 3)
+    assert buffer.counts() == (12, 65_535 + 2, 3, 0)
     assert list(buffer.take().tick) == [0, 1, 2, 3, 4, 5, 9, 10, 11, 12, 13, 14]
     assert np.isnan(buffer.take().sensed_N).all()
+
+
+def test_telemetry_that_nobody_asked_for_is_given_up_and_counted(monkeypatch):
+    monkeypatch.setattr("hilbo.device.telemetry._MOST", 3)
+    buffer = TelemetryBuffer(0.0127)
+    for tick in range(0, 15, 3):
+        buffer.add(frame(tick))
+    assert buffer.much and buffer.counts().unread == 6
+    assert list(buffer.take().tick) == list(range(6, 15))
+
+
+def test_a_long_call_for_samples_has_all_of_them(monkeypatch):
+    monkeypatch.setattr("hilbo.device.telemetry._MOST", 20)
+    with Renderer.open("sim", options={"rate": "lockstep", "finger": "none"}) as device:
+        device.samples(0.0)
+        ticks = device.samples(1.0).tick  # 250 messages
+        assert len(ticks) >= 1000 and np.all(np.diff(ticks) == 1) and device.counts().unread == 0
+
+
+@pytest.mark.parametrize("damping", [float("nan"), -0.1, float("inf")])
+def test_a_damping_that_is_none_is_refused(damping):
+    with pytest.raises(InputError, match=r"give a number from 0, in N\.s/m"):
+        Peer().open(damping=damping, **PATIENT)
+
+
+def test_times_and_numbers_that_are_none_are_refused():
+    with Renderer.open("sim", options={"rate": "lockstep", "finger": "none"}) as device:
+        for seconds in (float("nan"), float("inf"), -1.0, 1e8):
+            with pytest.raises(InputError, match="The drive's duration is"):
+                device.drive("position", "hold", 1.0, duration=seconds)
+        with pytest.raises(InputError, match="The time is nan s"):
+            device.samples(float("nan"))
+        with pytest.raises(InputError, match="K1 is '5,58'; give a number"):
+            device.send(**A | {"K1": "5,58"})
 
 
 def test_the_interpreter_ends_although_a_device_is_open():

@@ -143,7 +143,7 @@ static enum hb_cause fault(const struct hb_device *device, bool input_lost, bool
     if (device->heartbeat_age_ticks >= device->config->watchdog_ticks) {
         return HB_CAUSE_WATCHDOG;
     }
-    if (input_lost) {
+    if (input_lost || (hb_is_in(device, HB_DRIVING) && hb_drive_is_stuck(&device->drive, device->config))) {
         return HB_CAUSE_INPUT;
     }
     if (hb_is_too_fast(&device->safety, device->config)) {

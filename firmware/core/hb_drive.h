@@ -18,7 +18,16 @@ struct hb_drive {
     uint32_t tick;      /* since the start */
     float reference_mm; /* mode 1: where the servo wants to be now */
     float integral_N;   /* mode 1: what its integral has come to */
+    int32_t seen_counts;  /* mode 1: where the handle was when it last moved, or needed no push */
+    uint16_t still_ticks; /* mode 1: how long it has been pushed there without moving */
 };
+
+/* The handle is stuck where the servo pushes with more than this part of the force limit, more than so many encoder steps
+ * from where it should be, and sees it move by no more than one step in this part of a second. A servo as soft as the
+ * simulated one moves a handle against 60 N/mm further than that. */
+#define HB_STUCK_FORCE 0.125F
+#define HB_STUCK_STEPS 128
+#define HB_STUCK_PER_S 20U
 
 /* Its mode and shape have names. */
 bool hb_drive_is_named(const struct hb_drive_request *request);
@@ -27,10 +36,14 @@ bool hb_drive_is_named(const struct hb_drive_request *request);
 enum hb_reason hb_drive_check(const struct hb_drive_request *request, const struct hb_config *config, float *value,
                               float *limit);
 
-/* Start from a position. */
-void hb_drive_begin(struct hb_drive *drive, const struct hb_drive_request *request, float position_mm);
+/* Start from where the handle is. */
+void hb_drive_begin(struct hb_drive *drive, const struct hb_drive_request *request, const struct hb_config *config,
+                    const struct hb_safety *safety);
 
 bool hb_drive_has_ended(const struct hb_drive *drive);
+
+/* The servo pushes and sees no movement: the encoder is stuck, or what is in the way is stronger. */
+bool hb_drive_is_stuck(const struct hb_drive *drive, const struct hb_config *config);
 
 /* The command of one tick. */
 float hb_drive_step(struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety);

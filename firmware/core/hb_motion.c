@@ -87,7 +87,7 @@ enum hb_reason hb_drive(struct hb_device *device, const struct hb_frame *frame, 
     if (!hb_input_is_good(&device->safety)) {
         return HB_NACK_NO_INPUT;
     }
-    hb_drive_begin(&device->drive, &request, hb_position_mm(&device->safety, device->config));
+    hb_drive_begin(&device->drive, &request, device->config, &device->safety);
     hb_enter(device, HB_DRIVING, HB_CAUSE_NONE);
     device->safety.energy = 0;
     return HB_ACCEPTED;

@@ -56,6 +56,9 @@ FAULTS = [
           "(uint8_t)(value & 255U));\n    return put_u8(payload, at, (uint8_t)(value >> 8));",
           "(uint8_t)(value >> 8));\n    return put_u8(payload, at, (uint8_t)(value & 255U));", "frames"),
     Fault("four bad positions", "hb_safety.h", "HB_LOSS_LIMIT 30U", "HB_LOSS_LIMIT 40U", "safety"),
+    Fault("a stuck encoder is pushed on", "hb_device.c", "if (input_lost || (hb_is_in(device, HB_DRIVING) && "
+          "hb_drive_is_stuck(&device->drive, device->config))) {", "if (input_lost) {", "safety"),
+    Fault("friction taken for stuck", "hb_drive.c", " && ahead_mm >= 0.0F;", ";", "safety"),
     Fault("bad positions forgotten at once", "hb_safety.c", "(uint16_t)(safety->loss - 1U) : 0U;", "0U : 0U;",
           "contact"),
     Fault("a model is felt out of contact", "hb_device.c",

@@ -5,6 +5,7 @@ failed, 2: bad usage or bad input, numbers that the device refuses included. The
 command.
 """
 
+import contextlib
 import json
 import sys
 import time
@@ -18,6 +19,7 @@ from hilbo.cli.console import ForceFile, JsonToo, fail, print_result
 from hilbo.cli.device_options import Chosen, Line, chosen_set, opened, sets_of, takes
 from hilbo.cli.device_output import decoded, said, set_words
 from hilbo.cli.new_file import check_free, new_file
+from hilbo.device.failures import DeviceError
 from hilbo.errors import InputError
 
 __all__ = ["app"]
@@ -27,6 +29,8 @@ app = typer.Typer(
 )
 for name, command in measure.COMMANDS.items():
     app.command(name)(command)
+
+_PIECE = 1.0  # s of a recording between two writes to its file
 
 Seconds = Annotated[float | None, typer.Option(help="End after so many seconds of the device's time.")]
 
@@ -142,19 +146,39 @@ def record(
     force: ForceFile = False,
     as_json: JsonToo = False,
 ) -> None:
-    """Telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags."""
+    """Telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags. Ctrl-C ends it earlier."""
     check_free(out, force)
     wanted = chosen_set(chosen, line)
     with opened(line) as device:
         if render:
             _begin(device, wanted)
         device.samples(0.0)
-        table = device.telemetry(seconds)
+        with new_file(out) as path:
+            samples, ended = _recorded(device, seconds, path)
+            if not samples:
+                raise ended or KeyboardInterrupt
+        if ended is not None:
+            raise DeviceError(f"{ended} {out} holds the {samples} samples until then.") from ended
         state, counts = device.state().name, device.counts()
-    with new_file(out) as path:
-        table.to_csv(path, index=False)
-    content = {"file": str(out), "samples": len(table), "state": state, "counts": counts._asdict()}
-    print_result(content, f"{out}: {len(table)} samples", as_json)
+    content = {"file": str(out), "samples": samples, "state": state, "counts": counts._asdict()}
+    print_result(content, f"{out}: {samples} samples", as_json)
+
+
+def _recorded(device: Any, seconds: float, path: Path) -> tuple[int, DeviceError | None]:
+    """How many samples were written, as they came, and what the device or its line ended that by."""
+    samples, begun, ticks = 0, None, seconds / device.tick_s
+    with path.open("w", encoding="utf-8", newline="") as file, contextlib.suppress(KeyboardInterrupt):
+        while True:
+            try:
+                piece = device.samples(min(_PIECE, seconds))
+            except DeviceError as error:
+                return samples, error
+            begun = int(piece.tick[0]) if begun is None else begun
+            piece.table(device.tick_s, begun).to_csv(file, index=False, header=samples == 0)
+            samples += len(piece.tick)
+            if piece.tick[-1] + 1 - begun >= ticks:
+                break
+    return samples, None
 
 
 @app.command()

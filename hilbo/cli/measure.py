@@ -3,6 +3,7 @@
 Results on stdout, progress on stderr, exit codes as in `device`, which gives these commands their place.
 """
 
+import math
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +13,7 @@ import typer
 from hilbo.cli.console import ForceFile, JsonToo, fail, print_result, progress, seed_option
 from hilbo.cli.device_options import Line, opened, takes
 from hilbo.cli.new_file import check_free, new_file
+from hilbo.device.handshake import shortest
 
 __all__ = ["COMMANDS"]
 
@@ -58,8 +60,7 @@ def measure_damping(
     estimates = [(name, getattr(friction, name), unit) for name, unit in rows]
     content = {name: estimate._asdict() | {"unit": unit} for name, estimate, unit in estimates}
     words = [f"{name:9} {x.value:9.5f}  {x.lower:9.5f} to {x.upper:9.5f}  {unit}" for name, x, unit in estimates]
-    believed = friction.damping.lower
-    words.append(f"The device reports {reported:.4g} N.s/m; plan studies with at most {min(believed, reported):.4g}.")
+    words.append(f"The device reports {shortest(reported)} N.s/m; {_advice(min(friction.damping.lower, reported))}")
     if reported > friction.damping.upper:
         print("hilbo: the device reports more damping than it has; fix its configuration.", file=sys.stderr)
     rest = {
@@ -69,6 +70,14 @@ def measure_damping(
         "reported": reported,
     }
     print_result(content | rest, "\n".join(words), as_json)
+
+
+def _advice(damping: float) -> str:
+    """What studies may count on, which is never more than this (N·s/m)."""
+    if damping <= 0:
+        return "the measurement does not tell it from 0: measure again, with the handle free, and plan no study before."
+    least = 10.0 ** (math.floor(math.log10(damping)) - 3)
+    return f"plan studies with at most {math.floor(damping / least) * least:.4g}."
 
 
 @takes(line=Line)
@@ -86,17 +95,23 @@ def characterise(
     as_json: JsonToo = False,
 ) -> None:
     """Relaxation and creep of a material at position 0, pressed by the device itself."""
+    from hilbo.device.failures import DeviceError
     from hilbo.identification import device_tests
 
     check_free(out, force)
     with progress() as say, opened(line, rate="lockstep", material=_FOAM, noise=0.02) as device:
-        numbers = {"repeats": repeats, "depth": depth, "force": load, "after": after, "hold": hold, "rest": rest}
-        table = device_tests.characterise(device, say, **numbers, seed=seed)
         damping = device.device.damping_N_s_per_m
+        numbers = {"repeats": repeats, "depth": depth, "force": load, "after": after, "hold": hold, "rest": rest}
+        try:
+            table, ended = device_tests.characterise(device, say, **numbers, seed=seed), None
+        except device_tests.CutShortError as error:
+            table, ended = error.table, error
     with new_file(out) as path:
         table.to_csv(path, index=False)
+    if ended is not None:
+        raise DeviceError(f"{ended} {out} holds the {ended.repeats} repeats that are whole.")
     content = {"file": str(out), "samples": len(table), "repeats": repeats, "damping": damping}
-    print_result(content, f"{out}: now  hilbo identify {out} --out results --damping {damping:.6g}", as_json)
+    print_result(content, f"{out}: now  hilbo identify {out} --out results --damping {shortest(damping)}", as_json)
 
 
 COMMANDS = {"selftest": selftest, "measure-damping": measure_damping, "characterise": characterise}

@@ -3,9 +3,12 @@
 Whoever comes second takes over a device at rest: one that still moves for an earlier host is told to stop first.
 """
 
+import math
 import struct
 import time
 from typing import SupportsFloat
+
+import numpy as np
 
 from hilbo.device import protocol
 from hilbo.device.failures import DeviceError
@@ -15,7 +18,7 @@ from hilbo.device.messages import HelloReply
 from hilbo.device.reasons import State, held_because, meaning
 from hilbo.errors import InputError
 
-__all__ = ["greet", "take_over"]
+__all__ = ["greet", "shortest", "take_over"]
 
 _BOOT = 3.0  # s that a board may take to start when its port is opened
 _STOPPING = 2.0  # s
@@ -47,10 +50,12 @@ def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
             f"{link.name}: the device lets go after {silence:g} s without a heartbeat, and they come every {BEAT:g} s;"
             f" set its watchdog_ticks to {_BEATS * BEAT:g} s at least."
         )
+    if damping is not None and not 0.0 <= float(damping) < math.inf:  # NaN neither
+        raise InputError(f"The damping that the study counts on is {damping}; give a number from 0, in N.s/m.")
     if damping is not None and _f32(float(damping)) > device.damping_N_s_per_m:
         raise InputError(
-            f"{link.name}: the study counts on {float(damping):.6g} N.s/m of damping and the device has"
-            f" {device.damping_N_s_per_m:.6g}; plan the study with the device's damping."
+            f"{link.name}: the study counts on {shortest(float(damping))} N.s/m of damping and the device has"
+            f" {shortest(device.damping_N_s_per_m)}; plan the study with the device's damping."
         )
     return device
 
@@ -74,6 +79,11 @@ def take_over(link: Link, device: HelloReply) -> list[str]:
     link.restarted = False
     link.beat(device.boot_id)
     return notes
+
+
+def shortest(value: float) -> str:
+    """The shortest decimal of a number's binary32: read again, it is the same to the device."""
+    return np.format_float_positional(np.float32(value), trim="-")
 
 
 def _f32(value: float) -> float:

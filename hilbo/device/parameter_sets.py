@@ -91,13 +91,21 @@ def wanted_for(
     hurry.
     """
     rate = device.tick_rate_Hz
-    if not abs(rate * float(T) - 1) < 1e-9:
-        raise InputError(f"T is {T} s and the device's tick {1 / rate:g} s; a set belongs to its T, choose another.")
-    limit = device.force_limit_N if force_limit is None else float(force_limit)
+    if not abs(rate * _number("T", T) - 1) < 1e-9:
+        raise InputError(f"T is {T} s and the device's tick {1 / rate!r} s; a set belongs to its T, choose another.")
+    limit = device.force_limit_N if force_limit is None else _number("force_limit", force_limit)
     length = states if memory == "full" else N
-    wanted = ParameterSet(float(K0), float(K1), float(B1), float(alpha), memory, length, limit)
+    numbers = {name: _number(name, value) for name, value in (("K0", K0), ("K1", K1), ("B1", B1), ("alpha", alpha))}
+    wanted = ParameterSet(**numbers, memory=memory, length=length, force_limit=limit)
     wanted.messages(1, rate)
     return wanted
+
+
+def _number(name: str, value: SupportsFloat) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {value!r}; give a number.") from None
 
 
 def crc_of(messages: Sequence[SetParams | SetStates]) -> int:

@@ -126,7 +126,7 @@ ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_
 _HOLD = {
     HoldReason.NONE: "it was asked to",
     HoldReason.WATCHDOG: "it heard no heartbeat from the host",
-    HoldReason.INPUT: "too many positions were bad; check the encoder",
+    HoldReason.INPUT: "too many positions were bad, or none changed while it pushed; check the encoder",
     HoldReason.VELOCITY: "it moved faster than its velocity limit",
     HoldReason.OVERRUN: "a tick was missed or took too long",
     HoldReason.MODEL: "the model's force was not finite",

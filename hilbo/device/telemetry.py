@@ -5,13 +5,14 @@ Ticks are the device's only clock, 32 bits of it on the wire; here they count on
 
 import threading
 from collections import deque
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from hilbo.device.messages import Telemetry
 
-__all__ = ["Counts", "Samples", "TelemetryBuffer"]
+__all__ = ["Counts", "Samples", "TelemetryBuffer", "joined"]
 
 _MOST = 200_000  # messages: some twenty minutes at 1 kHz
 
@@ -25,21 +26,28 @@ class Samples(NamedTuple):
     sensed_N: np.ndarray
     flags: np.ndarray
 
-    def table(self, tick_s: float) -> Any:
-        """As a pandas table, with `time_s` from the first sample on."""
+    def table(self, tick_s: float, begun: int | None = None) -> Any:
+        """As a pandas table, with `time_s` from the tick `begun` on, or from the first sample's."""
         import pandas as pd
 
-        since = (self.tick - self.tick[:1].sum()) * tick_s
+        since = (self.tick - (self.tick[:1].sum() if begun is None else begun)) * tick_s
         columns = {"tick": self.tick, "time_s": since, "position_mm": self.position_mm, "force_N": self.force_N}
         return pd.DataFrame(columns | {"sensed_N": self.sensed_N, "flags": self.flags})
 
 
+def joined(pieces: Sequence[Samples]) -> Samples:
+    """Pieces one after the other."""
+    return Samples(*(np.concatenate(column) for column in zip(*pieces, strict=True)))
+
+
 class Counts(NamedTuple):
-    """What has arrived, and what has not: `dropped` by the device for want of room, `missing` on the way or there."""
+    """What has arrived, and what has not: `dropped` by the device for want of room, `missing` on the way or there;
+    `unread`: what had arrived and was given up here, because nobody asked for it for long."""
 
     samples: int
     dropped: int
     missing: int
+    unread: int
 
 
 class TelemetryBuffer:
@@ -47,9 +55,9 @@ class TelemetryBuffer:
 
     def __init__(self, encoder_step_mm: float):
         self._step = encoder_step_mm
-        self._messages: deque[tuple[int, Telemetry]] = deque(maxlen=_MOST)
+        self._messages: deque[tuple[int, Telemetry]] = deque()
         self._news = threading.Condition()
-        self._samples = self._missing = self._dropped = 0
+        self._samples = self._missing = self._dropped = self._unread = 0
         self._next: int | None = None  # tick that the next sample should have
         self._lost: int | None = None
         self.newest: Telemetry | None = None
@@ -68,6 +76,8 @@ class TelemetryBuffer:
             self._next, self._lost = tick + len(message.samples) * message.divisor, message.lost
             self._samples += len(message.samples)
             self._messages.append((tick, message))
+            if len(self._messages) > _MOST:
+                self._unread += len(self._messages.popleft()[1].samples)
             self.newest = message
             self._news.notify_all()
 
@@ -80,7 +90,12 @@ class TelemetryBuffer:
     def counts(self) -> Counts:
         """Since the buffer was made."""
         with self._news:
-            return Counts(self._samples, self._dropped, self._missing)
+            return Counts(self._samples, self._dropped, self._missing, self._unread)
+
+    @property
+    def much(self) -> bool:
+        """Whether so much waits to be taken that it should be."""
+        return len(self._messages) > _MOST // 2
 
     def wait(self, timeout: float) -> bool:
         """Whether something new came within `timeout` seconds."""

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hilbo.device.reasons import HoldReason, SampleFlag, held_because, meaning
-from hilbo.device.telemetry import Samples
+from hilbo.device.telemetry import Samples, joined
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import Capability, DeviceError, Renderer, State
 from hilbo.identification.friction import Friction, friction, sweeps
 from hilbo.identification.pressing import Pressed, pressed, table_of
 
-__all__ = ["SelfTest", "characterise", "drive", "measure_damping", "selftest", "wait_until"]
+__all__ = ["CutShortError", "SelfTest", "characterise", "drive", "measure_damping", "selftest", "wait_until"]
 
 _SWEEPS = 24  # there and back
 _SLOWEST, _FASTEST = 10.0, 55.0  # mm/s
@@ -24,6 +24,14 @@ _SETTLE = 0.12  # s after each turn
 _SPREAD = 0.01  # of depth and loads, from the least to the most
 _FREE = 0.1  # N that a free device's sensor may show
 _MOST = 2.0  # s for what the device does at once
+
+
+class CutShortError(DeviceError):
+    """A measurement ended before its time; `table` holds the `repeats` that were whole by then."""
+
+    def __init__(self, words: str, table: Any, repeats: int):
+        super().__init__(words)
+        self.table, self.repeats = table, repeats
 
 
 class SelfTest(NamedTuple):
@@ -58,7 +66,7 @@ def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: flo
     while not _ended(arrived[-1], begun):
         arrived.append(device.samples(0.05))
     wait_until(device, lambda: device.state() != State.STOPPING, "stopped")
-    whole = Samples(*(np.concatenate(column) for column in zip(*arrived, strict=True)))
+    whole = joined(arrived)
     driving = (whole.flags & SampleFlag.DRIVING) != 0
     if driving.sum() * device.divisor < round(times["duration"] / device.tick_s) - device.divisor:
         status = device.status()
@@ -80,8 +88,13 @@ def measure_damping(device: Renderer, say: Callable[[str], None], seed: int = 0)
     """Damping b, Coulomb friction and mass of the free device, by sweeps through its stroke at several speeds.
 
     Nothing may touch the handle. Raises `InputError` where the stroke is too short, `DeviceError` where something
-    touches it.
+    touches it, and where the line does not carry every tick: forces seen now and then say nothing of their mean.
     """
+    if device.divisor > 1:
+        raise DeviceError(
+            f"{device.link.name}: the line carries every {device.divisor}th tick, and damping needs all of them; use a"
+            " faster line (--baud, and the device's own rate)."
+        )
     about, rng = device.device, np.random.default_rng(seed)
     low, high = about.position_low_mm, about.position_high_mm
     middle, most, stretches = (low + high) / 2, 0.3 * (high - low), []
@@ -115,28 +128,41 @@ def characterise(
 
     Returns the table that `hilbo identify` reads: test, repeat, time_s, position_mm, force_N. Each test begins off the
     material and at rest; `rest` s between them let it recover. Depth and loads differ by up to half a per cent from
-    repeat to repeat, so that the encoder's rounding averages out. Raises `InputError` and `DeviceError`.
+    repeat to repeat, so that the encoder's rounding averages out. Raises `InputError` and `DeviceError`, which is
+    `CutShortError` once a repeat is whole.
     """
     step, low = device.device.encoder_step_mm, device.device.position_low_mm
-    if repeats < 1 or depth <= 0 or force <= 0 or hold <= 0:
-        raise InputError("Repeats, depth, force and hold must be above 0.")
+    if not (repeats >= 1 and depth > 0 and force > 0 and hold > 0 and rest > 0):  # nor is any of them NaN
+        raise InputError("Repeats, depth, force, hold and rest must be above 0.")
     away = max(low / 2, -1.0)
-    spread = _SPREAD * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
-    position_before = {"relaxation": away, "creep": -step}
+    spread = 1 + _SPREAD * (np.random.default_rng(seed).permutation(repeats) + 0.5 - repeats / 2) / repeats
     last = {"relaxation": hold, "creep": 2 * hold}
     presses: dict[str, list[Pressed]] = {"relaxation": [], "creep": []}
-    for repeat in range(repeats):
-        for kind, tests in presses.items():
-            say(f"{kind} {repeat + 1} of {repeats}")
-            free = drive(device, "position", "hold", position_before[kind], duration=rest)
-            if kind == "relaxation":
-                seen = drive(device, "position", "hold", depth * (1 + spread[repeat]), duration=hold + 0.5)
-            else:
-                loads = force * (1 + spread[repeat]), after * (1 + spread[repeat])
-                seen = drive(device, "force", "step", *loads, period=hold, duration=2 * hold + 0.1)
-            tests.append(pressed(seen, kind, bool(device.can & Capability.FORCE_SENSOR), _noise(free)))
-    drive(device, "position", "hold", away, duration=0.5)
+
+    try:
+        for repeat, scale in enumerate(spread, 1):
+            say(f"relaxation {repeat} of {repeats}")
+            way = "position", "hold", depth * scale
+            relaxation = _pressed(device, "relaxation", away, rest, *way, duration=hold + 0.5)
+            say(f"creep {repeat} of {repeats}")
+            way = "force", "step", force * scale, after * scale
+            creep = _pressed(device, "creep", -step, rest, *way, period=hold, duration=2 * hold + 0.1)
+            presses["relaxation"].append(relaxation)
+            presses["creep"].append(creep)
+        drive(device, "position", "hold", away, duration=0.5)
+    except (DeviceError, KeyboardInterrupt) as error:
+        whole = len(presses["creep"])
+        if not whole:
+            raise
+        words = str(error) or "It was ended from the keyboard."
+        raise CutShortError(words, table_of(presses, last, device.tick_s * device.divisor), whole) from error
     return table_of(presses, last, device.tick_s * device.divisor)
+
+
+def _pressed(device: Renderer, kind: str, before: float, rest: float, *way: Any, **times: float) -> Pressed:
+    """One test, driven in this `way`, after `rest` s at the position `before` (mm)."""
+    free = drive(device, "position", "hold", before, duration=rest)
+    return pressed(drive(device, *way, **times), kind, bool(device.can & Capability.FORCE_SENSOR), _noise(free))
 
 
 def _noise(free: Samples) -> float:

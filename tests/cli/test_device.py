@@ -97,6 +97,8 @@ def test_set(device, sets):
         (["record", "no/where.csv"], 2, "cannot be written"),
         (["characterise", "t.csv", "--repeats", "0"], 2, "--repeats"),
         (["feel", "none.csv"], 2, "cannot be read"),
+        (["measure-damping", "--sim", "line-rate=57600"], 1, "every 4th tick, and damping needs all of them"),
+        (["characterise", "t.csv", "--rest", "nan"], 2, "must be above 0"),
         (["clear", *FAST], 1, "CLEAR is refused while the device is STOPPED"),
         (["simulate", "--device", "/dev/null"], 2, "leave --device out"),
     ],
@@ -165,6 +167,30 @@ def test_stop_estop_and_monitor(device):
         assert device(command, "--json", *FAST)[0] == 0
     code, stdout, _ = device("monitor", "--seconds", 0.2, "--json", *FAST)
     assert (code, json.loads(stdout)["state"]) == (0, "STOPPED")
+
+
+def test_what_was_recorded_stays_when_the_device_is_gone_or_somebody_ends_it(device, tmp_path, monkeypatch):
+    from hilbo.hardware_bridge import DeviceError, Renderer
+
+    real = Renderer.samples
+    for error, code, words in (
+        (DeviceError("The line is gone."), 1, "samples until then"),
+        (KeyboardInterrupt(), 0, ""),
+    ):
+        calls = []
+
+        def samples(self, seconds, error=error, calls=calls):
+            calls.append(seconds)
+            if len(calls) > 3:
+                raise error
+            return real(self, seconds)
+
+        monkeypatch.setattr(Renderer, "samples", samples)
+        out = tmp_path / f"{code}.csv"
+        status, _, stderr = device("record", out, *A, "--seconds", 5, *FAST)
+        assert status == code and words in " ".join(stderr.split())
+        ticks = pd.read_csv(out)["tick"]
+        assert 2000 <= len(ticks) < 5000 and set(ticks.diff().dropna()) == {1}
 
 
 def test_record_and_decode(device, tmp_path):

@@ -257,6 +257,24 @@ def test_characterise_makes_the_table_that_identify_reads(tmp_path):
             assert np.std(out - expected[at]) < 0.01 * np.ptp(out)
 
 
+def test_repeats_that_were_whole_stay_when_a_later_one_fails(monkeypatch):
+    real, count = device_tests.drive, iter(range(1, 99))
+
+    def failing(device, *way, **times):
+        if next(count) > 10:  # within the third repeat, of four drives each
+            raise DeviceError("The device has ended its drive early.")
+        return real(device, *way, **times)
+
+    monkeypatch.setattr(device_tests, "drive", failing)
+    options = {"material": (*FOAM, 101), "noise": 0.02, "seed": 1}
+    with (
+        Renderer.open("sim", options=FAST | options) as device,
+        pytest.raises(device_tests.CutShortError, match="ended its drive early") as cut,
+    ):
+        device_tests.characterise(device, quiet, repeats=4, hold=0.2, rest=0.1)
+    assert cut.value.repeats == 2 and set(cut.value.table["repeat"]) == {1, 2}
+
+
 def test_a_material_that_is_not_there_is_said():
     still = Samples(*(np.zeros(100) for _ in Samples._fields))
     with pytest.raises(DeviceError, match="The relaxation test has met nothing at position 0"):

@@ -275,21 +275,56 @@ def test_drive_step_is_creep_with_recovery():
     assert list(forces) == [-3.0] * 30 + [-0.5] * 19
 
 
-def test_drive_position_reaches_its_goal_without_a_hold():
-    """A handle of 0.3 kg with the device's damping, on a spring of 0.8 N/mm."""
-    device = Device(velocity=500.0)
+def driven(device, stiffness, friction, offset, ticks, **shape):
+    """Positions (mm) of a handle of 0.3 kg on a spring (N/mm), with the device's damping and Coulomb friction (N), that
+    the servo drives."""
     device.beat()
-    device.must("DRIVE", mode=1, shape=0, offset=5.0, duration_ticks=3000, boot_id=7)
+    device.must("DRIVE", mode=1, offset=offset, duration_ticks=ticks + 100, boot_id=7, **shape)
     x = v = force = 0.0
     trace = []
-    for _ in range(2900):
-        v += 1e-3 * (-force * 1000 - 800 * x - 0.95 * v) / 0.3  # mm/s
+    for _ in range(ticks):
+        pull = -force - stiffness * x - 0.95e-3 * v
+        rubbed = v + pull / 0.3  # mm/s, after a tick of 1 ms
+        v = np.sign(rubbed) * max(0.0, abs(rubbed) - friction / 0.3)
         x += 1e-3 * v
         device.beat()
         force = device.tick(round(x / STEP))
         trace.append(x)
+    return np.array(trace)
+
+
+def test_drive_position_reaches_its_goal_without_a_hold():
+    device = Device(velocity=500.0)
+    trace = driven(device, 0.8, 0.0, 5.0, 2900)
     assert device.state == "DRIVING"
     assert abs(np.mean(trace[-200:]) - 5.0) < 0.03 and max(trace) < 6.5
+
+
+@pytest.mark.parametrize(("stiffness", "friction"), [(0.0, 2.0), (0.0, 4.0), (7.0, 0.5), (0.3, 3.0)])
+def test_a_handle_that_moves_is_not_taken_for_stuck(stiffness, friction):
+    device = Device(velocity=500.0)
+    driven(device, stiffness, friction, 5.0, 1500)
+    assert device.state == "DRIVING"
+    device = Device(velocity=500.0)
+    driven(device, stiffness, friction, 0.0, 1500, shape=1, amplitude=4.0, period_ticks=1000)
+    assert device.state == "DRIVING"
+
+
+def test_a_drive_that_sees_no_movement_lets_go():
+    """An encoder whose cable is off gives one count for ever, which is a good position in every other respect."""
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        counts, offset = rng.integers(-100, 500), rng.choice([-1, 1]) * rng.uniform(9.0, 15.0)
+        step, speed = rng.integers(0, 2), rng.uniform(10.0, 100.0)
+        device = Device(servo_speed=speed)
+        device.run([counts] * 3)
+        device.beat()
+        device.must("DRIVE", mode=1, offset=offset, duration_ticks=3000, boot_id=7)
+        forces, _ = device.run(counts + step * (np.arange(1500) % 2))  # the last digit may flicker
+        assert device.state == "HOLD" and cause(device) == "INPUT"
+        assert np.flatnonzero(forces)[-1] < 700 and np.abs(forces).max() < 15.0
+        device.beat()
+        device.must("CLEAR", boot_id=7)
 
 
 def test_drive_falls_silent_with_the_host():
