@@ -33,11 +33,14 @@ __all__ = [
     "polish",
     "residuals",
     "search",
+    "untared",
 ]
 
 Kind = Literal["relaxation", "creep", "modulus", "compliance"]
 MEASURED = ("relaxation", "creep")  # kinds with a recorded input
 FEWEST = 8  # points of a test
+_OPPOSED = -0.1  # correlation of position and force, about 0; noise does not bring a real test there
+_OFF_ZERO, _MOVED = 0.03, 0.2  # of a curve's range
 _RACE, _LONGEST = 12, 200  # steps of every start, and of the best one
 
 
@@ -47,7 +50,8 @@ class Test(eqx.Module):
     `time` (m,) in s, increasing; `output` (R, m): force (N) of relaxation, position (mm) of creep, modulus or
     compliance; `input` (R, m): the position (mm) or force (N) that was applied, None for moduli. Before the first row
     the material is at rest with no input (`start="rest"`), or in equilibrium with the first one.
-    Raises `InputError` for too few points, times that do not increase, numbers that are not finite, and flat curves.
+    Position and force of a push have one sign, whichever. Raises `InputError` for too few points, times that do not
+    increase, numbers that are not finite, flat curves, and opposite signs.
     """
 
     __test__ = False  # no test of pytest's
@@ -74,6 +78,21 @@ class Test(eqx.Module):
             raise InputError(f"The output of the {self.kind} test does not change; there is nothing to fit.")
         if self.input is not None and not np.any(self.input):
             raise InputError(f"The input of the {self.kind} test is 0 throughout; check the columns.")
+        self._check_signs()
+
+    def _check_signs(self):
+        """Refuse a repeat whose position and force oppose each other."""
+        for place, (put, out) in enumerate(zip(() if self.input is None else self.input, self.output, strict=False), 1):
+            opposed = _correlation(self.time, put, out) < _OPPOSED
+            changes = _correlation(self.time, put - put[0], out - out[0])
+            if self.start == "equilibrium":
+                opposed = changes < _OPPOSED
+            elif _off_zero(put, out):  # an offset of one of them is no opposite sign
+                opposed = opposed and not changes >= _OPPOSED
+            if opposed:
+                which = f" in repeat {place} of {self.repeats} (counted from 1)" if self.repeats > 1 else ""
+                fault = f"The {self.kind} test has position and force of opposite signs{which}"
+                raise InputError(f"{fault}; multiply one of them by -1.")
 
     @property
     def repeats(self) -> int:
@@ -167,6 +186,49 @@ class Fit(eqx.Module):
         """Coordinates within a millionth of the box's width of a bound: the data pull them out of it. (p,)."""
         reach = 1e-6 * (self.upper - self.lower)
         return (self.q - self.lower <= reach) | (self.upper - self.q <= reach)
+
+
+def untared(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:
+    """Which has an offset, "input" or "output": its first row is not 0, although the other's is. (m,) each.
+
+    A step in the first row itself looks alike, but there the other one moves while this one stays.
+    """
+    name = _off_zero(put, out)
+    held, other = (put, out) if name == "input" else (out, put)
+    leaves = np.abs(held - held[0]) > max(0.05, 4 * _jitter(held)) * np.ptp(held)
+    before = int(np.argmax(leaves)) if leaves.any() else held.size
+    return name if np.ptp(other[:before]) <= _MOVED * np.ptp(other) else None
+
+
+def _off_zero(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:
+    """Which, "input" or "output", is clearly not 0 in the first row, where the other one is."""
+    for name, one, other in (("input", put, out), ("output", out, put)):
+        height = _height(one)
+        zero = _height(other) <= max(0.1 * min(height, 1.0), 2 * _jitter(other))
+        if zero and height > max(_OFF_ZERO, 6 * _jitter(one)):
+            return name
+    return None
+
+
+def _height(values: Float[np.ndarray, " m"]) -> float:
+    """The first of the values, over their range."""
+    first, width = abs(values[0]), np.ptp(values)
+    return float(first / width) if width > 0 else np.inf if first > 0 else 0.0
+
+
+def _jitter(values: Float[np.ndarray, " m"]) -> float:
+    """Standard deviation of the noise from row to row, over the range of the values."""
+    second = np.abs(np.diff(values, 2))  # has the variance of six samples
+    return float(1.4826 * np.median(second) / np.sqrt(6) / (np.ptp(values) or np.inf))
+
+
+def _correlation(time: Float[np.ndarray, " m"], put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> float:
+    """Of two curves about 0, over the time; nan where one of them is 0.
+
+    A storage modulus is above 0 at every frequency, and so is this of whatever a material can do from rest.
+    """
+    both, ones, others = (np.trapezoid(product, time) for product in (put * out, put * put, out * out))
+    return float(both / np.sqrt(ones * others)) if ones * others > 0 else np.nan
 
 
 def fit(tests: Sequence[Test], model: Any) -> Fit:

@@ -73,15 +73,17 @@ def _passivity(needed, damping):
 
 
 def renderer_block(result: Characterisation, damping: float | None) -> str:
-    """The [renderer] table of a study file for this material, as text; the identified set as comments.
+    """The [renderer] table of a study file for this material, as text; the whole set as comments.
 
+    K_eff has its status beside it: the number of the best curve is there even where the data do not tell it.
     `damping`: the device's, N·s/m; None leaves a line to fill in.
     """
     model, values = result.fit.model, result.fit.parameters()
     lines = ["[renderer]", 'model = "fosls"', f'memory = "{model.memory}"']
     if model.memory == "short":
         lines.append(f"N = {int(model.N)}")
-    lines += [f"T = {model.T:g}             # s", f"K_eff = {values['K_eff']:.6g}       # N/mm, identified"]
+    worth = result.estimates["K_eff"].status
+    lines += [f"T = {model.T:g}             # s", f"K_eff = {values['K_eff']:.6g}       # N/mm, {worth}"]
     needed = result.minimum_damping
     note = "" if needed is None else f"; this set needs at least {needed:.4g}"
     if damping is None:

@@ -10,6 +10,7 @@ import pytest
 from commands import run
 from material import FOAM, foam_tests
 
+from hilbo.identification.fitting import Test
 from hilbo.report.figures.mechanics import passivity_figure
 from hilbo.report.passivity import passivity_result
 from hilbo.study.config import Study
@@ -64,6 +65,17 @@ def test_bad_input_ends_with_2_and_writes_nothing(capsys, monkeypatch, tmp_path,
     assert (code, stdout) == (2, "")
     assert words in stderr
     assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
+
+
+def test_opposite_signs_end_with_2_and_write_nothing(capsys, monkeypatch, tmp_path):
+    path, out = tmp_path / "pressed.csv", tmp_path / "out"
+    write([Test("creep", np.arange(9.0), np.r_[0, np.ones(8)][None], np.r_[0, np.ones(8)][None])], path)
+    flipped = pd.read_csv(path)
+    flipped["force_N"] *= -1
+    flipped.to_csv(path, index=False)
+    code, stdout, stderr = run(capsys, monkeypatch, "identify", path, "--out", out)
+    assert (code, stdout, out.exists()) == (2, "", False)
+    assert "pressed.csv: The creep test has position and force of opposite signs; multiply" in " ".join(stderr.split())
 
 
 def write(tests, path):

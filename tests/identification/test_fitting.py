@@ -9,7 +9,7 @@ from helpers import check_grad
 from material import FOAM, foam_tests, force, loads, position
 
 from hilbo.errors import InputError
-from hilbo.identification.fitting import Test, fit, nrmse
+from hilbo.identification.fitting import Test, fit, nrmse, untared
 from hilbo.identification.memory_selection import select_memory, smallest
 from hilbo.identification.sampled import Sampled
 from hilbo.viscoelastic import FOSLS
@@ -158,6 +158,59 @@ def of(kind="relaxation", points=50, **changes):
 def test_bad_input_gets_one_sentence(make, words):
     with pytest.raises(InputError, match=words):
         make()
+
+
+def signed(test, put=1.0, out=1.0, offset=0.0):
+    """A test with other signs, and an offset of its position."""
+    at = (0.0, offset) if test.kind == "creep" else (offset, 0.0)
+    return Test(test.kind, test.time, out * test.output + at[1], put * test.input + at[0], test.start)
+
+
+@pytest.mark.parametrize("kind", [0, 1])
+def test_opposite_signs_are_refused_and_flipped_ones_are_not(kind):
+    test = foam_tests(2, noise=0.04, hold=0.2)[kind]
+    with pytest.raises(InputError, match=f"The {test.kind} test has position and force of opposite signs in repeat 1"):
+        signed(test, put=-1)
+    with pytest.raises(InputError, match="multiply one of them by -1"):
+        signed(test, out=-1)
+    signed(test, -1, -1)
+    for offset in (-12.3, 12.3, -1000):  # a travel that is not tared is no opposite sign
+        signed(test, offset=offset)
+
+
+def test_one_repeat_of_opposite_sign_is_named():
+    test = foam_tests(3, hold=0.2)[0]
+    signs = np.array([[1.0], [-1.0], [1.0]])
+    with pytest.raises(InputError, match="in repeat 2 of 3"):
+        Test("relaxation", test.time, signs * test.output, test.input)
+
+
+def test_opposite_signs_beside_a_preload():
+    """From equilibrium the change counts: a pull from a push of 5 mm down to 0.1 mm has a force below 0 at first."""
+    (t, x), _ = loads(hold=0.2)
+    pull = 5 - 4.9 * x / 5
+    F = FOSLS(*FOAM).simulate(pull, start="equilibrium")
+    assert np.sum(np.asarray(F) * pull) < 0
+    Test("relaxation", t, np.asarray(F)[None], pull[None], "equilibrium")
+    with pytest.raises(InputError, match="opposite signs"):
+        Test("relaxation", t, np.asarray(-F)[None], pull[None], "equilibrium")
+
+
+def test_what_begins_off_zero_is_told_from_a_step_in_the_first_row():
+    (t, x), (_, F) = loads(hold=0.2)
+    relaxed, crept = force(FOAM, x), position(FOAM, F)
+    assert untared(x, relaxed) is None and untared(F, crept) is None
+    for offset in (0.5, -12.3, 1000):
+        assert untared(x + offset, relaxed) == "input" and untared(F, crept + offset) == "output"
+    assert untared(x, relaxed + 0.3) == "output"
+    ideal, late = force(FOAM, np.full(t.size, 5.0)), position(FOAM, np.full(t.size, 3.0))
+    late[0] = 0.0  # the row before the material moves
+    assert untared(np.full(t.size, 5.0), ideal) is None and untared(np.full(t.size, 3.0), late) is None
+    held = 3.0 - 2.5 * (t > 0.1)
+    late = position(FOAM, held)
+    late[0] = 0.0
+    assert untared(held, late) is None
+    assert untared(x[10:], relaxed[10:]) is None and untared(F[3:], crept[3:]) is None  # begins within the ramp
 
 
 def test_every_number_of_taps_is_the_same_compiled_function():

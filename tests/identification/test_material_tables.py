@@ -89,6 +89,12 @@ def test_mistakes_have_a_place(tmp_path, head, rows, words):
         read_material(table(tmp_path, head, rows))
 
 
+def test_opposite_signs_are_said_of_test_and_file(tmp_path):
+    rows = [("relaxation", r, 10 * i, r * min(i, 1), min(i, 1 + 1 / (i + 2))) for r in (1, -1) for i in range(12)]
+    with pytest.raises(InputError, match=r"t.csv: The relaxation test has position and force of opposite signs in r"):
+        read_material(table(tmp_path, rows=rows))
+
+
 def test_the_shipped_tables_are_read():
     fish = read_material("hilbo/data/fish_muscle.csv")
     assert (fish.tests[0].time.size, fish.stiffness_unit) == (566, "Pa")
