@@ -41,6 +41,7 @@ def identify(
     check_choice("weights", weights, (None, "range", "relative"))
     _positive("T", period)
     _positive("damping", damping)
+    _positive("longest", longest)
     with results(out, force) as folder, progress() as say:
         say("reading")
         start()

@@ -162,8 +162,10 @@ def _test(kind, values, repeats, source, start, longest, notes):
         refuse(values[output] <= 0, source, lambda row: f"{output} is not above 0.")
     first = [0.0 if put is None else table["time"].iloc[0] for table in tables]
     times = [table["time"].to_numpy() - zero for table, zero in zip(tables, first, strict=True)]
-    times, tables = _shortened(times, tables, longest)
+    times, tables = _shortened(times, tables, longest, f"{source}: the {kind} test")
     time, resampled = _common(times)
+    if not time.size:
+        raise InputError(f"{source}: the repeats of the {kind} test have no time in common; check their times.")
     if resampled:
         last = max(t[-1] for t in times)
         cut = f", up to {time[-1]:g} s, where the shortest ends (the longest: {last:g} s)" if time[-1] < last else ""
@@ -178,10 +180,13 @@ def _test(kind, values, repeats, source, start, longest, notes):
         raise InputError(f"{source}: {error}") from None
 
 
-def _shortened(times: list, tables: list, longest: float | None) -> tuple[list, list]:
-    """Times (s) of each repeat and its rows, up to `longest` s."""
+def _shortened(times: list, tables: list, longest: float | None, which: str) -> tuple[list, list]:
+    """Times (s) of each repeat and its rows, up to `longest` s. Raises `InputError` where `which` test has none."""
     if longest is None:
         return times, tables
+    latest = max(t[0] for t in times)
+    if not latest <= longest:
+        raise InputError(f"{which} has no row up to {longest:g} s; give a --longest above {latest:g} s.")
     kept = [t <= longest for t in times]
     return [t[k] for t, k in zip(times, kept, strict=True)], [p[k] for p, k in zip(tables, kept, strict=True)]
 

@@ -17,6 +17,7 @@ from hilbo.study.config import Study
 from hilbo.viscoelastic import FOSLS
 
 STUDY = "hilbo/data/paper.toml"
+FISH = str(Path("hilbo/data/fish_muscle.csv").resolve())
 
 
 def test_passivity_of_the_published_sets(capsys, monkeypatch):
@@ -56,6 +57,12 @@ def test_an_even_number_of_taps_has_no_closed_form():
         (["identify", "t.csv", "--out", "out"], 't.csv:1: column "time" has no unit'),
         (["identify", "t.csv", "--out", "out", "--memory", "long"], '--memory is "long"'),
         (["identify", "t.csv", "--out", "out", "--T", "0"], "--T is 0"),
+        (
+            ["identify", FISH, "--out", "out", "--longest", "0.001"],
+            "no row up to 0.001 s; give a --longest above 0.0139 s",
+        ),
+        (["identify", FISH, "--out", "out", "--longest", "-1"], "--longest is -1.0; it must be a number above 0"),
+        (["identify", FISH, "--out", "out", "--longest", "nan"], "--longest is nan; it must be a number above 0"),
     ],
 )
 def test_bad_input_ends_with_2_and_writes_nothing(capsys, monkeypatch, tmp_path, arguments, words):
@@ -63,7 +70,7 @@ def test_bad_input_ends_with_2_and_writes_nothing(capsys, monkeypatch, tmp_path,
     (tmp_path / "t.csv").write_text("test,time,x_mm,F_N\nrelaxation,0,0,0\n")
     code, stdout, stderr = run(capsys, monkeypatch, *arguments)
     assert (code, stdout) == (2, "")
-    assert words in stderr
+    assert words in " ".join(stderr.split())
     assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
 
 

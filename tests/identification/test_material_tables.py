@@ -56,6 +56,8 @@ def test_a_part_of_a_table(tmp_path):
     assert test.time[-1] == 0.08
     with pytest.raises(InputError, match='holds no test "creep"'):
         read_material(table(tmp_path), only="creep")
+    with pytest.raises(InputError, match="the relaxation test has no row up to -1 s; give a --longest above 0 s"):
+        read_material(table(tmp_path), longest=-1.0)
 
 
 def changed(**cells):
@@ -78,6 +80,7 @@ def changed(**cells):
         (HEAD, changed(time=10), "t.csv:5: time does not increase"),
         (HEAD, ROWS[:5], "t.csv: The relaxation test has 5 points"),
         (HEAD, [], "has no rows"),
+        ("repeat,t_s,G_Pa", [(i // 9, 1 + i, 20 - i) for i in range(18)], "t.csv: the repeats .* no time in common"),
         ("t_s,G_Pa", [(i, 5) for i in range(9)], "t.csv:2: time is not above 0"),
         ("t_s,G_Pa", [(i + 1, 5) for i in range(9)], "does not change"),
         ("t_s,G_Pa,J_1/Pa", [(1, 2, 3)], "put them into two tables"),
