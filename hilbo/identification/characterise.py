@@ -15,7 +15,7 @@ import numpy as np
 
 from hilbo import passivity
 from hilbo.identification import intervals
-from hilbo.identification.fitting import Fit, Test, fit, nrmse, polish
+from hilbo.identification.fitting import Fit, Test, fit, nrmse, polish, untared
 from hilbo.identification.memory_selection import Row, select_memory
 from hilbo.identification.residual_noise import noise
 from hilbo.identification.sampled import Sampled
@@ -25,6 +25,9 @@ __all__ = ["Characterisation", "Estimate", "characterise"]
 _DRAWS = 4000
 _RESTARTS = 3  # from a better place that the search for intervals came through
 _UNRELATED = 3.0  # times the repeats' own noise, above which the model misses something
+_WIDE, _TICKS = 5.0, 10.0  # medians of the time between rows, and T, above which it is a hole
+_SURE = 4.0  # standard errors
+_SHARE = 0.2  # of the input's range; what a hole may hide of it
 
 
 class Estimate(NamedTuple):
@@ -200,4 +203,36 @@ def _warnings(
             f"The samples of the {' and '.join(coarse)} test are further apart than T = {1000 * T:g} ms;"
             " the input was interpolated linearly in between."
         )
-    return tuple(words)
+    return (*words, *(sentence for test in tests for sentence in _recording(test, T)))
+
+
+def _recording(test: Test, T: float) -> Iterator[str]:
+    """What is amiss with the recorded input: a step that fell into a hole between rows, a beginning off 0."""
+    if test.input is None:
+        return
+    put, out, time = test.input.mean(axis=0), test.output.mean(axis=0), test.time - test.time[0]
+    apart, change = np.diff(time), np.abs(np.diff(put))
+    hole = (apart > _WIDE * np.median(apart)) & (apart > _TICKS * T) & (change > _SHARE * np.ptp(put))
+    if hole.any():
+        i = int(np.argmax(np.where(hole, change, 0)))
+        yield (
+            f"The {test.kind} test has no rows from {time[i]:g} s to {time[i + 1]:g} s, where its input changes by"
+            f" {change[i] / np.ptp(put):.0%} of its range: a straight line was taken there, and values and intervals"
+            " are wrong if the input went another way; record that part with rows as close as elsewhere."
+        )
+    offset = untared(put, out) if test.start == "rest" else None
+    if offset is not None and _above_scatter(test.input if offset == "input" else test.output):
+        names = ("position", "force") if (offset == "input") == (test.kind == "relaxation") else ("force", "position")
+        first = (put if offset == "input" else out)[0]
+        unit = "mm" if names[0] == "position" else "N"
+        yield (
+            f"The {test.kind} test does not begin at rest: its first row has a {names[0]} of {first:.3g} {unit} and no"
+            f" {names[1]}; unless that is noise, values and intervals are wrong: tare it (subtract that from every"
+            f" {names[0]})."
+        )
+
+
+def _above_scatter(values: np.ndarray) -> bool:
+    """Whether the repeats agree that their first row is not 0. (R, m)."""
+    first, repeats = values[:, 0], values.shape[0]
+    return repeats == 1 or bool(abs(first.mean()) > _SURE * np.std(first, ddof=1) / np.sqrt(repeats))
