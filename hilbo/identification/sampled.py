@@ -29,6 +29,7 @@ from hilbo.numerics.tracing import program
 __all__ = ["Sampled"]
 
 _TAPS = 1024
+_MOST = 2_000_000  # samples of a test; a fit takes 1.3 kB for each, its intervals more
 _LOG_KAPPA = np.log(10.0) * np.arange(-5.0, 3.1, 0.5)
 _LOGIT_ALPHA = np.array([-3.5, -2.2, -1.4, -0.6, 0.0, 0.6, 1.4, 2.2, 3.5, 4.4])
 
@@ -80,9 +81,13 @@ class Sampled(eqx.Module):
         return np.clip(np.stack(places), lower, upper)
 
     def prepare(self, test: Test) -> Curve:
-        """Inputs on the grid of the model, transformed; positions between grid points by linear interpolation."""
+        """Inputs on the grid of the model, transformed; positions between grid points by linear interpolation.
+
+        Raises `InputError` for a test of more samples than memory has room for.
+        """
         assert test.input is not None
         elapsed = test.time - test.time[0]
+        self._check_length(test.kind, float(elapsed[-1]))
         place = elapsed / self.T
         near = np.round(place)
         place = np.where(np.abs(place - near) < 1e-6, near, place)
@@ -104,6 +109,15 @@ class Sampled(eqx.Module):
             jnp.asarray(place - before),
             length,
         )
+
+    def _check_length(self, kind: str, seconds: float):
+        """Refuse a test that lasts too long for its T."""
+        if seconds > _MOST * self.T:
+            raise InputError(
+                f"The {kind} test lasts {seconds:g} s, which is {seconds / self.T:,.0f} samples of T = {self.T:g} s,"
+                f" and at most {_MOST:,} can be fitted; fit its first part by --longest {_MOST * self.T:g}, or give a"
+                " larger --T, the sampling time of a slower rendering."
+            )
 
     def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
         """The response to the weighted mean of the inputs, at the measured times.

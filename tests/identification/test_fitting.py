@@ -213,6 +213,15 @@ def test_what_begins_off_zero_is_told_from_a_step_in_the_first_row():
     assert untared(x[10:], relaxed[10:]) is None and untared(F[3:], crept[3:]) is None  # begins within the ramp
 
 
+def test_a_test_that_lasts_too_long_for_its_t_is_refused_before_memory_ends():
+    time = 60.0 * np.arange(1441)
+    day = Test("relaxation", time, 1 + np.exp(-time / 3600)[None], np.ones((1, time.size)))
+    words = "lasts 86400 s, which is 86,400,000 samples of T = 0.001 s, .* --longest 2000, or give a larger --T"
+    with pytest.raises(InputError, match=words):
+        fit([day], Sampled())
+    Sampled(T=0.1).prepare(day)
+
+
 def test_every_number_of_taps_is_the_same_compiled_function():
     tests = foam_tests(hold=0.2)
     one, other = (Sampled(N).at(tests) for N in (2, 101))
