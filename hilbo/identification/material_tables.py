@@ -3,13 +3,15 @@
 Columns carry their unit: `time_s`, `time (ms)` and `time [s]` are the same to the reader. `test` is relaxation
 (position applied, force measured) or creep (force applied, position measured), with `time`, `position` and `force` in
 every row; `repeat` tells repetitions apart and `material` materials. A table of moduli has `time` and `modulus`
-(relaxation) or `compliance` (creep) instead, and needs no `test`. Other columns are ignored.
+(relaxation) or `compliance` (creep) instead, and needs no `test`. Other columns are ignored, and so are letters that
+stand for something else (`_quantities`).
 Everything is turned into s, mm, N, Pa (or N/mm) and 1/Pa (or mm/N). Whatever is wrong is one sentence with file and
 line.
 """
 
 import os
 import re
+from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -30,6 +32,7 @@ _NAMES = {
     "modulus": ("modulus", "relaxation modulus", "g"),
     "compliance": ("compliance", "creep compliance", "j"),
 }
+_LETTERS = {"t", "x", "F", "G", "J"}  # as they are written for the quantities
 _QUANTITY = {name: quantity for quantity, names in _NAMES.items() for name in names}
 # Factor to the first unit of each line.
 _UNITS = {
@@ -98,35 +101,77 @@ def read_material(
     return Material(tuple(tests), "N/mm" if lengths in (set(), {True}) else "Pa", tuple(notes))
 
 
+class _Head(NamedTuple):
+    """A column that may hold a quantity: its name without the unit, and the unit."""
+
+    column: str
+    name: str
+    quantity: str
+    unit: str
+
+    @property
+    def short(self) -> bool:
+        """Whether the name is a letter, which may stand for something else."""
+        return len(self.name) == 1
+
+    @property
+    def usable(self) -> bool:
+        """Whether the unit is one of the quantity's."""
+        return self.unit in _UNITS[self.quantity]
+
+
 def _columns(text, source):
     """Which column holds each quantity, and in which unit."""
     columns, units = {}, {}
-    for column in text.columns:
-        match = _HEAD.fullmatch(column)
-        quantity = _QUANTITY.get(match[1].lower()) if match else None
-        if match is None or quantity is None:
-            continue
-        unit = next((group.strip() for group in match.groups()[1:] if group is not None), "").replace("µ", "u")
-        unit = unit.replace("μ", "u")
-        if unit not in _UNITS[quantity]:
+    for head in _quantities(text.columns):
+        quantity, unit = head.quantity, head.unit
+        if not head.usable:
             allowed = ", ".join(_UNITS[quantity])
             says = f'has the unit "{unit}"' if unit else "has no unit"
-            example = f"{match[1]} ({next(iter(_UNITS[quantity]))})"
+            example = f"{head.name} ({next(iter(_UNITS[quantity]))})"
             raise InputError(
-                f'{place(source)}column "{column}" {says}; write it like "{example}", with one of {allowed}.'
+                f'{place(source)}column "{head.column}" {says}; write it like "{example}", with one of {allowed}.'
             )
         if quantity in columns:
             raise InputError(
-                f'{place(source)}columns "{columns[quantity]}" and "{column}" both are a {quantity}; keep one.'
+                f'{place(source)}columns "{columns[quantity]}" and "{head.column}" both are a {quantity}; keep one.'
             )
-        columns[quantity], units[quantity] = column, unit
-    measured, derived = {"position", "force"} & set(columns), {"modulus", "compliance"} & set(columns)
-    if "time" not in columns or not (len(measured) == 2 or (derived and not measured)):
+        columns[quantity], units[quantity] = head.column, unit
+    if not _whole(columns):
         raise InputError(
             f"{place(source)}a material table has time, position and force, or time and modulus or compliance, each"
             f" with its unit as in time_s; found {', '.join(columns) or 'none of them'}."
         )
     return columns, units
+
+
+def _quantities(columns: Iterable[str]) -> list[_Head]:
+    """The columns that hold quantities, without letters that stand for something else: T (degC), F_max, g.
+
+    A letter is not the quantity's where a column has the quantity's name and the letter is not written as above, or
+    where its unit is none of the quantity's and the table is whole without it.
+    """
+    heads = [head for column in columns if (head := _head(column)) is not None]
+    named = {head.quantity for head in heads if not head.short}
+    heads = [head for head in heads if not head.short or head.quantity not in named or head.name in _LETTERS]
+    usable = {head.quantity for head in heads if head.usable}
+    return [head for head in heads if head.usable or not head.short or not _whole(usable)]
+
+
+def _head(column: str) -> _Head | None:
+    """A column's name and unit; None for one that holds no quantity."""
+    match = _HEAD.fullmatch(column)
+    quantity = _QUANTITY.get(match[1].lower()) if match else None
+    if match is None or quantity is None:
+        return None
+    unit = next((group.strip() for group in match.groups()[1:] if group is not None), "")
+    return _Head(column, match[1], quantity, unit.replace("µ", "u").replace("μ", "u"))
+
+
+def _whole(quantities: Collection[str]) -> bool:
+    """Whether these are a material table."""
+    measured, derived = {"position", "force"} & set(quantities), {"modulus", "compliance"} & set(quantities)
+    return "time" in quantities and (len(measured) == 2 or bool(derived and not measured))
 
 
 def _kinds(text, columns, source):

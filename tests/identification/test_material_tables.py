@@ -36,6 +36,32 @@ def test_moduli_keep_their_own_system(tmp_path, head, unit, factor):
     assert test.time[0] == (60 if "min" in head else 1)
 
 
+@pytest.mark.parametrize("head", ["T (degC)", "T_s", "F_max", "t_test", "g", "x", "f (Hz)", "J", "G (m/s2)", "X_mm"])
+def test_letters_that_stand_for_something_else_are_ignored(tmp_path, head):
+    columns = f"test,repeat,time (ms),position [m],force_N,{head}"
+    (test,), _, _ = read_material(table(tmp_path, columns, [(*row, 23) for row in ROWS]))
+    np.testing.assert_array_equal(test.input[0], np.minimum(np.arange(12), 5))
+
+
+@pytest.mark.parametrize(
+    ("head", "words"),
+    [
+        ("test,repeat,t,position [m],force_N,T (degC)", 'column "t" has no unit'),
+        ("test,repeat,time (ms),x [m],F_max,other", 'column "F_max" has the unit "max"'),
+        ("test,repeat,time (ms),x [m],force_max,F_N", 'column "force_max" has the unit "max"'),
+        ("test,repeat,time (ms),x [m],force_N,t_s", 'columns "time .ms." and "t_s" both are a time'),
+    ],
+)
+def test_a_letter_is_no_excuse_for_a_missing_unit(tmp_path, head, words):
+    with pytest.raises(InputError, match=words):
+        read_material(table(tmp_path, head, [(*row, 23) for row in ROWS]))
+
+
+def test_letters_in_either_case_hold_the_quantities_where_nothing_else_does(tmp_path):
+    (test,), _, _ = read_material(table(tmp_path, "test,repeat,T_ms,X_m,f_N,g", [(*row, 9.8) for row in ROWS]))
+    assert (test.kind, test.time[-1]) == ("relaxation", 0.11)
+
+
 def test_what_was_not_fitted_has_no_say_in_the_unit(tmp_path):
     columns = "test,repeat,time_s,position_mm,force_N,modulus_Pa"
     rows = [("relaxation", 1, i / 100, min(i, 5), 1 + 1 / (i + 2), 5.0) for i in range(12)]
