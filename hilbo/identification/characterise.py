@@ -25,6 +25,7 @@ __all__ = ["Characterisation", "Estimate", "characterise"]
 _DRAWS = 4000
 _RESTARTS = 3  # from a better place that the search for intervals came through
 _UNRELATED = 3.0  # times the repeats' own noise, above which the model misses something
+_ROUNDING = 1e-12  # of the largest value; repeats that differ less are copies
 _WIDE, _TICKS = 5.0, 10.0  # medians of the time between rows, and T, above which it is a hole
 _SURE = 4.0  # standard errors
 _SHARE = 0.2  # of the input's range; what a hole may hide of it
@@ -156,7 +157,8 @@ def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
         if test.repeats > 1:
             scatter = np.sqrt(np.mean(np.var(test.output, axis=0, ddof=1)) / test.repeats)
             size = float(autoregression.rms) * np.ptp(test.output.mean(axis=0))
-            row["over_repeat_noise"] = float(size / scatter) if scatter > 0 else np.inf
+            if scatter > _ROUNDING * np.max(np.abs(test.output)):  # copies tell nothing about noise
+                row["over_repeat_noise"] = float(size / scatter)
         yield row
 
 

@@ -214,11 +214,16 @@ def _test(kind, values, repeats, source, start, longest, notes):
     if resampled:
         last = max(t[-1] for t in times)
         cut = f", up to {time[-1]:g} s, where the shortest ends (the longest: {last:g} s)" if time[-1] < last else ""
+        how = "" if put else " in their logarithms"
         notes.append(
-            f"The repeats of the {kind} test have different times; they were interpolated to those of the first{cut}."
+            f"The repeats of the {kind} test have different times;"
+            f" they were interpolated{how} to those of the first{cut}."
         )
     columns = [output] + ([put] if put else [])
-    stacked = {c: np.stack([np.interp(time, t, p[c]) for t, p in zip(times, tables, strict=True)]) for c in columns}
+    between = _interpolated_logs if resampled and put is None else np.interp
+    stacked = {
+        c: np.stack([between(time, t, p[c].to_numpy()) for t, p in zip(times, tables, strict=True)]) for c in columns
+    }
     try:
         return Test(kind, time, stacked[output], stacked.get(put) if put else None, "rest" if put is None else start)
     except InputError as error:
@@ -243,3 +248,13 @@ def _common(times: list[Float[np.ndarray, " _"]]) -> tuple[Float[np.ndarray, " m
         return first, False
     earliest, latest = max(t[0] for t in times), min(t[-1] for t in times)
     return first[(first >= earliest) & (first <= latest)], True
+
+
+def _interpolated_logs(
+    time: Float[np.ndarray, " m"], known: Float[np.ndarray, " _"], values: Float[np.ndarray, " _"]
+) -> Float[np.ndarray, " m"]:
+    """`values` at `known` times, at other times: moduli are nearer to straight lines in their logarithms. All above 0.
+
+    `time` (m,) -> (m,), in the unit of the values.
+    """
+    return np.exp(np.interp(np.log(time), np.log(known), np.log(values)))

@@ -77,6 +77,15 @@ def test_repeats_with_other_times_are_interpolated(tmp_path):
     assert test.output[1, 1] == pytest.approx(np.interp(10, [0, 13], [1.5, 1 + 1 / 3]))
 
 
+@pytest.mark.parametrize(("head", "slope"), [("repeat,t_s,G_Pa", -0.3), ("repeat,t_s,J_1/Pa", 0.3)])
+def test_moduli_are_interpolated_in_their_logarithms(tmp_path, head, slope):
+    times = np.geomspace(1e-3, 1e3, 13)
+    rows = [(repeat, t, 100 * t**slope) for repeat, later in ((1, 1.0), (2, 1.3)) for t in (later * times).tolist()]
+    (test,), _, notes = read_material(table(tmp_path, head, rows))
+    assert "interpolated in their logarithms" in notes[0]
+    np.testing.assert_allclose(test.output, np.broadcast_to(100 * test.time**slope, test.output.shape), rtol=1e-12)
+
+
 def test_a_part_of_a_table(tmp_path):
     (test,), _, _ = read_material(table(tmp_path), longest=0.08)
     assert test.time[-1] == 0.08

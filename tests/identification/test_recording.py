@@ -1,18 +1,21 @@
 """What `characterise` says of tests that were badly recorded, and of good ones."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from material import FOAM, foam_tests, force, loads, position
 
-from hilbo.identification.characterise import _recording
+from hilbo.identification import characterise
 from hilbo.identification.fitting import Test
 from hilbo.identification.material_tables import read_material
+from hilbo.identification.sampled import Sampled
 
 T = 1e-3
 
 
 def said(test, T=T):
-    return " ".join(_recording(test, T))
+    return " ".join(characterise._recording(test, T))
 
 
 def shifted(test, x=0.0, F=0.0):
@@ -74,13 +77,21 @@ def test_repeats_that_begin_off_zero_by_chance_are_no_offset():
     assert said(Test("relaxation", relaxation.time, relaxation.output + drift, relaxation.input)) == ""
 
 
+@pytest.mark.parametrize(("apart", "ratio"), [(0.0, None), (1e-15, None), (1e-3, 1e-9)])
+def test_copies_tell_nothing_about_noise(monkeypatch, apart, ratio):
+    left = SimpleNamespace(lag_one=0.0, order=0, effective=50.0, rms=1e-12)
+    monkeypatch.setattr(characterise, "noise", lambda fitted: (left,))
+    time = np.arange(50.0)
+    curve = 3 + np.exp(-time / 5)
+    test = Test("modulus", time, curve + apart * np.array([[1.0], [-1.0]]))
+    (row,) = characterise._noise(None, [test])
+    assert row.get("over_repeat_noise") == (None if ratio is None else pytest.approx(ratio, rel=0.01))
+
+
 @pytest.mark.deep
 def test_characterise_says_it():
-    from hilbo.identification.characterise import characterise
-    from hilbo.identification.sampled import Sampled
-
     relaxation = shifted(without(foam_tests(2, noise=0.004, hold=0.5)[0], slice(1, 100)), F=0.3)
-    words = " ".join(characterise([relaxation], Sampled()).warnings)
+    words = " ".join(characterise.characterise([relaxation], Sampled()).warnings)
     assert "no rows from 0 s to 0.1 s" in words and "does not begin at rest" in words
 
 
