@@ -22,9 +22,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 
-from hilbo.numerics.shown import check_positive, numbers, shown
+from hilbo.numerics.shown import check_positive, float_dtype, floats, numbers, shown
 
 __all__ = ["RBF", "Kernel", "Levels", "Matern32", "Stationary", "embedded", "gram", "theta_of"]
 
@@ -68,8 +68,8 @@ class RBF(eqx.Module):
     def __init__(
         self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0, levels: tuple[int, ...] = ()
     ):
-        self.theta = numbers("RBF", "theta", theta, _float_dtype(theta))
-        self.variance = numbers("RBF", "variance", variance, _float_dtype(variance))
+        self.theta = numbers("RBF", "theta", theta, float_dtype(theta))
+        self.variance = numbers("RBF", "variance", variance, float_dtype(variance))
         self.levels = levels
         check_positive("RBF", theta=self.theta, variance=self.variance)
 
@@ -80,19 +80,21 @@ class RBF(eqx.Module):
         """The same kind of kernel, of the same levels, with another theta, a scalar or (d,), and variance, a scalar."""
         return RBF(theta, variance, self.levels)
 
-    def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
+    def __call__(self, x: Shaped[Array, " d"], y: Shaped[Array, " d"]) -> Float[Array, ""]:
         """Covariance of the latent function at `x` and at `y`, both (d,)."""
+        x, y = floats(x, self.variance.dtype), floats(y, self.variance.dtype)
         return self.variance.astype(x.dtype) * jnp.exp(-_squared(self, x, y))
 
-    def along(self, axis: int, x: Float[Array, " n"], y: Float[Array, " m"]) -> Float[Array, "n m"]:
+    def along(self, axis: int, x: Shaped[Array, " n"], y: Shaped[Array, " m"]) -> Float[Array, "n m"]:
         """The factor (n, m) that one coordinate of numbers contributes: the kernel is the product of these and the
         variance."""
         theta = self.theta[axis] if self.theta.ndim else self.theta
+        x, y = floats(x, theta.dtype), floats(y, theta.dtype)
         return jnp.exp(-theta.astype(x.dtype) * (x[:, None] - y[None, :]) ** 2)
 
-    def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+    def diagonal(self, x: Shaped[Array, " d"]) -> Float[Array, ""]:
         """The prior variance, the same everywhere. `x` (d,) -> a scalar."""
-        return self.variance.astype(x.dtype)
+        return self.variance.astype(floats(x, self.variance.dtype).dtype)
 
 
 class Matern32(eqx.Module):
@@ -109,8 +111,8 @@ class Matern32(eqx.Module):
     def __init__(
         self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0, levels: tuple[int, ...] = ()
     ):
-        self.theta = jnp.asarray(theta, dtype=_float_dtype(theta))
-        self.variance = jnp.asarray(variance, dtype=_float_dtype(variance))
+        self.theta = jnp.asarray(theta, dtype=float_dtype(theta))
+        self.variance = jnp.asarray(variance, dtype=float_dtype(variance))
         self.levels = levels
         check_positive("Matern32", theta=self.theta, variance=self.variance)
 
@@ -121,13 +123,14 @@ class Matern32(eqx.Module):
         """The same kind of kernel, of the same levels, with another theta, a scalar or (d,), and variance, a scalar."""
         return Matern32(theta, variance, self.levels)
 
-    def __call__(self, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
+    def __call__(self, x: Shaped[Array, " d"], y: Shaped[Array, " d"]) -> Float[Array, ""]:
         """Covariance of the latent function at `x` and at `y`, both (d,)."""
+        x, y = floats(x, self.variance.dtype), floats(y, self.variance.dtype)
         return self.variance.astype(x.dtype) * _matern32(6.0 * _squared(self, x, y))
 
-    def diagonal(self, x: Float[Array, " d"]) -> Float[Array, ""]:
+    def diagonal(self, x: Shaped[Array, " d"]) -> Float[Array, ""]:
         """The prior variance, the same everywhere. `x` (d,) -> a scalar."""
-        return self.variance.astype(x.dtype)
+        return self.variance.astype(floats(x, self.variance.dtype).dtype)
 
 
 Stationary = RBF | Matern32
@@ -216,15 +219,9 @@ def _matern32_slope_jvp(primals, tangents):
     return _matern32_slope(r), jnp.where(apart, jnp.exp(-root) / (4.0 * root), 0.0) * tangents[0]
 
 
-def gram(kernel: Kernel, x: Float[Array, "n d"], y: Float[Array, "m d"]) -> Float[Array, "n m"]:
+def gram(kernel: Kernel, x: Shaped[Array, "n d"], y: Shaped[Array, "m d"]) -> Float[Array, "n m"]:
     """Matrix of covariances between the rows of `x` and the rows of `y`.
 
     (n, d), (m, d) -> (n, m), in the units of the latent function squared.
     """
     return jax.vmap(lambda p: jax.vmap(lambda r: kernel(p, r))(y))(x)
-
-
-def _float_dtype(value: ArrayLike | Sequence[float | int]) -> jnp.dtype:
-    """The dtype of an inexact array; the default float dtype for Python numbers, integers and sequences."""
-    dtype = getattr(value, "dtype", None)
-    return jnp.dtype(dtype if dtype is not None and jnp.issubdtype(dtype, jnp.floating) else jnp.result_type(float))

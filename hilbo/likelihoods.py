@@ -20,7 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
-from hilbo.numerics.shown import check_positive, concrete, numbers, shown
+from hilbo.numerics.shown import check_positive, concrete, float_dtype, floats, numbers, shown
 from hilbo.numerics.tracing import traced_once
 from hilbo.numerics.truncated_normal import truncated_normal
 
@@ -52,10 +52,8 @@ class OrdinalProbit(eqx.Module):
     thresholds: Float[Array, " edges"]
     noise: Float[Array, ""]
 
-    def __init__(self, thresholds: ArrayLike | Sequence[float], noise: ArrayLike):
-        dtype = getattr(thresholds, "dtype", None)
-        dtype = dtype if dtype is not None else jnp.result_type(float)
-        self.thresholds = numbers("OrdinalProbit", "thresholds", thresholds, dtype)
+    def __init__(self, thresholds: ArrayLike | Sequence[float | int], noise: ArrayLike):
+        self.thresholds = numbers("OrdinalProbit", "thresholds", thresholds, float_dtype(thresholds))
         self.noise = numbers("OrdinalProbit", "noise", noise, self.thresholds.dtype)
         check_positive("OrdinalProbit", noise=self.noise)
         if concrete(self.thresholds) and not _rising(np.asarray(self.thresholds)):
@@ -110,7 +108,7 @@ class OrdinalProbit(eqx.Module):
 
         Paper, section VI: the noise grows to sqrt(noise^2 + variance), and the edges stay.
         """
-        mean, variance = jnp.asarray(mean), jnp.asarray(variance)
+        mean, variance = floats(jnp.asarray(mean), self.thresholds.dtype), jnp.asarray(variance)
         blurred = OrdinalProbit(self.thresholds, jnp.sqrt(self.noise**2 + variance.astype(self.noise.dtype)))
         return jnp.exp(jax.vmap(lambda q: blurred.log_prob(mean, q))(jnp.arange(self.categories)))
 
@@ -118,7 +116,8 @@ class OrdinalProbit(eqx.Module):
         self, f: ArrayLike, q: ArrayLike
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`."""
-        f = jnp.asarray(f, dtype=self.thresholds.dtype if isinstance(f, int | float) else None)
+        dtype = self.thresholds.dtype
+        f = floats(jnp.asarray(f, dtype if isinstance(f, int | float) else None), dtype)
         ends = jnp.full((1,), jnp.inf, f.dtype)
         edges = jnp.concatenate([-ends, self.thresholds.astype(f.dtype), ends])
         return f, edges[q], edges[q + 1], self.noise.astype(f.dtype)

@@ -29,7 +29,7 @@ from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
 from hilbo.kernels import RBF, Stationary, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit, OrdinalTerms, TiltedTerms
-from hilbo.numerics.shown import concrete, known, numbers, shown
+from hilbo.numerics.shown import concrete, floats, known, numbers, shown
 from hilbo.trials import Trials
 
 __all__ = ["RBF", "InferenceError", "OrdinalGP", "OrdinalProbit", "Posterior", "Trials", "fit"]
@@ -136,7 +136,8 @@ class Posterior(eqx.Module):
 
     def _points(self, x: _PointsLike) -> Float[Array, "m d"]:
         """Points as an array. Raises `InputError` for another shape than (m, d)."""
-        points = x if isinstance(x, jax.Array) else numbers("Posterior", "x", x, self.trials.x.dtype)
+        dtype = self.trials.x.dtype
+        points = floats(x, dtype) if isinstance(x, jax.Array) else numbers("Posterior", "x", x, dtype)
         if self.trials.x.ndim != 2:
             raise InputError("Posterior: holds several people; predict for each of them by jax.vmap.")
         if points.ndim != 2 or points.shape[1] != self.trials.x.shape[1]:

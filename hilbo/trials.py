@@ -3,6 +3,9 @@
 With a fixed capacity a session that grows from 0 to 25 answers compiles once.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
-from hilbo.numerics.shown import known
+from hilbo.numerics.shown import concrete, floats, known, numbers
 
 __all__ = ["Trials"]
 
@@ -23,6 +26,11 @@ def __dir__() -> list[str]:
 _BLOCK = 32  # default capacities are multiples of this, so that growing data rarely recompile
 
 
+def _floats(x: Any) -> Any:
+    """Points as floating-point numbers; trees of something else, such as filters, as they are."""
+    return floats(x) if isinstance(x, jax.Array | np.ndarray) else x
+
+
 class Trials(eqx.Module):
     """Answers of one participant, padded to a fixed capacity.
 
@@ -30,7 +38,7 @@ class Trials(eqx.Module):
     rows hold an answer. Rows without an answer have no influence whatever they contain.
     """
 
-    x: Float[Array, "n d"]
+    x: Float[Array, "n d"] = eqx.field(converter=_floats)
     q: Int[Array, " n"]
     mask: Bool[Array, " n"]
     context: Int[Array, " n"] | None = None
@@ -43,13 +51,16 @@ class Trials(eqx.Module):
         `capacity` defaults to n rounded up to a multiple of 32. Raises `InputError` for shapes that do not match,
         values that are not finite, categories that are not integers >= 0, or a capacity below n.
         """
-        points, answers = np.asarray(x), np.asarray(q)
+        points, answers = _array("x", x), _array("q", q)
+        _check_points(points)
         _check_arrays(points, answers)
         count = len(points)
         capacity = max(_BLOCK * -(-count // _BLOCK), _BLOCK) if capacity is None else capacity
+        if not isinstance(capacity, int | np.integer) or isinstance(capacity, bool):
+            raise InputError(f"Trials: capacity is {capacity}; give a whole number.")
         if capacity < max(count, 1):
             raise InputError(f"Trials: capacity is {capacity}, but {count} answers need at least {count or 1}.")
-        dtype = points.dtype if np.issubdtype(points.dtype, np.floating) else np.dtype(float)
+        dtype = points.dtype.newbyteorder("=") if np.issubdtype(points.dtype, np.floating) else np.dtype(float)
         padded = np.zeros((capacity, points.shape[1]), jax.dtypes.canonicalize_dtype(dtype))
         categories = np.zeros(capacity, np.int32)
         padded[:count], categories[:count] = points, answers
@@ -74,16 +85,22 @@ class Trials(eqx.Module):
         """How many answers there is room for."""
         return self.x.shape[-2]
 
-    def append(self, x: Float[Array, " d"], q: ArrayLike) -> "Trials":
+    def append(self, x: ArrayLike | Sequence[float], q: ArrayLike) -> "Trials":
         """With one more answer in the first free row: the shapes stay, nothing recompiles. A full table becomes NaN.
         Contexts are not kept.
 
-        `x` (d,) in the unit cube, `q` a category in 0..C-1.
+        `x` (d,) in the unit cube, `q` a category in 0..C-1. Raises `InputError` for a point of another shape, and what
+        is no category.
         """
+        point, dim = numbers("Trials", "x", x, self.x.dtype), self.x.shape[-1]
+        if point.shape != (dim,):
+            raise InputError(f"Trials: x has shape {point.shape}; append one point, of shape ({dim},).")
+        if concrete(q):
+            _check_categories(np.atleast_1d(_array("q", q)))
         row = jnp.sum(self.mask)
         full = row >= self.capacity
         return Trials(
-            jnp.where(full, jnp.nan, self.x.at[row].set(x.astype(self.x.dtype))),
+            jnp.where(full, jnp.nan, self.x.at[row].set(point)),
             self.q.at[row].set(jnp.asarray(q, self.q.dtype)),
             self.mask.at[row].set(True),
         )
@@ -94,6 +111,24 @@ class Trials(eqx.Module):
         return Trials(self.x, self.q, self.mask & keep, self.context)
 
 
+def _array(name: str, value: Any) -> np.ndarray:
+    """As NumPy has it. Raises `InputError` for rows of different lengths."""
+    try:
+        return np.asarray(value)
+    except ValueError:
+        words = "has rows of different lengths; give numbers, in rows of one length"
+        raise InputError(f"Trials: {name} {words}.") from None
+
+
+def _check_points(points: np.ndarray) -> None:
+    """Refuse what is no number, numbers that no fit computes with, and points without a coordinate."""
+    kind, size = points.dtype.kind, points.dtype.itemsize
+    if kind not in "biu" and (kind, size) not in {("f", 4), ("f", 8)}:
+        raise InputError(f"Trials: x is of type {points.dtype}; give numbers, as float32 or float64.")
+    if points.ndim == 2 and not points.shape[1]:
+        raise InputError(f"Trials: x has shape {points.shape}; give one column at least: each is a parameter.")
+
+
 def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
     if points.ndim != 2 or answers.ndim != 1 or len(points) != len(answers):
         raise InputError(
@@ -102,5 +137,11 @@ def _check_arrays(points: np.ndarray, answers: np.ndarray) -> None:
     if not np.all(np.isfinite(points)):
         row = int(np.argwhere(~np.isfinite(points))[0, 0])
         raise InputError(f"Trials: x[{row}] holds a value that is not finite; remove that answer or fix it.")
-    if len(answers) and (not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0):
+    if len(answers):
+        _check_categories(answers)
+
+
+def _check_categories(answers: np.ndarray) -> None:
+    """Refuse what is no category; a number beyond 32 bits would become a small one, which is a category."""
+    if not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0 or answers.max() > np.iinfo(np.int32).max:
         raise InputError("Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).")

@@ -100,6 +100,34 @@ MISTAKES = {
         lambda p, s: jax.vmap(lambda _: p)(jnp.arange(2)).predict(np.zeros((1, 2))),
         "Posterior: holds several people; predict for each of them by jax.vmap.",
     ),
+    "complex points": (
+        lambda p, s: Trials.from_arrays(np.full((1, 2), 0.5j), np.array([0])),
+        "Trials: x is of type complex128; give numbers, as float32 or float64.",
+    ),
+    "points that are text": (
+        lambda p, s: Trials.from_arrays(np.array([["a", "b"]]), np.array([0])),
+        "Trials: x is of type <U1; give numbers, as float32 or float64.",
+    ),
+    "points of half the digits": (
+        lambda p, s: Trials.from_arrays(np.full((1, 2), 0.5, np.float16), np.array([0])),
+        "Trials: x is of type float16; give numbers, as float32 or float64.",
+    ),
+    "points of nothing": (
+        lambda p, s: Trials.empty(3, 0),
+        "Trials: x has shape (0, 0); give one column at least: each is a parameter.",
+    ),
+    "a category beyond 32 bits": (
+        lambda p, s: Trials.from_arrays(np.zeros((1, 2)), np.array([2**32 + 1])),
+        "Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).",
+    ),
+    "one coordinate of two": (
+        lambda p, s: p.trials.append(jnp.array([0.5]), 1),
+        "Trials: x has shape (1,); append one point, of shape (2,).",
+    ),
+    "half a category": (
+        lambda p, s: p.trials.append(jnp.array([0.5, 0.5]), 1.5),
+        "Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).",
+    ),
     "the best of nothing": (
         lambda p, s: s.best(),
         "Session: there are no answers yet, and so no best rendering; tell one first.",
@@ -134,6 +162,14 @@ OF_ANOTHER_TYPE = {
         "Study: this is a NoneType; give a study file's tables, or Study.load(path).",
     ),
     "words at a point": (lambda p, s: s.tell("close", {"u": "low", "v": 12}), "Session: u is 'low'; give a number."),
+    "half a capacity": (
+        lambda p, s: Trials.from_arrays(np.zeros((1, 2)), [0], 2.5),
+        "Trials: capacity is 2.5; give a whole number.",
+    ),
+    "points in rows of different lengths": (
+        lambda p, s: Trials.from_arrays([[0.1, 0.2], [0.3]], [0, 1]),
+        "Trials: x has rows of different lengths; give numbers, in rows of one length.",
+    ),
     "one position": (
         lambda p, s: viscoelastic.FOSLS(-3, 5, 7, 0.2).simulate(1.0),
         "FOSLS: x has shape (); give one sample every T, of shape (n,).",
@@ -178,6 +214,19 @@ def test_mistakes_of_type_get_one_sentence_where_nobody_checks_types():
 def test_lists_are_points(posterior):
     mean, variance = posterior.predict([[0.5, 0.5]])
     assert mean.shape == variance.shape == (1,)
+
+
+@pytest.mark.parametrize("dtype", [int, bool])
+def test_corners_of_the_cube_may_be_whole_numbers(posterior, dtype):
+    x = jnp.array([[0, 1]])
+    plain, whole = x.astype(float), x.astype(dtype)
+    np.testing.assert_array_equal(posterior.predict(whole), posterior.predict(plain))
+    np.testing.assert_array_equal(posterior.class_probabilities(whole), posterior.class_probabilities(plain))
+    assert posterior._points(plain.astype(jnp.float32)).dtype == jnp.float32
+    mask, q = jnp.ones(1, bool), jnp.ones(1, int)
+    np.testing.assert_array_equal(Trials(whole, q, mask).x, Trials(plain, q, mask).x)
+    assert Trials(plain.astype(jnp.float32), q, mask).x.dtype == jnp.float32
+    np.testing.assert_array_equal(posterior.trials.append(whole[0], 1).x, posterior.trials.append(plain[0], 1).x)
 
 
 def test_what_is_traced_is_not_checked(posterior):

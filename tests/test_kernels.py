@@ -111,3 +111,11 @@ def test_gram_is_positive_semidefinite_up_to_rounding(theta, variance, seed):
     matrix = np.asarray(gram(RBF(theta, variance), x, x))
     assert np.linalg.eigvalsh(matrix)[0] >= -1e-14 * variance * 12
     assert matrix.max() == variance
+
+
+@pytest.mark.parametrize("kernel", [RBF, Matern32])
+def test_whole_numbers_are_the_same_points(kernel):
+    whole, k = jnp.array([[0, 1], [1, 1]]), kernel(0.63, 1.5)
+    plain = whole.astype(float)
+    np.testing.assert_array_equal(gram(k, whole, whole), gram(k, plain, plain))
+    assert k.diagonal(whole[0]) == 1.5 and k.diagonal(plain.astype(np.float32)[0]).dtype == np.float32

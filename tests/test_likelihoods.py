@@ -9,7 +9,9 @@ from functools import cache
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import numpy as np
+import pandas as pd
 import pytest
 from helpers import unchecked
 from hypothesis import given, settings
@@ -324,3 +326,19 @@ def test_two_categories_are_the_probit():
 @pytest.mark.parametrize(("thresholds", "noise"), [((0.5, -0.5), 0.5), ((-0.5, 0.5), -0.5), ((-0.5, 0.5), 0.0)])
 def test_nonsense_gives_nan_and_no_plausible_number(thresholds, noise):
     assert np.isnan(unchecked(thresholds, noise).log_prob(0.0, 1))
+
+
+@pytest.mark.parametrize("given", [np.array([-1, 1]), pd.Series([-1, 1]), jnp.array([-1, 1]), np.array([-1.0, 1.0])])
+def test_whole_thresholds_are_the_same_thresholds(given, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # who uses hilbo has no checks of types
+    listed, other = OrdinalProbit([-1, 1], noise=1.9), OrdinalProbit(given, noise=1.9)
+    assert other.thresholds.dtype == other.noise.dtype == np.float64
+    assert other.thresholds.tolist() == listed.thresholds.tolist() and other.noise == listed.noise == 1.9
+    assert OrdinalProbit(np.array([-1, 1], np.float32), 1.9).noise.dtype == np.float32
+
+
+@pytest.mark.parametrize("zero", [0, np.int64(0), jnp.array(0)])
+def test_a_whole_latent_value_is_the_same_value(zero):
+    likelihood = OrdinalProbit((-0.5, 0.5), 0.7)
+    assert float(likelihood.log_prob(zero, 1)) == float(likelihood.log_prob(0.0, 1))
+    assert likelihood.class_probabilities(zero).tolist() == likelihood.class_probabilities(0.0).tolist()

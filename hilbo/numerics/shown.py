@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.typing import DTypeLike
@@ -10,7 +11,7 @@ from jax.typing import DTypeLike
 from hilbo.errors import InputError
 from hilbo.numerics.host import placed
 
-__all__ = ["check_positive", "concrete", "known", "numbers", "shown"]
+__all__ = ["check_positive", "concrete", "float_dtype", "floats", "known", "numbers", "shown"]
 
 
 def concrete(*values: Any) -> bool:
@@ -21,6 +22,21 @@ def concrete(*values: Any) -> bool:
 def known(*values: Any) -> bool:
     """Whether these are arrays with numbers in them: else a record is a tree of something else, or traced."""
     return all(isinstance(value, jax.Array | np.ndarray) and not isinstance(value, Tracer) for value in values)
+
+
+def float_dtype(value: Any) -> np.dtype:
+    """The dtype of an array of floating-point numbers; the default one for Python numbers, integers and sequences."""
+    dtype = getattr(value, "dtype", None)
+    floating = isinstance(dtype, np.dtype) and jnp.issubdtype(dtype, jnp.floating)
+    return dtype if floating else jnp.result_type(float)
+
+
+def floats(array: Any, dtype: DTypeLike | None = None) -> Any:
+    """An array of floating-point numbers as it is; whole numbers, yes and no in this dtype, else in the default one:
+    what takes its dtype from an array would cut its own numbers off to whole ones."""
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    return array.astype(jnp.result_type(float) if dtype is None else dtype)
 
 
 def numbers(whose: str, name: str, value: Any, dtype: DTypeLike | None = None) -> jax.Array:
