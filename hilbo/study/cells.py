@@ -114,7 +114,11 @@ def _as_text(frame: pd.DataFrame, first_row: int) -> pd.DataFrame:
 def _column_as_text(column: pd.Series) -> list[str]:
     if column.dtype.kind == "f":
         return [repr(v) for v in column.tolist()]
-    return ["" if v is None or v is pd.NA else repr(v) if isinstance(v, float) else str(v) for v in column.tolist()]
+    return ["" if v is None or v is pd.NA else _decimals(v) for v in column.tolist()]
+
+
+def _decimals(value: object) -> str:
+    return repr(float(value)) if isinstance(value, float | np.floating) else str(value)  # NumPy's would be named
 
 
 def _csv_pieces(path: Path, source: str, needs: str) -> Iterator[pd.DataFrame]:

@@ -19,9 +19,8 @@ from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Trials
 from hilbo.population.recipes import RECIPES
 from hilbo.search.space import SearchSpace
-from hilbo.study.cells import FRAME, answer_forms, cells_of
 from hilbo.study.config import Study
-from hilbo.study.trial_table import checked_trials, flags, is_fitted
+from hilbo.study.trial_table import checked_trials, is_checked
 
 __all__ = ["Cohort", "cohort_of"]
 
@@ -78,13 +77,14 @@ class Cohort(eqx.Module):
 
 def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) -> Cohort:
     """Participants from a trial table: one that `trial_table.read_trials` made, whose rows stay in their order, that of
-    the answers; or a DataFrame of yours with the same columns, which is checked and put in order as a file is.
+    the answers; or a DataFrame of yours with the same columns, which is checked and put in order as a file is. So is
+    one that `read_trials` made and you changed.
 
     `capacity` defaults to the study's number of trials, or to the most answers of a participant if that is more.
     Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's answers exceed.
     """
-    if not _was_read(table, study):
-        table = checked_trials(table, study)
+    if not isinstance(table, pd.DataFrame) or not is_checked(table, study):
+        table = checked_trials(_levels_named(table, study), study)
     person, names = pd.factorize(table["participant"])
     counts = np.bincount(person)
     longest = int(counts.max())
@@ -111,19 +111,17 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     return Cohort(trials, physical, tuple(names), tuple(contexts))
 
 
-def _was_read(table: pd.DataFrame, study: Study) -> bool:
-    """Whether a table is one that `read_trials` made: its column `category` says what the answers do, and is no column
-    of somebody's own that happens to have this name."""
-    if not isinstance(table, pd.DataFrame) or not {"category", "participant", *study.space.names} <= {*table.columns}:
-        return False
-    category = table["category"]
-    if not pd.api.types.is_integer_dtype(category) or not category.between(0, len(study.responses) - 1).all():
-        return False
-    if "response" not in table:
-        return True
-    left = flags(cells_of(table[["voided"]]), "voided", FRAME).any() if "voided" in table else False
-    left |= (~is_fitted(table["phase"].astype(str))).any() if "phase" in table else False
-    return not left and bool((table["response"].map(answer_forms(study.responses)[0]) == category).all())
+def _levels_named(table: pd.DataFrame, study: Study) -> pd.DataFrame:
+    """Levels by their names, as a file has them, where a table has their places, as one that `read_trials` made. No
+    level's name is a number, so that nothing is mistaken."""
+    if not isinstance(table, pd.DataFrame):
+        return table
+    names = {}
+    for p in study.space.parameters:
+        if p.levels and p.name in table and pd.api.types.is_numeric_dtype(table[p.name]):
+            places = table[p.name]
+            names[p.name] = places.map(dict(enumerate(p.levels))).astype(object).fillna(places.astype(object))
+    return table.assign(**names)
 
 
 def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:

@@ -26,7 +26,7 @@ from hilbo.study.cells import numbers, parameter_values, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.departures import departures
-from hilbo.study.trial_table import NothingToFitError, check_texts, read_trials
+from hilbo.study.trial_table import NothingToFitError, check_texts, marked, read_trials
 from hilbo.study.validation_table import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]
@@ -175,7 +175,8 @@ def _material(
         compared = compared[compared["material"] == name]
     reference, words = _reference(material_study, name, sets, truth)
     validation = None if compared is None or compared.empty else compared
-    return Material(name, material_study, cohort_of(table, material_study), validation, reference, words)
+    cohort = cohort_of(marked(table, material_study), material_study)  # each table was checked as it was read
+    return Material(name, material_study, cohort, validation, reference, words)
 
 
 def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:

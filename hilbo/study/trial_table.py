@@ -7,6 +7,7 @@ rows: the last digits of sums, and where a search ends, depend on it. Whatever i
 and the line (Parquet: row). A table is read piece by piece, and a piece's text is gone when its numbers are known.
 """
 
+import hashlib
 import os
 import re
 from collections.abc import Callable, Collection, Iterable, Sequence
@@ -28,7 +29,9 @@ __all__ = [
     "check_texts",
     "checked_trials",
     "flags",
+    "is_checked",
     "is_fitted",
+    "marked",
     "of_material",
     "read_trials",
     "write_trials",
@@ -42,6 +45,8 @@ class NothingToFitError(InputError):
 NOT_FITTED = ("warm-up", "repeat")
 """Phases whose answers are kept and never fitted: familiarisation, and repetitions that check consistency."""
 _KEY = ("participant", "session", "phase", "material", "trial")
+_MARK = "hilbo checked"
+"""Of the attributes that pandas carries along with a table, the one that says what was checked."""
 _TRUE = {"1", "1.0", "1,0", "true", "yes"}
 _MISSING = {"", "nan", "none", "<na>"}
 _FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
@@ -98,7 +103,32 @@ def _read(
     table = of_material(table, material, source)
     keys = [name for name in ("participant", "session", "phase") if name in table]
     places = [table["trial"], *(_numbered(table[name]) for name in reversed(keys))]
-    return table.iloc[np.lexsort(places)]
+    return marked(table.iloc[np.lexsort(places)], study)
+
+
+def marked(table: pd.DataFrame, study: AnyStudy) -> pd.DataFrame:
+    """The table, marked as checked against this study. pandas carries the mark along; `is_checked` compares it with
+    what then stands in the table."""
+    table.attrs[_MARK] = _digest(table, study)
+    return table
+
+
+def is_checked(table: pd.DataFrame, study: AnyStudy) -> bool:
+    """Whether `read_trials` or `checked_trials` made the table for such a study, and nobody has changed it since."""
+    try:
+        return _MARK in table.attrs and table.attrs[_MARK] == _digest(table, study)
+    except TypeError:  # of cells that cannot be told apart, such as lists, which no check lets pass
+        return False
+
+
+def _digest(table: pd.DataFrame, study: AnyStudy) -> str:
+    """Of what fits take from a table, its rows in their order, and of what the study asks of it."""
+    columns = {*_KEY, "response", "category", "voided", "unblinded", study.random_effect, *study.space.names}
+    held = table.loc[:, [column for column in table.columns if column in columns]]
+    asked = study.responses, study.space.parameters, study.random_effect, study.stimulus and study.stimulus.unblinded
+    head = repr((asked, list(held.columns), [str(dtype) for dtype in held.dtypes]))
+    rows = pd.util.hash_pandas_object(held, index=False).to_numpy()
+    return hashlib.sha256(head.encode() + rows.tobytes()).hexdigest()
 
 
 def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, texts: dict[str, str]) -> pd.DataFrame:
@@ -239,8 +269,8 @@ def check_people(text: pd.DataFrame, source: str) -> None:
 
 def check_texts(text: pd.DataFrame, source: str, numeric: Collection[str] = ()) -> None:
     """Refuse cells, and heads of columns, that a spreadsheet would run; `numeric`: columns that hold no text."""
-    for column in map(str, text.columns):
-        check_text(column, "the name of a column", place(source).rstrip(": "))
+    for column in text.columns:  # in memory a name may be a number
+        check_text(str(column), "the name of a column", place(source).rstrip(": "))
         if column not in numeric:
             cells = text[column]
             wrong = cells.isin(formulas(cells))

@@ -15,9 +15,9 @@ ANSWERS = {(2.0, 1.0): [0, 1, *[2] * 10], (4.0, 2.0): [1, 1], (8.0, 4.0): [0]}
 
 
 def cohort(answers, study=STUDY):
-    rows = [(*place, category) for place, categories in answers.items() for category in categories]
-    table = pd.DataFrame(rows, columns=[*study.space.names, "category"])
-    return cohort_of(table.assign(participant=[f"P{i}" for i in range(len(rows))]), study)
+    rows = [(*place, study.responses[k]) for place, categories in answers.items() for k in categories]
+    table = pd.DataFrame(rows, columns=[*study.space.names, "response"])
+    return cohort_of(table.assign(participant=[f"P{i}" for i in range(len(rows))], trial=1), study)
 
 
 def areas(axes):

@@ -241,6 +241,16 @@ def test_renderings_of_other_files_are_named_or_placed():
             check_values(good | {"texture": wrong}, parameters, "f", "the best")
 
 
+def test_a_table_of_levels_that_was_read_and_shortened_is_checked_again(tmp_path):
+    study = surfaces()
+    write_trials(answers(), tmp_path / "t.csv")
+    read = read_trials(tmp_path / "t.csv", study)
+    whole, half = cohort_of(read, study), cohort_of(read[read["trial"] < 10], study)
+    np.testing.assert_array_equal(half.physical[0, :9], whole.physical[0, :9])
+    with pytest.raises(InputError, match=r'texture is "7\.0"; it must be one of silk, wood, stone'):
+        cohort_of(read.assign(texture=7.0), study)
+
+
 @pytest.mark.deep  # it compiles the search of many people
 def test_a_streamed_optimum_tries_the_other_levels():
     study = surfaces()

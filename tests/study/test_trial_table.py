@@ -1,5 +1,7 @@
 """Trial tables: what is read, in which order, to the last bit; and what is refused, with the line and what to do."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -417,3 +419,41 @@ def test_labels_with_commas_stay_labels_where_commas_are_decimal(tmp_path):
     text = HEADER.replace(",", ";") + "A;1;0,5;1;2\nA;2;1.5;1;2\n"
     table = read_trials(written(tmp_path, text), study(("0,5", "1.5", "2")))
     assert table["category"].tolist() == [0, 1]
+
+
+EDITS = {
+    "other units": (lambda t: t.assign(gain=t["gain"] * 1000), 'gain is "1000.0"'),
+    "twice the same": (lambda t: pd.concat([t, t]), "row 4: participant A, trial 1 stands in row 1 already"),
+    "two materials": (lambda t: t.assign(material=["foam", "foam", "gel"]), "holds 2 materials (foam, gel)"),
+    "a number that is missing": (lambda t: t.assign(gain=[1.0, np.nan, 1.0]), 'gain is "nan"'),
+    "a participant who is missing": (lambda t: t.assign(participant=["A", None, "B"]), "participant is empty"),
+    "cells that are lists": (lambda t: t.assign(session=[[1], [2], [3]], gain=9.0), 'gain is "9.0"'),
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_a_table_that_was_read_and_then_changed_is_checked_again(tmp_path, edit):
+    table = read_trials(written(tmp_path, HEADER + "A,1,close,1,2\nA,2,similar,1,2\nB,1,different,1,2\n"), study())
+    change, words = EDITS[edit]
+    with pytest.raises(InputError, match=re.escape(words)):
+        cohort_of(change(table), study())
+
+
+def test_rows_that_were_read_and_then_turned_round_come_in_order_again(tmp_path):
+    table = read_trials(written(tmp_path, HEADER + "A,1,close,1,2\nA,2,similar,1,2\nB,1,different,1,2\n"), study())
+    whole, turned = cohort_of(table, study()), cohort_of(table[::-1], study())
+    assert whole.names == turned.names == ("A", "B")
+    np.testing.assert_array_equal(turned.trials.q, whole.trials.q)
+    assert cohort_of(table[table["participant"] == "B"], study()).names == ("B",)
+
+
+def test_what_nobody_changed_is_checked_once(tmp_path, monkeypatch):
+    table = read_trials(written(tmp_path, HEADER + "A,1,close,1,2\n"), study())
+    monkeypatch.setattr("hilbo.study.cohort.checked_trials", lambda *_: pytest.fail("checked again"))
+    assert cohort_of(table.assign(note="kept"), study()).counts().tolist() == [1]
+
+
+def test_names_of_columns_may_be_numbers_and_cells_numpy_s():
+    frame = pd.DataFrame({"participant": "A", "trial": [1, 2], "response": "close", "delay": 2.0, 5: "x"})
+    frame["gain"] = pd.Series([np.float64(1.25), np.float64(2.0)], dtype=object)
+    assert cohort_of(frame, study()).physical[0, :2, 0].tolist() == [1.25, 2.0]

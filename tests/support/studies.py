@@ -128,5 +128,6 @@ def answered(study, people=2, trials=6):
     x = np.random.default_rng(1).uniform(size=(people * trials, study.space.dim))
     table = pd.DataFrame(np.asarray(study.space.to_physical(x)), columns=list(study.space.names))
     table["participant"] = np.repeat([f"P{i}" for i in range(people)], trials)
-    table["category"] = (np.abs(x - 0.5).max(axis=1) < 0.3).astype(int)
+    table["trial"] = np.tile(np.arange(1, trials + 1), people)
+    table["response"] = np.array(study.responses)[(np.abs(x - 0.5).max(axis=1) < 0.3).astype(int)]
     return cohort_of(table, study)
