@@ -6,22 +6,21 @@ assumes, and what a separated coefficient gets. `hilbo.statistics.paper_tables` 
 these.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
 from scipy.special import logit
 
 from hilbo.errors import InputError
 from hilbo.statistics import ordered_logit as likelihood
+from hilbo.statistics.columns import Columns, is_yes_or_no, predictors_of
 from hilbo.statistics.regression import Clusters, Regression, regress
 
 __all__ = ["binary_logit", "ordered_logit", "tied_preferences"]
 
-Predictors = Mapping[str, Any] | pd.DataFrame  # a column for each, n entries each
+Predictors = Columns
 
 
 def binary_logit(
@@ -39,9 +38,9 @@ def binary_logit(
     Raises `InputError` for an outcome that is empty or not of 0 and 1.
     """
     success = np.asarray(outcome)
-    if success.ndim != 1 or not success.size or not np.isin(success, (0, 1)).all():
+    if success.ndim != 1 or not is_yes_or_no(success):
         raise InputError("the outcome of a binary logit must be a list of 0 and 1 (or no and yes), and not empty.")
-    names, x = _matrix(predictors, len(success))
+    names, x = predictors_of(predictors, len(success))
     x = np.column_stack([np.ones(len(success)), x])
     model = likelihood.design(success.astype(int), x, np.zeros((1, 0)))
     start = np.zeros(x.shape[1])
@@ -70,7 +69,7 @@ def ordered_logit(
         raise InputError(f"category {used[-1]} has no name; {len(labels)} are given.")
     if len(used) < 2:
         raise InputError(f'all {len(answers)} answers are "{labels[used[0]]}": there is nothing to compare.')
-    names, x = _matrix(predictors, len(answers))
+    names, x = predictors_of(predictors, len(answers))
     edges = [f"{labels[a]}|{labels[b]}" for a, b in pairwise(used)]
     model = likelihood.design(ranks.ravel(), x, np.eye(len(edges)))
     below = np.cumsum(np.bincount(ranks.ravel()))[:-1] / len(answers)
@@ -98,6 +97,8 @@ def tied_preferences(
     and for a `reference` that is in no comparison.
     """
     left, right, chosen = (np.asarray(column, str) for column in (first, second, preferred))
+    if not left.shape == right.shape == chosen.shape == (left.size,):
+        raise InputError("first, second and preferred must be lists of one length: an entry each for a comparison.")
     wrong = (chosen != left) & (chosen != right) & (chosen != "tie")
     if not left.size or wrong.any():
         raise InputError(
@@ -109,20 +110,14 @@ def tied_preferences(
         raise InputError(f'the reference "{reference}" is in no comparison; the sets are {", ".join(sets)}.')
     sets.remove(reference)
     x = np.array([(left == name).astype(float) - (right == name) for name in sets]).T.reshape(len(left), len(sets))
-    if order is not None and np.any(order):
-        sets, x = [*sets, "shown first"], np.column_stack([x, np.asarray(order, float)])
+    shown_first = np.zeros(len(left)) if order is None else np.asarray(order)
+    if shown_first.shape != left.shape or pd.isna(shown_first).any() or not np.isin(shown_first, (-1, 0, 1)).all():
+        raise InputError("order must hold 1, -1 or 0 for each comparison: first was shown first, second, or unknown.")
+    if shown_first.any():
+        sets, x = [*sets, "shown first"], np.column_stack([x, shown_first.astype(float)])
     ties = bool((chosen == "tie").any())
     won = np.where(chosen == left, 1, 0) * (2 if ties else 1) + (chosen == "tie")
     model = likelihood.design(won, x, np.array([[-1.0], [1.0]]) if ties else np.zeros((1, 0)))
     start = np.concatenate([np.zeros(x.shape[1]), np.ones(int(ties))])
     terms = [*sets, *(["tie"] if ties else [])]
     return regress(model, terms, start, clusters, nuisance=int(ties), level=level)
-
-
-def _matrix(predictors: Predictors | None, n: int) -> tuple[list[str], Float[np.ndarray, "n p"]]:
-    """Names and columns (n, p) of the predictors, as finite numbers."""
-    columns = {} if predictors is None else {str(name): np.asarray(predictors[name], float) for name in predictors}
-    for name, values in columns.items():
-        if values.shape != (n,) or not np.isfinite(values).all():
-            raise InputError(f'predictor "{name}" must have one finite number for each of the {n} answers.')
-    return list(columns), np.array(list(columns.values())).T.reshape(n, len(columns))

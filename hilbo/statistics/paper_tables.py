@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from hilbo.errors import InputError
+from hilbo.statistics.columns import check_level
 from hilbo.statistics.logits import binary_logit, ordered_logit, tied_preferences
 from hilbo.statistics.preferences import classifications, confusion, preference_rates
 from hilbo.statistics.regression import Regression
@@ -54,6 +55,7 @@ def paper_tables(
     mid and worst. Without it the names say so, as plans give them: "best", "foam best", "foam P07 best"; and in table
     IV "aggregate" and "individual:PARTICIPANT", with or without a material before. Raises `InputError` for a bad table.
     """
+    check_level(level)
     table = of_material(check_validation(validation, responses), material)
     sources, roles = set_sources(table, sets)
     staged = table.assign(set_a=table["set_a"].map(roles), set_b=table["set_b"].map(roles))

@@ -6,7 +6,7 @@ the logit's intercept, mapped to rates, so that they stay within 0 and 1. Where 
 cluster; then the exact interval of the participants, all of whom agreed, stands beside that of the answers.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -14,6 +14,7 @@ from scipy.special import expit
 from scipy.stats import binomtest
 
 from hilbo.errors import InputError
+from hilbo.statistics.columns import check_level, is_yes_or_no, labels_of
 from hilbo.statistics.logits import binary_logit
 from hilbo.statistics.regression import Clusters
 from hilbo.study.validation_table import NONE, RESPONSES, TIE
@@ -51,17 +52,19 @@ def rate(
 
     Columns `rate`, `errors`, `low`, `high`, `p_value` (of a rate of 1/2), `assumes`. Raises `InputError`.
     """
+    check_level(level)
     hits = np.asarray(success)
-    if not hits.size or not np.isin(hits, (0, 1)).all():
+    if hits.ndim != 1 or not is_yes_or_no(hits):
         raise InputError("a rate needs a list of 0 and 1 (or no and yes) that is not empty.")
+    labels = labels_of(clusters, hits.size)
     test = binomtest(int(hits.sum()), hits.size)
     rows = [
         ("Wilson", *test.proportion_ci(level, "wilson"), np.nan, _INDEPENDENT),
         ("exact", *test.proportion_ci(level, "exact"), test.pvalue, _INDEPENDENT),
     ]
     if hits.min() == hits.max():
-        rows += _unanimous(hits, clusters, level)
-    elif clusters is not None and len(list(clusters)):
+        rows += _unanimous(hits, labels, level)
+    elif labels:
         fitted = binary_logit(hits, None, clusters, level=level).table
         fitted = fitted[fitted["errors"] != "iid"]
         rows += list(
@@ -84,6 +87,7 @@ def preference_rates(
     `sets` are the ones to compare, in the order in which a pair names them; all, by the alphabet, if none is given.
     Columns `set`, `over`, `comparisons`, `wins`, `losses`, `ties`, and those of `rate`. A pair with ties only has none.
     """
+    check_level(level)
     asked = table[table["preferred"] != NONE]
     names = list(sets) or sorted({*asked["set_a"], *asked["set_b"]})
     place = {name: i for i, name in enumerate(names)}
@@ -102,12 +106,13 @@ def preference_rates(
     return pd.concat(blocks, ignore_index=True) if blocks else pd.DataFrame()
 
 
-def _unanimous(hits: np.ndarray, clusters: Clusters | None, level: float) -> list[tuple[str, float, float, float, str]]:
+def _unanimous(
+    hits: np.ndarray, labels: Mapping[str, np.ndarray], level: float
+) -> list[tuple[str, float, float, float, str]]:
     """All agreed: how many people would, from the people who did."""
     rows = []
-    columns = {} if clusters is None else {str(name): np.asarray(clusters[name]) for name in clusters}
-    for name, codes in columns.items():
-        people = len(pd.unique(codes))
+    for name, codes in labels.items():
+        people = int(codes.max()) + 1
         test = binomtest(people if hits[0] else 0, people)
         assumes = f"clusters of {name} are independent; share of them that agree in every answer"
         rows.append((f"exact, of {people} by {name}", *test.proportion_ci(level, "exact"), test.pvalue, assumes))

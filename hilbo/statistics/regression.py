@@ -23,12 +23,13 @@ from scipy import stats
 from hilbo.errors import InputError
 from hilbo.statistics import ordered_logit
 from hilbo.statistics.cluster_robust import Covariance, clustered
+from hilbo.statistics.columns import Columns, check_level, labels_of
 from hilbo.statistics.ordered_logit import Design, Fit
 from hilbo.statistics.separation import Separation, decisive, independent, profile, separation
 
 __all__ = ["Clusters", "Errors", "Regression", "regress"]
 
-Clusters = Mapping[str, Any] | pd.DataFrame  # a column for each way, n entries each
+Clusters = Columns  # one for each way
 _FEW_CLUSTERS = 12
 _NO_SPREAD = 1e-8  # of the iid error: clusters that agree to rounding
 _NOTHING_LEFT = (
@@ -88,15 +89,17 @@ def regress(
     """Fit `model` and put every kind of error beside the estimates.
 
     The last `nuisance` coefficients (edges of categories) get no profile. `start` has its edges in order. Raises
-    `InputError` for coefficients that depend on each other and for more than two ways of clustering.
+    `InputError` for coefficients that depend on each other, for more than two ways of clustering, and for a level that
+    is not between 0 and 1.
 
     Everything is computed in units in which the largest entry of each column is about 1: ranks, linear programs and
     the repair of covariances compare columns with each other. The units are powers of two, which cost no rounding.
     """
+    check_level(level)
     names, effects = list(terms), len(terms) - nuisance
     model, units = _in_own_units(model)
     start = start * units
-    labels = _labels(clusters, len(model.upper))
+    labels = labels_of(clusters, len(model.upper))
     _check_independent(model, names, nuisance)
     separated = separation(model)
     warnings = [_separated_sentence(names, separated, effects)] if separated.infinite.any() else []
@@ -132,19 +135,6 @@ def _covariance(kind: Errors, terms: Mapping[int, str]) -> pd.DataFrame:
     """The covariance of these coefficients, by name."""
     shown = list(terms.values())
     return pd.DataFrame(kind.covariance.matrix[np.ix_(list(terms), list(terms))], shown, shown)
-
-
-def _labels(clusters: Clusters | None, n: int) -> dict[str, Int[np.ndarray, " n"]]:
-    """The number of every answer's cluster, by each way. Raises `InputError`."""
-    columns = {} if clusters is None else {str(name): np.asarray(clusters[name]) for name in clusters}
-    if len(columns) > 2:
-        raise InputError(f"errors can be clustered by one way or two, not by {len(columns)} ({', '.join(columns)}).")
-    for name, codes in columns.items():
-        if codes.shape != (n,):
-            raise InputError(f'clusters "{name}" has {codes.size} entries for {n} answers; give one for each answer.')
-        if pd.isna(codes).any():
-            raise InputError(f'clusters "{name}" has empty entries; name the cluster of every answer.')
-    return {name: np.unique(codes, return_inverse=True)[1].ravel() for name, codes in columns.items()}
 
 
 def _check_independent(model: Design, names: list[str], nuisance: int) -> None:

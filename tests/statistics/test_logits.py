@@ -2,6 +2,7 @@
 
 import functools
 
+import jaxtyping
 import numpy as np
 import pandas as pd
 import pytest
@@ -195,3 +196,62 @@ def test_the_units_of_a_predictor_do_not_matter(scale, separated):
     for name, covariance in fitted.covariances.items():
         if "x" in covariance:
             assert covariance.loc["x", "x"] * scale**2 == pytest.approx(own.covariances[name].loc["x", "x"], rel=1e-7)
+
+
+YES = np.array([0, 1, 1, 0, 1, 1, 0, 1])
+U = {"u": np.array([0.1, 0.5, 0.2, 0.7, 0.9, 0.3, 0.8, 0.4])}
+MISSING = pd.Series([0, 1, None, 0, 1, 1, 0, 1], dtype="boolean")
+A_LEVEL = "level is 95; it must be above 0 and below 1, such as 0.95."
+NAMED = "give a DataFrame, a Series or a dict, so that each column has a name."
+MISTAKES = {
+    "a logit of level 95": (lambda: st.binary_logit(YES, U, level=95), A_LEVEL),
+    "a rate of level 95": (lambda: rate(YES, level=95), A_LEVEL),
+    "pairs of level 95": (lambda: preference_rates(pd.DataFrame({"preferred": []}), level=95), A_LEVEL),
+    "tables of level 95": (lambda: paper_tables(paper_counts(np.random.default_rng(1)), level=95), A_LEVEL),
+    "a level of text": (
+        lambda: rate(YES, level="95%"),
+        "level is '95%'; it must be above 0 and below 1, such as 0.95.",
+    ),
+    "clusters in a list": (lambda: st.binary_logit(YES, U, list("aabbccdd")), f"clusters is a list; {NAMED}"),
+    "clusters of a rate in a list": (lambda: rate(YES > 2, list("aabbccdd")), f"clusters is a list; {NAMED}"),
+    "clusters in an array": (lambda: st.binary_logit(YES, U, YES), f"clusters is a ndarray; {NAMED}"),
+    "predictors in an array": (lambda: st.binary_logit(YES, U["u"]), f"predictors is a ndarray; {NAMED}"),
+    "too few clusters": (
+        lambda: rate(np.ones(3, int), {"p": ["a", "b"]}),
+        'clusters "p" has 2 entries for 3 answers; give one for each answer.',
+    ),
+    "a predictor of text": (
+        lambda: st.binary_logit(YES, {"u": list("abcdefgh")}),
+        'predictor "u" must have one finite number for each of the 8 answers.',
+    ),
+    "a missing outcome": (
+        lambda: st.binary_logit(MISSING, U),
+        "the outcome of a binary logit must be a list of 0 and 1 (or no and yes), and not empty.",
+    ),
+    "a missing success": (lambda: rate(MISSING), "a rate needs a list of 0 and 1 (or no and yes) that is not empty."),
+    "pairs of two lengths": (
+        lambda: st.tied_preferences(["a", "b"], ["b", "a"], ["a"]),
+        "first, second and preferred must be lists of one length: an entry each for a comparison.",
+    ),
+    "a missing order": (
+        lambda: st.tied_preferences(["a", "b"], ["b", "a"], ["a", "a"], order=[1, np.nan]),
+        "order must hold 1, -1 or 0 for each comparison: first was shown first, second, or unknown.",
+    ),
+}
+
+
+@pytest.mark.parametrize("what", MISTAKES)
+def test_what_is_given_wrongly_gets_one_sentence(what, monkeypatch):
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # who uses hilbo has no checks of types
+    mistake, sentence = MISTAKES[what]
+    with pytest.raises(InputError) as refused:
+        mistake()
+    assert str(refused.value) == sentence
+
+
+def test_a_column_with_its_name_is_enough_and_ids_may_be_numbers_and_texts():
+    table = st.binary_logit(YES, U, {"p": list("aabbccdd")}).table
+    ids = pd.Series([1, 1, "b", "b", 3, 3, "d", "d"], name="p", dtype=object)
+    pd.testing.assert_frame_equal(st.binary_logit(YES, pd.Series(U["u"], name="u"), ids).table, table)
+    pd.testing.assert_frame_equal(st.binary_logit(pd.Series(YES).astype("boolean"), U, ids).table, table)
+    assert rate(np.ones(8, int), ids)["errors"].tolist() == ["Wilson", "exact", "exact, of 4 by p"]

@@ -1,0 +1,69 @@
+"""What callers give to the statistics, as arrays: outcomes, predictors, clusters and levels; checked in one place."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+
+from hilbo.errors import InputError
+
+__all__ = ["Columns", "check_level", "is_yes_or_no", "labels_of", "predictors_of"]
+
+Columns = Mapping[str, Any] | pd.DataFrame | pd.Series  # a column for each name, n entries each
+
+
+def check_level(level: Any) -> None:
+    """Refuse a level of confidence that is none, such as 95: limits of it would be NaN."""
+    number = isinstance(level, int | float | np.number) and not isinstance(level, bool)
+    if not number or not 0 < level < 1:
+        raise InputError(f"level is {level!r}; it must be above 0 and below 1, such as 0.95.")
+
+
+def is_yes_or_no(values: np.ndarray) -> bool:
+    """Whether there is one entry at least, and each is 0 or 1, yes or no; a missing one is neither."""
+    return bool(values.size and not pd.isna(values).any() and np.isin(values, (0, 1)).all())
+
+
+def predictors_of(given: Columns | None, n: int) -> tuple[list[str], Float[np.ndarray, "n p"]]:
+    """Names and columns (n, p) of the predictors, as finite numbers. Raises `InputError`."""
+    columns = {name: _numbers(values) for name, values in _columns("predictors", given).items()}
+    for name, values in columns.items():
+        if values.shape != (n,) or not np.isfinite(values).all():
+            raise InputError(f'predictor "{name}" must have one finite number for each of the {n} answers.')
+    return list(columns), np.array(list(columns.values())).T.reshape(n, len(columns))
+
+
+def labels_of(given: Columns | None, n: int) -> dict[str, Int[np.ndarray, " n"]]:
+    """The number of every answer's cluster, by each way. Raises `InputError`."""
+    columns = {name: np.asarray(values) for name, values in _columns("clusters", given).items()}
+    if len(columns) > 2:
+        raise InputError(f"errors can be clustered by one way or two, not by {len(columns)} ({', '.join(columns)}).")
+    for name, codes in columns.items():
+        if codes.shape != (n,):
+            raise InputError(f'clusters "{name}" has {codes.size} entries for {n} answers; give one for each answer.')
+        if pd.isna(codes).any():
+            raise InputError(f'clusters "{name}" has empty entries; name the cluster of every answer.')
+    return {name: pd.factorize(codes, sort=True)[0] for name, codes in columns.items()}  # numbers and texts in one too
+
+
+def _columns(what: str, given: Columns | None) -> dict[str, Any]:
+    """Columns by name, of a Series by its own. Raises `InputError` for what has no names."""
+    if given is None:
+        return {}
+    if isinstance(given, pd.DataFrame | Mapping):
+        return {str(name): given[name] for name in given}
+    if isinstance(given, pd.Series):
+        name = getattr(given, "name", None)
+        return {what if name is None else str(name): given}
+    words = "give a DataFrame, a Series or a dict, so that each column has a name"
+    raise InputError(f"{what} is a {type(given).__name__}; {words}.")
+
+
+def _numbers(values: Any) -> Float[np.ndarray, "..."]:
+    """As float64; what is no number is one that is not finite."""
+    try:
+        return np.asarray(values, float)
+    except (TypeError, ValueError):
+        return np.full(np.shape(values), np.nan)
