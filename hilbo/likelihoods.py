@@ -117,10 +117,10 @@ class OrdinalProbit(eqx.Module):
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`."""
         dtype = self.thresholds.dtype
-        f = floats(jnp.asarray(f, dtype if isinstance(f, int | float) else None), dtype)
-        ends = jnp.full((1,), jnp.inf, f.dtype)
-        edges = jnp.concatenate([-ends, self.thresholds.astype(f.dtype), ends])
-        return f, edges[q], edges[q + 1], self.noise.astype(f.dtype)
+        latent = floats(jnp.asarray(f, dtype if isinstance(f, int | float) else None), dtype)
+        ends = jnp.full((1,), jnp.inf, latent.dtype)
+        edges = jnp.concatenate([-ends, self.thresholds.astype(latent.dtype), ends])
+        return latent, edges[q], edges[q + 1], self.noise.astype(latent.dtype)
 
 
 class OrdinalTerms(eqx.Module):

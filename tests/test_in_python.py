@@ -132,6 +132,18 @@ MISTAKES = {
         lambda p, s: s.best(),
         "Session: there are no answers yet, and so no best rendering; tell one first.",
     ),
+    "a seed of more than 64 bits": (
+        lambda p, s: Session.start(s.study, seed=2**63),
+        "Session: seed is 9223372036854775808; it must be at most 9223372036854775807, which is 2^63 - 1.",
+    ),
+    "an array at a point": (
+        lambda p, s: s.tell("close", {"u": np.array([0.5]), "v": 12}),
+        "Session: u is array([0.5]); give a number.",
+    ),
+    "a whole row of a table": (
+        lambda p, s: s.tell("close", pd.Series({"u": 0.5, "v": 12.0, 7: 1})),
+        "Session: at has u, v, 7; give u, v.",
+    ),
     "another parameter": (lambda p, s: s.tell("close", {"u": 0.5, "w": 0.5}), "Session: at has u, w; give u, v."),
     "out of range": (
         lambda p, s: s.tell("close", {"u": 0.5, "v": 0.5}),
@@ -162,6 +174,14 @@ OF_ANOTHER_TYPE = {
         "Study: this is a NoneType; give a study file's tables, or Study.load(path).",
     ),
     "words at a point": (lambda p, s: s.tell("close", {"u": "low", "v": 12}), "Session: u is 'low'; give a number."),
+    "a list at a point": (
+        lambda p, s: s.tell("close", [0.5, 12.0]),
+        "Session: at is a list; give a dict with a value for each of u, v.",
+    ),
+    "a number in place of a path": (
+        lambda p, s: Study.load(5),
+        "Study: the path is a int; give the path of a study file, as text.",
+    ),
     "half a capacity": (
         lambda p, s: Trials.from_arrays(np.zeros((1, 2)), [0], 2.5),
         "Trials: capacity is 2.5; give a whole number.",
@@ -227,6 +247,49 @@ def test_corners_of_the_cube_may_be_whole_numbers(posterior, dtype):
     np.testing.assert_array_equal(Trials(whole, q, mask).x, Trials(plain, q, mask).x)
     assert Trials(plain.astype(jnp.float32), q, mask).x.dtype == jnp.float32
     np.testing.assert_array_equal(posterior.trials.append(whole[0], 1).x, posterior.trials.append(plain[0], 1).x)
+
+
+def test_a_row_of_a_table_is_a_point_and_what_was_answered_stays(session):
+    row = pd.DataFrame({"u": [0.25], "v": [12.0]}).iloc[0]
+    told = session.tell(session.study.responses[0], row)
+    assert told.points.tolist() == [[0.25, 12.0]]
+    for array in (told.points, told.answers, told.proposal, session.points):
+        assert not array.flags.writeable
+
+
+def test_a_number_of_32_bits_does_not_leave_its_range():
+    study = Study.from_dict(PLAIN | {"parameters": {"u": {"low": 0.01, "high": 0.99}, "v": PLAIN["parameters"]["v"]}})
+    step = Session.start(study, seed=0).step
+    assert float(np.float32(0.99)) > 0.99 and float(np.float32(0.01)) < 0.01
+    step._run = lambda *_: np.array([0.99, 10.0, 7.0], np.float32)  # the posterior's numbers stand behind the point
+    count = len(step.initial)
+    assert step(np.zeros((count, 2)), np.zeros(count, int)).tolist() == [0.99, 10.0]
+    step._run = lambda *_: np.array([0.01, 20.0, 7.0], np.float32)
+    assert step(np.zeros((count, 2)), np.zeros(count, int)).tolist() == [0.01, 20.0]
+
+
+@pytest.mark.deep  # it compiles a session
+def test_a_session_in_32_bits_gives_a_table_that_can_be_read():
+    code = (
+        "import numpy as np, pandas as pd\n"
+        "from studies import PLAIN\n"
+        "from hilbo import Session, Study\n"
+        "from hilbo.study.cohort import cohort_of\n"
+        "parameters = {'u': {'low': 0.01, 'high': 0.99}, 'v': PLAIN['parameters']['v']}\n"
+        "study = Study.from_dict(PLAIN | {'parameters': parameters})\n"
+        "session, asked = Session.start(study), []\n"
+        "while not session.done:\n"
+        "    asked.append(session.ask())\n"
+        "    session = session.tell(study.responses[-1 if asked[-1]['u'] > 0.5 else 0])\n"
+        "table = pd.DataFrame(asked).assign(participant='A', trial=np.arange(1, len(asked) + 1))\n"
+        "cohort = cohort_of(table.assign(response=np.array(study.responses)[session.answers]), study)\n"
+        "assert table['u'].max() == 0.99 >= session.best()['u'], table\n"
+        "print(cohort.counts().tolist() == [len(asked)])\n"
+    )
+    path = os.pathsep.join([str(Path(__file__).parent / "support"), str(Path(__file__).parents[1])])
+    env = os.environ | {"PYTHONPATH": path, "JAX_ENABLE_X64": "0"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=env)
+    assert run.stdout == "True\n", run.stderr
 
 
 def test_what_is_traced_is_not_checked(posterior):

@@ -27,8 +27,9 @@ def known(*values: Any) -> bool:
 def float_dtype(value: Any) -> np.dtype:
     """The dtype of an array of floating-point numbers; the default one for Python numbers, integers and sequences."""
     dtype = getattr(value, "dtype", None)
-    floating = isinstance(dtype, np.dtype) and jnp.issubdtype(dtype, jnp.floating)
-    return dtype if floating else jnp.result_type(float)
+    if isinstance(dtype, np.dtype) and jnp.issubdtype(dtype, jnp.floating):
+        return dtype
+    return np.dtype(jnp.result_type(float))
 
 
 def floats(array: Any, dtype: DTypeLike | None = None) -> Any:

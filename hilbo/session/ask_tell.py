@@ -17,6 +17,7 @@ from typing import Any, SupportsFloat
 
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
@@ -26,6 +27,8 @@ from hilbo.session.step import Step, padding
 from hilbo.study.config import Study
 
 __all__ = ["Session", "physical_trials"]
+
+_LARGEST_SEED = 2**63 - 1  # of JAX's keys
 
 
 def physical_trials(study: Study, points: np.ndarray, answers: np.ndarray, capacity: int) -> Trials:
@@ -76,9 +79,11 @@ class Session:
             raise InputError(f"Session: study is a {type(study).__name__}; load it first, by Study.load(path).")
         if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
             raise InputError(f"Session: seed is {seed!r}; it must be a whole number from 0.")
+        if seed > _LARGEST_SEED:
+            raise InputError(f"Session: seed is {seed}; it must be at most {_LARGEST_SEED}, which is 2^63 - 1.")
         plan = design(study, seed)
         step = Step(study, plan)
-        points, answers = np.zeros((0, study.space.dim)), np.zeros(0, int)
+        points, answers = _read_only(np.zeros((0, study.space.dim)), np.zeros(0, int))
         return cls(study, plan, points, answers, step(points, answers), seed, step)
 
     @classmethod
@@ -112,11 +117,12 @@ class Session:
         """
         return self._named(_asked(self))
 
-    def tell(self, response: str, at: Mapping[str, Any] | None = None) -> "Session":
+    def tell(self, response: str, at: Mapping[str, Any] | pd.Series | None = None) -> "Session":
         """The next state, after the participant's answer (one of the study's responses) to the asked point.
 
-        `at`: the point that was really presented, if it was not the asked one.
-        Raises `InputError` for a `response` that the study does not have.
+        `at`: the point that was really presented, if it was not the asked one: each parameter's value by its name, as
+        `ask` has one, or a row of a DataFrame.
+        Raises `InputError` for a `response` that the study does not have, and a point that is none of its own.
         """
         step = self.step
         if response not in step.responses:
@@ -125,7 +131,7 @@ class Session:
             )
         shown = _asked(self) if at is None else self._point(at)
         points = np.concatenate([self.points, shown[None, :]])
-        answers = np.append(self.answers, step.responses.index(response))
+        points, answers = _read_only(points, np.append(self.answers, step.responses.index(response)))
         return replace(self, points=points, answers=answers, proposal=step(points, answers))
 
     def _named(self, point: np.ndarray) -> dict[str, Any]:
@@ -133,13 +139,17 @@ class Session:
         values = zip(self.study.space.parameters, point.tolist(), strict=True)
         return {p.name: p.shown(value) if p.levels else value for p, value in values}
 
-    def _point(self, at: Mapping[str, Any]) -> np.ndarray:
+    def _point(self, at: Mapping[str, Any] | pd.Series) -> np.ndarray:
         """A rendering (d,) that was presented. Raises `InputError` for one that is none of this study's."""
-        if set(at) != set(self.step.names):
-            raise InputError(f"Session: at has {', '.join(at)}; give {', '.join(self.step.names)}.")
+        names = ", ".join(self.step.names)
+        if not isinstance(at, Mapping | pd.Series):
+            raise InputError(f"Session: at is a {type(at).__name__}; give a dict with a value for each of {names}.")
+        given = list(at.keys())
+        if len(given) != len(self.step.names) or set(given) != set(self.step.names):
+            raise InputError(f"Session: at has {', '.join(map(str, given))}; give {names}.")
         for p in self.study.space.parameters:
             value = at[p.name]
-            if not p.levels and not isinstance(value, SupportsFloat):
+            if not p.levels and (not isinstance(value, SupportsFloat) or getattr(value, "ndim", 0)):
                 raise InputError(f"Session: {p.name} is {value!r}; give a number.")
             if not p.holds(p.number(str(value)) if p.levels else float(value)):
                 raise InputError(f"Session: {p.name} is {value}; it must be {p.range_words}.")
@@ -155,6 +165,13 @@ class Session:
         if not len(self.answers):
             raise InputError("Session: there are no answers yet, and so no best rendering; tell one first.")
         return self._named(self.step.best(self.posterior()))
+
+
+def _read_only(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The same arrays, which nobody can change: a state is a record, and its proposal depends on them."""
+    for array in arrays:
+        array.flags.writeable = False
+    return arrays
 
 
 def _asked(session) -> np.ndarray:

@@ -56,7 +56,8 @@ class Step:
     def __init__(self, study: Study, plan: Design) -> None:
         self._study, self._plan, self._choosing = study, plan, Choosing.of(study)
         self.weight, self.capacity = float(study.selection.weight), study.selection.trials
-        self.initial: Float[np.ndarray, "s d"] = np.asarray(_to_physical(study.space, plan.initial))
+        self._low, self._high = (np.array([getattr(p, end) for p in study.space.parameters]) for end in ("low", "high"))
+        self.initial: Float[np.ndarray, "s d"] = self._physical(_to_physical(study.space, plan.initial))
         self.responses, self.names = study.responses, study.space.names
         blank = padding(study, self.capacity).ravel()
         self._blank = np.concatenate([np.zeros(_FACTS + self.capacity), blank])
@@ -73,21 +74,30 @@ class Step:
             return None
         if count < len(self.initial):
             return self.initial[count]
-        return self._run(points, answers)[: len(self.names)]
+        return self._physical(self._run(points, answers)[: len(self.names)])
 
     def fitted(self, points: Float[np.ndarray, "n d"], answers: Any) -> Fitted:
         """The posterior after any number of answers, and the point that it chooses; by the same call."""
         numbers = self._run(points, answers)
         dim = len(self.names)
         posterior = Posterior(self._study.gp, *jax.device_put(self._layout.tree(numbers[dim:])))
-        return Fitted(numbers[:dim], _certified(posterior) if self._study.inference == "laplace" else posterior)
+        point = self._physical(numbers[:dim])
+        return Fitted(point, _certified(posterior) if self._study.inference == "laplace" else posterior)
 
     def best(self, posterior: Posterior) -> Float[np.ndarray, " d"]:
         """Where the mean of a posterior of this study is largest, in physical units; nothing is fitted."""
         query = self._blank.copy()
         query[_GIVEN] = 1.0
         packed = jax.device_put(self._layout.vector(posterior))
-        return np.asarray(self._bound_to_the_mean(query, packed))[: len(self.names)]
+        return self._physical(self._bound_to_the_mean(query, packed)[: len(self.names)])
+
+    def _physical(self, points: Any) -> Float[np.ndarray, "*n d"]:
+        """Points (..., d) of a program as float64, which tables and devices have, within the parameters' ranges: where
+        JAX computes with 32 bits, its number for an end may be beyond that end. Nobody may write to them."""
+        numbers = np.asarray(points).astype(np.float64)
+        numbers = np.where(numbers < self._low, self._low, np.where(numbers > self._high, self._high, numbers))
+        numbers.flags.writeable = False
+        return numbers
 
     def warm(self) -> None:
         """Compile what chooses."""

@@ -60,6 +60,8 @@ class Study(eqx.Module):
     @staticmethod
     def load(path: str | os.PathLike) -> "Study":
         """Read and check a study file; InputError says in one sentence what is wrong with it, and where."""
+        if not isinstance(path, str | os.PathLike):
+            raise InputError(f"Study: the path is a {type(path).__name__}; give the path of a study file, as text.")
         return read_study(path, Study.of)
 
     @staticmethod
