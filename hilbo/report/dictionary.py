@@ -37,7 +37,7 @@ _RATE = {
     "assumes": ("", "what the interval assumes of the answers"),
 }
 _MAP = {
-    "f": ("prior sd", "posterior mean of the latent score there"),
+    "mean": ("prior sd", "posterior mean of the latent score there"),
     "sd": ("prior sd", "its standard deviation"),
     "p_top": ("probability", "of the highest answer of a new participant"),
     "passivity_margin": ("N.s/m", "damping of the device more than passivity needs; negative: not passive"),
@@ -147,7 +147,7 @@ _BY_OTHERS = {
 def dictionary(tables: Mapping[str, pd.DataFrame], study: Study) -> pd.DataFrame:
     """A row for each column of the tables: `table`, `column`, `unit`, `meaning`. Raises KeyError for one without."""
     units = {p.name: (p.unit, "value of the parameter") for p in study.space.parameters}
-    meanings = units | {"K0": ("N/mm", "stiffness of the spring, derived from the effective stiffness")}
+    meanings = {"K0": ("N/mm", "stiffness of the spring, derived from the effective stiffness")} | units
     others = {} if study.space.mechanics is not None else _BY_OTHERS
     meanings |= {label: ("comparisons", f'in which the answer was "{label}"') for label in study.responses}
     rows = [

@@ -82,8 +82,8 @@ def tolerance_table(analysis: Analysis) -> pd.DataFrame:
 
 
 def alternatives_table(analysis: Analysis) -> pd.DataFrame:
-    """Everything that could be presented as the optimum: parameters, score, probability of the highest answer, and
-    with a renderer how far from the passive boundary (N.s/m; negative is not passive)."""
+    """Everything that could be presented as the optimum: parameters, latent score, probability of the highest answer,
+    and with a renderer how far from the passive boundary (N.s/m; negative is not passive)."""
     study, aggregate = analysis.study, analysis.aggregate
     claims: dict[str, tuple[Any, Any]] = {"population": (aggregate.optimum.x, aggregate.optimum)}
     claims |= {f"population, {name}": (other.x, other) for name, other in aggregate.alternatives.items()}
@@ -100,7 +100,7 @@ def alternatives_table(analysis: Analysis) -> pd.DataFrame:
         row |= (
             {}
             if optimum is None
-            else {"f": float(optimum.mean), "sd": float(optimum.sd), "p_top": float(optimum.class_probabilities[-1])}
+            else {"mean": float(optimum.mean), "sd": float(optimum.sd), "p_top": float(optimum.class_probabilities[-1])}
         )
         rows.append(row if study.space.mechanics is None else row | {"passivity_margin": margin_of(study.space, x)})
     return pd.DataFrame(rows)

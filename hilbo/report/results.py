@@ -148,7 +148,7 @@ def moved(study: Study, x: Float[Array, " d"], start: Float[Array, " d"]) -> dic
     levels = study.gp.kernel.levels
     percent = 100 * differences(levels, np.asarray(x), np.asarray(start))
     share = dict(zip(study.space.names, percent.tolist(), strict=True))
-    if "K0" in target:
+    if study.space.mechanics is not None:
         share = {"K0": 100 * (target["K0"] - origin["K0"]) / K0_range(study.space)} | share
     ways = {name: {"by": _way(origin[name], target[name]), "percent": share[name]} for name in target}
     return {"nrmse": float(nrmse(x, start, levels)), "moved": ways}

@@ -216,7 +216,7 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
 def _alternatives(study: Study, table: pd.DataFrame) -> dict[str, Any]:
     """Head and rows of the table of all optima on the page: no column without a number in it."""
     forms: dict[str, tuple[str, Any]] = {
-        "f": ("f", "{:.2f}".format),
+        "mean": ("latent score", "{:.2f}".format),
         "sd": ("sd", "{:.2f}".format),
         "p_top": (f'P("{study.responses[-1]}")', percent),
         "passivity_margin": ("passivity margin (N·s/m)", "{:+.3f}".format),

@@ -19,6 +19,7 @@ from hilbo.study.fields import Table as _Table
 from hilbo.study.fields import check_keys, check_present, check_table, missing_keys, read_table, shown
 from hilbo.study.fields import words as _text
 from hilbo.study.protocols import SessionTable
+from hilbo.study.reserved_names import TRIAL_COLUMNS, is_reserved
 from hilbo.study.simulation_table import SimulationTable
 from hilbo.study.stimulus_table import StimulusTable
 
@@ -180,13 +181,6 @@ _TABLES = {
 _REQUIRED = ("schema", "study", "parameters")
 _KEYS = ("schema", "study", "parameters", "renderer", *list(_TABLES)[1:], "constraints", "materials")
 _LEARNT = ("theta", "variance", "thresholds", "noise")
-_COLUMNS = ("participant", "trial", "response", "category", "phase", "material", "voided", "unblinded")
-_RESERVED = (
-    *_COLUMNS,
-    *("session", "status", "response_time", "answered_at", "presentations", "proposed_at", "set_id", "source", "role"),
-    *("location", "mean", "variance", "sd", "point"),
-)
-"""What columns of tables, and variables of map.nc, are called; a parameter of that name would be taken for one."""
 _OVERRIDES = ("renderer", "parameters")
 _NUMBERS_KEYS = ("low", "high", "unit", "scale", "integer")
 _UNITS = {"K1": "N/mm", "B1": "N.s^alpha/mm", "alpha": ""}
@@ -306,7 +300,8 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
         raise InputError(
             f"selection.space_filling is {selection.space_filling}; it must be at most trials = {selection.trials}."
         )
-    reserved = next((p.name for p in parameters if p.name in _RESERVED), None)
+    rendered = tables.renderer is not None
+    reserved = next((p.name for p in parameters if is_reserved(p.name, labels, rendered)), None)
     if reserved is not None:
         raise InputError(
             f"parameters.{reserved}: tables have a column {reserved} already; call the parameter otherwise, for example"
@@ -321,7 +316,7 @@ def check_together(tables: Tables, parameters: Sequence[Parameter]) -> None:
         tables.simulation.check(parameters, len(labels))
     _check_gp(tables.gp, tables.aggregation.rule, len(labels))
     column = "" if tables.random_effect is None else tables.random_effect.column
-    if column in _COLUMNS or column in {p.name for p in parameters} or column.startswith("_"):
+    if column in TRIAL_COLUMNS or column in {p.name for p in parameters} or column.startswith("_"):
         raise InputError(
             f'random_effect.column is "{column}", which has a meaning of its own; name another column of the'
             " answers' table, such as the clip or the day."

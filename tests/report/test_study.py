@@ -16,7 +16,7 @@ import xarray as xr
 from commands import run
 from studies import paper_counts, plain
 
-from hilbo import Trials
+from hilbo import Study, Trials
 from hilbo.population.maps import ALL_RULES, RuleMap
 from hilbo.report.comparison import comparison_section
 from hilbo.report.figures.people import people_figure
@@ -34,6 +34,7 @@ from hilbo.study.map_summary import tolerance
 from hilbo.study.new_study import NewStudy, study_text
 from hilbo.study.optima import predict_people
 from hilbo.study.progress import Progress, _counts, _splits, _to_other_half
+from hilbo.study.reserved_names import is_reserved
 from hilbo.study.tolerance_intervals import tolerance_ends
 
 
@@ -181,6 +182,9 @@ def test_groups_are_what_arviz_reads(tmp_path):
     study, cohort = plain(), crowd([HILL[:6], HILL[:4]])
     posteriors = fit_cohort(study, cohort)
     inference_data = groups(study, cohort, posteriors, draws=4000)
+    constants = inference_data["constant_data"]
+    own = {*constants.variables, *constants.dims} - {*study.space.names}
+    assert all(is_reserved(name, study.responses, False) for name in own)
     f = inference_data["posterior"]["f"].values[0]
     mean, variance = posteriors_at(posteriors)
     np.testing.assert_allclose(f[:, 0].mean(axis=0), mean[0], atol=0.06)
@@ -262,10 +266,21 @@ def test_a_report_of_two_materials(capsys, monkeypatch, tmp_path):
             assert (out / name / file).stat().st_size
         assert all((out / name / f"classes.{kind}").stat().st_size for kind in ("png", "svg"))
         assert "passivity" not in (out / name / "dictionary.csv").read_text()  # nothing of a renderer
+        check_reserved(out / name, folder / "study.toml")
     page = " ".join((out / "report.html").read_text().split())
     assert page.count("data:image/png;base64,") == 2 * 9 + 1 and "http://" not in page
     assert "Hypothesis 4" in page and "fair, good, excellent" in page
     assert run(capsys, monkeypatch, "report", folder, "--out", out, "--force", "--exclude", "mood > 1")[0] == 2
+
+
+def check_reserved(folder, path):
+    """No parameter of a study may be called as a column of a table that has one for each parameter."""
+    study = Study.load(path)
+    heads = {file.name: list(pd.read_csv(file, nrows=0)) for file in folder.glob("*.csv")}
+    with_all = {name: head for name, head in heads.items() if {*study.space.names} <= {*head}}
+    assert {"optima.csv", "alternatives.csv"} <= set(with_all)
+    for head in with_all.values():
+        assert all(is_reserved(name, study.responses, False) for name in head if name not in study.space.names)
 
 
 def test_the_comparison_of_rules_is_shown():
@@ -301,9 +316,10 @@ def test_the_comparison_of_rules_is_shown():
 
 
 def test_no_column_of_what_is_not_there():
-    rows = {"optimum": ["population", "mid"], "u": [0.25, 1.0], "f": [0.123, np.nan], "passivity_margin": [None, None]}
+    rows = {"optimum": ["population", "mid"], "u": [0.25, 1.0], "mean": [0.123, np.nan]}
+    rows |= {"passivity_margin": [None, None]}
     shown = _alternatives(plain(), pd.DataFrame(rows))
-    assert shown["head"] == ["", "u", "f"]
+    assert shown["head"] == ["", "u", "latent score"]
     assert shown["rows"] == [["population map (bcm)", "0.25", "0.12"], ["mid of the sets to compare", "1", ""]]
 
 

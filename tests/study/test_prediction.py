@@ -14,6 +14,7 @@ from hilbo.study.aggregate import aggregate_cohort, fit_cohort
 from hilbo.study.cohort import cohort_of
 from hilbo.study.inference_data import groups, inference_data
 from hilbo.study.prediction import predict_table
+from hilbo.study.reserved_names import is_reserved
 from hilbo.study.trial_table import checked_trials, read_trials
 
 STUDY = Study.from_dict(PLAIN)
@@ -85,6 +86,7 @@ X = np.array([[0.25, (12 - 10) / 10], [1.0, 1.0]])
 def check_predicted(model, moments, chances):
     predicted = predict_table(STUDY, model, ASK)
     assert list(predicted.columns) == ["v", "u", "name", "mean", "sd", *(f"P({r})" for r in STUDY.responses)]
+    assert all(is_reserved(name, STUDY.responses, False) for name in predicted.columns.drop([*ASK]))
     assert list(predicted.index) == ["r1", "r2"] and list(ASK.columns) == ["v", "u", "name"]
     np.testing.assert_allclose(predicted["mean"], moments[0], rtol=1e-12)
     np.testing.assert_allclose(predicted["sd"] ** 2, moments[1], rtol=1e-12)
