@@ -148,12 +148,15 @@ def dictionary(tables: Mapping[str, pd.DataFrame], study: Study) -> pd.DataFrame
     """A row for each column of the tables: `table`, `column`, `unit`, `meaning`. Raises KeyError for one without."""
     units = {p.name: (p.unit, "value of the parameter") for p in study.space.parameters}
     meanings = {"K0": ("N/mm", "stiffness of the spring, derived from the effective stiffness")} | units
-    others = {} if study.space.mechanics is not None else _BY_OTHERS
-    meanings |= {label: ("comparisons", f'in which the answer was "{label}"') for label in study.responses}
+    others = _BY_OTHERS if study.space.mechanics is None else {}
+    own = {name: columns | {key: others[key] for key in others if key in columns} for name, columns in _TABLES.items()}
+    if "confusion" in tables:  # whose first column has another name where an answer is called as it
+        counts = {label: ("comparisons", f'in which the answer was "{label}"') for label in study.responses}
+        own["confusion"] = counts | {str(tables["confusion"].columns[0]): _TABLES["confusion"]["set"]}
     rows = [
         {"table": f"{name}.csv", "column": column, "unit": unit, "meaning": meaning}
         for name, table in tables.items()
         for column in map(str, table.columns)
-        for unit, meaning in [(meanings | _TABLES[name] | others)[column]]
+        for unit, meaning in [(meanings | own[name])[column]]
     ]
     return pd.DataFrame(rows)

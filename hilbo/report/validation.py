@@ -132,11 +132,18 @@ def _plain(value):
 def validation_csv(validated: Validated) -> dict[str, pd.DataFrame]:
     """File name (without .csv) -> table."""
     tables = validated.tables
-    files = {"confusion": tables.confusion.reset_index(), "preferences": tables.preferences}
+    files = {"confusion": _with_sets(tables.confusion), "preferences": tables.preferences}
     files |= {f"table_{number}": table.table for number, table in validated.regressions().items()}
     if validated.overall is not None and validated.people is not None:
         files |= {"aggregate_best": validated.overall, "aggregate_best_people": validated.people}
     return files
+
+
+def _with_sets(confusion: pd.DataFrame) -> pd.DataFrame:
+    """The counts with a first column `set`, called set_1 (and so on) where an answer is called as it."""
+    names = itertools.chain(["set"], (f"set_{n}" for n in itertools.count(1)))
+    free = next(name for name in names if name not in confusion.columns)
+    return confusion.rename_axis(index=free, columns=None).reset_index()
 
 
 def validation_figures(validated: Validated) -> dict[str, Any]:

@@ -7,10 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 from commands import run
-from studies import paper_counts
+from studies import PLAIN, paper_counts
 
 from hilbo import Study
-from hilbo.report.validation import folder_names, p_words, safest, validate, validation_figures
+from hilbo.report.dictionary import dictionary
+from hilbo.report.validation import folder_names, p_words, safest, validate, validation_csv, validation_figures
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.validation_sessions import sets_table, validation_table
 from hilbo.study.map_summary import Sets
@@ -112,3 +113,17 @@ def test_simulated_judges_prefer_what_is_nearer():
     validated = validate(validation_table(study, PRESETS["paper"], sets, seed=3), sets.set_index("set_id"))
     rates = validated.tables.preferences.drop_duplicates(["set", "over"]).set_index(["set", "over"])["rate"]
     assert rates["best", "worst"] > 0.8 and rates["mid", "worst"] > 0.8 and validated.comparisons == 20 * 12 + 8 * 2
+
+
+@pytest.mark.parametrize("answers", [("liquid", "half", "set"), ("set_1", "class", "set"), ("index", "tie", "low_end")])
+def test_an_answer_may_have_any_label(answers):
+    """One of gelatin is "set", as the column of the sets is called."""
+    low, middle, high = answers
+    rows = [(f"V{i}", 1, "best", "mid", high, middle, "a") for i in range(3)]
+    rows += [(f"V{i}", 2, "mid", "worst", middle, low if i else high, "b") for i in range(3)]
+    counts = validation_csv(validate(pd.DataFrame(rows, columns=COLUMNS), responses=answers))["confusion"]
+    assert counts.columns.is_unique and counts.iloc[:, 0].tolist() == ["best", "mid", "worst"]
+    assert counts[high].tolist() == [3, 0, 1] and counts[middle].tolist() == [0, 6, 0]
+    study = Study.from_dict(PLAIN | {"study": {"name": "gelatin", "responses": list(answers)}})
+    words = dictionary({"confusion": counts}, study).set_index("column")["meaning"]
+    assert words[high] == f'in which the answer was "{high}"' and words.iloc[0].startswith("set that was shown")
