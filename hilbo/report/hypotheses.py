@@ -1,7 +1,8 @@
 """What a study's results say of the paper's hypotheses H1 to H4, item by item.
 
 Every item is a sentence with its figures, and whether it supports the hypothesis, contradicts it, or is inconclusive.
-The bounds are stated in the sentence. Items are not counted, and none is a test of its own. Only a study that asks for
+The bounds are stated in the sentence; what ties with its bound is inconclusive, so that a verdict does not depend on
+which end of a scale is written first. Items are not counted, and none is a test of its own. Only a study that asks for
 it has this section (`[report] hypotheses = true`): the hypotheses are the paper's, not everybody's.
 
     H1  individuals' parameters can be found by asking      H3  individuals need not have converged for that
@@ -24,6 +25,8 @@ __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
 Side = Literal["supports", "contradicts", "inconclusive"]
 _NEAR = 0.05
+_WORST_FIRST: tuple[Side, ...] = ("contradicts", "inconclusive")
+_SAME = 1e-9  # rounding: numbers that are as near as this are equal
 
 
 class Results(NamedTuple):
@@ -61,8 +64,16 @@ def hypotheses(results: Sequence[Results]) -> list[Hypothesis]:
     ]
 
 
-def _side(good: bool) -> Side:
-    return "supports" if good else "contradicts"
+def _side(one: float, other: float) -> Side:
+    """Whether one is more than the other, which supports; equal ones say nothing, nor does what is not known."""
+    if np.isclose(one, other, rtol=_SAME, atol=_SAME) or np.isnan(one) or np.isnan(other):
+        return "inconclusive"
+    return "supports" if one > other else "contradicts"
+
+
+def _largest(row: np.ndarray, place: int) -> Side:
+    """Whether the number at a place is larger than all others of its row."""
+    return _side(float(row[place]), float(np.delete(row, place).max()))
 
 
 def _individuals(results):
@@ -82,15 +93,16 @@ def _individuals(results):
         for columns in (slice(0, third), slice(longest - third, longest))
     )
     yield Evidence(
-        _side(late > early) if longest >= 6 else "inconclusive",
+        _side(late, early) if longest >= 6 else "inconclusive",
         f'Of {longest} trials, {totals.mean():.2f}{spread} were answered "{top}"; in the first third of the session'
         f" {100 * early:.0f} % of the answers, in the last third {100 * late:.0f} % (supports: more than in the"
         " first).",
     )
     chances = np.asarray(analysis.aggregate.individuals.class_probabilities)
-    likeliest = int((chances.argmax(axis=1) == chances.shape[1] - 1).sum())
+    sides = [_largest(row, -1) for row in chances]
+    likeliest, unlike = sides.count("supports"), sides.count("contradicts")
     yield Evidence(
-        _side(likeliest > people / 2),
+        "supports" if likeliest > people / 2 else "contradicts" if unlike > people / 2 else "inconclusive",
         f'At their own optimum "{top}" is the likeliest answer for {likeliest} of {people} participants (median'
         f" probability {100 * np.median(chances[:, -1]):.0f} %; supports: more than half of them).",
     )
@@ -128,14 +140,14 @@ def _population(results):
         mean, _ = misses(study, analysis.aggregate.mean_of_optima, results.reference)
         low, middle, high = np.percentile(individual_misses, [25, 50, 75])
         yield Evidence(
-            _side(bool(ours < middle and ours < mean)),
+            _side(min(float(middle), float(mean)), float(ours)),
             f"From {results.reference_name} the population optimum is {100 * ours:.1f} % away (NRMSE), the individual"
             f" optima {100 * middle:.0f} % (median; quartiles {100 * low:.0f} and {100 * high:.0f} %), their mean"
             f" {100 * mean:.1f} % (supports: nearer than both the median and the mean).",
         )
     p = float(best.class_probabilities[-1])
     yield Evidence(
-        _side(int(np.argmax(np.asarray(best.class_probabilities))) == len(study.responses) - 1),
+        _largest(np.asarray(best.class_probabilities), -1),
         f'At the population optimum the map gives "{study.responses[-1]}" a probability of {100 * p:.0f} %'
         " (supports: the likeliest answer).",
     )
@@ -148,12 +160,12 @@ def _population(results):
 def _validation(validated, responses):
     counts = validated.tables.confusion.to_numpy()
     if len(counts) == 3 and counts.sum(axis=1).all() and len(responses) == 3:
-        diagonal = bool((counts.argmax(axis=1) == np.arange(3)).all())
+        sides = [_largest(row, place) for place, row in enumerate(counts)]
         yield Evidence(
-            _side(diagonal),
-            f"The confusion matrix is {'' if diagonal else 'not '}diagonally dominant: best, mid and worst were called"
-            f' "{responses[-1]}", "{responses[1]}" and "{responses[0]}" in'
-            f" {', '.join(f'{100 * v:.0f} %' for v in np.diagonal(counts) / counts.sum(axis=1))} of the cases.",
+            next((side for side in _WORST_FIRST if side in sides), "supports"),
+            f'Best, mid and worst were called "{responses[-1]}", "{responses[1]}" and "{responses[0]}" in'
+            f" {', '.join(f'{100 * v:.0f} %' for v in np.diagonal(counts) / counts.sum(axis=1))} of the cases"
+            " (supports: each is the most frequent answer to its set).",
         )
     for number, term, words, sign in (
         ("II", "Best", f'the best set is called "{responses[-1]}" more often than the others', 1),
@@ -189,7 +201,7 @@ def _convergence(results):
         100 * float(np.median(v)) for v in (progress.halves[row], progress.halves[-1], progress.individual_to_half[row])
     )
     yield Evidence(
-        _side(half < individual),
+        _side(individual, half),
         f"After {progress.counts[row]} trials the optimum of one half of the people{how} is {half:.0f} % (NRMSE,"
         f" median of {progress.splits} random halves) from that of the other half after all trials, and individual"
         f" optima are {individual:.0f} % from it (supports: the half nearer than the individuals); after all trials the"
@@ -201,7 +213,7 @@ def _convergence(results):
             for x in (analysis.progress.population[row], analysis.progress.population[-1])
         ]
         yield Evidence(
-            _side(miss[0] <= miss[1] + _NEAR),
+            "supports" if miss[0] <= miss[1] + _NEAR else "contradicts",
             f"The optimum of everybody's first {progress.counts[row]} answers is {100 * miss[0]:.1f} % from"
             f" {results.reference_name}, that of all {100 * miss[1]:.1f} %{how}"
             f" (supports: at most {100 * _NEAR:.0f} % more).",
@@ -224,7 +236,7 @@ def _near(one):
     ours = float(misses(analysis.study, analysis.aggregate.optimum.x, one.reference)[0])
     individual_miss = float(np.median(misses(analysis.study, analysis.aggregate.individuals.x, one.reference)[0]))
     yield Evidence(
-        _side(ours < individual_miss),
+        _side(individual_miss, ours),
         f"{one.name}: the population optimum is {100 * ours:.1f} % from {one.reference_name}, the median individual one"
         f" {100 * individual_miss:.0f} % (supports: nearer than that).",
     )
