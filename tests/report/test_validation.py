@@ -1,17 +1,27 @@
 """`hilbo validate`: the paper's tables and the page, what few comparisons can say, and simulated judges."""
 
 import json
+import re
 
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 import pytest
 from commands import run
-from studies import PLAIN, paper_counts
+from studies import PLAIN, paper_counts, plain
 
 from hilbo import Study
 from hilbo.report.dictionary import dictionary
-from hilbo.report.validation import folder_names, p_words, safest, validate, validation_csv, validation_figures
+from hilbo.report.page import rendered
+from hilbo.report.validation import (
+    folder_names,
+    p_words,
+    safest,
+    validate,
+    validation_csv,
+    validation_figures,
+    validation_section,
+)
 from hilbo.simulation.presets import PRESETS
 from hilbo.simulation.validation_sessions import sets_table, validation_table
 from hilbo.study.map_summary import Sets
@@ -79,6 +89,21 @@ def test_ties_are_kept_apart():
     validated = validate(paper_counts(np.random.default_rng(4), ties=20))
     assert validated.people["ties"].sum() == 20 and validated.people["wins"].sum() == 279
     assert validated.overall["rate"].iloc[0] == pytest.approx(279 / 364)
+
+
+@pytest.mark.parametrize(("ties", "words"), [(0, "Binary logit"), (20, "Ordered logit with ties")])
+def test_table_iv_is_called_what_it_is(ties, words):
+    """And its probability is nearer to one half than the share of the decided comparisons, where there are ties."""
+    answers = paper_counts(np.random.default_rng(4), ties=ties)
+    validated = validate(answers[answers["session"] == "aggregate-best"])
+    section = validation_section(validated) | {"figures": {}}
+    content = {"study": "", "seed": 0, "versions": {}}
+    page = rendered("validation.html", study=plain(), content=content, warnings=[], sections=[section])
+    caption = " ".join(re.search(r"individuals&#39; own.*?</caption>", page, re.DOTALL).group().split())
+    assert words in caption and "table_IV.csv" in caption and ("nearer to one half" in caption) == (ties > 0)
+    row = safest(validated.tables.table_4).set_index("term").loc["Aggregate-Best"]
+    probability, share = 1 / (1 + np.exp(-row["estimate"])), validated.overall["rate"].iloc[0]
+    assert 0.5 < probability < share - 0.003 if ties else probability == pytest.approx(share)
 
 
 def test_a_pair_that_was_only_tied_is_drawn():
