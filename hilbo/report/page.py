@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
+from hilbo.population.recipes import RECIPES
 from hilbo.report.participants import People
 from hilbo.study.config import Study
 
@@ -67,6 +68,7 @@ def results_page(
         selection=selection,
         comparison=comparison,
         halves=halves,
+        centred=study.rule in RECIPES and RECIPES[study.rule].centred,
     )
 
 

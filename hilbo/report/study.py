@@ -38,7 +38,7 @@ from hilbo.study.set_table import ROLES
 __all__ = ["write_study"]
 
 _DIGITS = 2  # of measures of people and of ends of intervals, which a few dozen answers decide
-_FEWEST = 3  # people for a comparison of rules: each is left out in turn
+_FEWEST = 3  # people for a comparison of rules: each is left out in turn; parts.html says three
 
 
 def write_study(
@@ -77,11 +77,15 @@ def write_study(
     content = _content(folder, contents, claims, seed)
     (out / "result.json").write_text(as_json(content), encoding="utf-8")
     say("the page")
-    (out / "report.html").write_text(_page(folder, content, sections, claims), encoding="utf-8")
+    page = _page(folder, content, sections, claims, comparison)
+    (out / "report.html").write_text(page, encoding="utf-8")
     return content
 
 
-def _page(folder: StudyFolder, content, sections, claims) -> str:
+def _page(folder: StudyFolder, content, sections, claims, compares: bool) -> str:
+    """Somebody who is on the map of one material at least is not left out. `compares`: rules, where people suffice."""
+    kept = {name for section in sections for name in section["participants"]}
+    answered = kept.union(*(section["left_out"] for section in sections))
     return rendered(
         "study.html",
         study=folder.study,
@@ -89,7 +93,9 @@ def _page(folder: StudyFolder, content, sections, claims) -> str:
         warnings=[*content["warnings"], *content["limits"]],
         notes=folder.notes,
         sections=sections,
-        people=sum(len(m.cohort.names) for m in folder.materials),
+        people=len(kept),
+        left_out=len(answered) - len(kept),
+        compares=compares,
         hypotheses=claims,
     )
 

@@ -159,16 +159,18 @@ def validation_figures(validated: Validated) -> dict[str, Any]:
 
 
 def validation_section(validated: Validated) -> dict[str, Any]:
-    """What the page says of one material. `tied`: table IV is the model with ties."""
-    fourth = validated.tables.table_4
+    """What the page says of one material. `tied`: the table is of the model with ties."""
     return {
         "material": validated.material,
         "participants": validated.participants,
         "comparisons": validated.comparisons,
         "limits": validated.tables.limits,
-        "tied": fourth is not None and bool(fourth.table["term"].eq(TIE).any()),
         "regressions": {
-            number: {"rows": _shown(table), "warnings": table.warnings}
+            number: {
+                "rows": _shown(table),
+                "warnings": table.warnings,
+                "tied": bool(table.table["term"].eq(TIE).any()),
+            }
             for number, table in validated.regressions().items()
         },
     }

@@ -1,12 +1,14 @@
 """Pages: a number that a template misses is an error, and what a page says of the same numbers told differently."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from jinja2 import UndefinedError
 from studies import plain_study
 
+from hilbo.report import study as study_report
 from hilbo.report.page import _environment, rendered
 from hilbo.report.robustness import robustness_page
 from hilbo.search.rendering import set_of
@@ -37,6 +39,33 @@ def test_a_caption_is_text_in_the_description_of_its_figure():
     assert "how often the first was preferred, with the 95 % interval" in words(page)
     (alt,) = re.findall(r'alt="(Aggregate-best[^"]*)"', page)
     assert alt.startswith("Aggregate-best against individual-best. How often the population&#39;s set was preferred to")
+
+
+def test_the_lead_counts_the_people_of_the_map():
+    """Once each, whatever number of materials they answered of, and beside them who was left out."""
+    content = {"warnings": [], "limits": [], "study": "abc", "seed": 0, "versions": VERSIONS}
+    seen = []
+    for gone in ({}, {"E": "trials < 6"}, {"E": "trials < 6", "D": "trials < 6", "F": "trials < 6"}):
+        sections = [
+            {"participants": ["A", "B", "C", "D"], "left_out": gone},
+            {"participants": ["A", "B"], "left_out": {}},
+        ]
+        folder = SimpleNamespace(study=plain_study(1), notes=())
+        facts = {}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(study_report, "rendered", lambda name, facts=facts, **given: facts.update(given) or "")
+            study_report._page(folder, content, sections, [], True)
+        seen.append(words(rendered("study.html", **facts | {"sections": []})))
+    assert all("What 4 participants answered, and the population map of" in page for page in seen)
+    assert "left out" not in seen[0] and "1 more is left out by the study's rule." in seen[1].replace("&#39;", "'")
+    assert "2 more are left out" in seen[2]  # D is on the map of one material
+    assert "What 1 participant answered," in words(rendered("study.html", **facts | {"sections": [], "people": 1}))
+
+
+def test_it_says_why_rules_were_not_compared():
+    macro = _environment().get_template("parts.html").module.not_compared
+    assert "it takes three people" in macro(True) and "--no-compare" not in macro(True)
+    assert "--no-compare" in macro(False) and "it takes" not in macro(False)
 
 
 def robust(shared, nrmse):

@@ -1,5 +1,6 @@
 """Results folders: numbers against the mechanics' golden ones, formats, pages that explain themselves."""
 
+import dataclasses
 import json
 from html.parser import HTMLParser
 
@@ -11,6 +12,7 @@ import xarray as xr
 from studies import answered, plain_study
 
 from hilbo.report import participants, results
+from hilbo.report.page import results_page
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort_results import analyse_cohort
@@ -135,6 +137,22 @@ def test_the_page_is_whole_and_needs_nothing_else(written):
     assert "://" not in text and "<script" not in text and "nan" not in text.lower().replace("base64", "")[:2000]
     assert ("truth" in text) == ("truth" in content)
     assert study.hash in text and content["versions"]["jax"] in text
+
+
+@pytest.mark.parametrize(
+    ("rule", "sought"),
+    [
+        ("bcm", "this is where the aggregated map is highest."),
+        ("learnt-1", 'The optimum is where a new person most probably answers "good".'),
+        ("learnt-2", "The optimum is the place that the best rendering is most often near, of the renderings at which"),
+    ],
+)
+def test_the_page_says_what_the_optimum_is_by_its_rule(written, rule, sought):
+    study, aggregate, content, _ = written
+    content = content | {"rule": rule, "learnt": {"share": 0.5} if rule.startswith("learnt") else None}
+    people = participants.people_of(study, aggregate)
+    page = results_page(dataclasses.replace(study, rule=rule), content, {}, people)
+    assert sought in " ".join(page.split())
 
 
 def test_figures_are_png_and_svg(written):
