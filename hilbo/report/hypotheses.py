@@ -25,7 +25,6 @@ __all__ = ["Evidence", "Hypothesis", "Results", "hypotheses"]
 
 Side = Literal["supports", "contradicts", "inconclusive"]
 _NEAR = 0.05
-_WORST_FIRST: tuple[Side, ...] = ("contradicts", "inconclusive")
 _SAME = 1e-9  # rounding: numbers that are as near as this are equal
 
 
@@ -162,7 +161,7 @@ def _validation(validated, responses):
     if len(counts) == 3 and counts.sum(axis=1).all() and len(responses) == 3:
         sides = [_largest(row, place) for place, row in enumerate(counts)]
         yield Evidence(
-            next((side for side in _WORST_FIRST if side in sides), "supports"),
+            "contradicts" if "contradicts" in sides else "inconclusive" if "inconclusive" in sides else "supports",
             f'Best, mid and worst were called "{responses[-1]}", "{responses[1]}" and "{responses[0]}" in'
             f" {', '.join(f'{100 * v:.0f} %' for v in np.diagonal(counts) / counts.sum(axis=1))} of the cases"
             " (supports: each is the most frequent answer to its set).",

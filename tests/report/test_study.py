@@ -21,7 +21,7 @@ from hilbo.population.maps import ALL_RULES, RuleMap
 from hilbo.report.comparison import comparison_section
 from hilbo.report.figures.people import people_figure
 from hilbo.report.figures.progress import individual_convergence
-from hilbo.report.hypotheses import _convergence, _individuals, _largest, _materials, _nearer_to_others, _validation
+from hilbo.report.hypotheses import _convergence, _materials, _nearer_to_others
 from hilbo.report.study import _alternatives, _shown, _tolerances
 from hilbo.report.study_figures import comparison_figures
 from hilbo.report.validation import validate
@@ -106,47 +106,6 @@ def test_convergence_is_judged_by_people_who_are_not_among_them():
     assert _nearer_to_others(progress._replace(individual_to_half=own[::-1])).side == "contradicts"
     random = np.random.default_rng(0).uniform(size=(6, 3))
     assert _nearer_to_others(progress._replace(individual_to_half=random)).side == "inconclusive"
-
-
-@pytest.mark.parametrize(
-    ("counts", "side"),
-    [
-        ([[10, 9, 1], [4, 12, 4], [1, 9, 10]], "supports"),
-        ([[10, 10, 0], [4, 12, 4], [1, 9, 10]], "inconclusive"),  # best as often "similar"
-        ([[10, 9, 1], [4, 12, 4], [0, 10, 10]], "inconclusive"),  # its mirror image
-        ([[10, 10, 0], [4, 12, 4], [1, 11, 10]], "contradicts"),
-        ([[5, 5, 5], [5, 5, 5], [5, 5, 5]], "inconclusive"),
-    ],
-)
-def test_a_tie_of_answers_says_nothing_whichever_way_the_scale_runs(counts, side):
-    """Best, mid and worst by the three answers, highest first; reversed, the worst set is the best."""
-    for way in (1, -1):
-        tables = SimpleNamespace(confusion=pd.DataFrame(np.array(counts)[::way, ::way]))
-        (item,) = _validation(SimpleNamespace(tables=tables, regressions=dict), plain().responses)
-        assert item.side == side
-        assert item.text.endswith("of the cases (supports: each is the most frequent answer to its set).")
-
-
-@pytest.mark.parametrize(
-    ("first", "last", "chances", "sides"),
-    [
-        ([2, 0], [2, 0], [[0.2, 0.3, 0.5], [0.5, 0.3, 0.2]], ["inconclusive", "inconclusive"]),
-        ([2, 0], [2, 2], [[0.2, 0.3, 0.5], [0.4, 0.2, 0.4]], ["supports", "inconclusive"]),
-        ([2, 2], [2, 0], [[0.2, 0.3, 0.5], [0.2, 0.3, 0.5]], ["contradicts", "supports"]),
-        ([0, 0], [0, 0], [[0.5, 0.3, 0.2], [0.2, 0.6, 0.2]], ["inconclusive", "contradicts"]),
-    ],
-)
-def test_equal_shares_and_half_of_the_people_say_nothing(first, last, chances, sides):
-    cohort = crowd([[(0.5, 0.5, q) for q in (*first, 1, 1, *last)]] * 2)
-    aggregate = SimpleNamespace(individuals=SimpleNamespace(class_probabilities=np.array(chances)))
-    progress = SimpleNamespace(counts=np.arange(2), splits=0)
-    analysis = SimpleNamespace(study=plain(), cohort=cohort, aggregate=aggregate, progress=progress)
-    assert [item.side for item in _individuals(SimpleNamespace(analysis=analysis))] == sides
-
-
-def test_what_is_equal_to_rounding_is_equal():
-    assert _largest(np.array([0.3, 0.35, 0.35 + 1e-16]), -1) == _largest(np.array([0.1, np.nan]), -1) == "inconclusive"
-    assert _largest(np.array([0.3, 0.35, 0.35 + 1e-6]), -1) == "supports"
 
 
 def test_other_materials_are_the_others():

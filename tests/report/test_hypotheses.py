@@ -1,0 +1,53 @@
+"""Evidence of the paper's hypotheses: what ties with its bound says nothing, whichever way the scale runs."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from studies import plain
+
+from hilbo.report.hypotheses import _individuals, _largest, _validation
+
+
+@pytest.mark.parametrize(
+    ("counts", "side"),
+    [
+        ([[10, 9, 1], [4, 12, 4], [1, 9, 10]], "supports"),
+        ([[10, 10, 0], [4, 12, 4], [1, 9, 10]], "inconclusive"),  # best as often "similar"
+        ([[10, 9, 1], [4, 12, 4], [0, 10, 10]], "inconclusive"),  # its mirror image
+        ([[10, 10, 0], [4, 12, 4], [1, 11, 10]], "contradicts"),
+        ([[5, 5, 5], [5, 5, 5], [5, 5, 5]], "inconclusive"),
+    ],
+)
+def test_a_tie_of_answers_says_nothing_whichever_way_the_scale_runs(counts, side):
+    """Best, mid and worst by the three answers, highest first; reversed, the worst set is the best."""
+    for way in (1, -1):
+        tables = SimpleNamespace(confusion=pd.DataFrame(np.array(counts)[::way, ::way]))
+        (item,) = _validation(SimpleNamespace(tables=tables, regressions=dict), plain().responses)
+        assert item.side == side
+        assert item.text.endswith("of the cases (supports: each is the most frequent answer to its set).")
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "chances", "sides"),
+    [
+        ([2, 0], [2, 0], [[0.2, 0.3, 0.5], [0.5, 0.3, 0.2]], ["inconclusive", "inconclusive"]),
+        ([2, 0], [2, 2], [[0.2, 0.3, 0.5], [0.4, 0.2, 0.4]], ["supports", "inconclusive"]),
+        ([2, 2], [2, 0], [[0.2, 0.3, 0.5], [0.2, 0.3, 0.5]], ["contradicts", "supports"]),
+        ([0, 0], [0, 0], [[0.5, 0.3, 0.2], [0.2, 0.6, 0.2]], ["inconclusive", "contradicts"]),
+    ],
+)
+def test_equal_shares_and_half_of_the_people_say_nothing(first, last, chances, sides):
+    answers = np.array([[*first, 1, 1, *last]] * 2)
+    trials = SimpleNamespace(q=answers, mask=np.ones((2, 6), bool))
+    cohort = SimpleNamespace(names=("A", "B"), trials=trials, counts=lambda: np.full(2, 6))
+    aggregate = SimpleNamespace(individuals=SimpleNamespace(class_probabilities=np.array(chances)))
+    progress = SimpleNamespace(counts=np.arange(2), splits=0)
+    analysis = SimpleNamespace(study=plain(), cohort=cohort, aggregate=aggregate, progress=progress)
+    assert [item.side for item in _individuals(SimpleNamespace(analysis=analysis))] == sides
+
+
+def test_what_is_equal_to_rounding_is_equal():
+    assert _largest(np.array([0.3, 0.35, 0.35 + 1e-16]), -1) == _largest(np.array([0.1, np.nan]), -1) == "inconclusive"
+    assert _largest(np.array([0.3, 0.35, 0.35 + 1e-6]), -1) == "supports"
