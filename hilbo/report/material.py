@@ -83,13 +83,13 @@ def renderer_block(result: Characterisation, damping: float | None) -> str:
     if model.memory == "short":
         lines.append(f"N = {int(model.N)}")
     worth = result.estimates["K_eff"].status
-    lines += [f"T = {model.T:g}             # s", f"K_eff = {values['K_eff']:.6g}       # N/mm, {worth}"]
+    lines += [f"T = {float(model.T)!r}             # s", f"K_eff = {values['K_eff']:.6g}       # N/mm, {worth}"]
     needed = result.minimum_damping
     note = "" if needed is None else f"; this set needs at least {needed:.4g}"
     if damping is None:
         lines.append(f"# damping =           # N.s/m, a property of your device: measure it{note}")
     else:
-        lines.append(f"damping = {damping:g}       # N.s/m{note}")
+        lines.append(f"damping = {float(damping)!r}       # N.s/m{note}")
     lines += ["# The set itself, for this N and T only:"]
     lines += [f"#   {name} = {values[name]:.6g}" for name in ("K0", "K1", "B1", "alpha")]
     return "\n".join(lines) + "\n"

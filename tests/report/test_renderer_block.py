@@ -1,5 +1,6 @@
 """The [renderer] block that `hilbo identify` writes."""
 
+import tomllib
 from types import SimpleNamespace
 
 import pytest
@@ -9,10 +10,20 @@ from hilbo.identification.sampled import Sampled
 from hilbo.report.material import renderer_block
 
 
+def result(status="identified", **model):
+    values = {"K0": -2.9, "K1": 5.7, "B1": 5.9, "alpha": 0.2, "K_eff": 0.44}
+    fit = SimpleNamespace(model=Sampled(**model), parameters=lambda: values)
+    estimates = {"K_eff": Estimate(0.44, None, None, status)}
+    return SimpleNamespace(fit=fit, estimates=estimates, minimum_damping=0.7)
+
+
 @pytest.mark.parametrize("status", ["identified", "one-sided", "at bound", "not identifiable"])
 def test_the_effective_stiffness_has_its_status_beside_it(status):
-    values = {"K0": -2.9, "K1": 5.7, "B1": 5.9, "alpha": 0.2, "K_eff": 0.44}
-    fit = SimpleNamespace(model=Sampled(), parameters=lambda: values)
-    estimates = {"K_eff": Estimate(0.44, None, None, status)}
-    result = SimpleNamespace(fit=fit, estimates=estimates, minimum_damping=0.7)
-    assert f"K_eff = 0.44       # N/mm, {status}\n" in renderer_block(result, None)
+    assert f"K_eff = 0.44       # N/mm, {status}\n" in renderer_block(result(status), None)
+
+
+def test_period_and_damping_are_read_back_as_they_were():
+    """A device refuses a set of another T, and a study that counts on more damping than it has."""
+    period, damping = 1 / 3000, 0.95123458
+    block = tomllib.loads(renderer_block(result(T=period), damping))["renderer"]
+    assert (block["T"], block["damping"]) == (period, damping)
