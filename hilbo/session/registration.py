@@ -116,6 +116,15 @@ def selection_words(selection: Any) -> str:
     )
 
 
+_HIGHEST = "the maximum of the population map"
+_SOUGHT = {
+    "learnt-1": "the one to which a new person most probably gives the highest answer",
+    "learnt-2": "the place that the best one is most often near, of those to which a new person gives the highest"
+    " answer at most 0.05 less often than to any",
+}
+"""What a rule takes for the optimum, where that is not the map's maximum."""
+
+
 def _exclusion(study: StudyFile) -> list[str]:
     rule = study.tables.study.exclude
     if rule:
@@ -131,8 +140,8 @@ def _analysis(study: StudyFile) -> list[str]:
         f"* Population map: {words} (`{rule}`), by hilbo's documentation of that version.",
         *([f"* Random effect of each `{effect}`, where a rule learns the hyperparameters."] if effect else []),
         f"* Model of one person: Gaussian process with an ordinal probit likelihood, {_model(study)}.",
-        "* Primary result: the maximum of the population map among the stimuli that may be presented, with its"
-        " predicted responses of a new participant.",
+        f"* Primary result: among the stimuli that may be presented {_SOUGHT.get(rule, _HIGHEST)}, with its predicted"
+        " responses of a new participant.",
         "* Beside it: everybody's own maximum, alternative rules, sensitivity to the hyperparameters, predictive"
         " checks with each participant left out. They are secondary, and no rule is chosen by them.",
         f"* {_OPEN} Which hypotheses are tested, by which test, at which level.",

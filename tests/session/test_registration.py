@@ -7,10 +7,12 @@ import pytest
 from commands import run
 
 from hilbo.errors import InputError
+from hilbo.population.recipes import RECIPES
 from hilbo.session.plan import make_plan
 from hilbo.session.registration import registration
 from hilbo.study.departures import departures
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
+from hilbo.study.optima import _LOSS
 from hilbo.study.study_file import StudyFile
 
 PAPER = Path("hilbo/data/paper.toml")
@@ -73,6 +75,17 @@ def test_the_page_follows_the_study(page):
     assert "recipe learnt-1" in text and "the rest learnt" in text and "theta" not in text
     assert "`trials < 10` holds are left out" in text
     assert "probability of the highest answer)" in text
+
+
+@pytest.mark.parametrize("rule", ["bcm", *RECIPES])
+def test_the_primary_result_is_the_optimum_of_the_study_s_rule(page, rule):
+    text = page(TEXT.replace('rule = "bcm"', f'rule = "{rule}"'))
+    (primary,) = (line for line in text.splitlines() if line.startswith("* Primary result"))
+    assert ("maximum of the population map" in primary) == (rule == "bcm")
+    centred = rule != "bcm" and RECIPES[rule].centred
+    assert (
+        f"most often near, of those to which a new person gives the highest answer at most {_LOSS}" in primary
+    ) == centred
 
 
 def planned(tmp_path, text="", **others):
