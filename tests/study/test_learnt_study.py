@@ -204,6 +204,7 @@ def test_a_table_without_the_column_with_an_empty_cell_or_too_many_levels_gets_o
     path.write_text("\n".join([lines[0] + ",clip", *(line + ",Fox" for line in lines[1:])]))
     assert set(read_trials(path, study, others=False)["clip"]) == {"Fox"}
     many = pd.concat([answers] * 5, ignore_index=True)
+    many["trial"] = np.arange(1, len(many) + 1)
     with pytest.raises(InputError, match="has 240 different texts; a random effect takes up to 200"):
         cohort_of(many.assign(clip=[f"at {row}" for row in range(len(many))]), study)
 
