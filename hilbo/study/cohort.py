@@ -84,7 +84,7 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     Raises `InputError` for a table that is none of the study's, and a `capacity` that somebody's answers exceed.
     """
     if not isinstance(table, pd.DataFrame) or not is_checked(table, study):
-        table = checked_trials(_levels_named(table, study), study)
+        table = checked_trials(_as_in_a_file(table, study), study)
     person, names = pd.factorize(table["participant"])
     counts = np.bincount(person)
     longest = int(counts.max())
@@ -111,17 +111,20 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     return Cohort(trials, physical, tuple(names), tuple(contexts))
 
 
-def _levels_named(table: pd.DataFrame, study: Study) -> pd.DataFrame:
-    """Levels by their names, as a file has them, where a table has their places, as one that `read_trials` made. No
-    level's name is a number, so that nothing is mistaken."""
+def _as_in_a_file(table: pd.DataFrame, study: Study) -> pd.DataFrame:
+    """Levels by their names where a table has their places, as one that `read_trials` made: no level's name is a
+    number, so that nothing is mistaken. And of a table with categories alone the answers that they are."""
     if not isinstance(table, pd.DataFrame):
         return table
-    names = {}
+    words = {}
     for p in study.space.parameters:
         if p.levels and p.name in table and pd.api.types.is_numeric_dtype(table[p.name]):
             places = table[p.name]
-            names[p.name] = places.map(dict(enumerate(p.levels))).astype(object).fillna(places.astype(object))
-    return table.assign(**names)
+            words[p.name] = places.map(dict(enumerate(p.levels))).astype(object).fillna(places.astype(object))
+    if "response" not in table and "category" in table and pd.api.types.is_integer_dtype(table["category"]):
+        answers = table["category"].map(dict(enumerate(study.responses)))
+        words |= {"response": answers} if answers.notna().all() else {}  # a number beyond them may look like a rank
+    return table.assign(**words)
 
 
 def _random_effect(table: pd.DataFrame, study: Study) -> np.ndarray | None:

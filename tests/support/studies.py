@@ -77,6 +77,7 @@ def population_answers(people=PEOPLE, seed=0):
     apart = np.linalg.norm(x - rng.normal(0.45, 0.1, (people, 1, 2)), axis=2) + 0.1 * rng.normal(size=x.shape[:2])
     table = pd.DataFrame(np.asarray(STUDY.space.to_physical(x.reshape(-1, 2))), columns=["gain", "delay"])
     table["participant"] = np.repeat([f"P{j}" for j in range(people)], TRIALS)
+    table["trial"] = np.tile(np.arange(1, TRIALS + 1), people)
     table["category"] = (apart < 0.45).astype(int).ravel() + (apart < 0.25).ravel()
     return table[(np.tile(np.arange(TRIALS), people) < 4) | (np.repeat(np.arange(people), TRIALS) % 3 > 0)]
 
