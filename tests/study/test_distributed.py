@@ -91,7 +91,6 @@ def folder(tmp_path):
     (tmp_path / "study.toml").write_text(STUDY_FILE)
     table = population_answers(13)
     table["response"] = np.array(["bad", "fair", "good"])[table.pop("category")]
-    table.insert(0, "trial", table.groupby("participant").cumcount() + 1)
     write_trials(table, tmp_path / "trials.csv")
     return tmp_path
 
