@@ -134,6 +134,7 @@ def begun(wanted):
     return log, proposals
 
 
+@pytest.mark.deep  # compiles a session's choice twice: 2 s
 def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_path):
     study = study_of(tmp_path)
     file, logs = a_map(study, tmp_path / "map.nc"), tmp_path / "logs"

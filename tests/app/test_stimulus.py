@@ -96,6 +96,7 @@ def test_what_is_confirmed_counts_and_the_proposal_stays_in_the_log(tmp_path):
         assert proposed == [values["hue"] for values in SETS.values()]
 
 
+@pytest.mark.deep  # a whole session with its choices: 2 s
 def test_nobody_waits_for_a_fit_though_something_else_is_presented_than_was_asked_for(tmp_path):
     with LiveStimulus(tmp_path, blocks=(Block("optimisation", 5),)) as live, live.present() as program:
         program.off = -0.25

@@ -3,6 +3,8 @@
 import subprocess
 import sys
 
+import pytest
+
 DRAW = """
 import multiprocessing, os, signal, sys
 from pathlib import Path
@@ -47,6 +49,7 @@ assert len(both) == 12 and both == killed == files("alone")
 """
 
 
+@pytest.mark.deep  # processes that draw: 3 s
 def test_figures_are_the_same_by_one_process_by_two_and_after_one_was_killed(tmp_path):
     # A process of its own, a second: nothing is forked where JAX is loaded, as it is here.
     done = subprocess.run([sys.executable, "-c", DRAW], cwd=tmp_path, capture_output=True, text=True, timeout=60)
