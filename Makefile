@@ -4,6 +4,9 @@
 PYTHON ?= python3
 VENV ?= .venv
 JOBS ?= 2
+# For a sixth of their time the tests wait for servers, devices and clocks, so that three workers keep two processors busy; the slow ones compute,
+# and a worker of theirs takes up to 6 GB.
+TEST_JOBS ?= 3
 PYTEST_ARGS ?=
 
 BIN := $(VENV)/bin
@@ -16,7 +19,7 @@ PIP = $(BIN)/pip install --disable-pip-version-check -c constraints.txt -e '$(WH
 PATIENTLY = $(PIP) --quiet || { for pause in $(PAUSES); do sleep $$pause; $(PIP) && exit; done; exit 1; }
 $(STAMP): WHAT = .[dev,hardware,live,browser]
 $(DOCS_STAMP): WHAT = .[docs]
-PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist worksteal
+PYTEST := $(BIN)/python -m pytest --dist worksteal
 export PYTHONDONTWRITEBYTECODE :=  # tests begin hundreds of processes: sources are parsed once, whatever the shell says
 
 .DEFAULT_GOAL := help
@@ -34,10 +37,10 @@ firmware:  ## the C programs of the device, and its Cortex-M images where the cr
 	$(MAKE) --no-print-directory -C firmware
 
 test: $(STAMP)  ## the tests, without the slow ones
-	$(PYTEST) -m "not deep" $(PYTEST_ARGS)
+	$(PYTEST) -n $(TEST_JOBS) -m "not deep" $(PYTEST_ARGS)
 
 test-deep: $(STAMP)  ## all tests; with HILBO_REQUIRE_ALL=1 a skip is a failure
-	$(PYTEST) $(PYTEST_ARGS)
+	$(PYTEST) -n $(JOBS) $(PYTEST_ARGS)
 
 lint: $(STAMP)  ## ruff and pyright
 	$(BIN)/ruff check
