@@ -19,7 +19,6 @@ from hilbo.cli.console import ForceFile, JsonToo, fail, print_result
 from hilbo.cli.device_options import Chosen, Line, chosen_set, opened, sets_of, takes
 from hilbo.cli.device_output import decoded, said, set_words
 from hilbo.cli.new_file import check_free, new_file
-from hilbo.device.failures import DeviceError
 from hilbo.errors import InputError
 
 __all__ = ["app"]
@@ -147,6 +146,8 @@ def record(
     as_json: JsonToo = False,
 ) -> None:
     """Telemetry to a CSV file: tick, time_s, position_mm, force_N, sensed_N, flags. Ctrl-C ends it earlier."""
+    from hilbo.device.failures import DeviceError
+
     check_free(out, force)
     wanted = chosen_set(chosen, line)
     with opened(line) as device:
@@ -164,8 +165,10 @@ def record(
     print_result(content, f"{out}: {samples} samples", as_json)
 
 
-def _recorded(device: Any, seconds: float, path: Path) -> tuple[int, DeviceError | None]:
+def _recorded(device: Any, seconds: float, path: Path) -> tuple[int, Exception | None]:
     """How many samples were written, as they came, and what the device or its line ended that by."""
+    from hilbo.device.failures import DeviceError
+
     samples, begun, ticks = 0, None, seconds / device.tick_s
     with path.open("w", encoding="utf-8", newline="") as file, contextlib.suppress(KeyboardInterrupt):
         while True:

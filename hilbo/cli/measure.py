@@ -13,7 +13,6 @@ import typer
 from hilbo.cli.console import ForceFile, JsonToo, fail, print_result, progress, seed_option
 from hilbo.cli.device_options import Line, opened, takes
 from hilbo.cli.new_file import check_free, new_file
-from hilbo.device.handshake import shortest
 
 __all__ = ["COMMANDS"]
 
@@ -51,6 +50,7 @@ def measure_damping(
     line: Line, seed: Annotated[int, seed_option("of the motion")] = 0, as_json: JsonToo = False
 ) -> None:
     """Damping b and Coulomb friction of the free device, with 95 % intervals. It moves by itself."""
+    from hilbo.device.handshake import shortest
     from hilbo.identification import device_tests
 
     with progress() as say, opened(line, rate="lockstep", finger="none") as device:
@@ -96,6 +96,7 @@ def characterise(
 ) -> None:
     """Relaxation and creep of a material at position 0, pressed by the device itself."""
     from hilbo.device.failures import DeviceError
+    from hilbo.device.handshake import shortest
     from hilbo.identification import device_tests
 
     check_free(out, force)

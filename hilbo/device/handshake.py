@@ -8,8 +8,6 @@ import struct
 import time
 from typing import SupportsFloat
 
-import numpy as np
-
 from hilbo.device import protocol
 from hilbo.device.failures import DeviceError
 from hilbo.device.heartbeat import BEAT
@@ -83,6 +81,8 @@ def take_over(link: Link, device: HelloReply) -> list[str]:
 
 def shortest(value: float) -> str:
     """The shortest decimal of a number's binary32: read again, it is the same to the device."""
+    import numpy as np  # which commands that say no number need not wait for
+
     return np.format_float_positional(np.float32(value), trim="-")
 
 

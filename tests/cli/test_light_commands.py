@@ -87,6 +87,12 @@ def folder(tmp_path):
     return tmp_path
 
 
+def test_the_commands_themselves_load_no_arrays_and_no_device():
+    code = "import sys, hilbo.cli.main; print([n for n in sys.modules if n.startswith(('numpy', 'hilbo.device'))])"
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=True)
+    assert run.stdout == "[]\n"
+
+
 def test_where_nothing_is_computed_no_jax_is_loaded(folder):
     study, logs, plan = folder / "study.toml", folder / "logs", ("--out", folder / "plan.json")
     consent = ("--consent-time", "2026-05-04T10:15", "--protocol-number", "7")
