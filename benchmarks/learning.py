@@ -37,6 +37,7 @@ from hilbo.population.learnt_posterior import LEFT  # noqa: E402
 from hilbo.population.low_rank import shared_evidence  # noqa: E402
 from hilbo.population.maps import learnt_map  # noqa: E402
 from hilbo.population.recipes import LEARNT_1, RECIPES  # noqa: E402
+from hilbo.population.shared_features import pivots_of  # noqa: E402
 from hilbo.population.tallies import tallied  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
 from hilbo.simulation.simulate import simulate_study  # noqa: E402
@@ -99,8 +100,8 @@ def times(sizes):
 def evidence(learnt, trials, rank, tolerance):
     """The log evidence by so many features at most, of which the last leave this share of the prior variance."""
     given = tallied(trials, CATEGORIES)
-    rank = min(rank, int(given.asked.sum()))
-    return float(eqx.filter_jit(shared_evidence)(learnt.model, given, learnt.weights, rank, tolerance).value)
+    pivots = eqx.filter_jit(pivots_of)(learnt.model.unit, given, min(rank, int(given.asked.sum())), tolerance)
+    return float(eqx.filter_jit(shared_evidence)(learnt.model, given, learnt.weights, pivots).value)
 
 
 def sensitivity(recipe, seeds):

@@ -16,6 +16,7 @@ from hilbo.ordinal_gp import OrdinalGP
 from hilbo.population.low_rank import shared_evidence
 from hilbo.population.people_model import PeopleModel
 from hilbo.population.recipes import LEARNT_1, Prior
+from hilbo.population.shared_features import Pivots
 from hilbo.population.tallies import Tallies
 
 __all__ = [
@@ -70,8 +71,11 @@ class Problem(eqx.Module):
     answers: Tallies
     stated: Stated = eqx.field(static=True)
     priors: Mapping[str, Prior]
-    rank: int = eqx.field(static=True)
     kernel: type[Stationary] = eqx.field(static=True)
+    pivots: Pivots
+    """Of the shared function's features."""
+    theta: Float[Array, " d"]
+    """By which they were chosen."""
 
 
 class Cost(NamedTuple):
@@ -82,7 +86,6 @@ class Cost(NamedTuple):
     log_evidence: Float[Array, ""]
     weights: Float[Array, "M n"]
     usable: Bool[Array, ""]
-    left: Float[Array, ""]
 
 
 def every_theta(
@@ -101,19 +104,17 @@ def prior_model(dim: int, categories: int, stated: Stated = NOTHING) -> OrdinalG
 
 
 @program
-def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Problem, features: Coordinates) -> Cost:
-    """At some coordinates, by the points of the features that the coordinates `features` have: with other points the
-    value changes in a small step, which differences must not be taken across."""
-    lengths = model_at(features, problem.answers, problem.stated, problem.kernel).theta
+def cost_at(coordinates: Coordinates, start: Float[Array, "M n"], problem: Problem) -> Cost:
+    """At some coordinates; `start`: weights near which the mode is sought."""
 
     def value(coordinates):
         model = model_at(coordinates, problem.answers, problem.stated, problem.kernel)
-        evidence = shared_evidence(model, problem.answers, start, problem.rank, LEFT, lengths)
+        evidence = shared_evidence(model, problem.answers, start, problem.pivots)
         return -evidence.value - _log_prior(coordinates, problem), evidence
 
     (cost, evidence), gradient = jax.value_and_grad(value, has_aux=True)(coordinates)
     finite = jnp.all(jnp.isfinite(ravel_pytree(gradient)[0])) & jnp.isfinite(cost)
-    return Cost(cost, gradient, evidence.value, evidence.weights, evidence.arrived & finite, evidence.left)
+    return Cost(cost, gradient, evidence.value, evidence.weights, evidence.arrived & finite)
 
 
 def medians(answers: Tallies, stated: Stated, priors: Mapping[str, Prior], kernel: type[Stationary]) -> Coordinates:

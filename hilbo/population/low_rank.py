@@ -27,13 +27,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.kernels import gram
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.population.people_model import PeopleModel
-from hilbo.population.shared_features import TOLERANCE, Pivots, features_of, pivots_of
+from hilbo.population.shared_features import Pivots, features_of
 from hilbo.population.tallies import Expansion, Tallies, expand_counts
 
 __all__ = [
@@ -224,32 +223,20 @@ class SharedEvidence(NamedTuple):
     weights: Float[Array, "M n"]
     """Near which the mode of similar hyperparameters is."""
     arrived: Bool[Array, ""]
-    left: Float[Array, ""]
-    """Largest part of the prior variance of g, at an answered point, without a feature."""
 
 
-def shared_evidence(
-    model: PeopleModel,
-    answers: Tallies,
-    start: Float[Array, "M n"],
-    rank: int,
-    tolerance: ArrayLike = TOLERANCE,
-    lengths: Float[Array, " d"] | None = None,
-) -> SharedEvidence:
+def shared_evidence(model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], pivots: Pivots) -> SharedEvidence:
     """Log evidence of all answers, differentiable once in `model`.
 
-    **Arguments:** `start`: weights near which the mode is sought; `rank`: features of g, at most; `tolerance`: of g's
-    prior variance, the part that they may leave; `lengths`: the theta by which their points are chosen, the model's own
-    if it is not given. With other points the value changes in a small step, so that differences of it want the same.
+    **Arguments:** `start`: weights near which the mode is sought; `pivots`: of g, which stay where they are when the
+    model moves. With others the value changes in a small step, which differences and searches must not be taken across.
     """
     still = jax.lax.stop_gradient
-    unit = model.unit if lengths is None else model.unit.with_numbers(lengths, jnp.ones_like(model.shared))
-    pivots = pivots_of(still(unit), answers, rank, tolerance)
-    prior = prior_of(model, answers, pivots)
+    prior = prior_of(model, answers, still(pivots))
     mode = still(mode_of(still(model), answers, still(prior), start))
     value = _evidence_at_mode(model, answers, prior, mode.further)
     arrived = (mode.residual <= mode.tolerance) & jnp.isfinite(value)
-    return SharedEvidence(value, mode.weights, arrived, pivots.left)
+    return SharedEvidence(value, mode.weights, arrived)
 
 
 def evidence_at(

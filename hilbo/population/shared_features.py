@@ -19,7 +19,7 @@ from hilbo.kernels import Stationary, gram
 from hilbo.numerics.tracing import program
 from hilbo.population.tallies import Tallies
 
-__all__ = ["TOLERANCE", "Pivots", "features_of", "pivots_of", "rank_for", "root_of_pivots"]
+__all__ = ["TOLERANCE", "Pivots", "features_of", "pivots_for", "pivots_of", "root_of_pivots", "unexplained"]
 
 TOLERANCE = 1e-6
 """Largest part of the prior variance of g that the features may leave at an answered point."""
@@ -56,18 +56,30 @@ def pivots_of(kernel: Stationary, answers: Tallies, rank: int, tolerance: ArrayL
     return Pivots(x[chosen], jnp.arange(rank) < count, jnp.max(left))
 
 
-@program
-def _unexplained(kernel: Stationary, answers: Tallies, rank: int, tolerance: ArrayLike) -> Float[Array, ""]:
-    return pivots_of(kernel, answers, rank, tolerance).left
+_pivots_of = program(pivots_of)
 
 
-def rank_for(kernel: Stationary, answers: Tallies, tolerance: float = TOLERANCE) -> int:
-    """The number of features, from a short list, that g takes by this kernel; all points, or the largest, at most."""
-    points = int(np.asarray(answers.asked).sum())
+def pivots_for(
+    kernel: Stationary, answers: Tallies, tolerance: float = TOLERANCE, fewest: int = 0, most: int = _RANKS[-1]
+) -> Pivots:
+    """As many pivots, a number from a short list, as this kernel takes to leave no more than `tolerance`; room for all
+    points, or for `most`, at most, and for `fewest` at least."""
+    enough = min(int(np.asarray(answers.asked).sum()), most)
     for rank in _RANKS:
-        if rank >= points or float(_unexplained(kernel, answers, rank, tolerance)) <= tolerance:
-            return rank
-    return _RANKS[-1]
+        if rank < min(fewest, enough):
+            continue
+        pivots = _pivots_of(kernel, answers, rank, tolerance)
+        if rank >= enough or float(pivots.left) <= tolerance:
+            break
+    return pivots
+
+
+@program
+def unexplained(kernel: Stationary, answers: Tallies, pivots: Pivots) -> Float[Array, ""]:
+    """Largest part of the prior variance of g, at an answered point, that pivots leave, by whatever kernel they were
+    chosen."""
+    explained = jnp.sum(features_of(kernel, pivots, answers.x) ** 2, axis=2)
+    return jnp.max(jnp.where(answers.asked, 1.0 - explained, 0.0))
 
 
 def root_of_pivots(kernel: Stationary, pivots: Pivots) -> Float[Array, "r r"]:

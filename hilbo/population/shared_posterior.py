@@ -6,7 +6,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from hilbo.gaussian import Certificate, GaussianPosterior, evidence_known, evidence_rounding, evidence_tolerance
@@ -17,7 +16,7 @@ from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import OrdinalGP, Posterior, Trials
 from hilbo.population.low_rank import System, evidence_at, mode_of, prior_of
 from hilbo.population.people_model import PeopleModel
-from hilbo.population.shared_features import TOLERANCE, pivots_of, root_of_pivots
+from hilbo.population.shared_features import Pivots, root_of_pivots
 from hilbo.population.tallies import Tallies
 
 __all__ = ["ContextEffects", "SharedFunction", "shared_function"]
@@ -52,9 +51,7 @@ class SharedFunction(NamedTuple):
 
 
 @program
-def shared_function(
-    model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], rank: int, tolerance: ArrayLike = TOLERANCE
-) -> SharedFunction:
+def shared_function(model: PeopleModel, answers: Tallies, start: Float[Array, "M n"], pivots: Pivots) -> SharedFunction:
     """Posterior of the shared function g, as a GP of its prior that was asked at the pivots, and of the random effect;
     arguments as those of `shared_evidence`.
 
@@ -62,7 +59,7 @@ def shared_function(
     k(x, Z) L^-T w and k(x, Z) L^-T (I - S^-1) L^-1 k(Z, x) of the prior variance is explained. Never raises: read
     `certificate.converged`.
     """
-    pivots = pivots_of(model.unit, answers, rank, tolerance)
+    rank = len(pivots.points)
     prior = prior_of(model, answers, pivots)
     mode = mode_of(model, answers, prior, start)
     value, system = evidence_at(model, answers, prior, mode.weights)

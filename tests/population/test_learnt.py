@@ -11,8 +11,10 @@ from hilbo.errors import InputError
 from hilbo.kernels import Matern32
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
 from hilbo.population.learnt import drawn_functions, learn, learnt_function
-from hilbo.population.learnt_posterior import NOTHING, Stated, prior_model
+from hilbo.population.learnt_posterior import NOTHING, Stated, medians, model_at, prior_model
+from hilbo.population.learnt_search import first_search, searched
 from hilbo.population.recipes import LEARNT_1, LEARNT_2
+from hilbo.population.tallies import tallied
 
 PEOPLE, ANSWERS = 4, 12
 
@@ -66,6 +68,19 @@ def test_the_end_is_a_maximum_of_the_dense_posterior(learnt):
 @pytest.mark.deep  # a search of its own
 def test_the_end_of_learnt_1_is_a_maximum_of_the_dense_posterior():
     assert_maximum(learn(answers(), 3, recipe=LEARNT_1), kernel=RBF, sd=(1.2, 1.2, 1.0, 1.0, 1.5, 0.7))
+
+
+def test_the_end_does_not_depend_on_the_start_and_has_the_features_of_its_own_lengths(learnt):
+    """From functions that are so smooth that 8 features are all they need."""
+    data = tallied(answers(), 3)
+    start = medians(data, NOTHING, LEARNT_2.priors, LEARNT_2.kernel)
+    begun, problem = first_search(start | {"theta": start["theta"] - 7.0}, data, NOTHING, LEARNT_2)
+    end, its_problem = searched(begun, problem, frozenset(start) - {"widths"})
+    theta = model_at(end.coordinates, data, NOTHING, LEARNT_2.kernel).theta
+    assert np.all(np.abs(np.log(theta / its_problem.theta)) < 0.35)
+    assert its_problem.pivots.used.sum() > problem.pivots.used.sum()
+    for name, value in learnt.coordinates.items():
+        np.testing.assert_allclose(end.coordinates[name], value, atol=0.02)
 
 
 def test_curvature_gives_the_standard_deviations(learnt):

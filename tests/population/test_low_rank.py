@@ -11,7 +11,7 @@ from hilbo.population.counts import counts_of, fit_counts
 from hilbo.population.hierarchical import fit_people, of_people, shared_posterior
 from hilbo.population.low_rank import shared_evidence
 from hilbo.population.people_model import PeopleModel
-from hilbo.population.shared_features import rank_for
+from hilbo.population.shared_features import pivots_for, pivots_of, unexplained
 from hilbo.population.shared_posterior import shared_function
 from hilbo.population.tallies import Tallies, tallied
 
@@ -55,7 +55,8 @@ def with_slopes(people, answers, tolerance):
     """The evidence and its slopes: one program for all tests."""
 
     def of(people):
-        end = shared_evidence(people, answers, answers.blank, 24, tolerance)
+        pivots = pivots_of(jax.lax.stop_gradient(people.unit), answers, 24, tolerance)
+        end = shared_evidence(people, answers, answers.blank, pivots)
         return end.value, end
 
     slopes, end = eqx.filter_grad(of, has_aux=True)(people)
@@ -76,7 +77,7 @@ def test_is_the_dense_model():
     trials, people = stacked(), model()
     dense = fit_people(people.gp, of_people(trials), people.share)
     answers = apart(trials)
-    posterior = shared_function(people, answers, answers.blank, 24, EXACT).function
+    posterior = shared_function(people, answers, answers.blank, pivots_of(people.unit, answers, 24, EXACT)).function
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
     np.testing.assert_allclose(evidence(people, answers).value, dense.log_evidence, rtol=1e-10)
     np.testing.assert_allclose(posterior.log_evidence, dense.log_evidence, rtol=1e-10)
@@ -124,12 +125,13 @@ def test_gradients_are_differences_of_the_dense_evidence():
 def test_what_features_leave_is_said_and_bounds_the_covariances():
     trials = stacked(people=4, answers=30)
     theta, answers = jnp.array([3.0, 5.0]), apart(trials)
-    rank = rank_for(RBF(theta), answers)
+    pivots = pivots_for(RBF(theta), answers)
     held = eqx.tree_at(lambda m: m.log_widths, model(), jnp.zeros(4))
-    end = shared_evidence(held, answers, answers.blank, rank)
+    end = shared_evidence(held, answers, answers.blank, pivots)
     dense = fit_people(held.gp, of_people(trials), held.share)
-    assert float(end.left) <= 1e-6
-    assert rank < int(trials.mask.sum())
+    assert float(pivots.left) <= 1e-6
+    np.testing.assert_allclose(unexplained(RBF(theta), answers, pivots), pivots.left, atol=1e-12)
+    assert len(pivots.points) < int(trials.mask.sum())
     np.testing.assert_allclose(end.value, dense.log_evidence, atol=1e-4)
 
 

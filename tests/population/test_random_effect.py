@@ -12,6 +12,7 @@ from hilbo.population.leave_one_out import _newcomer
 from hilbo.population.low_rank import shared_evidence
 from hilbo.population.maps import RuleMap
 from hilbo.population.people_model import PeopleModel
+from hilbo.population.shared_features import pivots_of
 from hilbo.population.shared_posterior import shared_function
 from hilbo.population.tallies import Tallies, tallied
 
@@ -80,10 +81,14 @@ def at(x, context):
     return jnp.asarray(np.concatenate([x, np.stack(columns, axis=1)], axis=1))
 
 
+def pivots(answers):
+    return pivots_of(model().unit, answers, RANK, EXACT)
+
+
 @jax.jit
 @jax.value_and_grad
 def evidence(effect, answers):
-    return shared_evidence(model(effect), answers, answers.blank, RANK, EXACT).value
+    return shared_evidence(model(effect), answers, answers.blank, pivots(answers)).value
 
 
 def tallied_apart(trials):
@@ -94,7 +99,7 @@ def tallied_apart(trials):
 
 def test_the_shared_function_is_the_dense_models(by_all):
     answers = tallied(stacked(), 3)
-    posterior = shared_function(model(), answers, answers.blank, RANK, EXACT).function
+    posterior = shared_function(model(), answers, answers.blank, pivots(answers)).function
     mean, explained = by_all.predict_explained(at(places(), NOWHERE))
     np.testing.assert_allclose(posterior.log_evidence, by_all.log_evidence, rtol=1e-10)
     np.testing.assert_allclose(posterior.predict(places()), (mean, 0.6 - explained), atol=1e-7)
@@ -103,7 +108,7 @@ def test_the_shared_function_is_the_dense_models(by_all):
 
 def test_contexts_add_what_the_dense_model_says(by_all):
     answers = tallied(stacked(), 3)
-    effects = shared_function(model(), answers, answers.blank, RANK, EXACT).effects
+    effects = shared_function(model(), answers, answers.blank, pivots(answers)).effects
     context = np.arange(20) % CONTEXTS
     shift, more = jax.jit(lambda *at: effects.added(*at))(places(), jnp.asarray(context))
     mean, explained = by_all.predict_explained(at(places(), NOWHERE))
@@ -122,8 +127,8 @@ def test_the_gradient_in_the_variance_is_that_of_differences():
 def test_an_effect_without_variance_is_none():
     answers = tallied(stacked(), 3)
     none = tallied(eqx.tree_at(lambda t: t.context, stacked(), None), 3)
-    without = shared_function(model(None), none, none.blank, RANK, EXACT).function
-    limit = shared_function(model(1e-14), answers, answers.blank, RANK, EXACT).function
+    without = shared_function(model(None), none, none.blank, pivots(none)).function
+    limit = shared_function(model(1e-14), answers, answers.blank, pivots(answers)).function
     np.testing.assert_allclose(limit.log_evidence, without.log_evidence, rtol=1e-12)
     np.testing.assert_allclose(limit.predict(places()), without.predict(places()), atol=1e-10)
 
@@ -143,7 +148,7 @@ def test_what_a_context_adds_is_learnt_from_one_answer_in_it_wherever_that_was()
     """A new person at two corners of the square, where the kernel hardly correlates; nobody was asked in context 1."""
     trials = eqx.tree_at(lambda t: t.mask, stacked(), stacked().mask & (stacked().context != 1))
     answers, people = tallied_apart(trials), model(4.0)
-    function, effects = shared_function(people, answers, answers.blank, RANK, EXACT)
+    function, effects = shared_function(people, answers, answers.blank, pivots(answers))
     of_all = RuleMap("learnt-2", "exact", None, function, people.share, jnp.asarray(1.0), effects=effects)
 
     def second(first_answer, contexts):
