@@ -23,6 +23,7 @@ __all__ = ["TOLERANCE", "Pivots", "features_of", "pivots_for", "pivots_of", "roo
 
 TOLERANCE = 1e-6
 """Largest part of the prior variance of g that the features may leave at an answered point."""
+_ROOMS = (64, 256, 1024)  # of the programs that choose pivots
 _RANKS = (32, 64, 128, 256, 640, 1024)  # 640: all points of 24 people with 25 answers
 
 
@@ -35,14 +36,17 @@ class Pivots(NamedTuple):
     """Largest part of the prior variance of g, at an answered point, that they do not explain."""
 
 
-def pivots_of(kernel: Stationary, answers: Tallies, rank: int, tolerance: ArrayLike) -> Pivots:
-    """At most `rank` of the points that people were asked at, each where the ones before explain least."""
+def pivots_of(
+    kernel: Stationary, answers: Tallies, room: int, tolerance: ArrayLike, most: ArrayLike | None = None
+) -> Pivots:
+    """At most `room`, or `most`, of the points that people were asked at, each where the ones before explain least."""
     x = answers.x.reshape(-1, answers.x.shape[-1])
     start = answers.asked.reshape(-1).astype(x.dtype)
+    largest = jnp.asarray(room if most is None else most)
 
     def going(state):
         count, _, left, _ = state
-        return (count < rank) & (jnp.max(left) > tolerance)
+        return (count < largest) & (jnp.max(left) > tolerance)
 
     def choose(state):
         count, rows, left, chosen = state
@@ -51,9 +55,9 @@ def pivots_of(kernel: Stationary, answers: Tallies, rank: int, tolerance: ArrayL
         row = (column - rows[:, place] @ rows) / jnp.sqrt(left[place])
         return count + 1, rows.at[count].set(row), (left - row**2).at[place].set(0.0), chosen.at[count].set(place)
 
-    initial = (jnp.asarray(0), jnp.zeros((rank, x.shape[0]), x.dtype), start, jnp.zeros(rank, int))
+    initial = (jnp.asarray(0), jnp.zeros((room, x.shape[0]), x.dtype), start, jnp.zeros(room, int))
     count, _, left, chosen = jax.lax.while_loop(going, choose, initial)
-    return Pivots(x[chosen], jnp.arange(rank) < count, jnp.max(left))
+    return Pivots(x[chosen], jnp.arange(room) < count, jnp.max(left))
 
 
 _pivots_of = program(pivots_of)
@@ -62,16 +66,23 @@ _pivots_of = program(pivots_of)
 def pivots_for(
     kernel: Stationary, answers: Tallies, tolerance: float = TOLERANCE, fewest: int = 0, most: int = _RANKS[-1]
 ) -> Pivots:
-    """As many pivots, a number from a short list, as this kernel takes to leave no more than `tolerance`; room for all
-    points, or for `most`, at most, and for `fewest` at least."""
+    """The pivots that leave no more than `tolerance`, `most` at most. They stand in records of a few sizes, because each
+    size is a program of its own to whoever uses them; `fewest`: a size, from which on."""
     enough = min(int(np.asarray(answers.asked).sum()), most)
-    for rank in _RANKS:
-        if rank < min(fewest, enough):
-            continue
-        pivots = _pivots_of(kernel, answers, rank, tolerance)
-        if rank >= enough or float(pivots.left) <= tolerance:
+    for room in _ROOMS:
+        pivots = _pivots_of(kernel, answers, room, jnp.asarray(tolerance), jnp.asarray(most))
+        used = int(pivots.used.sum())
+        if room >= enough or used < room:
             break
-    return pivots
+    rank = next(rank for rank in _RANKS if rank >= max(used, fewest))
+    return _with_room(pivots, rank)
+
+
+def _with_room(pivots: Pivots, rank: int) -> Pivots:
+    """With this much room, of which the used ones take less."""
+    more = max(rank - len(pivots.used), 0)
+    points, used = np.pad(pivots.points[:rank], ((0, more), (0, 0))), np.pad(pivots.used[:rank], (0, more))
+    return Pivots(jnp.asarray(points), jnp.asarray(used), pivots.left)
 
 
 @program
