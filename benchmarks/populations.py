@@ -3,15 +3,16 @@
 All rules have the same answers.
 
     python benchmarks/populations.py FILE [--studies 100] [--regions 100] [--first 1000] [--only NAME] [--design 12x15]
-        [--chance]
+        [--chance | --medians]
     python benchmarks/populations.py FILE --write
 
 FILE (JSON Lines) collects a row for each study and design; a run that was stopped goes on where it was. What has been
 run with this recipe is in benchmarks/populations.jsonl. *Regret* is how much less often a new person of the population
 gives the highest answer at the optimum found than at the best feasible rendering. Choices of method were made on seeds
 0 to 99; what is reported begins at 1000. --regions: of how many studies of each population the region is made,
-which is half of the work. --chance: points by chance in place of sessions. --write puts the tables into
-docs/methods/which_method.md.
+which is half of the work. --chance: points by chance in place of sessions. --medians: sessions choose by the medians of
+the recipes' priors, as those of a study file that `hilbo init` writes; else by the paper's hyperparameters. --write
+puts the tables into docs/methods/which_method.md.
 """
 
 import argparse
@@ -46,6 +47,7 @@ from hilbo.study.optima import individual_optima, map_optimum  # noqa: E402
 from hilbo.study.optimum_region import optimum_region  # noqa: E402
 
 FIRST = 1000  # seed of what is reported
+MEDIANS = " by medians"
 RULES = ("learnt-2", "learnt-1", "bcm", "average", "mean of the individual optima")
 
 
@@ -57,7 +59,9 @@ def main():
     options.add_argument("--first", type=int, default=FIRST)
     options.add_argument("--only")
     options.add_argument("--design", default="24x25")
-    options.add_argument("--chance", action="store_true")
+    asked = options.add_mutually_exclusive_group()
+    asked.add_argument("--chance", dest="asked", action="store_const", const=" by chance", default="")
+    asked.add_argument("--medians", dest="asked", action="store_const", const=MEDIANS)
     options.add_argument("--write", action="store_true")
     chosen = options.parse_args()
     rows = Rows(chosen.file)
@@ -65,7 +69,7 @@ def main():
         write(rows.rows)
         return
     known = {(row["population"], row["design"], row["seed"]) for row in rows}
-    design = chosen.design + (" by chance" if chosen.chance else "")
+    design = chosen.design + chosen.asked
     for seed in range(chosen.first, chosen.first + chosen.studies):
         for name in POPULATIONS:
             if (name, design, seed) in known or chosen.only not in (None, name):
@@ -91,7 +95,8 @@ def one_study(name, design, seed, with_region=True):
     if "chance" in design:
         answers = by_chance(study, scene.persons, people, trials, seed)
     else:
-        answers = simulate_study(study, scene.persons, seed)
+        asking = without_gp(study) if MEDIANS in design else study
+        answers = simulate_study(asking, scene.persons, seed)
     cohort = cohort_from(answers)
     candidates = search_points(study.space, seed)
     best = highest(study, scene.chance, candidates)
@@ -138,6 +143,13 @@ def with_trials(study, trials):
     raw = {"schema": 1} | json.loads(study.content)
     raw["selection"] |= {"space_filling": min(5, trials), "trials": trials}
     return Study.from_dict(raw)
+
+
+def without_gp(study):
+    """Its sessions choose by the medians of the recipes' priors."""
+    raw = {"schema": 1} | json.loads(study.content)
+    del raw["gp"]
+    return Study.from_dict(raw | {"aggregation": {"rule": RECOMMENDED}})
 
 
 def by_chance(study, persons, people, trials, seed):
@@ -255,10 +267,33 @@ def itself(parts):
     return lined(heads, lines)
 
 
+def sessions(rows, design):
+    """learnt-2 from sessions that choose by the medians of its priors, beside sessions of the same people that choose by
+    the paper's hyperparameters."""
+    other = {(row["population"], row["seed"]): row for row in rows if row["design"] == design}
+    pairs = [
+        (row, other[row["population"], row["seed"]])
+        for row in rows
+        if row["design"] == design + MEDIANS and (row["population"], row["seed"]) in other
+    ]
+    heads = ["sessions choose by", "studies", "the medians", "the paper's", "the medians' less the paper's, 95 %"]
+    lines = []
+    for name, belongs in GROUPS.items():
+        part = [pair for pair in pairs if belongs(pair[0]["population"])]
+        by_medians, by_paper = (values_of(of, RECOMMENDED) for of in zip(*part, strict=True))
+        less = by_medians - by_paper
+        half = 1.96 * less.std(ddof=1) / np.sqrt(len(less))
+        cells = f"{less.mean():+.3f} [{less.mean() - half:+.3f}, {less.mean() + half:+.3f}]"
+        lines.append([name, str(len(part)), interval(by_medians), interval(by_paper), cells])
+    return lined(heads, lines)
+
+
 def write(rows):
-    for design in sorted({row["design"] for row in rows}):
-        text = tables([row for row in rows if row["design"] == design], EVEN[design])
-        put("methods/which_method.md", f"populations {design}", text)
+    for design, even in EVEN.items():
+        put(
+            "methods/which_method.md", f"populations {design}", tables([r for r in rows if r["design"] == design], even)
+        )
+    put("methods/which_method.md", "populations by medians", sessions(rows, "24x25"))
 
 
 if __name__ == "__main__":

@@ -66,8 +66,8 @@ _pivots_of = program(pivots_of)
 def pivots_for(
     kernel: Stationary, answers: Tallies, tolerance: float = TOLERANCE, fewest: int = 0, most: int = _RANKS[-1]
 ) -> Pivots:
-    """The pivots that leave no more than `tolerance`, `most` at most. They stand in records of a few sizes, because each
-    size is a program of its own to whoever uses them; `fewest`: a size, from which on."""
+    """The pivots that leave no more than `tolerance`, `most` at most. Their record has one of a few sizes, `fewest` at
+    least: whoever uses it has a program for each size."""
     enough = min(int(np.asarray(answers.asked).sum()), most)
     for room in _ROOMS:
         pivots = _pivots_of(kernel, answers, room, jnp.asarray(tolerance), jnp.asarray(most))
