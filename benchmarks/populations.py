@@ -268,8 +268,8 @@ def itself(parts):
 
 
 def sessions(rows, design):
-    """learnt-2 from sessions that choose by the medians of its priors, beside sessions of the same people that choose by
-    the paper's hyperparameters."""
+    """learnt-2 from sessions that choose by the medians of its priors, beside sessions of the same people that choose
+    by the paper's hyperparameters."""
     other = {(row["population"], row["seed"]): row for row in rows if row["design"] == design}
     pairs = [
         (row, other[row["population"], row["seed"]])
