@@ -15,7 +15,7 @@ from hilbo.population.tallies import Tallies
 
 __all__ = ["Search", "first_search", "searched"]
 
-_STEPS = 100
+_STEPS, _ROUNDS = 100, 10  # of one descent; descents
 _NEAR = 2e-6  # of the cost: another choice of features moves it as much as a nearer step would
 _LARGEST = 256  # features: functions that need more are too rugged to be shared by few answers
 _MOVED = 0.35  # of log theta: lengths that differ by a fifth have as good features
@@ -45,18 +45,19 @@ def searched(search: Search, problem: Problem, free: Set[str]) -> tuple[Search, 
     """The maximum over the coordinates that are `free`, from where a search is, and the problem there.
 
     While it descends the features stay as they are, because the cost would jump with others. Where the lengths at its
-    end ask for others, it goes on with those.
+    end ask for others, it goes on with those. If they do so again and again it has not `ended`.
     """
-    while True:
+    for _ in range(_ROUNDS):
         search = _descended(search, problem, free)
         model = model_at(search.coordinates, problem.answers, problem.stated, problem.kernel)
         rank = len(problem.pivots.points)
         pivots = pivots_for(model.unit, problem.answers, LEFT, fewest=rank, most=_LARGEST)
-        moved = np.abs(np.log(np.asarray(model.theta / problem.theta)))
-        if len(pivots.points) == rank and np.all(moved < _MOVED):
+        moved = np.abs(np.log(np.asarray(model.theta)) - np.log(np.asarray(problem.theta)))
+        if len(pivots.points) == rank and not np.any(moved > _MOVED):
             return search, problem
         problem = dataclasses.replace(problem, pivots=pivots, theta=model.theta)
         search = search._replace(cost=cost_at(search.coordinates, search.cost.weights, problem))
+    return search._replace(ended=False), problem
 
 
 def _descended(search: Search, problem: Problem, free: Set[str]) -> Search:
