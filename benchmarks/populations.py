@@ -290,10 +290,11 @@ def sessions(rows, design):
 
 def write(rows):
     for design, even in EVEN.items():
-        put(
-            "methods/which_method.md", f"populations {design}", tables([r for r in rows if r["design"] == design], even)
-        )
-    put("methods/which_method.md", "populations by medians", sessions(rows, "24x25"))
+        part = [row for row in rows if row["design"] == design]
+        if part:
+            put("methods/which_method.md", f"populations {design}", tables(part, even))
+    if any(row["design"] == "24x25" + MEDIANS for row in rows):
+        put("methods/which_method.md", "populations by medians", sessions(rows, "24x25"))
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from hilbo.population.people_model import PeopleModel
 from hilbo.population.recipes import LEARNT_1, Recipe
 from hilbo.population.shared_features import pivots_for, unexplained
 from hilbo.population.shared_posterior import SharedFunction, shared_function
-from hilbo.population.tallies import tallied
+from hilbo.population.tallies import Tallies, tallied
 
 __all__ = [
     "Learnt",
@@ -87,9 +87,14 @@ class Learnt(eqx.Module):
 
 def learnt_function(learnt: Learnt, trials: Trials) -> SharedFunction:
     """The posterior of the shared function, and of a random effect, by learnt hyperparameters, from stacked trials (M,
-    n)."""
-    answers = tallied(trials, learnt.model.thresholds.size + 1)
+    n): those that were learnt from, or some of them."""
+    answers = _as_learnt(learnt, trials)
     return shared_function(learnt.model, answers, learnt.weights, pivots_for(learnt.model.unit, answers))
+
+
+def _as_learnt(learnt: Learnt, trials: Trials) -> Tallies:
+    """Answers with as much room for each person as those that were learnt from."""
+    return tallied(trials, learnt.model.thresholds.size + 1, learnt.weights.shape[1])
 
 
 def drawn_functions(learnt: Learnt, trials: Trials, stated: Stated, seed: int, count: int) -> list[Posterior]:
@@ -98,13 +103,16 @@ def drawn_functions(learnt: Learnt, trials: Trials, stated: Stated, seed: int, c
 
     **Arguments:** `trials` and `stated`: those that were learnt from.
     """
-    values, vectors = np.linalg.eigh(np.asarray(learnt.covariance + learnt.covariance.T) / 2)
+    covariance = np.asarray(learnt.covariance + learnt.covariance.T) / 2
+    if not np.all(np.isfinite(covariance)):
+        return []
+    values, vectors = np.linalg.eigh(covariance)
     if not np.all(values > 0):
         return []
     flat, restore = ravel_pytree({name: value for name, value in learnt.coordinates.items() if name != "widths"})
     widths = {name: value for name, value in learnt.coordinates.items() if name == "widths"}
     steps = np.random.default_rng([seed, count]).standard_normal((count, flat.size)) * np.sqrt(values) @ vectors.T
-    answers, unit = tallied(trials, learnt.model.thresholds.size + 1), learnt.model.unit
+    unit, answers = learnt.model.unit, _as_learnt(learnt, trials)
     rank = len(pivots_for(unit, answers).points)
 
     def function(step: Float[np.ndarray, " k"]) -> Posterior:
@@ -127,20 +135,26 @@ def learn(
     """The hyperparameters of stacked trials (M, n) of answers in `categories`.
 
     **Arguments:** `stated`: what is kept; `near`: what was learnt by the same recipe from nearly the same answers of as
-    many people, where the search may begin. Raises InputError where nobody answered.
+    many people, where the search may begin; elsewhere if it cannot. Raises InputError where nobody answered.
     """
     if not np.asarray(trials.mask).any():
         raise InputError(f"{recipe.name}: nobody gave an answer; at least one person's answers are needed.")
-    answers = tallied(trials, categories)
+    answers = tallied(trials, categories, 0 if near is None else near.weights.shape[1])
     start = medians(answers, stated, recipe.priors, recipe.kernel)
     common = frozenset(start) - {"widths"}
     if near is not None:
         start |= {name: near.coordinates[name] for name in common}
-    alike, problem = searched(*first_search(start, answers, stated, recipe), common)
+    begun, problem = first_search(start, answers, stated, recipe)
+    if near is not None and not bool(begun.cost.usable):
+        return learn(trials, categories, stated, recipe)
+    alike, problem = searched(begun, problem, common)
     chosen, free, gain = alike, common, 0.0
     if "widths" in start:
         different, its_own = searched(alike, problem, frozenset(start))
-        gain = _gain_of_widths(alike, different, its_own)
+        same = alike
+        if its_own is not problem:  # costs by other features differ by more than a gain may
+            same = alike._replace(cost=cost_at(alike.coordinates, alike.cost.weights, its_own))
+        gain = _gain_of_widths(same, different, its_own)
         if gain > _WORTH:
             chosen, free, problem = different, frozenset(start), its_own
     sd, covariance = _spread(chosen, problem, free)
@@ -163,8 +177,12 @@ def learn(
 
 
 def _gain_of_widths(alike: Search, different: Search, problem: Problem) -> float:
-    """What widths of people's own add to the log evidence, by Laplace's method in each width alone. -inf where the
-    search ended at no maximum of some width: the method then says nothing, and nobody has a width."""
+    """What widths of people's own add to the log evidence, by Laplace's method with widths that are taken for
+    independent: what stands for each one's curvature is its row of the Hessian added up, as in `_spread`. -inf where
+    the search ended at no maximum by these: the method then says nothing, and nobody has a width.
+
+    **Arguments:** `problem`: of which both costs are.
+    """
     widths = different.coordinates["widths"]
 
     def slope(step):

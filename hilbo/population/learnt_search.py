@@ -15,10 +15,11 @@ from hilbo.population.tallies import Tallies
 
 __all__ = ["Search", "first_search", "searched"]
 
-_STEPS, _ROUNDS = 100, 10  # of one descent; descents
+_STEPS, _ROUNDS = 100, 8  # of one descent; descents
 _NEAR = 2e-6  # of the cost: another choice of features moves it as much as a nearer step would
 _LARGEST = 256  # features: functions that need more are too rugged to be shared by few answers
-_MOVED = 0.35  # of log theta: lengths that differ by a fifth have as good features
+_MOVED = 0.35  # of log theta: features of other lengths leave more, but the RBF's no more than 0.004 of the variance
+_REACH = 1.5  # of log theta, in one descent: where lengths grow far beyond it, features become singular
 # About the standard deviations that 600 answers leave: in these units a search is as wide in all directions.
 _UNITS = {"theta": 0.7, "shared": 0.5, "own": 0.4, "middle": 0.5, "gaps": 0.1, "widths": 0.3, "effect": 0.5}
 
@@ -44,8 +45,9 @@ def first_search(start: Coordinates, answers: Tallies, stated: Stated, recipe: R
 def searched(search: Search, problem: Problem, free: Set[str]) -> tuple[Search, Problem]:
     """The maximum over the coordinates that are `free`, from where a search is, and the problem there.
 
-    While it descends the features stay as they are, because the cost would jump with others. Where the lengths at its
-    end ask for others, it goes on with those. If they do so again and again it has not `ended`.
+    The features stay as they are while it descends, because the cost would jump with others. Where the lengths at its
+    end ask for others, or the descent stopped short, it goes on with those that belong there; after eight descents it
+    has not `ended`.
     """
     for _ in range(_ROUNDS):
         search = _descended(search, problem, free)
@@ -53,7 +55,7 @@ def searched(search: Search, problem: Problem, free: Set[str]) -> tuple[Search, 
         rank = len(problem.pivots.points)
         pivots = pivots_for(model.unit, problem.answers, LEFT, fewest=rank, most=_LARGEST)
         moved = np.abs(np.log(np.asarray(model.theta)) - np.log(np.asarray(problem.theta)))
-        if len(pivots.points) == rank and not np.any(moved > _MOVED):
+        if search.ended and len(pivots.points) == rank and not np.any(moved > _MOVED):
             return search, problem
         problem = dataclasses.replace(problem, pivots=pivots, theta=model.theta)
         search = search._replace(cost=cost_at(search.coordinates, search.cost.weights, problem))
@@ -75,14 +77,42 @@ def _descended(search: Search, problem: Problem, free: Set[str]) -> Search:
         here = search
         if np.any(z):
             coordinates = held | restore(flat + units * jnp.asarray(z, flat.dtype))
-            here = search._replace(coordinates=coordinates, cost=cost_at(coordinates, latest.cost.weights, problem))
-        if not bool(here.cost.usable):  # the line search is to turn back
-            return np.inf, np.zeros(flat.size)
+            here = Search(coordinates, cost_at(coordinates, latest.cost.weights, problem), 0, False)
+        if not bool(here.cost.usable):
+            raise _UnusableError
         latest = here
         lowest = min(lowest, here, key=lambda each: float(each.cost.value))
         slope = ravel_pytree({name: here.cost.gradient[name] for name in free})[0]
         return float(here.cost.value), np.asarray(units * slope, float)
 
+    steps = 0
+
+    def count(_: object) -> None:
+        nonlocal steps
+        steps += 1
+
     options = {"maxiter": _STEPS, "ftol": _NEAR, "gtol": 1e-3}
-    result = minimize(cost, np.zeros(flat.size), jac=True, method="L-BFGS-B", options=options)
-    return lowest._replace(steps=search.steps + int(result.nit), ended=bool(result.success))
+    bounds = _bounds(begin, problem)
+    try:
+        result = minimize(
+            cost, np.zeros(flat.size), jac=True, method="L-BFGS-B", bounds=bounds, callback=count, options=options
+        )
+        ended = bool(result.success)
+    except _UnusableError:  # L-BFGS-B does not turn back where the cost is infinite: it would say that it has ended
+        ended = False
+    return lowest._replace(steps=search.steps + steps, ended=ended)
+
+
+class _UnusableError(Exception):
+    """No mode was found there, or no finite slope."""
+
+
+def _bounds(begin: Coordinates, problem: Problem) -> list[tuple[float, float]]:
+    """Of the steps from `begin`, in units: those of log theta stay near that by which the features were chosen."""
+    ends = []
+    for sign in (-1, 1):
+        ways = {name: jnp.full_like(value, sign * jnp.inf) for name, value in begin.items()}
+        if "theta" in begin:
+            ways["theta"] = (jnp.log(problem.theta) + sign * _REACH - begin["theta"]) / _UNITS["theta"]
+        ends.append(np.asarray(ravel_pytree(ways)[0], float))
+    return list(zip(*ends, strict=True))

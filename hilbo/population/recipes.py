@@ -1,7 +1,7 @@
 """Recipes that learn the hyperparameters from all people's answers.
 
-Each has a name, and never changes: a study that names one gets the same numbers from a later hilbo. A better recipe
-gets another name.
+Each has a name, and never changes: a study that names one gets the same numbers from a later hilbo, but for how near
+the search comes to the maximum, which is hundredths of a standard deviation. A better recipe gets another name.
 
 In units of the classification noise, with d parameters and C categories, people's functions and answers are those of
 `people_model.PeopleModel`. The priors of the hyperparameters:

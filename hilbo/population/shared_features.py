@@ -39,10 +39,11 @@ class Pivots(NamedTuple):
 def pivots_of(
     kernel: Stationary, answers: Tallies, room: int, tolerance: ArrayLike, most: ArrayLike | None = None
 ) -> Pivots:
-    """At most `room`, or `most`, of the points that people were asked at, each where the ones before explain least."""
+    """Of the points that people were asked at, each where the ones before explain least; no more than there is `room`
+    for, and than `most`."""
     x = answers.x.reshape(-1, answers.x.shape[-1])
     start = answers.asked.reshape(-1).astype(x.dtype)
-    largest = jnp.asarray(room if most is None else most)
+    largest = room if most is None else jnp.minimum(room, most)
 
     def going(state):
         count, _, left, _ = state

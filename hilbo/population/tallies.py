@@ -35,14 +35,17 @@ class Tallies(eqx.Module):
         return jnp.zeros(self.x.shape[:2], self.x.dtype)
 
 
-def tallied(trials: Trials, categories: int) -> Tallies:
-    """Stacked trials (M, n), each person's points once in each context, in the order in which they were first asked."""
+def tallied(trials: Trials, categories: int, room: int = 0) -> Tallies:
+    """Stacked trials (M, n), each person's points once in each context, in the order in which they were first asked.
+
+    `room`: for how many points at least, for the shapes to be those of other answers.
+    """
     x, q, mask = (np.asarray(leaf) for leaf in (trials.x, trials.q, trials.mask))
     context = np.zeros(q.shape, np.int32) if trials.context is None else np.asarray(trials.context)
-    people, capacity, _ = x.shape
-    points, counts = np.zeros_like(x), np.zeros((people, capacity, categories), x.dtype)
+    people, capacity, d = x.shape
+    capacity, longest = max(capacity, room), max(room, 1)
+    points, counts = np.zeros((people, capacity, d), x.dtype), np.zeros((people, capacity, categories), x.dtype)
     contexts = np.zeros((people, capacity), np.int32)
-    longest = 1
     for person in range(people):
         asked, answers, of = (each[person][mask[person]] for each in (x, q, context))
         both = np.concatenate([asked, of[:, None]], axis=1)

@@ -125,6 +125,18 @@ def test_the_map_is_that_of_the_dense_model(learnt):
         np.testing.assert_allclose(by_features, by_all, atol=2e-3)
 
 
+def test_the_map_without_the_person_who_was_asked_most(learnt):
+    """Others have fewer points; nothing that stays depends on the room that the most would take."""
+    fewer = jnp.asarray(np.arange(ANSWERS)[None, :] < np.array([12, 11, 9, 8])[:, None])
+    everybody = eqx.tree_at(lambda t: t.mask, answers(), fewer)
+    rest = eqx.tree_at(lambda t: t.mask, everybody, fewer.at[0].set(False))
+    x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 2)))
+    by_map = learnt_function(learnt, rest).function.predict(x)
+    dense = shared_posterior(fit_people(learnt.model.gp, of_people(rest), learnt.model.share)).predict(x)
+    for by_features, by_all in zip(by_map, dense, strict=True):
+        np.testing.assert_allclose(by_features, by_all, atol=2e-3)
+
+
 def test_before_the_answers_stand_the_medians_and_what_is_stated():
     gp = prior_model(3, 3)
     np.testing.assert_allclose(gp.kernel.theta, 8.0)
