@@ -88,7 +88,14 @@ def _environment() -> Environment:
     environment = Environment(
         loader=PackageLoader("hilbo.report"), autoescape=select_autoescape(), undefined=StrictUndefined
     )
-    environment.filters |= {"number": number, "percent": percent, "symbol": _symbol, "unit": _unit, "each": _each}
+    environment.filters |= {
+        "number": number,
+        "extent": _extent,
+        "percent": percent,
+        "symbol": _symbol,
+        "unit": _unit,
+        "each": _each,
+    }
     environment.globals |= {"heads": heads, "zip": zip, "estimate_words": estimate_words}
     return environment
 
@@ -112,6 +119,13 @@ def number(value: float | str) -> str:
     if isinstance(value, str):
         return value
     return np.format_float_positional(value, precision=4, unique=False, fractional=False, trim="-")
+
+
+def _extent(values: list[float | str]) -> str:
+    """From which end to which a parameter's values go, or which levels are among them."""
+    if isinstance(values[0], str) or values[0] == values[1]:
+        return "= " + " or ".join(map(number, dict.fromkeys(values)))
+    return f"from {number(values[0])} to {number(values[1])}"
 
 
 def percent(share: float, digits: int = 0) -> str:

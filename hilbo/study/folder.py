@@ -26,7 +26,7 @@ from hilbo.study.cells import numbers, parameter_values, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.departures import departures
-from hilbo.study.trial_table import NothingToFitError, check_texts, marked, read_trials
+from hilbo.study.trial_table import NothingToFitError, check_texts, marked, ordered, read_trials
 from hilbo.study.validation_table import check_validation, sets_frame
 
 __all__ = ["Material", "StudyFolder", "read_folder"]
@@ -193,7 +193,7 @@ def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:
         raise empty[0]
     for error in empty:
         warnings.warn(InputRemark(f"{error} It is left out."), stacklevel=2)
-    return pd.concat(tables, ignore_index=True)
+    return ordered(pd.concat(tables, ignore_index=True))
 
 
 def _check_answers_once(table: pd.DataFrame, path: Path) -> None:

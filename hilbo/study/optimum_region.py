@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from hilbo.kernels import Stationary, embedded
 from hilbo.ordinal_gp import Trials
@@ -65,14 +65,27 @@ def optimum_region(study: Study, map_: RuleMap, trials: Trials, seed: int = 0, c
     if study.learnt is not None:
         functions = drawn_functions(study.learnt, trials, study.stated, seed, _HYPERPARAMETERS) or functions
     places = best_places(study.space, functions, seed, count, _DRAWS)
-    points, weight = map(np.asarray, places)
-    mean, variance = map(np.asarray, predict_map(map_, places.points))
+    first, which = _distinct(np.asarray(places.points))
+    points, weight = np.asarray(places.points)[first], np.bincount(which, np.asarray(places.share))
+    mean, variance = (np.asarray(each)[first] for each in predict_map(map_, places.points))
     order = np.argsort(-weight, kind="stable")
     held = int(np.searchsorted(np.cumsum(weight[order]), PROBABILITY)) + 1
     inside = np.zeros(len(weight), bool)
     inside[order[:held]] = True
-    hills = hills_of(np.asarray(study.space.to_box(places.points)), mean, np.sqrt(variance), weight, study.gp.kernel)
-    return Region(points[inside], points[~inside], float(inside[:count].mean()), hills)
+    hills = hills_of(
+        np.asarray(study.space.to_box(jnp.asarray(points))), mean, np.sqrt(variance), weight, study.gp.kernel
+    )
+    return Region(points[inside], points[~inside], float(inside[first < count].mean()), hills)
+
+
+def _distinct(points: Float[np.ndarray, "m d"]) -> tuple[Int[np.ndarray, " k"], Int[np.ndarray, " m"]]:
+    """Where each of the points is for the first time, and which of these each point is. Levels and whole numbers have
+    few renderings, and walls have corners: copies would each be a hill, and share its draws."""
+    _, first, which = np.unique(points, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    return first[order], rank[which.reshape(-1)]
 
 
 def region_content(study: Study, region: Region | None) -> dict[str, Any] | None:

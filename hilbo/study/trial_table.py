@@ -33,6 +33,7 @@ __all__ = [
     "is_fitted",
     "marked",
     "of_material",
+    "ordered",
     "read_trials",
     "write_trials",
 ]
@@ -101,9 +102,17 @@ def _read(
     if table.empty:
         raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
     table = of_material(table, material, source)
-    keys = [name for name in ("participant", "session", "phase") if name in table]
+    return marked(ordered(table), study)
+
+
+def ordered(table: pd.DataFrame) -> pd.DataFrame:
+    """A checked table, or several as one, by participant, session and trial; where a session has a number in several
+    phases, by phase before."""
+    keys = [name for name in ("participant", "session") if name in table]
+    if "phase" in table and table.duplicated([*keys, "trial"]).any():
+        keys.append("phase")
     places = [table["trial"], *(_numbered(table[name]) for name in reversed(keys))]
-    return marked(table.iloc[np.lexsort(places)], study)
+    return table.iloc[np.lexsort(places)]
 
 
 def marked(table: pd.DataFrame, study: AnyStudy) -> pd.DataFrame:

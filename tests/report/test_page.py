@@ -26,6 +26,14 @@ def test_a_missing_number_is_an_error():
         rendered("robustness.html", warnings=[])
 
 
+def test_an_extent_has_both_ends_or_every_level():
+    extent = _environment().filters["extent"]
+    assert extent([0.25, 3.0]) == "from 0.25 to 3"
+    assert extent([4.0, 4.0]) == "= 4"
+    assert extent(["stone"]) == "= stone"
+    assert extent(["silk", "stone", "wood"]) == "= silk or stone or wood"
+
+
 def test_a_caption_is_text_in_the_description_of_its_figure():
     figure = {"png": "", "width": "10"}
     content = {"materials": [], "study": "abc", "seed": 0, "versions": VERSIONS}

@@ -132,6 +132,15 @@ def test_a_catch_trial_with_the_map_s_worst_is_no_comparison_of_its_best():
     assert len(aggregate_comparisons(table, sources, {"best": "best", "worst": "worst", "own": ""})) == 1
 
 
+def test_answers_over_several_tables_are_in_the_order_of_their_trials(tmp_path):
+    """Whatever the files are called: Monday's before Friday's."""
+    monday, friday = HEAD + "A,1,close,5,6,0.2\n", HEAD + "B,1,close,5,6,0.5\nA,2,similar,5,6,0.3\n"
+    folder = folder_with(tmp_path, **{"trials-2_friday__csv": friday, "trials-monday__csv": monday})
+    (material,) = read_folder(folder).materials
+    assert material.cohort.names == ("A", "B")
+    assert material.cohort.trials.q[0].tolist()[:2] == [2, 1]
+
+
 def test_the_same_answers_with_and_without_a_session_are_the_same(tmp_path):
     second = "session," + HEAD + "1," + ROW
     folder = folder_with(tmp_path, trials__csv=HEAD + ROW, **{"trials-2__csv": second})

@@ -70,6 +70,15 @@ def test_rows_come_by_participant_and_in_the_order_of_their_trials(tmp_path):
     assert table["category"].tolist() == [2, 1, 0, 2]
 
 
+def test_trials_that_count_through_phases_stay_in_their_order(tmp_path):
+    """Whatever the phases are called; where each phase begins with 1 one follows the other."""
+    through = "phase," + HEADER + "space filling,A,1,close,1,2\nadaptive,A,2,close,1,3\n"
+    assert read_trials(written(tmp_path, through), study())["trial"].tolist() == [1, 2]
+    anew = through + "adaptive,A,1,close,1,4\n"
+    table = read_trials(written(tmp_path, anew), study())
+    assert table["phase"].tolist() == ["adaptive", "adaptive", "space filling"] and table["trial"].tolist() == [1, 2, 1]
+
+
 @pytest.mark.parametrize("names", [["P2", "P10", "P10b"], ["9", "010", "10", "1e3"], ["Ada", "Ben", "ada"]])
 def test_the_order_of_the_rows_makes_no_difference(tmp_path, names):
     phases, trials = ("first", "second"), range(1, 4)
