@@ -54,10 +54,15 @@ class Gate:
             re.compile(f"{before}{key}".encode()) for before in ("earer {1,8}", f"hilbo_(?:{roles})_{port}=")
         ]
         self.origins = frozenset(f"http://{host}" for host in self.hosts)
+        self._tokens: dict[str, Role] = {}
+        self.keep_in(keys)
+
+    def keep_in(self, keys: Path | None) -> None:
+        """From now on the keys are those in this file, and new ones go there: whose session it is may be known only
+        once the server has its port."""
         self._file = keys
         self._keys: dict[Role, str] = _kept(keys, "keys")
         self._links: dict[Role, str] = _kept(keys, "links")  # role -> the token for which its key was given
-        self._tokens: dict[str, Role] = {}
 
     def invite(self, role: Role) -> str:
         """A new token for a role, good for one use; earlier ones of the role that nobody has used are void."""

@@ -78,19 +78,21 @@ def session(
     from hilbo.app import serve
 
     with contextlib.ExitStack() as held:
-        file = held.enter_context(_claimed(served.logs, participant, name))
-        place = serve.bound(served.port, lan=served.lan, keys=file)
+        _claim(served.logs, participant, name)
+        place = serve.bound(served.port, lan=served.lan)
         held.callback(place.socket.close)
         with progress() as say:
             say("loading")
             start()
             from hilbo.app.opening import Wanted, let_go, opened
+            from hilbo.session.event_log import keys_path
 
             wanted = Wanted(
                 study, participant, name, seed, served.logs, plan, material, resume, people, warm_start, dry_run
             )
             hub, log = opened(wanted, line.open, say)
         held.callback(let_go, log, resume)
+        place.gate.keep_in(keys_path(log.path))
         if hub.state.study.stimulus is not None and line.device != "sim":
             raise InputError(f"{study}: has no [renderer], and a device nothing to render; leave --device out.")
         hub.gap = served.gap
@@ -136,11 +138,8 @@ def _started(hub, place, served, as_json) -> None:
         webbrowser.open(links["experimenter"])
 
 
-@contextlib.contextmanager
-def _claimed(logs: Path, participant: str, name: str):
-    """The file of this session's keys; made with its folder."""
-    import re
-
+def _claim(logs: Path, participant: str, name: str) -> None:
+    """The folder of the logs, made; words that no session can be called by are refused before."""
     from hilbo.study.text_cells import check_id, check_text
 
     check_id(participant, "--participant")
@@ -149,7 +148,6 @@ def _claimed(logs: Path, participant: str, name: str):
         logs.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{logs}: cannot be made ({error.strerror}); choose another --logs.") from error
-    yield logs / f".{participant}-{re.sub(r'[^A-Za-z0-9_.-]', '-', name)}.keys"
 
 
 def need_extra() -> None:

@@ -30,7 +30,7 @@ from hilbo.session.state import LiveSession
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.typed_files import converted, decoded, read_bytes
 
-__all__ = ["EventLog", "LogError", "begun", "in_use", "log_name", "log_paths", "read_log", "read_session"]
+__all__ = ["EventLog", "LogError", "begun", "in_use", "keys_path", "log_name", "log_paths", "read_log", "read_session"]
 
 _SUFFIX = ".session.jsonl"
 _MODE = 0o600
@@ -197,6 +197,12 @@ def log_name(header: Header) -> str:
     """File name of a session's log."""
     parts = (header.participant, header.session)
     return "_".join(re.sub(r"[^\w.-]", "-", part) for part in parts) + _SUFFIX
+
+
+def keys_path(log: Path) -> Path:
+    """The file beside a log that keeps the keys of its browsers. It has the log's own name, so that no other session
+    can have it."""
+    return log.with_name(f".{log.name.removesuffix(_SUFFIX)}.keys")
 
 
 def log_paths(folder: str | os.PathLike) -> list[Path]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilbo.errors import InputError
-from hilbo.session.event_log import in_use, read_log
+from hilbo.session.event_log import in_use, keys_path, read_log
 from hilbo.session.withdrawn_names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
@@ -68,7 +68,7 @@ def delete_participant(folder: str | os.PathLike, participant: str) -> Withdrawa
     for path in theirs:
         if in_use(path):
             raise InputError(f"{path}: is being written; end the session first.")
-    for path in [*theirs, *_keys(root, participant, set(whose.values()))]:
+    for path in [*theirs, *_keys(root, participant, whose)]:
         path.unlink()
         done.removed[str(path)] = 1
     folders = results_folders(root)
@@ -106,13 +106,21 @@ def _logs(root: Path) -> tuple[dict[Path, str], list[Path]]:
     return whose, damaged
 
 
-def _keys(root: Path, participant: str, people: set[str]) -> list[Path]:
-    """The files of keys of one participant's sessions, .ID-SESSION.keys; not those of somebody whose id begins so."""
-    longer = tuple(f".{person}-" for person in people if person.startswith(f"{participant}-"))
-    paths = (path for end in ("*.keys", "*.keys.part") for path in root.rglob(end))
-    return sorted(
-        path for path in paths if path.name.startswith(f".{participant}-") and not path.name.startswith(longer)
-    )
+def _keys(root: Path, participant: str, whose: dict[Path, str]) -> list[Path]:
+    """The files of keys of one participant's sessions: those beside their logs, and those without a log that begin with
+    the id (.ID_SESSION.keys, of earlier versions .ID-SESSION.keys), not with a longer one of somebody else."""
+    beside = {keys_path(path): person for path, person in whose.items()}
+    begins = (f".{participant}_", f".{participant}-")
+    others = {f".{person}{mark}" for person in whose.values() for mark in "_-"}
+    longer = tuple(name for name in others if name.startswith(begins) and name not in begins)
+
+    def theirs(path: Path) -> bool:
+        person = beside.get(path.with_name(path.name.removesuffix(".part")))
+        if person is not None:
+            return person == participant
+        return path.name.startswith(begins) and not path.name.startswith(longer)
+
+    return sorted(path for end in ("*.keys", "*.keys.part") for path in root.rglob(end) if theirs(path))
 
 
 def _tables(root: Path, done: Withdrawal) -> None:

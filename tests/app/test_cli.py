@@ -108,6 +108,34 @@ def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_
     assert again.state == hub.state
 
 
+def served(monkeypatch, *arguments):
+    """What keeps the keys of a session that is begun and ended; nobody is waited for."""
+    gates = []
+    monkeypatch.setattr(serve, "serve", lambda place, hub, started: gates.append(place.gate))
+    command("session", *arguments)
+    return gates.pop()
+
+
+def test_each_session_of_a_person_has_keys_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
+    study = study_of(tmp_path)
+    plans = {label: tmp_path / f"plan {label}.json" for label in ("1", "2")}
+    for label, path in plans.items():
+        path.write_text(json.dumps(make_plan(study, ["P01"], session=label)))
+    file, logs = tmp_path / "study.toml", tmp_path / "logs"
+    place = (file, "--logs", logs, "--port", 0, "--dry-run", "--participant")
+    first = served(monkeypatch, *place, "P01", "--plan", plans["1"])
+    _, key = first.redeem(first.invite("participant"))
+    others = [("P01", "--plan", plans["2"]), ("P01", "--session", "1-x"), ("P01-1", "--session", "x")]
+    gates = [served(monkeypatch, *place, *other) for other in others]
+    assert not any(gate.admits("participant", key) for gate in gates)
+    keys = [gate.redeem(gate.invite("participant"))[1] for gate in gates]
+    for other, kept in zip(others, keys, strict=True):
+        again = served(monkeypatch, *place, *other)
+        assert [again.admits("participant", one) for one in (key, *keys)] == [one == kept for one in (key, *keys)]
+    assert served(monkeypatch, *place, "P01", "--plan", plans["1"]).admits("participant", key)
+
+
 def a_map(study, path):
     """The map.nc of a population that likes one corner."""
     sides = [np.linspace(0.0, 1.0, 4)] * study.space.dim

@@ -164,6 +164,18 @@ def older_log(folder, person):
     return folder / log_name(header)
 
 
+def test_keys_of_their_sessions_go_and_those_of_longer_ids_stay(folder):
+    """P02_3 is somebody else, and so is P02-4, whose logs are here."""
+    for person in ("P02", "P02_3", "P02-4"):
+        older_log(folder, person)
+    gone = [".P02_3.keys", ".P02_1.keys", ".P02_1.keys.part", ".P02-1.keys"]
+    stay = [".P02_3_3.keys", ".P02-4_3.keys", ".P02-4-3.keys", ".P020_3.keys", ".P01_3.keys"]
+    for name in (*gone, *stay):
+        (folder / name).write_text("{}")
+    delete_participant(folder, "P02")
+    assert sorted(path.name for path in folder.glob(".*.keys*")) == sorted(stay)
+
+
 def test_logs_of_others_are_listed_and_stay_as_they_are(folder, capsys, monkeypatch):
     theirs, others = older_log(folder, "P02"), older_log(folder, "P03")
     content = others.read_bytes()
