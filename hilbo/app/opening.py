@@ -28,12 +28,12 @@ __all__ = ["Wanted", "let_go", "opened"]
 
 
 class Wanted(NamedTuple):
-    """A session as a person asks for it."""
+    """A session as a person asks for it; None: as the plan, the log or the default has it."""
 
     study: Path
     participant: str
-    session: str = "1"
-    seed: int = 0
+    session: str | None = None
+    seed: int | None = None
     logs: Path = Path("logs")
     plan: Path | None = None
     material: str | None = None
@@ -83,6 +83,11 @@ def _damping(study, material) -> float:
 
 def _begun(wanted, study) -> tuple[EventLog, LiveChooser]:
     """A new log, last of all: what is refused leaves none behind."""
+    if wanted.plan is None and wanted.material is None and study.materials:
+        names = ", ".join(study.materials)
+        raise InputError(
+            f"{wanted.study}: has the materials {names}; add --material with the one of this session, or --plan."
+        )
     header = _header(wanted, study)
     path = wanted.logs / log_name(header)
     if begun(path):
@@ -113,16 +118,17 @@ def _resumed(wanted, study) -> tuple[EventLog, LiveChooser]:
 
 
 def _check_asked_for(wanted, header: Header, log: EventLog) -> None:
-    """Refuse a log that is of somebody else, or was begun with another material or plan, than the command says."""
+    """Refuse a log that is of somebody else, or was begun with another material, seed or plan than asked for."""
     begun = log.state.header
     if (begun.participant, begun.session) != (header.participant, header.session):
         raise InputError(
             f"{log.path}: is session {begun.session} of participant {begun.participant}; choose another --session."
         )
-    materials = [list(dict.fromkeys(block.material for block in one.blocks)) for one in (begun, header)]
-    if wanted.material is not None and materials[0] != materials[1]:
-        with_ = ", ".join(name or "none" for name in materials[0])
+    if wanted.material is not None and _materials(begun) != _materials(header):
+        with_ = ", ".join(_materials(begun))
         raise InputError(f"{log.path}: was begun with the material {with_}; choose another --session, or --material.")
+    if wanted.seed is not None and begun.seed != wanted.seed:
+        raise InputError(f"{log.path}: was begun with the seed {begun.seed}; choose another --session, or --seed.")
     if wanted.plan is not None and begun.plan != header.plan:
         raise InputError(f"{log.path}: was begun by another plan, or without one; give that one, or another --session.")
 
@@ -140,15 +146,35 @@ def _header(wanted, study) -> Header:
         people = read_people(wanted.people or wanted.logs / "participants.csv")
         facts["consent"] = check_consent(people, wanted.participant, number)["consent_time"]
     if wanted.plan is None:
-        place = (wanted.participant, wanted.session, wanted.seed)
+        place = (wanted.participant, "1" if wanted.session is None else wanted.session, wanted.seed or 0)
         header = header_for(study, *place, materials=(wanted.material,), **facts)
         shown = {} if wanted.reference is None else {"reference": dict(wanted.reference)}
         return msgspec.structs.replace(header, sets=header.sets | shown)
     plan = read_plan(wanted.plan)
     try:
-        return planned_header(plan, study, wanted.participant, **facts)
+        header = planned_header(plan, study, wanted.participant, **facts)
     except InputError as error:
         raise InputError(f"{wanted.plan}: {error}") from error
+    return _as_asked(wanted, header)
+
+
+def _as_asked(wanted, header: Header) -> Header:
+    """A planned header, under the label that was asked for. Another seed or material than the plan's is refused.
+
+    With a label of its own somebody whose session was ended by accident goes through the same plan again.
+    """
+    where = f"{wanted.plan}: plans the session of {wanted.participant}"
+    if wanted.seed not in (None, header.seed):
+        raise InputError(f"{where} with the seed {header.seed}; leave --seed {wanted.seed} out.")
+    if wanted.material is not None and _materials(header) != [wanted.material]:
+        with_ = ", ".join(_materials(header))
+        raise InputError(f"{where} with the material {with_}; leave --material {wanted.material} out.")
+    return header if wanted.session is None else msgspec.structs.replace(header, session=wanted.session)
+
+
+def _materials(header: Header) -> list[str]:
+    """The materials of a session, as they come."""
+    return list(dict.fromkeys(block.material or "none" for block in header.blocks))
 
 
 def _warm_starts(wanted, study, header) -> dict[str | None, Any]:

@@ -157,14 +157,18 @@ def rehearse(
     out.mkdir(parents=True, exist_ok=True)
     file = fast_study(source, out / "study.toml", seconds, warm_up)
     study = Study.load(file)
-    population = placed(study, population_of(study, preset)[1], seed)
+    material = next(iter(study.materials), None)
+    here = study if material is None else study.material(material)
+    population = placed(here, population_of(here, preset)[1], seed)
     arguments = [str(file), "--participant", "P01", "--logs", str(out / "logs"), "--port", "0"]
-    arguments += ["--seed", str(seed), "--dry-run", "--gap", "0.7" if seconds is None else "0.05"]
+    arguments += ["--dry-run", "--gap", "0.7" if seconds is None else "0.05"]
     if phase != "optimisation":
-        arguments += ["--plan", str(_plan(study, population, out, phase, seed))]
+        arguments += ["--plan", str(_plan(study, population, out, phase, seed))]  # which has the seed
+    else:
+        arguments += ["--seed", str(seed)] + ([] if material is None else ["--material", material])
     say("starting the server")
     rendered = _by_device if study.stimulus is None else functools.partial(_by_stand_in, study)
-    with rendered(arguments, Decider(study, population, seed)) as (links, decide, touches), browser() as program:
+    with rendered(arguments, Decider(here, population, seed)) as (links, decide, touches), browser() as program:
         say("in session")
         summary = _session(program, links, decide, touches, out, say)
     summary["log"] = links["log"]

@@ -59,7 +59,9 @@ def session(
     line: Device,
     served: Served,
     participant: Annotated[str, typer.Option(help="Pseudonym of the participant.")],
-    name: Annotated[str, typer.Option("--session", help="Which of the participant's sessions.")] = "1",
+    name: Annotated[
+        str | None, typer.Option("--session", help="Label of the session; by default 1, or the plan's.")
+    ] = None,
     plan: Annotated[Path | None, typer.Option(help="Plan of the study, from `hilbo plan`.")] = None,
     material: Annotated[str | None, typer.Option(help="Which of the study's materials.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the session that has a log.")] = False,
@@ -70,7 +72,9 @@ def session(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Nobody takes part: no consent is looked for, and the log says so.")
     ] = False,
-    seed: Annotated[int, seed_option("of the points among which trials are chosen")] = 0,
+    seed: Annotated[
+        int | None, seed_option("of the points among which trials are chosen; by default 0, or the plan's")
+    ] = None,
     as_json: JsonToo = False,
 ) -> None:
     """A live session: the participant's and the experimenter's page, what shows renderings, and the log."""
@@ -138,12 +142,12 @@ def _started(hub, place, served, as_json) -> None:
         webbrowser.open(links["experimenter"])
 
 
-def _claim(logs: Path, participant: str, name: str) -> None:
+def _claim(logs: Path, participant: str, name: str | None) -> None:
     """The folder of the logs, made; words that no session can be called by are refused before."""
     from hilbo.study.text_cells import check_id, check_text
 
     check_id(participant, "--participant")
-    check_text(name, "--session")
+    check_text(name or "", "--session")
     try:
         logs.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -12,7 +12,7 @@ import pytest
 import xarray as xr
 from commands import run
 from live_server import DATA, study_of
-from msgspec import to_builtins
+from msgspec import structs, to_builtins
 
 from hilbo.app import serve
 from hilbo.app.opening import Wanted, opened
@@ -71,6 +71,22 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
         other.listen()
         assert "choose another --port" in refused(DATA, *place[:2], "--port", other.getsockname()[1], *place[4:])
     assert list(logs.glob("*.jsonl")) == []
+
+
+@pytest.mark.parametrize("phase", ["optimisation", "validation"])
+def test_a_rehearsal_asks_for_a_session_that_can_begin(tmp_path, monkeypatch, phase):
+    """Which session it is comes from the plan alone, or from a seed and a material."""
+    text = study_text(NewStudy("s", (parameter_of("u=0:1"), parameter_of("v=0:1"))))
+    materials = "\n[materials.foam]\n[materials.gel]\n" if phase == "optimisation" else ""
+    (tmp_path / "base.toml").write_text(text + materials)
+
+    def asked(study, arguments, decide):
+        raise RuntimeError(*arguments)
+
+    monkeypatch.setattr("hilbo.app.rehearsal._by_stand_in", asked)
+    with pytest.raises(RuntimeError) as caught:
+        rehearse(tmp_path / "base.toml", tmp_path / "out", phase=phase, seed=3)
+    served(monkeypatch, *caught.value.args)
 
 
 def test_a_study_is_made_fast_whether_it_has_steps_or_not(tmp_path):
@@ -176,7 +192,7 @@ def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_p
     assert log.state.header.seed == 7
     assert log.state.header.warm_start == f"={hashlib.sha256(file.read_bytes()).hexdigest()[:16]}"
     assert [data["choice"]["by"] for data in first] == ["map", "map"]
-    again = wanted._replace(resume=True, seed=3)
+    again = wanted._replace(resume=True)
     assert begun(again)[1] == first
     with pytest.raises(InputError, match="give that map with --warm-start"):
         opened(again._replace(warm_start=None), lambda _: None, lambda _: None)
@@ -254,6 +270,49 @@ def test_a_log_of_somebody_else_or_of_another_material_is_not_resumed(tmp_path):
         with pytest.raises(InputError, match=words):
             opened(wanted._replace(resume=True, **change), lambda _: None, lambda _: None)
     opened(wanted._replace(resume=True), lambda _: None, lambda _: None)[1].close()
+
+
+def test_options_that_contradict_the_plan_are_refused_and_another_label_begins_it_anew(tmp_path):
+    study_of(tmp_path)
+    file, path = tmp_path / "study.toml", tmp_path / "plan.json"
+    file.write_text(file.read_text() + "\n[materials.foam]\n[materials.gel]\n")
+    plan = make_plan(Study.load(file), ["P01"], 5, materials=["gel"], session="gel")
+    path.write_text(json.dumps(plan))
+    seed = plan["participants"][0]["header"]["seed"]
+    wanted = Wanted(file, "P01", logs=tmp_path / "logs", plan=path, dry_run=True)
+    wanted.logs.mkdir()
+    for change, words in (
+        ({"material": "foam"}, "plans the session of P01 with the material gel; leave --material foam out"),
+        ({"seed": 5}, f"plans the session of P01 with the seed {seed}; leave --seed 5 out"),
+    ):
+        for resume in (False, True):
+            with pytest.raises(InputError, match=words):
+                opened(wanted._replace(resume=resume, **change), lambda _: None, lambda _: None)
+    assert not list(wanted.logs.iterdir())
+    for same, name in (({"material": "gel", "seed": seed}, "P01_gel"), ({"session": "gel-2"}, "P01_gel-2")):
+        log = opened(wanted._replace(**same), lambda _: None, lambda _: None)[1]
+        log.close()
+        assert log.path.name == f"{name}.session.jsonl"
+        opened(wanted._replace(resume=True, **same), lambda _: None, lambda _: None)[1].close()
+    first, second = (read_log(wanted.logs / f"P01_{label}.session.jsonl")[0] for label in ("gel", "gel-2"))
+    assert second == structs.replace(first, session="gel-2")
+
+
+def test_a_session_without_a_plan_needs_a_material_and_is_resumed_with_its_own_seed(tmp_path):
+    study_of(tmp_path)
+    file = tmp_path / "study.toml"
+    file.write_text(file.read_text() + "\n[materials.foam]\n[materials.gel]\n")
+    wanted = Wanted(file, "P01", logs=tmp_path / "logs", seed=3, dry_run=True)
+    wanted.logs.mkdir()
+    with pytest.raises(InputError, match="has the materials foam, gel; add --material with the one of this session"):
+        opened(wanted, lambda _: None, lambda _: None)
+    assert not list(wanted.logs.iterdir())
+    opened(wanted._replace(material="gel"), lambda _: None, lambda _: None)[1].close()
+    with pytest.raises(InputError, match="was begun with the seed 3; choose another --session, or --seed"):
+        opened(wanted._replace(resume=True, seed=4), lambda _: None, lambda _: None)
+    log = opened(wanted._replace(resume=True, seed=None), lambda _: None, lambda _: None)[1]
+    log.close()
+    assert (log.state.header.seed, log.state.header.blocks[0].material) == (3, "gel")
 
 
 def test_a_dry_run_stays_one_and_a_session_with_a_person_too(tmp_path, monkeypatch):
