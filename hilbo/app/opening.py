@@ -18,7 +18,7 @@ from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, begun, log_name
 from hilbo.session.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.participants import check_consent, read_people
-from hilbo.session.plan import header_for, planned_header, read_plan
+from hilbo.session.plan import header_for, planned_by, planned_header, read_plan
 from hilbo.session.records import Header
 from hilbo.session.state import LiveSession
 from hilbo.session.warm_start import read_warm_start
@@ -129,7 +129,7 @@ def _check_asked_for(wanted, header: Header, log: EventLog) -> None:
         raise InputError(f"{log.path}: was begun with the material {with_}; choose another --session, or --material.")
     if wanted.seed is not None and begun.seed != wanted.seed:
         raise InputError(f"{log.path}: was begun with the seed {begun.seed}; choose another --session, or --seed.")
-    if wanted.plan is not None and begun.plan != header.plan:
+    if wanted.plan is not None and not planned_by(read_plan(wanted.plan), header, begun):
         raise InputError(f"{log.path}: was begun by another plan, or without one; give that one, or another --session.")
 
 

@@ -35,6 +35,7 @@ __all__ = [
     "make_plan",
     "material_seed",
     "plan_hash",
+    "planned_by",
     "planned_header",
     "read_plan",
     "reissue",
@@ -64,6 +65,7 @@ class _Plan(msgspec.Struct):
     study: str
     participants: Annotated[tuple[_Row, ...], msgspec.Meta(min_length=1)]
     source: Source | None = None
+    replaces: tuple[str, ...] = ()
 
 
 def seed_of(seed: int, *place: int) -> int:
@@ -196,6 +198,13 @@ def planned_header(plan: Mapping[str, Any], study: AnyStudy, participant: str, *
     return msgspec.structs.replace(rows[participant], plan=checked.hash, **others)
 
 
+def planned_by(plan: Mapping[str, Any], planned: Header, begun: Header) -> bool:
+    """Whether a session was begun by this plan, or by one that it replaces and with the same row; `planned` is what the
+    row gives today. Its label may be another."""
+    known = begun.plan in (plan["hash"], *plan.get("replaces", ()))
+    return known and _for_plan(begun) == _for_plan(msgspec.structs.replace(planned, session=begun.session))
+
+
 def read_plan(path: str | os.PathLike) -> dict[str, Any]:
     """A plan's content as plain data, which `check_plan` checks. Raises InputError."""
     return decoded(read_bytes(path), dict[str, Any], str(path), _WHAT)
@@ -243,7 +252,8 @@ def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
         "reissued_from": dropped,
         "header": row["header"] | {"participant": new},
     }
-    changed = {**plan, "participants": [*plan["participants"], fresh]}
+    replaces = [*plan.get("replaces", []), plan["hash"]]  # which is in the logs that there are
+    changed = {**plan, "participants": [*plan["participants"], fresh], "replaces": replaces}
     return changed | {"hash": plan_hash(changed)}
 
 

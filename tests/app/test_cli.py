@@ -25,8 +25,9 @@ from hilbo.hardware_bridge import Renderer
 from hilbo.session import actions
 from hilbo.session.event_log import read_log
 from hilbo.session.participants import add_person
-from hilbo.session.plan import header_for, make_plan, plan_hash
+from hilbo.session.plan import header_for, make_plan, plan_hash, reissue
 from hilbo.session.warm_start import read_warm_start
+from hilbo.session.withdrawal import delete_participant
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
@@ -296,6 +297,29 @@ def test_options_that_contradict_the_plan_are_refused_and_another_label_begins_i
         opened(wanted._replace(resume=True, **same), lambda _: None, lambda _: None)[1].close()
     first, second = (read_log(wanted.logs / f"P01_{label}.session.jsonl")[0] for label in ("gel", "gel-2"))
     assert second == structs.replace(first, session="gel-2")
+
+
+def test_a_session_is_resumed_by_a_plan_that_replaces_its_own(tmp_path):
+    study = study_of(tmp_path)
+    file, path, logs = tmp_path / "study.toml", tmp_path / "plan.json", tmp_path / "logs"
+    plan = make_plan(study, ["P01", "P02", "P03"])
+    path.write_text(json.dumps(plan))
+    wanted = Wanted(file, "P01", logs=logs, plan=path, dry_run=True)
+    logs.mkdir()
+    opened(wanted, lambda _: None, lambda _: None)[1].close()
+    path.write_text(json.dumps(reissue(plan, "P02", "P04")))
+    opened(wanted._replace(resume=True), lambda _: None, lambda _: None)[1].close()
+    delete_participant(tmp_path, "P03")
+    opened(wanted._replace(resume=True), lambda _: None, lambda _: None)[1].close()
+    changed = json.loads(path.read_text())
+    assert len(changed["replaces"]) == 2
+    for other in (
+        make_plan(study, ["P01"]),
+        make_plan(study, ["P01"], 1) | {"replaces": [plan["hash"]]},  # what was begun is not in it
+    ):
+        path.write_text(json.dumps(other | {"hash": plan_hash(other)}))
+        with pytest.raises(InputError, match="was begun by another plan"):
+            opened(wanted._replace(resume=True), lambda _: None, lambda _: None)
 
 
 def test_a_session_without_a_plan_needs_a_material_and_is_resumed_with_its_own_seed(tmp_path):

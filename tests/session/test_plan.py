@@ -150,6 +150,7 @@ def test_a_row_is_reissued_with_its_order_and_seed():
     changed = reissue(plan, "P03", "P30")
     old, new = (planned_header(changed, MATERIALS, person) for person in ("P03", "P30"))
     assert new == msgspec.structs.replace(old, participant="P30") and changed["hash"] != plan["hash"]
+    assert changed["replaces"] == [plan["hash"]]
     with pytest.raises(InputError, match="must be in the plan"):
         reissue(plan, "P99", "P30")
 
