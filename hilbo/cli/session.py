@@ -51,7 +51,7 @@ def plan(
     if register is not None:
         _check_register(register, out, reissue, force)
     if reissue is not None:
-        _write_plan(_reissued(out, file, reissue), out, as_json)
+        _write_plan(_reissued(out, study, file, reissue, results_ or []), out, as_json)
         return
     check_choice("kind", kind, PHASES[1:])
     check_choice("source", source, ("aggregate", "individual"))
@@ -227,7 +227,7 @@ def _by_material(materials, given) -> dict[str, Path]:
     return {name: Path(path) for name, _, path in pairs}
 
 
-def _reissued(path, study, text):
+def _reissued(path, study_path, study, text, results_):
     from hilbo.session.plan import check_plan, read_plan, reissue
 
     old, equals, new = text.partition("=")
@@ -238,7 +238,28 @@ def _reissued(path, study, text):
     except InputError as error:
         raise InputError(f"{path}: is no plan that can be read; give the one to change with --out.") from error
     check_plan(plan, study)
-    return reissue(plan, old.strip(), new.strip())
+    changed = reissue(plan, old.strip(), new.strip())
+    if plan.get("phase") == "validation" and plan["source"] == "aggregate":
+        materials = tuple(name for name in plan["materials"] if name is not None)
+        _check_not_in_map(path, study_path, materials, results_, new.strip())
+    return changed
+
+
+def _check_not_in_map(path, study_path, materials, results_, new):
+    """Refuse somebody new who is in the map that is validated. The plan itself does not say who is."""
+    if not results_:
+        raise InputError(
+            f"{path}: validates an aggregate, by people who are not in it; add --from result.json, of which its sets"
+            f" are made, so that {new} can be looked for there."
+        )
+    start()
+    from hilbo.session.plan_sets import check_participants
+    from hilbo.study.result_file import read_result
+
+    study = _whole(study_path)
+    for material, source in _by_material(materials, results_).items():
+        result = read_result(source, study.material(material) if material else study)
+        check_participants(result, [new], "aggregate")
 
 
 def _check_register(register, out, reissue, force):

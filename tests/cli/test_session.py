@@ -11,7 +11,7 @@ from hilbo import Study
 from hilbo.cli import main
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.plan import planned_header
+from hilbo.session.plan import make_plan, planned_header
 from hilbo.session.records import Block
 from hilbo.study.folder import read_folder
 from hilbo.study.validation_table import read_validation, sets_frame
@@ -123,6 +123,44 @@ def a_result(study, **changes):
     ]
     optimum = {"parameters": {"u": 0.3, "v": 0.6}, "mean": 1.0}
     return {"optimum": optimum, "participants": people, "study": study.hash, "seed": 0} | changes
+
+
+def test_nobody_is_given_a_row_to_validate_a_map_that_they_are_in(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=6))
+    study = Study.load("study.toml")
+    sets = {name: {"u": u, "v": 0.5} for name, u in (("best", 0.1), ("mid", 0.5), ("worst", 0.9))}
+    plan = make_plan(study, ["V01", "V02"], 0, "validation", sets={"": sets}, source="aggregate")
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    (tmp_path / "result.json").write_text(json.dumps(a_result(study)))
+    before = (tmp_path / "plan.json").read_bytes()
+    for arguments, sentence in (
+        (("V02=P01", "--from", "result.json"), '"P01" is in the map that is to be validated'),
+        (("V02=V03",), "add --from result.json, of which its sets are made, so that V03 can be looked for there"),
+        (("V02=V03", "--from", "none.json"), "none.json: cannot be read"),
+    ):
+        code, _, err = hilbo("plan", "study.toml", "--reissue", *arguments)
+        assert code == 2 and sentence in err and (tmp_path / "plan.json").read_bytes() == before
+    assert hilbo("plan", "study.toml", "--reissue", "V02=V03", "--from", "result.json")[0] == 0
+    assert planned_header(json.loads((tmp_path / "plan.json").read_text()), study, "V03").participant == "V03"
+
+
+def test_a_validation_of_two_materials_looks_for_somebody_new_in_both_maps(hilbo, tmp_path):
+    text = TOML.format(trials=6) + "[materials.foam]\n[materials.gel]\n"
+    (tmp_path / "study.toml").write_text(text)
+    study = Study.load("study.toml")
+    sets = {name: {"u": u, "v": 0.5} for name, u in (("best", 0.1), ("mid", 0.5), ("worst", 0.9))}
+    both = dict.fromkeys(("foam", "gel"), sets)
+    plan = make_plan(study, ["V01", "V02"], 0, "validation", sets=both, source="aggregate")
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    people = {"foam": ["P01"], "gel": ["P02"]}
+    for name, ids in people.items():
+        result = a_result(study.material(name), participants=[{"participant": one} for one in ids])
+        (tmp_path / f"{name}.json").write_text(json.dumps(result))
+    given = ("--from", "foam=foam.json", "--from", "gel=gel.json")
+    for person in ("P01", "P02"):
+        code, _, err = hilbo("plan", "study.toml", "--reissue", f"V02={person}", *given)
+        assert code == 2 and f'"{person}" is in the map' in err
+    assert hilbo("plan", "study.toml", "--reissue", "V02=V03", *given)[0] == 0
 
 
 def no_number(value):
