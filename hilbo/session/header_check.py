@@ -9,9 +9,10 @@ from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import check_id, check_text
 from hilbo.study.typed_files import check_values
 
-__all__ = ["check_header", "check_new_header", "study_of"]
+__all__ = ["SCHEMA", "check_header", "check_new_header", "study_of"]
 
-_SCHEMA = 1
+SCHEMA = 2  # of what is begun today
+_SCHEMAS = (1, SCHEMA)  # sessions of 1 have other seeds: `hilbo.session.plan.material_seed`
 _MOST = 100_000  # trials of a block
 _LABEL = 64  # characters of a session's label, and of an id
 _DAY = 86_400.0  # s
@@ -24,8 +25,9 @@ def study_of(study: AnyStudy, material: str | None) -> AnyStudy:
 
 def check_header(study: AnyStudy, header: Header) -> None:
     """Refuse a header that no session of this study can have, of whatever version. Raises InputError."""
-    if header.schema != _SCHEMA:
-        raise InputError(f"the session's header is of schema {header.schema}; this hilbo knows {_SCHEMA}.")
+    if header.schema not in _SCHEMAS:
+        known = " and ".join(map(str, _SCHEMAS))
+        raise InputError(f"the session's header is of schema {header.schema}; this hilbo knows {known}.")
     person = header.participant
     if not 0 < len(person) <= _LABEL or not person.isprintable() or any(mark in person for mark in "/\\"):
         raise InputError(f"the session's participant is \"{person[:_LABEL]}\", which is nobody's id.")

@@ -11,6 +11,8 @@ import os
 import time
 from pathlib import Path
 
+import msgspec
+
 from hilbo.errors import InputError
 from hilbo.session import actions as live
 from hilbo.session.event_log import EventLog, begun, log_name
@@ -37,7 +39,7 @@ class LoggedSession:
             log = EventLog.create(path, study, header)
             return cls(log, LiveChooser(log.state))
         log = EventLog.resume(path, study)
-        if log.state.header != header:
+        if log.state.header != msgspec.structs.replace(header, schema=log.state.header.schema):
             log.close()
             raise InputError(f"{path}: was begun with another seed, plan or sets; give those, or another label.")
         return cls(log, LiveChooser(log.state))

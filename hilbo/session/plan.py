@@ -20,7 +20,7 @@ import numpy as np
 
 from hilbo.errors import InputError
 from hilbo.session.counterbalance import block_size, comparisons, orders
-from hilbo.session.header_check import check_header
+from hilbo.session.header_check import SCHEMA, check_header
 from hilbo.session.records import Block, Header, Planned
 from hilbo.session.set_codes import OWN, Sets, coded, set_codes
 from hilbo.study.protocols import Phase, protocol
@@ -74,13 +74,20 @@ def seed_of(seed: int, *place: int) -> int:
 
 
 def material_seed(header: Header, material: str | None) -> int:
-    """The seed of what is chosen with a material. Where a session chooses with several, each has its own, from the
-    session's and its name: points that came again in the same order would be recognised, and no order balances that.
+    """The seed of what is chosen with a material, from the session's, the material's name and the session's label:
+    points that came again in the same order would be recognised, and no order balances that. Without a material, and
+    with the label "1", it is the session's own, as `hilbo.Session` has it.
+
+    Sessions of schema 1 keep theirs: of their materials several had seeds of their own, one had not.
     """
-    if len({block.material for block in header.blocks if not block.trials}) <= 1:
-        return header.seed
-    digest = hashlib.sha256((material or "").encode()).digest()
-    return seed_of(header.seed, int.from_bytes(digest[:4]))
+    name = material or ""
+    if header.schema == 1:
+        own = len({block.material for block in header.blocks if not block.trials}) > 1
+    else:
+        name += "" if header.session == "1" else f"\n{header.session}"  # neither has a line's end in it
+        own = name != ""
+    digest = hashlib.sha256(name.encode()).digest()
+    return seed_of(header.seed, int.from_bytes(digest[:4])) if own else header.seed
 
 
 def warm_up(study: AnyStudy, seed: int, material: str | None = None) -> tuple[Block, dict[str, dict[str, float]]]:
@@ -121,6 +128,7 @@ def header_for(
 def _made(study, participant, session, seed, blocks, sets, **others) -> Header:
     """The header of these blocks, with what it says of the study."""
     return Header(
+        schema=SCHEMA,
         study=study.hash,
         participant=participant,
         session=session,
@@ -195,7 +203,7 @@ def planned_header(plan: Mapping[str, Any], study: AnyStudy, participant: str, *
             f'participant "{participant}" is not in the plan, which has {len(rows)}, {min(rows)} to {max(rows)}; add'
             " them by a new plan, or reissue the row of somebody who dropped out."
         )
-    return msgspec.structs.replace(rows[participant], plan=checked.hash, **others)
+    return msgspec.structs.replace(rows[participant], schema=SCHEMA, plan=checked.hash, **others)
 
 
 def planned_by(plan: Mapping[str, Any], planned: Header, begun: Header) -> bool:

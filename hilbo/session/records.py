@@ -60,6 +60,7 @@ class Block(msgspec.Struct, frozen=True, omit_defaults=True):
 class Header(msgspec.Struct, frozen=True, kw_only=True):
     """All that decides a session in advance: the first line of its log.
 
+    `schema`: of 2 is what is begun today (`header_check.SCHEMA`); sessions of 1 choose with other seeds.
     `unblinded`: what showed its participant the parameters, "try" for `hilbo try`; "" where nothing did.
     `shown_to`: the roles that were shown the parameters of what is presented, where no device of ours does.
     """

@@ -18,6 +18,7 @@ from hilbo.session.excluded import APART, spread_point
 from hilbo.session.logged_session import LoggedSession
 from hilbo.session.look_ahead import Answers, LiveChooser, _missing
 from hilbo.session.pace import minutes_left
+from hilbo.session.plan import header_for
 from hilbo.session.progress import consistency, trust_of
 from hilbo.session.records import Block
 from hilbo.session.state import LiveSession
@@ -299,8 +300,20 @@ def test_materials_have_space_filling_points_of_their_own_that_do_not_depend_on_
     assert seen["soft", "hard"] == seen["hard", "soft"]
     both = seen["soft", "hard"]
     assert not any(point in both["hard"] for point in both["soft"])
-    alone = Session.start(study.material("soft"), seed=0)  # one material keeps the points of the session's seed
+    alone = Session.start(study.material("soft"), seed=0)  # in schema 1 one material has the session's seed
     assert seen[("soft",)]["soft"] == [alone.ask(), alone.tell("close").ask()]
+
+
+def test_a_log_of_before_goes_on_with_its_points_and_a_second_session_has_others(tmp_path):
+    today = header_for(STUDY, "P01", "2", 0, warm=False)
+    plain = Session.start(STUDY, seed=0)
+    first, second = plain.ask(), plain.tell("close").ask()
+    LoggedSession.open(tmp_path, STUDY, msgspec.structs.replace(today, schema=1)).close()
+    with LoggedSession.open(tmp_path, STUDY, today) as session:
+        assert session.ask() == first
+    (tmp_path / "new").mkdir()
+    with LoggedSession.open(tmp_path / "new", STUDY, today) as session:
+        assert session.ask() not in (first, second)
 
 
 def test_a_voided_space_filling_trial_is_asked_again_and_no_other_one(chooser):

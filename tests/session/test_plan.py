@@ -12,8 +12,9 @@ from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session import actions as live
 from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue, warm_up
+from hilbo.session.plan import header_for, make_plan, material_seed, plan_hash, planned_header, reissue, warm_up
 from hilbo.session.plan_sets import aggregate_best_sets, check_participants
+from hilbo.session.records import Block
 from hilbo.session.state import LiveSession
 from hilbo.session.views import participant_view
 from hilbo.study.protocols import protocol
@@ -153,6 +154,30 @@ def test_a_row_is_reissued_with_its_order_and_seed():
     assert changed["replaces"] == [plan["hash"]]
     with pytest.raises(InputError, match="must be in the plan"):
         reissue(plan, "P99", "P30")
+
+
+def choosing(label, *materials, **changes):
+    """Material -> the seed of what a session of the seed 7 chooses with it."""
+    head = header_for(STUDY, "P01", label, 7, warm=False)
+    blocks = tuple(Block("optimisation", 2, material=name) for name in materials)
+    head = msgspec.structs.replace(head, blocks=blocks, **changes)
+    return {name: material_seed(head, name) for name in materials}
+
+
+def test_nobody_meets_the_points_of_an_earlier_session_or_of_another_material():
+    labels, materials = ("1", "2", "red", "1.0"), (None, "red", "blue")
+    seeds = [choosing(label, material)[material] for label in labels for material in materials]
+    assert len(set(seeds)) == len(seeds) and choosing("1", None) == {None: 7}
+    assert choosing("2", "red", "blue") == choosing("2", "blue", "red") == choosing("2", "red") | choosing("2", "blue")
+    plan = make_plan(STUDY, ["P01"])
+    assert planned_header(plan, STUDY, "P01").schema == header_for(STUDY, "P01", warm=False).schema == 2
+
+
+def test_sessions_of_schema_1_keep_their_seeds():
+    """The numbers are those of hilbo 0.2.0."""
+    for label in ("1", "2"):
+        assert choosing(label, "foam", "gel", schema=1) == {"foam": 1333066126, "gel": 509532018}
+        assert choosing(label, "foam", schema=1) == {"foam": 7} and choosing(label, None, schema=1) == {None: 7}
 
 
 def test_warm_up_renderings_are_feasible_spread_and_seeded():
