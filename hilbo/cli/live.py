@@ -144,10 +144,13 @@ def _started(hub, place, served, as_json) -> None:
 
 def _claim(logs: Path, participant: str, name: str | None) -> None:
     """The folder of the logs, made; words that no session can be called by are refused before."""
+    from hilbo.session.header_check import check_label
     from hilbo.study.text_cells import check_id, check_text
 
     check_id(participant, "--participant")
-    check_text(name or "", "--session")
+    if name is not None:
+        check_label(name)
+        check_text(name, "--session")
     try:
         logs.mkdir(parents=True, exist_ok=True)
     except OSError as error:

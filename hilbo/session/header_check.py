@@ -9,7 +9,7 @@ from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import check_id, check_text
 from hilbo.study.typed_files import check_values
 
-__all__ = ["SCHEMA", "check_header", "check_new_header", "study_of"]
+__all__ = ["SCHEMA", "check_header", "check_label", "check_new_header", "study_of"]
 
 SCHEMA = 2  # of what is begun today
 _SCHEMAS = (1, SCHEMA)  # sessions of 1 have other seeds: `hilbo.session.plan.material_seed`
@@ -31,8 +31,7 @@ def check_header(study: AnyStudy, header: Header) -> None:
     person = header.participant
     if not 0 < len(person) <= _LABEL or not person.isprintable() or any(mark in person for mark in "/\\"):
         raise InputError(f"the session's participant is \"{person[:_LABEL]}\", which is nobody's id.")
-    if not 0 < len(header.session) <= _LABEL or not header.session.isprintable():
-        raise InputError(f'the session\'s label is "{header.session[:_LABEL]}"; it has 1 to {_LABEL} characters.')
+    check_label(header.session)
     if not 0 <= header.seed < 2**63:
         raise InputError(f"the session's seed is {header.seed}; it must be a whole number from 0.")
     if not header.blocks:
@@ -42,6 +41,15 @@ def check_header(study: AnyStudy, header: Header) -> None:
     for name, values in header.sets.items():
         if not all(math.isfinite(value) for value in values.values()):
             raise InputError(f'the set "{name}" of the session holds what is no finite number.')
+
+
+def check_label(label: str) -> None:
+    """Refuse what no session can be called. Raises InputError."""
+    if not 0 < len(label) <= _LABEL or not label.isprintable():
+        words = "".join(c if c.isprintable() else "?" for c in label[:_LABEL])
+        raise InputError(
+            f'the session\'s label is "{words}"; it must have 1 to {_LABEL} characters, all of which can be printed.'
+        )
 
 
 def check_new_header(study: AnyStudy, header: Header) -> None:

@@ -170,6 +170,7 @@ def make_plan(
     for i, person in enumerate(participants):
         in_order = [names[k] for k in sequence[i]]
         header = _header(study, person, session, seed_of(seed, i), phase, in_order, sets, source, codes)
+        check_header(study, header)
         people.append({"participant": person, "order": i, "header": _for_plan(header)})
     size = block_size(len(names))
     plan = {

@@ -62,6 +62,8 @@ def test_bad_input_is_one_sentence_and_begins_nothing(tmp_path, monkeypatch):
     assert "participants.csv: cannot be read" in refused(DATA, *place)
     assert "an id has" in refused(DATA, "--logs", logs, "--port", 0, "--participant", "Jane Doe")
     assert "no such session was begun" in refused(DATA, *place, "--resume")
+    for label in ("x" * 300, "a\nb", ""):
+        assert "it must have 1 to 64 characters" in refused(DATA, *place, "--dry-run", "--session", label)
     (tmp_path / "plan.json").write_text("{}")
     assert "is no plan" in refused(DATA, *place, "--plan", tmp_path / "plan.json", "--dry-run")
     add_person(logs / "participants.csv", PERSON | {"participant": "P02"})

@@ -86,6 +86,8 @@ def test_a_plan_is_written_once_and_can_be_reissued(hilbo, tmp_path):
         (("--participants", 2, "--kind", "validation", "--from", "none.json"), "none.json: cannot be read"),
         (("--participants", 2, "--kind", "validation", "--from", "a", "--from", "b"), "once for each material (none"),
         (("--names", "P1,P1"), "each once"),
+        (("--names", "P1", "--session", "x" * 65), "it must have 1 to 64 characters"),
+        (("--names", "P1", "--session", "a\nb"), 'the session\'s label is "a?b"; it must have'),
         (("--names", "P1", "--material", "foam"), "materials.foam is not in the study"),
         (("--reissue", "P1=P2"), "is no plan that can be read"),
         (("--reissue", "P1"), '--reissue is "P1"; write OLD=NEW'),

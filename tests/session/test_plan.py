@@ -51,6 +51,10 @@ def test_a_changed_plan_another_study_and_strangers_are_refused():
         planned_header({}, STUDY, "P01")
     with pytest.raises(InputError, match="each once"):
         make_plan(STUDY, ["P01", "P01"])
+    for label in ("x" * 65, "a\nb", ""):
+        with pytest.raises(InputError, match="label"):
+            make_plan(STUDY, ["P01"], session=label)
+    assert planned_header(make_plan(STUDY, ["P01"], session="x" * 64), STUDY, "P01").session == "x" * 64
 
 
 def test_three_materials_come_in_all_orders():
