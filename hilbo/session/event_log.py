@@ -4,11 +4,12 @@ The first line is the header, every other an event:
 
     {"seq":1,"kind":"propose","time":…,"data":{…},"previous":"…","crc":"…"}
 
-`previous` is the start of the SHA-256 of the line before, `crc` the CRC-32 of this line up to it. A last line without
-its end was never acknowledged: it is dropped, and said so; a file without a whole first line is no log yet. Any other
-damage is refused with its line. Neither digest has a secret, so that events are checked for what they say too
-(`hilbo.session.replay`). One writer at a time, by a lock of the operating system on the file, which goes with the
-process that holds it. A log is its owner's alone to read.
+`previous` is the start of the SHA-256 of the line before, `crc` the CRC-32 of this line up to it. A last line that
+lacks nothing but its newline counts, and gets it when the log is opened for writing; one that is cut off within is
+dropped, and said so; a file without a whole first line is no log yet. Any other damage is refused with its line.
+Neither digest has a secret, so that events are checked for what they say too (`hilbo.session.replay`). One writer at a
+time, by a lock of the operating system on the file, which goes with the process that holds it. A log is its owner's
+alone to read.
 """
 
 import hashlib
@@ -16,7 +17,7 @@ import os
 import re
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,9 @@ __all__ = ["EventLog", "LogError", "begun", "in_use", "keys_path", "log_name", "
 _SUFFIX = ".session.jsonl"
 _MODE = 0o600
 _WHAT = "is not what this hilbo writes"
+_WHY_CUT = (
+    "where hilbo was killed while it wrote, nothing acknowledged is missing; where this is a copy, copy the log again."
+)
 
 
 class _Line(msgspec.Struct, forbid_unknown_fields=True):
@@ -99,7 +103,7 @@ class EventLog:
 
     @classmethod
     def resume(cls, path: str | os.PathLike, study: AnyStudy) -> "EventLog":
-        """Open a log to go on with it; a torn last line is cut off. Raises InputError."""
+        """Open a log to go on with it; a last line that is not whole is cut off. Raises InputError."""
         path = Path(path)
         try:
             file = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
@@ -110,16 +114,13 @@ class EventLog:
         try:
             _lock(file, path)
             content = _content(file)
-            header, events, whole, dropped = _parsed(content, path)
+            header, events, lines, dropped = _parsed(content, path)
             state = _folded(path, study, header, events)
+            size = _ended(file, path, content, sum(map(len, lines)))
         except BaseException:
             os.close(file)
             raise
-        lines = content[:whole].splitlines(keepends=True)
-        if whole < len(content):
-            os.ftruncate(file, whole)
-            os.fsync(file)
-        return cls(path, file, state, lines[-1], whole, dropped, events)
+        return cls(path, file, state, lines[-1], size, dropped, events)
 
     def append(self, event: Event) -> LiveSession:
         """Put an event on the disk, and only then into the state, which is returned. Raises LogError."""
@@ -166,9 +167,14 @@ def read_log(path: str | os.PathLike, study: AnyStudy | None = None) -> tuple[He
     return header, events, dropped
 
 
-def read_session(path: str | os.PathLike, study: AnyStudy) -> LiveSession:
-    """The session of a log, every event checked; for readers, without a lock. Raises InputError."""
-    header, events, _ = read_log(path, study)
+def read_session(
+    path: str | os.PathLike, study: AnyStudy, note: Callable[[str], Any] = lambda sentence: None
+) -> LiveSession:
+    """The session of a log, every event checked; for readers, without a lock. `note` is told of what was dropped at the
+    end. Raises InputError."""
+    header, events, dropped = read_log(path, study)
+    if dropped:
+        note(dropped)
     return _folded(path, study, header, events)
 
 
@@ -232,27 +238,50 @@ _CRC = re.compile(rb',"crc":"([0-9a-f]{8})"\}\n\Z')
 
 
 def _parsed(content, path):
-    """Header, events, the number of good bytes, and a sentence on what follows those."""
-    lines = [line for line in re.split(rb"(?<=\n)", content) if line]
-    dropped, header, events, previous, whole = "", None, [], b"", 0
-    for number, line in enumerate(lines, 1):
-        if number == len(lines) and not line.endswith(b"\n"):
-            dropped = f"{path}:{number}: the last line is torn; it was never acknowledged, and is left out."
-            break
-        raw = _checked(line, number, previous, path)
+    """Header, events, the good lines, each with its newline, and a sentence on what follows those."""
+    dropped, header, events, good = "", None, [], []
+    for number, line in enumerate(filter(None, re.split(rb"(?<=\n)", content)), 1):
+        if not line.endswith(b"\n"):
+            if number == 1 or not _fits(line + b"\n"):
+                dropped = f"{path}:{number}: the last line is cut off, and is left out; {_WHY_CUT}"
+                break
+            line += b"\n"
+        raw = _checked(line, number, good[-1] if good else b"", path)
         if number == 1:
             header = converted(raw.data, Header, f"{path}:{number}", _WHAT)
         else:
             events.append(Event(seq=raw.seq, kind=raw.kind, time=raw.time, data=raw.data))
-        previous, whole = line, whole + len(line)
+        good.append(line)
     if header is None:
         raise InputError(f"{path}: holds no session, it has no whole first line; begin it without --resume.")
-    return header, events, whole, dropped
+    return header, events, good, dropped
+
+
+def _fits(line) -> bool:
+    """Whether a line is what its checksum says."""
+    checksum = _CRC.search(line)
+    return checksum is not None and int(checksum[1], 16) == zlib.crc32(line[: checksum.start()])
+
+
+def _ended(file, path, content, size) -> int:
+    """Bring a log to the end of its last good line: what is torn off goes, a newline that is missing comes. The size.
+    Raises InputError."""
+    if size == len(content):
+        return size
+    try:
+        if size < len(content):
+            os.ftruncate(file, size)
+        else:
+            os.lseek(file, len(content), os.SEEK_SET)
+            os.write(file, b"\n")
+        os.fsync(file)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}); free some space and try again.") from error
+    return size
 
 
 def _checked(line, number, previous, path):
-    checksum = _CRC.search(line)
-    if checksum is None or int(checksum[1], 16) != zlib.crc32(line[: checksum.start()]):
+    if not _fits(line):
         raise InputError(f"{path}:{number}: is damaged; restore the file from a copy, nothing after it can be trusted.")
     raw = decoded(line, _Line, f"{path}:{number}", _WHAT)
     if raw.seq != number - 1 or raw.previous != _hash(previous):

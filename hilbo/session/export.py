@@ -73,14 +73,15 @@ _WORDS = {
 def read_sessions(
     folder: str | os.PathLike, study: AnyStudy, note: Callable[[str], Any] = lambda sentence: None
 ) -> list[LiveSession]:
-    """Every session in a folder but dry runs; `note` is told of those. Raises InputError if there is none, or a log is
+    """Every session in a folder but dry runs; `note` is told of those, and of logs that are cut off.
+    Raises InputError if there is none, or a log is
     damaged or of another study."""
     paths = log_paths(folder)
     if not paths:
         raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
     sessions, dry = [], 0
     for path in paths:
-        state = read_session(path, study)
+        state = read_session(path, study, note)
         dry += state.header.dry_run
         if not state.header.dry_run:
             sessions.append(state)

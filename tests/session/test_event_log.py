@@ -72,6 +72,8 @@ def test_a_log_cut_anywhere_resumes_to_the_same_next_trial(tmp_path_factory, dri
     path = folder / "cut.jsonl"
     path.write_bytes(whole[:cut])
     lines = whole[:cut].count(b"\n")
+    if lines and whole[cut : cut + 1] == b"\n":
+        lines += 1  # its newline alone is missing
     if lines == 0:
         with pytest.raises(InputError, match="no whole first line"):
             EventLog.resume(path, STUDY)
@@ -79,8 +81,9 @@ def test_a_log_cut_anywhere_resumes_to_the_same_next_trial(tmp_path_factory, dri
     with EventLog.resume(path, STUDY) as log:
         kept = driven.events[: lines - 1]
         assert log.state == LiveSession.fold(STUDY, driven.header, kept)
-        assert bool(log.dropped) == (whole[:cut][-1:] != b"\n")
-        assert path.read_bytes() == whole[: whole[:cut].rfind(b"\n") + 1]
+        good = b"".join(whole.splitlines(keepends=True)[:lines])
+        assert bool(log.dropped) == (len(good) < cut)
+        assert path.read_bytes() == good
         following = driven.events[lines - 1] if lines - 1 < len(driven.events) else None
         if following is not None and following.kind == "propose":
             assert live.propose(log.state, CHOOSER, following.time) == following
@@ -89,12 +92,44 @@ def test_a_log_cut_anywhere_resumes_to_the_same_next_trial(tmp_path_factory, dri
     assert path.read_bytes().split(b"\n")[1:] == whole.split(b"\n")[1:]
 
 
+def test_a_last_line_that_lacks_its_newline_counts_and_gets_it(tmp_path, driven):
+    path = tmp_path / "log.jsonl"
+    whole = write(path, driven)
+    path.write_bytes(whole[:-1])
+    assert read_log(path, STUDY) == (driven.header, driven.events, "")
+    with EventLog.resume(path, STUDY) as log:
+        assert log.state == driven.state and log.dropped == ""
+        assert path.read_bytes() == whole
+        log.append(live.note(log.state, "goes on", 1e9))
+    assert len(read_log(path, STUDY)[1]) == len(driven.events) + 1
+    lines = whole.splitlines(keepends=True)
+    path.write_bytes(b"".join([*lines[:-2], lines[-1][:-1]]))
+    with pytest.raises(InputError, match="does not follow"):
+        read_log(path)
+
+
+def test_a_newline_that_cannot_be_written_is_one_sentence_and_the_log_stays(tmp_path, driven, monkeypatch):
+    path = tmp_path / "log.jsonl"
+    whole = write(path, driven)
+    path.write_bytes(whole[:-1])
+
+    def full(file, content):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(InputError, match=r"log\.jsonl: cannot be written \(No space left"):
+        EventLog.resume(path, STUDY)
+    monkeypatch.undo()
+    assert path.read_bytes() == whole[:-1]
+    EventLog.resume(path, STUDY).close()  # nobody holds it
+
+
 @given(st.integers(0, 10**9), st.integers(1, 255))
 @settings(max_examples=80)
 def test_a_changed_byte_is_refused_with_its_line(tmp_path_factory, driven, number, change):
     folder = tmp_path_factory.mktemp("damage")
     content = bytearray(write(folder / "whole.jsonl", driven))
-    place = number % (len(content) - 1)  # the very last newline away is a torn line
+    place = number % (len(content) - 1)  # without the very last newline the line counts
     line = content[:place].count(b"\n") + 1
     content[place] ^= change
     path = folder / "damaged.jsonl"

@@ -195,6 +195,20 @@ def test_dry_runs_are_nobodys_answers(folder, tmp_path):
         read_sessions(tmp_path / "dry", STUDY)
 
 
+def test_a_log_that_lacks_its_last_newline_is_whole_and_one_cut_off_is_said(folder):
+    before, heard = read_log_trials(folder, STUDY), []
+    path = folder / "P01_1.session.jsonl"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1])
+    pd.testing.assert_frame_equal(read_log_trials(folder, STUDY, note=heard.append), before)
+    assert heard == []
+    path.write_bytes(whole[:-9])
+    read_log_trials(folder, STUDY, note=heard.append)
+    (sentence,) = heard
+    last = len(whole.splitlines())
+    assert sentence.startswith(f"{path}:{last}: the last line is cut off, and is left out;")
+
+
 def test_answers_of_hilbo_try_are_marked_and_not_read_beside_others(folder, tmp_path):
     write(folder, "try-1", "optimisation", "1", unblinded="try")
     table = trials_table(read_sessions(folder, STUDY))
