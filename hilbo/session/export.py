@@ -74,22 +74,38 @@ def read_sessions(
     folder: str | os.PathLike, study: AnyStudy, note: Callable[[str], Any] = lambda sentence: None
 ) -> list[LiveSession]:
     """Every session in a folder but dry runs; `note` is told of those, and of logs that are cut off.
-    Raises InputError if there is none, or a log is
-    damaged or of another study."""
+
+    Raises InputError if there is none, a log is damaged or of another study, or two are of one session.
+    """
     paths = log_paths(folder)
     if not paths:
         raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
-    sessions, dry = [], 0
+    sessions: dict[Path, LiveSession] = {}
+    dry = 0
     for path in paths:
         state = read_session(path, study, note)
         dry += state.header.dry_run
         if not state.header.dry_run:
-            sessions.append(state)
+            sessions[path] = state
     if not sessions:
         raise InputError(f"{folder}: holds nothing but dry runs, in which nobody took part.")
     if dry:
         note(f"{folder}: {'1 dry run is' if dry == 1 else f'{dry} dry runs are'} left out.")
-    return sessions
+    _check_once(sessions)
+    return list(sessions.values())
+
+
+def _check_once(sessions: Mapping[Path, LiveSession]) -> None:
+    """Refuse two logs of one session, such as a copy beside its original: their answers would count twice."""
+    first: dict[tuple[str, str], Path] = {}
+    for path, state in sessions.items():
+        header = state.header
+        other = first.setdefault((header.participant, header.session), path)
+        if other != path:
+            raise InputError(
+                f'{path.parent}: "{other.name}" and "{path.name}" are both logs of session {header.session} of'
+                f" participant {header.participant}, whose answers would count twice; keep one of them here."
+            )
 
 
 def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:

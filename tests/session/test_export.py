@@ -97,12 +97,12 @@ def test_netcdf_is_read_by_xarray_and_arviz(folder, tmp_path):
     path = tmp_path / "trials.nc"
     netcdf(read_sessions(folder, STUDY), path, STUDY)
     tree = xr.open_datatree(path, engine="h5netcdf").load()
-    assert tree["observed_data"]["category"].sizes == {"obs_id": 13}  # with the repetition
+    assert tree["observed_data"]["category"].sizes == {"obs_id": 12}  # without the repetition, which is never fitted
     data = arviz.from_netcdf(str(path))
     table = read_log_trials(folder, STUDY)
-    fitted = data.constant_data["phase"].values == "optimisation"
-    assert sorted(data.constant_data["u"].values[fitted]) == sorted(table["u"])
-    assert data.observed_data["category"].values[fitted].sum() == table["category"].sum()
+    assert set(data.constant_data["phase"].values) == {"optimisation"}
+    assert sorted(data.constant_data["u"].values) == sorted(table["u"])
+    assert data.observed_data["category"].values.sum() == table["category"].sum()
     tree.close()
 
 
@@ -207,6 +207,22 @@ def test_a_log_that_lacks_its_last_newline_is_whole_and_one_cut_off_is_said(fold
     (sentence,) = heard
     last = len(whole.splitlines())
     assert sentence.startswith(f"{path}:{last}: the last line is cut off, and is left out;")
+
+
+def test_two_logs_of_one_session_are_refused_with_both_names(folder):
+    path = folder / "P01_1.session.jsonl"
+    copy = folder / "P01_1 (copy).session.jsonl"
+    copy.write_bytes(path.read_bytes())
+    for read in (read_sessions, read_log_trials):
+        with pytest.raises(InputError) as refused:
+            read(folder, STUDY)
+        text = str(refused.value)
+        assert text.startswith(
+            f'{folder}: "{copy.name}" and "{path.name}" are both logs of session 1 of participant P01'
+        )
+    copy.unlink()
+    write(folder, "P01", "validation", "2")  # another session of theirs is none
+    assert len(read_sessions(folder, STUDY)) == 4
 
 
 def test_answers_of_hilbo_try_are_marked_and_not_read_beside_others(folder, tmp_path):
