@@ -126,7 +126,8 @@ def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
 
 
 def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """Every comparison that counts."""
+    """Every comparison that counts. Where a program presents, with what it confirmed of either side, which may be off
+    from the sets that were planned."""
     rows = []
     for state in sessions:
         for trial in state.trials:
@@ -140,13 +141,26 @@ def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
                     | {"set_a": sets["a"], "set_b": sets["b"], "first": sets[trial.first]}
                     | {"class_a": values.get("class_a", ""), "class_b": values.get("class_b", "")}
                     | {"preferred": sets[values["preferred"]]}
+                    | _confirmed(state.study, trial)
                     | _times(trial)
                 )
     return _table(rows)
 
 
+def _confirmed(study: AnyStudy, trial: Trial) -> dict[str, float | str]:
+    """What was presented on either side, in columns that no parameter's own name can be; {} where a device renders."""
+    if study.stimulus is None:
+        return {}
+    shown = {side: in_words(study, values) for side, values in trial.presented.items()}
+    return {_presented(side, p.name): shown[side][p.name] for side in shown for p in study.space.parameters}
+
+
+def _presented(side: str, name: str) -> str:
+    return f"presented_{side}_{name}"
+
+
 def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
-    """The parameter sets that were compared. Raises InputError if one name stands for two sets."""
+    """The compared parameter sets, as they were planned. Raises InputError if one name stands for two sets."""
     rows: dict[str, dict[str, Any]] = {}
     for state in sessions:
         for block in state.header.blocks:
@@ -240,9 +254,7 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> 
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^A-Za-z0-9]", "", study.name) or "study"
-    words = _WORDS | {
-        p.name: f"Parameter, {p.range_words if p.levels else p.unit or 'no unit'}" for p in study.space.parameters
-    }
+    words = _WORDS | _parameter_words(study)
     written, columns = [], {}
     for kind, table in tables.items():
         if table.empty:
@@ -267,6 +279,16 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> 
     path = folder / "dataset_description.json"
     path.write_text(_json(description), encoding="utf-8")
     return [*written, path]
+
+
+def _parameter_words(study: AnyStudy) -> dict[str, str]:
+    """What the columns of parameters mean."""
+    words = {}
+    for p in study.space.parameters:
+        kind = p.range_words if p.levels else p.unit or "no unit"
+        words[p.name] = f"Parameter, {kind}"
+        words |= {_presented(side, p.name): f"What was confirmed as presented on side {side}, {kind}" for side in "ab"}
+    return words
 
 
 def _written(text: Any) -> Any:

@@ -1,5 +1,8 @@
 """What a program confirms counts in place of what it was asked for, within the study's tolerance and nowhere else."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import hypothesis.strategies as st
 import msgspec
 import pytest
@@ -10,9 +13,9 @@ from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session import actions as live
 from hilbo.session.confirmed import check_confirmed, counted
-from hilbo.session.export import trials_table
+from hilbo.session.export import psych_ds, sets_table, trials_table, validation_table
 from hilbo.session.look_ahead import Answers
-from hilbo.session.records import Block, RefusedError
+from hilbo.session.records import Block, Planned, RefusedError
 from hilbo.session.state import LiveSession
 
 STUDY = Study.from_dict(RAW | {"stimulus": {"tolerance": {"u": 0.01}, "within": 2.0}})
@@ -138,3 +141,43 @@ def test_a_device_and_a_program_do_not_both_present():
     assert Study.from_dict(raw).stimulus is None and Study.from_dict(RAW).stimulus is not None
     with pytest.raises(InputError, match="a study has one"):
         Study.from_dict(raw | {"stimulus": {}})
+
+
+def compared(study, off):
+    """A session of one comparison, whose sides are confirmed a little off."""
+    block = Block("validation", 1, (Planned("D", "E"),))
+    first = msgspec.structs.replace(header(), study=study.hash, blocks=(block,))
+    state = LiveSession.start(study, first)
+    state = state.after(live.propose(state, CHOOSER, 1.0))
+    for step, (show, _) in enumerate(state.steps_of(state.pending)):
+        values = SETS[{"a": "D", "b": "E"}.get(show, "D")]
+        values = values | {"u": values["u"] + off.get(show, 0.0)}
+        for event in beginning(state, 1, step, 2.0, values):
+            state = state.after(event)
+    values = {"class_a": "close", "class_b": "similar", "preferred": "a"}
+    return state.after(live.answer(state, 1, "c", values, 3.0))
+
+
+def test_the_table_of_comparisons_has_what_was_confirmed_of_either_side(tmp_path):
+    state = compared(STUDY, {"a": 0.004, "b": -0.006})
+    (row,) = validation_table([state]).to_dict("records")
+    assert row["presented_a_u"] == SETS["D"]["u"] + 0.004 and row["presented_b_u"] == SETS["E"]["u"] - 0.006
+    assert row["presented_a_v"] == SETS["D"]["v"] and row["presented_b_v"] == SETS["E"]["v"]
+    assert sets_table([state]).set_index("set_id").at["D", "u"] == SETS["D"]["u"]  # as it was planned
+    psych_ds([state], tmp_path, STUDY)
+    sidecar = (tmp_path / "data" / "study-plain_table-validation_data.json").read_text()
+    assert "What was confirmed as presented on side b, no unit" in sidecar
+
+
+def test_confirmed_values_take_the_place_of_no_other_column():
+    raw = RAW | {"parameters": {n: RAW["parameters"]["u"] for n in ("set", "class", "presented_a_set")}}
+    raw |= {"stimulus": {"within": 2.0}}
+    study = Study.from_dict(raw)
+    trial = compared(STUDY, {}).trials[0]
+    columns = [f"presented_{side}_{name}" for side in "ab" for name in study.space.names]
+    values = {side: dict(zip(study.space.names, (0.1, 0.2, 0.3), strict=True)) for side in "ab"}
+    trial = replace(trial, data=trial.data | {"renderings": values}, confirmed={})
+    state = SimpleNamespace(study=study, header=header("validation"), trials=[trial])
+    table = validation_table([state])
+    assert [name for name in table if name.startswith("presented_")] == columns
+    assert table["set_a"].tolist() == ["D"] and table["class_b"].tolist() == ["similar"]
