@@ -2,9 +2,9 @@
 
 `trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
 and `sets_table` are those of `hilbo.study.validation_table` (voided comparisons left out), `presentations_table` has
-every trial that was ever proposed, and what became of it. `read_log_trials` reads a folder of logs as
-`hilbo.study.trial_table.read_trials` reads the exported table, through the very same text, so that both give the same
-bits.
+every trial that was ever proposed, and what became of it, `sessions_table` the plan that each session was held by.
+`read_log_trials` reads a folder of logs as `hilbo.study.trial_table.read_trials` reads the exported table, through the
+very same text, so that both give the same bits.
 """
 
 import json
@@ -22,6 +22,7 @@ from hilbo.session.confirmed import in_words
 from hilbo.session.event_log import log_name, log_paths, read_session
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
+from hilbo.session.table_words import UNWRITTEN, column_words, presented_column
 from hilbo.study.set_table import role_of, source_of
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import check_text, runs_in_a_spreadsheet
@@ -33,41 +34,13 @@ __all__ = [
     "psych_ds",
     "read_log_trials",
     "read_sessions",
+    "sessions_table",
     "sets_table",
     "trials_table",
     "validation_table",
 ]
 
-_UNWRITTEN = "see the log"
-"""What stands in the place of words that a spreadsheet would run; the log has them."""
 _SINGLE = ("warm-up", "optimisation", "repeat")
-_WORDS = {
-    "participant": "Pseudonymous id",
-    "session": "Label of the session",
-    "phase": "warm-up, optimisation, repeat, validation or aggregate-best",
-    "material": "Reference material",
-    "trial": "Number of the trial, counted within participant, session, phase and material",
-    "response": "The participant's answer",
-    "voided": "1 if the answer does not count",
-    "unblinded": "What showed the participant the parameters; empty where nothing did",
-    "status": "answered, undone, void, dropped, left out (by a person, after the device stopped it twice) or pending",
-    "response_time": "Time from the question to the answer, s, by the browser's clock",
-    "answered_at": "Time of the answer, s since 1970, by the server's clock",
-    "set_a": "Parameter set on side a",
-    "set_b": "Parameter set on side b",
-    "first": "The set that was felt first",
-    "class_a": "Answer about set_a",
-    "class_b": "Answer about set_b",
-    "preferred": "The set that was preferred",
-    "set_id": "Name of the parameter set",
-    "source": "aggregate, sysid or individual:PARTICIPANT",
-    "role": "best, mid or worst of the map that the set was read from; empty for others",
-    "memory": "short or full: how the past is rendered",
-    "states": "Number of exponentials of full memory",
-    "voided_reason": f"Why the trial does not count; '{_UNWRITTEN}' for words that a spreadsheet would run",
-    "N": "Number of past samples that are rendered",
-    "T": "Time between two samples, s",
-}
 
 
 def read_sessions(
@@ -152,11 +125,7 @@ def _confirmed(study: AnyStudy, trial: Trial) -> dict[str, float | str]:
     if study.stimulus is None:
         return {}
     shown = {side: in_words(study, values) for side, values in trial.presented.items()}
-    return {_presented(side, p.name): shown[side][p.name] for side in shown for p in study.space.parameters}
-
-
-def _presented(side: str, name: str) -> str:
-    return f"presented_{side}_{name}"
+    return {presented_column(side, p.name): shown[side][p.name] for side in shown for p in study.space.parameters}
 
 
 def sets_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
@@ -216,6 +185,17 @@ def presentations_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
     return _table(rows)
 
 
+def sessions_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
+    """Every session, with the hash of the plan that it was held by; empty where it was held by none."""
+    rows = []
+    for state in sessions:
+        header = state.header
+        phases = ", ".join(dict.fromkeys(block.phase for block in header.blocks))
+        place = {"participant": header.participant, "session": header.session, "phases": phases}
+        rows.append(place | {"plan": _written(header.plan or ""), "seed": header.seed})
+    return pd.DataFrame(rows)
+
+
 def read_log_trials(
     folder: str | os.PathLike,
     study: AnyStudy,
@@ -250,20 +230,22 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> 
         "validation": validation_table(sessions),
         "sets": sets_table(sessions),
         "presentations": presentations_table(sessions),
+        "sessions": sessions_table(sessions),
     }
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
     name = re.sub(r"[^A-Za-z0-9]", "", study.name) or "study"
-    words = _WORDS | _parameter_words(study)
-    written, columns = [], {}
+    written: list[Path] = []
+    columns: dict[str, Any] = {}
     for kind, table in tables.items():
         if table.empty:
             continue
         path = data / f"study-{name}_table-{kind}_data.csv"
         write_trials(table, path)
-        columns |= dict.fromkeys(map(str, table.columns))
         sidecar = path.with_suffix(".json")
+        words = column_words(study, kind)
         here = [_variable(str(column), words) for column in table.columns]
+        columns |= {variable["name"]: variable for variable in here if variable["name"] not in columns}
         sidecar.write_text(
             _json({"description": f"{kind} of {study.name}", "variableMeasured": here}), encoding="utf-8"
         )
@@ -274,25 +256,15 @@ def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> 
         "name": study.name,
         "description": f"Live sessions of {len(sessions)} logs, study {study.hash}, written by hilbo.",
         "schemaVersion": "Psych-DS 0.4.0",
-        "variableMeasured": [_variable(column, words) for column in columns],
+        "variableMeasured": list(columns.values()),
     }
     path = folder / "dataset_description.json"
     path.write_text(_json(description), encoding="utf-8")
     return [*written, path]
 
 
-def _parameter_words(study: AnyStudy) -> dict[str, str]:
-    """What the columns of parameters mean."""
-    words = {}
-    for p in study.space.parameters:
-        kind = p.range_words if p.levels else p.unit or "no unit"
-        words[p.name] = f"Parameter, {kind}"
-        words |= {_presented(side, p.name): f"What was confirmed as presented on side {side}, {kind}" for side in "ab"}
-    return words
-
-
 def _written(text: Any) -> Any:
-    return _UNWRITTEN if isinstance(text, str) and runs_in_a_spreadsheet(text) else text
+    return UNWRITTEN if isinstance(text, str) and runs_in_a_spreadsheet(text) else text
 
 
 def _check_names(state: LiveSession) -> None:

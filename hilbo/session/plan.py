@@ -244,7 +244,7 @@ def check_plan(plan: Mapping[str, Any], study: AnyStudy) -> _Plan:
 
 def reissue(plan: Mapping[str, Any], dropped: str, new: str) -> dict[str, Any]:
     """The plan in which somebody new has the row (order, seed, sets) of a participant who dropped out. A row is given
-    away once. Raises InputError."""
+    away once. `replaces` keeps the hash that logs have. Raises InputError."""
     check_id(new, "plan")
     rows = [row["participant"] for row in plan["participants"]]
     if dropped not in rows or new in rows:

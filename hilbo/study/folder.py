@@ -6,9 +6,9 @@
     sets*.csv         optional: sets tables; a set of source "sysid" is what tables and figures are held against
     truth.csv         optional, of a simulated study: `source` "population" and the parameters that are the truth
     plan.json         optional: the plan of `hilbo plan`, from which the answers may depart
-The folder of `hilbo export` is one: its data/ holds trials, validation and sets by the names of a Psych-DS. A study of
-several materials names them in [materials.NAME] (which overrides the renderer or parameters) or in the tables' column
-`material` alone, when they share everything. Whatever is wrong is one sentence with its file.
+The folder of `hilbo export` is one: its data/ holds trials, validation, sets, and sessions (for the plan) by the names
+of a Psych-DS. A study of several materials names them in [materials.NAME] (which overrides the renderer or parameters)
+or in the tables' column `material` alone, when they share everything. Whatever is wrong is one sentence with its file.
 """
 
 import json
@@ -25,7 +25,7 @@ from hilbo.errors import InputError, InputRemark
 from hilbo.study.cells import numbers, parameter_values, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
-from hilbo.study.departures import departures
+from hilbo.study.departures import PHASE, Held, departures
 from hilbo.study.trial_table import NothingToFitError, check_texts, marked, ordered, read_trials
 from hilbo.study.validation_table import check_validation, sets_frame
 
@@ -84,7 +84,7 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     }
     _check_materials_named(names, tables)
     materials = [_material(name, study, trials, compared, sets, truth) for name in names]
-    departs, as_planned = _departures(folder / "plan.json", study, materials)
+    departs, as_planned = _departures(folder, study, materials)
     limits = (*departs, *_missing_tables(study, materials, compared, sets))
     return StudyFolder(study, materials, sets, limits, as_planned)
 
@@ -246,15 +246,30 @@ def _reference(
     return None, ""
 
 
-def _departures(path: Path, study: Study, materials: list[Material]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """How the answers depart from the folder's plan, and what is as planned; nothing where there is no plan."""
+    path = folder / "plan.json"
     if not path.exists():
         return (), ()
     counts: dict[str, list[int]] = {}
     for material in materials:
         for name, count in zip(material.cohort.names, material.cohort.counts().tolist(), strict=True):
             counts.setdefault(name, []).append(count)
-    return departures(path, study.hash, study.selection.trials, counts)
+    return departures(path, study.hash, study.selection.trials, counts, _held(folder))
+
+
+def _held(folder: Path) -> list[Held] | None:
+    """By which plans the sessions of an export were held; None where there is no table of sessions."""
+    paths = sorted((folder / "data").glob("*_table-sessions_data.csv"))
+    held = []
+    for path in paths:
+        cells = read_cells(path, "a table of sessions needs a header and a session")
+        missing = [name for name in (*Held._fields, "phases") if name not in cells]
+        if missing:
+            raise InputError(f'{path}:1: column "{missing[0]}" is missing; export the logs again.')
+        here = cells[[PHASE in phases.split(", ") for phases in cells["phases"]]]
+        held += [Held(*row) for row in here[list(Held._fields)].itertuples(index=False)]
+    return held if paths else None
 
 
 def _missing_tables(

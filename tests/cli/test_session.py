@@ -294,12 +294,34 @@ def test_a_report_reads_the_folder_of_an_export(hilbo, tmp_path):
     assert material.cohort.names == ("P02",) and len(material.validation) == 6
     assert set(folder.sets.index) == {*"DEF", "measured"} and material.reference_name == "system identification"
     assert any("P01" in sentence for sentence in folder.limits)  # the plan is looked at
+    assert any(
+        sentence.endswith("Held by no plan: P02 (session 1).") for sentence in folder.limits
+    )  # not its comparisons
     (tmp_path / "tables" / "sets.csv").write_text("set_id,source,u,v\nD,sysid,0.3,0.6\n")
     with pytest.raises(InputError, match='the set "D" is in two sets tables; keep one'):
         read_folder(tmp_path / "tables")
     (tmp_path / "fixed.json").write_text("{}")
     code, _, err = hilbo("export", "logs", "--study", "study.toml", "--plan", "fixed.json", "--out", "again")
     assert code == 2 and "plan" in err and not (tmp_path / "again").exists()
+
+
+def test_sessions_of_the_plan_that_is_exported_with_them_depart_from_nothing(hilbo, tmp_path):
+    (tmp_path / "study.toml").write_text(TOML.format(trials=3))
+    study = Study.load("study.toml")
+    assert hilbo("plan", "study.toml", "--names", "P01", "--out", "fixed.json")[0] == 0
+    plan = json.loads((tmp_path / "fixed.json").read_text())
+    logs_of(tmp_path / "logs", study, ["P01"], 3, plan=plan["hash"])
+    code, _, err = hilbo("export", "logs", "--study", "study.toml", "--plan", "fixed.json", "--out", "tables")
+    assert code == 0, err
+    (note,) = read_folder(tmp_path / "tables").notes
+    assert note.endswith("their sessions were held by it.")
+    table = tmp_path / "tables" / "data" / "study-plain_table-sessions_data.csv"
+    table.write_text(table.read_text().replace(plan["hash"], "0" * 16, 1))
+    folder = read_folder(tmp_path / "tables")
+    assert not folder.notes and any(f"P01 (session 1, plan {'0' * 16})" in sentence for sentence in folder.limits)
+    table.write_text("participant,session\nP01,1\n")
+    with pytest.raises(InputError, match=r'sessions_data\.csv:1: column "plan" is missing'):
+        read_folder(tmp_path / "tables")
 
 
 @pytest.mark.deep

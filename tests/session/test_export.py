@@ -80,7 +80,7 @@ def test_the_psych_ds_folder_describes_every_column(folder, tmp_path):
     description = json.loads((tmp_path / "out" / "dataset_description.json").read_text())
     measured = {variable["name"] for variable in description["variableMeasured"]}
     tables = [path for path in written if path.suffix == ".csv"]
-    assert len(tables) == 4
+    assert len(tables) == 5
     for path in tables:
         table = pd.read_csv(path)
         assert set(table.columns) <= measured
@@ -113,7 +113,7 @@ def test_one_participant_is_deleted_from_everything(folder, tmp_path):
     for person in ("P01", "P02", "P03"):
         add_person(people, {"participant": person, "consent_time": "2026-05-04T10:00", "protocol_number": "7"})
     gone = delete_participant(tmp_path, "P02")
-    assert len(gone.removed) == 5 and not (gone.renamed or gone.left)  # list, trials, presentations, netCDF, log
+    assert len(gone.removed) == 6 and not (gone.renamed or gone.left)  # list, three tables, netCDF, log
     assert set(read_people(people)) == {"P01", "P03"}
     for path in tmp_path.rglob("*"):
         if path.suffix in (".csv", ".jsonl"):

@@ -8,9 +8,9 @@ from commands import run
 
 from hilbo.errors import InputError
 from hilbo.population.recipes import RECIPES
-from hilbo.session.plan import make_plan
+from hilbo.session.plan import make_plan, reissue
 from hilbo.session.registration import registration
-from hilbo.study.departures import departures
+from hilbo.study.departures import Held, departures
 from hilbo.study.new_study import NewStudy, parameter_of, study_text
 from hilbo.study.optima import _LOSS
 from hilbo.study.study_file import StudyFile
@@ -106,6 +106,30 @@ def test_departures_from_a_plan(tmp_path):
     for part in ("planned with (0000", "without answers here: P02 (1 of 2)", "Not in the plan", "P09.", "P01 (12, 25)"):
         assert part in text
     assert "P09 (25)" not in text
+
+
+def test_sessions_that_were_held_by_no_plan_or_by_another_are_named(tmp_path):
+    path, study = planned(tmp_path)
+    plan, counts = json.loads(path.read_text()), {"P01": [25], "P02": [25]}
+
+    def said(*plans):
+        sessions = [Held(name, "1", by) for name, by in zip(counts, plans, strict=False)]
+        return departures(path, study, 25, counts, sessions)
+
+    own = plan["hash"]
+    departs, (nothing,) = said(own, own)
+    assert departs == () and nothing.endswith("25 answers each; their sessions were held by it.")
+    assert "by which plan they were held is not said here" in departures(path, study, 25, counts)[1][0]
+    (sentence,), nothing = said(own, "")
+    assert nothing == () and sentence == f"Departs from the plan {own}. Held by no plan: P02 (session 1)."
+    (sentence,), _ = said("0123", own)
+    assert sentence.endswith("Held by another plan: P01 (session 1, plan 0123).")
+    (sentence,), _ = said(own)
+    assert sentence.endswith("does not say by which plan these were held: P02.")
+    twice = reissue(reissue(plan, "P02", "P03"), "P03", "P04")
+    path.write_text(json.dumps(twice))
+    assert twice["replaces"][0] == own and len({*twice["replaces"], twice["hash"]}) == 3
+    assert not any("plan:" in sentence for sentence in said(*twice["replaces"])[0])
 
 
 def test_a_file_that_is_no_plan_is_refused(tmp_path):
