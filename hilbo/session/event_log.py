@@ -211,9 +211,15 @@ def keys_path(log: Path) -> Path:
     return log.with_name(f".{log.name.removesuffix(_SUFFIX)}.keys")
 
 
-def log_paths(folder: str | os.PathLike) -> list[Path]:
-    """The logs in a folder that were begun, in the order of their names."""
-    return [path for path in sorted(Path(folder).glob("*" + _SUFFIX)) if begun(path)]
+def log_paths(folder: str | os.PathLike, note: Callable[[str], Any] = lambda sentence: None) -> list[Path]:
+    """The logs in a folder that were begun, in the order of their names; `note` is told of others."""
+    whole = []
+    for path in sorted(Path(folder).glob("*" + _SUFFIX)):
+        if begun(path):
+            whole.append(path)
+        else:
+            note(f"{path}: has no whole first line, and is left out; {_WHY_CUT}")
+    return whole
 
 
 def _line(seq, kind, at, data, previous) -> bytes:

@@ -50,7 +50,7 @@ def read_sessions(
 
     Raises InputError if there is none, a log is damaged or of another study, or two are of one session.
     """
-    paths = log_paths(folder)
+    paths = log_paths(folder, note)
     if not paths:
         raise InputError(f"{folder}: holds no session logs (*.session.jsonl); check the path.")
     sessions: dict[Path, LiveSession] = {}

@@ -207,6 +207,11 @@ def test_a_log_that_lacks_its_last_newline_is_whole_and_one_cut_off_is_said(fold
     (sentence,) = heard
     last = len(whole.splitlines())
     assert sentence.startswith(f"{path}:{last}: the last line is cut off, and is left out;")
+    heard.clear()
+    path.write_bytes(b"")  # a copy onto a full disk
+    assert set(read_log_trials(folder, STUDY, note=heard.append)["participant"]) == {"P02"}
+    (sentence,) = heard
+    assert sentence.startswith(f"{path}: has no whole first line, and is left out;")
 
 
 def test_two_logs_of_one_session_are_refused_with_both_names(folder):
