@@ -13,6 +13,7 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import in_use, keys_path, read_log
+from hilbo.session.withdrawn_files import Below, files_below, is_closed, remove
 from hilbo.session.withdrawn_names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
@@ -34,7 +35,6 @@ __all__ = ["Withdrawal", "delete_participant"]
 _OPTIONAL = ("trials", "validation", "sets", "truth")  # a report takes none of these rather than one without rows
 _UNREADABLE = "cannot be read; if it holds their answers, delete it"
 _PICTURES = (".png", ".jpg", ".jpeg", ".gif")
-_CLOSED = (".zip", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".xlsx", ".xls", ".ods", ".docx", ".doc", ".odt", ".pdf")
 
 
 @dataclass
@@ -63,31 +63,33 @@ def delete_participant(folder: str | os.PathLike, participant: str) -> Withdrawa
         raise InputError("participants delete: give the id of the participant.")
     root = Path(folder)
     done = Withdrawal(participant, f"withdrawn-{secrets.token_hex(3)}")
-    whose, damaged = _logs(root)
+    below = _below(root)
+    whose, damaged = _logs(below.files)
     theirs = [path for path, person in whose.items() if person == participant]
     for path in theirs:
         if in_use(path):
             raise InputError(f"{path}: is being written; end the session first.")
-    for path in [*theirs, *_keys(root, participant, whose)]:
-        path.unlink()
+    for path in [*theirs, *_keys(below.files, participant, whose)]:
+        remove(path)
         done.removed[str(path)] = 1
-    folders = results_folders(root)
+    folders = results_folders(below.files)
     for results in folders:
-        cleared = clear_results(results, participant)
+        cleared = clear_results(results, participant, below.files)
         done.removed |= dict.fromkeys(map(str, cleared.removed), 1)
         done.marked += map(str, cleared.marked)
         done.commands += cleared.commands
-    _tables(root, done)
-    _plans(root, done)
-    changed = {Path(name) for name in (*done.removed, *done.renamed)}
+    _tables(below, done)
+    _plans(below.files, done)
+    changed = _changed(below.links, done)
     for results in folders:
         if (results / LIST).exists():
             relist(results, changed)
-    done.left |= _left(root, participant, whose, damaged)
+    after = files_below(root) if root.exists() else Below([], {}, {})  # results, of which nothing is left
+    done.left = after.left | _left(after.files, participant, whose, damaged) | done.left
     if not (done.removed or done.renamed):
-        also = f"; {len(done.left)} files name them that are not touched, {next(iter(done.left))}" if done.left else ""
+        also = f"; {len(done.left)} places may and are not touched, {_first(done.left)}" if done.left else ""
         raise InputError(f'{folder}: holds nothing of participant "{participant}"{also}; check id and folder.')
-    if coded := _coded(root):
+    if coded := _coded(after.files):
         done.left[str(root)] = (
             f"{len(coded)} files below hold renderings from individuals' maps under codes, theirs perhaps among them;"
             f" the values stay with those who compared them: {', '.join(map(str, coded))}"
@@ -95,10 +97,32 @@ def delete_participant(folder: str | os.PathLike, participant: str) -> Withdrawa
     return done
 
 
-def _logs(root: Path) -> tuple[dict[Path, str], list[Path]]:
+def _first(left: dict[str, str]) -> str:
+    return ": ".join(next(iter(left.items())))
+
+
+def _below(root: Path) -> Below:
+    below = files_below(root)
+    if str(root) in below.left:
+        raise InputError(f"{root}: {below.left[str(root)].partition(';')[0]}; give the folder that holds everything.")
+    return below
+
+
+def _changed(links: dict[Path, Path], done: Withdrawal) -> set[Path]:
+    """All paths at which something changed: also links to files that did. Those to files that went go too."""
+    changed = {Path(name) for name in (*done.removed, *done.renamed)}
+    places = {path.resolve() for path in changed} | {links[path] for path in changed if path in links}
+    for link, place in links.items():
+        if os.path.islink(link) and not os.path.exists(place):
+            link.unlink()
+            done.removed[str(link)] = 1
+    return changed | {link for link, place in links.items() if place in places}
+
+
+def _logs(files: Iterable[Path]) -> tuple[dict[Path, str], list[Path]]:
     """Whose each log is, and the logs that cannot be read."""
     whose, damaged = {}, []
-    for path in sorted(root.rglob("*.session.jsonl")):
+    for path in _ending(files, ".session.jsonl"):
         try:
             whose[path] = read_log(path)[0].participant
         except InputError:
@@ -106,7 +130,7 @@ def _logs(root: Path) -> tuple[dict[Path, str], list[Path]]:
     return whose, damaged
 
 
-def _keys(root: Path, participant: str, whose: dict[Path, str]) -> list[Path]:
+def _keys(files: Iterable[Path], participant: str, whose: dict[Path, str]) -> list[Path]:
     """The files of keys of one participant's sessions: those beside their logs, and those without a log that begin with
     the id (.ID_SESSION.keys, of earlier versions .ID-SESSION.keys), not with a longer one of somebody else."""
     beside = {keys_path(path): person for path, person in whose.items()}
@@ -120,12 +144,14 @@ def _keys(root: Path, participant: str, whose: dict[Path, str]) -> list[Path]:
             return person == participant
         return path.name.startswith(begins) and not path.name.startswith(longer)
 
-    return sorted(path for end in ("*.keys", "*.keys.part") for path in root.rglob(end) if theirs(path))
+    return sorted(path for path in _ending(files, ".keys", ".keys.part") if theirs(path))
 
 
-def _tables(root: Path, done: Withdrawal) -> None:
+def _tables(below: Below, done: Withdrawal) -> None:
     """Their rows of every table; names of their sets that others have compared become nobody's."""
-    paths = sorted(path for end in ("*.csv", "*.parquet") for path in root.rglob(end))
+    paths = _ending(below.files, ".csv", ".parquet")
+    places = set(paths)  # a link to one of these is the same table
+    paths = [path for path in paths if below.links.get(path) not in places]
     tables = {path: table for path in paths if (table := read_table(path)) is not None}
     done.left |= {str(path): _UNREADABLE for path in paths if path.suffix == ".parquet" and path not in tables}
     names, gone_sets = _sets(tables.values(), done.participant, done.label)
@@ -137,10 +163,10 @@ def _tables(root: Path, done: Withdrawal) -> None:
         if edited.table.rows or path.stem.partition("-")[0] not in _OPTIONAL:
             write_table(path, edited)
         else:
-            path.unlink()
+            remove(path)
         done.removed |= {str(path): rows_removed} if rows_removed else {}
         done.renamed |= {str(path): edited.renamed} if edited.renamed else {}
-    for path in sorted(root.rglob("*.nc")):
+    for path in _ending(below.files, ".nc"):
         rows_removed = netcdf_without(path, done.participant)
         if rows_removed is None:
             done.left[str(path)] = _UNREADABLE
@@ -162,16 +188,16 @@ def _sets(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[s
     return names, (theirs | set(names)) - compared
 
 
-def _plans(root: Path, done: Withdrawal) -> None:
-    for path in sorted(root.rglob("*.json")):
+def _plans(files: Iterable[Path], done: Withdrawal) -> None:
+    for path in _ending(files, ".json"):
         if path.name != LIST and plan_without(path, done.participant, done.label):
             done.renamed[str(path)] = 1
 
 
-def _coded(root: Path) -> list[Path]:
+def _coded(files: Iterable[Path]) -> list[Path]:
     """The files with renderings of individuals' maps that others compare under codes."""
     coded = []
-    for path in sorted(path for end in ("*.csv", "*.parquet", "*.json", "*.jsonl") for path in root.rglob(end)):
+    for path in _ending(files, ".csv", ".parquet", ".json", ".jsonl"):
         if path.suffix in (".csv", ".parquet"):
             table = read_table(path)
             holds = table is not None and any(CODED_JUDGED.search(name) for name in named_sets(table))
@@ -181,11 +207,15 @@ def _coded(root: Path) -> list[Path]:
     return coded
 
 
-def _left(root: Path, participant: str, whose: dict[Path, str], damaged: Iterable[Path]) -> dict[str, str]:
+def _ending(files: Iterable[Path], *ends: str) -> list[Path]:
+    return [path for path in files if path.name.endswith(ends)]
+
+
+def _left(files: list[Path], participant: str, whose: dict[Path, str], damaged: Iterable[Path]) -> dict[str, str]:
     """The files that still name somebody, and why they stay."""
     left = {str(path): "is a log that cannot be read; if it is theirs, delete it" for path in damaged if path.exists()}
-    ours = {folder / name for folder in results_folders(root) for name in listed(folder).files}
-    for path in sorted(path for path in root.rglob("*") if path.is_file() and str(path) not in left):
+    ours = {folder / name for folder in results_folders(files) for name in listed(folder).files}
+    for path in (path for path in files if str(path) not in left):
         if path in whose:
             if file_names(path, participant):
                 left[str(path)] = (
@@ -193,7 +223,7 @@ def _left(root: Path, participant: str, whose: dict[Path, str], damaged: Iterabl
                 )
         elif path not in ours and file_is_called_after(path, participant):
             left[str(path)] = "is called after them and is no file that hilbo changes; look at it yourself"
-        elif path.suffix.lower() in _CLOSED:
+        elif is_closed(path):
             if path not in ours:
                 left[str(path)] = "cannot be searched; if it holds anything of theirs, delete it"
         elif path.suffix.lower() not in _PICTURES and file_names(path, participant):

@@ -6,16 +6,19 @@ nobody and may hold their answers (of `hilbo validate`, or of earlier versions w
 by a file beside them.
 """
 
+import contextlib
 import json
+import os
 import re
 import shlex
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
 from hilbo.session.plan import plan_hash
+from hilbo.session.withdrawn_files import remove
 from hilbo.session.withdrawn_names import file_names, renamed_set
 from hilbo.session.withdrawn_tables import replace_file
 from hilbo.study.results_list import LIST, Listed, digest, listed, write_list
@@ -38,16 +41,18 @@ class Cleared(NamedTuple):
     commands: list[str]
 
 
-def results_folders(root: Path) -> list[Path]:
-    """The results folders below a folder, the folder itself among them."""
-    return sorted(path.parent for path in root.rglob(LIST))
+def results_folders(files: Iterable[Path]) -> list[Path]:
+    """The results folders among whose files these are."""
+    return sorted(path.parent for path in files if path.name == LIST)
 
 
-def clear_results(folder: Path, participant: str) -> Cleared:
-    """Take away, or mark, what was computed from somebody's answers; the folder's list and command say so."""
-    results = listed(folder)
+def clear_results(folder: Path, participant: str, files: Collection[Path]) -> Cleared:
+    """Take away, or mark, what was computed from somebody's answers; the folder's list and command say so.
+
+    `files`: those that may be touched."""
+    results, files = listed(folder), set(files)
     parts = {
-        part: [path for name in names if not _is_kept(results, name) and (path := folder / name).is_file()]
+        part: [path for name in names if not _is_kept(results, name) and (path := folder / name) in files]
         for part, names in _parts(results).items()
     }
     named = [part for part, paths in parts.items() if any(_names(path, participant) for path in paths)]
@@ -56,9 +61,9 @@ def clear_results(folder: Path, participant: str) -> Cleared:
     removed = [path for part in named for path in parts[part]]
     marked = [part for part, paths in parts.items() if paths and part not in named and _may_hold(results)]
     for path in removed:
-        path.unlink()
+        remove(path)
     again = command_without(results.command, participant)
-    stays = any(path.name != LIST for path in folder.rglob("*") if path.is_file())
+    stays = any(path.name != LIST and path.is_file() for path in files if folder in path.parents)
     forced = f"{again} --force" if again and stays and "--force" not in again.split() else again
     commands = {part: _command(folder / part, results, forced) for part in [*named, *marked] if parts[part]}
     for part in marked:
@@ -112,11 +117,11 @@ def _names(path: Path, participant: str) -> bool:
 
 def _remove_empty(folder: Path) -> None:
     """Folders in which nothing but the list is left go too."""
-    for path in sorted((path for path in folder.rglob("*") if path.is_dir()), reverse=True):
-        if not any(path.iterdir()):
-            path.rmdir()
-    if [path.name for path in folder.iterdir()] == [LIST]:
-        (folder / LIST).unlink()
+    for place, _, _ in os.walk(folder, topdown=False):
+        with contextlib.suppress(OSError):  # one that holds something
+            os.rmdir(place)
+    if os.listdir(folder) == [LIST]:
+        remove(folder / LIST)
         folder.rmdir()
 
 
@@ -185,9 +190,10 @@ def plan_without(path: Path, participant: str, label: str) -> bool:
     ]
     plan["replaces"] = [*plan.get("replaces", []), plan["hash"]]
     plan["hash"] = plan_hash(plan) if whole else plan["hash"]
-    new_file = path.with_name(f".{path.name}-new")
+    place = path.resolve()
+    new_file = place.with_name(f".{place.name}-new")
     new_file.write_text(json.dumps(plan, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    replace_file(path, new_file)
+    replace_file(place, new_file)
     return True
 
 

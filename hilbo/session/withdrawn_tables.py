@@ -140,8 +140,9 @@ def _renamed(cell: str, column: str, names: Mapping[str, str]) -> str:
 
 
 def write_table(path: Path, edited: Edited) -> None:
-    """Write a table anew, whole or not at all."""
-    handle, new_file = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    """Write a table anew, whole or not at all; where the path is a link, in the place that it leads to."""
+    place = path.resolve()
+    handle, new_file = tempfile.mkstemp(dir=place.parent, prefix=f".{path.stem}-", suffix=path.suffix)
     with open(handle, "w", newline="", encoding="utf-8") as file:
         if path.suffix != ".parquet":
             writer = csv.writer(file, delimiter=edited.table.delimiter, lineterminator="\n")
@@ -150,7 +151,7 @@ def write_table(path: Path, edited: Edited) -> None:
         os.fsync(file.fileno())
     if path.suffix == ".parquet":
         _parquet(path, edited).to_parquet(new_file, index=False)
-    replace_file(path, Path(new_file))
+    replace_file(place, Path(new_file))
 
 
 def _parquet(path: Path, edited: Edited):
@@ -186,10 +187,11 @@ def netcdf_without(path: Path, participant: str) -> int | None:
         tree = xr.DataTree.from_dict(
             {name: group.isel(kept_in[name]).drop_encoding() for name, group in groups.items()}
         )
-        new_file = path.with_name(f".{path.name}-new")
+        place = path.resolve()
+        new_file = place.with_name(f".{place.name}-new")
         try:
             tree.to_netcdf(new_file, engine="h5netcdf")
-            replace_file(path, new_file)
+            replace_file(place, new_file)
         finally:
             new_file.unlink(missing_ok=True)
     return removed
