@@ -125,11 +125,18 @@ def delete(
     yes: Annotated[bool, typer.Option("--yes", help="Do it; without, nothing is touched.")] = False,
 ) -> None:
     """Remove one participant who withdraws from everything below a folder, and say all that was done and left."""
-    from hilbo.session.withdrawal import delete_participant
+    from hilbo.session.withdrawal import Withdrawal, delete_participant
 
     if not yes:
         raise InputError(f"this removes everything of participant {participant} below {folder}; add --yes to do it.")
-    done = delete_participant(folder, participant)
+    done = Withdrawal(participant)
+    try:
+        delete_participant(folder, participant, done)
+    finally:  # also of a withdrawal that an error ends
+        _say_done(done)
+
+
+def _say_done(done) -> None:
     for path, count in done.removed.items():
         typer.echo(f"{path}: {count} removed", err=True)
     for path, count in done.renamed.items():

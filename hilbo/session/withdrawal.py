@@ -5,6 +5,7 @@ else, which is chained and theirs, even where it names a set of the one who with
 are listed. The study goes on: every command still runs on what is left.
 """
 
+import contextlib
 import os
 import secrets
 from collections.abc import Iterable
@@ -12,8 +13,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilbo.errors import InputError
+<<<<<<< HEAD
 from hilbo.session.event_log import in_use, keys_path, read_log
 from hilbo.session.withdrawn_files import Below, files_below, is_closed, remove
+=======
+from hilbo.session.event_log import in_use, read_log
+from hilbo.session.withdrawn_files import Below, files_below, is_closed, refusals, remove
+>>>>>>> 752ef03 (A withdrawal goes on where a file is refused, and always says what it did)
 from hilbo.session.withdrawn_names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
@@ -42,7 +48,7 @@ class Withdrawal:
     """What a withdrawal did, and what it left."""
 
     participant: str
-    label: str
+    label: str = field(default_factory=lambda: f"withdrawn-{secrets.token_hex(3)}")
     """What stands in the place of the id where something of theirs stays as nobody's."""
     removed: dict[str, int] = field(default_factory=dict)
     """File -> rows that went, or 1 for the whole file."""
@@ -56,19 +62,22 @@ class Withdrawal:
     """File that still names them, or may -> why it stays."""
 
 
-def delete_participant(folder: str | os.PathLike, participant: str) -> Withdrawal:
+def delete_participant(folder: str | os.PathLike, participant: str, done: Withdrawal | None = None) -> Withdrawal:
     """Remove one participant from everything below a folder. Raises InputError if nothing of theirs is there, or one of
-    their sessions is running."""
+    their sessions is running.
+
+    `done` is filled on the way, so that who gave it can say what was done if something unforeseen ends it."""
     if not participant.strip():
         raise InputError("participants delete: give the id of the participant.")
     root = Path(folder)
-    done = Withdrawal(participant, f"withdrawn-{secrets.token_hex(3)}")
+    done = Withdrawal(participant) if done is None else done
     below = _below(root)
     whose, damaged = _logs(below.files)
     theirs = [path for path, person in whose.items() if person == participant]
     for path in theirs:
         if in_use(path):
             raise InputError(f"{path}: is being written; end the session first.")
+<<<<<<< HEAD
     for path in [*theirs, *_keys(below.files, participant, whose)]:
         remove(path)
         done.removed[str(path)] = 1
@@ -78,27 +87,25 @@ def delete_participant(folder: str | os.PathLike, participant: str) -> Withdrawa
         done.removed |= dict.fromkeys(map(str, cleared.removed), 1)
         done.marked += map(str, cleared.marked)
         done.commands += cleared.commands
+=======
+    done.left |= below.left
+    _remove([*theirs, *_keys(below.files, participant, set(whose.values()))], done)
+    _results(below.files, done)
+>>>>>>> 752ef03 (A withdrawal goes on where a file is refused, and always says what it did)
     _tables(below, done)
     _plans(below.files, done)
-    changed = _changed(below.links, done)
-    for results in folders:
-        if (results / LIST).exists():
-            relist(results, changed)
+    _lists(below, done)
     after = files_below(root) if root.exists() else Below([], {}, {})  # results, of which nothing is left
-    done.left = after.left | _left(after.files, participant, whose, damaged) | done.left
+    done.left |= after.left | _left(after.files, participant, whose, damaged) | done.left
     if not (done.removed or done.renamed):
-        also = f"; {len(done.left)} places may and are not touched, {_first(done.left)}" if done.left else ""
-        raise InputError(f'{folder}: holds nothing of participant "{participant}"{also}; check id and folder.')
+        also = f"; look at what is LEFT ({', '.join([*done.left][:3])})" if done.left else ""
+        raise InputError(f'{folder}: nothing of participant "{participant}" was removed{also}; check id and folder.')
     if coded := _coded(after.files):
         done.left[str(root)] = (
             f"{len(coded)} files below hold renderings from individuals' maps under codes, theirs perhaps among them;"
             f" the values stay with those who compared them: {', '.join(map(str, coded))}"
         )
     return done
-
-
-def _first(left: dict[str, str]) -> str:
-    return ": ".join(next(iter(left.items())))
 
 
 def _below(root: Path) -> Below:
@@ -108,15 +115,40 @@ def _below(root: Path) -> Below:
     return below
 
 
+def _results(files: list[Path], done: Withdrawal) -> None:
+    """What was computed from their answers goes, or is marked."""
+    for folder in results_folders(files):
+        cleared = clear_results(folder, done.participant, files)
+        done.removed |= dict.fromkeys(map(str, cleared.removed), 1)
+        done.marked += map(str, cleared.marked)
+        done.commands += cleared.commands
+        done.left |= cleared.left
+
+
+def _lists(below: Below, done: Withdrawal) -> None:
+    """Bring the lists of results folders up to date."""
+    changed = _changed(below.links, done)
+    for folder in results_folders(below.files):
+        with refusals(folder / LIST, done.left):
+            if (folder / LIST).exists():
+                relist(folder, changed)
+
+
 def _changed(links: dict[Path, Path], done: Withdrawal) -> set[Path]:
     """All paths at which something changed: also links to files that did. Those to files that went go too."""
     changed = {Path(name) for name in (*done.removed, *done.renamed)}
     places = {path.resolve() for path in changed} | {links[path] for path in changed if path in links}
     for link, place in links.items():
         if os.path.islink(link) and not os.path.exists(place):
-            link.unlink()
-            done.removed[str(link)] = 1
+            _remove([link], done)
     return changed | {link for link, place in links.items() if place in places}
+
+
+def _remove(paths: Iterable[Path], done: Withdrawal) -> None:
+    for path in paths:
+        with refusals(path, done.left):
+            remove(path)
+            done.removed[str(path)] = 1
 
 
 def _logs(files: Iterable[Path]) -> tuple[dict[Path, str], list[Path]]:
@@ -160,18 +192,20 @@ def _tables(below: Below, done: Withdrawal) -> None:
         rows_removed = len(table.rows) - len(edited.kept)
         if not (rows_removed or edited.renamed):
             continue
-        if edited.table.rows or path.stem.partition("-")[0] not in _OPTIONAL:
-            write_table(path, edited)
-        else:
-            remove(path)
-        done.removed |= {str(path): rows_removed} if rows_removed else {}
-        done.renamed |= {str(path): edited.renamed} if edited.renamed else {}
+        with refusals(path, done.left):
+            if edited.table.rows or path.stem.partition("-")[0] not in _OPTIONAL:
+                write_table(path, edited)
+            else:
+                remove(path)
+            done.removed |= {str(path): rows_removed} if rows_removed else {}
+            done.renamed |= {str(path): edited.renamed} if edited.renamed else {}
     for path in _ending(below.files, ".nc"):
-        rows_removed = netcdf_without(path, done.participant)
-        if rows_removed is None:
-            done.left[str(path)] = _UNREADABLE
-        elif rows_removed:
-            done.removed[str(path)] = rows_removed
+        with refusals(path, done.left):
+            rows_removed = netcdf_without(path, done.participant)
+            if rows_removed is None:
+                done.left[str(path)] = _UNREADABLE
+            elif rows_removed:
+                done.removed[str(path)] = rows_removed
 
 
 def _sets(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[str, str], set[str]]:
@@ -190,21 +224,23 @@ def _sets(tables: Iterable[Cells], participant: str, label: str) -> tuple[dict[s
 
 def _plans(files: Iterable[Path], done: Withdrawal) -> None:
     for path in _ending(files, ".json"):
-        if path.name != LIST and plan_without(path, done.participant, done.label):
-            done.renamed[str(path)] = 1
+        with refusals(path, done.left):
+            if path.name != LIST and plan_without(path, done.participant, done.label):
+                done.renamed[str(path)] = 1
 
 
 def _coded(files: Iterable[Path]) -> list[Path]:
     """The files with renderings of individuals' maps that others compare under codes."""
-    coded = []
-    for path in _ending(files, ".csv", ".parquet", ".json", ".jsonl"):
+
+    def holds(path: Path) -> bool:
         if path.suffix in (".csv", ".parquet"):
             table = read_table(path)
-            holds = table is not None and any(CODED_JUDGED.search(name) for name in named_sets(table))
-        else:
-            holds = CODED_JUDGED.search(path.read_text(encoding="utf-8", errors="replace")) is not None
-        coded += [path] if holds else []
-    return coded
+            return table is not None and any(CODED_JUDGED.search(name) for name in named_sets(table))
+        with contextlib.suppress(OSError):  # listed already
+            return CODED_JUDGED.search(path.read_text(encoding="utf-8", errors="replace")) is not None
+        return False
+
+    return [path for path in _ending(files, ".csv", ".parquet", ".json", ".jsonl") if holds(path)]
 
 
 def _ending(files: Iterable[Path], *ends: str) -> list[Path]:
@@ -213,19 +249,28 @@ def _ending(files: Iterable[Path], *ends: str) -> list[Path]:
 
 def _left(files: list[Path], participant: str, whose: dict[Path, str], damaged: Iterable[Path]) -> dict[str, str]:
     """The files that still name somebody, and why they stay."""
-    left = {str(path): "is a log that cannot be read; if it is theirs, delete it" for path in damaged if path.exists()}
+    left = {str(path): "is a log that cannot be read; if it is theirs, delete it" for path in damaged if path in files}
     ours = {folder / name for folder in results_folders(files) for name in listed(folder).files}
     for path in (path for path in files if str(path) not in left):
         if path in whose:
-            if file_names(path, participant):
-                left[str(path)] = (
-                    f"is the log of {whose[path]} and names a set of theirs; it is chained, and stays as it is"
-                )
-        elif path not in ours and file_is_called_after(path, participant):
-            left[str(path)] = "is called after them and is no file that hilbo changes; look at it yourself"
-        elif is_closed(path):
-            if path not in ours:
-                left[str(path)] = "cannot be searched; if it holds anything of theirs, delete it"
-        elif path.suffix.lower() not in _PICTURES and file_names(path, participant):
-            left[str(path)] = "names them and is no file that hilbo changes; look at it yourself"
+            named = file_names(path, participant)
+            why = f"is the log of {whose[path]} and names a set of theirs; it is chained, and stays as it is"
+            left |= {str(path): why} if named else {}
+        elif why := _why_left(path, participant, path in ours):
+            left[str(path)] = why
     return left
+
+
+def _why_left(path: Path, participant: str, ours: bool) -> str:
+    """Why a file that is no log is to be looked at; empty if it is not. `ours`: a file of results."""
+    if not ours and file_is_called_after(path, participant):
+        return "is called after them and is no file that hilbo changes; look at it yourself"
+    try:
+        closed = is_closed(path)
+    except OSError as error:
+        return f"cannot be read ({error.strerror}); if it holds anything of theirs, delete it"
+    if closed:
+        return "" if ours else "cannot be searched; if it holds anything of theirs, delete it"
+    if path.suffix.lower() not in _PICTURES and file_names(path, participant):
+        return "names them and is no file that hilbo changes; look at it yourself"
+    return ""

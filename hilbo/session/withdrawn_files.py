@@ -4,12 +4,14 @@ Links are followed within the folder and not out of it: what lies elsewhere may 
 looked into is never passed over in silence; each has its reason.
 """
 
+import contextlib
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["Below", "files_below", "is_closed", "remove"]
+__all__ = ["Below", "files_below", "is_closed", "refusals", "remove"]
 
 _CLOSED = (".zip", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".xlsx", ".xls", ".ods", ".docx", ".doc", ".odt", ".pdf")
 # How files begin in which a text cannot be found: archives, office files (zip, OLE), compressed data of statistics.
@@ -71,6 +73,15 @@ def _sort_in(path: Path, inside: Path, below: Below) -> None:
         below.files.append(path)
         if linked:
             below.links[path] = place
+
+
+@contextlib.contextmanager
+def refusals(path: Path, left: dict[str, str]) -> Iterator[None]:
+    """What the system refuses about one file is listed, and the rest of a withdrawal goes on."""
+    try:
+        yield
+    except OSError as error:
+        left[str(path)] = f"could not be changed ({error.strerror or error}); if it holds anything of theirs, delete it"
 
 
 def remove(path: Path) -> None:

@@ -11,14 +11,14 @@ import json
 import os
 import re
 import shlex
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
 from hilbo.session.plan import plan_hash
-from hilbo.session.withdrawn_files import remove
+from hilbo.session.withdrawn_files import refusals, remove
 from hilbo.session.withdrawn_names import file_names, renamed_set
 from hilbo.session.withdrawn_tables import replace_file
 from hilbo.study.results_list import LIST, Listed, digest, listed, write_list
@@ -34,11 +34,13 @@ _COUNT_PEOPLE = ("plan", "simulate", "power")  # commands whose --participants i
 
 
 class Cleared(NamedTuple):
-    """What became of results: files that went, files that were made, commands that make results again."""
+    """What became of results: files that went, files that were made, commands that make results again, and what was
+    refused, file -> why."""
 
     removed: list[Path]
     marked: list[Path]
     commands: list[str]
+    left: dict[str, str]
 
 
 def results_folders(files: Iterable[Path]) -> list[Path]:
@@ -58,21 +60,40 @@ def clear_results(folder: Path, participant: str, files: Collection[Path]) -> Cl
     named = [part for part, paths in parts.items() if any(_names(path, participant) for path in paths)]
     if named and "" in parts and "result.json" not in results.files:
         named = list(dict.fromkeys([*named, ""]))  # what lies above several results was made of all of them
-    removed = [path for part in named for path in parts[part]]
     marked = [part for part, paths in parts.items() if paths and part not in named and _may_hold(results)]
-    for path in removed:
-        remove(path)
+    left: dict[str, str] = {}
+    removed = _removed([path for part in named for path in parts[part]], left)
     again = command_without(results.command, participant)
     stays = any(path.name != LIST and path.is_file() for path in files if folder in path.parents)
     forced = f"{again} --force" if again and stays and "--force" not in again.split() else again
     commands = {part: _command(folder / part, results, forced) for part in [*named, *marked] if parts[part]}
-    for part in marked:
-        (folder / part / MARK).write_text(_marked(commands[part]), encoding="utf-8")
+    marks = _write_marks({folder / part / MARK: commands[part] for part in marked}, left)
     if removed or marked or again != results.command:
-        _list_again(folder, results, {folder / part / MARK for part in marked}, again)
-        _remove_empty(folder)
+        with refusals(folder / LIST, left):
+            _list_again(folder, results, set(marks), again)
+            _remove_empty(folder)
     given = [command for command in dict.fromkeys(commands.values()) if command]
-    return Cleared(removed, [folder / part / MARK for part in marked], given)
+    return Cleared(removed, marks, given, left)
+
+
+def _removed(paths: Iterable[Path], left: dict[str, str]) -> list[Path]:
+    """Remove files; those that went."""
+    removed = []
+    for path in paths:
+        with refusals(path, left):
+            remove(path)
+            removed.append(path)
+    return removed
+
+
+def _write_marks(marks: Mapping[Path, str], left: dict[str, str]) -> list[Path]:
+    """Write files that say how results beside them are made again; those that could be written."""
+    written = []
+    for path, command in marks.items():
+        with refusals(path, left):
+            path.write_text(_marked(command), encoding="utf-8")
+            written.append(path)
+    return written
 
 
 def _list_again(folder: Path, results: Listed, marks: set[Path], command: str) -> None:

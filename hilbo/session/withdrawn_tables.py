@@ -143,15 +143,18 @@ def write_table(path: Path, edited: Edited) -> None:
     """Write a table anew, whole or not at all; where the path is a link, in the place that it leads to."""
     place = path.resolve()
     handle, new_file = tempfile.mkstemp(dir=place.parent, prefix=f".{path.stem}-", suffix=path.suffix)
-    with open(handle, "w", newline="", encoding="utf-8") as file:
-        if path.suffix != ".parquet":
-            writer = csv.writer(file, delimiter=edited.table.delimiter, lineterminator="\n")
-            writer.writerows([edited.table.head, *edited.table.rows])
-        file.flush()
-        os.fsync(file.fileno())
-    if path.suffix == ".parquet":
-        _parquet(path, edited).to_parquet(new_file, index=False)
-    replace_file(place, Path(new_file))
+    try:
+        with open(handle, "w", newline="", encoding="utf-8") as file:
+            if path.suffix != ".parquet":
+                writer = csv.writer(file, delimiter=edited.table.delimiter, lineterminator="\n")
+                writer.writerows([edited.table.head, *edited.table.rows])
+            file.flush()
+            os.fsync(file.fileno())
+        if path.suffix == ".parquet":
+            _parquet(path, edited).to_parquet(new_file, index=False)
+        replace_file(place, Path(new_file))
+    finally:
+        Path(new_file).unlink(missing_ok=True)
 
 
 def _parquet(path: Path, edited: Edited):

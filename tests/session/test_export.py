@@ -176,8 +176,7 @@ def test_a_deletion_that_cannot_be_ended_begins_with_the_logs(folder, monkeypatc
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", full)
-    with pytest.raises(OSError, match="space"):
-        delete_participant(tmp_path, "P02")
+    assert "No space left" in delete_participant(tmp_path, "P02").left[str(people)]
     assert not list(folder.glob("P02*"))
     monkeypatch.setattr(os, "replace", real)
     assert delete_participant(tmp_path, "P02").removed == {str(people): 1}

@@ -12,6 +12,7 @@ import pytest
 from commands import run
 
 from hilbo.errors import InputError
+from hilbo.session import withdrawal
 from hilbo.session.withdrawal import delete_participant
 from hilbo.study.results_list import list_files
 
@@ -109,4 +110,55 @@ def test_where_nothing_is_found_what_was_not_searched_is_named(study, capsys, mo
     (study / "logs").symlink_to("../real")
     (study / "trials.csv").unlink()
     code, _, err = run(capsys, monkeypatch, "participants", "delete", study, "P01", "--yes")
-    assert code == 2 and f"{study / 'logs'}: is a link to {study.parent / 'real'}" in err
+    assert code == 2 and f"{study / 'logs'}: LEFT; is a link to {study.parent / 'real'}" in err
+
+
+def refusing(monkeypatch, owner, name, place):
+    """Let the system refuse one function one file."""
+    real = getattr(owner, name)
+
+    def refused(path, *arguments, **options):
+        if place in [Path(str(given)).name for given in (path, *arguments[:1])]:
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path, *arguments, **options)
+
+    monkeypatch.setattr(owner, name, refused)
+
+
+def test_what_cannot_be_read_is_listed_and_the_rest_is_done(study, capsys, monkeypatch):
+    (study / ".#plan.json").symlink_to("me@there.123:456")
+    (study / "others.json").write_text("{}")
+    refusing(monkeypatch, Path, "open", "others.json")
+    refusing(monkeypatch, Path, "read_bytes", "others.json")
+    code, _, err = run(capsys, monkeypatch, "participants", "delete", study, "P01", "--yes")
+    lines = {line.partition(": ")[0]: line for line in err.splitlines()}
+    assert code == 0 and set(lines) == {str(study / name) for name in (".#plan.json", "others.json", "trials.csv")}
+    assert "LEFT; is a link to what cannot be opened" in lines[str(study / ".#plan.json")]
+    assert "LEFT; cannot be read (Permission denied)" in lines[str(study / "others.json")]
+
+
+def test_what_cannot_be_changed_is_listed_and_the_rest_is_done(study, monkeypatch):
+    (study / ".P01-1.keys").write_text("{}")
+    (study / "fixed.csv").write_text(TABLE)
+    (study / "map").mkdir()
+    for name in ("result.json", "report.html"):
+        (study / "map" / name).write_text('{"participants": [{"participant": "P01"}]}')
+    list_files(study / "map", "hilbo aggregate trials.csv")
+    refusing(monkeypatch, Path, "unlink", ".P01-1.keys")
+    refusing(monkeypatch, Path, "unlink", "report.html")
+    refusing(monkeypatch, os, "replace", "fixed.csv")
+    done = delete_participant(study, "P01")
+    assert set(done.removed) == {str(study / name) for name in ("trials.csv", "map/result.json")} and done.commands
+    assert set(done.left) == {str(study / name) for name in (".P01-1.keys", "fixed.csv", "map/report.html")}
+    assert all("could not be changed (Permission denied)" in why for why in done.left.values())
+    assert (study / "fixed.csv").read_text() == TABLE
+    assert sorted(path.name for path in study.iterdir()) == [".P01-1.keys", "fixed.csv", "map", "trials.csv"]
+
+
+def test_a_withdrawal_that_an_error_ends_says_what_it_did(study, capsys, monkeypatch):
+    def broken(*_):
+        raise RuntimeError("of a library")
+
+    monkeypatch.setattr(withdrawal, "_plans", broken)
+    code, _, err = run(capsys, monkeypatch, "participants", "delete", study, "P01", "--yes")
+    assert code == 1 and f"{study / 'trials.csv'}: 1 removed\n" in err and "of a library" in err
