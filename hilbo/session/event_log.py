@@ -24,6 +24,7 @@ from typing import Any
 import msgspec
 
 from hilbo.errors import InputError
+from hilbo.session.file_lock import lock
 from hilbo.session.header_check import check_new_header
 from hilbo.session.records import Event, Header
 from hilbo.session.replay import replayed
@@ -90,7 +91,7 @@ class EventLog:
             raise InputError(f"{path}: cannot be written ({error.strerror}); choose another folder.") from error
         log = cls(path, file, state, b"", 0, "")
         try:
-            _lock(file, path)
+            lock(file, path)
             if not _unbegun(_content(file)):
                 raise InputError(f"{path}: exists already; resume it, or choose another session.")
             _cut(file, 0)
@@ -112,7 +113,7 @@ class EventLog:
         except OSError as error:
             raise InputError(f"{path}: cannot be opened ({error.strerror}); check the path.") from error
         try:
-            _lock(file, path)
+            lock(file, path)
             content = _content(file)
             header, events, lines, dropped = _parsed(content, path)
             state = _folded(path, study, header, events)
@@ -191,7 +192,7 @@ def in_use(path: str | os.PathLike) -> bool:
     """Whether somebody is writing this log."""
     file = os.open(path, os.O_RDWR)
     try:
-        _lock(file, Path(path))
+        lock(file, Path(path))
     except InputError:
         return True
     finally:
@@ -340,18 +341,3 @@ def _content(file) -> bytes:
     while piece := os.read(file, 2**20):
         pieces.append(piece)
     return b"".join(pieces)
-
-
-def _lock(file, path):
-    try:
-        if os.name == "nt":
-            import msvcrt
-
-            os.lseek(file, 2**30, os.SEEK_SET)  # a byte that no log has: readers are not to be locked out
-            msvcrt.locking(file, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined]
-        else:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        raise InputError(f"{path}: is being written by another hilbo; close that one first.") from None

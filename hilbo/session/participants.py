@@ -13,6 +13,7 @@ from itertools import zip_longest
 from pathlib import Path
 
 from hilbo.errors import InputError
+from hilbo.session.file_lock import locked_beside
 from hilbo.study.text_cells import check_id, check_text, csv_rows
 
 __all__ = ["COLUMNS", "add_person", "check_consent", "read_people"]
@@ -57,19 +58,34 @@ def read_people(path: str | os.PathLike) -> People:
 
 
 def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
-    """Add a row, and write the table anew, whole or not at all; with its folder. Raises InputError."""
-    people = read_people(path) if Path(path).exists() else {}
+    """Add a row, and write the table anew, whole or not at all; with its folder. One hilbo after the other, and where
+    the path is a link, in the place that it leads to. Raises InputError."""
     person = {key: str(value).strip() for key, value in row.items()}
     _check_words(person, str(path))
     _check(person, str(path))
-    if person["participant"] in people:
-        raise InputError(f"{path}: participant {person['participant']} stands there already; choose another id.")
-    people[person["participant"]] = person
+    _check_past(person, str(path))
+    place = _place(Path(path))
     try:
-        _write(Path(path), people, _delimiter(path))
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with locked_beside(place):
+            people = read_people(path) if place.exists() else {}
+            if person["participant"] in people:
+                raise InputError(
+                    f"{path}: participant {person['participant']} stands there already; choose another id."
+                )
+            people[person["participant"]] = person
+            _write(place, people, _delimiter(place))
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another place.") from error
     return people
+
+
+def _place(path: Path) -> Path:
+    """Where a list lies. Behind a link it must be there: else a drive that is missing would get a list of its own."""
+    place = Path(os.path.realpath(path))
+    if path.is_symlink() and not place.exists():
+        raise InputError(f"{path}: is a link to {place}, where no list is; connect its drive, or remove the link.")
+    return place
 
 
 def check_consent(people: People, participant: str, protocol_number: str = "") -> dict[str, str]:
@@ -82,6 +98,7 @@ def check_consent(people: People, participant: str, protocol_number: str = "") -
     for column in ("consent_time", "protocol_number"):
         if not row[column]:
             raise InputError(f"participant {participant} has no {column}; no trial may begin before it stands there.")
+    _check_past(row, f"participant {participant}")
     if protocol_number and row["protocol_number"] != protocol_number:
         raise InputError(
             f"participant {participant} agreed to protocol {row['protocol_number']}, the study's is {protocol_number};"
@@ -112,6 +129,15 @@ def _check(row, place):
         raise InputError(f'{place}: handedness is "{row["handedness"]}"; it must be right, left, both, or empty.')
 
 
+def _check_past(row, place):
+    """Nobody has agreed tomorrow; a day is left, since a time without its zone may be of another one."""
+    if not row.get("consent_time"):
+        return
+    consent = datetime.datetime.fromisoformat(row["consent_time"])
+    if consent > datetime.datetime.now(consent.tzinfo) + datetime.timedelta(days=1):
+        raise InputError(f"{place}: consent_time is {row['consent_time']}, which is to come; write when they agreed.")
+
+
 def _delimiter(path) -> str:
     """What stands between the cells of a list that is there already."""
     if not Path(path).exists():
@@ -123,7 +149,6 @@ def _delimiter(path) -> str:
 def _write(path, people, delimiter):
     columns = list(dict.fromkeys((*COLUMNS, *(key for row in people.values() for key in row))))
     rows = [[row.get(column, "") for column in columns] for row in people.values()]
-    path.parent.mkdir(parents=True, exist_ok=True)
     _replace(path, [columns, *rows], delimiter)
 
 
