@@ -81,7 +81,8 @@ def _versions() -> Check:
 
 
 def _disk(folder: Path) -> Check:
-    place = folder if folder.is_dir() else folder.resolve().parent
+    above = (folder, *folder.resolve().parents)
+    place = next((path for path in above if os.path.lexists(path)), folder)  # a session makes what is missing below
     try:
         with tempfile.NamedTemporaryFile(dir=place) as file:
             begun = time.perf_counter()
@@ -205,9 +206,12 @@ def _step(study: Any) -> Check:
     """From an answer to the next point without anything chosen in advance, compiled before."""
     from hilbo.session.ask_tell import Session
 
-    session = Session.start(study, seed=0)
+    steps = min(study.selection.space_filling + 1, study.selection.trials - 1)
+    if not steps:
+        return Check("time of a step", "good", "none to measure: a session has one trial")
+    session, took = Session.start(study, seed=0), 0.0
     session.warm().join()
-    for _ in range(min(study.selection.space_filling + 1, study.selection.trials - 1)):
+    for _ in range(steps):
         begun = time.perf_counter()
         session = session.tell(study.responses[0])
         took = time.perf_counter() - begun

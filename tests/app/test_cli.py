@@ -399,7 +399,8 @@ def test_the_doctor_says_what_to_mend(tmp_path):
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        checks = {check.name: check for check in doctor.checks(DATA, connect, tmp_path / "no" / "where", port)}
+        (tmp_path / "file").write_text("")
+        checks = {check.name: check for check in doctor.checks(DATA, connect, tmp_path / "file", port)}
     assert checks["damping"].level == "bad"
     assert "measure-damping" in checks["damping"].fix
     assert checks["server's port"].level == "bad"

@@ -1,0 +1,37 @@
+"""What `hilbo doctor` says of a folder for logs, and of a study of one trial."""
+
+import tomllib
+
+import pytest
+
+from hilbo.cli import doctor
+from hilbo.study.new_study import NewStudy, parameter_of, study_text
+from hilbo.study.study_file import StudyFile
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "afile").write_text("")
+    (tmp_path / "gone").symlink_to("drive")
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", [".", "nope", "nope/deeper/logs"])
+def test_folders_that_a_session_makes_are_no_fault(folder, name):
+    check = doctor._disk(folder / name)
+    assert check.level == "good" and check.words.startswith(f"{folder}")
+    assert sorted(path.name for path in folder.iterdir()) == ["afile", "gone"]
+
+
+@pytest.mark.parametrize("name", ["afile", "afile/logs", "gone"])
+def test_what_no_session_can_write_to_is_a_fault(folder, name):
+    check = doctor._disk(folder / name)
+    assert check.level == "bad" and check.words.startswith(f"{folder / name.partition('/')[0]}: ") and check.fix
+
+
+def test_a_study_of_one_trial_has_no_step_to_measure():
+    content = tomllib.loads(study_text(NewStudy("x", (parameter_of("a=0:2"),))))
+    content["selection"] = {"trials": 1, "space_filling": 1}
+    study = StudyFile.from_dict(content)
+    assert study.selection.trials == 1
+    assert "none to measure" in doctor._step(study).words
