@@ -13,13 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilbo.errors import InputError
-<<<<<<< HEAD
 from hilbo.session.event_log import in_use, keys_path, read_log
-from hilbo.session.withdrawn_files import Below, files_below, is_closed, remove
-=======
-from hilbo.session.event_log import in_use, read_log
 from hilbo.session.withdrawn_files import Below, files_below, is_closed, refusals, remove
->>>>>>> 752ef03 (A withdrawal goes on where a file is refused, and always says what it did)
 from hilbo.session.withdrawn_names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
 from hilbo.session.withdrawn_tables import (
@@ -77,21 +72,9 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
     for path in theirs:
         if in_use(path):
             raise InputError(f"{path}: is being written; end the session first.")
-<<<<<<< HEAD
-    for path in [*theirs, *_keys(below.files, participant, whose)]:
-        remove(path)
-        done.removed[str(path)] = 1
-    folders = results_folders(below.files)
-    for results in folders:
-        cleared = clear_results(results, participant, below.files)
-        done.removed |= dict.fromkeys(map(str, cleared.removed), 1)
-        done.marked += map(str, cleared.marked)
-        done.commands += cleared.commands
-=======
     done.left |= below.left
-    _remove([*theirs, *_keys(below.files, participant, set(whose.values()))], done)
+    _remove([*theirs, *_keys(below.files, participant, whose)], done)
     _results(below.files, done)
->>>>>>> 752ef03 (A withdrawal goes on where a file is refused, and always says what it did)
     _tables(below, done)
     _plans(below.files, done)
     _lists(below, done)
