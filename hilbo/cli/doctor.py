@@ -204,11 +204,11 @@ def _feasible(study: Any) -> Check:
 
 def _step(study: Any) -> Check:
     """From an answer to the next point without anything chosen in advance, compiled before."""
-    from hilbo.session.ask_tell import Session
-
     steps = min(study.selection.space_filling + 1, study.selection.trials - 1)
     if not steps:
         return Check("time of a step", "good", "none to measure: a session has one trial")
+    from hilbo.session.ask_tell import Session
+
     session, took = Session.start(study, seed=0), 0.0
     session.warm().join()
     for _ in range(steps):

@@ -1,7 +1,5 @@
 """What `hilbo doctor` says of a folder for logs, and of a study of one trial."""
 
-import tomllib
-
 import pytest
 
 from hilbo.cli import doctor
@@ -29,9 +27,9 @@ def test_what_no_session_can_write_to_is_a_fault(folder, name):
     assert check.level == "bad" and check.words.startswith(f"{folder / name.partition('/')[0]}: ") and check.fix
 
 
-def test_a_study_of_one_trial_has_no_step_to_measure():
-    content = tomllib.loads(study_text(NewStudy("x", (parameter_of("a=0:2"),))))
-    content["selection"] = {"trials": 1, "space_filling": 1}
-    study = StudyFile.from_dict(content)
+def test_a_study_of_one_trial_has_no_step_to_measure(tmp_path):
+    path = tmp_path / "study.toml"
+    path.write_text(study_text(NewStudy("x", (parameter_of("a=0:2"),), trials=1)))
+    study = StudyFile.load(path)
     assert study.selection.trials == 1
     assert "none to measure" in doctor._step(study).words
