@@ -6,7 +6,7 @@ The hub makes its parts, and they know no more of it than this: nothing but `com
 import asyncio
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from hilbo.app.rig import Rig
 from hilbo.app.security import Role
@@ -16,6 +16,7 @@ from hilbo.session.state import LiveSession
 __all__ = ["Held", "Leading", "Looking"]
 
 
+@runtime_checkable
 class Leading(Protocol):
     """What leads a session on, the `Runner`: where it is, and what makes it go on."""
 
@@ -57,6 +58,7 @@ class Leading(Protocol):
         ...
 
 
+@runtime_checkable
 class Looking(Protocol):
     """Who looks, the `Watchers`."""
 
@@ -66,6 +68,7 @@ class Looking(Protocol):
         ...
 
 
+@runtime_checkable
 class Held(Protocol):
     """The session. `begun`: the participant has said so, since the server started or the page came back."""
 

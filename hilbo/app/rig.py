@@ -7,7 +7,7 @@ A rig knows nothing of answers. It makes a rendering ready, shows it, rests, sto
 
 import threading
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from hilbo.study.protocols import Show
 
@@ -54,6 +54,7 @@ class MissedError(RuntimeError):
     """What was asked for was not presented: the trial is void."""
 
 
+@runtime_checkable
 class Rig(Protocol):
     """What shows renderings. `notes`: what to tell whoever started it. `simulated`: nothing moves. Whatever fails is a
     RuntimeError with a sentence."""
