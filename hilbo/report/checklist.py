@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.page import number, percent
+from hilbo.session.registration import sought
 from hilbo.study.analysis import Analysis
 
 __all__ = ["Item", "checklist"]
@@ -61,14 +63,13 @@ def _data(analysis):
 
 
 def _model(analysis):
-    gp, learnt = analysis.study.gp, analysis.study.learnt is not None
-    values = f"theta {_each(gp.kernel.theta)}, variance {_each(gp.kernel.variance)}, thresholds"
-    values += f" {_each(gp.likelihood.thresholds)}, noise {_each(gp.likelihood.noise)}"
+    study, gp = analysis.study, analysis.study.gp
+    given = "as the study file states" if study.learnt is None else "learnt from these answers by a fixed recipe"
     return (
-        "Ordinal probit likelihood on a latent Gaussian process with a squared-exponential covariance;"
-        f" {values}, {'learnt from these answers by a fixed recipe' if learnt else 'as the study file states'};"
-        f" people aggregated by the rule {analysis.study.rule}"
-        + (f", with a random effect of {analysis.study.random_effect}." if analysis.aggregate.map.effects else ".")
+        f"Ordinal probit likelihood on a latent Gaussian process with a {covariance_words(gp.kernel)} covariance of the"
+        f" normalised parameters, {formula(gp.kernel)}; thresholds {_each(gp.likelihood.thresholds)}, noise"
+        f" {_each(gp.likelihood.noise)}; all {given}; people aggregated by the rule {study.rule}"
+        + (f", with a random effect of {study.random_effect}." if analysis.aggregate.map.effects else ".")
     )
 
 
@@ -92,8 +93,9 @@ def _posterior(analysis, content):
     best = content["optimum"]
     where = ", ".join(f"{name} {number(value)}" for name, value in best["parameters"].items())
     return (
-        f"Maximum of the population map: {where}; latent score {best['mean']:.2f} ± {best['sd']:.2f} (standard"
-        " deviation); tolerance intervals with bootstrap resamples of the people above."
+        f"The optimum is, among what may be presented, {sought(analysis.study.rule)}: {where}; latent score"
+        f" {best['mean']:.2f} ± {best['sd']:.2f} (standard deviation); tolerance intervals with bootstrap resamples of"
+        " the people above."
     )
 
 

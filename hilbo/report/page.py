@@ -9,6 +9,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
 
 from hilbo.population.recipes import RECIPES
+from hilbo.report.kernel_words import covariance_words, formula
 from hilbo.report.participants import People
 from hilbo.study.config import Study
 
@@ -97,6 +98,7 @@ def _environment() -> Environment:
         "each": _each,
     }
     environment.globals |= {"heads": heads, "zip": zip, "estimate_words": estimate_words}
+    environment.globals |= {"covariance_words": covariance_words, "formula": formula}
     return environment
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from hilbo.study.protocols import Phase, protocol
 from hilbo.study.study_file import StudyFile
 
-__all__ = ["registration", "selection_words"]
+__all__ = ["registration", "selection_words", "sought"]
 
 _OPEN = "**To be written by you.**"
 _ACQUISITIONS = {
@@ -125,6 +125,11 @@ _SOUGHT = {
 """What a rule takes for the optimum, where that is not the map's maximum."""
 
 
+def sought(rule: str) -> str:
+    """What a rule takes for the optimum, among what may be presented."""
+    return _SOUGHT.get(rule, _HIGHEST)
+
+
 def _exclusion(study: StudyFile) -> list[str]:
     rule = study.tables.study.exclude
     if rule:
@@ -140,7 +145,7 @@ def _analysis(study: StudyFile) -> list[str]:
         f"* Population map: {words} (`{rule}`), by hilbo's documentation of that version.",
         *([f"* Random effect of each `{effect}`, where a rule learns the hyperparameters."] if effect else []),
         f"* Model of one person: Gaussian process with an ordinal probit likelihood, {_model(study)}.",
-        f"* Primary result: among the stimuli that may be presented {_SOUGHT.get(rule, _HIGHEST)}, with its predicted"
+        f"* Primary result: among the stimuli that may be presented {sought(rule)}, with its predicted"
         " responses of a new participant.",
         "* Beside it: everybody's own maximum, alternative rules, sensitivity to the hyperparameters, predictive"
         " checks with each participant left out. They are secondary, and no rule is chosen by them.",

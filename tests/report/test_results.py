@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 from studies import answered, plain_study
 
+from hilbo.kernels import Matern32
 from hilbo.report import participants, results
 from hilbo.report.page import results_page
 from hilbo.search.rendering import K0_range, margin_of, set_of
@@ -153,6 +154,13 @@ def test_the_page_says_what_the_optimum_is_by_its_rule(written, rule, sought):
     people = participants.people_of(study, aggregate)
     page = results_page(dataclasses.replace(study, rule=rule), content, {}, people)
     assert sought in " ".join(page.split())
+
+
+def test_the_page_prints_the_covariance_of_its_rule(written):
+    study, aggregate, content, _ = written
+    study = eqx.tree_at(lambda s: s.gp.kernel, study, Matern32(np.full(study.space.dim, 5.5), 2.0))
+    page = " ".join(results_page(study, content, {}, participants.people_of(study, aggregate)).split())
+    assert "Gaussian-process prior of Matérn 3/2 covariance, k(x, x′) = 2 · (1 + s) exp(−s), s² = 6 Σ θᵢ" in page
 
 
 def test_figures_are_png_and_svg(written):
