@@ -25,7 +25,7 @@ from hilbo.report.participants import people_of
 from hilbo.report.result_tables import alternatives_table, convergence_table, table_1, tolerance_table
 from hilbo.report.results import as_json, optima_table, result, save_figures, versions
 from hilbo.report.study_figures import comparison_figures, study_figures
-from hilbo.report.validation import Validated, folder_names, validate
+from hilbo.report.validation import Validated, folder_names, named_warnings, validate
 from hilbo.study.analysis import Analysis, analyse, moved_by_evidence
 from hilbo.study.config import Study
 from hilbo.study.folder import Material, StudyFolder
@@ -107,7 +107,7 @@ def _content(folder: StudyFolder, contents, claims, seed) -> dict[str, Any]:
         "study": folder.study.hash,
         "seed": seed,
         "versions": versions(),
-        "warnings": [w for one in contents.values() for w in one["warnings"]],
+        "warnings": named_warnings(contents),
         "limits": list(folder.limits),
     }
 

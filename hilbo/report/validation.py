@@ -8,7 +8,7 @@ finds the safest; all kinds of error are in the CSV tables.
 """
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,7 @@ __all__ = [
     "Validated",
     "folder_names",
     "materials_of",
+    "named_warnings",
     "p_words",
     "safest",
     "validate",
@@ -229,7 +230,7 @@ def write_validation(
         contents.append(validation_content(validated))
         sections.append(validation_section(validated) | {"figures": pictures})
     content = {"materials": contents, "study": study.hash, "seed": seed, "versions": versions()}
-    content["warnings"] = [w for entry in contents for w in entry["warnings"]]
+    content["warnings"] = named_warnings(dict(zip(names, contents, strict=True)))
     (folder / "result.json").write_text(as_json(content), encoding="utf-8")
     page = rendered("validation.html", study=study, content=content, warnings=[], sections=sections)
     (folder / "report.html").write_text(page, encoding="utf-8")
@@ -242,6 +243,12 @@ def _read(path: Path, study: Study, material: str | None) -> pd.DataFrame:
         return read_validation(path, study.responses, material)
     cells = read_cells(path, "a validation table needs a header and a comparison")
     return check_validation(cells, study.responses, str(path))
+
+
+def named_warnings(contents: Mapping[Any, Mapping[str, Any]]) -> list[str]:
+    """The warnings of the contents of result.json by material; each says of which it is, where there are several."""
+    several = len(contents) > 1
+    return [f"{name}: {text}" if several else text for name, one in contents.items() for text in one["warnings"]]
 
 
 def folder_names(names: Sequence[str | None]) -> dict[str | None, str]:

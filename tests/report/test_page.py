@@ -12,6 +12,7 @@ from hilbo.report import study as study_report
 from hilbo.report.page import _environment, rendered
 from hilbo.report.robustness import robustness_page
 from hilbo.search.rendering import set_of
+from hilbo.study.folder import StudyFolder
 
 VERSIONS = {"hilbo": "1", "python": "3.11"}
 
@@ -68,6 +69,17 @@ def test_the_lead_counts_the_people_of_the_map():
     assert "left out" not in seen[0] and "1 more is left out by the study's rule." in seen[1].replace("&#39;", "'")
     assert "2 more are left out" in seen[2]  # D is on the map of one material
     assert "What 1 participant answered," in words(rendered("study.html", **facts | {"sections": [], "people": 1}))
+
+
+def test_a_warning_says_of_which_material_it_is():
+    """Where a study has several."""
+    folder = StudyFolder(plain_study(1), [], None, ("No sets table.",))
+    gel, foam = {"warnings": ["The optimum lies at an edge."]}, {"warnings": ["A fit failed.", "The map is flat."]}
+    several = study_report._content(folder, {"gel": gel, "foam": foam}, [], 0)
+    assert several["warnings"] == ["gel: The optimum lies at an edge.", "foam: A fit failed.", "foam: The map is flat."]
+    assert several["materials"]["gel"] == gel and several["limits"] == ["No sets table."]
+    for name in ("gel", ""):
+        assert study_report._content(folder, {name: gel}, [], 0)["warnings"] == gel["warnings"]
 
 
 def test_it_says_why_rules_were_not_compared():
