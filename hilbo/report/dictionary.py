@@ -96,7 +96,7 @@ _TOLERANCE = {
     "parameter": ("", "name of the parameter, whose unit the ends have"),
     "low": ("parameter's", "lower end of the tolerance interval"),
     "high": ("parameter's", "upper end"),
-    "low_end": ("", "what ends it there: another answer, the range, or passivity"),
+    "low_end": ("", "what ends it there"),  # and in `_bounds` what that may be
     "high_end": ("", "the same of the upper end"),
     "draws_without": ("share", "bootstrap resamples of the people without an interval"),
 } | {
@@ -116,7 +116,7 @@ _TABLE_1 = {
 _TABLES: dict[str, dict[str, tuple[str, str]]] = {
     "optima": {
         "source": ("", "whose optimum: aggregate, an alternative rule or inference, individual:PARTICIPANT"),
-        "location": ("", "what is to be known of where it lies: an edge, the device's border, an extrapolation"),
+        "location": ("", "what is to be known of where it lies"),
     },
     "table_I": _TABLE_1,
     "convergence": _CONVERGENCE,
@@ -137,19 +137,14 @@ _TABLES: dict[str, dict[str, tuple[str, str]]] = {
     "table_III": _REGRESSION,
     "table_IV": _REGRESSION,
 }
-# What is said otherwise where there is no renderer.
-_BY_OTHERS = {
-    "low_end": ("", "what ends it there: another answer, or the range"),
-    "location": ("", "what is to be known of where it lies: an edge, an extrapolation"),
-}
 
 
 def dictionary(tables: Mapping[str, pd.DataFrame], study: Study) -> pd.DataFrame:
     """A row for each column of the tables: `table`, `column`, `unit`, `meaning`. Raises KeyError for one without."""
     units = {p.name: (p.unit, "value of the parameter") for p in study.space.parameters}
     meanings = {"K0": ("N/mm", "stiffness of the spring, derived from the effective stiffness")} | units
-    others = _BY_OTHERS if study.space.mechanics is None else {}
-    own = {name: columns | {key: others[key] for key in others if key in columns} for name, columns in _TABLES.items()}
+    bounds = _bounds(study)
+    own = {name: columns | {key: bounds[key] for key in bounds if key in columns} for name, columns in _TABLES.items()}
     if "confusion" in tables:  # whose first column has another name where an answer is called as it
         counts = {label: ("comparisons", f'in which the answer was "{label}"') for label in study.responses}
         own["confusion"] = counts | {str(tables["confusion"].columns[0]): _TABLES["confusion"]["set"]}
@@ -160,3 +155,19 @@ def dictionary(tables: Mapping[str, pd.DataFrame], study: Study) -> pd.DataFrame
         for unit, meaning in [(meanings | own[name])[column]]
     ]
     return pd.DataFrame(rows)
+
+
+def _bounds(study: Study) -> dict[str, tuple[str, str]]:
+    """What is said by what the study has: constraints, a renderer, a range of effective damping."""
+    mechanics = study.space.mechanics
+    ends, places = ["another answer", "the range"], ["an edge"]
+    if study.space.constraints:
+        ends, places = [*ends, "a constraint"], [*places, "a constraint"]
+    if mechanics is not None:
+        ends, places = [*ends, "the passive boundary"], [*places, "the device's border"]
+    if mechanics is not None and mechanics.effective_damping is not None:
+        ends, places = [*ends, "the range of effective damping"], [*places, "that of effective damping"]
+    return {
+        "low_end": ("", f"what ends it there: {', '.join(ends[:-1])} or {ends[-1]}"),
+        "location": ("", f"what is to be known of where it lies: {', '.join(places)}, an extrapolation"),
+    }

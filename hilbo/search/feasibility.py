@@ -24,7 +24,17 @@ from hilbo.mechanics.span import Span, span
 from hilbo.search.box import Constraint, Mechanics, Parameter
 from hilbo.search.linear import MARGIN
 
-__all__ = ["SEARCH_MARGIN", "K0_of", "K1_interval", "K1_range", "allowed", "keeps", "largest_K1", "minimum_damping"]
+__all__ = [
+    "SEARCH_MARGIN",
+    "K0_of",
+    "K1_interval",
+    "K1_range",
+    "allowed",
+    "keeps",
+    "largest_K1",
+    "minimum_damping",
+    "passive",
+]
 
 SEARCH_MARGIN = 1e-3
 """The search uses the damping b·(1 - SEARCH_MARGIN)."""
@@ -38,14 +48,21 @@ _Physical = Mapping[str, Real[ArrayLike, "..."]]
 
 def allowed(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
     """Whether parameter sets are passive with the search margin, and damped as asked for."""
-    eps = float(jnp.finfo(jnp.result_type(1.0, *_model_parameters(physical))).eps)
-    passive = minimum_damping(m, physical) <= m.damping * (1 - SEARCH_MARGIN) * (1 + _ROUNDING * eps)
     if m.effective_damping is None:
-        return passive
+        return passive(m, physical)
     low, high = m.effective_damping
     damping = viscoelastic.effective_damping(*_model_parameters(physical), m.N, m.T, memory=m.memory, states=m.states)
-    slack = 4 * _ROUNDING * eps
-    return passive & (low * (1 - slack) <= damping) & (damping <= high * (1 + slack))
+    slack = 4 * _slack(physical)
+    return passive(m, physical) & (low * (1 - slack) <= damping) & (damping <= high * (1 + slack))
+
+
+def passive(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
+    """Whether parameter sets are passive with the search margin."""
+    return minimum_damping(m, physical) <= m.damping * (1 - SEARCH_MARGIN) * (1 + _slack(physical))
+
+
+def _slack(physical: _Physical) -> float:
+    return _ROUNDING * float(jnp.finfo(jnp.result_type(1.0, *_model_parameters(physical))).eps)
 
 
 def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:

@@ -17,7 +17,7 @@ refusing or by hit and run between the walls of constraints.
 
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -32,11 +32,14 @@ from hilbo.numerics.tracing import program
 from hilbo.search import linear
 from hilbo.search.box import Box, Constraint, Mechanics, Parameter
 from hilbo.search.columns import Columns, check_volume, rosenblatt, volume
-from hilbo.search.feasibility import K0_of, allowed, keeps, minimum_damping
+from hilbo.search.feasibility import K0_of, allowed, keeps, minimum_damping, passive
 from hilbo.search.space_filling import HELD, Chunks, latin_chunks, sobol_chunks, spread_out, take, wall_chunks
 from hilbo.search.steps import neighbours, steps_of
 
-__all__ = ["SearchSpace", "share_of_cube"]
+__all__ = ["Bound", "SearchSpace", "share_of_cube"]
+
+Bound = Literal["constraint", "passive boundary", "effective damping"]
+"""What, within the ranges, a rendering may be beyond."""
 
 _ROOMY, _PILOT = 0.02, 4096  # share of the cube, of so many points, from which constrained points are drawn in it
 _CLUSTERED = 200  # points for each of a space-filling design between walls
@@ -180,6 +183,15 @@ class SearchSpace(eqx.Module):
         for constraint in self.constraints:
             inside &= keeps(constraint, self._split(physical))
         return inside
+
+    def broken(self, x: Real[ArrayLike, " d"]) -> Bound | None:
+        """What a point (d,) within the unit cube is beyond; None where it is feasible."""
+        physical = self._split(self.to_physical(_on_device(x)))
+        if not all(keeps(constraint, physical) for constraint in self.constraints):
+            return "constraint"
+        if self.mechanics is None or allowed(self.mechanics, physical):
+            return None
+        return "effective damping" if passive(self.mechanics, physical) else "passive boundary"
 
     def derived(self, physical: Mapping[str, Real[ArrayLike, "..."]]) -> dict[str, Float[Array, "..."]]:
         """What follows from the parameters: K0 (N/mm) with mechanics, nothing without.

@@ -11,7 +11,8 @@ The *tolerance interval* of a parameter is the connected feasible interval throu
 answer is the most probable one of what `predict` is about, a new person's function (paper, section VII-C). Along any
 parameter but K1 the slice stays passive: K1 is held where it is passive, and on the passive boundary where it is not,
 the closest passive point; along K1 the interval ends, one-sided, where the boundary cuts it. Each end says what it is:
-another answer, the passive boundary, or the range.
+another answer, the range, or what the next rendering is beyond: a constraint of the study, the passive boundary, or the
+range of effective damping.
 """
 
 from collections.abc import Callable
@@ -29,12 +30,13 @@ from hilbo.errors import InputError
 from hilbo.numerics.climbing import Choice
 from hilbo.numerics.tracing import program
 from hilbo.search.apart import differences
+from hilbo.search.space import Bound
 from hilbo.study.config import Study
 
 __all__ = ["End", "Predict", "Sets", "Tolerance", "best_mid_worst", "dominant", "slice_through", "tolerance"]
 
 Predict = Callable[[Float[Array, "m d"]], tuple[Float[Array, " m"], Float[Array, " m"]]]
-End = Literal["other answer", "passive boundary", "range"]
+End = Literal["other answer", "range"] | Bound
 
 _STARTS = 24  # minima that are looked into,
 _SEPARATE = 0.1  # from starts so far apart
@@ -131,7 +133,7 @@ def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: 
     index = study.space.names.index(parameter)
     here, searched = float(x[index]), study.space.parameters[index]
     grid = searched.axis(_GRID) if searched.discrete else np.unique(np.append(np.linspace(0.0, 1.0, _GRID), here))
-    inside, passive = _tolerated(study, predict, x, parameter, jnp.asarray(grid, x.dtype))
+    inside = _tolerated(study, predict, x, parameter, jnp.asarray(grid, x.dtype))
     middle = int(np.argmin(np.abs(grid - here)))
     if not inside[middle]:
         return None
@@ -144,33 +146,40 @@ def tolerance(study: Study, predict: Predict, x: Float[Array, " d"], parameter: 
         if not 0 <= beyond < len(grid):
             ends.append((grid[last], "range"))
             continue
-        kind: End = "other answer" if passive[beyond] else "passive boundary"
-        if searched.discrete:
-            ends.append((grid[last], kind))
-            continue
-        ends.append((_bisect(study, predict, x, parameter, grid[last], grid[beyond]), kind))
+        inner, outer = grid[last], grid[beyond]
+        if not searched.discrete:
+            inner, outer = _bisect(study, predict, x, parameter, inner, outer)
+        ends.append((inner, _end(study, x, parameter, outer)))
     to_physical = searched.to_physical
     (low, low_end), (high, high_end) = ((float(to_physical(jnp.asarray(end))), kind) for end, kind in ends)
     return Tolerance(parameter, low, high, low_end, high_end)
 
 
+def _end(study: Study, x: Float[Array, " d"], parameter: str, outer: float) -> End:
+    """What ends an interval, by the first value that is beyond it."""
+    (point,), _ = slice_through(study, x, parameter, jnp.asarray([outer], x.dtype))
+    return study.space.broken(point) or "other answer"
+
+
 def _tolerated(
     study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, values: Float[Array, " m"]
-) -> tuple[Bool[np.ndarray, " m"], Bool[np.ndarray, " m"]]:
-    """Of values of a parameter: where the highest answer is the likeliest and feasible, and where it is feasible."""
+) -> Bool[np.ndarray, " m"]:
+    """Of values of a parameter: where the highest answer is the likeliest, and feasible."""
     points, feasible = slice_through(study, x, parameter, values)
-    return np.asarray(feasible & dominant(study, predict, points)), np.asarray(feasible)
+    return np.asarray(feasible & dominant(study, predict, points))
 
 
-def _bisect(study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, inner: float, outer: float) -> float:
-    """The end of an interval between a value inside it and one outside."""
+def _bisect(
+    study: Study, predict: Predict, x: Float[Array, " d"], parameter: str, inner: float, outer: float
+) -> tuple[float, float]:
+    """The end of an interval between a value inside it and one outside: the last that is inside, and one beyond."""
     for _ in range(_HALVINGS):
         middle = (inner + outer) / 2
-        if _tolerated(study, predict, x, parameter, jnp.asarray([middle], x.dtype))[0][0]:
+        if _tolerated(study, predict, x, parameter, jnp.asarray([middle], x.dtype))[0]:
             inner = middle
         else:
             outer = middle
-    return inner
+    return inner, outer
 
 
 @program

@@ -1,5 +1,6 @@
 """Where an optimum lies, in sentences: at an edge of what was searched, or where nobody was asked."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -7,18 +8,25 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from hilbo.search.linear import rows_of
 from hilbo.study.config import Study
 
 __all__ = ["location_notes", "location_sentences", "optimum_sentence", "truth_sentence"]
 
 _AT = 1e-6  # of a range
+_BORDERS = {
+    "passive boundary": ("what the device may render", "on the device"),
+    "effective damping": ("the study's range of effective damping", "within the range of effective damping"),
+}
 
 
 class _Edges(NamedTuple):
-    """Ends of the search ranges that hold a point, and parameters that could not be higher there on the device."""
+    """What holds a point: ends of the search ranges, constraints, and the border of what the renderer may do."""
 
     ends: list[str]
-    border: list[str]
+    constraints: list[str]
+    border: list[tuple[str, str, tuple[str, str]]]
+    """A parameter that could not be "higher" or "lower" there; by what, in words for a sentence and for a note."""
 
 
 def optimum_sentence(study: Study, x: Float[Array, " d"]) -> str:
@@ -51,11 +59,15 @@ def location_sentences(
             f"The optimum lies at {' and '.join(edges.ends)}: whether people would like what is beyond is not known"
             " from this study."
         )
-    if edges.border:
+    if edges.constraints:
         sentences.append(
-            f"The optimum lies at the border of what the device may render: {' and '.join(edges.border)} could not be"
-            " higher there."
+            f"The optimum lies on the study's constraint {' and '.join(edges.constraints)}: whether people would like"
+            " what is beyond is not known from this study."
         )
+    sentences += [
+        f"The optimum lies at the border of {what}: {name} could not be {way} there."
+        for name, way, (what, _) in edges.border
+    ]
     if asked is not None and _extrapolates(sd, asked):
         sentences.append(
             f"The optimum is an extrapolation: the map's standard deviation there, {float(sd):.2g}, is larger than"
@@ -71,7 +83,8 @@ def location_notes(
     """The same in a few words each, for a row of a table; arguments as above."""
     edges = _edges(study, np.asarray(x))
     notes = [f"at {end}" for end in edges.ends]
-    notes += [f"{name} could not be higher on the device" for name in edges.border]
+    notes += [f"on the constraint {words}" for words in edges.constraints]
+    notes += [f"{name} could not be {way} {by}" for name, way, (_, by) in edges.border]
     if asked is not None and _extrapolates(sd, asked):
         notes.append("an extrapolation: less is known there than wherever somebody answered")
     return notes
@@ -82,7 +95,7 @@ def _extrapolates(sd: Float[Array, ""], asked: Float[Array, ""]) -> bool:
 
 
 def _edges(study: Study, x: Float[np.ndarray, " d"]) -> _Edges:
-    inner, edges = np.asarray(study.space.to_box(x)), _Edges([], [])
+    inner, edges = np.asarray(study.space.to_box(x)), _Edges([], _constraints(study, x), [])
     for i, parameter in enumerate(study.space.parameters):
         if parameter.levels:
             continue
@@ -91,5 +104,21 @@ def _edges(study: Study, x: Float[np.ndarray, " d"]) -> _Edges:
             if abs(x[i] - place) < _AT:
                 edges.ends.append(f"the {word} {parameter.name} that was searched ({end:g}{unit})")
             elif abs(inner[i] - place) < _AT:
-                edges.border.append(parameter.name)
+                beyond = x.copy()
+                beyond[i] += 2 * _AT * (2 * place - 1)
+                if (bound := study.space.broken(beyond)) in _BORDERS:
+                    edges.border.append((parameter.name, "higher" if place else "lower", _BORDERS[bound]))
     return edges
+
+
+def _constraints(study: Study, x: Float[np.ndarray, " d"]) -> list[str]:
+    """The sides of constraints that hold a point, in words."""
+    parameters, held = study.space.parameters, []
+    low, high = (np.array([getattr(p, end) for p in parameters]) for end in ("low", "high"))
+    shares = (np.asarray(study.space.to_physical(x)) - low) / (high - low)
+    for constraint in study.space.constraints:
+        for one in (dataclasses.replace(constraint, least=None), dataclasses.replace(constraint, most=None)):
+            walls = rows_of(parameters, [one])
+            if np.any(np.abs(walls.normals @ shares - walls.offsets) < _AT):
+                held.append(one.words)
+    return held

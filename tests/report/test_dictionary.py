@@ -3,11 +3,12 @@
 import numpy as np
 import pandas as pd
 import pytest
-from studies import paper_counts, plain
+from studies import PLAIN, paper_counts, plain
 
 from hilbo.report.comparison import _COLUMNS
 from hilbo.report.dictionary import dictionary
 from hilbo.report.validation import validate, validation_csv
+from hilbo.study.config import Study
 
 
 def test_every_column_has_a_unit_and_a_meaning():
@@ -17,6 +18,18 @@ def test_every_column_has_a_unit_and_a_meaning():
     assert len(shown) == sum(len(table.columns) for table in tables.values())
     assert (shown["meaning"].str.len() > 3).all() and set(shown["table"]) == {"comparison.csv", "confusion.csv"}
     assert shown[shown["column"] == "close"]["meaning"].iloc[0] == 'in which the answer was "close"'
+
+
+def test_what_may_end_an_interval_is_what_the_study_has():
+    def said(study):
+        tables = {"tolerance": pd.DataFrame(columns=["low_end"]), "optima": pd.DataFrame(columns=["location"])}
+        return dictionary(tables, study)["meaning"].tolist()
+
+    between = Study.from_dict(PLAIN | {"constraints": [{"terms": {"u": 10.0, "v": 1.0}, "most": 20.0}]})
+    assert said(plain())[0] == "what ends it there: another answer or the range"
+    assert said(between)[0] == "what ends it there: another answer, the range or a constraint"
+    assert "a constraint" in said(between)[1] and "a constraint" not in said(plain())[1]
+    assert said(Study.load("hilbo/data/paper.toml"))[0].endswith("the range or the passive boundary")
 
 
 @pytest.mark.deep

@@ -14,6 +14,7 @@ from studies import answered, plain_study
 from hilbo.kernels import Matern32
 from hilbo.report import participants, results
 from hilbo.report.page import results_page
+from hilbo.search.box import Constraint
 from hilbo.search.rendering import K0_range, margin_of, set_of
 from hilbo.study.aggregate import aggregate_cohort
 from hilbo.study.cohort_results import analyse_cohort
@@ -161,6 +162,16 @@ def test_the_page_prints_the_covariance_of_its_rule(written):
     study = eqx.tree_at(lambda s: s.gp.kernel, study, Matern32(np.full(study.space.dim, 5.5), 2.0))
     page = " ".join(results_page(study, content, {}, participants.people_of(study, aggregate)).split())
     assert "Gaussian-process prior of Matérn 3/2 covariance, k(x, x′) = 2 · (1 + s) exp(−s), s² = 6 Σ θᵢ" in page
+
+
+def test_the_page_says_where_the_optimum_was_searched(written):
+    study, aggregate, content, _ = written
+    people = participants.people_of(study, aggregate)
+    constraint = Constraint(tuple((name, 1.0) for name in study.space.names), None, 50.0)
+    between = dataclasses.replace(study, space=dataclasses.replace(study.space, constraints=(constraint,)))
+    page = " ".join(results_page(between, content, {}, people).split())
+    assert "searched over the whole box" in results_page(study, content, {}, people)
+    assert "whole box" not in page and "where the study's constraints hold (p0" in page.replace("&#39;", "'")
 
 
 def test_figures_are_png_and_svg(written):

@@ -3,6 +3,7 @@
 All read from as many points, so that they share what is compiled.
 """
 
+import dataclasses
 import functools
 from importlib.resources import files
 
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 from scipy.stats import norm
-from studies import plain
+from studies import PLAIN, plain
 
 from hilbo import Study, passivity
 from hilbo.errors import InputError
@@ -132,6 +133,25 @@ def test_tolerance_on_the_passive_boundary():
         inside = np.asarray(feasible)
         assert np.all(damping[inside] <= b * (1 + 1e-12))
         assert inside.mean() > 0.5
+
+
+def test_tolerance_ends_at_a_constraint():
+    """Of a study without a renderer: nothing there is passive, and the hill is good beyond the constraint too."""
+    study = Study.from_dict(PLAIN | {"constraints": [{"terms": {"u": 10.0, "v": 1.0}, "most": 20.0}]})
+    hill = Hill([0.47, 0.5], [5.0, 5.0])
+    interval = tolerance(study, hill, jnp.asarray(hill.top), "u")
+    assert (interval.low_end, interval.high_end) == ("other answer", "constraint")
+    np.testing.assert_allclose(interval.high, 0.5, atol=1e-9)
+
+
+def test_tolerance_ends_at_the_range_of_effective_damping():
+    """K1 is bounded on both sides by it, where the device would let it go on."""
+    study = haptic()
+    mechanics = dataclasses.replace(study.space.mechanics, damping=5.0, effective_damping=(30.0, 80.0))
+    study = dataclasses.replace(study, space=dataclasses.replace(study.space, mechanics=mechanics))
+    x = study.space.from_box(jnp.full(3, 0.5))
+    K1 = tolerance(study, Hill(x, np.full(3, 5.0)), x, "K1")
+    assert (K1.low_end, K1.high_end) == ("effective damping", "effective damping")
 
 
 def test_dominant_is_what_the_probabilities_say():

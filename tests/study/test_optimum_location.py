@@ -1,7 +1,10 @@
 """An optimum at an edge, at the border of what may be rendered, or where nobody was asked says so."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
+from studies import PLAIN
 
 from hilbo.study.config import Study
 from hilbo.study.optimum_location import location_notes, location_sentences, truth_sentence
@@ -24,6 +27,34 @@ def test_the_border_of_the_passive_set_is_named():
     assert 0 < float(x[0]) < 1
     (sentence,) = location_sentences(STUDY, x, SD, ASKED)
     assert "border of what the device may render: K1 could not be higher" in sentence
+
+
+def test_a_constraint_that_holds_the_optimum_is_named():
+    limits = [{"terms": {"u": 10.0, "v": 1.0}, "least": 12.0, "most": 20.0}]
+    study = Study.from_dict(PLAIN | {"constraints": limits})
+    for x, words in (
+        ([0.3, 0.7], "10 u + v <= 20"),
+        ([0.3 - 1e-9, 0.7], "10 u + v <= 20"),
+        ([0.15, 0.05], "12 <= 10 u + v"),
+    ):
+        (sentence,) = location_sentences(study, jnp.array(x), SD, ASKED)
+        assert sentence.startswith(
+            f"The optimum lies on the study's constraint {words}: whether people would like what"
+        )
+        assert location_notes(study, jnp.array(x), SD, ASKED) == [f"on the constraint {words}"]
+    assert location_sentences(study, jnp.array([0.3, 0.69]), SD, ASKED) == []
+
+
+def test_the_border_of_effective_damping_is_named():
+    """Not the device's, and it may hold K1 from below."""
+    mechanics = dataclasses.replace(STUDY.space.mechanics, damping=5.0, effective_damping=(30.0, 80.0))
+    study = dataclasses.replace(STUDY, space=dataclasses.replace(STUDY.space, mechanics=mechanics))
+    for share, way in ((0.0, "lower"), (1.0, "higher")):
+        x = study.space.from_box(jnp.array([share, 0.5, 0.5]))
+        assert 0 < float(x[0]) < 1
+        (sentence,) = location_sentences(study, x, SD, ASKED)
+        assert f"border of the study's range of effective damping: K1 could not be {way} there" in sentence
+        assert location_notes(study, x, SD, ASKED) == [f"K1 could not be {way} within the range of effective damping"]
 
 
 def test_an_extrapolation_is_called_one():
