@@ -98,7 +98,7 @@ _TOLERANCE = {
     "high": ("parameter's", "upper end"),
     "low_end": ("", "what ends it there"),  # and in `_bounds` what that may be
     "high_end": ("", "the same of the upper end"),
-    "draws_without": ("share", "bootstrap resamples of the people without an interval"),
+    "draws_without": ("share", "bootstrap resamples of the people without an interval; empty: of one person"),
 } | {
     f"{end}_{side}": ("parameter's", f"{side} 95 % of bootstrap resamples, {end} end")
     for end in ("low", "high")

@@ -97,7 +97,7 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
         "optimised": optimum_content(study, check.optimised),
         "nrmse": float(check.nrmse),
         "flagged": bool(check.flagged),
-        "resampled": dict(zip(("median", "95 %"), np.percentile(check.resampled, [50, 95]).tolist(), strict=True)),
+        "resampled": None if check.resampled is None else _percentiles(check.resampled),
         "rule": check.rule,
         "participants": rows,
         "learned": {
@@ -115,6 +115,10 @@ def robustness_result(study: Study, cohort: Cohort, check: Robustness, seed: int
         "seed": seed,
         "versions": versions(),
     }
+
+
+def _percentiles(draws):
+    return dict(zip(("median", "95 %"), np.percentile(draws, [50, 95]).tolist(), strict=True))
 
 
 def _warnings(check, stacked):

@@ -264,18 +264,18 @@ def _tolerances(table):
     """The tolerance intervals as they are read: each end with what it is, and with its interval."""
     rows = []
     for row in table.to_dict("records"):
+        resampled = np.isfinite(row["draws_without"])  # not of one person
         ends = [
             [
                 f"{_cell(row[end])} ({row[f'{end}_end']})",
-                " to ".join(_cell(row[f"{end}_{side}"], _DIGITS) for side in ("from", "to")),
+                " to ".join(_cell(row[f"{end}_{side}"], _DIGITS) for side in ("from", "to")) if resampled else "–",
             ]
             if np.isfinite(row[end])
             else ["–", "–"]
             for end in ("low", "high")
         ]
-        rows.append(
-            [row["hyperparameters"], row["parameter"], *ends[0], *ends[1], f"{100 * row['draws_without']:.0f} %"]
-        )
+        without = percent(row["draws_without"]) if resampled else "–"
+        rows.append([row["hyperparameters"], row["parameter"], *ends[0], *ends[1], without])
     return rows
 
 

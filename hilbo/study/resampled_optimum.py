@@ -16,7 +16,12 @@ from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior
 from hilbo.population.pointwise import Rule, aggregate
 
-__all__ = ["resampled_tops"]
+__all__ = ["can_resample", "resampled_tops"]
+
+
+def can_resample(posteriors: Posterior) -> bool:
+    """Whether at least two people answered: of one person all resamples are the same, as if others could not differ."""
+    return int(np.any(np.asarray(posteriors.trials.mask), axis=1).sum()) > 1
 
 
 def resampled_tops(

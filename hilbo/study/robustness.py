@@ -30,7 +30,7 @@ from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import Cohort
 from hilbo.study.config import Study
 from hilbo.study.optima import Optimum, individual_optima, population_optimum, predict_people
-from hilbo.study.resampled_optimum import resampled_tops
+from hilbo.study.resampled_optimum import can_resample, resampled_tops
 
 __all__ = ["LIMIT", "Robustness", "robustness"]
 
@@ -55,8 +55,9 @@ class Robustness(eqx.Module):
     nrmse: Float[Array, ""]
     """Between the population optima."""
     individual_nrmse: Float[Array, " M"]
-    resampled: Float[Array, " draws"]
-    """NRMSE of the population optimum of bootstrap resamples of the people to that of all, fixed hyperparameters."""
+    resampled: Float[Array, " draws"] | None
+    """NRMSE of the population optimum of bootstrap resamples of the people to that of all, fixed hyperparameters; None
+    of one person, who says nothing of others."""
     sensitivity: dict[str, Float[Array, "..."]]
     """d(population optimum, unit cube) / d(log theta, log noise, first threshold, log gaps) at the fixed values."""
     shared: bool = eqx.field(static=True)
@@ -162,8 +163,11 @@ def _resampled(
     rule: Rule,
     share: Float[Array, ""] | None,
     seed: int,
-) -> Float[Array, " draws"]:
-    """How far the optimum of resampled people is from x, sought among x and some of the candidates."""
+) -> Float[Array, " draws"] | None:
+    """How far the optimum of resampled people is from x, sought among x and some of the candidates; None of one person,
+    of whom every resample is the same."""
+    if not can_resample(posteriors):
+        return None
     points = jnp.concatenate([x[None, :], candidates[:_POINTS]])
     tops = resampled_tops(posteriors, points, rule, share, study.gp.kernel.variance, seed)
     return nrmse(points[tops], x[None, :], study.gp.kernel.levels)

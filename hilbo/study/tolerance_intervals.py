@@ -4,7 +4,10 @@
 aggregated anew from the same posteriors, and the interval through the same optimum is read off a grid; percentiles of
 its ends over these draws are what the choice of participants leaves open. A draw in which the highest answer is not the
 likeliest at the optimum has no interval, and counts as such. Nothing is refitted: aggregation is a sum over people.
+One person says nothing of others, of whom all draws are the same: there the percentiles are not known.
 """
+
+import math
 
 import equinox as eqx
 import jax
@@ -18,6 +21,7 @@ from hilbo.ordinal_gp import Posterior
 from hilbo.population.pointwise import Rule, aggregate
 from hilbo.study.config import Study
 from hilbo.study.map_summary import slice_through
+from hilbo.study.resampled_optimum import can_resample
 
 __all__ = ["Ends", "tolerance_ends"]
 
@@ -26,7 +30,7 @@ _DRAWS = 200
 
 
 class Ends(eqx.Module):
-    """95 % percentile intervals of both ends of a tolerance interval, in the parameter's unit."""
+    """95 % percentile intervals of both ends of a tolerance interval, in the parameter's unit; NaN: not known."""
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -45,10 +49,13 @@ def tolerance_ends(
     share: ArrayLike | None = None,
     draws: int = _DRAWS,
 ) -> Ends | None:
-    """Bootstrap over people of the tolerance interval of a parameter through `x` (d,); None if no draw has one.
+    """Bootstrap over people of the tolerance interval of a parameter through `x` (d,); None if no draw has one. With
+    fewer than two people with answers every number is NaN.
 
     `share` is the hierarchical rule's.
     """
+    if not can_resample(posteriors):
+        return Ends((math.nan, math.nan), (math.nan, math.nan), math.nan)
     index = study.space.names.index(parameter)
     grid = study.space.parameters[index].axis(_GRID)
     if not study.space.parameters[index].discrete:

@@ -1,7 +1,7 @@
 """Pages: a number that a template misses is an error, and what a page says of the same numbers told differently."""
 
 import re
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_it_says_why_rules_were_not_compared():
     assert "--no-compare" in macro(False) and "it takes" not in macro(False)
 
 
-def robust(shared, nrmse):
+def robust(shared, nrmse, resampled=MappingProxyType({"median": 0.02, "95 %": 0.025})):
     """The page of a robustness check of two people, the second of whom moved."""
     study = plain_study(2)
     optimum = {"parameters": set_of(study.space, np.full(2, 0.5)), "mean": 1.0, "sd": 0.25}
@@ -101,7 +101,7 @@ def robust(shared, nrmse):
         "optimised": optimum,
         "nrmse": nrmse,
         "flagged": nrmse >= 0.03,
-        "resampled": {"median": 0.02, "95 %": 0.025},
+        "resampled": resampled,
         "rule": "bcm",
         "participants": [still, still | {"participant": "B", "nrmse": 0.2, "flagged": True, "converged": False}],
         "learned": learned,
@@ -124,6 +124,11 @@ def test_the_page_of_a_robustness_check():
     own = robust(shared=False, nrmse=0.03)
     assert "each person's own" in own.replace("&#39;", "'") and "[gp]" not in own
     assert "which is 3 % or more: it is not robust" in own and "the shift is more than that" in own
+
+
+def test_one_person_claims_no_sampling_error():
+    page = robust(shared=True, nrmse=0.01, resampled=None).replace("&#39;", "'")
+    assert "is not known: one person's answers tell nothing of sampling." in page and "sampling error" not in page
 
 
 def test_a_sentence_in_a_table_wraps_and_a_number_does_not():

@@ -35,6 +35,7 @@ from hilbo.study.new_study import NewStudy, study_text
 from hilbo.study.optima import predict_people
 from hilbo.study.progress import Progress, _counts, _splits, _to_other_half
 from hilbo.study.reserved_names import is_reserved
+from hilbo.study.robustness import _resampled
 from hilbo.study.tolerance_intervals import tolerance_ends
 
 
@@ -163,10 +164,23 @@ class Population(eqx.Module):
         return predict_people(self.posteriors, x)
 
 
+def test_one_person_has_no_resamples():
+    """All of them would be the same map, an interval of width 0."""
+    study, cohort = plain(), crowd([HILL, []])
+    posteriors, x = fit_cohort(study, cohort), jnp.array([0.4, 0.5])
+    ends = tolerance_ends(study, posteriors, x, "v", draws=5)
+    assert np.isnan([*ends.low, *ends.high, ends.lost]).all()
+    assert _resampled(study, posteriors, x[None, :], x, "bcm", None, 0) is None
+    row = dict(hyperparameters="fixed", parameter="v", draws_without=ends.lost, low_end="range", high_end="range")
+    row |= dict(low=1.0, high=2.0, low_from=np.nan, low_to=np.nan, high_from=np.nan, high_to=np.nan)
+    ((*_, low, low_draws, _, high_draws, without),) = _tolerances(pd.DataFrame([row]))
+    assert (low, low_draws, high_draws, without) == ("1 (range)", "–", "–", "–")
+
+
 @pytest.mark.deep
-def test_one_persons_tolerance_does_not_depend_on_the_draw():
-    """With one participant every bootstrap draw is the same map, and the ends are those of the exact interval."""
-    study, cohort = plain(), crowd([HILL * 3])
+def test_tolerance_of_people_who_agree_does_not_depend_on_the_draw():
+    """With two alike every bootstrap draw is the same map, and the ends are those of the exact interval."""
+    study, cohort = plain(), crowd([HILL * 3] * 2)
     posteriors, x = fit_cohort(study, cohort), jnp.array([0.4, 0.5])
     exact = tolerance(study, Population(posteriors), x, "v")
     ends = tolerance_ends(study, posteriors, x, "v", draws=5)
