@@ -214,8 +214,12 @@ def read_log_trials(
     with tempfile.TemporaryDirectory() as made:
         path = Path(made) / "trials.csv"
         write_trials(table, path)
+
+        def note_of_logs(sentence: str) -> None:
+            note(sentence.replace(str(path), str(folder)))
+
         try:
-            return read_trials(path, chosen, material, others=others, say=say)
+            return read_trials(path, chosen, material, others=others, say=say, note=note_of_logs)
         except InputError as error:
             raise InputError(str(error).replace(str(path), str(folder))) from None
 

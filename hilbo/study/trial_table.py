@@ -10,6 +10,7 @@ and the line (Parquet: row). A table is read piece by piece, and a piece's text 
 import hashlib
 import os
 import re
+import warnings
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hilbo.errors import InputError
+from hilbo.errors import InputError, InputRemark
 from hilbo.study.cells import FRAME, answer_forms, cell_pieces, cells_of, numbers, parameter_values, place, refuse
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, check_text, formulas, no_ids
@@ -49,8 +50,13 @@ _KEY = ("participant", "session", "phase", "material", "trial")
 _MARK = "hilbo checked"
 """Of the attributes that pandas carries along with a table, the one that says what was checked."""
 _TRUE = {"1", "1.0", "1,0", "true", "yes"}
+_NAMED = 6  # people of whom a remark says the names
 _MISSING = {"", "nan", "none", "<na>"}
 _FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
+
+
+def _remark(sentence: str) -> None:
+    warnings.warn(InputRemark(sentence), stacklevel=5)
 
 
 def read_trials(
@@ -60,14 +66,16 @@ def read_trials(
     *,
     others: bool = True,
     say: Callable[[int], None] = lambda rows: None,
+    note: Callable[[str], Any] = _remark,
 ) -> pd.DataFrame:
     """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
 
     Adds the column `category` (0 = lowest response). Warm-up, repeated and voided rows are checked and left out.
     `material` selects the rows of one material, and must be given if there are several. `others`: keep the columns that
-    are nobody's business. `say` is told how many rows have been read. Raises `InputError`.
+    are nobody's business. `say` is told how many rows have been read, and `note` who has no answer that
+    counts: a warning, if nothing else is given. Raises `InputError`.
     """
-    return _read(cell_pieces(path), study, material, str(path), others, say)
+    return _read(cell_pieces(path), study, material, str(path), others, say, note)
 
 
 def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = None) -> pd.DataFrame:
@@ -76,11 +84,11 @@ def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = 
     text = cells_of(frame)
     for column in text.columns.intersection(_KEY):
         text.loc[frame[column].isna().to_numpy(), column] = ""  # a missing participant is nobody called "nan"
-    return _read([text], study, material, FRAME, True, lambda rows: None)
+    return _read([text], study, material, FRAME, True, lambda rows: None, _remark)
 
 
 def _read(
-    whole: Iterable[pd.DataFrame], study: AnyStudy, material: str | None, source: str, others: bool, say: Any
+    whole: Iterable[pd.DataFrame], study: AnyStudy, material: str | None, source: str, others: bool, say: Any, note: Any
 ) -> pd.DataFrame:
     texts, pieces, rows, named = {}, [], 0, {}
     for text in whole:
@@ -97,11 +105,13 @@ def _read(
     table = pd.concat(pieces)
     del pieces
     _check_duplicates(table, source)
-    table = table[table.pop("_fitted")]
+    fitted = table.pop("_fitted")
+    left, table = table[~fitted], table[fitted]
     _check_blinded(table.pop("_blinded"), study, source)
     if table.empty:
         raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
     table = of_material(table, material, source)
+    _note_the_absent(left, table, source if material is None else f"{source} ({material})", note)
     return marked(ordered(table), study)
 
 
@@ -113,6 +123,17 @@ def ordered(table: pd.DataFrame) -> pd.DataFrame:
         keys.append("phase")
     places = [table["trial"], *(_numbered(table[name]) for name in reversed(keys))]
     return table.iloc[np.lexsort(places)]
+
+
+def _note_the_absent(left: pd.DataFrame, table: pd.DataFrame, source: str, note: Callable[[str], Any]) -> None:
+    """Say who has answers, and none that counts: without a word that person would be missing everywhere."""
+    kept = set(table["participant"].unique())
+    absent = [str(name) for name in left["participant"].unique() if name not in kept]
+    if absent:
+        who = ", ".join(absent[:_NAMED]) + (f" and {len(absent) - _NAMED} more" if len(absent) > _NAMED else "")
+        answers = f"{len(left)} answers are" if len(left) > 1 else "1 answer is"
+        have = "has" if len(absent) == 1 else "have"
+        note(f"{source}: {answers} voided, warm-up or repeated, and not fitted; {who} {have} no other answer in it.")
 
 
 def marked(table: pd.DataFrame, study: AnyStudy) -> pd.DataFrame:

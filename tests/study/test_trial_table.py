@@ -293,6 +293,23 @@ def test_warm_up_alone_is_refused(tmp_path):
     assert "no rows to fit" in refusal(tmp_path, text)
 
 
+def test_who_has_no_answer_that_counts_is_named(tmp_path):
+    """And nobody is where everybody has one."""
+    text = HEADER.replace("\n", ",phase,voided\n") + "A,1,close,1,2,main,0\nA,2,close,1,2,main,1\n"
+    assert len(read_trials(written(tmp_path, text), study())) == 1
+    text += "B,1,close,1,2,main,1\nC,1,close,1,2,warm-up,0\nC,1,close,1,2,repeat,0\n"
+    with pytest.warns(InputRemark) as remarks:
+        table = read_trials(written(tmp_path, text), study())
+    (said,) = (str(remark.message).replace(f"{tmp_path}/", "") for remark in remarks)
+    assert said.startswith(
+        "t.csv: 4 answers are voided, warm-up or repeated, and not fitted; B, C have no other answer"
+    )
+    assert set(table["participant"]) == {"A"}
+    text += "".join(f"Z{i},1,close,1,2,main,1\n" for i in range(7))
+    with pytest.warns(InputRemark, match=r"11 answers .*; B, C, Z0, Z1, Z2, Z3 and 3 more have no other answer"):
+        read_trials(written(tmp_path, text), study())
+
+
 def test_a_voided_flag_is_yes_or_no(tmp_path):
     text = HEADER.replace("\n", ",voided\n") + "A,1,close,1,2,maybe\n"
     assert 't.csv:2: voided is "maybe"; write 1 or 0' in refusal(tmp_path, text)
@@ -305,7 +322,7 @@ def test_unblinded_answers_are_not_read_beside_others(tmp_path):
         "t.csv:3: is an unblinded answer, as hilbo try gives, beside"
     )
     for kept in (head + "B,1,close,1,2,try,0\nB,2,close,1,2,try,0\n", text.replace("try,0", "try,1")):
-        assert len(read_trials(written(tmp_path, kept), study())) == kept.count(",0\n")
+        assert len(read_trials(written(tmp_path, kept), study(), note=str)) == kept.count(",0\n")
     assert len(read_trials(written(tmp_path, text), study(stimulus={"unblinded": True}))) == 2
 
 
