@@ -38,6 +38,12 @@ class Cohort(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     contexts: tuple[str, ...] = eqx.field(static=True, default=())
     """Levels of the study's random effect, in the order of `trials.context`."""
+    numbers: np.ndarray | None = None
+    """The table's trial number of each answer (M, capacity), 0 where there is none; None of no table."""
+    session: np.ndarray | None = None
+    """The place in `sessions` of each answer's session (M, capacity), where the table has that column,"""
+    sessions: tuple[str, ...] = eqx.field(static=True, default=())
+    """and their names."""
 
     def __repr__(self) -> str:
         if not known(self.trials.x, self.trials.mask):
@@ -68,7 +74,9 @@ class Cohort(eqx.Module):
     def rows(self, rows: Int[np.ndarray, " k"]) -> "Cohort":
         """Only the participants in these places. `rows` (k,): numbers from 0."""
         names = tuple(self.names[row] for row in rows)
-        return Cohort(rows_of(self.trials, rows), self.physical[rows], names, self.contexts)
+        numbers, session = (None if held is None else held[rows] for held in (self.numbers, self.session))
+        of_rows = rows_of(self.trials, rows), self.physical[rows], names
+        return Cohort(*of_rows, self.contexts, numbers, session, self.sessions)
 
     def counts(self) -> Int[np.ndarray, " M"]:
         """Answers of each participant. (M,)."""
@@ -101,14 +109,27 @@ def cohort_of(table: pd.DataFrame, study: Study, capacity: int | None = None) ->
     held = np.arange(capacity)[None, :] < counts[:, None]
     middle = [(p.low + p.high) / 2 for p in study.space.parameters]
     x = _to_unit(study.space, np.where(held[..., None], physical, middle))
+    asked = _asked(table.iloc[order], rows, held.shape)
     texts = _random_effect(table, study)
     if texts is None:
-        return Cohort(jax.vmap(Trials)(x, placed(answers), placed(held)), physical, tuple(names))
+        return Cohort(jax.vmap(Trials)(x, placed(answers), placed(held)), physical, tuple(names), (), *asked)
     levels, contexts = pd.factorize(texts, sort=True)
     context = np.zeros((len(counts), capacity), np.int32)
     context[rows] = levels[order]
     trials = jax.vmap(Trials)(x, placed(answers), placed(held), placed(context))
-    return Cohort(trials, physical, tuple(names), tuple(contexts))
+    return Cohort(trials, physical, tuple(names), tuple(contexts), *asked)
+
+
+def _asked(
+    table: pd.DataFrame, rows: tuple[np.ndarray, np.ndarray], shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """Trial numbers and sessions of a table's rows, which go to these places, and the names of the sessions."""
+    numbers, session = np.zeros(shape, np.int64), np.zeros(shape, np.int32)
+    numbers[rows] = table["trial"].to_numpy(int)
+    if "session" not in table:
+        return numbers, None, ()
+    session[rows], sessions = pd.factorize(table["session"].fillna("").astype(str))
+    return numbers, session, tuple(sessions)
 
 
 def _as_in_a_file(table: pd.DataFrame, study: Study) -> pd.DataFrame:

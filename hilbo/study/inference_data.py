@@ -1,13 +1,16 @@
 """A material's results for ArviZ: posterior, posterior predictive and observed answers as netCDF groups.
 
-Groups and variables (dimensions chain, draw, participant, trial; of log_likelihood chain, draw, obs_id):
+Groups and variables (dimensions chain, draw, participant, answer; of log_likelihood chain, draw, obs_id):
     posterior             f: latent score at everybody's own trials, drawn from N(mode, K - K C K)
     posterior_predictive  response: answers (categories from 0) that would be given there again
-    log_likelihood        response: log P(answer | f) of the answers alone, with participant and trial of each, since
+    log_likelihood        response: log P(answer | f) of the answers alone, with participant and answer of each, since
                           `arviz.loo` takes every element for an answer
     observed_data         response: the answers, -1 where there is none
-    constant_data         one variable for each parameter, in its unit; thresholds and noise of the likelihood
-`arviz.from_netcdf` and `xarray.open_datatree` read the file. Everybody's posterior is their own: nothing is shared.
+    constant_data         one variable for each parameter, in its unit; thresholds and noise of the likelihood; trial
+                          (and session) of each answer, as in the trial table
+`answer` counts everybody's fitted answers from 1. Voided, warm-up and repeated ones are not among them, so that it is
+not the trial number: the table's rows are found by `trial` and `session`. `arviz.from_netcdf` and
+`xarray.open_datatree` read the file. Everybody's posterior is their own: nothing is shared.
 """
 
 import os
@@ -30,7 +33,7 @@ from hilbo.study.config import Study
 
 __all__ = ["groups", "inference_data", "predictive_shares", "write_groups"]
 
-_DIMS = ("chain", "draw", "participant", "trial")
+_DIMS = ("chain", "draw", "participant", "answer")
 
 
 def groups(
@@ -40,24 +43,29 @@ def groups(
     keys = jax.random.split(jax.random.key(seed), len(cohort.names))
     f, response, log_likelihood = (np.moveaxis(np.asarray(leaf), 0, 1)[None] for leaf in _draw(posteriors, keys, draws))
     mask = np.asarray(cohort.trials.mask)
-    coords = {"participant": list(cohort.names), "trial": np.arange(1, mask.shape[1] + 1)}
+    coords = {"participant": list(cohort.names), "answer": np.arange(1, mask.shape[1] + 1)}
     chains = coords | {"chain": [0], "draw": np.arange(draws)}
     held = mask[None, None]
     observed = np.where(mask, np.asarray(cohort.trials.q), -1)
     constants: dict[str, Any] = {
-        p.name: (("participant", "trial"), np.where(mask, cohort.physical[..., i], np.nan), _of(p))
+        p.name: (_DIMS[2:], np.where(mask, cohort.physical[..., i], np.nan), _of(p))
         for i, p in enumerate(study.space.parameters)
     }
     likelihood = jax.tree.map(lambda leaf: leaf[0], posteriors.gp).likelihood  # what a rule learnt, where it learns
     constants["thresholds"] = ("edge", np.asarray(likelihood.thresholds))
     constants["noise"] = ((), np.asarray(likelihood.noise))
+    if cohort.numbers is not None:
+        constants["trial"] = (_DIMS[2:], np.where(mask, cohort.numbers, -1), {"long_name": "trial of the table"})
+    if cohort.session is not None:
+        names_of = np.array(cohort.sessions, object)[cohort.session]
+        constants["session"] = (_DIMS[2:], np.where(mask, names_of, ""))
     names = ", ".join(f"{k} = {label}" for k, label in enumerate(study.responses))
     say = {"long_name": "answer", "categories": names}
     return {
         "posterior": xr.Dataset({"f": (_DIMS, np.where(held, f, np.nan), {"long_name": study.attribute})}, chains),
         "posterior_predictive": xr.Dataset({"response": (_DIMS, np.where(held, response, -1), say)}, chains),
         "log_likelihood": _of_answers(log_likelihood, mask, cohort.names),
-        "observed_data": xr.Dataset({"response": (("participant", "trial"), observed, say)}, coords),
+        "observed_data": xr.Dataset({"response": (_DIMS[2:], observed, say)}, coords),
         "constant_data": xr.Dataset(constants, coords, {"study": study.hash, "inference": study.inference}),
     }
 
@@ -72,17 +80,17 @@ def _of(parameter: Parameter) -> dict[str, Any]:
 def _of_answers(
     values: Float[np.ndarray, "1 draws M n"], mask: Bool[np.ndarray, "M n"], names: Sequence[str]
 ) -> xr.Dataset:
-    """The values where somebody answered, by person and then by trial."""
-    person, trial = np.nonzero(mask)
+    """The values where somebody answered, by person and then by answer."""
+    person, answer = np.nonzero(mask)
     chain, draw, *_ = values.shape
     coords = {
         "chain": np.arange(chain),
         "draw": np.arange(draw),
         "obs_id": np.arange(1, len(person) + 1),
         "participant": ("obs_id", np.array(names, object)[person]),
-        "trial": ("obs_id", trial + 1),
+        "answer": ("obs_id", answer + 1),
     }
-    return xr.Dataset({"response": (("chain", "draw", "obs_id"), values[..., person, trial])}, coords)
+    return xr.Dataset({"response": (("chain", "draw", "obs_id"), values[..., person, answer])}, coords)
 
 
 def inference_data(study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0) -> Any:

@@ -21,7 +21,7 @@ _TABLES = {
         *("central_95", "central_95_error", "z2", "covered", "optimum_sd", "most_influential", "refused"),
     ),
     "map.nc": ("mean", "variance", "feasible", "point"),
-    "inference.nc": ("thresholds", "edge", "noise"),
+    "inference.nc": ("thresholds", "edge", "noise", "answer"),
     "predicted": ("mean", "sd"),
 }
 _EVERYWHERE = frozenset(name for columns in _TABLES.values() for name in columns)

@@ -28,7 +28,7 @@ from hilbo.report.validation import validate
 from hilbo.search.box import Parameter
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.analysis import limits_of
-from hilbo.study.cohort import Cohort
+from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.map_summary import tolerance
 from hilbo.study.new_study import NewStudy, study_text
@@ -207,7 +207,7 @@ def test_groups_are_what_arviz_reads(tmp_path):
     given = inference_data["log_likelihood"]["response"]
     expected = jax.jit(jax.vmap(study.gp.likelihood.log_prob))(f[0, 1, :4], np.asarray(cohort.trials.q)[1, :4])
     np.testing.assert_allclose(given.values[0, 0, -4:], expected)
-    assert list(given["participant"].values[-5:]) == ["P0", *["P1"] * 4] and list(given["trial"].values[-4:]) == [
+    assert list(given["participant"].values[-5:]) == ["P0", *["P1"] * 4] and list(given["answer"].values[-4:]) == [
         1,
         2,
         3,
@@ -225,6 +225,23 @@ def test_groups_are_what_arviz_reads(tmp_path):
     tree = xr.open_datatree(tmp_path / "inference.nc", engine="h5netcdf")
     np.testing.assert_array_equal(tree["constant_data"]["u"].values[0], cohort.physical[0, :, 0])
     tree.close()
+
+
+def test_answers_are_found_in_the_table_by_trial_and_session(tmp_path):
+    """A voided answer moves the count of the fitted ones, and not the table's numbers."""
+    table = pd.DataFrame({"participant": ["A"] * 4 + ["B"] * 2, "session": ["1", "1", "1", "2", "1", "1"]})
+    table = table.assign(
+        trial=[1, 2, 3, 1, 5, 4], voided=[0, 1, 0, 0, 0, 0], response="close", u=np.arange(6) / 8, v=12.0
+    )
+    study = plain()
+    cohort = cohort_of(table, study, 4)
+    write_groups(groups(study, cohort, fit_cohort(study, cohort), draws=2), tmp_path / "inference.nc")
+    with xr.open_dataset(tmp_path / "inference.nc", group="constant_data", engine="h5netcdf") as constants:
+        frame = constants[["trial", "session", "u"]].to_dataframe().reset_index()
+    joined = frame[frame["trial"] > 0].merge(table, on=["participant", "session", "trial"], validate="one_to_one")
+    assert len(joined) == 5 and (joined["u_x"] == joined["u_y"]).all()
+    assert list(frame["answer"]) == [1, 2, 3, 4] * 2 and (frame["trial"] == -1).sum() == 3
+    np.testing.assert_array_equal(cohort.rows(np.array([1])).numbers, [[4, 5, 0, 0]])
 
 
 def posteriors_at(posteriors):
