@@ -1,7 +1,7 @@
 """Pages: a number that a template misses is an error, and what a page says of the same numbers told differently."""
 
 import re
-from types import MappingProxyType, SimpleNamespace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -59,7 +59,7 @@ def test_the_lead_counts_the_people_of_the_map():
             {"participants": ["A", "B", "C", "D"], "left_out": gone},
             {"participants": ["A", "B"], "left_out": {}},
         ]
-        folder = SimpleNamespace(study=plain_study(1), notes=())
+        folder = StudyFolder(plain_study(1), [], None, ())
         facts = {}
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(study_report, "rendered", lambda name, facts=facts, **given: facts.update(given) or "")

@@ -166,7 +166,7 @@ class Population(eqx.Module):
 
 def test_one_person_has_no_resamples():
     """All of them would be the same map, an interval of width 0."""
-    study, cohort = plain(), crowd([HILL, []])
+    study, cohort = plain(), crowd([HILL[:6], []])
     posteriors, x = fit_cohort(study, cohort), jnp.array([0.4, 0.5])
     ends = tolerance_ends(study, posteriors, x, "v", draws=5)
     assert np.isnan([*ends.low, *ends.high, ends.lost]).all()
@@ -234,14 +234,14 @@ def test_answers_are_found_in_the_table_by_trial_and_session(tmp_path):
         trial=[1, 2, 3, 1, 5, 4], voided=[0, 1, 0, 0, 0, 0], response="close", u=np.arange(6) / 8, v=12.0
     )
     study = plain()
-    cohort = cohort_of(table, study, 4)
+    cohort = cohort_of(table, study, 6)
     write_groups(groups(study, cohort, fit_cohort(study, cohort), draws=2), tmp_path / "inference.nc")
     with xr.open_dataset(tmp_path / "inference.nc", group="constant_data", engine="h5netcdf") as constants:
         frame = constants[["trial", "session", "u"]].to_dataframe().reset_index()
     joined = frame[frame["trial"] > 0].merge(table, on=["participant", "session", "trial"], validate="one_to_one")
     assert len(joined) == 5 and (joined["u_x"] == joined["u_y"]).all()
-    assert list(frame["answer"]) == [1, 2, 3, 4] * 2 and (frame["trial"] == -1).sum() == 3
-    np.testing.assert_array_equal(cohort.rows(np.array([1])).numbers, [[4, 5, 0, 0]])
+    assert list(frame["answer"]) == [1, 2, 3, 4, 5, 6] * 2 and (frame["trial"] == -1).sum() == 7
+    np.testing.assert_array_equal(cohort.rows(np.array([1])).numbers, [[4, 5, 0, 0, 0, 0]])
 
 
 def posteriors_at(posteriors):
