@@ -312,3 +312,11 @@ def test_importing_it_loads_no_jax(module):
     code = f"import sys, {module}; print(*sorted({heavy} & set(sys.modules)))"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent)
     assert run.stdout == "\n"
+
+
+def test_protocols_can_be_checked_where_calls_are():
+    """Deep tests check the types of arguments, and a protocol that is not made for it fails at import."""
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ClassDef) and any(ast.unparse(base) == "Protocol" for base in node.bases):
+                assert "runtime_checkable" in map(ast.unparse, node.decorator_list), f"{path}: {node.name}"

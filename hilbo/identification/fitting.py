@@ -10,7 +10,7 @@ Units: N, mm, s; B1 N·s^α/mm. Moduli keep their own unit.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -100,6 +100,7 @@ class Test(eqx.Module):
         return self.output.shape[0]
 
 
+@runtime_checkable
 class Model(Protocol):
     """What is fitted: a prediction of four coordinates q, with bounds and starts that the data suggest.
 

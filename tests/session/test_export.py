@@ -199,21 +199,24 @@ def test_dry_runs_are_nobodys_answers(folder, tmp_path):
 
 
 def test_a_log_that_lacks_its_last_newline_is_whole_and_one_cut_off_is_said(folder):
-    before, heard = read_log_trials(folder, STUDY), []
-    path = folder / "P01_1.session.jsonl"
+    heard = []
+    before = read_log_trials(folder, STUDY, note=heard.append)  # P03 has no answer that counts, and that is said
+    path, same = folder / "P01_1.session.jsonl", list(heard)
+    heard.clear()
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])
     pd.testing.assert_frame_equal(read_log_trials(folder, STUDY, note=heard.append), before)
-    assert heard == []
+    assert heard == same
+    heard.clear()
     path.write_bytes(whole[:-9])
     read_log_trials(folder, STUDY, note=heard.append)
-    (sentence,) = heard
+    sentence, _ = heard
     last = len(whole.splitlines())
     assert sentence.startswith(f"{path}:{last}: the last line is cut off, and is left out;")
     heard.clear()
     path.write_bytes(b"")  # a copy onto a full disk
     assert set(read_log_trials(folder, STUDY, note=heard.append)["participant"]) == {"P02"}
-    (sentence,) = heard
+    sentence, _ = heard
     assert sentence.startswith(f"{path}: has no whole first line, and is left out;")
 
 
