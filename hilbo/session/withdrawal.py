@@ -165,7 +165,7 @@ def _keys(files: Iterable[Path], participant: str, whose: dict[Path, str]) -> li
 def _tables(below: Below, done: Withdrawal) -> None:
     """Their rows of every table; names of their sets that others have compared become nobody's."""
     paths = _ending(below.files, ".csv", ".parquet")
-    places = set(paths)  # a link to one of these is the same table
+    places = {path.resolve() for path in paths if path not in below.links}  # a link to one of these is the same table
     paths = [path for path in paths if below.links.get(path) not in places]
     tables = {path: table for path in paths if (table := read_table(path)) is not None}
     done.left |= {str(path): _UNREADABLE for path in paths if path.suffix == ".parquet" and path not in tables}

@@ -30,6 +30,13 @@ def study(tmp_path):
     return folder
 
 
+def test_a_table_with_a_link_to_it_counts_once_from_within_the_folder_too(study, monkeypatch):
+    (study / "a.csv").symlink_to("trials.csv")
+    monkeypatch.chdir(study)
+    assert delete_participant(".", "P01").removed == {"trials.csv": 1}
+    assert (study / "a.csv").is_symlink() and (study / "trials.csv").read_text() == WITHOUT
+
+
 def test_links_that_lead_out_are_listed_and_stay(study):
     links = {"logs": "../real", "more.csv": "../real/more.csv", "gone": "../not-mounted", "up": "..", "loop": "loop"}
     for name, target in links.items():
