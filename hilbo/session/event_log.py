@@ -1,56 +1,31 @@
 """A session on disk: JSON Lines, appended and forced to the disk one event at a time, read back whole or refused.
 
-The first line is the header, every other an event:
-
-    {"seq":1,"kind":"propose","time":…,"data":{…},"previous":"…","crc":"…"}
-
-`previous` is the start of the SHA-256 of the line before, `crc` the CRC-32 of this line up to it. A last line that
-lacks nothing but its newline counts, and gets it when the log is opened for writing; one that is cut off within is
-dropped, and said so; a file without a whole first line is no log yet. Any other damage is refused with its line.
-Neither digest has a secret, so that events are checked for what they say too (`hilbo.session.replay`). One writer at a
-time, by a lock of the operating system on the file, which goes with the process that holds it. A log is its owner's
-alone to read.
+What a line is, and what of a damaged file counts, is in `hilbo.session.log_lines`; a last line that lacks its newline
+gets it when the log is opened for writing, and one that is cut off within goes. One writer at a time, by a lock of
+the operating system on the file, which goes with the process that holds it. A log is its owner's alone to read.
 """
 
-import hashlib
 import os
 import re
 import time
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from hilbo.errors import InputError
 from hilbo.session.file_lock import lock
 from hilbo.session.header_check import check_new_header
+from hilbo.session.log_lines import WHY_CUT, event_line, header_line, is_unbegun, read_lines
 from hilbo.session.records import Event, Header
 from hilbo.session.replay import replayed
 from hilbo.session.state import LiveSession
 from hilbo.study.study_file import AnyStudy
-from hilbo.study.typed_files import converted, decoded, read_bytes
+from hilbo.study.typed_files import read_bytes
 
 __all__ = ["EventLog", "LogError", "begun", "in_use", "keys_path", "log_name", "log_paths", "read_log", "read_session"]
 
 _SUFFIX = ".session.jsonl"
 _MODE = 0o600
-_WHAT = "is not what this hilbo writes"
-_WHY_CUT = (
-    "where hilbo was killed while it wrote, nothing acknowledged is missing; where this is a copy, copy the log again."
-)
-
-
-class _Line(msgspec.Struct, forbid_unknown_fields=True):
-    """A line of a log."""
-
-    seq: int
-    kind: str
-    time: float
-    data: dict[str, Any]
-    previous: str
-    crc: str
 
 
 class LogError(RuntimeError):
@@ -92,10 +67,10 @@ class EventLog:
         log = cls(path, file, state, b"", 0, "")
         try:
             lock(file, path)
-            if not _unbegun(_content(file)):
+            if not is_unbegun(_content(file)):
                 raise InputError(f"{path}: exists already; resume it, or choose another session.")
             _cut(file, 0)
-            log._write(_line(0, "header", time.time(), msgspec.to_builtins(header), b""))
+            log._write(header_line(header))
         except (LogError, InputError):
             log.close()
             raise
@@ -115,7 +90,7 @@ class EventLog:
         try:
             lock(file, path)
             content = _content(file)
-            header, events, lines, dropped = _parsed(content, path)
+            header, events, lines, dropped = read_lines(content, path)
             state = _folded(path, study, header, events)
             size = _ended(file, path, content, sum(map(len, lines)))
         except BaseException:
@@ -126,7 +101,7 @@ class EventLog:
     def append(self, event: Event) -> LiveSession:
         """Put an event on the disk, and only then into the state, which is returned. Raises LogError."""
         state = self.state.after(event)
-        self._write(_line(event.seq, event.kind, event.time, event.data, self._previous))
+        self._write(event_line(event, self._previous))
         self.state = state
         return state
 
@@ -162,7 +137,7 @@ class EventLog:
 
 def read_log(path: str | os.PathLike, study: AnyStudy | None = None) -> tuple[Header, list[Event], str]:
     """Header, events, and what was dropped at the end; for readers, without a lock. Raises InputError."""
-    header, events, _, dropped = _parsed(read_bytes(path), path)
+    header, events, _, dropped = read_lines(read_bytes(path), path)
     if study is not None:
         _check_study(path, study, header)
     return header, events, dropped
@@ -183,7 +158,7 @@ def begun(path: str | os.PathLike) -> bool:
     """Whether there is a session at this path, or another file: not where a log was killed within its first line."""
     try:
         with open(path, "rb") as file:
-            return not _unbegun(file.readline())
+            return not is_unbegun(file.readline())
     except FileNotFoundError:
         return False
 
@@ -219,55 +194,8 @@ def log_paths(folder: str | os.PathLike, note: Callable[[str], Any] = lambda sen
         if begun(path):
             whole.append(path)
         else:
-            note(f"{path}: has no whole first line, and is left out; {_WHY_CUT}")
+            note(f"{path}: has no whole first line, and is left out; {WHY_CUT}")
     return whole
-
-
-def _line(seq, kind, at, data, previous) -> bytes:
-    body = {"seq": seq, "kind": kind, "time": at, "data": data, "previous": _hash(previous)}
-    text = msgspec.json.encode(body)[:-1]
-    return text + b',"crc":"%08x"}\n' % zlib.crc32(text)
-
-
-def _hash(line) -> str:
-    return hashlib.sha256(line).hexdigest()[:16] if line else ""
-
-
-_FIRST = b'{"seq":0,"kind":"header",'
-
-
-def _unbegun(content) -> bool:
-    """Whether this is the beginning of a log's first line, without its end."""
-    return b"\n" not in content and content[: len(_FIRST)] == _FIRST[: len(content)]
-
-
-_CRC = re.compile(rb',"crc":"([0-9a-f]{8})"\}\n\Z')
-
-
-def _parsed(content, path):
-    """Header, events, the good lines, each with its newline, and a sentence on what follows those."""
-    dropped, header, events, good = "", None, [], []
-    for number, line in enumerate(filter(None, re.split(rb"(?<=\n)", content)), 1):
-        if not line.endswith(b"\n"):
-            if number == 1 or not _fits(line + b"\n"):
-                dropped = f"{path}:{number}: the last line is cut off, and is left out; {_WHY_CUT}"
-                break
-            line += b"\n"
-        raw = _checked(line, number, good[-1] if good else b"", path)
-        if number == 1:
-            header = converted(raw.data, Header, f"{path}:{number}", _WHAT)
-        else:
-            events.append(Event(seq=raw.seq, kind=raw.kind, time=raw.time, data=raw.data))
-        good.append(line)
-    if header is None:
-        raise InputError(f"{path}: holds no session, it has no whole first line; begin it without --resume.")
-    return header, events, good, dropped
-
-
-def _fits(line) -> bool:
-    """Whether a line is what its checksum says."""
-    checksum = _CRC.search(line)
-    return checksum is not None and int(checksum[1], 16) == zlib.crc32(line[: checksum.start()])
 
 
 def _ended(file, path, content, size) -> int:
@@ -285,17 +213,6 @@ def _ended(file, path, content, size) -> int:
     except OSError as error:
         raise InputError(f"{path}: cannot be written ({error.strerror}); free some space and try again.") from error
     return size
-
-
-def _checked(line, number, previous, path):
-    if not _fits(line):
-        raise InputError(f"{path}:{number}: is damaged; restore the file from a copy, nothing after it can be trusted.")
-    raw = decoded(line, _Line, f"{path}:{number}", _WHAT)
-    if raw.seq != number - 1 or raw.previous != _hash(previous):
-        raise InputError(f"{path}:{number}: does not follow the line before it; lines are missing or were changed.")
-    if (number == 1) != (raw.kind == "header"):
-        raise InputError(f"{path}:{number}: is no {'header' if number == 1 else 'event'}; this is no session's log.")
-    return raw
 
 
 def _check_study(path, study, header):
