@@ -201,7 +201,7 @@ def _logs(folder: Path) -> None:
     """The trial table's answers as logs of the sessions in which they were given."""
     from hilbo.session import actions
     from hilbo.session.event_log import EventLog, log_name
-    from hilbo.session.plan import header_for
+    from hilbo.session.headers import header_for
     from hilbo.study.config import Study
 
     study, table = Study.load("study.toml"), pd.read_csv("trials.csv")

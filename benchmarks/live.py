@@ -25,8 +25,8 @@ from hilbo.app.robot import Client
 from hilbo.cli.console import start
 from hilbo.session.actions import answer, present, propose
 from hilbo.session.ask_tell import Session
+from hilbo.session.headers import header_for
 from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.plan import header_for
 from hilbo.session.state import LiveSession
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study

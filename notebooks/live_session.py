@@ -18,8 +18,8 @@ from hilbo.app.rehearsal import Decider
 from hilbo.hardware_bridge import Renderer
 from hilbo.session.actions import answer, go_on, present, propose, sent
 from hilbo.session.event_log import EventLog, log_name
+from hilbo.session.headers import header_for
 from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.plan import header_for
 from hilbo.session.views import participant_view
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study

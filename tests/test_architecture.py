@@ -67,13 +67,13 @@ WITHOUT_JAX = {
     "study.trial_table",
     *(
         f"session.{name}"
-        for name in ("actions", "confirmed", "event_log", "export", "header_check", "log_lines", "netcdf")
+        for name in ("actions", "confirmed", "event_log", "export", "header_check", "headers", "log_lines")
     ),
     *(
         f"session.{name}"
         for name in ("plan", "records", "replay", "state", "transitions", "views", "withdrawal", "withdrawn_results")
     ),
-    *("session.pace", "session.participants", "session.table_words"),
+    *("session.netcdf", "session.pace", "session.participants", "session.table_words"),
 }
 # These import JAX for a set with full memory, and to convert a value, and not before.
 LATER = {"device.parameter_sets", "search.box"}

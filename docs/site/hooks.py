@@ -35,8 +35,8 @@ API = {
     ),
     "sessions": (
         "Studies and sessions",
-        "study.config session.ask_tell session.logged_session session.plan session.actions session.state"
-        " session.event_log session.look_ahead session.views session.warm_start",
+        "study.config session.ask_tell session.logged_session session.headers session.plan session.actions"
+        " session.state session.event_log session.look_ahead session.views session.warm_start",
     ),
     "simulation": (
         "Simulation",

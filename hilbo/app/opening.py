@@ -16,9 +16,10 @@ from hilbo.app.slices import Maps
 from hilbo.app.stimulus_rig import StimulusRig
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, begun, log_name
+from hilbo.session.headers import header_for
 from hilbo.session.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.participants import check_consent, read_people
-from hilbo.session.plan import header_for, planned_by, planned_header, read_plan
+from hilbo.session.plan import planned_by, planned_header, read_plan
 from hilbo.session.records import Header
 from hilbo.session.state import LiveSession
 from hilbo.session.warm_start import read_warm_start

@@ -20,7 +20,7 @@ from hilbo.errors import InputError
 from hilbo.session import excluded as apart
 from hilbo.session.ask_tell import Session
 from hilbo.session.explanation import Choice, explained
-from hilbo.session.plan import material_seed
+from hilbo.session.headers import material_seed
 from hilbo.session.records import Need, Planned
 from hilbo.session.set_facts import described
 from hilbo.session.state import LiveSession

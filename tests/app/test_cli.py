@@ -24,8 +24,9 @@ from hilbo.errors import InputError
 from hilbo.hardware_bridge import Renderer
 from hilbo.session import actions
 from hilbo.session.event_log import read_log
+from hilbo.session.headers import header_for
 from hilbo.session.participants import add_person
-from hilbo.session.plan import header_for, make_plan, plan_hash, reissue
+from hilbo.session.plan import make_plan, plan_hash, reissue
 from hilbo.session.warm_start import read_warm_start
 from hilbo.session.withdrawal import delete_participant
 from hilbo.simulation.presets import preset_of

@@ -15,10 +15,10 @@ from hilbo.session import actions as live
 from hilbo.session import explanation
 from hilbo.session.event_log import EventLog, log_name, read_log
 from hilbo.session.excluded import APART, spread_point
+from hilbo.session.headers import header_for
 from hilbo.session.logged_session import LoggedSession
 from hilbo.session.look_ahead import Answers, LiveChooser, _missing
 from hilbo.session.pace import minutes_left
-from hilbo.session.plan import header_for
 from hilbo.session.progress import consistency, trust_of
 from hilbo.session.records import Block
 from hilbo.session.state import LiveSession

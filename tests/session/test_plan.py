@@ -11,8 +11,9 @@ from live import RAW, STUDY
 from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session import actions as live
+from hilbo.session.headers import header_for, material_seed, warm_up
 from hilbo.session.look_ahead import LiveChooser
-from hilbo.session.plan import header_for, make_plan, material_seed, plan_hash, planned_header, reissue, warm_up
+from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue
 from hilbo.session.plan_sets import aggregate_best_sets, check_participants
 from hilbo.session.records import Block
 from hilbo.session.state import LiveSession

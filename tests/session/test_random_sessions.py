@@ -18,7 +18,8 @@ from live import RAW, beginning
 
 from hilbo import Study
 from hilbo.session import actions as live
-from hilbo.session.plan import header_for, make_plan, planned_header
+from hilbo.session.headers import header_for
+from hilbo.session.plan import make_plan, planned_header
 from hilbo.session.records import RefusedError
 from hilbo.session.state import LiveSession
 from hilbo.session.views import experimenter_view, participant_view
