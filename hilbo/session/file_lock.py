@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 
-__all__ = ["lock", "locked_beside"]
+__all__ = ["lock", "lock_name", "locked_beside"]
 
 _PATIENCE = 10.0  # s; a table is written anew in far less
 _PAUSE = 0.01  # s
@@ -30,14 +30,20 @@ def lock(file: int, path: Path) -> None:
         raise InputError(f"{path}: is being written by another hilbo; close that one first.") from None
 
 
+def lock_name(path: Path) -> str:
+    """The name of the empty file beside a file that is replaced, by which one is alone with it."""
+    return f".{path.name}.lock"
+
+
 @contextlib.contextmanager
 def locked_beside(path: Path, patience: float = _PATIENCE) -> Iterator[None]:
     """Be alone with a file that is replaced, by an empty file beside it, which stays. Raises InputError if another is
     not done within `patience` (s), and OSError."""
-    file = os.open(path.with_name(f".{path.name}.lock"), os.O_RDWR | os.O_CREAT, 0o666)
+    beside = path.with_name(lock_name(path))
+    file = os.open(beside, os.O_RDWR | os.O_CREAT, 0o666)
     try:
         with contextlib.suppress(OSError):  # somebody else's, who has done so
-            os.chmod(path.with_name(f".{path.name}.lock"), 0o666)
+            os.chmod(beside, 0o666)
         deadline = time.monotonic() + patience
         while True:
             try:

@@ -8,12 +8,13 @@ are listed. The study goes on: every command still runs on what is left.
 import contextlib
 import os
 import secrets
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import in_use, keys_path, read_log
+from hilbo.session.file_lock import lock_name, locked_beside
 from hilbo.session.withdrawn_files import Below, files_below, is_closed, refusals, remove
 from hilbo.session.withdrawn_names import CODED_JUDGED, CODED_OWN, file_is_called_after, file_names
 from hilbo.session.withdrawn_results import clear_results, plan_without, results_folders
@@ -73,11 +74,12 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
         if in_use(path):
             raise InputError(f"{path}: is being written; end the session first.")
     done.left |= below.left
-    _remove([*theirs, *_keys(below.files, participant, whose)], done)
-    _results(below.files, done)
-    _tables(below, done)
-    _plans(below.files, done)
-    _lists(below, done)
+    with _alone_with_lists(below.files):
+        _remove([*theirs, *_keys(below.files, participant, whose)], done)
+        _results(below.files, done)
+        _tables(below, done)
+        _plans(below.files, done)
+        _lists(below, done)
     after = files_below(root) if root.exists() else Below([], {}, {})  # results, of which nothing is left
     done.left |= after.left | _left(after.files, participant, whose, damaged) | done.left
     if not (done.removed or done.renamed):
@@ -89,6 +91,19 @@ def delete_participant(folder: str | os.PathLike, participant: str, done: Withdr
             f" the values stay with those who compared them: {', '.join(map(str, coded))}"
         )
     return done
+
+
+@contextlib.contextmanager
+def _alone_with_lists(files: Iterable[Path]) -> Iterator[None]:
+    """Nobody is added to a list of participants meanwhile, who would be lost when it is written anew. Raises InputError
+    before anything is removed if another hilbo is not done with one."""
+    places = sorted({path.resolve() for path in _ending(files, ".csv")})
+    with contextlib.ExitStack() as locks:
+        for place in places:
+            if place.with_name(lock_name(place)).exists():
+                with contextlib.suppress(OSError):  # what cannot be locked cannot be written either, which is said
+                    locks.enter_context(locked_beside(place))
+        yield
 
 
 def _below(root: Path) -> Below:
