@@ -9,6 +9,7 @@ before the answers is not identified.
 
 from collections.abc import Set
 from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -147,33 +148,46 @@ def learn(
     begun, problem = first_search(start, answers, stated, recipe)
     if near is not None and not bool(begun.cost.usable):
         return learn(trials, categories, stated, recipe)
-    alike, problem = searched(begun, problem, common)
-    chosen, free, gain = alike, common, 0.0
-    if "widths" in start:
-        different, its_own = searched(alike, problem, frozenset(start))
-        same = alike
-        if its_own is not problem:  # costs by other features differ by more than a gain may
-            same = alike._replace(cost=cost_at(alike.coordinates, alike.cost.weights, its_own))
-        gain = _gain_of_widths(same, different, its_own)
-        if gain > _WORTH:
-            chosen, free, problem = different, frozenset(start), its_own
-    sd, covariance = _spread(chosen, problem, free)
-    model = model_at(chosen.coordinates, answers, stated, recipe.kernel)
+    search, problem, free, gain = _with_widths_if_worth(*searched(begun, problem, common), frozenset(start))
+    sd, covariance = _spread(search, problem, free)
+    model = model_at(search.coordinates, answers, stated, recipe.kernel)
     left = unexplained(model.unit, answers, problem.pivots)
     return Learnt(
         recipe=recipe.name,
         model=model,
-        weights=chosen.cost.weights,
-        log_evidence=chosen.cost.log_evidence,
-        coordinates={name: value for name, value in chosen.coordinates.items() if name in free},
+        weights=search.cost.weights,
+        log_evidence=search.cost.log_evidence,
+        coordinates={name: value for name, value in search.coordinates.items() if name in free},
         sd=sd,
         covariance=covariance,
         gain_of_widths=jnp.asarray(gain),
-        steps=jnp.asarray(chosen.steps),
+        steps=jnp.asarray(search.steps),
         rank=jnp.asarray(len(problem.pivots.points)),
         left=left,
-        converged=chosen.cost.usable & jnp.asarray(chosen.ended) & (left <= _ROUGH),
+        converged=search.cost.usable & jnp.asarray(search.ended) & (left <= _ROUGH),
     )
+
+
+class _Chosen(NamedTuple):
+    """The search that counts, the problem that it solved, what was free in it, and what widths add to the evidence."""
+
+    search: Search
+    problem: Problem
+    free: Set[str]
+    gain: float
+
+
+def _with_widths_if_worth(alike: Search, problem: Problem, coordinates: Set[str]) -> _Chosen:
+    """What is learnt with widths of people's own where they add enough; else `alike`, where all have the same."""
+    without = _Chosen(alike, problem, coordinates - {"widths"}, 0.0)
+    if "widths" not in coordinates:
+        return without
+    different, its_own = searched(alike, problem, coordinates)
+    same = alike
+    if its_own is not problem:  # costs by other features differ by more than a gain may
+        same = alike._replace(cost=cost_at(alike.coordinates, alike.cost.weights, its_own))
+    gain = _gain_of_widths(same, different, its_own)
+    return _Chosen(different, its_own, coordinates, gain) if gain > _WORTH else without._replace(gain=gain)
 
 
 def _gain_of_widths(alike: Search, different: Search, problem: Problem) -> float:
