@@ -12,7 +12,7 @@ Reference: Tresp (2000), Neural Computation 12:2719.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -23,6 +23,8 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
 from hilbo.errors import InputError
+from hilbo.numerics.host import placed
+from hilbo.numerics.shown import concrete, float_dtype, numbers
 
 __all__ = ["Evidence", "average", "combine", "combine_explained", "stream"]
 
@@ -31,6 +33,8 @@ def __dir__() -> list[str]:
     return __all__
 
 
+Numbers = ArrayLike | Sequence
+"""An array, or lists of numbers."""
 _Map = tuple[Float[Array, " m"], Float[Array, " m"]]
 """Mean and variance (m,) of the population map."""
 
@@ -51,11 +55,11 @@ class Evidence(eqx.Module):
 
 
 def combine(
-    means: Float[Array, "M m"],
-    variances: Float[Array, "M m"],
-    prior_variance: ArrayLike,
+    means: Numbers,
+    variances: Numbers,
+    prior_variance: Numbers,
     *,
-    mask: Bool[Array, " M"] | None = None,
+    mask: Numbers | None = None,
     throw: bool = True,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Population mean and variance (m,) from participants' posterior means and variances at the same m points.
@@ -65,31 +69,30 @@ def combine(
     - `means`, `variances`: (M, m).
     - `prior_variance`: k, a scalar or (m,), the same for all participants.
     - `mask`: (M,), False for absent participants.
-    - `throw`: raise for variances that are not positive, for more variance after the answers than before as a
-      whole (no positive precision), or for priors that differ; `False` returns NaN there.
+    - `throw`: raise for means that are no numbers, for variances that are not positive, and for more variance after
+      the answers than before as a whole (no positive precision); `False` returns NaN there.
 
-    Where the explained variance is known directly, [`combine_explained`][] is more precise for weak experts.
+    What an absent participant's rows hold has no influence. Where the explained variance is known directly,
+    [`combine_explained`][] is more precise for weak experts.
     """
-    means, variances = _people(means, variances, "variances")
-    prior = _checked_prior(prior_variance, means)
+    means, variances, prior = _people(means, "variances", variances, prior_variance)
     return combine_explained(means, prior[None, :] - variances, prior, mask=mask, throw=throw)
 
 
 def combine_explained(
-    means: Float[Array, "M m"],
-    explained: Float[Array, "M m"],
-    prior_variance: ArrayLike,
+    means: Numbers,
+    explained: Numbers,
+    prior_variance: Numbers,
     *,
-    mask: Bool[Array, " M"] | None = None,
+    mask: Numbers | None = None,
     throw: bool = True,
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """As [`combine`][], with its errors, from the variances e_j = k - sigma_j^2 that the answers explain, (M, m).
 
     Raises `InputError` for other shapes.
     """
-    means, explained = _people(means, explained, "explained")
-    prior = _checked_prior(prior_variance, means)
-    merged, invalid = _merged(means, explained, prior, mask)
+    means, explained, prior = _people(means, "explained", explained, prior_variance)
+    merged, invalid = _merged(means, explained, prior, _present(mask, means))
     return _raise_if(invalid, merged) if throw else merged
 
 
@@ -106,7 +109,7 @@ def stream(
 
     def evidence_of(one):
         means, explained = (row[None] for row in expert(one))
-        return _evidence(means, explained, jnp.broadcast_to(prior_variance, means.shape[1:]), None)
+        return _evidence(means, explained, jnp.broadcast_to(prior_variance, means.shape[1:]))
 
     shape = jax.eval_shape(evidence_of, jax.tree.map(lambda leaf: leaf[0], experts))
     total = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shape)
@@ -114,24 +117,27 @@ def stream(
 
 
 def average(
-    means: Float[Array, "M m"], variances: Float[Array, "M m"], *, mask: Bool[Array, " M"] | None = None
+    means: Numbers, variances: Numbers, *, mask: Numbers | None = None
 ) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
     """Plain average of the latent functions, for comparison (paper, section II-C): every person counts the same,
     however little is known; mean (m,), and the variance (m,) of the mean of independent functions.
 
-    Raises `InputError` for other shapes.
+    Raises `InputError` for other shapes, and where nobody is present; if that is traced, the average is NaN.
     """
-    means, variances = _people(means, variances, "variances")
-    return _averaged(means, variances, mask)
+    means, variances, _ = _people(means, "variances", variances, 1.0)
+    present = _present(mask, means)
+    if concrete(present) and not np.any(present):
+        raise InputError("bcm: nobody is present; an average needs one participant at least.")
+    return _averaged(means, variances, present)
 
 
 @_one_program
-def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], mask: Bool[Array, " M"] | None) -> _Map:
+def _averaged(means: Float[Array, "M m"], variances: Float[Array, "M m"], present: Bool[Array, " M"]) -> _Map:
     """Of `average`, with arrays that were checked."""
-    present = jnp.ones(means.shape[0], bool) if mask is None else mask
-    present = present.astype(means.dtype)
-    share = present / jnp.sum(present)
-    return share @ means, share**2 @ variances
+    means, variances = _of_those(present, means), _of_those(present, variances)
+    count = jnp.sum(present)
+    count = jnp.where(count > 0, count.astype(means.dtype), jnp.nan)
+    return jnp.sum(means, axis=0) / count, jnp.sum(variances, axis=0) / count**2
 
 
 @_one_program
@@ -139,25 +145,24 @@ def _merged(
     means: Float[Array, "M m"],
     explained: Float[Array, "M m"],
     prior: Float[Array, " m"],
-    mask: Bool[Array, " M"] | None,
+    present: Bool[Array, " M"],
 ) -> tuple[_Map, Bool[Array, " m"]]:
     """The map by the committee machine, NaN where it cannot be; and where that is."""
-    evidence = _evidence(means, explained, prior, mask)
-    invalid = _invalid(explained, prior, mask) | ~(1.0 + prior * evidence.added > 0.0)
+    means, explained = _of_those(present, means), _of_those(present, explained)
+    evidence = _evidence(means, explained, prior)
+    invalid = _invalid(means, explained, prior) | ~(1.0 + prior * evidence.added > 0.0)
     mean, variance = evidence.merge(prior)
     return (jnp.where(invalid, jnp.nan, mean), jnp.where(invalid, jnp.nan, variance)), invalid
 
 
-def _evidence(
-    means: Float[Array, "M m"],
-    explained: Float[Array, "M m"],
-    prior: Float[Array, " m"],
-    mask: Bool[Array, " M"] | None,
-) -> Evidence:
+def _of_those(present: Bool[Array, " M"], rows: Float[Array, "M m"]) -> Float[Array, "M m"]:
+    """Rows of those who are present; of others 0, which explains nothing and adds nothing."""
+    return jnp.where(present[:, None], rows, 0.0)
+
+
+def _evidence(means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"]) -> Evidence:
     remaining = prior[None, :] - explained
     added, weighted = explained / (prior[None, :] * remaining), means / remaining
-    if mask is not None:
-        added, weighted = (jnp.where(mask[:, None], by_person, 0.0) for by_person in (added, weighted))
     return Evidence(jnp.sum(added, axis=0), jnp.sum(weighted, axis=0))
 
 
@@ -166,41 +171,50 @@ def _add(left: Evidence, right: Evidence) -> Evidence:
 
 
 def _people(
-    means: Float[ArrayLike, "M m"], others: Float[ArrayLike, "M m"], name: str
-) -> tuple[Float[Array, "M m"], Float[Array, "M m"]]:
-    """Both as arrays of one shape. Raises `InputError` for others."""
-    means, others = jnp.asarray(means), jnp.asarray(others)
+    means: Numbers, name: str, others: Numbers, prior_variance: Numbers
+) -> tuple[Float[Array, "M m"], Float[Array, "M m"], Float[Array, " m"]]:
+    """Both as arrays of one shape, and one prior for each point, all of one floating dtype. Raises `InputError` for
+    other shapes. `name`: of `others`."""
+    dtype = np.promote_types(float_dtype(means), float_dtype(others))
+    means, others = numbers("bcm", "means", means, dtype), numbers("bcm", name, others, dtype)
     if means.ndim != 2 or means.shape != others.shape:
         raise InputError(
             f"bcm: means has shape {means.shape} and {name} {others.shape}; give both as (M, m): a row for each"
             " participant, a column for each point."
         )
-    return means, others
-
-
-def _checked_prior(prior_variance: ArrayLike, means: Float[Array, "M m"]) -> Float[Array, " m"]:
-    """One value per point."""
-    prior = jnp.asarray(prior_variance, means.dtype)
+    prior = numbers("bcm", "prior_variance", prior_variance, dtype)
     if prior.ndim > 1 or (prior.ndim == 1 and prior.shape != means.shape[1:]):
         raise InputError(
             f"bcm: the prior variance has shape {prior.shape}; the committee machine needs one prior for all experts,"
             f" a scalar or one value per point {means.shape[1:]}."
         )
-    return jnp.broadcast_to(prior, means.shape[1:])
+    return means, others, jnp.broadcast_to(prior, means.shape[1:])
+
+
+def _present(mask: Numbers | None, means: Float[Array, "M m"]) -> Bool[Array, " M"]:
+    """Who is present. Raises `InputError` for what is not one flag for each participant."""
+    if mask is None:
+        return placed(np.ones(means.shape[0], bool))
+    flags = numbers("bcm", "mask", mask)
+    if flags.dtype != bool or flags.shape != means.shape[:1]:
+        raise InputError(
+            f"bcm: mask is {flags.dtype} of shape {flags.shape}; give True or False for each of {means.shape[0]}"
+            " participants."
+        )
+    return flags
 
 
 def _invalid(
-    explained: Float[Array, "M m"], prior: Float[Array, " m"], mask: Bool[Array, " M"] | None
+    means: Float[Array, "M m"], explained: Float[Array, "M m"], prior: Float[Array, " m"]
 ) -> Bool[Array, " m"]:
-    """Points at which some expert's variance is not positive (or NaN)."""
-    wrong = ~(prior[None, :] - explained > 0.0)
-    return jnp.any(wrong if mask is None else wrong & mask[:, None], axis=0)
+    """Points at which some expert's mean is no number, or some variance is not positive (or no number)."""
+    return jnp.any(~jnp.isfinite(means) | ~(prior[None, :] - explained > 0.0), axis=0)
 
 
 def _raise_if(invalid: Bool[Array, " m"], merged: _Map) -> _Map:
     message = (
-        "bcm: an expert's variance is not positive, or the experts' variances exceed the prior's so far that no"
-        " positive precision is left; check that prior_variance is the one all experts were fitted with"
+        "bcm: an expert's mean is no number, a variance is not positive, or the experts' variances exceed the prior's"
+        " so far that no positive precision is left; check that prior_variance is the one all experts were fitted with"
     )
     if isinstance(invalid, jax.core.Tracer):
         return eqx.error_if(merged, invalid, message)

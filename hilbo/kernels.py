@@ -111,8 +111,8 @@ class Matern32(eqx.Module):
     def __init__(
         self, theta: ArrayLike | Sequence[float | int], variance: ArrayLike = 1.0, levels: tuple[int, ...] = ()
     ):
-        self.theta = jnp.asarray(theta, dtype=float_dtype(theta))
-        self.variance = jnp.asarray(variance, dtype=float_dtype(variance))
+        self.theta = numbers("Matern32", "theta", theta, float_dtype(theta))
+        self.variance = numbers("Matern32", "variance", variance, float_dtype(variance))
         self.levels = levels
         check_positive("Matern32", theta=self.theta, variance=self.variance)
 

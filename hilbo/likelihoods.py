@@ -109,18 +109,29 @@ class OrdinalProbit(eqx.Module):
         Paper, section VI: the noise grows to sqrt(noise^2 + variance), and the edges stay.
         """
         mean, variance = floats(jnp.asarray(mean), self.thresholds.dtype), jnp.asarray(variance)
-        blurred = OrdinalProbit(self.thresholds, jnp.sqrt(self.noise**2 + variance.astype(self.noise.dtype)))
+        spread = jnp.sqrt(self.noise**2 + variance.astype(self.noise.dtype))
+        blurred = OrdinalProbit(self.thresholds, jnp.where(self.noise > 0, spread, jnp.nan))
         return jnp.exp(jax.vmap(lambda q: blurred.log_prob(mean, q))(jnp.arange(self.categories)))
 
     def _edges(
         self, f: ArrayLike, q: ArrayLike
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
-        """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`."""
+        """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`; NaN where there
+        is no such category or likelihood. Raises `InputError` for what are no scalars."""
+        if jnp.ndim(f) or jnp.ndim(q) or self.noise.ndim or self.thresholds.ndim != 1:
+            shapes = f"{jnp.shape(f)}, {jnp.shape(q)}, {self.thresholds.shape} and {self.noise.shape}"
+            raise InputError(
+                f"OrdinalProbit: value, category, thresholds and noise have the shapes {shapes}; all but the thresholds"
+                " are scalars, use jax.vmap for several."
+            )
         dtype = self.thresholds.dtype
         latent = floats(jnp.asarray(f, dtype if isinstance(f, int | float) else None), dtype)
         ends = jnp.full((1,), jnp.inf, latent.dtype)
         edges = jnp.concatenate([-ends, self.thresholds.astype(latent.dtype), ends])
-        return latent, edges[q], edges[q + 1], self.noise.astype(latent.dtype)
+        rises = jnp.all(self.thresholds[1:] > self.thresholds[:-1])
+        noise = jnp.where(rises & (self.noise > 0), self.noise, jnp.nan).astype(latent.dtype)
+        lower = jnp.where(jnp.asarray(q) < 0, jnp.nan, edges[q])  # which an index below 0 would count from the end
+        return latent, lower, edges[q + 1], noise
 
 
 class OrdinalTerms(eqx.Module):

@@ -26,7 +26,8 @@ from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained, s
 from hilbo.inference.ep import ep
 from hilbo.inference.ep_corrected import ep_corrected
 from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
-from hilbo.kernels import RBF, Stationary, gram
+from hilbo.inference.fitting_input import check_answers, check_shapes
+from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit, OrdinalTerms, TiltedTerms
 from hilbo.numerics.shown import concrete, floats, known, numbers, shown
@@ -249,17 +250,20 @@ def fit(
         raise InputError(f"fit: takes an OrdinalGP and Trials, not {given}; write fit(gp, Trials.from_arrays(x, q)).")
     if inference not in _SOUGHT:
         raise InputError(f'fit: inference is "{inference}"; it must be one of {", ".join(_SOUGHT)}.')
-    dim = trials.x.shape[-1]
-    if isinstance(gp.kernel, Stationary) and gp.kernel.theta.shape not in ((), (dim,)):
-        raise InputError(
-            f"fit: theta has shape {gp.kernel.theta.shape} and x {dim} parameters; give one number or {dim}."
-        )
+    check_shapes(gp.kernel, gp.likelihood, trials, start)
     posterior = _fit(gp, trials, start, inference)
     return _checked(posterior, _SOUGHT[inference]) if throw else posterior
 
 
+def _answers_alone(trials: Trials) -> Trials:
+    """The trials with nothing in the rows that hold no answer: 0 times NaN is NaN, in values and in derivatives."""
+    x = jnp.where(trials.mask[:, None], trials.x, 0)
+    return Trials(x, jnp.where(trials.mask, trials.q, 0), trials.mask, trials.context)
+
+
 @functools.partial(jax.jit, static_argnames="inference")
 def _fit(gp: OrdinalGP, trials: Trials, start: Float[Array, " n"] | None, inference: str) -> Posterior:
+    trials = _answers_alone(trials)
     covariance = gram(gp.kernel, trials.x, trials.x)
     if inference in ("ep", "ep_corrected"):
         tilted = TiltedTerms(gp.likelihood, trials.q, trials.mask)
@@ -284,13 +288,7 @@ def _checked(posterior: Posterior, sought: str) -> Posterior:
         message = f"the {sought} was not found to its tolerance; fit with throw=False and read the certificate"
         return eqx.error_if(posterior, ~certificate.converged, message)
     if not bool(certificate.converged):
-        categories = len(posterior.gp.likelihood.thresholds) + 1
-        highest = int(jnp.max(jnp.where(posterior.trials.mask, posterior.trials.q, 0)))
-        if highest >= categories:
-            raise InputError(
-                f"fit: an answer has category {highest}, but the likelihood has {categories - 1} thresholds and so the"
-                f" categories 0 to {categories - 1}; check the answers or the thresholds."
-            )
+        check_answers(posterior.trials, posterior.gp.likelihood.categories)
         words = shortfall(certificate, posterior.log_evidence)
         raise InferenceError(f"the {sought} was {words}, or throw=False to look at the certificate.")
     return posterior

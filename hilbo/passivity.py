@@ -35,7 +35,7 @@ from hilbo.mechanics.memory import sums
 from hilbo.mechanics.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
 from hilbo.mechanics.span import Memory, Span, span
 from hilbo.numerics.host import namespace_of, on_host
-from hilbo.viscoelastic import check_ranges, elementwise
+from hilbo.viscoelastic import elementwise
 
 __all__ = [
     "Certificate",
@@ -66,9 +66,9 @@ def minimum_damping(
     """Smallest device damping b (N·s/m) with which the rendering is passive; elementwise.
 
     `inf` where `K_eff` < 0: a negative static stiffness is active whatever the damping. For a set with a K0 of its
-    own, `K_eff` is its `viscoelastic.dc_gain`. Raises `InputError` for even N, and for values that no model has.
+    own, `K_eff` is its `viscoelastic.dc_gain`. Raises `InputError` for even N, and for values that no model has; where
+    they are traced the result is NaN.
     """
-    check_ranges(K1=K1, B1=B1, alpha=alpha, T=T)
     return elementwise(_minimum_damping, _closed(memory, N), K1, B1, alpha, K_eff, T)
 
 
@@ -85,9 +85,9 @@ def largest_K1(
     """Largest passive K1 (N/mm) on a device with damping `b` (N·s/m); elementwise.
 
     `inf` where every K1 is passive, 0 where none is. Differentiable, with derivative 0 at `inf` and at 0.
-    Raises `InputError` for even N, and for values that no model or device has.
+    Raises `InputError` for even N, and for values that no model or device has; where they are traced the result is
+    NaN, never a K1 that would pass for passive.
     """
-    check_ranges(B1=B1, alpha=alpha, b=b, T=T)
     return elementwise(_largest_K1, _closed(memory, N), B1, alpha, b, K_eff, T)
 
 

@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
-from hilbo.numerics.shown import concrete, floats, known, numbers
+from hilbo.numerics.shown import concrete, floats, known, numbers, shown
 
 __all__ = ["Trials"]
 
@@ -86,21 +86,26 @@ class Trials(eqx.Module):
         return self.x.shape[-2]
 
     def append(self, x: ArrayLike | Sequence[float], q: ArrayLike) -> "Trials":
-        """With one more answer in the first free row: the shapes stay, nothing recompiles. A full table becomes NaN.
-        Contexts are not kept.
+        """With one more answer in the first free row: the shapes stay, nothing recompiles. Contexts are not kept.
 
-        `x` (d,) in the unit cube, `q` a category in 0..C-1. Raises `InputError` for a point of another shape, and what
-        is no category.
+        `x` (d,) in the unit cube, `q` a category in 0..C-1. Raises `InputError` for a point of another shape, values
+        that are not finite, what is no category, answers of several people, and a table that is full; where these are
+        traced, x becomes NaN.
         """
+        if self.mask.ndim != 1:
+            raise InputError(f"Trials: holds {len(self.mask)} people; append to the answers of one, or use jax.vmap.")
         point, dim = numbers("Trials", "x", x, self.x.dtype), self.x.shape[-1]
         if point.shape != (dim,):
             raise InputError(f"Trials: x has shape {point.shape}; append one point, of shape ({dim},).")
+        if concrete(point) and not np.all(np.isfinite(point)):
+            raise InputError(f"Trials: x is {shown(point)}; give finite numbers.")
         if concrete(q):
             _check_categories(np.atleast_1d(_array("q", q)))
-        row = jnp.sum(self.mask)
-        full = row >= self.capacity
+        if concrete(self.mask) and np.all(self.mask):
+            raise InputError(f"Trials: all {self.capacity} rows hold an answer; make it with a larger capacity.")
+        row = jnp.argmin(self.mask)
         return Trials(
-            jnp.where(full, jnp.nan, self.x.at[row].set(point)),
+            jnp.where(jnp.all(self.mask), jnp.nan, self.x.at[row].set(point)),
             self.q.at[row].set(jnp.asarray(q, self.q.dtype)),
             self.mask.at[row].set(True),
         )

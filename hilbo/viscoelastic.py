@@ -15,15 +15,14 @@ under another N. Reference: Podlubny (1999), Fractional Differential Equations, 
 """
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from inspect import signature
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
-from hilbo.errors import InputError
 from hilbo.mechanics.continuous import creep_compliance, relaxation_modulus
 from hilbo.mechanics.fosls import FOSLS, pot_stiffness, slow_damping, slow_stiffness
 from hilbo.mechanics.materials import (
@@ -38,9 +37,9 @@ from hilbo.mechanics.materials import (
     springpot,
 )
 from hilbo.mechanics.memory import GLSums, gl_coefficients, gl_sums, sums
+from hilbo.mechanics.ranges import RANGES, check_ranges, possible
 from hilbo.mechanics.span import Memory, Span, span
 from hilbo.mechanics.switching import switched_force
-from hilbo.numerics.shown import concrete, shown
 
 __all__ = [
     "FOSLS",
@@ -74,13 +73,11 @@ def __dir__() -> list[str]:
 
 def gl_sum(alpha: Real[ArrayLike, "..."], N: int) -> Float[Array, "..."]:
     """S_N = C(1) = Π_{i=1..N} (1 - α/i), elementwise in `alpha`."""
-    check_ranges(alpha=alpha)
     return elementwise(_gl_sum, span("short", N), alpha)
 
 
 def gl_alternating_sum(alpha: Real[ArrayLike, "..."], N: int) -> Float[Array, "..."]:
     """C(-1) = Σ (-1)^i c_i, elementwise in `alpha`; within 3.4e-4 of 2^α at N = 101."""
-    check_ranges(alpha=alpha)
     return elementwise(_gl_alternating_sum, span("short", N), alpha)
 
 
@@ -97,9 +94,8 @@ def K0_from_effective_stiffness(
     """K0 (N/mm) with which the rendering has the static stiffness H(1) = `K_eff` (N/mm); elementwise.
 
     K1 and `K_eff` in N/mm, B1 in N·s^α/mm, T in s; arrays that broadcast. Raises `InputError` for values that no
-    model has, here and below, except where they are traced.
+    model has, here and below; where they are traced the result is NaN.
     """
-    check_ranges(K1=K1, B1=B1, alpha=alpha, T=T)
     return elementwise(_K0, span(memory, N), K1, B1, alpha, K_eff, T)
 
 
@@ -114,7 +110,6 @@ def dc_gain(
     memory: Memory = "short",
 ) -> Float[Array, "..."]:
     """Static stiffness H(1) (N/mm) of the sampled model; elementwise."""
-    check_ranges(K1=K1, B1=B1, alpha=alpha, T=T)
     return elementwise(_dc_gain, span(memory, N), K0, K1, B1, alpha, T)
 
 
@@ -129,35 +124,34 @@ def effective_damping(
     states: int = 10,
 ) -> Float[Array, "..."]:
     """dH/ds at s = 0 (N·s/m): the damping felt in slow motion, T·K1²·β·M1/(K1 + β·S_N)²; elementwise."""
-    check_ranges(K1=K1, B1=B1, alpha=alpha, T=T)
     return elementwise(_effective_damping, span(memory, N, states), K1, B1, alpha, T)
 
 
-_RANGES = {
-    "alpha": (lambda v: (v > 0) & (v <= 1), "above 0 and at most 1: the order of the fractional element"),
-    "T": (lambda v: (v > 0) & np.isfinite(v), "a number of seconds above 0"),
-}
-_FROM_0 = (lambda v: v >= 0, "0 or above")
-
-
-def check_ranges(**values: Real[ArrayLike, "..."]) -> None:
-    """Raises `InputError` for numbers that no model, and no device, has; what is traced is not looked at."""
-    for name, value in values.items():
-        allowed, words = _RANGES.get(name, _FROM_0)
-        if concrete(value) and not np.all(fine := allowed(np.asarray(value, float))):
-            wrong = np.asarray(value, float)[~fine][0] if np.ndim(value) else value
-            raise InputError(f"{name} is {shown(wrong)}; it must be {words}.")
-
-
 def elementwise(function: Callable, span: Span, *args: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once."""
+    """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once.
+
+    By the names of its parameters: raises `InputError` for what no model has; where that is traced, the result is NaN.
+    """
+    names = _ranged(function)
+    check_ranges(**{name: args[i] for i, name in names})
     dtype = jnp.result_type(1.0, *args)
     return _compiled(function, span, *(jnp.asarray(arg, dtype) for arg in args))
 
 
+@cache
+def _ranged(function: Callable) -> tuple[tuple[int, str], ...]:
+    """The scalars that have a range: their places after `span`, and their names. K0 may be any number here."""
+    names = [*signature(function).parameters][1:]
+    return tuple((i, name) for i, name in enumerate(names) if name in RANGES and name != "K0")
+
+
 @partial(jax.jit, static_argnums=(0, 1))
 def _compiled(function: Callable, span: Span, *args: Float[Array, "..."]) -> Float[Array, "..."]:
-    return jnp.vectorize(partial(function, span))(*args)
+    def one(*scalars):
+        allowed = possible(**{name: scalars[i] for i, name in _ranged(function)})
+        return jnp.where(allowed, function(span, *scalars), jnp.nan)
+
+    return jnp.vectorize(one)(*args)
 
 
 def _gl_sum(span: Span, alpha: Float[Array, ""]) -> Float[Array, ""]:

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from reference_laplace import bcm_mp
 
 from hilbo import bcm
+from hilbo.errors import InputError
 
 
 def experts(count, points, prior=1.3, weakest=1e-12, seed=0):
@@ -136,3 +137,39 @@ def test_without_throw_only_the_bad_point_is_nan():
     mean, variance = bcm.combine(jnp.zeros((2, 2)), jnp.array([[0.5, 0.5], [0.5, -1.0]]), 1.0, throw=False)
     assert jnp.isnan(variance).tolist() == [False, True]
     assert jnp.isnan(mean).tolist() == [False, True]
+
+
+def test_whole_numbers_are_numbers():
+    whole, halves = np.array([[0, 1], [1, 0]]), np.full((2, 2), 0.5)
+    for means in (whole, whole.tolist(), whole.astype(np.float32)):
+        np.testing.assert_array_equal(bcm.combine(means, halves, 1.5), bcm.combine(whole * 1.0, halves, 1.5))
+    np.testing.assert_array_equal(bcm.combine(whole, halves, 0.9), bcm.combine(whole * 1.0, halves, 0.9))
+
+
+def test_rows_of_somebody_absent_have_no_influence():
+    means, variances = jnp.array([[1.0, 2.0], [jnp.nan, jnp.inf]]), jnp.array([[0.5, 0.5], [jnp.nan, -1.0]])
+    mask = [True, False]
+    for rule in (lambda k, m, v, p: bcm.combine(m, v, k, mask=p), lambda k, m, v, p: bcm.average(m, v, mask=p)):
+        alone = rule(1.0, means[:1], variances[:1], None)
+        np.testing.assert_allclose(rule(1.0, means, variances, mask), alone, rtol=1e-15)
+    slope = jax.grad(lambda k: bcm.combine(means, variances, k, mask=jnp.array(mask), throw=False)[0].sum())(1.0)
+    assert np.isfinite(slope)
+
+
+def test_nobody_has_no_average():
+    halves = jnp.full((2, 2), 0.5)
+    with pytest.raises(InputError, match="nobody is present; an average needs one participant"):
+        bcm.average(halves, halves, mask=np.zeros(2, bool))
+    assert np.isnan(jax.jit(lambda mask: bcm.average(halves, halves, mask=mask))(np.zeros(2, bool))).all()
+
+
+@pytest.mark.parametrize("mask", [[True], [[True, False]], [1, 0]])
+def test_a_mask_is_a_flag_for_each_participant(mask):
+    halves = jnp.full((2, 2), 0.5)
+    with pytest.raises(InputError, match="give True or False for each of 2 participants"):
+        bcm.combine(halves, halves, 1.0, mask=mask)
+
+
+def test_a_mean_that_is_no_number_is_refused():
+    with pytest.raises(InputError, match=r"mean is no number.*first at point 1"):
+        bcm.combine([[1.0, np.nan], [1.0, 1.0]], np.full((2, 2), 0.5), 1.0)

@@ -30,6 +30,8 @@ from hilbo import (
     passivity,
     viscoelastic,
 )
+from hilbo.kernels import Matern32
+from hilbo.search.box import Mechanics, Parameter
 
 
 @pytest.fixture(scope="module")
@@ -42,6 +44,11 @@ def posterior():
 @pytest.fixture(scope="module")
 def session():
     return Session.start(Study.from_dict(PLAIN), seed=0)
+
+
+def with_first(trials, name, value):
+    """Trials whose first row holds something else."""
+    return eqx.tree_at(lambda t: getattr(t, name), trials, getattr(trials, name).at[0].set(value))
 
 
 MISTAKES = {
@@ -128,6 +135,52 @@ MISTAKES = {
         lambda p, s: p.trials.append(jnp.array([0.5, 0.5]), 1.5),
         "Trials: q must hold the categories as integers from 0 (lowest) to C - 1 (highest).",
     ),
+    "a point that is nowhere": (
+        lambda p, s: p.trials.append([0.5, np.nan], 1),
+        "Trials: x is [0.5, nan]; give finite numbers.",
+    ),
+    "one answer more than there is room for": (
+        lambda p, s: Trials.from_arrays(np.zeros((1, 2)), np.array([0]), 1).append([0.5, 0.5], 1),
+        "Trials: all 1 rows hold an answer; make it with a larger capacity.",
+    ),
+    "one answer to several people": (
+        lambda p, s: jax.vmap(lambda _: p.trials)(jnp.arange(2)).append([0.5, 0.5], 1),
+        "Trials: holds 2 people; append to the answers of one, or use jax.vmap.",
+    ),
+    "the answers of several people": (
+        lambda p, s: fit(p.gp, jax.vmap(lambda _: p.trials)(jnp.arange(2))),
+        "fit: these trials hold 2 people; fit those of one, or use jax.vmap with throw=False.",
+    ),
+    "a category below 0": (
+        lambda p, s: fit(p.gp, with_first(p.trials, "q", -1)),
+        "fit: an answer has category -1, but the likelihood has 2 thresholds and so the categories 0 to 2; check the"
+        " answers or the thresholds.",
+    ),
+    "an answer at no point": (
+        lambda p, s: fit(p.gp, with_first(p.trials, "x", np.nan)),
+        "fit: x[0] of the trials is not finite; fix that answer or take it out.",
+    ),
+    "a start for fewer answers": (
+        lambda p, s: fit(p.gp, p.trials, start=jnp.zeros(3)),
+        "fit: start has shape (3,); give one weight for each of 32 rows.",
+    ),
+    "levels for 1 of 2 parameters": (
+        lambda p, s: fit(OrdinalGP(RBF(5.0, levels=(3,)), p.gp.likelihood), p.trials),
+        "fit: the kernel has levels (3,) and x 2 parameters; give 2 of them.",
+    ),
+    "probabilities at several values": (
+        lambda p, s: p.gp.likelihood.class_probabilities(jnp.zeros(12)),
+        "OrdinalProbit: value, category, thresholds and noise have the shapes (12,), (), (2,) and (); all but the"
+        " thresholds are scalars, use jax.vmap for several.",
+    ),
+    "creep with a K0 below 0": (
+        lambda p, s: viscoelastic.creep_compliance(np.array([0.01, 0.1]), -2.89, 5.7, 5.89, 0.203),
+        "K0 is -2.89; it must be 0 or above.",
+    ),
+    "relaxation of order 1.5": (
+        lambda p, s: viscoelastic.relaxation_modulus(1.0, 1.0, 1.0, 1.0, 1.5),
+        "alpha is 1.5; it must be above 0 and at most 1: the order of the fractional element.",
+    ),
     "the best of nothing": (
         lambda p, s: s.best(),
         "Session: there are no answers yet, and so no best rendering; tell one first.",
@@ -190,6 +243,22 @@ OF_ANOTHER_TYPE = {
         lambda p, s: Trials.from_arrays([[0.1, 0.2], [0.3]], [0, 1]),
         "Trials: x has rows of different lengths; give numbers, in rows of one length.",
     ),
+    "a start with a capital": (
+        lambda p, s: viscoelastic.FOSLS(-3, 5, 7, 0.2).simulate(np.ones(2), start="Equilibrium"),
+        'start is "Equilibrium"; it must be "rest" or "equilibrium".',
+    ),
+    "words for a Matern's theta": (
+        lambda p, s: Matern32("long"),
+        "Matern32: theta is 'long'; give numbers, in rows of one length.",
+    ),
+    "a scale with a capital": (
+        lambda p, s: Parameter("a", 1.0, 100.0, scale="Log"),
+        'parameters.a.scale is "Log"; it must be linear or log.',
+    ),
+    "a long memory": (
+        lambda p, s: Mechanics(0.44, 0.95, memory="long"),
+        'renderer.memory is "long"; it must be short or full.',
+    ),
     "one position": (
         lambda p, s: viscoelastic.FOSLS(-3, 5, 7, 0.2).simulate(1.0),
         "FOSLS: x has shape (); give one sample every T, of shape (n,).",
@@ -229,6 +298,50 @@ def test_mistakes_of_type_get_one_sentence_where_nobody_checks_types():
         env=os.environ | {"PYTHONPATH": path, "JAX_ENABLE_X64": "1"},
     )
     assert run.stdout == "all\n", run.stderr
+
+
+IMPOSSIBLE = {
+    "a damping factor below 0": (passivity.largest_K1, (-1.0, 0.5)),
+    "an order below 0": (passivity.largest_K1, (1.0, -0.5)),
+    "an order above 1": (passivity.minimum_damping, (1.0, 1.0, 1.5)),
+    "a model of order above 1": (lambda *values: viscoelastic.FOSLS(*values).dc_gain(), (0.5, 1.0, 1.0, 1.5)),
+    "a modulus before time 0": (viscoelastic.relaxation_modulus, (-1.0, 1.0, 1.0, 1.0, 0.5)),
+    "creep with a K0 below 0": (viscoelastic.creep_compliance, (1.0, -2.0, 1.0, 1.0, 0.5)),
+    "a noise below 0": (lambda noise: OrdinalProbit((-0.5, 0.5), noise).class_probabilities(0.1, 0.3), (-0.5,)),
+    "a noise below 0 and one answer": (lambda noise: OrdinalProbit((-0.5, 0.5), noise).log_prob(0.1, 1), (-0.5,)),
+    "falling thresholds": (lambda t: OrdinalProbit(t, 0.5).log_prob(0.1, 0), (np.array([0.5, -0.5]),)),
+    "a category below 0": (lambda q: OrdinalProbit((-0.5, 0.5), 0.5).log_prob(0.1, q), (-2,)),
+}
+
+
+@pytest.mark.parametrize("what", IMPOSSIBLE)
+def test_traced_values_that_no_model_has_give_nan(what):
+    function, values = IMPOSSIBLE[what]
+    assert np.isnan(jax.jit(function)(*values)).all()
+
+
+def test_an_answer_goes_into_the_first_free_row():
+    trials = with_first(Trials.from_arrays(np.full((4, 2), 0.5), np.array([0, 1, 2, 1]), 8), "mask", False)
+    more = trials.append([0.9, 0.9], 0)
+    np.testing.assert_array_equal(more.q[:5], [0, 1, 2, 1, 0])
+    assert more.mask.sum() == 4 and more.x[0, 0] == 0.9
+
+
+def test_rows_without_an_answer_have_no_influence(posterior):
+    gp, trials = posterior.gp, posterior.trials
+    rubbish = Trials(trials.x.at[7:].set(np.nan), trials.q.at[7:].set(-1), trials.mask)
+    at = np.full((1, 2), 0.3)
+    np.testing.assert_array_equal(fit(gp, rubbish).predict(at), posterior.predict(at))
+
+    def evidence(noise, trials):
+        return fit(OrdinalGP(gp.kernel, OrdinalProbit((-0.5, 0.5), noise)), trials, throw=False).log_evidence
+
+    slope = jax.jit(jax.grad(evidence))
+    assert slope(0.5, rubbish) == slope(0.5, trials)
+
+
+def test_creep_of_a_spring_alone():
+    np.testing.assert_array_equal(viscoelastic.creep_compliance(np.array([0.0, 1.0]), 2.0, 0.0, 1.0, 0.5), [0.5, 0.5])
 
 
 def test_lists_are_points(posterior):

@@ -214,11 +214,14 @@ def test_an_unknown_inference_is_refused():
 
 def test_one_answer_too_many_is_not_forgotten_in_silence():
     data = separated()
-    full = answers(data, CAPACITY).append(jnp.zeros(3), 1)
-    for _ in range(5):
-        full = full.append(jnp.full(3, 0.5), 2)
+    trials = answers(data, CAPACITY)
+    while not trials.mask.all():
+        trials = trials.append(jnp.full(3, 0.5), 2)
+    with pytest.raises(InputError, match=f"all {CAPACITY} rows hold an answer; make it with a larger capacity"):
+        trials.append(jnp.full(3, 0.5), 2)
+    full = jax.jit(lambda trials: trials.append(jnp.full(3, 0.5), 2))(trials)  # traced, nobody knows that it is full
     assert np.all(np.isnan(full.x))
-    with pytest.raises(InferenceError):
+    with pytest.raises(InputError, match=r"x\[0\] of the trials is not finite"):
         fit(model(data), full)
 
 

@@ -10,6 +10,7 @@ The second form of J holds at K0 = 0 too, where creep has no end. Units: N/mm, N
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +19,12 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Real
 
 from hilbo.mechanics.fosls import share
+from hilbo.mechanics.ranges import check_ranges, possible
 from hilbo.numerics.mittag_leffler import mittag_leffler, mittag_leffler_increment
 
 __all__ = ["creep_compliance", "relaxation_modulus"]
 
 
-@jax.jit
 def relaxation_modulus(
     t: Real[ArrayLike, "..."],
     K0: Real[ArrayLike, "..."],
@@ -33,12 +34,13 @@ def relaxation_modulus(
 ) -> Float[Array, "..."]:
     """G(t) in N/mm for t >= 0; elementwise, differentiable in every parameter, with derivative 0 of the t^α at t = 0.
 
-    K1 = inf, a spring-pot beside K0, gives K0 + B1·t^{-α}/Γ(1 - α), which is infinite at t = 0.
+    K1 = inf, a spring-pot beside K0, gives K0 + B1·t^{-α}/Γ(1 - α), which is infinite at t = 0. Raises `InputError` for
+    values that no model has; where they are traced, and where B1 is 0, the result is NaN.
     """
+    check_ranges(t=t, K1=K1, B1=B1, alpha=alpha)
     return _elementwise(_relaxation, t, K0, K1, B1, alpha)
 
 
-@jax.jit
 def creep_compliance(
     t: Real[ArrayLike, "..."],
     K0: Real[ArrayLike, "..."],
@@ -46,13 +48,16 @@ def creep_compliance(
     B1: Real[ArrayLike, "..."],
     alpha: Real[ArrayLike, "..."],
 ) -> Float[Array, "..."]:
-    """J(t) in mm/N for t >= 0 and K0 >= 0, K1 > 0, B1 > 0; elementwise and differentiable, K1 may be inf.
+    """J(t) in mm/N for t >= 0 and K0 >= 0; elementwise and differentiable, K1 may be inf. Errors as those of
+    `relaxation_modulus`: under a load, a material of K0 < 0 creeps without end.
 
     Creep with recovery by superposition: F1·J(t) + (F2 - F1)·J(t - t1) for t >= t1.
     """
+    check_ranges(t=t, K0=K0, K1=K1, B1=B1, alpha=alpha)
     return _elementwise(_creep, t, K0, K1, B1, alpha)
 
 
+@partial(jax.jit, static_argnums=0)
 def _elementwise(function: Callable, *args: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
     """`function` of scalars over broadcast arguments, in their common floating dtype."""
     dtype = jnp.result_type(1.0, *args)
@@ -75,7 +80,8 @@ def _relaxation(
     # 1/Γ(1 - α) = Γ(α)·sin(πα)/π.
     size = B1 * jnp.exp(gammaln(alpha)) * jnp.sin(jnp.pi * alpha) / jnp.pi
     pot = jnp.where(t > 0, size / jnp.where(t > 0, power, 1), jnp.inf)
-    return K0 + jnp.where(rigid, pot, branch)
+    allowed = possible(t=t, K1=K1, B1=B1, alpha=alpha) & (B1 > 0)
+    return jnp.where(allowed, K0 + jnp.where(rigid, pot, branch), jnp.nan)
 
 
 def _creep(
@@ -84,5 +90,6 @@ def _creep(
     """J(t) in the second form of this module's head."""
     power = _power(t, alpha)
     ratio = share(K1, K0)  # K1/(K0 + K1)
-    instant = jnp.where(jnp.isinf(K1), 0, ratio / jnp.where(jnp.isinf(K1), 1, K1))
-    return instant + ratio**2 / B1 * power * mittag_leffler_increment(alpha, K0 * ratio / B1 * power)
+    later = ratio**2 / B1 * power * mittag_leffler_increment(alpha, K0 * ratio / B1 * power)
+    allowed = possible(t=t, K0=K0, K1=K1, B1=B1, alpha=alpha) & (B1 > 0)
+    return jnp.where(allowed, 1 / (K0 + K1) + later, jnp.nan)

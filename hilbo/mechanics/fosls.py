@@ -17,23 +17,23 @@ another material under another N. Reference: Podlubny (1999), Fractional Differe
 """
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.typing import ArrayLike
 from jaxtyping import Array, Complex, Float, Inexact, Real
 
 from hilbo.errors import InputError
 from hilbo.mechanics.memory import GLSums, gl_coefficients, response, sums
+from hilbo.mechanics.ranges import possible
 from hilbo.mechanics.recursion import BLOCK, past_of
 from hilbo.mechanics.span import Memory, Span, span
 from hilbo.numerics.host import namespace_of, on_host
 from hilbo.numerics.mittag_leffler import mittag_leffler
-from hilbo.numerics.shown import numbers, shown
+from hilbo.numerics.shown import concrete, numbers, shown
 from hilbo.numerics.tracing import program
 
 __all__ = ["FOSLS", "Start", "pot_stiffness", "series", "share", "slow_damping", "slow_stiffness"]
@@ -48,7 +48,8 @@ class FOSLS(eqx.Module):
     K0, K1 (N/mm), B1 (N·s^α/mm) and alpha are scalars of one floating dtype; `jax.vmap` over records or over
     constructors for several. Of NumPy's numbers, `dc_gain`, `beta` and the passivity certificate of short memory are
     computed by NumPy, at once. K1 may be `inf`: K0 beside a spring-pot. Raises InputError for K1 < 0, B1 < 0, α outside
-    (0, 1], numbers that are not finite, and for K0 < 0 with full memory; not inside `jit`, where values are unknown.
+    (0, 1], numbers that are not finite, and for K0 < 0 with full memory. Inside `jit`, where values are unknown, alpha
+    is NaN for what no model has, and so is what follows from it.
     """
 
     K0: Float[Any, ""]
@@ -75,6 +76,9 @@ class FOSLS(eqx.Module):
         xp = np if on_host(K0, K1, B1, alpha) else jnp
         dtype = xp.result_type(1.0, K0, K1, B1, alpha)
         self.K0, self.K1, self.B1, self.alpha = (xp.asarray(value, dtype) for value in (K0, K1, B1, alpha))
+        if not concrete(self.K1, self.B1, self.alpha):
+            allowed = possible(K1=self.K1, B1=self.B1, alpha=self.alpha)
+            self.alpha = jnp.where(allowed, self.alpha, jnp.nan)
         self.N, self.T, self.memory, self.states = N, float(T), memory, states
 
     def __repr__(self) -> str:
@@ -86,7 +90,7 @@ class FOSLS(eqx.Module):
         span(self.memory, self.N, self.states)
         if not 0 < self.T < math.inf:
             raise InputError(f"T is {self.T} s; it must be a number above 0; write for example T = 0.001.")
-        if not any(isinstance(value, Tracer) for value in (self.K0, self.K1, self.B1, self.alpha)):
+        if concrete(self.K0, self.K1, self.B1, self.alpha):
             _check_values(float(self.K0), float(self.K1), float(self.B1), float(self.alpha), self.memory)
 
     @property
@@ -142,17 +146,17 @@ class FOSLS(eqx.Module):
         sample by sample; larger blocks give the same numbers up to rounding, faster.
         `x` (n,) -> (n,).
         """
-        return _force(self, self._series("x", x), start, unilateral, block)
+        return _force(self, self._series("x", x), _checked_start(start), unilateral, block)
 
     def simulate_force(
         self, F: Real[ArrayLike, " n"], *, start: Start = "rest", block: int = BLOCK
     ) -> Float[Array, " n"]:
         """Position (mm) that follows forces `F` (N): the inverse of `simulate`, see there.
 
-        An equilibrium under force needs H(1) > 0; without it, the positions from such a start are not finite.
+        An equilibrium under force needs H(1) > 0; without it there is none that a material would rest in.
         `F` (n,) -> (n,).
         """
-        return _position(self, self._series("F", F), start, block)
+        return _position(self, self._series("F", F), _checked_start(start), block)
 
     def _series(self, name: str, value: Real[ArrayLike, " n"]) -> Float[Array, " n"]:
         """Samples as an array. Raises `InputError` for another shape than (n,)."""
@@ -286,6 +290,12 @@ def _full_settling(model: FOSLS, fraction: Float[Array, ""]) -> Float[Array, ""]
     widest = jnp.asarray(80, fraction.dtype)
     log_z, _ = jax.lax.fori_loop(0, 60, halve, (-widest, widest))
     return jnp.where(fraction > 0, jnp.exp((log_z + jnp.log(model.B1) - jnp.log(model.K1)) / model.alpha), 0)
+
+
+def _checked_start(start: Start) -> Start:
+    if start not in get_args(Start):
+        raise InputError(f'start is "{start}"; it must be "rest" or "equilibrium".')
+    return start
 
 
 def _check_values(K0: float, K1: float, B1: float, alpha: float, memory: Memory) -> None:

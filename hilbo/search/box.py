@@ -55,6 +55,8 @@ class Parameter:
             raise InputError(f"{path} runs from {self.low} to {self.high}, both ends must be finite numbers.")
         if not self.low < self.high:
             raise InputError(f"{path}.low is {self.low}; it must be below high = {self.high}.")
+        if self.scale not in ("linear", "log"):
+            raise InputError(f'{path}.scale is "{self.scale}"; it must be linear or log.')
         if self.scale == "log" and self.low <= 0:
             raise InputError(f'{path}.low is {self.low}; it must be above 0 on a scale = "log".')
         for key, end in (("low", self.low), ("high", self.high)):
@@ -168,6 +170,11 @@ class Constraint:
     least: float | None = None
     most: float | None = None
 
+    def __post_init__(self):
+        for key, value in (("least", self.least), ("most", self.most), *self.terms):
+            if value is not None and not math.isfinite(value):
+                raise InputError(f"constraints: {key} is {value}; give a finite number, or leave out least or most.")
+
     @property
     def words(self) -> str:
         """Such as `0 <= gain + 2 grains <= 24`."""
@@ -201,6 +208,8 @@ class Mechanics:
             value = getattr(self, key)
             if not least < value < math.inf:
                 raise InputError(f"renderer.{key} is {value}; it must be {'0 or' if least else 'a number'} above 0.")
+        if self.memory not in ("short", "full"):
+            raise InputError(f'renderer.memory is "{self.memory}"; it must be short or full.')
         if self.memory == "full" and self.states not in STATES:
             raise InputError(f"renderer.states is {self.states}; it must be one of {', '.join(map(str, STATES))}.")
         if self.memory == "short" and (self.N < 1 or self.N % 2 == 0):

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from hilbo.errors import InputError
 
-__all__ = ["Columns", "check_level", "is_yes_or_no", "labels_of", "predictors_of"]
+__all__ = ["Columns", "check_aligned", "check_level", "is_yes_or_no", "labels_of", "predictors_of"]
 
 Columns = Mapping[str, Any] | pd.DataFrame | pd.Series  # a column for each name, n entries each
 
@@ -19,6 +19,23 @@ def check_level(level: Any) -> None:
     number = isinstance(level, int | float | np.number) and not isinstance(level, bool)
     if not number or not 0 < level < 1:
         raise InputError(f"level is {level!r}; it must be above 0 and below 1, such as 0.95.")
+
+
+def check_aligned(**given: Any) -> None:
+    """Refuse Series and frames whose row labels differ: their rows are taken in the order in which they stand. What has
+    no labels, and mappings of columns, may stand beside them. Raises `InputError`."""
+    labelled = [
+        (name, column.index)
+        for name, value in given.items()
+        for column in (value.values() if isinstance(value, Mapping) else [value])
+        if isinstance(column, pd.Series | pd.DataFrame)
+    ]
+    for name, index in labelled[1:]:
+        if not index.equals(labelled[0][1]):
+            raise InputError(
+                f"{name} and {labelled[0][0]} have different row labels; bring their rows into one order, then"
+                " reset_index(drop=True) both."
+            )
 
 
 def is_yes_or_no(values: np.ndarray) -> bool:

@@ -15,7 +15,7 @@ from scipy.special import logit
 
 from hilbo.errors import InputError
 from hilbo.statistics import ordered_logit as likelihood
-from hilbo.statistics.columns import Columns, is_yes_or_no, predictors_of
+from hilbo.statistics.columns import Columns, check_aligned, is_yes_or_no, predictors_of
 from hilbo.statistics.regression import Clusters, Regression, regress
 
 __all__ = ["binary_logit", "ordered_logit", "tied_preferences"]
@@ -35,8 +35,10 @@ def binary_logit(
 
     `clusters`: up to two columns that name the cluster of every answer, participants say. An outcome that never
     changes has no finite intercept and is answered with a one-sided interval.
-    Raises `InputError` for an outcome that is empty or not of 0 and 1.
+    Raises `InputError` for an outcome that is empty or not of 0 and 1, and, here and below, for Series and frames whose
+    row labels differ.
     """
+    check_aligned(outcome=outcome, predictors=predictors, clusters=clusters)
     success = np.asarray(outcome)
     if success.ndim != 1 or not is_yes_or_no(success):
         raise InputError("the outcome of a binary logit must be a list of 0 and 1 (or no and yes), and not empty.")
@@ -60,6 +62,7 @@ def ordered_logit(
     `categories` names them, lowest first; the edge between two is the term "a|b". A category that never occurs has no
     edge of its own; raises `InputError` if fewer than two occur.
     """
+    check_aligned(category=category, predictors=predictors, clusters=clusters)
     answers = np.asarray(category)
     if answers.ndim != 1 or not answers.size or not np.issubdtype(answers.dtype, np.integer) or answers.min() < 0:
         raise InputError("the categories of an ordered logit must be a list of whole numbers from 0, and not empty.")
@@ -96,6 +99,7 @@ def tied_preferences(
     All sequences are (n,), one entry a comparison. Raises `InputError` for a preference that is neither set nor a tie,
     and for a `reference` that is in no comparison.
     """
+    check_aligned(first=first, second=second, preferred=preferred, clusters=clusters, order=order)
     left, right, chosen = (np.asarray(column, str) for column in (first, second, preferred))
     if not left.shape == right.shape == chosen.shape == (left.size,):
         raise InputError("first, second and preferred must be lists of one length: an entry each for a comparison.")

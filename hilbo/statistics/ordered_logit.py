@@ -28,6 +28,7 @@ from scipy.special import expit, log_expit
 __all__ = ["Design", "Fit", "design", "fit", "information", "log_likelihood", "scores"]
 
 _NEAR = 1e-6  # mean score at which the trust region hands over to Newton's method, which then takes a step or two
+_NO_MAXIMUM = "The logit did not reach its maximum: it has none, or its parameters are not unique."
 _LAST_STEP = 1e-9  # of the largest parameter: Newton's last step, whose square is below rounding
 
 
@@ -130,31 +131,46 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
 
     `start` must have its edges in order, and a maximum must exist (`hilbo.statistics.separation`) and be unique. The
     trust region comes first because Newton's full steps alone ended nowhere in 1 of 8 fits of random small tables. Both
-    work in units in which every column's largest entry is 1, so that the predictors' units do not matter.
+    work in coordinates in which the columns are orthogonal and of one size, so that neither the predictors' units nor
+    their origin matter (days since the year 0, say, beside the constant).
     """
+    from scipy.linalg import solve_triangular
     from statsmodels.base.model import LikelihoodModel  # a third of a second: who fits nothing does not pay it
 
-    units = np.abs(np.vstack([model.upper, model.lower])).max(axis=0)
-    scaled = model._replace(upper=model.upper / units, lower=model.lower / units)
+    columns = np.vstack([model.upper, model.lower])
+    units = np.abs(columns).max(axis=0)
+    to_orthogonal = np.linalg.qr(columns / units, mode="r") * units / np.sqrt(len(columns))
+    if not np.all(np.diag(to_orthogonal)):
+        raise RuntimeError(_NO_MAXIMUM)
+    upper, lower = (solve_triangular(to_orthogonal, side.T, trans="T").T for side in (model.upper, model.lower))
+    orthogonal = model._replace(upper=upper, lower=lower)
 
     class IntervalLogit(LikelihoodModel):
         """The likelihood under the names by which statsmodels asks for it."""
 
         def loglike(self, theta):
-            return log_likelihood(scaled, theta)
+            return log_likelihood(orthogonal, theta)
 
         def score(self, theta):
-            return scores(scaled, theta).sum(axis=0)
+            return scores(orthogonal, theta).sum(axis=0)
 
         def hessian(self, theta):
-            return -information(scaled, theta)
+            return -information(orthogonal, theta)
 
     likelihood = IntervalLogit(np.zeros(len(model.upper)))  # statsmodels counts these; the answers are in `model`
     options = {"disp": 0, "warn_convergence": False, "skip_hessian": True}
-    near = likelihood.fit(start * units, method="minimize", min_method="trust-exact", gtol=_NEAR, **options).params
+    near = likelihood.fit(
+        to_orthogonal @ start, method="minimize", min_method="trust-exact", gtol=_NEAR, **options
+    ).params
     last_step = _LAST_STEP * (1 + np.abs(near).max())
     results = likelihood.fit(near, method="newton", tol=last_step, ridge_factor=0, **options)
     if not results.mle_retvals["converged"]:
-        raise RuntimeError("The logit did not reach its maximum: it has none, or its parameters are not unique.")
-    estimate = results.params / units
-    return Fit(estimate, results.llf, results.normalized_cov_params / np.outer(units, units), scores(model, estimate))
+        raise RuntimeError(_NO_MAXIMUM)
+    estimate = solve_triangular(to_orthogonal, results.params)
+    half = solve_triangular(to_orthogonal, results.normalized_cov_params)
+    return Fit(
+        estimate,
+        results.llf,
+        solve_triangular(to_orthogonal, half.T),
+        scores(orthogonal, results.params) @ to_orthogonal,
+    )

@@ -198,6 +198,16 @@ def test_the_units_of_a_predictor_do_not_matter(scale, separated):
             assert covariance.loc["x", "x"] * scale**2 == pytest.approx(own.covariances[name].loc["x", "x"], rel=1e-7)
 
 
+@pytest.mark.parametrize("origin", [1e5, 739_000.0, 1.7e9])
+def test_the_origin_of_a_predictor_does_not_matter(origin):
+    rng = np.random.default_rng(4)
+    x, clusters = rng.normal(size=60), {"p": np.arange(60) % 9}
+    yes, rank = (rng.random(60) < expit(x)).astype(int), np.digitize(x + rng.logistic(size=60), [-1.0, 1.0])
+    for fitted in (lambda x: st.binary_logit(yes, {"x": x}, clusters), lambda x: st.ordered_logit(rank, {"x": x})):
+        here, there = (fitted(at).table.set_index("term").loc[["x"]] for at in (x, x + origin))
+        pd.testing.assert_frame_equal(there, here, rtol=1e-15 * origin + 1e-9)
+
+
 YES = np.array([0, 1, 1, 0, 1, 1, 0, 1])
 U = {"u": np.array([0.1, 0.5, 0.2, 0.7, 0.9, 0.3, 0.8, 0.4])}
 MISSING = pd.Series([0, 1, None, 0, 1, 1, 0, 1], dtype="boolean")
@@ -227,6 +237,16 @@ MISTAKES = {
     "a missing outcome": (
         lambda: st.binary_logit(MISSING, U),
         "the outcome of a binary logit must be a list of 0 and 1 (or no and yes), and not empty.",
+    ),
+    "predictors in another order": (
+        lambda: st.binary_logit(pd.Series(YES), pd.DataFrame(U).sort_values("u")),
+        "predictors and outcome have different row labels; bring their rows into one order, then"
+        " reset_index(drop=True) both.",
+    ),
+    "clusters in another order": (
+        lambda: st.binary_logit(YES, pd.DataFrame(U), {"p": pd.Series(YES, index=range(8, 0, -1))}),
+        "clusters and predictors have different row labels; bring their rows into one order, then"
+        " reset_index(drop=True) both.",
     ),
     "a missing success": (lambda: rate(MISSING), "a rate needs a list of 0 and 1 (or no and yes) that is not empty."),
     "pairs of two lengths": (

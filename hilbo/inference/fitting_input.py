@@ -1,0 +1,49 @@
+"""What `hilbo.fit` refuses: a model and answers that do not fit together, with what to do."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.errors import InputError
+from hilbo.kernels import Kernel, Stationary
+from hilbo.likelihoods import OrdinalProbit
+from hilbo.trials import Trials
+
+__all__ = ["check_answers", "check_shapes"]
+
+
+def check_shapes(kernel: Kernel, likelihood: OrdinalProbit, trials: Trials, start: Float[Array, "..."] | None) -> None:
+    """Raises `InputError` for shapes of model, answers and start that do not belong together."""
+    if trials.mask.ndim != 1:
+        raise InputError(
+            f"fit: these trials hold {len(trials.mask)} people; fit those of one, or use jax.vmap with throw=False."
+        )
+    if isinstance(kernel, Stationary):
+        _check_kernel(kernel, trials.x.shape[-1])
+    if likelihood.noise.ndim:
+        raise InputError(f"fit: noise has shape {likelihood.noise.shape}; it is a scalar.")
+    if start is not None and jnp.shape(start) != trials.mask.shape:
+        shape = jnp.shape(start)
+        raise InputError(f"fit: start has shape {shape}; give one weight for each of {trials.capacity} rows.")
+
+
+def _check_kernel(kernel: Stationary, dim: int) -> None:
+    if kernel.theta.shape not in ((), (dim,)):
+        raise InputError(f"fit: theta has shape {kernel.theta.shape} and x {dim} parameters; give one number or {dim}.")
+    if kernel.variance.ndim:
+        raise InputError(f"fit: the kernel's variance has shape {kernel.variance.shape}; it is a scalar.")
+    if kernel.levels and len(kernel.levels) != dim:
+        raise InputError(f"fit: the kernel has levels {kernel.levels} and x {dim} parameters; give {dim} of them.")
+
+
+def check_answers(trials: Trials, categories: int) -> None:
+    """Raises `InputError` for answers that no model of so many categories takes; for values that are known."""
+    finite, q = np.isfinite(trials.x).all(axis=-1), np.asarray(trials.q)
+    if not finite.all():
+        row = int(np.argmin(finite))
+        raise InputError(f"fit: x[{row}] of the trials is not finite; fix that answer or take it out.")
+    if np.any(wrong := (q < 0) | (q >= categories)):
+        raise InputError(
+            f"fit: an answer has category {q[wrong][0]}, but the likelihood has {categories - 1} thresholds and so the"
+            f" categories 0 to {categories - 1}; check the answers or the thresholds."
+        )

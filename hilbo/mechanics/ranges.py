@@ -1,0 +1,41 @@
+"""Which numbers a model, and a device, may have: refused where they are known, NaN where they are traced."""
+
+import functools
+import operator
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Real
+
+from hilbo.errors import InputError
+from hilbo.numerics.shown import concrete, shown
+
+__all__ = ["RANGES", "check_ranges", "possible"]
+
+_FROM_0 = (lambda v: v >= 0, "0 or above")
+_FINITE = (lambda v: (v >= 0) & (v < np.inf), "0 or above, and finite")
+RANGES = {
+    "alpha": (lambda v: (v > 0) & (v <= 1), "above 0 and at most 1: the order of the fractional element"),
+    "T": (lambda v: (v > 0) & (v < np.inf), "a number of seconds above 0"),
+    "t": _FROM_0,
+    "K0": _FROM_0,  # where it is the static stiffness
+    "K1": _FROM_0,
+    "B1": _FINITE,
+    "b": _FROM_0,
+}
+"""Name -> whether values are allowed, elementwise; and what they must be, in words."""
+
+
+def check_ranges(**values: Real[ArrayLike, "..."]) -> None:
+    """Raises `InputError` for numbers that no model, and no device, has; what is traced is not looked at."""
+    for name, value in values.items():
+        allowed, words = RANGES[name]
+        if concrete(value) and not np.all(fine := allowed(np.asarray(value, float))):
+            wrong = np.asarray(value, float)[~fine][0] if np.ndim(value) else value
+            raise InputError(f"{name} is {shown(wrong)}; it must be {words}.")
+
+
+def possible(**values: Any) -> Bool[Array, "..."]:
+    """Whether a model has all of these, elementwise; also of what is traced."""
+    return functools.reduce(operator.and_, (RANGES[name][0](value) for name, value in values.items()))
