@@ -130,6 +130,11 @@ class Held(Protocol):
         ...
 
     @property
+    def without_map(self) -> str:
+        """Why there will be no map, in a sentence; empty where nothing hinders it."""
+        ...
+
+    @property
     def alert(self) -> str | None:
         """Why nothing can be written."""
         ...

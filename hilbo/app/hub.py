@@ -58,6 +58,7 @@ class Hub:
         self._rig: Rig | None = None
         self.begun = False  # whether the participant has said so, since the server started or the page came back
         self.alert: str | None = None
+        self.without_map = ""  # why, in a sentence
         self.trust: list[list[str]] = []
         self.recent: deque = deque(reversed(log.before[-_RECENT:]), maxlen=_RECENT)
         self.delays: list[dict[str, float]] = []  # s, from each answer on
@@ -91,8 +92,12 @@ class Hub:
         self.chooser.warm()
         if self._make_maps is not None:
             maps = self._make_maps(self.chooser)
-            maps.warm()
-            self._maps = maps
+            try:
+                maps.warm()
+            except Exception as error:  # whatever it is: a person is waiting, and the session needs no map
+                self.without_map = f"There will be no map ({error}); the session goes on without it."
+            else:
+                self._maps = maps
 
     def _warmed(self, warm: asyncio.Future) -> None:
         if warm.cancelled():  # the session ends before it

@@ -1,4 +1,7 @@
-"""Slices of the posterior mean through its maximum, for the experimenter's page; one compiled function."""
+"""Slices of the posterior mean through its maximum, for the experimenter's page; one compiled function.
+
+There is one for each pair of parameters. Of a single parameter there is one, with the answers up.
+"""
 
 import itertools
 from collections.abc import Mapping
@@ -21,6 +24,8 @@ from hilbo.study.config import Study
 __all__ = ["Maps"]
 
 _SIDE = 33
+_ANSWER = "answer given"  # what is up where there is one parameter
+_Pair = tuple[int, int | None]  # of parameters, across and up
 
 
 class Maps:
@@ -57,9 +62,9 @@ class Maps:
         return rows
 
     def slices(self, state: LiveSession) -> dict[str, Any] | None:
-        """For each pair of parameters: mean on a grid (row by row, None where not feasible), the maximum, and the
-        trials with their distance from the slice; and the parameters' ranges. None where the session chooses nothing,
-        no slices before there is an answer."""
+        """For each pair of parameters, or the one: mean on a grid (row by row, None where not feasible), the maximum,
+        and the trials with their distance from the slice; and the parameters' ranges. None where the session chooses
+        nothing, no slices before there is an answer."""
         blocks = self._chooser.chosen_blocks
         if not blocks:
             return None
@@ -73,6 +78,8 @@ class Maps:
             p.name: {"unit": p.unit, "scale": p.scale, "low": p.low, "high": p.high, "levels": p.levels}
             for p in parameters
         }
+        if len(parameters) == 1:
+            ranges[_ANSWER] = {"unit": "", "scale": "linear", "low": 0, "high": 1, "levels": state.study.responses}
         return {"slices": slices, "ranges": ranges}
 
     def _sliced(self, answers: Answers, asked: Mapping[str, float] | None) -> list[dict[str, Any]]:
@@ -84,8 +91,13 @@ class Maps:
         marks = np.asarray(fitted.posterior.trials.x)[: len(answers.categories)]
         levels = np.array(answers.categories, int) / (len(study.responses) - 1)
         felt = None if asked is None else np.asarray(study.space.to_unit(np.array([asked[name] for name in names])))
-        pairs = itertools.combinations(range(len(names)), 2)
-        return [_slice(study, maps, k, pair, marks, levels, felt) for k, pair in enumerate(pairs)]
+        pairs = enumerate(_pairs(len(names)))
+        return [_slice(study, maps, k, pair, marks, levels, felt) for k, pair in pairs]
+
+
+def _pairs(dim: int) -> list[_Pair]:
+    """The parameters across and up of each slice; a single one has nothing up."""
+    return [*itertools.combinations(range(dim), 2)] or [(0, None)]
 
 
 class _Slices(NamedTuple):
@@ -96,28 +108,29 @@ class _Slices(NamedTuple):
     feasible: Bool[Array, "pairs side side"]
 
 
-def _slice(study, maps: _Slices, k: int, pair: tuple[int, int], marks, levels, felt) -> dict[str, Any]:
+def _slice(study, maps: _Slices, k: int, pair: _Pair, marks, levels, felt) -> dict[str, Any]:
     """One grid, for the page; `marks` (n, d) and `levels` (n,) are the answers, `felt` (d,) what is being felt."""
     best, names = maps.best, study.space.names
     others = [i for i in range(len(names)) if i not in pair]
     held = [_held(study.space.parameters[i], float(best[i])) for i in others]
     across, up = pair
     trials = [
-        {"x": float(x[across]), "y": float(x[up]), "level": float(level), "now": False,
+        {"x": float(x[across]), "y": float(level if up is None else x[up]), "level": float(level), "now": False,
          "away": float(np.linalg.norm(differences(study.gp.kernel.levels, x, best)[others]) / 0.35)}
         for x, level in zip(marks, levels, strict=True)
     ]  # fmt: skip
     if felt is not None:
-        trials.append({"x": float(felt[across]), "y": float(felt[up]), "level": 0.0, "now": True, "away": 0.0})
+        y = 0.5 if up is None else float(felt[up])
+        trials.append({"x": float(felt[across]), "y": y, "level": 0.0, "now": True, "away": 0.0})
     shown = [
         [round(float(v), 4) if ok else None for v, ok in zip(row, oks, strict=True)]
         for row, oks in zip(maps.mean[k], maps.feasible[k], strict=True)
     ]
     return {
         "across": names[across],
-        "up": names[up],
+        "up": _ANSWER if up is None else names[up],
         "held": ", ".join(held),
-        "best": [float(best[across]), float(best[up])],
+        "best": [float(best[across]), 1.0 if up is None else float(best[up])],
         "mean": shown,
         "trials": trials,
     }
@@ -141,10 +154,10 @@ def _slices(study: Study, posterior: Posterior, physical: Float[Array | np.ndarr
     best = study.space.to_unit(physical)
     axes = [jnp.asarray(_axis(p), best.dtype) for p in study.space.parameters]
     grids = []
-    for i, j in itertools.combinations(range(study.space.dim), 2):
-        up, across = jnp.meshgrid(axes[j], axes[i], indexing="ij")
-        grid = jnp.broadcast_to(best, (_SIDE * _SIDE, best.shape[0]))
-        grids.append(grid.at[:, i].set(across.ravel()).at[:, j].set(up.ravel()))
+    for i, j in _pairs(study.space.dim):
+        up, across = jnp.meshgrid(axes[i if j is None else j], axes[i], indexing="ij")
+        grid = jnp.broadcast_to(best, (_SIDE * _SIDE, best.shape[0])).at[:, i].set(across.ravel())
+        grids.append(grid if j is None else grid.at[:, j].set(up.ravel()))
     points = jnp.concatenate(grids)
     shape = (len(grids), _SIDE, _SIDE)
     return _Slices(best, posterior.mean(points).reshape(shape), study.space.feasible(points).reshape(shape))

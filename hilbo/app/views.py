@@ -129,7 +129,11 @@ def experimenter(hub: Held) -> dict[str, Any]:
         "trust": hub.trust,
         "table": table(state),
         "log": [line(state, event) for event in list(hub.recent)[:60]],
-        "alert": hub.alert or hub.fault or (runner.trouble if runner.stage == "trouble" else None),
+        "alert": hub.alert
+        or hub.fault
+        or (runner.trouble if runner.stage == "trouble" else None)
+        or hub.without_map
+        or None,
         "may": _may(hub),
         "means": {
             "void": meant(state.voidable),
