@@ -48,6 +48,13 @@ def parameters_of(study: AnyStudy) -> list[dict[str, Any]]:
     return [
         {"name": p.name, "levels": list(p.levels)}
         if p.levels
-        else {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "tolerance": study.stimulus.off_by(p)}
+        else {
+            "name": p.name,
+            "unit": p.unit,
+            "low": p.low,
+            "high": p.high,
+            "scale": p.scale,
+            "tolerance": study.stimulus.borne(p),
+        }
         for p in study.space.parameters
     ]

@@ -163,7 +163,10 @@ def rehearse(
     arguments = [str(file), "--participant", "P01", "--logs", str(out / "logs"), "--port", "0"]
     arguments += ["--dry-run", "--gap", "0.7" if seconds is None else "0.05"]
     if phase != "optimisation":
-        arguments += ["--plan", str(_plan(study, population, out, phase, seed))]  # which has the seed
+        made = _plan(study, material, example_sets(here, population), phase, seed)
+        plan = out / "plan.json"
+        plan.write_text(json.dumps(made, indent=2), encoding="utf-8")
+        arguments += ["--plan", str(plan)]  # which has the seed
     else:
         arguments += ["--seed", str(seed)] + ([] if material is None else ["--material", material])
     say("starting the server")
@@ -200,14 +203,12 @@ def _by_stand_in(study, arguments, decide):
         )
 
 
-def _plan(study, population, out, phase, seed) -> Path:
-    sets = example_sets(study, population)
+def _plan(study, material, sets, phase, seed) -> dict[str, Any]:
+    """Of one session, with one of the study's materials."""
     if phase == "aggregate-best":
         sets = {"aggregate": sets["best"], "individual:S1": sets["mid"], "individual:S2": sets["worst"]}
-    plan = make_plan(study, ["P01"], seed, phase, sets={"": sets}, source="aggregate")  # type: ignore[arg-type]
-    path = out / "plan.json"
-    path.write_text(json.dumps(plan, indent=2), encoding="utf-8")
-    return path
+    materials = () if material is None else (material,)
+    return make_plan(study, ["P01"], seed, phase, materials=materials, sets={material or "": sets}, source="aggregate")
 
 
 def _session(program, links, decide, touches, out, say) -> dict[str, Any]:

@@ -142,6 +142,7 @@ class Participant:
             )
             if not key:
                 return
+            self.window.wait_for_function("performance.now() - laidOut > SETTLES")  # sooner the page takes none
             self.window.keyboard.press(str(key))
         self.answered += bool(names)
 

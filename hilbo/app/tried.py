@@ -66,6 +66,11 @@ def check_study(study: StudyFile) -> None:
         raise InputError(
             f"{study.source}: has a [renderer], and hilbo try presents by itself; use one with [stimulus]."
         )
+    if study.stimulus.by == "person" or study.stimulus.experimenter_sees is False:
+        raise InputError(
+            f"{study.source}: the page of hilbo try presents by itself and shows the map at the end; leave by and"
+            " experimenter_sees out of [stimulus]."
+        )
     if set(study.space.names) != set(NAMES) or study.materials:
         raise InputError(f"{study.source}: hilbo try presents {', '.join(NAMES)} of one material, and nothing else.")
     if len(study.responses) != _ANSWERS:

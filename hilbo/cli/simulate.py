@@ -1,6 +1,7 @@
 """`hilbo simulate`: a study whose truth is known, or one session without people."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -9,15 +10,18 @@ import typer
 from hilbo.cli.aggregate import aggregate_cohort
 from hilbo.cli.console import Force, Json, Out, Preset, finish, progress, results, seed_option, start
 from hilbo.cli.live import live as hold_session
+from hilbo.errors import InputError
 
 __all__ = ["simulate"]
+
+_PEOPLE = 24
 
 
 def simulate(
     out: Out,
     preset: Preset = None,
     study: Annotated[Path | None, typer.Option("--study", help="Study file; by default the paper's.")] = None,
-    participants: Annotated[int, typer.Option(min=1, help="How many people.")] = 24,
+    participants: Annotated[int | None, typer.Option(min=1, help="How many people; by default 24.")] = None,
     seed: Annotated[
         int, seed_option("of the people, of their answers and of the points among which optima are sought")
     ] = 0,
@@ -26,18 +30,30 @@ def simulate(
     live: Annotated[
         bool, typer.Option("--live", help="One person's session instead: real server, pages and simulated device.")
     ] = False,
-    kind: Annotated[str, typer.Option(help="With --live: optimisation, validation or aggregate-best.")] = (
-        "optimisation"
-    ),
+    kind: Annotated[
+        str | None,
+        typer.Option(help="With --live: optimisation, validation or aggregate-best; by default optimisation."),
+    ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.05, help="With --live: duration of every step.")] = None,
 ) -> None:
     """Simulate a study whose truth is known, and aggregate it; or hold one session without people."""
+    _check_mode(live, {"--participants": participants, "--force": force}, {"--kind": kind, "--seconds": seconds})
     if live:
-        _simulate_live(preset, study, out, kind, seconds, seed, as_json)
+        _simulate_live(preset, study, out, kind or "optimisation", seconds, seed, as_json)
         return
     with results(out, force) as folder, progress() as say:
-        content = _simulate(preset, study, participants, seed, folder, say)
+        content = _simulate(preset, study, participants or _PEOPLE, seed, folder, say)
     finish(content, out, as_json, say.printed)
+
+
+def _check_mode(live: bool, of_a_study: Mapping[str, Any], of_a_session: Mapping[str, Any]) -> None:
+    """Refuse options that would be ignored. Raises `InputError`."""
+    if live and (given := [name for name, value in of_a_study.items() if value]):
+        raise InputError(
+            f"{given[0]} does nothing with --live, which holds one person's session in a new folder; leave it out."
+        )
+    if not live and (given := [name for name, value in of_a_session.items() if value]):
+        raise InputError(f"{given[0]} does nothing without --live; add --live, or leave it out.")
 
 
 def _simulate(preset, source, count, seed, folder, say) -> dict[str, Any]:

@@ -170,11 +170,6 @@ class Constraint:
     least: float | None = None
     most: float | None = None
 
-    def __post_init__(self):
-        for key, value in (("least", self.least), ("most", self.most), *self.terms):
-            if value is not None and not math.isfinite(value):
-                raise InputError(f"constraints: {key} is {value}; give a finite number, or leave out least or most.")
-
     @property
     def words(self) -> str:
         """Such as `0 <= gain + 2 grains <= 24`."""
@@ -260,6 +255,9 @@ class Box:
         if constraint.least is None and constraint.most is None:
             raise InputError(f"{path} has no least and no most; it must have one of them, or both.")
         least, most = constraint.least, constraint.most
+        for key, end in (("least", least), ("most", most)):
+            if end is not None and not math.isfinite(end):
+                raise InputError(f"{path}.{key} is {end}; it must be a finite number, or be left out.")
         if least is not None and most is not None and not least < most:
             raise InputError(f"{path}.least is {least}; it must be below most = {most}.")
 

@@ -55,12 +55,19 @@ def rows_of(parameters: Sequence[Parameter], constraints: Sequence[Constraint], 
 
 
 def check_room(parameters: Sequence[Parameter], constraints: Sequence[Constraint]) -> None:
-    """Refuse constraints that leave nothing of the ranges, alone, in pairs or together. Raises `InputError`."""
+    """Refuse constraints that leave nothing of the ranges, or an edge of them, alone, in pairs or together. Raises
+    `InputError`."""
     if _radius(rows_of(parameters, constraints))[0] > _LEAST:
         return
     numbers = range(1, len(constraints) + 1)
     for number in numbers:
-        if _radius(rows_of(parameters, [constraints[number - 1]]))[0] <= _LEAST:
+        radius, _ = _radius(rows_of(parameters, [constraints[number - 1]]))
+        if abs(radius) <= _LEAST:
+            raise InputError(
+                f"constraints.{number} leaves no more than an edge of the ranges; narrow the range of one of its"
+                " parameters instead."
+            )
+        if radius < _LEAST:
             raise InputError(f"constraints.{number} leaves nothing of the ranges; change its least or most.")
     for a in numbers:
         for b in range(a + 1, len(constraints) + 1):

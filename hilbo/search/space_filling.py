@@ -73,7 +73,11 @@ def crossings(
 
 
 def spread_out(points: Float[np.ndarray, "m d"], count: int, seed: int) -> Float[np.ndarray, "count d"]:
-    """The points that are nearest to the centres of as many clusters, each another one."""
+    """The points that are nearest to the centres of as many clusters, each another one. Where so many points are not
+    different, as those of levels and whole numbers, all that there are, by chance in turn."""
+    distinct = np.unique(points, axis=0)
+    if len(distinct) <= count:
+        return np.resize(np.random.default_rng(seed).permutation(distinct), (count, points.shape[1]))
     from scipy.cluster.vq import kmeans2
     from scipy.spatial.distance import cdist
 

@@ -23,7 +23,8 @@ def check_confirmed(study: AnyStudy, asked: Mapping[str, float], values: Mapping
         raise RefusedError("bad-answer", f"a confirmation has a value for {', '.join(names)}, and for nothing else.")
     assert study.stimulus is not None  # whoever asks has looked
     for parameter in study.space.parameters:
-        value, wanted, most = values[parameter.name], asked[parameter.name], study.stimulus.off_by(parameter)
+        value, wanted = values[parameter.name], asked[parameter.name]
+        most = study.stimulus.off_by(parameter, wanted)
         if not math.isfinite(value):
             raise RefusedError("bad-answer", f"{parameter.name} is confirmed as {value}, which is no number.")
         if parameter.levels and value != wanted:

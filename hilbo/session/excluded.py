@@ -15,7 +15,7 @@ from hilbo.session.selection import Design, point_apart
 from hilbo.session.warm_start import WarmStart, warm_point
 from hilbo.study.config import Study
 
-__all__ = ["APART", "is_near", "point_from_map", "point_kept_apart", "spread_point"]
+__all__ = ["APART", "are_all", "is_near", "point_from_map", "point_kept_apart", "spread_point"]
 
 APART = 0.05
 """Least distance in the unit cube from a rendering in which the device stopped twice."""
@@ -30,6 +30,15 @@ def is_near(study: Study, point: Float[np.ndarray, " d"], excluded: Float[np.nda
         return False
     unit = _to_unit(study, np.concatenate([excluded, np.asarray(point)[None]]))
     return bool(np.min(np.linalg.norm(differences(study.gp.kernel.levels, unit[:-1], unit[-1]), axis=1)) < APART)
+
+
+def are_all(study: Study, excluded: Float[np.ndarray, "k d"]) -> bool:
+    """Whether nothing else can be rendered: of whole numbers and levels there may be few. Physical units."""
+    if not len(excluded) or not all(study.space.discrete):
+        return False
+    candidates = np.asarray(study.space.candidates(_SPREAD, 0))
+    away = differences(study.gp.kernel.levels, candidates[:, None], _to_unit(study, excluded)[None])
+    return bool(np.all(np.min(np.linalg.norm(away, axis=2), axis=1) < APART))
 
 
 def spread_point(

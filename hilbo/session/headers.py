@@ -1,7 +1,7 @@
 """What a session is to be, before it begins: its blocks, its warm-up, and the seeds of what is chosen in it."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -79,7 +79,7 @@ def header_of(
     session: str,
     seed: int,
     blocks: Sequence[Block],
-    sets: Mapping[str, Mapping[str, float]],
+    sets: dict[str, dict[str, float]],
     **others: Any,
 ) -> Header:
     """The header of a session of these blocks, with what it says of the study."""

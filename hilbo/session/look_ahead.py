@@ -196,6 +196,8 @@ class LiveChooser:
         study, session = self.study(answers.block), self._session(answers.block)
         warm = self._warm_starts.get(self._blocks[answers.block].material)
         excluded = _rows(situation.excluded, study)
+        if apart.are_all(study, excluded):  # whatever stopped them may be over
+            return Choice(excluded[0], "stopped least often")
         if warm is not None:
             return Choice(apart.point_from_map(study, warm, fitted.posterior, excluded), "map")
         initial = session.step.initial

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from operator import itemgetter
 from typing import Any, Literal
 
 from hilbo.errors import InputError
@@ -97,10 +98,11 @@ class LiveSession:
         return Counter(stop_key(t, side) for t, why in voided if why is not None for side in why["sides"])
 
     def excluded(self, block: int) -> list[dict[str, float]]:
-        """Renderings in which the device stopped twice, of a block that chooses them; they are not proposed again."""
+        """Renderings in which the device stopped twice, of a block that chooses them, those that stopped least often
+        first; they are not proposed again while there are others."""
         if self.header.blocks[block].trials:
             return []
-        return [dict(key) for key, count in self.stops(block).items() if count >= STOPS]
+        return [dict(key) for key, count in sorted(self.stops(block).items(), key=itemgetter(1)) if count >= STOPS]
 
     def put_off(self, block: int) -> list[int]:
         """Planned trials without an answer that the device stopped twice; they come last."""

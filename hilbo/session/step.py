@@ -222,8 +222,9 @@ def _fitted(choosing: Choosing, query: _Query):
     """Trials and latent values."""
     mask = jnp.arange(len(query.categories), dtype=query.count.dtype) < query.count
     trials = Trials(choosing.space.to_unit(query.points), query.categories, mask)
-    latent = fit(choosing.gp, trials, inference=choosing.inference, throw=False).latent
-    return trials, _uncertified(latent) if choosing.inference == "laplace" else latent
+    posterior = fit(choosing.gp, trials, inference=choosing.inference, throw=False)
+    latent = posterior.latent
+    return posterior.trials, _uncertified(latent) if choosing.inference == "laplace" else latent
 
 
 def _uncertified(latent: Any) -> GaussianPosterior:

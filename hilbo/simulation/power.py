@@ -85,16 +85,11 @@ def simulate_power(
     jobs = min(cores() if jobs is None else jobs, plan.studies)
     sent = study.content, study.rule, population_, plan
     blocks: dict[int, pd.DataFrame] = {}
-    if jobs == 1:
-        for index in range(plan.studies):
-            blocks[index] = _study_in_process(*sent, index)
+    with _pool(jobs, begin) as pool:  # of one process too: several cores add up in another order
+        work = {pool.submit(_study_in_process, *sent, i): i for i in range(plan.studies)}
+        for done in as_completed(work):
+            blocks[work[done]] = done.result()
             say(len(blocks))
-    else:
-        with _pool(jobs, begin) as pool:
-            work = {pool.submit(_study_in_process, *sent, i): i for i in range(plan.studies)}
-            for done in as_completed(work):
-                blocks[work[done]] = done.result()
-                say(len(blocks))
     return pd.concat([blocks[index] for index in range(plan.studies)], ignore_index=True)
 
 

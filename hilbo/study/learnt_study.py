@@ -32,12 +32,12 @@ def by_rule(study: Study, rule: str) -> Study:
     needs a [gp] where the study learns its own."""
     if rule == study.rule:
         return study
+    if rule not in ALL_RULES:
+        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
     if rule in RECIPES:
         return that_learns(study, rule)
     if study.rule in RECIPES:
         raise InputError(f'--rule is "{rule}", and the study, whose rule is "{study.rule}", has no [gp] for it.')
-    if rule not in ALL_RULES:
-        raise InputError(f'--rule is "{rule}"; it must be one of {", ".join(ALL_RULES)}.')
     return dataclasses.replace(study, rule=rule)
 
 

@@ -13,18 +13,19 @@ from hilbo.study.fields import Table, shown, words
 
 __all__ = ["StimulusTable"]
 
-_EXACT = 1e-6  # of a parameter's range: more than a number of 32 bits is off by
+_EXACT = 1e-6  # of a parameter's range, or of the value on a logarithmic scale: more than 32 bits are off by
 _PATIENCE = {"within": 5.0, "silence": 3.0}  # s that a person who presents needs at least, and a tablet that slumbers
 _Seconds = Annotated[float, msgspec.Meta(ge=0.1, le=600), words("a number of seconds from 0.1 to 600", "1.0")]
 
 
 class StimulusTable(Table, frozen=True):
     """`within`: s from an order until it is confirmed that it is presented. `silence`: s without a word from the
-    program until it counts as gone. `tolerance`: parameter -> how far the confirmed value may be off, physical units;
-    a millionth of the range where nothing is said. `unblinded`: who takes part is presented to by their own page, which
-    knows the parameters; answers to any other study that were given so are not aggregated with others'. `by`: whether a
-    program presents, or a person by hand, from the preparer's page. `experimenter_sees`: whether the experimenter is
-    shown the parameters; if nothing is said they are, but where a person presents."""
+    program until it counts as gone. `tolerance`: parameter -> how far the confirmed value may be off, in physical
+    units, on a logarithmic scale as a share of the value; a millionth of the range, or of the value, where nothing is
+    said. `unblinded`: who takes part is presented to by their own page, which knows the parameters; answers to any
+    other study that were given so are not aggregated with others'. `by`: whether a program presents, or a person by
+    hand, from the preparer's page. `experimenter_sees`: whether the experimenter is shown the parameters; if nothing is
+    said they are, but where a person presents."""
 
     within: _Seconds = 1.0
     silence: _Seconds = 1.0
@@ -38,6 +39,7 @@ class StimulusTable(Table, frozen=True):
     def check(self, parameters: Sequence[Parameter]) -> None:
         """Refuse tolerances of what is no parameter, and those that are none. Raises `InputError`."""
         names, levels = [p.name for p in parameters], [p.name for p in parameters if p.levels]
+        logs = [p.name for p in parameters if p.scale == "log"]
         for name, value in self.tolerance.items():
             path = f"stimulus.tolerance.{name}"
             if name not in names:
@@ -46,6 +48,11 @@ class StimulusTable(Table, frozen=True):
                 raise InputError(f"{path} is of levels, and another level is none that was asked for; leave it out.")
             if not 0 <= value < math.inf:
                 raise InputError(f"{path} is {shown(value)}; it must be a number, 0 or above.")
+            if name in logs and value >= 1:
+                raise InputError(
+                    f"{path} is {shown(value)}; on a logarithmic scale it is a share of the value and must be below 1,"
+                    " such as 0.01."
+                )
         for key, least in _PATIENCE.items() if self.by == "person" else ():
             if getattr(self, key) < least:
                 raise InputError(
@@ -63,8 +70,19 @@ class StimulusTable(Table, frozen=True):
         sees = self.by == "program" if self.experimenter_sees is None else self.experimenter_sees
         return (self.role, "experimenter") if sees else (self.role,)
 
-    def off_by(self, parameter: Parameter) -> float:
-        """How far a confirmed value may be off, in the parameter's unit."""
-        return self.tolerance.get(
-            parameter.name, 0.0 if parameter.levels else _EXACT * (parameter.high - parameter.low)
-        )
+    def borne(self, parameter: Parameter) -> float:
+        """How far a confirmed value may be off: in the parameter's unit, on a logarithmic scale as a share of it."""
+        if parameter.levels:
+            return 0.0
+        exact = _EXACT if parameter.scale == "log" else _EXACT * (parameter.high - parameter.low)
+        return self.tolerance.get(parameter.name, exact)
+
+    def off_by(self, parameter: Parameter, wanted: float) -> float:
+        """How far the confirmation of a value may be off, in the parameter's unit."""
+        return self.borne(parameter) * (wanted if parameter.scale == "log" else 1.0)
+
+    def borne_words(self, parameter: Parameter) -> str:
+        """`borne` in words, such as 0.5 deg, or 1 %."""
+        if parameter.scale == "log":
+            return f"{100 * self.borne(parameter):.3g} %"
+        return f"{self.borne(parameter):.3g} {parameter.unit}".rstrip()

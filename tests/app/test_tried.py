@@ -53,6 +53,8 @@ def test_the_shipped_study_is_presented_as_it_says(tmp_path):
             OWN.replace('["different", "similar", "close"]', '["no", "yes"]').replace("[1.0, 3.0]", "[1.0]"),
             "has 2 responses; the page of hilbo try has three",
         ),
+        (OWN.replace("[stimulus]", '[stimulus]\nby = "person"'), "leave by and experimenter_sees out"),
+        (OWN.replace("[stimulus]", "[stimulus]\nexperimenter_sees = false"), "leave by and experimenter_sees out"),
         (OWN.replace('{show = "a"', '{show = "reference", seconds = 1}, {show = "a"'), "test and reference at once"),
     ],
 )

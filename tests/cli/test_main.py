@@ -131,6 +131,20 @@ def test_unknown_rules_are_refused(capsys, monkeypatch, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--live", "--force"], "--force does nothing with --live"),
+        (["--live", "--participants", "3"], "--participants does nothing with --live"),
+        (["--kind", "validation"], "--kind does nothing without --live"),
+        (["--seconds", "0.1"], "--seconds does nothing without --live"),
+    ],
+)
+def test_options_of_the_other_kind_of_simulation_are_refused(capsys, monkeypatch, tmp_path, options, words):
+    code, _, stderr = run(capsys, monkeypatch, "simulate", *options, "--out", tmp_path / "out")
+    assert code == 2 and words in stderr and not list(tmp_path.iterdir())
+
+
 @pytest.mark.parametrize("arguments", [["aggregate"], ["simulate", "--preset", "nobody", "--out", "x"], ["fly"]])
 def test_bad_usage_ends_with_2(capsys, monkeypatch, tmp_path, arguments):
     monkeypatch.chdir(tmp_path)

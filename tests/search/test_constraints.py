@@ -165,7 +165,7 @@ def test_candidates_beside_the_passive_wall_are_even(parameters, constraint):
             ],
             "constraints leave nothing of the ranges, all together",
         ),
-        ([Constraint((("a", 1.0), ("c", 10.0)), most=0.0)], "constraints.1 leaves nothing"),  # a corner alone
+        ([Constraint((("a", 1.0), ("c", 10.0)), most=0.0)], "constraints.1 leaves no more than an edge"),  # a corner
     ],
 )
 def test_constraints_that_leave_nothing_are_refused(constraints, sentence):
@@ -179,6 +179,8 @@ def test_constraints_that_leave_nothing_are_refused(constraints, sentence):
         (Constraint((("z", 1.0),), most=1.0), "constraints.1.terms names z, which is no parameter"),
         (Constraint((("a", 0.0),), most=1.0), "has no weight but 0"),
         (Constraint((("a", np.inf),), most=1.0), "must be a finite number"),
+        (Constraint((("a", 1.0),), most=np.inf), "constraints.1.most is inf; it must be a finite number, or be left"),
+        (Constraint((("a", 1.0),), least=np.nan), "constraints.1.least is nan"),
         (Constraint((("a", 1.0),)), "has no least and no most"),
         (Constraint((("a", 1.0),), 3.0, 2.0), "least is 3.0; it must be below most = 2.0"),
     ],
@@ -191,3 +193,11 @@ def test_a_constraint_that_is_none_is_refused(constraint, sentence):
 def test_more_parameters_than_a_study_has_are_refused():
     with pytest.raises(InputError, match=r"parameters are 9, .* 8 at most"):
         Box(tuple(Parameter(f"p{i}", 0.0, 1.0) for i in range(9)))
+
+
+def test_few_renderings_are_asked_in_turn_and_nothing_is_said_of_clusters(recwarn):
+    whole = tuple(Parameter(name, 1.0, 3.0, integer=True) for name in ("a", "b"))
+    space = SearchSpace(whole, None, (Constraint((("a", 1.0), ("b", 1.0)), most=3.0),))
+    design = space.latin_hypercube(8, 0)
+    assert len(np.unique(design, axis=0)) == 3 and len(np.unique(design[:3], axis=0)) == 3
+    assert not recwarn.list

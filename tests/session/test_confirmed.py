@@ -53,6 +53,22 @@ def test_a_value_is_taken_within_its_tolerance_and_nowhere_else(du, dv):
     assert caught.value.code == "off"
 
 
+LOGARITHMIC = RAW | {
+    "parameters": RAW["parameters"] | {"f": {"low": 1.0, "high": 1000.0, "unit": "Hz", "scale": "log"}}
+}
+
+
+@pytest.mark.parametrize("wanted", [1.5, 900.0])
+@pytest.mark.parametrize(("stated", "share"), [({"f": 0.01}, 0.01), ({}, 1e-6)])
+def test_on_a_logarithmic_scale_a_share_of_the_value_may_be_off(wanted, stated, share):
+    study = Study.from_dict(LOGARITHMIC | {"stimulus": {"tolerance": stated}})
+    asked_for = ASKED | {"f": wanted}
+    check_confirmed(study, asked_for, asked_for | {"f": wanted * (1 + 0.99 * share)})
+    for factor in (1 + 1.01 * share, 1 - 1.01 * share):
+        with pytest.raises(RefusedError, match="was asked for, and it may be off by"):
+            check_confirmed(study, asked_for, asked_for | {"f": wanted * factor})
+
+
 @pytest.mark.parametrize(
     "values", [None, {}, {"u": 0.1}, ASKED | {"w": 1.0}, ASKED | {"u": float("nan")}, ASKED | {"v": float("inf")}]
 )
@@ -122,16 +138,17 @@ def test_what_is_missed_is_void_by_rule_and_counts_as_a_stop_in_its_rendering():
     [
         ({"within": 0.0}, "stimulus.within is 0.0; it must be a number of seconds from 0.1 to 600"),
         ({"silence": "long"}, "stimulus.silence"),
-        ({"tolerance": {"w": 1.0}}, "stimulus.tolerance.w is of no parameter of the study, those are u, v"),
+        ({"tolerance": {"w": 1.0}}, "stimulus.tolerance.w is of no parameter of the study, those are u, v, f"),
         ({"tolerance": {"u": -1.0}}, "stimulus.tolerance.u is -1.0; it must be a number, 0 or above"),
         ({"tolerance": {"u": float("nan")}}, "stimulus.tolerance.u"),
+        ({"tolerance": {"f": 10.0}}, "stimulus.tolerance.f is 10.0; on a logarithmic scale it is a share of the value"),
         ({"tolerance": 3}, "stimulus.tolerance is 3; it must be a table"),
         ({"late": 3}, "stimulus.late is not a key"),
     ],
 )
 def test_a_bad_table_is_refused_in_one_sentence(table, words):
     with pytest.raises(InputError) as caught:
-        Study.from_dict(RAW | {"stimulus": table})
+        Study.from_dict(LOGARITHMIC | {"stimulus": table})
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 

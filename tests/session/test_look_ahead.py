@@ -170,6 +170,23 @@ def test_where_every_value_was_asked_the_one_asked_least_comes_and_no_excluded_o
     assert counts == [3, 3, 1, 3, 3]
 
 
+def test_where_every_rendering_stopped_twice_they_come_in_turn():
+    raw = RAW | {"parameters": {"n": {"low": 0.0, "high": 2.0, "integer": True}}}
+    study = Study.from_dict(raw)
+    state = LiveSession.start(study, header_for(study, "P01", warm=False))
+    chooser, stopped = LiveChooser(state), []
+    while len(stopped) < 12:
+        state = asked(state, chooser)
+        stopped.append(state.pending.renderings["a"]["n"])
+        for event in beginning(state, state.pending.id, 1, 0.5):
+            state = state.after(event)
+        state = state.after(live.device(state, "hold", 1.0))
+    assert sorted(stopped[:6]) == [0, 0, 1, 1, 2, 2]
+    assert [sorted(stopped[i : i + 3]) for i in (6, 9)] == [[0, 1, 2], [0, 1, 2]]
+    state = asked(state, chooser)
+    assert state.pending.data["choice"]["by"] == "stopped least often"
+
+
 def test_a_warm_start_keeps_apart_from_one_level_and_not_from_its_neighbour():
     """Levels have no order: of 30 the next in the list is as far away as any other."""
     raw = RAW | {"parameters": {"sound": {"levels": [f"s{i}" for i in range(30)]}}}

@@ -15,7 +15,7 @@ let view = null;                     // what the server said last
 let answers = {}, asked = 0;         // of the question that is on the page
 let shownAt = 0, stepEnds = 0;       // performance.now()
 let laidOut = 0, goAt = 0;           // when the answers' buttons and Begin came up
-const SETTLES = 300;                 // ms: a tap that comes sooner was for what stood there before
+const SETTLES = 300;                 // ms: a tap or key that comes sooner was for what stood there before
 let trial = null;                    // id of the trial on the page
 let cued = null;                     // the trial whose question came up while it was still being felt
 let sending = false, connected = false, over = false;
@@ -94,12 +94,13 @@ function drawOptions(q) {
     }
     b.append(Object.assign(document.createElement("kbd"), { textContent: String(i + 1) }));
     b.dataset.value = option.value;
-    b.addEventListener("click", () => { if (performance.now() - laidOut > SETTLES) choose(i); });
+    b.addEventListener("click", () => choose(i));
     return b;
   }));
 }
 
 function choose(i) {
+  if (performance.now() - laidOut <= SETTLES) return;
   const q = view && !kept() && !over && view.questions && view.questions[asked];
   if (!q || !q.options[i]) return;
   answers[q.name] = q.options[i].value;

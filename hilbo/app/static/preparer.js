@@ -9,7 +9,7 @@ const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent 
 const show = (id, yes) => { at(id).hidden = !yes; };
 const SETTLES = 300;                 // ms: a tap that comes sooner was for what stood there before
 
-let run = null, silence = 10, units = {}, digits = {}, levels = {};
+let run = null, silence = 10, units = {}, borne = {}, levels = {};
 let order = { order: 0, do: "neutral" }, done = "neutral";   // the newest order, and what was done about it
 let since = 0, heard = 0, alerted = "", over = "";           // when it came, when the server was heard (performance.now())
 let presentedBefore = false;         // something stands there that is to be taken away
@@ -31,14 +31,18 @@ async function ready() {
     run = found.run; silence = found.silence_s; presentedBefore = false; alerted = "";
     for (const p of found.parameters) {
       units[p.name] = p.unit; levels[p.name] = p.levels || null;
-      // Rounded to these many digits, a value is off by half of what is borne at most.
-      digits[p.name] = p.tolerance > 0 ? Math.min(12, Math.max(0, Math.ceil(-Math.log10(p.tolerance)))) : null;
+      borne[p.name] = (value) => p.scale === "log" ? p.tolerance * value : p.tolerance;
     }
     put("what", found.study);
     take(found);
     await report("neutral");         // whoever presses Ready says that nothing is presented
     listen(run);
   } catch { lost("The server does not answer."); }
+}
+
+// As few digits after the point as leave a value off by half of what is borne at most.
+function rounded(value, off) {
+  return String(off > 0 ? Number(value.toFixed(Math.min(100, Math.max(0, Math.ceil(-Math.log10(off)))))) : value);
 }
 
 // Signs of life, and the newest order, as long as this run goes on.
@@ -86,7 +90,7 @@ function layOut() {
       ? Object.assign(document.createElement("select"), { id: `value-${i}` })
       : Object.assign(document.createElement("input"), { id: `value-${i}`, inputMode: "decimal", autocomplete: "off" });
     if (choice) input.replaceChildren(...choice.map((level) => new Option(level, level)));
-    input.value = typeof values[name] === "number" && digits[name] !== null ? String(Number(values[name].toFixed(digits[name]))) : String(values[name]);
+    input.value = typeof values[name] === "number" ? rounded(values[name], borne[name] ? borne[name](values[name]) : 0) : String(values[name]);
     input.dataset.name = name;
     input.dataset.number = typeof values[name] === "number" ? "yes" : "";
     return [
