@@ -73,7 +73,7 @@ WITHOUT_JAX = {
         f"session.{name}"
         for name in ("plan", "records", "replay", "state", "transitions", "views", "withdrawal", "withdrawn_results")
     ),
-    *("session.netcdf", "session.pace", "session.participants", "session.table_words"),
+    *("session.netcdf", "session.pace", "session.psych_ds", "session.participants", "session.table_words"),
 }
 # These import JAX for a set with full memory, and to convert a value, and not before.
 LATER = {"device.parameter_sets", "search.box"}

@@ -82,6 +82,7 @@ def export(
     from hilbo.session import export as log_tables
     from hilbo.session.netcdf import netcdf
     from hilbo.session.plan import check_plan, read_plan
+    from hilbo.session.psych_ds import psych_ds
     from hilbo.study.study_file import StudyFile
 
     chosen = StudyFile.load(study)
@@ -93,7 +94,7 @@ def export(
         say("writing tables")
         if log_tables.computes_sets(sessions):
             start()
-        log_tables.psych_ds(sessions, folder, chosen)
+        psych_ds(sessions, folder, chosen)
         shutil.copyfile(study, folder / "study.toml")
         if plan is not None:
             shutil.copyfile(plan, folder / "plan.json")

@@ -1,4 +1,4 @@
-"""Session logs as tables and as a Psych-DS folder, made from the logs alone.
+"""Session logs as tables, made from the logs alone.
 
 `trials_table` is a trial table (every answer to one rendering; voided and undone ones marked so), `validation_table`
 and `sets_table` are those of `hilbo.study.validation_table` (voided comparisons left out), `presentations_table` has
@@ -7,9 +7,7 @@ every trial that was ever proposed, and what became of it, `sessions_table` the 
 very same text, so that both give the same bits.
 """
 
-import json
 import os
-import re
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,19 +17,18 @@ import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.session.confirmed import in_words
-from hilbo.session.event_log import log_name, log_paths, read_session
+from hilbo.session.event_log import log_paths, read_session
 from hilbo.session.records import Trial
 from hilbo.session.state import LiveSession
-from hilbo.session.table_words import UNWRITTEN, column_words, presented_column
+from hilbo.session.table_words import UNWRITTEN, presented_column
 from hilbo.study.set_table import role_of, source_of
 from hilbo.study.study_file import AnyStudy
-from hilbo.study.text_cells import check_text, runs_in_a_spreadsheet
+from hilbo.study.text_cells import runs_in_a_spreadsheet
 from hilbo.study.trial_table import read_trials, write_trials
 
 __all__ = [
     "computes_sets",
     "presentations_table",
-    "psych_ds",
     "read_log_trials",
     "read_sessions",
     "sessions_table",
@@ -224,60 +221,8 @@ def read_log_trials(
             raise InputError(str(error).replace(str(path), str(folder))) from None
 
 
-def psych_ds(sessions: Sequence[LiveSession], folder: Path, study: AnyStudy) -> list[Path]:
-    """Tables with their sidecars and dataset_description.json, in the shape of a Psych-DS data set; the files.
-    Raises InputError for an id, label or name of a set that a spreadsheet would run."""
-    for state in sessions:
-        _check_names(state)
-    tables = {
-        "trials": trials_table(sessions),
-        "validation": validation_table(sessions),
-        "sets": sets_table(sessions),
-        "presentations": presentations_table(sessions),
-        "sessions": sessions_table(sessions),
-    }
-    data = folder / "data"
-    data.mkdir(parents=True, exist_ok=True)
-    name = re.sub(r"[^A-Za-z0-9]", "", study.name) or "study"
-    written: list[Path] = []
-    columns: dict[str, Any] = {}
-    for kind, table in tables.items():
-        if table.empty:
-            continue
-        path = data / f"study-{name}_table-{kind}_data.csv"
-        write_trials(table, path)
-        sidecar = path.with_suffix(".json")
-        words = column_words(study, kind)
-        here = [_variable(str(column), words) for column in table.columns]
-        columns |= {variable["name"]: variable for variable in here if variable["name"] not in columns}
-        sidecar.write_text(
-            _json({"description": f"{kind} of {study.name}", "variableMeasured": here}), encoding="utf-8"
-        )
-        written += [path, sidecar]
-    description = {
-        "@context": "https://schema.org/",
-        "@type": "Dataset",
-        "name": study.name,
-        "description": f"Live sessions of {len(sessions)} logs, study {study.hash}, written by hilbo.",
-        "schemaVersion": "Psych-DS 0.4.0",
-        "variableMeasured": list(columns.values()),
-    }
-    path = folder / "dataset_description.json"
-    path.write_text(_json(description), encoding="utf-8")
-    return [*written, path]
-
-
 def _written(text: Any) -> Any:
     return UNWRITTEN if isinstance(text, str) and runs_in_a_spreadsheet(text) else text
-
-
-def _check_names(state: LiveSession) -> None:
-    """Names cannot be left out as words can: without them a table does not say whose its rows are."""
-    header, place = state.header, log_name(state.header)
-    check_text(header.participant, "participant", place)
-    check_text(header.session, "the session's label", place)
-    for name in header.sets:
-        check_text(name, "the name of a set", place)
 
 
 def _place(state, trial: Trial):
@@ -306,11 +251,3 @@ def _table(rows):
         if column in table and table[column].isna().all():
             table = table.drop(columns=column)
     return table
-
-
-def _variable(column, words):
-    return {"@type": "PropertyValue", "name": column, "description": words.get(column, column.replace("_", " "))}
-
-
-def _json(content):
-    return json.dumps(content, indent=2, ensure_ascii=False) + "\n"

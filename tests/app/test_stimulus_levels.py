@@ -11,8 +11,9 @@ from hilbo.app.log_words import table
 from hilbo.app.robot import browser, find_browser
 from hilbo.app.slices import Maps
 from hilbo.app.stand_in import StandIn
-from hilbo.session.export import psych_ds, sets_table, trials_table
+from hilbo.session.export import sets_table, trials_table
 from hilbo.session.netcdf import netcdf
+from hilbo.session.psych_ds import psych_ds
 from hilbo.session.records import Block
 from hilbo.study.cohort import cohort_of
 

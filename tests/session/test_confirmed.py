@@ -13,8 +13,9 @@ from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session import actions as live
 from hilbo.session.confirmed import check_confirmed, counted
-from hilbo.session.export import psych_ds, sets_table, trials_table, validation_table
+from hilbo.session.export import sets_table, trials_table, validation_table
 from hilbo.session.look_ahead import Answers
+from hilbo.session.psych_ds import psych_ds
 from hilbo.session.records import Block, Planned, RefusedError
 from hilbo.session.state import LiveSession
 

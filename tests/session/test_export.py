@@ -13,9 +13,10 @@ from live import STUDY, Driver
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.export import psych_ds, read_log_trials, read_sessions, sets_table, trials_table
+from hilbo.session.export import read_log_trials, read_sessions, sets_table, trials_table
 from hilbo.session.netcdf import netcdf
 from hilbo.session.participants import add_person, check_consent, read_people
+from hilbo.session.psych_ds import psych_ds
 from hilbo.session.withdrawal import delete_participant
 from hilbo.study.aggregate import fit_cohort
 from hilbo.study.cohort import cohort_of

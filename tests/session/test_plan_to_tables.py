@@ -9,8 +9,9 @@ from hilbo import Study
 from hilbo.report.validation import validate, validation_figures
 from hilbo.session import actions as live
 from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.export import psych_ds, read_sessions, sets_table
+from hilbo.session.export import read_sessions, sets_table
 from hilbo.session.plan import make_plan, planned_header
+from hilbo.session.psych_ds import psych_ds
 from hilbo.session.records import Block, Header, Planned
 from hilbo.session.state import LiveSession
 from hilbo.statistics.paper_tables import paper_tables

@@ -10,7 +10,8 @@ from live import STUDY, Driver
 
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog
-from hilbo.session.export import psych_ds, read_sessions
+from hilbo.session.export import read_sessions
+from hilbo.session.psych_ds import psych_ds
 
 
 def write(path, kind):
