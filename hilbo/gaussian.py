@@ -192,7 +192,7 @@ def shortfall(certificate: Any, log_evidence: Float[Array, ""]) -> str:
     """What a certificate that does not hold says, in words, and what may help. A sampled posterior's has a residual,
     and says no by that alone."""
     remedy, residual = "use a larger noise, float64", f"{float(certificate.residual):.3g}"
-    if not bool(certificate.residual <= certificate.tolerance):
+    if not bool(certificate.residual <= certificate.tolerance) and not bool(jnp.isnan(certificate.tolerance)):
         steps, tolerance = int(certificate.iterations), float(certificate.tolerance)
         return (
             f"not found: its residual is {residual} after {steps} steps and should be at most {tolerance:.3g}; {remedy}"

@@ -117,9 +117,9 @@ class OrdinalProbit(eqx.Module):
         self, f: ArrayLike, q: ArrayLike
     ) -> tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""], Float[Array, ""]]:
         """`f`, the two edges of category `q` (infinite at the ends) and the noise, in the dtype of `f`; NaN where there
-        is no such category or likelihood. Raises `InputError` for what are no scalars."""
-        if jnp.ndim(f) or jnp.ndim(q) or self.noise.ndim or self.thresholds.ndim != 1:
-            shapes = f"{jnp.shape(f)}, {jnp.shape(q)}, {self.thresholds.shape} and {self.noise.shape}"
+        is no such likelihood, and for a category below 0. Raises `InputError` for what are no scalars."""
+        if jnp.ndim(f) or jnp.ndim(q) or jnp.ndim(self.noise) or jnp.ndim(self.thresholds) != 1:
+            shapes = f"{jnp.shape(f)}, {jnp.shape(q)}, {jnp.shape(self.thresholds)} and {jnp.shape(self.noise)}"
             raise InputError(
                 f"OrdinalProbit: value, category, thresholds and noise have the shapes {shapes}; all but the thresholds"
                 " are scalars, use jax.vmap for several."

@@ -251,6 +251,8 @@ def fit(
     if inference not in _SOUGHT:
         raise InputError(f'fit: inference is "{inference}"; it must be one of {", ".join(_SOUGHT)}.')
     check_shapes(gp.kernel, gp.likelihood, trials, start)
+    if inference == "exact" and concrete(trials):  # whose samples would take -1 for the last category
+        check_answers(_answers_alone(trials), gp.likelihood.categories)
     posterior = _fit(gp, trials, start, inference)
     return _checked(posterior, _SOUGHT[inference]) if throw else posterior
 

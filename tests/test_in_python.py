@@ -307,6 +307,15 @@ IMPOSSIBLE = {
     "a model of order above 1": (lambda *values: viscoelastic.FOSLS(*values).dc_gain(), (0.5, 1.0, 1.0, 1.5)),
     "a modulus before time 0": (viscoelastic.relaxation_modulus, (-1.0, 1.0, 1.0, 1.0, 0.5)),
     "creep with a K0 below 0": (viscoelastic.creep_compliance, (1.0, -2.0, 1.0, 1.0, 0.5)),
+    "the settling time of a negative B1": (
+        lambda B: viscoelastic.FOSLS(1.0, 1.0, B, 0.5).settling_time(0.9),
+        (-2.0,),
+    ),
+    "full memory with a K0 below 0": (
+        lambda K0: viscoelastic.FOSLS(K0, 1.0, 1.0, 0.5, memory="full").dc_gain(),
+        (-1.0,),
+    ),
+    "a constant order of 1.5": (lambda K0: viscoelastic.FOSLS(K0, 1.0, 1.0, 1.5).dc_gain(), (0.5,)),
     "a noise below 0": (lambda noise: OrdinalProbit((-0.5, 0.5), noise).class_probabilities(0.1, 0.3), (-0.5,)),
     "a noise below 0 and one answer": (lambda noise: OrdinalProbit((-0.5, 0.5), noise).log_prob(0.1, 1), (-0.5,)),
     "falling thresholds": (lambda t: OrdinalProbit(t, 0.5).log_prob(0.1, 0), (np.array([0.5, -0.5]),)),

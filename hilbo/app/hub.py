@@ -29,6 +29,7 @@ from hilbo.session.state import LiveSession
 
 __all__ = ["PRESSES", "Hub"]
 
+_WHY = 200  # characters of an error
 _RECENT = 200  # events that the experimenter's page may show
 PRESSES = ("begin", "break", "more", "here")
 
@@ -90,14 +91,15 @@ class Hub:
     def _warm(self) -> None:
         """Compile what choosing and drawing need; nothing is rendered before it is done."""
         self.chooser.warm()
-        if self._make_maps is not None:
+        if self._make_maps is None:
+            return
+        try:
             maps = self._make_maps(self.chooser)
-            try:
-                maps.warm()
-            except Exception as error:  # whatever it is: a person is waiting, and the session needs no map
-                self.without_map = f"There will be no map ({error}); the session goes on without it."
-            else:
-                self._maps = maps
+            maps.warm()
+            self._maps = maps
+        except Exception as error:  # whatever it is: a person is waiting, and the session needs no map
+            why = " ".join(str(error).split())[:_WHY]
+            self.without_map = f"There will be no map ({why}); the session goes on without it."
 
     def _warmed(self, warm: asyncio.Future) -> None:
         if warm.cancelled():  # the session ends before it

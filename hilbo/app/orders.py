@@ -6,6 +6,7 @@ An order says what shall be the case from now on, not what shall change, so that
 from typing import Any, NamedTuple
 
 from hilbo.app.rig import Showing
+from hilbo.search.box import Parameter
 from hilbo.session.confirmed import in_words
 from hilbo.session.header_check import study_of
 from hilbo.session.set_codes import label_of
@@ -43,18 +44,14 @@ def as_sent(order: Order, study: AnyStudy, tag: str) -> dict[str, Any]:
 
 
 def parameters_of(study: AnyStudy) -> list[dict[str, Any]]:
-    """What the parameters of orders may be, and how far off a confirmation may be; parameters have their units."""
+    """What the parameters of orders may be, and how far off a confirmation may be, in their units. On a logarithmic
+    scale, where that grows with the value, it is told for the low end, and as a share."""
+    return [_parameter(study, p) for p in study.space.parameters]
+
+
+def _parameter(study: AnyStudy, p: Parameter) -> dict[str, Any]:
     assert study.stimulus is not None
-    return [
-        {"name": p.name, "levels": list(p.levels)}
-        if p.levels
-        else {
-            "name": p.name,
-            "unit": p.unit,
-            "low": p.low,
-            "high": p.high,
-            "scale": p.scale,
-            "tolerance": study.stimulus.borne(p),
-        }
-        for p in study.space.parameters
-    ]
+    if p.levels:
+        return {"name": p.name, "levels": list(p.levels)}
+    told = {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "tolerance": study.stimulus.off_by(p, p.low)}
+    return told | ({"share": study.stimulus.borne(p)} if p.scale == "log" else {})

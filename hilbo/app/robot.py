@@ -142,7 +142,8 @@ class Participant:
             )
             if not key:
                 return
-            self.window.wait_for_function("performance.now() - laidOut > SETTLES")  # sooner the page takes none
+            while not self.window.evaluate("performance.now() - laidOut > SETTLES"):  # sooner the page takes no key
+                self.window.wait_for_timeout(20)
             self.window.keyboard.press(str(key))
         self.answered += bool(names)
 

@@ -263,7 +263,11 @@ def _stimulus(file: Any) -> Iterator[Check]:
     words = f"a {table.by} presents, and confirms within {table.within:g} s"
     words += f"; values may be off by {off}" if off else ""
     said = file.tables.stimulus is not None
-    yield Check("stimulus", "good" if said else "note", words, "" if said else "say so in a table [stimulus]")
+    try:
+        table.check_shares(parameters)
+        yield Check("stimulus", "good" if said else "note", words, "" if said else "say so in a table [stimulus]")
+    except InputError as error:
+        yield Check("stimulus", "bad", str(error), "fix the study file")
     left = [key for key in ("title", "hello", "feel_reference", "feel_test") if key not in file.session.texts]
     yield Check(
         "participants' texts",

@@ -20,18 +20,20 @@ def check_shapes(kernel: Kernel, likelihood: OrdinalProbit, trials: Trials, star
         )
     if isinstance(kernel, Stationary):
         _check_kernel(kernel, trials.x.shape[-1])
-    if likelihood.noise.ndim:
-        raise InputError(f"fit: noise has shape {likelihood.noise.shape}; it is a scalar.")
+    if jnp.ndim(likelihood.noise):
+        raise InputError(f"fit: noise has shape {jnp.shape(likelihood.noise)}; it is a scalar.")
     if start is not None and jnp.shape(start) != trials.mask.shape:
         shape = jnp.shape(start)
         raise InputError(f"fit: start has shape {shape}; give one weight for each of {trials.capacity} rows.")
 
 
 def _check_kernel(kernel: Stationary, dim: int) -> None:
-    if kernel.theta.shape not in ((), (dim,)):
-        raise InputError(f"fit: theta has shape {kernel.theta.shape} and x {dim} parameters; give one number or {dim}.")
-    if kernel.variance.ndim:
-        raise InputError(f"fit: the kernel's variance has shape {kernel.variance.shape}; it is a scalar.")
+    if jnp.shape(kernel.theta) not in ((), (dim,)):
+        raise InputError(
+            f"fit: theta has shape {jnp.shape(kernel.theta)} and x {dim} parameters; give one number or {dim}."
+        )
+    if jnp.ndim(kernel.variance):
+        raise InputError(f"fit: the kernel's variance has shape {jnp.shape(kernel.variance)}; it is a scalar.")
     if kernel.levels and len(kernel.levels) != dim:
         raise InputError(f"fit: the kernel has levels {kernel.levels} and x {dim} parameters; give {dim} of them.")
 

@@ -76,8 +76,9 @@ class FOSLS(eqx.Module):
         xp = np if on_host(K0, K1, B1, alpha) else jnp
         dtype = xp.result_type(1.0, K0, K1, B1, alpha)
         self.K0, self.K1, self.B1, self.alpha = (xp.asarray(value, dtype) for value in (K0, K1, B1, alpha))
-        if not concrete(self.K1, self.B1, self.alpha):
+        if not concrete(self.K0, self.K1, self.B1, self.alpha):
             allowed = possible(K1=self.K1, B1=self.B1, alpha=self.alpha)
+            allowed = allowed & possible(K0=self.K0) if memory == "full" else allowed
             self.alpha = jnp.where(allowed, self.alpha, jnp.nan)
         self.N, self.T, self.memory, self.states = N, float(T), memory, states
 
@@ -175,7 +176,7 @@ class FOSLS(eqx.Module):
         if not 0 <= fraction < 1:
             raise InputError(f"fraction is {fraction}; it must be at least 0 and below 1; write 0.9 for t90.")
         find = _short_settling if self.memory == "short" else _full_settling
-        return find(self, jnp.asarray(fraction, self.K0.dtype))
+        return jnp.where(jnp.isnan(self.alpha), jnp.nan, find(self, jnp.asarray(fraction, self.K0.dtype)))
 
 
 def series(K1: Float[Any, "..."], pot: Inexact[Any, "..."]) -> Inexact[Any, "..."]:

@@ -15,7 +15,7 @@ from hilbo.session.selection import Design, point_apart
 from hilbo.session.warm_start import WarmStart, warm_point
 from hilbo.study.config import Study
 
-__all__ = ["APART", "are_all", "is_near", "point_from_map", "point_kept_apart", "spread_point"]
+__all__ = ["APART", "is_near", "point_from_map", "point_kept_apart", "spread_point", "when_nothing_is_apart"]
 
 APART = 0.05
 """Least distance in the unit cube from a rendering in which the device stopped twice."""
@@ -32,13 +32,19 @@ def is_near(study: Study, point: Float[np.ndarray, " d"], excluded: Float[np.nda
     return bool(np.min(np.linalg.norm(differences(study.gp.kernel.levels, unit[:-1], unit[-1]), axis=1)) < APART)
 
 
-def are_all(study: Study, excluded: Float[np.ndarray, "k d"]) -> bool:
-    """Whether nothing else can be rendered: of whole numbers and levels there may be few. Physical units."""
+def when_nothing_is_apart(study: Study, excluded: Float[np.ndarray, "k d"]) -> Float[np.ndarray, " d"] | None:
+    """What comes where nothing is `APART` from all excluded renderings, since of whole numbers and levels there are
+    few: the candidate farthest from them; where they are all that there is, the first of them, whose stops are fewest.
+    None where something is apart. Physical units."""
     if not len(excluded) or not all(study.space.discrete):
-        return False
+        return None
     candidates = np.asarray(study.space.candidates(_SPREAD, 0))
     away = differences(study.gp.kernel.levels, candidates[:, None], _to_unit(study, excluded)[None])
-    return bool(np.all(np.min(np.linalg.norm(away, axis=2), axis=1) < APART))
+    nearest = np.min(np.linalg.norm(away, axis=2), axis=1)
+    farthest = int(np.argmax(nearest))
+    if nearest[farthest] >= APART:
+        return None
+    return np.asarray(study.space.to_physical(candidates[farthest])) if nearest[farthest] > _SAME else excluded[0]
 
 
 def spread_point(

@@ -11,8 +11,10 @@ from hilbo.study.typed_files import check_values
 
 __all__ = ["SCHEMA", "check_header", "check_label", "check_new_header", "study_of"]
 
-SCHEMA = 2  # of what is begun today
-_SCHEMAS = (1, SCHEMA)  # sessions of 1 have other seeds: `hilbo.session.plan.material_seed`
+SCHEMA = 3  # of what is begun today
+_SCHEMAS = (1, 2, SCHEMA)
+# Sessions of 1 have other seeds (`hilbo.session.headers.material_seed`), and up to 2 tolerances of a logarithmic scale
+# were in the parameter's unit (`hilbo.session.confirmed`).
 _MOST = 100_000  # trials of a block
 _LABEL = 64  # characters of a session's label, and of an id
 _DAY = 86_400.0  # s
@@ -26,7 +28,7 @@ def study_of(study: AnyStudy, material: str | None) -> AnyStudy:
 def check_header(study: AnyStudy, header: Header) -> None:
     """Refuse a header that no session of this study can have, of whatever version. Raises InputError."""
     if header.schema not in _SCHEMAS:
-        known = " and ".join(map(str, _SCHEMAS))
+        known = ", ".join(map(str, _SCHEMAS))
         raise InputError(f"the session's header is of schema {header.schema}; this hilbo knows {known}.")
     person = header.participant
     if not 0 < len(person) <= _LABEL or not person.isprintable() or any(mark in person for mark in "/\\"):
@@ -56,6 +58,9 @@ def check_new_header(study: AnyStudy, header: Header) -> None:
     """Refuse a header with which no session may begin: one that `check_header` refuses, or with an id or words against
     the rules for them. Raises InputError."""
     check_header(study, header)
+    for here in {block.material: study_of(study, block.material) for block in header.blocks}.values():
+        if here.stimulus is not None:
+            here.stimulus.check_shares(here.space.parameters)
     check_id(header.participant, "the session's header")
     check_text(header.session, "the session's label")
     for number, block in enumerate(header.blocks, 1):

@@ -3,7 +3,7 @@
 `LiveChooser.lookahead(state)` finds the next rendering for each answer that may come; `choose` then only looks it up.
 Each answer's posterior is fitted once, by the step that chooses (`hilbo.session.step`), and kept: it explains the
 choice, and the experimenter's page reads it. Optimisation renderings are `hilbo.session.ask_tell.Session`'s, bit for
-bit: they depend on the study, the seed (of the material: `plan.material_seed`) and the answers that count. A
+bit: they depend on the study, the seed (of the material: `headers.material_seed`) and the answers that count. A
 space-filling point without an answer that counts comes before all others. With a warm start
 (`hilbo.session.warm_start`, one for each material) there are no space-filling trials: points come from it.
 """
@@ -196,8 +196,9 @@ class LiveChooser:
         study, session = self.study(answers.block), self._session(answers.block)
         warm = self._warm_starts.get(self._blocks[answers.block].material)
         excluded = _rows(situation.excluded, study)
-        if apart.are_all(study, excluded):  # whatever stopped them may be over
-            return Choice(excluded[0], "stopped least often")
+        left = apart.when_nothing_is_apart(study, excluded)
+        if left is not None:
+            return Choice(left, "stopped least often")
         if warm is not None:
             return Choice(apart.point_from_map(study, warm, fitted.posterior, excluded), "map")
         initial = session.step.initial

@@ -36,6 +36,7 @@ __all__ = ["Withdrawal", "delete_participant"]
 
 _OPTIONAL = ("trials", "validation", "sets", "truth")  # a report takes none of these rather than one without rows
 _UNREADABLE = "cannot be read; if it holds their answers, delete it"
+_HEAD = 2**12  # bytes of a table's first line
 _PICTURES = (".png", ".jpg", ".jpeg", ".gif")
 
 
@@ -100,10 +101,15 @@ def _alone_with_lists(files: Iterable[Path]) -> Iterator[None]:
     places = sorted({path.resolve() for path in _ending(files, ".csv")})
     with contextlib.ExitStack() as locks:
         for place in places:
-            if place.with_name(lock_name(place)).exists():
-                with contextlib.suppress(OSError):  # what cannot be locked cannot be written either, which is said
+            with contextlib.suppress(OSError):  # what cannot be read or locked cannot be written either, which is said
+                if place.with_name(lock_name(place)).exists() or _is_list_of_people(place):
                     locks.enter_context(locked_beside(place))
         yield
+
+
+def _is_list_of_people(path: Path) -> bool:
+    with open(path, "rb") as file:
+        return b"consent_time" in file.readline(_HEAD)
 
 
 def _below(root: Path) -> Below:

@@ -138,6 +138,8 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
     from statsmodels.base.model import LikelihoodModel  # a third of a second: who fits nothing does not pay it
 
     columns = np.vstack([model.upper, model.lower])
+    if len(columns) < columns.shape[1]:
+        raise RuntimeError(_NO_MAXIMUM)
     units = np.abs(columns).max(axis=0)
     to_orthogonal = np.linalg.qr(columns / units, mode="r") * units / np.sqrt(len(columns))
     if not np.all(np.diag(to_orthogonal)):
@@ -159,11 +161,13 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
 
     likelihood = IntervalLogit(np.zeros(len(model.upper)))  # statsmodels counts these; the answers are in `model`
     options = {"disp": 0, "warn_convergence": False, "skip_hessian": True}
-    near = likelihood.fit(
-        to_orthogonal @ start, method="minimize", min_method="trust-exact", gtol=_NEAR, **options
-    ).params
-    last_step = _LAST_STEP * (1 + np.abs(near).max())
-    results = likelihood.fit(near, method="newton", tol=last_step, ridge_factor=0, **options)
+    begun = to_orthogonal @ start
+    try:
+        near = likelihood.fit(begun, method="minimize", min_method="trust-exact", gtol=_NEAR, **options).params
+        last_step = _LAST_STEP * (1 + np.abs(near).max())
+        results = likelihood.fit(near, method="newton", tol=last_step, ridge_factor=0, **options)
+    except np.linalg.LinAlgError:
+        raise RuntimeError(_NO_MAXIMUM) from None
     if not results.mle_retvals["converged"]:
         raise RuntimeError(_NO_MAXIMUM)
     estimate = solve_triangular(to_orthogonal, results.params)

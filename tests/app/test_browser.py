@@ -85,6 +85,12 @@ def press(experimenter, command, reason=None):
         experimenter.click("#sure button[value=yes]")
 
 
+def press_key(window, key):
+    """A key, once the page takes one."""
+    until(window, "performance.now() - laidOut > SETTLES")
+    window.keyboard.press(key)
+
+
 def until(window, expression):
     """Waits for what is true in a page; pages allow no waiting by a script of others."""
     end = time.monotonic() + PATIENCE
@@ -269,7 +275,7 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
     window.route("**/api/participant/answer", lambda route: route.abort())  # sent, never arrives
     trial = window.evaluate("trial")
     for _ in range(3):
-        window.keyboard.press("1")
+        press_key(window, "1")
     until(window, "localStorage.getItem('hilbo.answer') !== null")
     window.wait_for_timeout(300)
     window.unroute_all(behavior="wait")
@@ -285,7 +291,7 @@ def test_an_answer_survives_a_lost_network_and_a_closed_page(pages):
             window.click("#go")  # which counts when it has stood there for a moment
         window.wait_for_timeout(50)
     for _ in range(3):
-        window.keyboard.press("2")
+        press_key(window, "2")
     until_logged(live, window, count + 1)
     window.unroute_all(behavior="wait")  # a request may be on its way
     until(window, "localStorage.getItem('hilbo.answer') === null")

@@ -14,6 +14,7 @@ from hilbo.errors import InputError
 from hilbo.session import actions as live
 from hilbo.session.confirmed import check_confirmed, counted
 from hilbo.session.export import sets_table, trials_table, validation_table
+from hilbo.session.header_check import check_new_header
 from hilbo.session.look_ahead import Answers
 from hilbo.session.psych_ds import psych_ds
 from hilbo.session.records import Block, Planned, RefusedError
@@ -68,6 +69,18 @@ def test_on_a_logarithmic_scale_a_share_of_the_value_may_be_off(wanted, stated, 
     for factor in (1 + 1.01 * share, 1 - 1.01 * share):
         with pytest.raises(RefusedError, match="was asked for, and it may be off by"):
             check_confirmed(study, asked_for, asked_for | {"f": wanted * factor})
+
+
+def test_a_log_of_before_is_read_with_tolerances_in_the_unit_and_none_is_begun():
+    study = Study.from_dict(LOGARITHMIC | {"stimulus": {"tolerance": {"f": 10.0}}})
+    asked_for = ASKED | {"f": 1.5}
+    check_confirmed(study, asked_for, ASKED | {"f": 11.0}, schema=2)
+    with pytest.raises(RefusedError, match="may be off by 10 Hz"):
+        check_confirmed(study, asked_for, ASKED | {"f": 12.0}, schema=2)
+    with pytest.raises(InputError, match=r"tolerance.f is 10.0; on a logarithmic scale it is a share of the value"):
+        check_new_header(
+            study, msgspec.structs.replace(header(), study=study.hash, sets={}, blocks=header().blocks[1:])
+        )
 
 
 @pytest.mark.parametrize(
@@ -142,7 +155,6 @@ def test_what_is_missed_is_void_by_rule_and_counts_as_a_stop_in_its_rendering():
         ({"tolerance": {"w": 1.0}}, "stimulus.tolerance.w is of no parameter of the study, those are u, v, f"),
         ({"tolerance": {"u": -1.0}}, "stimulus.tolerance.u is -1.0; it must be a number, 0 or above"),
         ({"tolerance": {"u": float("nan")}}, "stimulus.tolerance.u"),
-        ({"tolerance": {"f": 10.0}}, "stimulus.tolerance.f is 10.0; on a logarithmic scale it is a share of the value"),
         ({"tolerance": 3}, "stimulus.tolerance is 3; it must be a table"),
         ({"late": 3}, "stimulus.late is not a key"),
     ],

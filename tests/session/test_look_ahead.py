@@ -14,7 +14,7 @@ from hilbo.search.candidates import search_points
 from hilbo.session import actions as live
 from hilbo.session import explanation
 from hilbo.session.event_log import EventLog, log_name, read_log
-from hilbo.session.excluded import APART, spread_point
+from hilbo.session.excluded import APART, spread_point, when_nothing_is_apart
 from hilbo.session.headers import header_for
 from hilbo.session.logged_session import LoggedSession
 from hilbo.session.look_ahead import Answers, LiveChooser, _missing
@@ -185,6 +185,16 @@ def test_where_every_rendering_stopped_twice_they_come_in_turn():
     assert [sorted(stopped[i : i + 3]) for i in (6, 9)] == [[0, 1, 2], [0, 1, 2]]
     state = asked(state, chooser)
     assert state.pending.data["choice"]["by"] == "stopped least often"
+
+
+def test_of_many_steps_one_that_never_stopped_comes_first():
+    raw = RAW | {"parameters": {"n": {"low": 0.0, "high": 40.0, "integer": True}}}
+    stopped = np.arange(0.0, 41.0, 2.0)[:, None]
+    (left,) = when_nothing_is_apart(Study.from_dict(raw), stopped)
+    assert left % 2 == 1
+    everything = np.arange(41.0)[::-1, None]
+    assert when_nothing_is_apart(Study.from_dict(raw), everything).tolist() == [40.0]
+    assert when_nothing_is_apart(Study.from_dict(raw), stopped[:3]) is None
 
 
 def test_a_warm_start_keeps_apart_from_one_level_and_not_from_its_neighbour():

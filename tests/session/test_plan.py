@@ -175,7 +175,7 @@ def test_nobody_meets_the_points_of_an_earlier_session_or_of_another_material():
     assert len(set(seeds)) == len(seeds) and choosing("1", None) == {None: 7}
     assert choosing("2", "red", "blue") == choosing("2", "blue", "red") == choosing("2", "red") | choosing("2", "blue")
     plan = make_plan(STUDY, ["P01"])
-    assert planned_header(plan, STUDY, "P01").schema == header_for(STUDY, "P01", warm=False).schema == 2
+    assert planned_header(plan, STUDY, "P01").schema == header_for(STUDY, "P01", warm=False).schema == 3
 
 
 def test_sessions_of_schema_1_keep_their_seeds():

@@ -98,7 +98,7 @@ FORGED = {
     "a block of no material": lambda lines: lines[0]["data"]["blocks"][0].update(material="cheese"),
     "a planned trial of no set": lambda lines: lines[0]["data"]["blocks"][0]["trials"][0].update(a="Z"),
     "a participant who is a path": lambda lines: lines[0]["data"].update(participant="../P01"),
-    "another schema": lambda lines: lines[0]["data"].update(schema=3),
+    "another schema": lambda lines: lines[0]["data"].update(schema=4),
 }
 
 

@@ -14,7 +14,7 @@ from hilbo.cli.console import results
 from hilbo.errors import InputError
 from hilbo.session import file_lock, withdrawal
 from hilbo.session.event_log import EventLog, log_name
-from hilbo.session.participants import add_person, read_people
+from hilbo.session.participants import read_people
 from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue
 from hilbo.session.records import Block, Header, Planned
 from hilbo.session.withdrawal import delete_participant
@@ -338,9 +338,8 @@ def test_a_number_is_an_id_where_ids_stand_alone(tmp_path):
 
 
 def test_a_list_that_somebody_is_added_to_is_waited_for(tmp_path, monkeypatch):
-    path = tmp_path / "participants.csv"
-    for person in ("P01", "P02"):
-        add_person(path, {"participant": person, "consent_time": "2026-01-05", "protocol_number": "1"})
+    path = tmp_path / "participants.csv"  # made by hand: nobody was added to it by hilbo
+    path.write_text("participant,consent_time,protocol_number\nP01,2026-01-05,1\nP02,2026-01-05,1\n")
     monkeypatch.setattr(withdrawal, "locked_beside", lambda place: file_lock.locked_beside(place, 0.05))
     with file_lock.locked_beside(path), pytest.raises(InputError, match="is being written by another hilbo"):
         delete_participant(tmp_path, "P01")

@@ -31,7 +31,7 @@ async function ready() {
     run = found.run; silence = found.silence_s; presentedBefore = false; alerted = "";
     for (const p of found.parameters) {
       units[p.name] = p.unit; levels[p.name] = p.levels || null;
-      borne[p.name] = (value) => p.scale === "log" ? p.tolerance * value : p.tolerance;
+      borne[p.name] = (value) => p.share ? p.share * value : p.tolerance;
     }
     put("what", found.study);
     take(found);
