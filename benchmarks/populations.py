@@ -190,7 +190,7 @@ GROUPS = {
     "all": lambda name: True,
 }
 ENOUGH, MANY = 10, 100  # studies for a row of a population's own among the regrets, and in the other tables
-EVEN = {"24x25": 53, "12x15": 10}  # studies of each population that a group counts, whatever more one has
+EVEN = {"24x25": 79, "12x15": 10}  # studies of each population that a group counts, whatever more one has
 
 
 def interval(values, digits=3):

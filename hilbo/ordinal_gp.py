@@ -22,11 +22,11 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hilbo.errors import InputError
+from hilbo.fitting_input import check_answers, check_shapes
 from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained, shortfall
 from hilbo.inference.ep import ep
 from hilbo.inference.ep_corrected import ep_corrected
 from hilbo.inference.exact import ExactPosterior, SamplingCertificate, exact
-from hilbo.inference.fitting_input import check_answers, check_shapes
 from hilbo.kernels import RBF, gram
 from hilbo.laplace import laplace
 from hilbo.likelihoods import OrdinalProbit, OrdinalTerms, TiltedTerms

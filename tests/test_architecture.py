@@ -19,7 +19,7 @@ MAY_IMPORT = {
     "errors": set(),
     "kernels": {"numerics"},
     "programs": set(),
-    "bcm": set(),
+    "bcm": {"numerics"},
     "numerics": set(),
     "acquisition": {"numerics"},
     "likelihoods": {"numerics"},
@@ -27,7 +27,8 @@ MAY_IMPORT = {
     "laplace": {"gaussian"},
     "trials": {"numerics"},
     "inference": {"laplace"},
-    "ordinal_gp": {"inference", "kernels", "likelihoods", "trials"},
+    "fitting_input": {"kernels", "likelihoods", "trials"},
+    "ordinal_gp": {"inference", "fitting_input"},
     "hyperparameters": {"ordinal_gp"},
     "population": {"ordinal_gp", "bcm"},
     "mechanics": {"numerics"},
@@ -48,7 +49,7 @@ MAY_IMPORT = {
 # The mathematics: no files, clock, printing or environment.
 MATHS = {
     *("kernels", "bcm", "numerics", "acquisition", "likelihoods", "gaussian", "laplace", "inference", "ordinal_gp"),
-    "trials",
+    *("trials", "fitting_input"),
     *("hyperparameters", "population", "mechanics", "viscoelastic", "passivity", "search"),
     *(f"statistics.{name}" for name in ("ordered_logit", "separation", "cluster_robust", "regression")),
     *(

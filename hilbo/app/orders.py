@@ -53,5 +53,11 @@ def _parameter(study: AnyStudy, p: Parameter) -> dict[str, Any]:
     assert study.stimulus is not None
     if p.levels:
         return {"name": p.name, "levels": list(p.levels)}
-    told = {"name": p.name, "unit": p.unit, "low": p.low, "high": p.high, "tolerance": study.stimulus.off_by(p, p.low)}
-    return told | ({"share": study.stimulus.borne(p)} if p.scale == "log" else {})
+    content = {
+        "name": p.name,
+        "unit": p.unit,
+        "low": p.low,
+        "high": p.high,
+        "tolerance": study.stimulus.off_by(p, p.low),
+    }
+    return content | ({"share": study.stimulus.borne(p)} if p.scale == "log" else {})

@@ -14,7 +14,6 @@ Studies are dealt to processes, one core each; the numbers do not depend on how 
 """
 
 import contextlib
-import functools
 import json
 import os
 from collections.abc import Callable, Iterator
@@ -23,7 +22,6 @@ from multiprocessing import get_context
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jaxtyping import Array, Float
@@ -80,7 +78,7 @@ def simulate_power(
     """Errors of every study at every (m, t): columns `study`, `participants`, `trials`, `optimum`, `map`.
 
     `jobs`: processes, by default as many as there are cores; each is a new one, also if it is alone, and calls `begin`
-    first (a cache). So a script needs its `if __name__ == "__main__":`.
+    first (float64, a cache), else it computes as JAX does by default. So a script needs `if __name__ == "__main__":`.
     `say` is told how many studies are done.
     Raises `InputError` for numbers of people or of answers that the study's rule cannot aggregate.
     """
@@ -123,21 +121,13 @@ def _pool(jobs: int, initializer: Callable[[], None] | None) -> Iterator[Process
     before = os.environ.get("XLA_FLAGS")
     os.environ["XLA_FLAGS"] = f"{before or ''} {_ONE_CORE}".strip()
     try:
-        begin = functools.partial(_begun, jnp.result_type(float) == jnp.float64, initializer)
-        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=begin) as pool:
+        with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=initializer) as pool:
             yield pool
     finally:
         if before is None:
             del os.environ["XLA_FLAGS"]
         else:
             os.environ["XLA_FLAGS"] = before
-
-
-def _begun(in_float64: bool, begin: Callable[[], None] | None) -> None:
-    """A process computes with the precision of the one that began it, and then does what it is asked to."""
-    jax.config.update("jax_enable_x64", in_float64)
-    if begin is not None:
-        begin()
 
 
 def _study_in_process(content: str, rule: str, population_: Population, plan: Plan, index: int) -> pd.DataFrame:
