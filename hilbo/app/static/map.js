@@ -55,7 +55,7 @@ function dot(c, x, y, t) {
 // `across` and `up`: name, unit, scale, low, high, levels; with `hidden_unit` in both, the truth is marked too.
 function drawSlice(canvas, slice, across, up, range) {
   const ratio = devicePixelRatio, w = canvas.clientWidth, h = canvas.clientHeight, c = canvas.getContext("2d");
-  const text = w < 320 ? 12 : 14, left = 3.4 * text + 10, foot = 2.9 * text + 4, head = 1.2 * text + 4, font = "px system-ui, sans-serif";
+  const text = w < 320 ? 12 : 14, names = (up.levels || []).length, left = (names ? 6 : 3.4) * text + 10, foot = 2.9 * text + 4, head = 1.2 * text + 4, font = "px system-ui, sans-serif";
   const side = Math.min(w - left - 8, h - head - foot), x = (w - side + left - 8) / 2, y = head + (h - head - foot - side) / 2;
   canvas.width = w * ratio; canvas.height = h * ratio;
   c.scale(ratio, ratio);
@@ -76,7 +76,7 @@ function drawSlice(canvas, slice, across, up, range) {
   }
   c.textAlign = "right";
   for (const u of ticks(up)) {
-    c.fillText(value(up, u), x - 5, y + (1 - u) * side + (u === 1 ? .8 * text : u === 0 ? 0 : .35 * text), left - 1.2 * text);
+    c.fillText(value(up, u), x - 5, y + (1 - u) * side + (u === 1 ? .8 * text : u === 0 ? 0 : .35 * text), left - (names ? 2.2 : 1.2) * text);
   }
   const label = (p) => p.name + (p.unit ? ` (${p.unit})` : "");
   c.font = `600 ${text}${font}`; c.textAlign = "center";
