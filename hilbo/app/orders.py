@@ -60,4 +60,4 @@ def _parameter(study: AnyStudy, p: Parameter) -> dict[str, Any]:
         "high": p.high,
         "tolerance": study.stimulus.off_by(p, p.low),
     }
-    return content | ({"share": study.stimulus.borne(p)} if p.scale == "log" else {})
+    return content | ({"share": study.stimulus.tolerance_of(p)} if p.scale == "log" else {})

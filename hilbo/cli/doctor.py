@@ -259,7 +259,7 @@ def _language(file: Any) -> Iterator[Check]:
 def _stimulus(file: Any) -> Iterator[Check]:
     """What a study still lacks whose renderings a program presents."""
     table, parameters = file.stimulus, file.space.parameters
-    off = ", ".join(f"{p.name} {table.borne_words(p)}" for p in parameters if not p.levels)
+    off = ", ".join(f"{p.name} {table.tolerance_words(p)}" for p in parameters if not p.levels)
     words = f"a {table.by} presents, and confirms within {table.within:g} s"
     words += f"; values may be off by {off}" if off else ""
     said = file.tables.stimulus is not None

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hilbo.session.header_check import SCHEMA
+from hilbo.session.header_check import SCHEMA, study_of
 from hilbo.session.records import Block, Header, Planned
 from hilbo.study.protocols import protocol
 from hilbo.study.study_file import AnyStudy
@@ -43,7 +43,7 @@ def warm_up(study: AnyStudy, seed: int, material: str | None = None) -> tuple[Bl
     from hilbo.search.space import SearchSpace  # with JAX, which nothing else here needs
 
     count = protocol(study.session, "warm-up").count
-    box = _of(study, material).space
+    box = study_of(study, material).space
     space = SearchSpace(box.parameters, box.mechanics, box.constraints)
     unit = np.concatenate([space.latin_hypercube(count, seed_of(seed, k)) for k in range(_SPARE)])
     physical = np.asarray(space.to_physical(unit))
@@ -94,7 +94,3 @@ def header_of(
         language=study.session.language,
         **others,
     )
-
-
-def _of(study, material):
-    return study if material is None else study.material(material)

@@ -211,7 +211,7 @@ def _wall(constraint: Constraint) -> list[str]:
 
 
 def _presenting(new: NewStudy, parameters: Sequence[Parameter]) -> str:
-    """The table of what presents. A person is borne a hundredth of each range, or of the value."""
+    """The table of what presents. The tolerance for a person is a hundredth of each range, or of the value."""
     if new.device:
         return _MODEL
     text, part = (_PERSON, 100) if new.by == "person" else (_STIMULUS, 1000)
@@ -219,10 +219,10 @@ def _presenting(new: NewStudy, parameters: Sequence[Parameter]) -> str:
 
 
 def _tolerance(parameters: Sequence[Parameter], part: int) -> str:
-    borne = {p.name: (1 if p.scale == "log" else p.high - p.low) / part for p in parameters if not p.levels}
+    tolerances = {p.name: (1 if p.scale == "log" else p.high - p.low) / part for p in parameters if not p.levels}
     logs = " and ".join(_quoted(p.name) for p in parameters if p.scale == "log")
     shares = f"  # of {logs} a share of the value, the scale is logarithmic" if logs else ""
-    return "{" + ", ".join(f"{_quoted(name)} = {value:.2g}" for name, value in borne.items()) + "}" + shares
+    return "{" + ", ".join(f"{_quoted(name)} = {value:.2g}" for name, value in tolerances.items()) + "}" + shares
 
 
 def _rule(new: NewStudy) -> list[str]:

@@ -68,13 +68,14 @@ class StimulusTable(Table, frozen=True):
         """Refuse tolerances that are no shares, where shares are wanted; in earlier versions they were in the unit, and
         sessions of those are still read. Raises `InputError`."""
         for p in parameters:
-            if p.scale == "log" and self.borne(p) >= 1:
+            share = self.tolerance_of(p)
+            if p.scale == "log" and share >= 1:
                 raise InputError(
-                    f"stimulus.tolerance.{p.name} is {shown(self.borne(p))}; on a logarithmic scale it is a share of"
-                    " the value and must be below 1, such as 0.01."
+                    f"stimulus.tolerance.{p.name} is {shown(share)}; on a logarithmic scale it is a share of the value"
+                    " and must be below 1, such as 0.01."
                 )
 
-    def borne(self, parameter: Parameter) -> float:
+    def tolerance_of(self, parameter: Parameter) -> float:
         """How far a confirmed value may be off: in the parameter's unit, on a logarithmic scale as a share of it."""
         if parameter.levels:
             return 0.0
@@ -83,14 +84,14 @@ class StimulusTable(Table, frozen=True):
 
     def off_by(self, parameter: Parameter, wanted: float) -> float:
         """How far the confirmation of a value may be off, in the parameter's unit."""
-        return self.borne(parameter) * (wanted if parameter.scale == "log" else 1.0)
+        return self.tolerance_of(parameter) * (wanted if parameter.scale == "log" else 1.0)
 
     def off_by_before(self, parameter: Parameter) -> float:
         """The same in sessions whose header has a schema below 3: on every scale in the unit, as of a linear one."""
         return self.tolerance.get(parameter.name, _EXACT * (parameter.high - parameter.low))
 
-    def borne_words(self, parameter: Parameter) -> str:
-        """`borne` in words, such as 0.5 deg, or 1 %."""
+    def tolerance_words(self, parameter: Parameter) -> str:
+        """`tolerance_of` in words, such as 0.5 deg, or 1 %."""
         if parameter.scale == "log":
-            return f"{100 * self.borne(parameter):.3g} %"
-        return f"{self.borne(parameter):.3g} {parameter.unit}".rstrip()
+            return f"{100 * self.tolerance_of(parameter):.3g} %"
+        return f"{self.tolerance_of(parameter):.3g} {parameter.unit}".rstrip()

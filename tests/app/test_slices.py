@@ -34,10 +34,10 @@ def test_one_parameter_has_one_slice_with_the_answers_up():  # compiles a step o
                 state = state.after(event)
         state = state.after(actions.answer(state, state.pending.id, response, {"class_a": response}, 0.0))
     assert state.screen == "done"
-    found = maps.slices(state)
-    (only,) = found["slices"]
+    content = maps.slices(state)
+    (only,) = content["slices"]
     assert (only["across"], only["up"], only["held"]) == ("gain", "answer given", "")
-    assert found["ranges"]["answer given"]["levels"] == ("different", "similar", "close")
+    assert content["ranges"]["answer given"]["levels"] == ("different", "similar", "close")
     assert [trial["y"] for trial in only["trials"]] == [0.0, 1.0, 0.5]
     mean = np.array(only["mean"])
     assert mean.shape == (33, 33) and (mean == mean[0]).all()

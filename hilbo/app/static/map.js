@@ -55,7 +55,8 @@ function dot(c, x, y, t) {
 // `across` and `up`: name, unit, scale, low, high, levels; with `hidden_unit` in both, the truth is marked too.
 function drawSlice(canvas, slice, across, up, range) {
   const ratio = devicePixelRatio, w = canvas.clientWidth, h = canvas.clientHeight, c = canvas.getContext("2d");
-  const text = w < 320 ? 12 : 14, names = (up.levels || []).length, left = (names ? 6 : 3.4) * text + 10, foot = 2.9 * text + 4, head = 1.2 * text + 4, font = "px system-ui, sans-serif";
+  const text = w < 320 ? 12 : 14, names = (up.levels || []).length, left = (names ? 6 : 3.4) * text + 10;
+  const foot = 2.9 * text + 4, head = 1.2 * text + 4, font = "px system-ui, sans-serif";
   const side = Math.min(w - left - 8, h - head - foot), x = (w - side + left - 8) / 2, y = head + (h - head - foot - side) / 2;
   canvas.width = w * ratio; canvas.height = h * ratio;
   c.scale(ratio, ratio);

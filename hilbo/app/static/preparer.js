@@ -9,7 +9,7 @@ const put = (id, text) => { if (at(id).textContent !== text) at(id).textContent 
 const show = (id, yes) => { at(id).hidden = !yes; };
 const SETTLES = 300;                 // ms: a tap that comes sooner was for what stood there before
 
-let run = null, silence = 10, units = {}, borne = {}, levels = {};
+let run = null, silence = 10, units = {}, tolerances = {}, levels = {};
 let order = { order: 0, do: "neutral" }, done = "neutral";   // the newest order, and what was done about it
 let since = 0, heard = 0, alerted = "", over = "";           // when it came, when the server was heard (performance.now())
 let presentedBefore = false;         // something stands there that is to be taken away
@@ -31,7 +31,7 @@ async function ready() {
     run = found.run; silence = found.silence_s; presentedBefore = false; alerted = "";
     for (const p of found.parameters) {
       units[p.name] = p.unit; levels[p.name] = p.levels || null;
-      borne[p.name] = (value) => p.share ? p.share * value : p.tolerance;
+      tolerances[p.name] = (value) => p.share ? p.share * value : p.tolerance;
     }
     put("what", found.study);
     take(found);
@@ -40,7 +40,7 @@ async function ready() {
   } catch { lost("The server does not answer."); }
 }
 
-// As few digits after the point as leave a value off by half of what is borne at most.
+// As few digits after the point as round a value by half of its tolerance at most.
 function rounded(value, off) {
   return String(off > 0 ? Number(value.toFixed(Math.min(100, Math.max(0, Math.ceil(-Math.log10(off)))))) : value);
 }
@@ -90,7 +90,7 @@ function layOut() {
       ? Object.assign(document.createElement("select"), { id: `value-${i}` })
       : Object.assign(document.createElement("input"), { id: `value-${i}`, inputMode: "decimal", autocomplete: "off" });
     if (choice) input.replaceChildren(...choice.map((level) => new Option(level, level)));
-    input.value = typeof values[name] === "number" ? rounded(values[name], borne[name] ? borne[name](values[name]) : 0) : String(values[name]);
+    input.value = typeof values[name] === "number" ? rounded(values[name], tolerances[name] ? tolerances[name](values[name]) : 0) : String(values[name]);
     input.dataset.name = name;
     input.dataset.number = typeof values[name] === "number" ? "yes" : "";
     return [
