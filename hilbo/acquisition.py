@@ -50,13 +50,18 @@ class UCB(eqx.Module):
 
 
 class LogEI(eqx.Module):
-    """Logarithm of the expected improvement over `best`, usually the largest posterior mean among the asked points."""
+    """Logarithm of the expected improvement over `best`, usually the largest posterior mean among the asked points.
+
+    Where the variance is 0 the improvement is certain: log(mean - best), and -inf where there is none.
+    """
 
     best: Float[Array, ""] = eqx.field(converter=jnp.asarray)
 
     def __call__(self, mean, variance):
-        sd = jnp.sqrt(variance)
-        return jnp.log(sd) + _log_improvement((mean - self.best.astype(mean.dtype)) / sd)
+        gain, certain = mean - self.best.astype(mean.dtype), variance == 0
+        sd = jnp.sqrt(jnp.where(certain, 1.0, variance))
+        sure = jnp.where(gain > 0, jnp.log(jnp.where(gain > 0, gain, 1.0)), -jnp.inf)
+        return jnp.where(certain, sure, jnp.log(sd) + _log_improvement(gain / sd))
 
     def optimistic(self, mean: Float[Array, "..."], prior: Float[Array, ""]) -> Float[Array, "..."]:
         """With all of the prior's variance left: more spread means more improvement."""

@@ -22,6 +22,16 @@ def test_log_expected_improvement(z):
     np.testing.assert_allclose(float(value), float(expected), rtol=1e-12, atol=1e-14)
 
 
+def test_what_is_certain_improves_by_the_mean_alone():
+    score = acquisition.LogEI(1.0)
+    gains = jnp.array([-0.5, 0.0, 0.25])
+    values = jax.vmap(lambda gain: score(1.0 + gain, jnp.asarray(0.0)))(gains)
+    np.testing.assert_allclose(values, [-np.inf, -np.inf, np.log(0.25)])
+    np.testing.assert_allclose(values[2], score(jnp.asarray(1.25), jnp.asarray(1e-12)), rtol=1e-9)
+    slopes = jax.vmap(jax.grad(lambda gain: score(1.0 + gain, jnp.asarray(0.0))))(gains)
+    np.testing.assert_allclose(slopes, [0.0, 0.0, 4.0])
+
+
 def test_scores_are_differentiable():
     scores = (acquisition.UCB(0.7), acquisition.LogEI(0.2), acquisition.TopCategory(0.5, 0.5), acquisition.Mean())
     for score in scores:

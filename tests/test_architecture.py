@@ -64,7 +64,10 @@ WITHOUT_JAX = {
     *("errors", "device", "hardware_bridge", "identification.device_tests", "cli.measure", "cli.device"),
     "cli.device_screen",
     *("mechanics.span", "search.box", "report.json_text"),
-    *(f"study.{name}" for name in ("fields", "protocols", "set_table", "stimulus_table", "study_file", "study_tables")),
+    *(
+        f"study.{name}"
+        for name in ("fields", "protocols", "set_table", "stimulus_table", "study_file", "study_schema", "study_tables")
+    ),
     "study.trial_table",
     *(
         f"session.{name}"

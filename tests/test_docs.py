@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 
-from hilbo.study import study_tables
+from hilbo.study import study_schema
 from hilbo.study.protocols import PhaseTable
 from hilbo.study.study_file import checked
 
@@ -140,9 +140,9 @@ def test_pictures_of_the_readme_are_shown_on_its_page():
 
 def schemas():
     """The tables of a study file by the heading of the page that describes them."""
-    tables = {f"[{name}]": kind for name, kind in study_tables._TABLES.items()}
-    own = {"[renderer]": study_tables._RendererTable, "[parameters.NAME]": study_tables._ParameterTable}
-    own["[parameters.NAME] of levels"] = study_tables._LevelsTable
+    tables = {f"[{name}]": kind for name, kind in study_schema.TABLES.items()}
+    own = {"[renderer]": study_schema.RendererTable, "[parameters.NAME]": study_schema.ParameterTable}
+    own["[parameters.NAME] of levels"] = study_schema.LevelsTable
     return tables | own | {"[session.PHASE]": PhaseTable}
 
 

@@ -24,7 +24,7 @@ from hilbo.search.lattice import Lattice, nodes_for, screen, screen_points
 from hilbo.search.space import SearchSpace
 from hilbo.search.space_lattice import lattice_of
 from hilbo.study.config import Inference, Study
-from hilbo.study.study_tables import Selection
+from hilbo.study.study_schema import Selection
 
 __all__ = ["Choosing", "Design", "design", "next_point", "point_after", "point_apart"]
 

@@ -97,7 +97,7 @@ def tied_preferences(
     comparison; the strength of `reference` (default: the last in the alphabet) is 0. `order` (+1 if `first` was shown
     first, -1 if not, 0 if not known) adds the term "shown first".
     All sequences are (n,), one entry a comparison. Raises `InputError` for a preference that is neither set nor a tie,
-    and for a `reference` that is in no comparison.
+    for a set called "tie", and for a `reference` that is in no comparison.
     """
     check_aligned(first=first, second=second, preferred=preferred, clusters=clusters, order=order)
     left, right, chosen = (np.asarray(column, str) for column in (first, second, preferred))
@@ -109,6 +109,8 @@ def tied_preferences(
             "every comparison must prefer one of its two sets, or be a tie; and there must be one at least."
         )
     sets = sorted({*left, *right})
+    if "tie" in sets:
+        raise InputError('a set called "tie" cannot be told from a tie; give it another name.')
     reference = sets[-1] if reference is None else reference
     if reference not in sets:
         raise InputError(f'the reference "{reference}" is in no comparison; the sets are {", ".join(sets)}.')

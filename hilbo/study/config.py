@@ -18,7 +18,7 @@ from hilbo.study.protocols import SessionTable
 from hilbo.study.simulation_table import SimulationTable
 from hilbo.study.stimulus_table import StimulusTable
 from hilbo.study.study_file import StudyFile, checked, hash_of, made_of_material, materials_in, read_study
-from hilbo.study.study_tables import Inference, ReportTable, Selection
+from hilbo.study.study_schema import Inference, ReportTable, Selection
 
 __all__ = ["RBF", "OrdinalGP", "OrdinalProbit", "Study"]
 

@@ -22,7 +22,8 @@ from hilbo.search.box import Box, Constraint, Mechanics, Parameter
 from hilbo.study.fields import enclosing, lines_of, prefix
 from hilbo.study.protocols import SessionTable
 from hilbo.study.stimulus_table import StimulusTable
-from hilbo.study.study_tables import Selection, Tables, box_of, check_together, of_material, read
+from hilbo.study.study_schema import Selection, Tables
+from hilbo.study.study_tables import box_of, check_together, of_material, read
 
 __all__ = ["AnyStudy", "StudyFile", "checked", "hash_of", "made_of_material", "materials_in", "read_study"]
 

@@ -156,6 +156,7 @@ def test_missing_sessions_are_said():
         (lambda: st.binary_logit([0, 1], None, {"a": ["x", None]}), "has empty entries"),
         (lambda: st.tied_preferences(["a"], ["b"], ["c"]), "must prefer one of its two sets"),
         (lambda: st.tied_preferences(["a"], ["b"], ["a"], reference="z"), 'reference "z" is in no comparison'),
+        (lambda: st.tied_preferences(["tie", "b"], ["b", "tie"], ["b", "tie"]), 'a set called "tie"'),
         (lambda: rate([]), "not empty"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 
 from hilbo.errors import InputError
 from hilbo.study.config import Study
-from hilbo.study.study_tables import Selection
+from hilbo.study.study_schema import Selection
 
 GOOD = """\
 schema = 1
