@@ -101,6 +101,25 @@ def tied_preferences(
     """
     check_aligned(first=first, second=second, preferred=preferred, clusters=clusters, order=order)
     left, right, chosen = (np.asarray(column, str) for column in (first, second, preferred))
+    sets = _sets_compared(left, right, chosen)
+    reference = sets[-1] if reference is None else reference
+    if reference not in sets:
+        raise InputError(f'the reference "{reference}" is in no comparison; the sets are {", ".join(sets)}.')
+    sets.remove(reference)
+    x = np.array([(left == name).astype(float) - (right == name) for name in sets]).T.reshape(len(left), len(sets))
+    shown_first = _shown_first(order, len(left))
+    if shown_first.any():
+        sets, x = [*sets, "shown first"], np.column_stack([x, shown_first.astype(float)])
+    ties = bool((chosen == "tie").any())
+    won = np.where(chosen == left, 1, 0) * (2 if ties else 1) + (chosen == "tie")
+    model = likelihood.design(won, x, np.array([[-1.0], [1.0]]) if ties else np.zeros((1, 0)))
+    start = np.concatenate([np.zeros(x.shape[1]), np.ones(int(ties))])
+    terms = [*sets, *(["tie"] if ties else [])]
+    return regress(model, terms, start, clusters, nuisance=int(ties), level=level)
+
+
+def _sets_compared(left: np.ndarray, right: np.ndarray, chosen: np.ndarray) -> list[str]:
+    """The names of all sets in comparisons (n,), in the order of the alphabet. Raises `InputError`."""
     if not left.shape == right.shape == chosen.shape == (left.size,):
         raise InputError("first, second and preferred must be lists of one length: an entry each for a comparison.")
     wrong = (chosen != left) & (chosen != right) & (chosen != "tie")
@@ -111,19 +130,12 @@ def tied_preferences(
     sets = sorted({*left, *right})
     if "tie" in sets:
         raise InputError('a set called "tie" cannot be told from a tie; give it another name.')
-    reference = sets[-1] if reference is None else reference
-    if reference not in sets:
-        raise InputError(f'the reference "{reference}" is in no comparison; the sets are {", ".join(sets)}.')
-    sets.remove(reference)
-    x = np.array([(left == name).astype(float) - (right == name) for name in sets]).T.reshape(len(left), len(sets))
-    shown_first = np.zeros(len(left)) if order is None else np.asarray(order)
-    if shown_first.shape != left.shape or pd.isna(shown_first).any() or not np.isin(shown_first, (-1, 0, 1)).all():
+    return sets
+
+
+def _shown_first(order: Sequence | np.ndarray | None, count: int) -> np.ndarray:
+    """`order` (count,), 0 where nothing is known. Raises `InputError`."""
+    shown_first = np.zeros(count) if order is None else np.asarray(order)
+    if shown_first.shape != (count,) or pd.isna(shown_first).any() or not np.isin(shown_first, (-1, 0, 1)).all():
         raise InputError("order must hold 1, -1 or 0 for each comparison: first was shown first, second, or unknown.")
-    if shown_first.any():
-        sets, x = [*sets, "shown first"], np.column_stack([x, shown_first.astype(float)])
-    ties = bool((chosen == "tie").any())
-    won = np.where(chosen == left, 1, 0) * (2 if ties else 1) + (chosen == "tie")
-    model = likelihood.design(won, x, np.array([[-1.0], [1.0]]) if ties else np.zeros((1, 0)))
-    start = np.concatenate([np.zeros(x.shape[1]), np.ones(int(ties))])
-    terms = [*sets, *(["tie"] if ties else [])]
-    return regress(model, terms, start, clusters, nuisance=int(ties), level=level)
+    return shown_first

@@ -131,21 +131,12 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
 
     `start` must have its edges in order, and a maximum must exist (`hilbo.statistics.separation`) and be unique. The
     trust region comes first because Newton's full steps alone ended nowhere in 1 of 8 fits of random small tables. Both
-    work in coordinates in which the columns are orthogonal and of one size, so that neither the predictors' units nor
-    their origin matter (days since the year 0, say, beside the constant).
+    work in the coordinates of `_orthogonal`. Raises RuntimeError where no maximum is reached.
     """
     from scipy.linalg import solve_triangular
     from statsmodels.base.model import LikelihoodModel  # a third of a second: who fits nothing does not pay it
 
-    columns = np.vstack([model.upper, model.lower])
-    if len(columns) < columns.shape[1]:
-        raise RuntimeError(_NO_MAXIMUM)
-    units = np.abs(columns).max(axis=0)
-    to_orthogonal = np.linalg.qr(columns / units, mode="r") * units / np.sqrt(len(columns))
-    if not np.all(np.diag(to_orthogonal)):
-        raise RuntimeError(_NO_MAXIMUM)
-    upper, lower = (solve_triangular(to_orthogonal, side.T, trans="T").T for side in (model.upper, model.lower))
-    orthogonal = model._replace(upper=upper, lower=lower)
+    orthogonal, to_orthogonal = _orthogonal(model)
 
     class IntervalLogit(LikelihoodModel):
         """The likelihood under the names by which statsmodels asks for it."""
@@ -178,3 +169,21 @@ def fit(model: Design, start: Float[np.ndarray, " k"]) -> Fit:
         solve_triangular(to_orthogonal, half.T),
         scores(orthogonal, results.params) @ to_orthogonal,
     )
+
+
+def _orthogonal(model: Design) -> tuple[Design, Float[np.ndarray, "k k"]]:
+    """The model in coordinates in which its columns are orthogonal and of one size, and the upper triangular matrix
+    that takes coefficients there: neither the predictors' units nor their origin matter then (days since the year 0,
+    say, beside the constant). Raises RuntimeError where columns depend on each other.
+    """
+    from scipy.linalg import solve_triangular
+
+    columns = np.vstack([model.upper, model.lower])
+    if len(columns) < columns.shape[1]:
+        raise RuntimeError(_NO_MAXIMUM)
+    units = np.abs(columns).max(axis=0)
+    to_orthogonal = np.linalg.qr(columns / units, mode="r") * units / np.sqrt(len(columns))
+    if not np.all(np.diag(to_orthogonal)):
+        raise RuntimeError(_NO_MAXIMUM)
+    upper, lower = (solve_triangular(to_orthogonal, side.T, trans="T").T for side in (model.upper, model.lower))
+    return model._replace(upper=upper, lower=lower), to_orthogonal
