@@ -190,7 +190,7 @@ GROUPS = {
     "all": lambda name: True,
 }
 ENOUGH, MANY = 10, 100  # studies for a row of a population's own among the regrets, and in the other tables
-EVEN = {"24x25": 79, "12x15": 10}  # studies of each population that a group counts, whatever more one has
+EVEN = {"24x25": 100, "12x15": 10}  # studies of each population that a group counts, whatever more one has
 
 
 def interval(values, digits=3):
@@ -212,7 +212,10 @@ def tables(rows, even):
     enough, many = (
         parts | {f"`{name}`": part for name, part in own.items() if len(part) >= count} for count in (ENOUGH, MANY)
     )
-    return "\n\n".join((regrets(enough), differences(many), itself(many)))
+    located = {
+        name: part for name, part in many.items() if sum("region" in row for row in part) >= MANY or name in parts
+    }
+    return "\n\n".join((regrets(enough), differences(many), itself(located)))
 
 
 def lined(heads, lines):

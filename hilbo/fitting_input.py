@@ -1,15 +1,19 @@
-"""What `hilbo.fit` refuses: a model and answers that do not fit together, with what to do."""
+"""What `hilbo.fit` refuses: a model and answers that do not fit together, with what to do; and what it remarks."""
+
+import warnings
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hilbo.errors import InputError
+from hilbo.errors import InputError, InputRemark
 from hilbo.kernels import Kernel, Stationary
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.trials import Trials
 
-__all__ = ["check_answers", "check_shapes"]
+__all__ = ["check_answers", "check_shapes", "remark_outside"]
+
+_ROUNDING = 1e-3  # beyond the unit cube that is no remark
 
 
 def check_shapes(kernel: Kernel, likelihood: OrdinalProbit, trials: Trials, start: Float[Array, "..."] | None) -> None:
@@ -49,3 +53,17 @@ def check_answers(trials: Trials, categories: int) -> None:
             f"fit: an answer has category {q[wrong][0]}, but the likelihood has {categories - 1} thresholds and so the"
             f" categories 0 to {categories - 1}; check the answers or the thresholds."
         )
+
+
+def remark_outside(whose: str, kernel: Kernel, points: Float[np.ndarray, "n d"]) -> None:
+    """Warn of known points (n, d) that lie outside the unit cube by more than rounding, such as those in physical
+    units: answers there hardly depend on each other, and predictions are the prior. Only of the kernels that see a
+    study's points alone."""
+    if not isinstance(kernel, Stationary):
+        return
+    outside = np.abs(points - 0.5).max(axis=-1, initial=0.0) > 0.5 + _ROUNDING
+    if outside.any():
+        row = int(np.argmax(outside))
+        where = ", ".join(f"{v:.4g}" for v in points[row])
+        sentence = f"{whose}: x[{row}] is [{where}], outside the unit cube, in which lengths are measured"
+        warnings.warn(InputRemark(f"{sentence}; a study's space.to_unit gives such points."), stacklevel=4)

@@ -58,7 +58,7 @@ class RBF(eqx.Module):
     - `variance`: prior variance of the latent function, > 0.
     - `levels`: for each coordinate its number of unordered levels, 0 for numbers; left out, all are numbers.
 
-    Raises `InputError` for numbers that are not above 0; what is traced is not checked.
+    Raises `InputError` for numbers that are not above 0; what is traced cannot be refused, and below 0 gives NaN.
     """
 
     theta: Float[Array, "*d"]
@@ -83,18 +83,18 @@ class RBF(eqx.Module):
     def __call__(self, x: Shaped[Array, " d"], y: Shaped[Array, " d"]) -> Float[Array, ""]:
         """Covariance of the latent function at `x` and at `y`, both (d,)."""
         x, y = floats(x, self.variance.dtype), floats(y, self.variance.dtype)
-        return self.variance.astype(x.dtype) * jnp.exp(-_squared(self, x, y))
+        return _possible(self.variance).astype(x.dtype) * jnp.exp(-_squared(self, x, y))
 
     def along(self, axis: int, x: Shaped[Array, " n"], y: Shaped[Array, " m"]) -> Float[Array, "n m"]:
         """The factor (n, m) that one coordinate of numbers contributes: the kernel is the product of these and the
         variance."""
         theta = self.theta[axis] if self.theta.ndim else self.theta
         x, y = floats(x, theta.dtype), floats(y, theta.dtype)
-        return jnp.exp(-theta.astype(x.dtype) * (x[:, None] - y[None, :]) ** 2)
+        return jnp.exp(-_possible(theta).astype(x.dtype) * (x[:, None] - y[None, :]) ** 2)
 
     def diagonal(self, x: Shaped[Array, " d"]) -> Float[Array, ""]:
         """The prior variance, the same everywhere. `x` (d,) -> a scalar."""
-        return self.variance.astype(floats(x, self.variance.dtype).dtype)
+        return _possible(self.variance).astype(floats(x, self.variance.dtype).dtype)
 
 
 class Matern32(eqx.Module):
@@ -126,11 +126,11 @@ class Matern32(eqx.Module):
     def __call__(self, x: Shaped[Array, " d"], y: Shaped[Array, " d"]) -> Float[Array, ""]:
         """Covariance of the latent function at `x` and at `y`, both (d,)."""
         x, y = floats(x, self.variance.dtype), floats(y, self.variance.dtype)
-        return self.variance.astype(x.dtype) * _matern32(6.0 * _squared(self, x, y))
+        return _possible(self.variance).astype(x.dtype) * _matern32(6.0 * _squared(self, x, y))
 
     def diagonal(self, x: Shaped[Array, " d"]) -> Float[Array, ""]:
         """The prior variance, the same everywhere. `x` (d,) -> a scalar."""
-        return self.variance.astype(floats(x, self.variance.dtype).dtype)
+        return _possible(self.variance).astype(floats(x, self.variance.dtype).dtype)
 
 
 Stationary = RBF | Matern32
@@ -175,11 +175,16 @@ def _numbers_shown(kernel: Stationary) -> str:
     return f"theta={shown(kernel.theta)}, variance={shown(kernel.variance)}{levels}"
 
 
+def _possible(value: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
+    """A kernel's number, NaN below 0: what is traced cannot be refused, and exp(+|x - x'|^2) is no covariance."""
+    return jnp.where(value < 0, jnp.nan, value)
+
+
 def _squared(kernel: Stationary, x: Float[Array, " d"], y: Float[Array, " d"]) -> Float[Array, ""]:
     """theta |x - y|^2, summed coordinate by coordinate: under vmap this becomes one fused loop over pairs, about three
     times faster than a reduction over an axis of length d, and it keeps the digits that |x|^2 + |y|^2 - 2xy would lose.
     """
-    theta = jnp.broadcast_to(kernel.theta, x.shape).astype(x.dtype)
+    theta = jnp.broadcast_to(_possible(kernel.theta), x.shape).astype(x.dtype)
     counts = kernel.levels or (0,) * x.shape[0]
 
     def part(i):

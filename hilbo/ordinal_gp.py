@@ -22,7 +22,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hilbo.errors import InputError
-from hilbo.fitting_input import check_answers, check_shapes
+from hilbo.fitting_input import check_answers, check_shapes, remark_outside
 from hilbo.gaussian import Certificate, GaussianPosterior, mean_and_explained, shortfall
 from hilbo.inference.ep import ep
 from hilbo.inference.ep_corrected import ep_corrected
@@ -147,6 +147,8 @@ class Posterior(eqx.Module):
         if concrete(points) and not np.all(np.isfinite(points)):
             row = int(np.argwhere(~np.isfinite(points))[0, 0])
             raise InputError(f"Posterior: x[{row}] holds a value that is not finite; give points of the unit cube.")
+        if concrete(points):
+            remark_outside("Posterior", self.gp.kernel, np.asarray(points))
         return points
 
     def __repr__(self) -> str:
@@ -253,6 +255,8 @@ def fit(
     check_shapes(gp.kernel, gp.likelihood, trials, start)
     if inference == "exact" and concrete(trials):  # whose samples would take -1 for the last category
         check_answers(_answers_alone(trials), gp.likelihood.categories)
+    if concrete(trials):
+        remark_outside("fit", gp.kernel, np.asarray(trials.x)[np.asarray(trials.mask)])
     posterior = _fit(gp, trials, start, inference)
     return _checked(posterior, _SOUGHT[inference]) if throw else posterior
 

@@ -87,6 +87,17 @@ def test_a_theta_of_the_wrong_length_is_refused():
         RBF((1.0, 2.0))(jnp.zeros(3), jnp.zeros(3))
 
 
+@pytest.mark.parametrize("kernel", [RBF, Matern32])
+def test_what_is_traced_and_no_kernel_has_gives_nan(kernel):
+    """exp(+|x - y|^2) would be no covariance, and a search that runs there would not see it."""
+    x, y = jnp.zeros(2), jnp.ones(2)
+    of_theta = jax.jit(lambda theta: kernel(theta)(x, y))
+    of_variance = jax.jit(lambda variance: (kernel(3.0, variance)(x, y), kernel(3.0, variance).diagonal(x)))
+    assert np.isnan(of_theta(-0.01)) and np.isnan(of_theta(jnp.array([1.0, -0.5]))) and of_theta(0.0) == 1.0
+    assert np.isnan(of_variance(-1.0)).all() and np.isfinite(of_variance(1.0)).all()
+    assert np.isnan(jax.jit(lambda theta: RBF(theta).along(0, x, y))(-1.0)).all()
+
+
 def test_gradients_are_those_of_the_formula():
     x, y, theta = jnp.asarray(X[0]), jnp.asarray(Y[0]), jnp.array([4.0, 9.0, 2.5])
     kernel = RBF(theta, 1.7)

@@ -13,7 +13,7 @@ from oracles import oracle
 from reference_laplace import mpmath_laplace
 
 from hilbo import RBF, OrdinalGP, OrdinalProbit, Trials, fit, ordinal_gp
-from hilbo.errors import InputError
+from hilbo.errors import InputError, InputRemark
 from hilbo.gaussian import shortfall
 from hilbo.ordinal_gp import InferenceError
 from tests.vectors.laplace import CASES, PER_DIMENSION, SCALAR, hyperparameters, unpack
@@ -205,6 +205,17 @@ def test_the_parts_of_a_prediction_agree():
 def test_bad_trials_are_refused_in_a_sentence(x, q, capacity, message):
     with pytest.raises(InputError, match=message):
         Trials.from_arrays(x, q, capacity)
+
+
+def test_points_in_physical_units_get_a_warning():
+    """They fit and predict without an error: hardly correlated answers, and the prior."""
+    gp = model(repeated())
+    with pytest.warns(InputRemark, match=r"fit: x\[1\] is \[5.7, 0.2\], outside the unit cube"):
+        fit(gp, Trials.from_arrays(np.array([[0.1, 0.2], [5.7, 0.2]]), np.zeros(2, int)))
+    posterior = fit(gp, answers(repeated()))
+    with pytest.warns(InputRemark, match="Posterior: x.0. is .* outside the unit cube"):
+        posterior.predict(np.full((1, posterior.trials.x.shape[1]), 5.7))
+    fit(gp, Trials.from_arrays(np.array([[1 + 1e-6, 0.0], [-1e-6, 1.0]]), np.zeros(2, int)))  # rounding
 
 
 def test_an_unknown_inference_is_refused():

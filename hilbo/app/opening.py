@@ -16,7 +16,7 @@ from hilbo.app.slices import Maps
 from hilbo.app.stimulus_rig import StimulusRig
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, begun, log_name
-from hilbo.session.headers import header_for
+from hilbo.session.headers import header_for, participant_seed
 from hilbo.session.look_ahead import LiveChooser, warm_start_sources
 from hilbo.session.participants import check_consent, read_people
 from hilbo.session.plan import planned_by, planned_header, read_plan
@@ -147,7 +147,8 @@ def _header(wanted, study) -> Header:
         people = read_people(wanted.people or wanted.logs / "participants.csv")
         facts["consent"] = check_consent(people, wanted.participant, number)["consent_time"]
     if wanted.plan is None:
-        place = (wanted.participant, "1" if wanted.session is None else wanted.session, wanted.seed or 0)
+        seed = participant_seed(0, wanted.participant) if wanted.seed is None else wanted.seed
+        place = (wanted.participant, "1" if wanted.session is None else wanted.session, seed)
         header = header_for(study, *place, materials=(wanted.material,), **facts)
         shown = {} if wanted.reference is None else {"reference": dict(wanted.reference)}
         return msgspec.structs.replace(header, sets=header.sets | shown)

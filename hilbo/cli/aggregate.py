@@ -17,6 +17,7 @@ __all__ = ["aggregate", "aggregate_cohort", "read_cohort", "robustness"]
 # What draws and writes, loaded beside the arithmetic. Packages that the arithmetic never imports, because two threads
 # that import one package at once may see half of it.
 _DRAW_AND_WRITE = ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2")
+_SUMS = ("bcm", "rbcm", "average")  # sums over people, at each point for itself
 _LARGE = 1000  # participants: above, posteriors are not kept, and what costs a fit of everybody is left out
 
 StudyOption = Annotated[Path, typer.Option("--study", help="Study file (TOML).")]
@@ -72,16 +73,22 @@ def aggregate(
         with team.agreement() as agree:
             folder = held.enter_context(results(out, force)) if team.writes else None
             chosen, cohort = read_cohort(trials, study, material, say)
-            cohort = cohort.of([name.strip() for name in participants.split(",")]) if participants else cohort
+            cohort = _chosen(cohort, participants) if participants else cohort
             cohort, left_out = _included(chosen, cohort)  # by the study's own model, whatever --rule aggregates
             chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.first(first) if first else cohort
             agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
-        if team.devices == 1 and len(cohort.names) <= _LARGE and individuals:
+        whole = team.devices == 1 and len(cohort.names) <= _LARGE
+        if whole and not individuals and chosen.rule not in _SUMS:
+            remark(f'Everybody\'s own optimum is sought, too: the rule "{chosen.rule}" takes all answers at once.')
+            individuals = True
+        if whole and individuals:
             content = aggregate_cohort(chosen, cohort, folder, seed, say, compare=compare, left_out=left_out)
         elif compare:
             raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
         else:
+            if chosen.rule == "hierarchical":
+                remark("The hierarchical rule is taken person by person at each point here; the exact map may differ.")
             content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say, left_out)
     if team.writes:
         finish(content, out, as_json, say.printed)
@@ -110,7 +117,7 @@ def robustness(
         from hilbo.study.robustness import robustness as check
 
         say("hyperparameters by maximum evidence")
-        comparison = check(chosen, cohort, seed, learn=tuple(learn.split(",")), shared=not own)
+        comparison = check(chosen, cohort, seed, learn=tuple(name.strip() for name in learn.split(",")), shared=not own)
         say("maps, figures and report")
         content = write_robustness(chosen, cohort, comparison, folder, seed, left_out)
     finish(content, out, as_json)
@@ -150,6 +157,12 @@ def _only_material(trials: Path, study: Any) -> str | None:
     if not named:
         remark(f"{trials}: names no material; it is read by the study's own tables, and none of [materials].")
     return named[0] if named else None
+
+
+def _chosen(cohort: Any, participants: str) -> Any:
+    """Those who are named, separated by commas, in the order of the table. Raises `InputError`."""
+    some = cohort.of([name.strip() for name in participants.split(",")])
+    return some.of([name for name in cohort.names if name in set(some.names)])
 
 
 def _included(study, everybody) -> tuple[Any, list[str]]:

@@ -12,6 +12,7 @@ import math
 import os
 import shlex
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -108,6 +109,20 @@ def _keep_programs() -> None:
 
 
 @contextlib.contextmanager
+def orderly() -> Iterator[None]:
+    """SIGTERM ends the command as Ctrl-C does: a device is told to stop, and nothing half written is left behind."""
+
+    def end(_number, _frame):
+        raise SystemExit(143)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
 def results(out: Path, force: bool) -> Iterator[Path]:
     """A new folder that becomes `out` when everything in it is complete; with a list of what it holds, so that
     `force` replaces nothing else later."""
@@ -123,10 +138,11 @@ def results(out: Path, force: bool) -> Iterator[Path]:
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror}); choose another --out.") from error
     try:
-        yield made
-        made.chmod(0o755)
-        list_files(made, shlex.join(["hilbo", *sys.argv[1:]]), os.getcwd())
-        _publish(made, out, force)
+        with orderly():
+            yield made
+            made.chmod(0o755)
+            list_files(made, shlex.join(["hilbo", *sys.argv[1:]]), os.getcwd())
+            _publish(made, out, force)
     finally:
         shutil.rmtree(made, ignore_errors=True)
 

@@ -7,7 +7,6 @@ the device or there is one sentence and exit code 1; bad input, refused numbers 
 import contextlib
 import functools
 import inspect
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from hilbo.cli.console import fail
+from hilbo.cli.console import fail, orderly
 from hilbo.errors import InputError
 
 __all__ = [
@@ -107,7 +106,7 @@ def opened(line: Line, **simulated: Any) -> Iterator[Any]:
 
     with contextlib.ExitStack() as stack:
         capture = stack.enter_context(_capture(line.capture)) if line.capture else None
-        stack.enter_context(_orderly())
+        stack.enter_context(orderly())
         device = stack.enter_context(
             Renderer.open(
                 line.device,
@@ -225,17 +224,3 @@ def _capture(path):
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another --capture.") from error
     with file:
         yield file
-
-
-@contextlib.contextmanager
-def _orderly():
-    """SIGTERM ends the command as Ctrl-C does, so that the device is told to stop."""
-
-    def end(_number, _frame):
-        raise SystemExit(143)
-
-    before = signal.signal(signal.SIGTERM, end)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)

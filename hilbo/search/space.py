@@ -130,11 +130,21 @@ class SearchSpace(eqx.Module):
         named -= set() if self.mechanics is None else {"K1"}
         return tuple(p.name in named and p.scale == "log" for p in self.parameters)
 
+    def _check_axis(self, points: Any) -> None:
+        """Raises `InputError` for points with another number of coordinates: JAX would take the last one twice."""
+        shape = np.shape(points)
+        if not shape or shape[-1] != self.dim:
+            raise InputError(
+                f"SearchSpace: points have the shape {shape}; the last axis must hold {self.dim} numbers, of"
+                f" {', '.join(self.names)}."
+            )
+
     def to_unit(self, physical: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Physical values to the unit cube, last axis = parameter; exact at both ends.
 
         (..., d) -> (..., d); each parameter in its own unit.
         """
+        self._check_axis(physical)
         physical = _on_device(physical)
         return jnp.stack([p.to_unit(physical[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
@@ -143,6 +153,7 @@ class SearchSpace(eqx.Module):
 
         (..., d) -> (..., d); each parameter in its own unit.
         """
+        self._check_axis(unit)
         points = floating(unit)
         xp = namespace_of(points)
         return placed(xp.stack([p.to_physical(points[..., i]) for i, p in enumerate(self.parameters)], axis=-1))
@@ -153,6 +164,7 @@ class SearchSpace(eqx.Module):
         In a column without a feasible point x_K1 is 0 and `feasible` says no.
         (..., d) -> (..., d).
         """
+        self._check_axis(w)
         w = _on_device(w)
         for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
             w = w.at[..., i].set(p.to_unit(p.low + (p.high - p.low) * w[..., i])) if linear_in_box else w
@@ -160,6 +172,7 @@ class SearchSpace(eqx.Module):
 
     def to_box(self, x: Real[ArrayLike, "*batch d"]) -> Float[Array, "*batch d"]:
         """Inverse of `from_box`, for `x` in the feasible set. (..., d) -> (..., d)."""
+        self._check_axis(x)
         x = _on_device(x)
         w = x
         for i, (p, linear_in_box) in enumerate(zip(self.parameters, self._linear, strict=True)):
@@ -172,6 +185,7 @@ class SearchSpace(eqx.Module):
 
         (..., d) -> (...,).
         """
+        self._check_axis(x)
         plain = self.mechanics is None and not self.constraints
         points = floating(x) if plain else _on_device(x)
         inside = namespace_of(points).all((points >= 0) & (points <= 1), axis=-1)

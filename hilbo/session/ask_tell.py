@@ -22,6 +22,7 @@ import pandas as pd
 from hilbo.errors import InputError
 from hilbo.numerics.tracing import program
 from hilbo.ordinal_gp import Posterior, Trials, fit
+from hilbo.search.box import Parameter
 from hilbo.session.selection import Design, design
 from hilbo.session.step import Step, padding
 from hilbo.study.config import Study
@@ -151,9 +152,9 @@ class Session:
             value = at[p.name]
             if not p.levels and (not isinstance(value, SupportsFloat) or getattr(value, "ndim", 0)):
                 raise InputError(f"Session: {p.name} is {value!r}; give a number.")
-            if not p.holds(p.number(str(value)) if p.levels else float(value)):
+            if not p.holds(_in_its_digits(p, value)):
                 raise InputError(f"Session: {p.name} is {value}; it must be {p.range_words}.")
-        return np.array([p.number(at[p.name]) if p.levels else at[p.name] for p in self.study.space.parameters], float)
+        return np.array([_in_its_digits(p, at[p.name]) for p in self.study.space.parameters])
 
     def posterior(self) -> Posterior:
         """The participant's posterior after the answers so far."""
@@ -165,6 +166,14 @@ class Session:
         if not len(self.answers):
             raise InputError("Session: there are no answers yet, and so no best rendering; tell one first.")
         return self._named(self.step.best(self.posterior()))
+
+
+def _in_its_digits(parameter: Parameter, value: Any) -> float:
+    """A given value as a physical number. The 0.99 of a float32 is 0.99, not 0.9900000095, beyond the range's end."""
+    if parameter.levels:
+        return parameter.number(str(value))
+    dtype = getattr(value, "dtype", np.dtype(float))
+    return float(str(value)) if dtype.kind == "f" and dtype.itemsize < 8 else float(value)
 
 
 def _read_only(*arrays: np.ndarray) -> tuple[np.ndarray, ...]:

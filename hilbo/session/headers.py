@@ -11,7 +11,7 @@ from hilbo.session.records import Block, Header, Planned
 from hilbo.study.protocols import protocol
 from hilbo.study.study_file import AnyStudy
 
-__all__ = ["header_for", "header_of", "material_seed", "seed_of", "warm_up"]
+__all__ = ["header_for", "header_of", "material_seed", "participant_seed", "seed_of", "warm_up"]
 
 _SPARE = 2  # warm-up renderings in store: so many times the least number
 
@@ -19,6 +19,12 @@ _SPARE = 2  # warm-up renderings in store: so many times the least number
 def seed_of(seed: int, *place: int) -> int:
     """A seed below 2^31 for a place in a study, from the study's."""
     return int(np.random.SeedSequence([seed, *place]).generate_state(1)[0] >> 1)
+
+
+def participant_seed(seed: int, participant: str) -> int:
+    """The seed of a person's sessions, from the study's and their id: people who are planned in several batches, or
+    without a plan, do not meet the same points, so that all of them together cover the space."""
+    return seed_of(seed, int.from_bytes(hashlib.sha256(participant.encode()).digest()[:4]))
 
 
 def material_seed(header: Header, material: str | None) -> int:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from hilbo.errors import InputError
 from hilbo.session.file_lock import locked_beside
-from hilbo.study.text_cells import check_id, check_text, csv_rows
+from hilbo.study.text_cells import but_for_case, check_id, check_text, csv_rows
 
 __all__ = ["COLUMNS", "add_person", "check_consent", "read_people"]
 
@@ -73,6 +73,8 @@ def add_person(path: str | os.PathLike, row: Mapping[str, str]) -> People:
                 raise InputError(
                     f"{path}: participant {person['participant']} stands there already; choose another id."
                 )
+            if alike := but_for_case([*people, person["participant"]]):
+                raise InputError(f"{path}: {alike} differ in capitals only; choose another id.")
             people[person["participant"]] = person
             _write(place, people, _delimiter(place))
     except OSError as error:

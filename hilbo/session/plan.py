@@ -20,12 +20,12 @@ import msgspec
 from hilbo.errors import InputError
 from hilbo.session.counterbalance import block_size, comparisons, orders
 from hilbo.session.header_check import SCHEMA, check_header
-from hilbo.session.headers import header_for, header_of, seed_of, warm_up
+from hilbo.session.headers import header_for, header_of, participant_seed, seed_of, warm_up
 from hilbo.session.records import Block, Header, Planned
 from hilbo.session.set_codes import OWN, Sets, coded, set_codes
 from hilbo.study.protocols import Phase, protocol
 from hilbo.study.study_file import AnyStudy
-from hilbo.study.text_cells import check_id, check_text
+from hilbo.study.text_cells import but_for_case, check_id, check_text
 from hilbo.study.typed_files import converted, decoded, read_bytes
 
 __all__ = [
@@ -85,6 +85,8 @@ def make_plan(
         raise InputError("plan: participants must be named, each once.")
     for person in participants:
         check_id(person, "plan")
+    if alike := but_for_case(participants):
+        raise InputError(f"plan: {alike} differ in capitals only, and many disks take their logs for one; rename one.")
     check_text(session, "--session")
     names: list[str | None] = list(materials or study.materials) or [None]
     codes = set_codes(sets or {})
@@ -92,7 +94,7 @@ def make_plan(
     people = []
     for i, person in enumerate(participants):
         in_order = [names[k] for k in sequence[i]]
-        header = _header(study, person, session, seed_of(seed, i), phase, in_order, sets, source, codes)
+        header = _header(study, person, session, participant_seed(seed, person), phase, in_order, sets, source, codes)
         check_header(study, header)
         people.append({"participant": person, "order": i, "header": _for_plan(header)})
     size = block_size(len(names))

@@ -49,6 +49,11 @@ def validation_sets(
 ) -> NamedSets:
     """Best, mid and worst of the map, or of each participant's own (`PARTICIPANT best`): name -> parameters."""
     cohort = cohort.of([person.participant for person in result.participants])
+    if result.rule not in (None, study.rule):
+        raise InputError(
+            f'plan: result.json is by the rule "{result.rule}", and the study\'s is "{study.rule}"; aggregate again'
+            " without --rule, or write that rule into the study file."
+        )
     study = resolved(study, cohort)
     aggregated = aggregate_cohort(study, cohort, result.seed, alternatives=False)
     _check_same(study, result, np.asarray(aggregated.optimum.x))

@@ -17,6 +17,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from hilbo.errors import InputError
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.numerics.host import placed
 from hilbo.numerics.shown import known
@@ -138,8 +139,14 @@ def aggregate_cohort(
 
     `seed` decides the candidates that the optima are searched from. Failed certificates are left to the caller, who
     finds them in `posteriors.certificate`. A rule that learns the hyperparameters does so first, if they are not
-    there. `first` is told the optimum and its map as soon as they are known.
+    there. `first` is told the optimum and its map as soon as they are known. Raises `InputError` for a table in place
+    of a cohort.
     """
+    if not isinstance(cohort, Cohort):
+        raise InputError(
+            f"aggregate_cohort: cohort is a {type(cohort).__name__}; hilbo.study.cohort.cohort_of(table, study) makes"
+            " one of a table."
+        )
     study = resolved(study, cohort)
     candidates = search_points(study.space, seed)
     posteriors = fit_cohort(study, cohort)

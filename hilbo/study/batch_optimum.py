@@ -109,8 +109,8 @@ def _streamed(rule: str, people: int) -> Rule:
     """A rule that is a sum over people, as a stream of them needs it."""
     if rule not in RULES:
         raise InputError(
-            f'The rule "{rule}" needs all answers at once and cannot be streamed over {people:,} people; use'
-            f" {', '.join(RULES[:-1])} or {RULES[-1]}."
+            f'The rule "{rule}" takes all answers at once, on one device, not in a stream of {people:,} people;'
+            f" use {', '.join(RULES[:-1])} or {RULES[-1]}."
         )
     return rule
 

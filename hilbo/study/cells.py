@@ -8,6 +8,7 @@ piece. Whatever is wrong is one sentence with the file and the line (Parquet: ro
 import csv
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -112,13 +113,10 @@ def _as_text(frame: pd.DataFrame, first_row: int) -> pd.DataFrame:
 
 
 def _column_as_text(column: pd.Series) -> list[str]:
-    if column.dtype.kind == "f":
-        return [repr(v) for v in column.tolist()]
-    return ["" if v is None or v is pd.NA else _decimals(v) for v in column.tolist()]
-
-
-def _decimals(value: object) -> str:
-    return repr(float(value)) if isinstance(value, float | np.floating) else str(value)  # NumPy's would be named
+    """Each cell with the fewest digits that are this number in the column's own precision: 0.99 of a float32 column is
+    0.99, and no number above it."""
+    narrow = column.dtype.kind == "f" and column.dtype.itemsize < 8
+    return ["" if v is None or v is pd.NA else str(v) for v in (column.to_numpy() if narrow else column.tolist())]
 
 
 def _csv_pieces(path: Path, source: str, needs: str) -> Iterator[pd.DataFrame]:
@@ -185,9 +183,12 @@ def answer_forms(responses: Sequence[str]) -> tuple[dict[str, int], str]:
     """How an answer may be written -> its category from 0, and the words for what else than a label may be written.
 
     Labels are compared as text. Ranks from 1 are understood only if no label reads as a number: of a scale with the
-    labels "1.0", "1.5", "2.0" a rank would be another answer.
+    labels "1.0", "1.5", "2.0" a rank would be another answer. Of one with whole numbers "6.0" is 6: so pandas writes a
+    column in which an answer is missing.
     """
     forms = {label: i for i, label in enumerate(responses)}
+    if all(re.fullmatch("0|-?[1-9][0-9]*", label) for label in responses):
+        return {form: i for label, i in forms.items() for form in (label, f"{label}.0", f"{label},0")}, ""
     if any(math.isfinite(_number(without_decimal_comma(label))) for label in responses):
         return forms, ""
     ranks = {form: i for i in range(len(responses)) for form in (str(i + 1), f"{i + 1}.0", f"{i + 1},0")}

@@ -53,14 +53,17 @@ class Cohort(eqx.Module):
         return f"Cohort({len(self.names)} participants ({few}), {answers} answers, {dim} parameters)"
 
     def first(self, count: int) -> "Cohort":
-        """Only everybody's first `count` trials."""
+        """Only everybody's first `count` trials. Raises `InputError` for fewer than one."""
+        if count < 1:
+            raise InputError(f"Cohort: asked for everybody's first {count} trials; give a number from 1.")
         mask = np.asarray(self.trials.mask) & (np.arange(self.trials.mask.shape[1]) < count)[None, :]
         return dataclasses.replace(self, trials=eqx.tree_at(lambda t: t.mask, self.trials, placed(mask)))
 
     def of(self, names: Sequence[str]) -> "Cohort":
         """Only these participants. Raises `InputError` for a name that the table does not have, or that comes twice."""
+        names = [names] if isinstance(names, str) else list(names)
         if len(set(names)) < len(names):
-            twice = next(name for name in names if list(names).count(name) > 1)
+            twice = next(name for name in names if names.count(name) > 1)
             raise InputError(f'participant "{twice}" is named twice; name each person once.')
         present = set(self.names)
         unknown = [name for name in names if name not in present]

@@ -23,6 +23,7 @@ import numpy as np
 import xarray as xr
 from jaxtyping import Array, Bool, Float, Int, Key
 
+from hilbo.errors import InputError
 from hilbo.kernels import gram
 from hilbo.numerics.linalg import eigh
 from hilbo.numerics.tracing import program
@@ -94,8 +95,18 @@ def _of_answers(
 
 
 def inference_data(study: Study, cohort: Cohort, posteriors: Posterior, draws: int = 200, seed: int = 0) -> Any:
-    """The groups as ArviZ has them (`arviz.InferenceData`): what `arviz.from_netcdf` reads from inference.nc."""
+    """The groups as ArviZ has them (`arviz.InferenceData`): what `arviz.from_netcdf` reads from inference.nc.
+
+    `posteriors` are those of the cohort's people, stacked. Raises `InputError` for those of other people.
+    """
     import arviz
+
+    if posteriors.trials.mask.shape != cohort.trials.mask.shape:
+        held, asked = posteriors.trials.mask.shape[0], len(cohort.names)
+        raise InputError(
+            f"inference_data: posteriors are of {held} people, the cohort is of {asked};"
+            " hilbo.study.aggregate.fit_cohort makes those of a cohort."
+        )
 
     return arviz.InferenceData(**groups(study, cohort, posteriors, draws, seed))  # type: ignore[arg-type]
 

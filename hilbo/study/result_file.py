@@ -38,6 +38,7 @@ class Result(msgspec.Struct, frozen=True):
     participants: tuple[FoundPerson, ...]
     seed: Annotated[int, msgspec.Meta(ge=0, lt=2**31)] = 0
     digest: str | None = None
+    rule: str | None = None
 
 
 def read_result(path: str | os.PathLike, study: Study) -> Result:

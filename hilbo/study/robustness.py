@@ -34,6 +34,7 @@ from hilbo.study.resampled_optimum import can_resample, resampled_tops
 
 __all__ = ["LIMIT", "Robustness", "robustness"]
 
+_LEARNABLE = ("theta", "noise", "thresholds")
 _POINTS = 1000  # among which the optimum of resampled people is sought
 LIMIT = 0.03
 """NRMSE from which an optimum is flagged as not robust (paper, section IV-3)."""
@@ -93,7 +94,7 @@ def robustness(
     cohort: Cohort,
     seed: int = 0,
     *,
-    learn: Sequence[str] = ("theta", "noise", "thresholds"),
+    learn: Sequence[str] = _LEARNABLE,
     shared: bool = True,
     weak_priors: bool = True,
 ) -> Robustness:
@@ -139,6 +140,8 @@ def _check(study: Study, learn: Sequence[str]) -> None:
     """Raises InputError for a study, or hyperparameters, that cannot be compared."""
     if "variance" in learn:
         raise InputError("robustness: the prior variance cannot be learnt here; the committee needs one prior for all.")
+    if unknown := [name for name in learn if name not in _LEARNABLE]:
+        raise InputError(f'robustness: asked to learn "{unknown[0]}"; choose from {", ".join(_LEARNABLE)}.')
     if study.rule in RECIPES:
         raise InputError(
             f'robustness: compares fixed hyperparameters with learnt ones, and the rule "{study.rule}" has no fixed'

@@ -18,6 +18,7 @@ from hilbo.errors import InputError, InputRemark
 __all__ = [
     "FORMULA_WORDS",
     "ID_WORDS",
+    "but_for_case",
     "check_id",
     "check_text",
     "csv_rows",
@@ -49,6 +50,16 @@ def check_id(participant: str, place: str) -> None:
     """Refuse what is no pseudonymous id; `place` says where it stands."""
     if not is_id(participant):
         raise InputError(f'{place}: participant is "{participant}"; {ID_WORDS}.')
+
+
+def but_for_case(names: Iterable[str]) -> str:
+    """The first two different names that are the same but for capitals, in words; empty where there are none."""
+    first: dict[str, str] = {}
+    for name in names:
+        other = first.setdefault(name.casefold(), name)
+        if other != name:
+            return f'participants "{other}" and "{name}"'
+    return ""
 
 
 def runs_in_a_spreadsheet(text: str) -> bool:

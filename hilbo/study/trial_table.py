@@ -21,7 +21,7 @@ import pandas as pd
 from hilbo.errors import InputError, InputRemark
 from hilbo.study.cells import FRAME, answer_forms, cell_pieces, cells_of, numbers, parameter_values, place, refuse
 from hilbo.study.study_file import AnyStudy
-from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, check_text, formulas, no_ids
+from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, but_for_case, check_text, formulas, no_ids
 
 __all__ = [
     "NOT_FITTED",
@@ -112,6 +112,8 @@ def _read(
         raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
     table = of_material(table, material, source)
     _note_the_absent(left, table, source if material is None else f"{source} ({material})", note)
+    if alike := but_for_case(table["participant"].unique()):
+        note(f"{source}: {alike} differ in capitals only; they are taken for two people.")
     return marked(ordered(table), study)
 
 

@@ -220,3 +220,11 @@ def test_a_small_hill_is_found_beside_a_wide_plateau(study, finished):
     at_choice, at_hill = UCB(0.7)(*fitted.posterior.predict(jnp.stack([chosen, hill])))
     assert study.space.feasible(hill) and at_hill > 0.701
     assert at_choice > at_hill
+
+
+def test_what_was_presented_may_be_in_single_precision():
+    """0.3 is 0.300000012 then, above a range that ends at 0.3."""
+    ranges = {name: {"low": 0.1, "high": 0.3} for name in SMALL.space.names}
+    session = Session.start(Study.from_dict(RAW | {"parameters": ranges}), seed=0)
+    told = session.tell(SMALL.responses[0], at=dict.fromkeys(ranges, np.float32(0.3)))
+    assert told.points[0].tolist() == [0.3] * len(ranges)

@@ -79,3 +79,11 @@ def test_consent_of_a_zone_that_is_ahead_is_taken(tmp_path):
         add_person(tmp_path / "list.csv", person(name, (now + datetime.timedelta(hours=hours)).isoformat()))
     add_person(tmp_path / "list.csv", person("P03", datetime.datetime.now(datetime.UTC).isoformat()))
     assert len(read_people(tmp_path / "list.csv")) == 3
+
+
+def test_an_id_that_differs_in_capitals_only_is_refused(tmp_path):
+    path = tmp_path / "participants.csv"
+    add_person(path, person("P01"))
+    with pytest.raises(InputError, match='participants "P01" and "p01" differ in capitals only'):
+        add_person(path, person("p01"))
+    assert list(read_people(path)) == ["P01"]

@@ -5,6 +5,7 @@ from collections import Counter
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pytest
 from live import RAW, STUDY
 
@@ -14,12 +15,13 @@ from hilbo.session import actions as live
 from hilbo.session.headers import header_for, material_seed, warm_up
 from hilbo.session.look_ahead import LiveChooser
 from hilbo.session.plan import make_plan, plan_hash, planned_header, reissue
-from hilbo.session.plan_sets import aggregate_best_sets, check_participants
+from hilbo.session.plan_sets import aggregate_best_sets, check_participants, validation_sets
 from hilbo.session.records import Block
 from hilbo.session.state import LiveSession
 from hilbo.session.views import participant_view
+from hilbo.study.cohort import cohort_of
 from hilbo.study.protocols import protocol
-from hilbo.study.result_file import Result, read_result
+from hilbo.study.result_file import FoundOptimum, FoundPerson, Result, read_result
 
 PEOPLE = [f"P{i:02d}" for i in range(1, 9)]
 SETS = {name: {"u": 0.1 + 0.3 * i, "v": 0.9 - 0.2 * i} for i, name in enumerate(("best", "mid", "worst"))}
@@ -284,3 +286,23 @@ def test_a_study_changes_protocols_and_texts():
 def test_a_wrong_session_table_is_one_sentence(session, sentence):
     with pytest.raises(InputError, match=sentence):
         Study.from_dict(RAW | {"session": session})
+
+
+def test_people_planned_in_two_batches_share_no_seed():
+    one, other = (make_plan(STUDY, people, seed=3)["participants"] for people in (["A1", "A2"], ["B1", "B2"]))
+    assert len({row["header"]["seed"] for row in [*one, *other]}) == 4
+    longer = make_plan(STUDY, ["A1", "A2", "A3"], seed=3)["participants"]
+    assert [row["header"]["seed"] for row in longer[:2]] == [row["header"]["seed"] for row in one]
+
+
+def test_ids_that_differ_in_capitals_only_are_refused():
+    with pytest.raises(InputError, match='participants "P01" and "p01" differ in capitals only'):
+        make_plan(STUDY, ["P01", "P02", "p01"])
+
+
+def test_a_result_by_another_rule_is_told_apart_from_other_trials():
+    result = Result(STUDY.hash, FoundOptimum({}), (FoundPerson("P01"),), rule="average")
+    answers = pd.DataFrame({"participant": "P01", "trial": [1], "response": "close", "u": 0.5, "v": 0.5})
+    cohort = cohort_of(answers, STUDY)
+    with pytest.raises(InputError, match=r'is by the rule "average", and the study\'s is "bcm"'):
+        validation_sets(STUDY, result, cohort, "aggregate", ["P01"])

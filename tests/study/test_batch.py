@@ -69,7 +69,7 @@ def test_other_rules_are_sums_of_their_own(rule, share):
 
 def test_rules_that_are_no_sum_are_refused():
     study = dataclasses.replace(STUDY, rule="pooled")
-    with pytest.raises(InputError, match='"pooled" needs all answers at once and cannot be streamed'):
+    with pytest.raises(InputError, match='"pooled" takes all answers at once, on one device'):
         aggregate_population(study, cohort(), distributed.alone())
 
 

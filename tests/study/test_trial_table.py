@@ -79,6 +79,7 @@ def test_trials_that_count_through_phases_stay_in_their_order(tmp_path):
     assert table["phase"].tolist() == ["adaptive", "adaptive", "space filling"] and table["trial"].tolist() == [1, 2, 1]
 
 
+@pytest.mark.filterwarnings("ignore:.*differ in capitals only")
 @pytest.mark.parametrize("names", [["P2", "P10", "P10b"], ["9", "010", "10", "1e3"], ["Ada", "Ben", "ada"]])
 def test_the_order_of_the_rows_makes_no_difference(tmp_path, names):
     phases, trials = ("first", "second"), range(1, 4)
@@ -170,6 +171,30 @@ def test_labels_that_read_as_integers_are_labels(tmp_path):
     assert table["category"].tolist() == [0, 2]
     mixed = study(("none", "1", "2"))
     assert 'response is "3"; it must be one of none, 1, 2.' in refusal(tmp_path, HEADER + "A,1,3,1,2\n", of=mixed)
+
+
+def test_whole_numbers_that_pandas_made_floats_are_labels_and_the_missing_one_is_named(tmp_path):
+    likert = study(tuple("1234567"))
+    frame = pd.DataFrame({"participant": "A", "trial": [1, 2], "response": [6.0, 7.0], "gain": 1.0, "delay": 2.0})
+    assert np.asarray(cohort_of(frame, likert).trials.q)[0, :2].tolist() == [5, 6]
+    with pytest.raises(InputError, match=r'row 2: response is "nan"; it must be one of 1, 2'):
+        cohort_of(frame.assign(response=[6.0, np.nan]), likert)
+    table = read_trials(written(tmp_path, HEADER + "A,1,3.0,1,2\n"), study(("3", "2", "1")))
+    assert table["category"].tolist() == [0]
+
+
+def test_single_precision_reaches_the_ends_of_a_range():
+    """0.3 in single precision is 0.300000012, above the end of a range that ends at 0.3."""
+    here = study(parameters={"gain": {"low": 0.1, "high": 0.3}, "delay": {"low": 1.0, "high": 100.0}})
+    ends = np.array([0.1, 0.3], np.float32)
+    frame = pd.DataFrame({"participant": "A", "trial": [1, 2], "response": "close", "gain": ends, "delay": 2.0})
+    assert cohort_of(frame, here).physical[0, :2, 0].tolist() == [0.1, 0.3]
+
+
+def test_ids_that_differ_in_capitals_only_are_two_people_with_a_warning(tmp_path):
+    rows = HEADER + "A,1,close,1,2\na,1,close,1,2\n"
+    with pytest.warns(InputRemark, match='participants "A" and "a" differ in capitals only'):
+        assert set(read_trials(written(tmp_path, rows), study())["participant"]) == {"A", "a"}
 
 
 @pytest.mark.parametrize("labels", [("1.0", "1.5", "2.0"), ("0,0", "1,0", "2,0"), ("+1", "2e0", "three")])

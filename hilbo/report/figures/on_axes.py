@@ -11,7 +11,6 @@ import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from hilbo.errors import InputError
 from hilbo.ordinal_gp import Posterior
@@ -35,14 +34,14 @@ def draw_map(
 
     - `pair`: names of the parameters across and up; the first two without it. Of a study with one parameter the mean
       is drawn as a curve with its standard deviation.
-    - `ax`: the axes to draw on; new ones without it.
+    - `ax`: the axes to draw on; without it those of a new figure of pyplot, which notebooks show.
 
     **Returns:** the axes. Infeasible renderings are left white, the maximum is a star; the others are named in the
     title. Raises `InputError` for parameters that the study does not have.
     """
     names = study.space.names
     with mpl.rc_context(STYLE):
-        axes = Figure(figsize=(4.0, 3.2), layout="constrained").subplots() if ax is None else ax
+        axes = _new_axes() if ax is None else ax
         best = _maximum(study, model)
         if len(names) == 1 and pair is None:
             _curve(axes, study, model)
@@ -58,6 +57,12 @@ def draw_map(
         held = [level_words(study, k, float(best[k])) for k in range(len(names)) if k not in (i, j)]
         axes.set_title(", ".join(held))
     return axes
+
+
+def _new_axes() -> Axes:
+    from matplotlib import pyplot  # looks for a display: who brings axes does not wait for it
+
+    return pyplot.subplots(figsize=(4.0, 3.2), layout="constrained")[1]
 
 
 def _maximum(study: Study, model: Any) -> np.ndarray:
