@@ -213,8 +213,8 @@ def _filled(state: LiveSession, trial: Trial) -> bool:
         return bool(trial.voided and trial.voided.get("asked_again")) and not waits
     others = state.answers(trial.block)
     if trial.planned is None:
-        before = trial.voided["before"] if trial.voided else 0  # a level may have been answered before, for itself
-        same = any(other.id > before and other.renderings == trial.renderings for other in others)
+        beside = trial.voided["beside"] if trial.voided else ()  # a level may have been answered before, for itself
+        same = any(other.id not in beside and other.renderings == trial.renderings for other in others)
     else:
         same = any(other.planned == trial.planned for other in others)
     return same or len(others) >= state.quota(trial.block)

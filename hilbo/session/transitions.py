@@ -109,9 +109,10 @@ def stop_key(trial: Trial, side: str) -> Any:
 
 
 def _made_void(state, trial, by, reason, sides=()):
-    """`sides`: the one that was on when the device stopped. `asked_again`: whether a repetition is. `before`: the
-    newest trial at that time; what comes later may take the place of this one."""
-    voided = {"by": by, "reason": reason, "sides": list(sides), "before": len(state.trials)}
+    """`sides`: the one that was on when the device stopped. `asked_again`: whether a repetition is. `beside`: the
+    answers to the same renderings that counted at that time; any other takes the place of this one."""
+    beside = [t.id for t in state.answers(trial.block) if t.id != trial.id and t.renderings == trial.renderings]
+    voided = {"by": by, "reason": reason, "sides": list(sides), "beside": beside}
     state = _taken_out(state, trial, status="void", voided=voided)
     if not trial.repeats:
         return state

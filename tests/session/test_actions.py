@@ -141,7 +141,7 @@ def test_a_hold_voids_what_has_begun_and_the_second_one_excludes_it():
     driver.do("hold early", 0)
     assert driver.state.pending.status == "pending" and driver.state.pending.renderings["a"] == point
     driver.do("hold", 0)
-    voided = {"by": "rule", "reason": "device: hold (speed)", "sides": ["a"], "before": 3}
+    voided = {"by": "rule", "reason": "device: hold (speed)", "sides": ["a"], "beside": []}
     assert driver.state.trials[-2].voided == voided
     assert driver.state.pending.renderings["a"] == point
     driver.do("hold", 0)
@@ -260,6 +260,22 @@ def test_an_earlier_answer_to_the_same_level_does_not_fill_the_place_of_a_voided
     driver.log(live.void(driver.state, voided, "a misclick", 1.0))
     driver.log(live.restore(driver.state, voided, 1.0))
     assert driver.state.trial(voided).status == "answered"
+
+
+def test_of_two_voided_answers_to_one_rendering_one_may_be_restored():
+    """The second was asked in the place of the first."""
+    driver = to_first_answerable()
+    voided = []
+    for _ in range(2):
+        voided.append(driver.state.pending.id)
+        driver.do("answer", 0)
+        driver.log(live.void(driver.state, voided[-1], "a cough", 1.0))
+        driver.step()
+    first, second = (driver.state.trial(id) for id in voided)
+    assert first.renderings == second.renderings
+    driver.log(live.restore(driver.state, voided[0], 1.0))
+    with pytest.raises(RefusedError, match="has been filled by another one"):
+        live.restore(driver.state, voided[1], 1.0)
 
 
 def test_a_pause_in_mid_trial_begins_the_trial_again():
