@@ -87,7 +87,7 @@ def aggregate(
         elif compare:
             raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
         else:
-            if chosen.rule == "hierarchical":
+            if chosen.rule == "hierarchical" and team.writes:
                 remark("The hierarchical rule is taken person by person at each point here; the exact map may differ.")
             content = _aggregate_population(chosen, cohort, team, folder, seed, individuals, say, left_out)
     if team.writes:

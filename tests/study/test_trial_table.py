@@ -191,6 +191,16 @@ def test_single_precision_reaches_the_ends_of_a_range():
     assert cohort_of(frame, here).physical[0, :2, 0].tolist() == [0.1, 0.3]
 
 
+@pytest.mark.parametrize("dtype", ["float32", "Float32", "Float64", "Sparse[float64]", "Sparse[float32]"])
+def test_columns_of_any_kind_of_float_are_read(dtype):
+    frame = pd.DataFrame({"participant": "A", "trial": [1, 2], "response": "close", "gain": [0.1, 0.3], "delay": 2.0})
+    frame["gain"] = frame["gain"].astype(dtype)
+    assert cohort_of(frame, study()).physical[0, :2, 0].tolist() == [0.1, 0.3]
+    if not dtype.startswith("Sparse"):
+        with pytest.raises(InputError, match="row 2: gain is"):
+            cohort_of(frame.assign(gain=frame["gain"].where([True, False])), study())
+
+
 def test_ids_that_differ_in_capitals_only_are_two_people_with_a_warning(tmp_path):
     rows = HEADER + "A,1,close,1,2\na,1,close,1,2\n"
     with pytest.warns(InputRemark, match='participants "A" and "a" differ in capitals only'):
