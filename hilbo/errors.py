@@ -1,6 +1,11 @@
 """The one exception that means "the person who gave this input can fix it", and the one warning about an input."""
 
-__all__ = ["InputError", "InputRemark"]
+import sys
+import warnings
+
+__all__ = ["InputError", "InputRemark", "warn_caller"]
+
+_INSIDE = {"hilbo", "equinox", "jaxtyping", "beartype"}  # between the user's line and the place that warns
 
 
 def __dir__() -> list[str]:
@@ -17,3 +22,11 @@ class InputError(ValueError):
 
 class InputRemark(UserWarning):
     """How an input was understood where it could be understood otherwise: one sentence, with the place."""
+
+
+def warn_caller(sentence: str) -> None:
+    """An `InputRemark` that names the user's own line: the nearest one outside hilbo and what wraps its functions."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back and frame.f_globals.get("__name__", "").partition(".")[0] in _INSIDE:
+        level, frame = level + 1, frame.f_back
+    warnings.warn(InputRemark(sentence), stacklevel=level)

@@ -1,12 +1,10 @@
 """What `hilbo.fit` refuses: a model and answers that do not fit together, with what to do; and what it remarks."""
 
-import warnings
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hilbo.errors import InputError, InputRemark
+from hilbo.errors import InputError, warn_caller
 from hilbo.kernels import Kernel, Stationary
 from hilbo.likelihoods import OrdinalProbit
 from hilbo.trials import Trials
@@ -66,4 +64,4 @@ def remark_outside(whose: str, kernel: Kernel, points: Float[np.ndarray, "n d"])
         row = int(np.argmax(outside))
         where = ", ".join(f"{v:.4g}" for v in points[row])
         sentence = f"{whose}: x[{row}] is [{where}], outside the unit cube, in which lengths are measured"
-        warnings.warn(InputRemark(f"{sentence}; a study's space.to_unit gives such points."), stacklevel=4)
+        warn_caller(f"{sentence}; a study's space.to_unit gives such points.")

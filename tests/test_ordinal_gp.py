@@ -210,11 +210,12 @@ def test_bad_trials_are_refused_in_a_sentence(x, q, capacity, message):
 def test_points_in_physical_units_get_a_warning():
     """They fit and predict without an error: hardly correlated answers, and the prior."""
     gp = model(repeated())
-    with pytest.warns(InputRemark, match=r"fit: x\[1\] is \[5.7, 0.2\], outside the unit cube"):
+    with pytest.warns(InputRemark, match=r"fit: x\[1\] is \[5.7, 0.2\], outside the unit cube") as of_fit:
         fit(gp, Trials.from_arrays(np.array([[0.1, 0.2], [5.7, 0.2]]), np.zeros(2, int)))
     posterior = fit(gp, answers(repeated()))
-    with pytest.warns(InputRemark, match="Posterior: x.0. is .* outside the unit cube"):
+    with pytest.warns(InputRemark, match="Posterior: x.0. is .* outside the unit cube") as of_points:
         posterior.predict(np.full((1, posterior.trials.x.shape[1]), 5.7))
+    assert {warning.filename for warning in (*of_fit, *of_points)} == {__file__}  # the user's own line
     fit(gp, Trials.from_arrays(np.array([[1 + 1e-6, 0.0], [-1e-6, 1.0]]), np.zeros(2, int)))  # rounding
 
 

@@ -78,14 +78,8 @@ def aggregate(
             chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.first(first) if first else cohort
             agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
-        whole = team.devices == 1 and len(cohort.names) <= _LARGE
-        if whole and not individuals and chosen.rule not in _SUMS:
-            remark(f'Everybody\'s own optimum is sought, too: the rule "{chosen.rule}" takes all answers at once.')
-            individuals = True
-        if whole and individuals:
+        if _at_once(chosen.rule, len(cohort.names), team.devices, individuals, compare):
             content = aggregate_cohort(chosen, cohort, folder, seed, say, compare=compare, left_out=left_out)
-        elif compare:
-            raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
         else:
             if chosen.rule == "hierarchical" and team.writes:
                 remark("The hierarchical rule is taken person by person at each point here; the exact map may differ.")
@@ -176,6 +170,18 @@ def _included(study, everybody) -> tuple[Any, list[str]]:
     for sentence in sentences:
         remark(sentence)
     return cohort, sentences
+
+
+def _at_once(rule: str, people: int, devices: int, individuals: bool, compare: bool) -> bool:
+    """Whether everybody's posterior is kept, with everybody's own optimum; otherwise people are merged as a stream.
+    Raises `InputError` where --compare asks for what a stream does not have."""
+    few = devices == 1 and people <= _LARGE
+    if few and not individuals and rule not in _SUMS:
+        remark(f'Everybody\'s own optimum is sought, too: the rule "{rule}" takes all answers at once.')
+        return True
+    if compare and not (few and individuals):
+        raise InputError(f"--compare is for up to {_LARGE:,} people on one device, with their own optima.")
+    return few and individuals
 
 
 def aggregate_cohort(

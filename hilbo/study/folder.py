@@ -12,7 +12,6 @@ or in the tables' column `material` alone, when they share everything. Whatever 
 """
 
 import json
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +20,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
-from hilbo.errors import InputError, InputRemark
+from hilbo.errors import InputError, warn_caller
 from hilbo.study.cells import numbers, parameter_values, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
@@ -192,7 +191,7 @@ def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:
     if not tables:
         raise empty[0]
     for error in empty:
-        warnings.warn(InputRemark(f"{error} It is left out."), stacklevel=2)
+        warn_caller(f"{error} It is left out.")
     return ordered(pd.concat(tables, ignore_index=True))
 
 

@@ -9,11 +9,10 @@ no such text.
 
 import csv
 import re
-import warnings
 from collections.abc import Iterable
 from typing import Any, TextIO
 
-from hilbo.errors import InputError, InputRemark
+from hilbo.errors import InputError, warn_caller
 
 __all__ = [
     "FORMULA_WORDS",
@@ -97,8 +96,7 @@ def csv_rows(file: TextIO, source: str) -> tuple[Any, str]:
 def say_delimiter(delimiter: str, source: str) -> None:
     """Warn where it is no comma: a comma in a number is then the decimal point."""
     if delimiter != ",":
-        sentence = f"{source}: is read with {_DELIMITERS[delimiter]} between its cells; 1,5 is one and a half."
-        warnings.warn(InputRemark(sentence), stacklevel=2)
+        warn_caller(f"{source}: is read with {_DELIMITERS[delimiter]} between its cells; 1,5 is one and a half.")
 
 
 def is_decimal(cell: str, mark: str) -> bool:

@@ -10,7 +10,6 @@ and the line (Parquet: row). A table is read piece by piece, and a piece's text 
 import hashlib
 import os
 import re
-import warnings
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from hilbo.errors import InputError, InputRemark
+from hilbo.errors import InputError, warn_caller
 from hilbo.study.cells import FRAME, answer_forms, cell_pieces, cells_of, numbers, parameter_values, place, refuse
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, but_for_case, check_text, formulas, no_ids
@@ -55,10 +54,6 @@ _MISSING = {"", "nan", "none", "<na>"}
 _FALSE = {"", "0", "0.0", "0,0", "false", "no", "nan", "none", "<na>"}
 
 
-def _remark(sentence: str) -> None:
-    warnings.warn(InputRemark(sentence), stacklevel=5)
-
-
 def read_trials(
     path: str | os.PathLike,
     study: AnyStudy,
@@ -66,7 +61,7 @@ def read_trials(
     *,
     others: bool = True,
     say: Callable[[int], None] = lambda rows: None,
-    note: Callable[[str], Any] = _remark,
+    note: Callable[[str], Any] = warn_caller,
 ) -> pd.DataFrame:
     """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
 
@@ -84,7 +79,7 @@ def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = 
     text = cells_of(frame)
     for column in text.columns.intersection(_KEY):
         text.loc[frame[column].isna().to_numpy(), column] = ""  # a missing participant is nobody called "nan"
-    return _read([text], study, material, FRAME, True, lambda rows: None, _remark)
+    return _read([text], study, material, FRAME, True, lambda rows: None, warn_caller)
 
 
 def _read(

@@ -4,7 +4,7 @@ import pandas as pd
 import pytest
 from studies import PLAIN, plain
 
-from hilbo.cli.aggregate import _included, read_cohort
+from hilbo.cli.aggregate import _at_once, _included, read_cohort
 from hilbo.errors import InputError
 from hilbo.study.cohort import cohort_of
 from hilbo.study.config import Study
@@ -65,3 +65,28 @@ def test_whom_the_study_leaves_out_is_not_aggregated(capsys):
     assert kept.names == ("B",) and sentences == ['[study] exclude = "trials < 2" leaves out 1: A (trials is 1).']
     assert sentences[0] in capsys.readouterr().err
     assert _included(plain(), cohort) == (cohort, [])
+
+
+@pytest.mark.parametrize(
+    ("rule", "people", "devices", "individuals", "at_once"),
+    [
+        ("bcm", 24, 1, True, True),
+        ("bcm", 1001, 1, True, False),
+        ("bcm", 24, 2, True, False),
+        ("bcm", 24, 1, False, False),
+        ("average", 24, 1, False, False),
+        ("hierarchical", 24, 1, False, True),  # a sum over people is another rule
+        ("learnt-2", 24, 1, False, True),
+    ],
+)
+def test_a_rule_that_takes_all_answers_at_once_is_never_taken_as_a_stream(
+    rule, people, devices, individuals, at_once, capsys
+):
+    assert _at_once(rule, people, devices, individuals, compare=False) is at_once
+    assert ("Everybody's own optimum is sought, too" in capsys.readouterr().err) is (at_once and not individuals)
+
+
+@pytest.mark.parametrize(("people", "devices", "individuals"), [(1001, 1, True), (24, 2, True), (24, 1, False)])
+def test_a_stream_of_people_has_no_comparison_of_all_rules(people, devices, individuals):
+    with pytest.raises(InputError, match="--compare is for up to 1,000 people on one device"):
+        _at_once("bcm", people, devices, individuals, compare=True)

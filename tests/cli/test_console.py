@@ -1,6 +1,7 @@
 """What the commands say while they work, and the folder that is whole or absent."""
 
 import os
+import signal
 import subprocess
 import sys
 
@@ -42,6 +43,19 @@ def test_a_folder_is_whole_or_absent(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be written"), results(tmp_path / "file" / "out", False):
         pass
+
+
+def test_a_command_that_is_told_to_end_leaves_nothing_behind(tmp_path):
+    def told():
+        with results(tmp_path / "out", False) as folder:
+            (folder / "half").write_text("")
+            signal.raise_signal(signal.SIGTERM)
+
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(SystemExit) as ended:
+        told()
+    assert ended.value.code == 143 and not list(tmp_path.iterdir())
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 @pytest.mark.parametrize("force", [False, True])

@@ -428,8 +428,9 @@ def test_a_parquet_file_has_rows_and_no_lines(tmp_path):
 
 def test_a_table_with_semicolons_has_decimal_commas_and_it_is_said(tmp_path):
     text = HEADER.replace(",", ";").replace("\n", ";note\n") + "A;1;close;1,25;2,5;so, so\nA;2;similar;0;1e2;3,4\n"
-    with pytest.warns(InputRemark, match=r"t\.csv: is read with semicolons between its cells; 1,5 is one and a half\."):
+    with pytest.warns(InputRemark, match=r"t\.csv: is read with semicolons between its cells; 1,5 is one") as remarks:
         table = read_trials(written(tmp_path, text), study())
+    assert remarks[0].filename == __file__  # the user's own line
     assert table[["gain", "delay"]].to_numpy().tolist() == [[1.25, 2.5], [0.0, 100.0]]
     assert table["note"].tolist() == ["so, so", "3,4"]  # other columns are as they are
 
