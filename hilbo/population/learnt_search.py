@@ -16,7 +16,8 @@ from hilbo.population.tallies import Tallies
 __all__ = ["Search", "first_search", "searched"]
 
 _STEPS, _ROUNDS = 100, 8  # of one descent; descents
-_NEAR = 2e-6  # of the cost: another choice of features moves it as much as a nearer step would
+_NEAR = 1e-3  # nats that a step must gain for another: a small part of what answers leave open, however many they are
+_REMEMBERED = 30  # steps; with widths of people's own, the 10 of SciPy take a quarter more of them
 _LARGEST = 256  # features: functions that need more are too rugged to be shared by few answers
 _MOVED = 0.35  # of log theta: features of other lengths leave more, but the RBF's no more than 0.004 of the variance
 _REACH = 1.5  # of log theta, in one descent: where lengths grow far beyond it, features become singular
@@ -91,7 +92,8 @@ def _descended(search: Search, problem: Problem, free: Set[str]) -> Search:
         nonlocal steps
         steps += 1
 
-    options = {"maxiter": _STEPS, "ftol": _NEAR, "gtol": 1e-3}
+    near = _NEAR / max(1.0, abs(float(search.cost.value)))  # SciPy's is a part of the cost
+    options = {"maxiter": _STEPS, "ftol": near, "gtol": 1e-3, "maxcor": _REMEMBERED}
     bounds = _bounds(begin, problem)
     try:
         result = minimize(

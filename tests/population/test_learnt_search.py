@@ -69,6 +69,19 @@ def test_a_search_that_runs_out_of_steps_has_not_ended(monkeypatch):
     assert not end.ended
 
 
+@pytest.mark.parametrize("level", [0.0, 2e4, -3e5])
+def test_a_search_ends_as_near_the_maximum_by_many_answers_as_by_few(monkeypatch, level):
+    """Costs grow with the answers, what a hyperparameter may still be does not: within a tenth of its own error."""
+
+    def valley(z):
+        along, across = z[0] + z[2], np.array([z[0] - z[2], z[1]])
+        slope = np.array([2e-2 * along**3 + 2e3 * across[0], 2e3 * across[1], 2e-2 * along**3 - 2e3 * across[0]])
+        return level + 5e-3 * along**4 + 1e3 * np.sum(across**2), slope, True
+
+    end, _ = searched_by(monkeypatch, valley, (1.0, 1.0))
+    assert end.ended and float(end.cost.value) - level < 0.005
+
+
 def test_pivots_leave_what_they_say_and_are_no_more_than_wanted():
     rng = np.random.default_rng(0)
     answers = Tallies(jnp.asarray(rng.uniform(size=(4, 75, 2))), jnp.ones((4, 75, 3)))
