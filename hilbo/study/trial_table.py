@@ -79,6 +79,8 @@ def checked_trials(frame: pd.DataFrame, study: AnyStudy, material: str | None = 
     text = cells_of(frame)
     for column in text.columns.intersection(_KEY):
         text.loc[frame[column].isna().to_numpy(), column] = ""  # a missing participant is nobody called "nan"
+    if _MARK in frame.attrs and {"response", "category"} <= set(text.columns):
+        _check_recoding(text, study.responses)
     return _read([text], study, material, FRAME, True, lambda rows: None, warn_caller)
 
 
@@ -227,6 +229,20 @@ def _categories(cells: pd.Series, responses: Sequence[str], source: str) -> pd.S
     allowed = ", ".join(responses) + (ranks and f", or {ranks}")
     refuse(categories.isna(), source, lambda row: f'response is "{cells.at[row]}"; it must be one of {allowed}.')
     return categories.astype(int)
+
+
+def _check_recoding(text: pd.DataFrame, responses: Sequence[str]) -> None:
+    """Refuse a table that `read_trials` made in which somebody changed `category` and left `response` as it was, or the
+    reverse: the fit would be to one of them, without a word."""
+    categories = _categories(text["response"], responses, FRAME)
+    refuse(
+        pd.to_numeric(text["category"], errors="coerce") != categories,
+        FRAME,
+        lambda row: (
+            f'category is {text.at[row, "category"]}, but response "{text.at[row, "response"]}" is category'
+            f" {categories.at[row]}; change the response, and leave the column category out."
+        ),
+    )
 
 
 def is_fitted(phases: pd.Series) -> pd.Series:

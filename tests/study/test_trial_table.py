@@ -501,6 +501,15 @@ def test_a_table_that_was_read_and_then_changed_is_checked_again(tmp_path, edit)
         cohort_of(change(table), study())
 
 
+def test_a_category_that_was_recoded_without_its_response_is_refused(tmp_path):
+    table = read_trials(written(tmp_path, HEADER + "A,1,close,1,2\nA,2,similar,1,2\n"), study())
+    with pytest.raises(InputError, match='category is 0, but response "similar" is category 1; change the response'):
+        cohort_of(table.assign(category=[2, 0]), study())
+    both = table.assign(category=[2, 0], response=["close", "different"])
+    for recoded in (both, both.astype({"category": float}), both.drop(columns="category")):
+        assert np.asarray(cohort_of(recoded, study()).trials.q)[0, :2].tolist() == [2, 0]
+
+
 def test_rows_that_were_read_and_then_turned_round_come_in_order_again(tmp_path):
     table = read_trials(written(tmp_path, HEADER + "A,1,close,1,2\nA,2,similar,1,2\nB,1,different,1,2\n"), study())
     whole, turned = cohort_of(table, study()), cohort_of(table[::-1], study())
