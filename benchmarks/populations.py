@@ -35,6 +35,7 @@ from rows import Rows  # noqa: E402
 
 from hilbo import acquisition  # noqa: E402
 from hilbo.ordinal_gp import Trials  # noqa: E402
+from hilbo.population.leave_one_out import clustered  # noqa: E402
 from hilbo.population.maps import learnt_map, rule_map  # noqa: E402
 from hilbo.population.recipes import RECIPES, RECOMMENDED  # noqa: E402
 from hilbo.search.candidates import search_points  # noqa: E402
@@ -193,10 +194,21 @@ ENOUGH, MANY = 10, 100  # studies for a row of a population's own among the regr
 EVEN = {"24x25": 100, "12x15": 10}  # studies of each population that a group counts, whatever more one has
 
 
-def interval(values, digits=3):
-    """The mean with its standard error over studies."""
-    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-    return f"{values.mean():.{digits}f} ± {error:.{digits}f}"
+def interval(values, seeds=None, digits=3):
+    """The mean with its standard error over seeds; without them, each value has its own."""
+    mean, error = clustered(values, np.arange(len(values)) if seeds is None else seeds)
+    return f"{mean:.{digits}f} ± {error:.{digits}f}"
+
+
+def ends(gain, seeds):
+    """The mean with its 95 % interval over seeds."""
+    mean, error = clustered(gain, seeds)
+    return f"{mean:+.3f} [{mean - 1.96 * error:+.3f}, {mean + 1.96 * error:+.3f}]"
+
+
+def seeds_of(rows):
+    """One seed draws related people in every population."""
+    return np.array([row["seed"] for row in rows])
 
 
 def values_of(rows, rule, measure="regret"):
@@ -228,7 +240,7 @@ def regrets(parts):
     lines = []
     for name, part in parts.items():
         mean = {rule: values_of(part, rule).mean() for rule in (RECOMMENDED, "bcm")}
-        of_rules = [interval(values_of(part, rule)) for rule in RULES]
+        of_rules = [interval(values_of(part, rule), seeds_of(part)) for rule in RULES]
         lines.append([name, str(len(part)), *of_rules, f"{mean[RECOMMENDED] / mean['bcm']:.2f}"])
     return lined(heads, lines)
 
@@ -241,9 +253,7 @@ def differences(parts):
     for name, part in parts.items():
         cells = [name]
         for other in others:
-            gain = values_of(part, other) - values_of(part, RECOMMENDED)
-            half = 1.96 * gain.std(ddof=1) / np.sqrt(len(gain))
-            cells.append(f"{gain.mean():+.3f} [{gain.mean() - half:+.3f}, {gain.mean() + half:+.3f}]")
+            cells.append(ends(values_of(part, other) - values_of(part, RECOMMENDED), seeds_of(part)))
         far = {rule: 100 * np.median(values_of(part, rule, "nrmse")) for rule in (RECOMMENDED, "bcm")}
         lines.append([*cells, f"{far[RECOMMENDED]:.1f} % (bcm {far['bcm']:.1f} %)"])
     return lined(heads, lines)
@@ -266,7 +276,7 @@ def itself(parts):
         promised = np.array([row["said"] - row["is"] for row in part])
         failed = sum(not row["converged"] for row in part)
         share = f"{sum(held)} of {len(held)} ({100 * np.mean(held):.0f} %)"
-        lines.append([name, share, f"{100 * volume:.0f} %", interval(promised), str(failed)])
+        lines.append([name, share, f"{100 * volume:.0f} %", interval(promised, seeds_of(part)), str(failed)])
     return lined(heads, lines)
 
 
@@ -284,10 +294,9 @@ def sessions(rows, design):
     for name, belongs in GROUPS.items():
         part = [pair for pair in pairs if belongs(pair[0]["population"])]
         by_medians, by_paper = (values_of(of, RECOMMENDED) for of in zip(*part, strict=True))
-        less = by_medians - by_paper
-        half = 1.96 * less.std(ddof=1) / np.sqrt(len(less))
-        cells = f"{less.mean():+.3f} [{less.mean() - half:+.3f}, {less.mean() + half:+.3f}]"
-        lines.append([name, str(len(part)), interval(by_medians), interval(by_paper), cells])
+        seeds = seeds_of([row for row, _ in part])
+        cells = interval(by_medians, seeds), interval(by_paper, seeds), ends(by_medians - by_paper, seeds)
+        lines.append([name, str(len(part)), *cells])
     return lined(heads, lines)
 
 
