@@ -131,6 +131,16 @@ def test_one_person_claims_no_sampling_error():
     assert "is not known: one person's answers tell nothing of sampling." in page and "sampling error" not in page
 
 
+def test_peaks_are_named_by_their_tops_and_a_single_one_is_not_named():
+    """The mean of the draws on a peak may be a dark part of the map; its top is not."""
+    peaks = _environment().get_template("parts.html").module.peaks
+    high = {"probability": 0.7, "top": {"hue": 254.3}, "centre": {"hue": 205.2}}
+    low = {"probability": 0.3, "top": {"hue": 150.0}, "centre": {"hue": 160.0}}
+    assert str(peaks([high])) == ""
+    page = " ".join(str(peaks([high, low])).split())
+    assert "hue = 254.3 (70 %); hue = 150 (30 %)." in page and "205.2" not in page
+
+
 def test_a_sentence_in_a_table_wraps_and_a_number_does_not():
     """A sentence on one line would end beyond the right edge of the page."""
     row = (
