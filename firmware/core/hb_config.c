@@ -16,15 +16,22 @@ const char *hb_error_sentence(enum hb_error error)
     case HB_ERROR_LINE:
         return "line_rate_baud must be 1200 to 100000000.";
     case HB_ERROR_LIMITS:
-        return "damping, force limit (at most 1000 N), slew limit and velocity limit must be finite and above 0.";
+        return "damping must be 0.001 to 1000 N.s/m, the force limit at most 100 N, the slew limit from the force limit "
+               "in 1 s to the force limit in 1 tick, the velocity limit one encoder step a tick or more.";
     case HB_ERROR_STROKE:
-        return "The stroke must include 0 and a position above it, and lie within 32767 encoder steps, each <= 0.1 mm.";
+        return "The stroke must reach an encoder step or more to both sides of 0, within 32767 steps, each <= 0.1 mm.";
     case HB_ERROR_STEP:
         return "plausible_step_mm must be finite and larger than what the velocity limit allows in one tick.";
     case HB_ERROR_PARAMETERS:
         return "Each parameter range must be finite with low <= high, K1 and B1 above 0, alpha in [2^-10, 1 - 2^-10].";
     case HB_ERROR_SERVO:
         return "The servo's gains must be finite and not negative, its speed above 0 and below the velocity limit.";
+    case HB_ERROR_DELAY:
+        return "delay_us must be at most one period, and above 0 on a device that is not simulated: measure it.";
+    case HB_ERROR_HEATING:
+        return "continuous_force_N must be above 0 and at most the force limit, heating_s 0.1 to 1000 s.";
+    case HB_ERROR_BOOT_ID:
+        return "The boot id is 0: give one that differs at every start.";
     case HB_ERRORS:
     default:
         return "This error has no name.";
@@ -52,14 +59,28 @@ static bool ticks_are_good(const struct hb_config *c)
 
 static bool limits_are_good(const struct hb_config *c)
 {
-    return within(c->damping_N_s_per_m, SMALLEST, LARGEST) && within(c->force_limit_N, SMALLEST, 1000.0F) &&
-           within(c->slew_limit_N_per_s, SMALLEST, LARGEST) && within(c->velocity_limit_mm_per_s, SMALLEST, LARGEST);
+    float rate_Hz = (float)c->tick_rate_Hz;
+    return within(c->damping_N_s_per_m, 0.001F, 1000.0F) && within(c->force_limit_N, SMALLEST, 100.0F) &&
+           within(c->slew_limit_N_per_s, c->force_limit_N, c->force_limit_N * rate_Hz) &&
+           within(c->velocity_limit_mm_per_s, SMALLEST, LARGEST) &&
+           c->velocity_limit_mm_per_s >= c->encoder_step_mm * rate_Hz;
+}
+
+static bool delay_is_good(const struct hb_config *c)
+{
+    bool simulated = (c->capabilities & (uint8_t)HB_IS_SIMULATED) != 0U;
+    return c->delay_us <= 1000000U / c->tick_rate_Hz && (simulated || c->delay_us > 0U);
+}
+
+static bool heating_is_good(const struct hb_config *c)
+{
+    return within(c->continuous_force_N, SMALLEST, c->force_limit_N) && within(c->heating_s, 0.1F, 1000.0F);
 }
 
 static bool stroke_is_good(const struct hb_config *c)
 {
     float reach_mm = 32767.0F * c->encoder_step_mm;
-    return within(c->encoder_step_mm, SMALLEST, 0.1F) && within(c->position_low_mm, -reach_mm, 0.0F) &&
+    return within(c->encoder_step_mm, SMALLEST, 0.1F) && within(c->position_low_mm, -reach_mm, -c->encoder_step_mm) &&
            within(c->position_high_mm, c->encoder_step_mm, reach_mm);
 }
 
@@ -85,7 +106,7 @@ enum hb_error hb_config_check(const struct hb_config *config)
     if (config->most_taps > HB_MAX_TAPS || config->most_states > HB_MAX_STATES) {
         return HB_ERROR_MAXIMA;
     }
-    if (config->capabilities >= 16U) {
+    if (config->capabilities >= 32U) {
         return HB_ERROR_CAPABILITIES;
     }
     if (config->line_rate_baud < 1200U || config->line_rate_baud > 100000000U) {
@@ -106,6 +127,12 @@ enum hb_error hb_config_check(const struct hb_config *config)
     }
     if ((config->capabilities & (uint8_t)HB_CAN_DRIVE) != 0U && !servo_is_good(config)) {
         return HB_ERROR_SERVO;
+    }
+    if (!delay_is_good(config)) {
+        return HB_ERROR_DELAY;
+    }
+    if (!heating_is_good(config)) {
+        return HB_ERROR_HEATING;
     }
     return HB_OK;
 }

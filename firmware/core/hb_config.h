@@ -28,7 +28,8 @@ enum hb_capability {
     HB_CAN_DRIVE = 1,
     HB_CAN_SENSE_FORCE = 2,
     HB_CAN_CONTROL_PASSIVITY = 4, /* the passivity controller is on */
-    HB_IS_SIMULATED = 8
+    HB_IS_SIMULATED = 8,
+    HB_IS_HOMED_AT_BOOT = 16 /* its encoder is absolute; any other device waits for HOME */
 };
 
 struct hb_range {
@@ -41,19 +42,23 @@ struct hb_config {
     uint32_t firmware;       /* hash of the build, told in HELLO */
     uint32_t line_rate_baud; /* what the line carries; decides which STREAM fits */
     uint16_t tick_rate_Hz;   /* 100 to 10000 */
-    uint16_t watchdog_ticks; /* without a heartbeat: HOLD; at most 1 s */
+    uint16_t watchdog_ticks; /* without a fresh round trip: HOLD; at most 1 s */
     uint16_t hold_ticks;     /* HOLD and STOP reach zero force within this; at most 0.1 s */
     uint16_t most_taps;      /* <= HB_MAX_TAPS */
     uint8_t most_states;     /* <= HB_MAX_STATES */
     uint8_t capabilities;    /* of enum hb_capability */
+    uint32_t delay_us;       /* longest time from when a tick is due until its force is out; at most one period.
+                              * Sets are checked for it, a tick that takes longer is an overrun. 0: only if simulated */
 
     float damping_N_s_per_m;       /* physical damping b, measured: passivity is checked with it */
-    float force_limit_N;           /* largest force command, either sign */
+    float force_limit_N;           /* largest force command, either sign; at most 100 N */
+    float continuous_force_N;      /* root mean square over about heating_s that the motor bears: more is a HOLD */
+    float heating_s;               /* time constant of the motor's heating, 0.1 to 1000 s */
     float position_low_mm;         /* stroke; a position outside is bad input */
     float position_high_mm;        /* at most 32767 encoder steps either way */
     float encoder_step_mm;         /* position of one count */
-    float slew_limit_N_per_s;      /* largest rise of the force command; in DRIVE largest change */
-    float velocity_limit_mm_per_s; /* faster: HOLD */
+    float slew_limit_N_per_s;      /* largest rise of the force command, in DRIVE largest change; >= force limit per s */
+    float velocity_limit_mm_per_s; /* faster: HOLD; at least one encoder step a tick */
     float plausible_step_mm;       /* more than this in one tick is bad input; above velocity_limit / tick_rate */
 
     struct hb_range K0_N_per_mm; /* parameters outside are refused */
@@ -81,6 +86,9 @@ enum hb_error {
     HB_ERROR_STEP,
     HB_ERROR_PARAMETERS,
     HB_ERROR_SERVO,
+    HB_ERROR_DELAY,
+    HB_ERROR_HEATING,
+    HB_ERROR_BOOT_ID, /* of hb_init, not of a config */
     HB_ERRORS /* how many there are */
 };
 

@@ -18,9 +18,13 @@ enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, 
     device->boot_id = boot_id;
     device->state = (uint8_t)HB_ESTOPPED;
     device->cause = (uint8_t)HB_CAUSE_BOOT;
+    if (error == HB_OK && boot_id == 0U) {
+        error = HB_ERROR_BOOT_ID;
+    }
     if (error == HB_OK) {
         device->config = config;
         device->heartbeat_age_ticks = config->watchdog_ticks;
+        hb_safety_begin(&device->safety, config);
         hb_enter(device, HB_STOPPED, HB_CAUSE_BOOT);
     }
     return error;
@@ -86,7 +90,7 @@ static float below_limit(struct hb_device *device, float felt_N)
 }
 
 /* The force while RUNNING and in contact, up to and with the slew limit. `old_N`: of the set that was in force before,
- * while the device goes on from it; otherwise 0. */
+ * while the device goes on from it. */
 static float run(struct hb_device *device, float model_N, float old_N)
 {
     const struct hb_config *config = device->config;
@@ -96,14 +100,14 @@ static float run(struct hb_device *device, float model_N, float old_N)
     if (model_N > felt_N) {
         hb_mark_saturated(safety);
     }
-    if (device->starting || device->flipped) {
+    if (device->flipped) {
         device->offset_N = gap_N;
     }
     float before_N = below_limit(device, felt_N);
     bool switching = device->offset_N != 0.0F;
     if (switching) {
         safety->flags |= (uint16_t)HB_FLAG_SWITCHING;
-        if (!device->starting && !device->flipped) {
+        if (!device->flipped) {
             fade(device, felt_N, gap_N);
         }
     }
@@ -127,7 +131,6 @@ static float render(struct hb_device *device, float model_N, float old_N)
     } else {
         device->offset_N = 0.0F;
     }
-    device->starting = false;
     return force_N;
 }
 
@@ -138,7 +141,13 @@ static float drive(struct hb_device *device)
     return hb_slew(&device->safety, device->config, force_N, force_N);
 }
 
-static enum hb_cause fault(const struct hb_device *device, bool input_lost, bool overrun, bool finite)
+/* A tick was missed, or the last force came out later than sets are checked for. */
+static bool is_late(const struct hb_device *device, const struct hb_input *input)
+{
+    return input->overrun || input->delay_us > device->config->delay_us;
+}
+
+static enum hb_cause fault(const struct hb_device *device, bool input_lost, bool late, bool hot, bool finite)
 {
     if (device->heartbeat_age_ticks >= device->config->watchdog_ticks) {
         return HB_CAUSE_WATCHDOG;
@@ -149,8 +158,11 @@ static enum hb_cause fault(const struct hb_device *device, bool input_lost, bool
     if (hb_is_too_fast(&device->safety, device->config)) {
         return HB_CAUSE_VELOCITY;
     }
-    if (overrun) {
+    if (late) {
         return HB_CAUSE_OVERRUN;
+    }
+    if (hot) {
+        return HB_CAUSE_HEAT;
     }
     return finite ? HB_CAUSE_NONE : HB_CAUSE_MODEL;
 }
@@ -163,9 +175,11 @@ static float command(struct hb_device *device, float wanted_N, enum hb_cause cau
     if (moves && cause != HB_CAUSE_NONE) {
         hb_count_up(&safety->count.holds);
         hb_ramp_begin(safety);
+        device->stops += 1U;
         hb_enter(device, HB_HOLDING, cause);
-    } else if (hb_is_in(device, HB_DRIVING) && hb_drive_has_ended(&device->drive)) {
+    } else if (hb_is_in(device, HB_DRIVING) && hb_drive_has_ended(&device->drive, device->config, safety)) {
         hb_ramp_begin(safety);
+        device->stops += 1U;
         hb_enter(device, HB_STOPPING, HB_CAUSE_NONE);
     } else if (moves) {
         return wanted_N;
@@ -206,9 +220,15 @@ float hb_tick(struct hb_device *device, const struct hb_input *input)
     if (device->heartbeat_age_ticks < config->watchdog_ticks) {
         device->heartbeat_age_ticks += 1U;
     }
-    if (input->overrun) {
+    bool late = is_late(device, input);
+    if (late) {
         hb_count_up(&safety->count.overruns);
     }
+    device->stop_open = input->stop_open;
+    if (input->stop_open) {
+        hb_estop(device, HB_CAUSE_SWITCH);
+    }
+    bool hot = hb_is_too_hot(safety, config);
     bool input_lost = !hb_check_input(safety, config, input);
     float old_N = 0.0F;
     float model_N = hb_render(device, hb_penetration_mm(safety, config), &old_N);
@@ -221,7 +241,7 @@ float hb_tick(struct hb_device *device, const struct hb_input *input)
         wanted_N = drive(device);
     }
     device->flipped = false;
-    safety->force_N = command(device, wanted_N, fault(device, input_lost, input->overrun, finite));
+    safety->force_N = command(device, wanted_N, fault(device, input_lost, late, hot, finite));
     safety->flags = state_flags(device);
     struct hb_sample sample = {(int16_t)safety->counts, safety->flags, safety->force_N, input->sensed_N};
     hb_stream_tick(&device->stream, &device->output, device->tick, &sample);

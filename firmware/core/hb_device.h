@@ -22,6 +22,7 @@
 #include <stdint.h>
 
 #include "hb_config.h"
+#include "hb_delay.h"
 #include "hb_drive.h"
 #include "hb_frame.h"
 #include "hb_line.h"
@@ -36,20 +37,22 @@ struct hb_device {
     uint32_t tick;
     uint8_t state;                /* enum hb_state */
     uint8_t cause;                /* enum hb_cause: why it is in this state */
+    bool stop_open;               /* the hardware stop, at the last tick */
     bool greeted;                 /* HELLO has been said */
-    uint32_t heartbeat_age_ticks; /* stays at watchdog_ticks */
+    uint32_t heartbeat_age_ticks; /* since the last tick that the host is known to have heard; stays at watchdog_ticks */
+    uint32_t stops;               /* STOPs, ESTOPs, HOLDs and ends of a DRIVE since the start */
+    uint32_t drive_crc;           /* of the request for the DRIVE that runs */
 
     struct hb_renderer bank[2];
     uint32_t crc[2];       /* of the bytes that each set came in */
     uint8_t active;        /* bank in force; the other one is staged */
     bool in_force;         /* there is a set in force */
-    uint8_t staging;       /* enum hb_staging; READY is told by warm_left */
+    uint8_t staging;       /* enum hb_staging; READY is told by warm_left and delay_check */
     uint16_t states_known; /* exponentials of the staged set that have come */
     uint32_t warm_left;    /* ticks until the staged history is its own */
+    struct hb_delay_check delay_check; /* of the staged set; done at once on a device without delay */
     bool flipped;          /* the next tick is the first of a set that follows another */
-    bool starting;         /* the next tick is the first after START */
-    bool follows;          /* the offset is to the force of the idle bank, which was in force before; else to 0 */
-    float offset_N;        /* what is left of the difference of two forces; 0 out of contact */
+    float offset_N;        /* what is left of the difference to the force of the idle bank; 0 out of contact */
 
     struct hb_safety safety;
     struct hb_drive drive;

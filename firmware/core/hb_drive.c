@@ -14,7 +14,9 @@ static bool crosses(float number, float low, float high, float *value, float *li
 
 bool hb_drive_is_named(const struct hb_drive_request *request)
 {
-    return request->mode <= (uint8_t)HB_DRIVE_POSITION && request->shape <= (uint8_t)HB_DRIVE_STEP;
+    bool nudges = request->shape == (uint8_t)HB_DRIVE_NUDGE;
+    return request->shape <= (uint8_t)HB_DRIVE_NUDGE &&
+           request->mode <= (uint8_t)(nudges ? HB_DRIVE_FORCE : HB_DRIVE_POSITION);
 }
 
 enum hb_reason hb_drive_check(const struct hb_drive_request *request, const struct hb_config *config, float *value,
@@ -33,8 +35,11 @@ enum hb_reason hb_drive_check(const struct hb_drive_request *request, const stru
         last = request->offset + request->amplitude;
     } else if (request->shape == (uint8_t)HB_DRIVE_STEP) {
         last = request->amplitude;
+    } else if (request->shape == (uint8_t)HB_DRIVE_NUDGE &&
+               crosses(request->amplitude, config->encoder_step_mm, config->position_high_mm, value, limit)) {
+        return HB_NACK_DRIVE_RANGE;
     }
-    bool periodic = request->shape != (uint8_t)HB_DRIVE_CONSTANT;
+    bool periodic = request->shape == (uint8_t)HB_DRIVE_TRIANGLE || request->shape == (uint8_t)HB_DRIVE_STEP;
     if (crosses(first, low, high, value, limit) || crosses(last, low, high, value, limit) ||
         crosses((float)request->duration_ticks, 1.0F, (float)HB_MAX_DRIVE_TICKS, value, limit) ||
         (periodic && crosses((float)request->period_ticks, 4.0F, (float)HB_MAX_DRIVE_TICKS, value, limit))) {
@@ -49,6 +54,7 @@ void hb_drive_begin(struct hb_drive *drive, const struct hb_drive_request *reque
     *drive = (struct hb_drive){
         .request = *request,
         .tick = 0U,
+        .from_counts = safety->counts,
         .reference_mm = hb_position_mm(safety, config),
         .integral_N = 0.0F,
         .seen_counts = safety->counts,
@@ -56,9 +62,11 @@ void hb_drive_begin(struct hb_drive *drive, const struct hb_drive_request *reque
     };
 }
 
-bool hb_drive_has_ended(const struct hb_drive *drive)
+bool hb_drive_has_ended(const struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety)
 {
-    return drive->tick >= drive->request.duration_ticks;
+    float moved_mm = hb_absolute((float)(safety->counts - drive->from_counts) * config->encoder_step_mm);
+    bool nudged = drive->request.shape == (uint8_t)HB_DRIVE_NUDGE && moved_mm >= drive->request.amplitude;
+    return nudged || drive->tick >= drive->request.duration_ticks;
 }
 
 bool hb_drive_is_stuck(const struct hb_drive *drive, const struct hb_config *config)

@@ -11,11 +11,14 @@
 #include "hb_safety.h"
 
 enum hb_drive_mode { HB_DRIVE_FORCE = 0, HB_DRIVE_POSITION = 1 };
-enum hb_drive_shape { HB_DRIVE_CONSTANT = 0, HB_DRIVE_TRIANGLE = 1, HB_DRIVE_STEP = 2 };
+/* A nudge is a force of `offset` that ends when the handle has moved by `amplitude`: by its own work it gives a handle at
+ * most their product (N mm = mJ). It is for a device whose signs nobody has checked. */
+enum hb_drive_shape { HB_DRIVE_CONSTANT = 0, HB_DRIVE_TRIANGLE = 1, HB_DRIVE_STEP = 2, HB_DRIVE_NUDGE = 3 };
 
 struct hb_drive {
     struct hb_drive_request request;
     uint32_t tick;      /* since the start */
+    int32_t from_counts; /* where the handle was then */
     float reference_mm; /* mode 1: where the servo wants to be now */
     float integral_N;   /* mode 1: what its integral has come to */
     int32_t seen_counts;  /* mode 1: where the handle was when it last moved, or needed no push */
@@ -40,7 +43,7 @@ enum hb_reason hb_drive_check(const struct hb_drive_request *request, const stru
 void hb_drive_begin(struct hb_drive *drive, const struct hb_drive_request *request, const struct hb_config *config,
                     const struct hb_safety *safety);
 
-bool hb_drive_has_ended(const struct hb_drive *drive);
+bool hb_drive_has_ended(const struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety);
 
 /* The servo pushes and sees no movement: the encoder is stuck, or what is in the way is stronger. */
 bool hb_drive_is_stuck(const struct hb_drive *drive, const struct hb_config *config);

@@ -54,6 +54,18 @@ float hb_power(uint32_t base, float exponent)
     return (float)rounded * ((float)(UINT32_C(1) << whole) / 8388608.0F);
 }
 
+float hb_root(float value)
+{
+    if (!(value > 0.0F)) {
+        return 0.0F;
+    }
+    float root = hb_float_of_bits((hb_bits_of_float(value) >> 1) + UINT32_C(0x1fc00000)); /* within 6 % */
+    for (uint32_t i = 0U; i < 3U; i += 1U) {
+        root = 0.5F * (root + value / root);
+    }
+    return root;
+}
+
 bool hb_is_finite(float value)
 {
     return (hb_bits_of_float(value) & UINT32_C(0x7f800000)) != UINT32_C(0x7f800000);

@@ -15,6 +15,10 @@ bool hb_is_finite(float value);
 /*@ assigns \nothing; */
 float hb_absolute(float value);
 
+/* Square root of a finite value >= 0, within one unit in the last place; without libm, by Newton's steps. */
+/*@ assigns \nothing; */
+float hb_root(float value);
+
 /* `value`, or the nearer of the two bounds; low <= high, none of them NaN. */
 /*@ assigns \nothing; */
 float hb_clamp(float value, float low, float high);

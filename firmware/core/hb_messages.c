@@ -79,17 +79,19 @@ size_t hb_request_size(uint8_t type, const uint8_t *payload, size_t size)
     case HB_SET_STATES:
         return size < 4U || payload[3] == 0U || payload[3] > 7U ? 60U : 4U + 8U * (size_t)payload[3];
     case HB_COMMIT:
-    case HB_START:
+    case HB_HOME:
         return 12U;
+    case HB_START:
+        return 16U;
     case HB_GET_SET:
         return 1U;
     case HB_STREAM:
         return 2U;
     case HB_CLEAR:
     case HB_HEARTBEAT:
-        return 4U;
+        return 8U;
     case HB_DRIVE:
-        return 24U;
+        return 28U;
     case HB_ABORT:
     case HB_GET_STATUS:
     case HB_GET_LIMITS:
@@ -155,15 +157,29 @@ bool hb_unpack_drive(const uint8_t *payload, struct hb_drive_request *drive)
     drive->period_ticks = get_u32(payload + 12);
     drive->duration_ticks = get_u32(payload + 16);
     drive->boot_id = get_u32(payload + 20);
+    drive->stop = get_u32(payload + 24);
     return get_u16(payload + 2) == 0U;
 }
 
-uint32_t hb_unpack_boot_id(const uint8_t *payload)
+uint32_t hb_unpack_stop(const uint8_t *payload)
 {
     return get_u32(payload);
 }
 
-size_t hb_pack_hello_reply(const struct hb_config *config, uint32_t boot_id, uint8_t *payload)
+void hb_unpack_pair(const uint8_t *payload, struct hb_pair *pair)
+{
+    pair->boot_id = get_u32(payload);
+    pair->second = get_u32(payload + 4);
+}
+
+void hb_unpack_home(const uint8_t *payload, struct hb_home_request *home)
+{
+    home->boot_id = get_u32(payload);
+    home->stop = get_u32(payload + 4);
+    home->position_mm = get_f32(payload + 8);
+}
+
+size_t hb_pack_hello_reply(const struct hb_config *config, uint32_t boot_id, uint32_t tick, uint8_t *payload)
 {
     size_t at = put_u16(payload, 0U, HB_PROTOCOL_VERSION);
     at = put_u16(payload, at, config->tick_rate_Hz);
@@ -182,7 +198,8 @@ size_t hb_pack_hello_reply(const struct hb_config *config, uint32_t boot_id, uin
     at = put_u16(payload, at, config->hold_ticks);
     at = put_u16(payload, at, config->most_taps);
     at = put_u8(payload, at, config->most_states);
-    return put_u8(payload, at, config->capabilities);
+    at = put_u8(payload, at, config->capabilities);
+    return put_u32(payload, at, tick);
 }
 
 size_t hb_pack_limits(const struct hb_config *config, uint8_t *payload)
@@ -190,15 +207,19 @@ size_t hb_pack_limits(const struct hb_config *config, uint8_t *payload)
     size_t at = put_range(payload, 0U, config->K0_N_per_mm);
     at = put_range(payload, at, config->K1_N_per_mm);
     at = put_range(payload, at, config->B1_N_s_alpha_per_mm);
-    return put_range(payload, at, config->alpha);
+    at = put_range(payload, at, config->alpha);
+    at = put_u32(payload, at, config->delay_us);
+    at = put_f32(payload, at, config->continuous_force_N);
+    return put_f32(payload, at, config->heating_s);
 }
 
-size_t hb_pack_ack(uint8_t request, uint16_t set_id, uint32_t crc, uint8_t *payload)
+size_t hb_pack_ack(uint8_t request, uint16_t set_id, uint32_t crc, uint32_t stops, uint8_t *payload)
 {
     size_t at = put_u8(payload, 0U, request);
     at = put_u8(payload, at, 0U);
     at = put_u16(payload, at, set_id);
-    return put_u32(payload, at, crc);
+    at = put_u32(payload, at, crc);
+    return put_u32(payload, at, stops);
 }
 
 size_t hb_pack_nack(const struct hb_nack *nack, uint8_t *payload)
@@ -233,7 +254,9 @@ size_t hb_pack_status(const struct hb_status *status, uint8_t *payload)
     for (size_t i = 0U; i < 8U; i += 1U) {
         at = put_u16(payload, at, status->counts[i]);
     }
-    return at;
+    at = put_u32(payload, at, status->stops);
+    at = put_u16(payload, at, status->flags);
+    return put_u16(payload, at, 0U);
 }
 
 size_t hb_pack_set(const struct hb_set_reply *reply, uint8_t *payload)
@@ -259,7 +282,8 @@ size_t hb_pack_notice(const struct hb_notice *notice, uint8_t *payload)
     at = put_u32(payload, at, notice->boot_id);
     at = put_u8(payload, at, notice->state);
     at = put_u8(payload, at, notice->reason);
-    return put_u16(payload, at, 0U);
+    at = put_u16(payload, at, 0U);
+    return put_u32(payload, at, notice->stops);
 }
 
 size_t hb_pack_telemetry_head(uint32_t tick, uint8_t divisor, uint8_t fields, uint16_t lost, uint8_t *payload)

@@ -10,8 +10,8 @@
 #include "hb_frame.h"
 #include "hb_renderer.h"
 
-#define HB_PROTOCOL_VERSION 1U
-#define HB_SCHEMA_CRC 0x1a3dd452U /* CRC-32 of the schema block; a test compares it with PROTOCOL.md */
+#define HB_PROTOCOL_VERSION 2U
+#define HB_SCHEMA_CRC 0xd2ad5d8aU /* CRC-32 of the schema block; a test compares it with PROTOCOL.md */
 
 enum hb_type {
     HB_HELLO = 0x01,
@@ -30,6 +30,7 @@ enum hb_type {
     HB_HEARTBEAT = 0x0e,
     HB_DRIVE = 0x0f,
     HB_ECHO = 0x10,
+    HB_HOME = 0x11,
     HB_HELLO_REPLY = 0x41,
     HB_LIMITS = 0x42,
     HB_ACK = 0x43,
@@ -38,7 +39,8 @@ enum hb_type {
     HB_SET = 0x46,
     HB_NOTICE = 0x47,
     HB_TELEMETRY = 0x48,
-    HB_ECHO_REPLY = 0x49
+    HB_ECHO_REPLY = 0x49,
+    HB_PULSE = 0x4a
 };
 
 enum hb_memory { HB_SHORT = 0, HB_FULL = 1 };
@@ -57,7 +59,9 @@ enum hb_cause {
     HB_CAUSE_MODEL = 5,
     HB_CAUSE_ENERGY = 6,
     HB_CAUSE_ESTOP = 7,
-    HB_CAUSE_BOOT = 8
+    HB_CAUSE_BOOT = 8,
+    HB_CAUSE_SWITCH = 9, /* the hardware stop is open */
+    HB_CAUSE_HEAT = 10
 };
 
 /* Why a request is refused (NACK). */
@@ -92,7 +96,11 @@ enum hb_reason {
     HB_NACK_LINE_TOO_SLOW = 27,
     HB_NACK_NOT_CAPABLE = 28,
     HB_NACK_DRIVE_RANGE = 29,
-    HB_NACK_NO_INPUT = 30
+    HB_NACK_NO_INPUT = 30,
+    HB_NACK_IN_CONTACT = 31,
+    HB_NACK_STALE = 32,
+    HB_NACK_NOT_HOMED = 33,
+    HB_NACK_STOP_OPEN = 34
 };
 
 /* Flags of a telemetry sample. */
@@ -116,11 +124,23 @@ struct hb_hello {
     uint32_t schema;
 };
 
-/* COMMIT and START */
+/* COMMIT, and START, which also names a stop */
 struct hb_confirmation {
     uint16_t set_id;
     uint32_t crc;
     uint32_t boot_id;
+};
+
+/* CLEAR: which start of the device, and which stop; HEARTBEAT: which start, and the last tick that the host has heard. */
+struct hb_pair {
+    uint32_t boot_id;
+    uint32_t second;
+};
+
+struct hb_home_request {
+    uint32_t boot_id;
+    uint32_t stop;
+    float position_mm;
 };
 
 struct hb_states {
@@ -139,6 +159,7 @@ struct hb_drive_request {
     uint32_t period_ticks;
     uint32_t duration_ticks;
     uint32_t boot_id;
+    uint32_t stop;
 };
 
 #define HB_NO_REQUEST SIZE_MAX
@@ -162,12 +183,18 @@ void hb_unpack_states(const uint8_t *payload, struct hb_states *states);
 /*@ requires \valid_read(payload + (0 .. 11)) && \valid(confirmation);
     assigns *confirmation; */
 bool hb_unpack_confirmation(const uint8_t *payload, struct hb_confirmation *confirmation);
-/*@ requires \valid_read(payload + (0 .. 23)) && \valid(drive);
+/*@ requires \valid_read(payload + (0 .. 27)) && \valid(drive);
     assigns *drive; */
 bool hb_unpack_drive(const uint8_t *payload, struct hb_drive_request *drive);
 /*@ requires \valid_read(payload + (0 .. 3));
     assigns \nothing; */
-uint32_t hb_unpack_boot_id(const uint8_t *payload); /* CLEAR and HEARTBEAT */
+uint32_t hb_unpack_stop(const uint8_t *payload); /* the last four bytes of START */
+/*@ requires \valid_read(payload + (0 .. 7)) && \valid(pair);
+    assigns *pair; */
+void hb_unpack_pair(const uint8_t *payload, struct hb_pair *pair);
+/*@ requires \valid_read(payload + (0 .. 11)) && \valid(home) && \separated(payload + (0 .. 11), home);
+    assigns *home; */
+void hb_unpack_home(const uint8_t *payload, struct hb_home_request *home);
 
 #define HB_TELEMETRY_HEAD 8U
 #define HB_SAMPLE_SIZE(with_sensed) ((with_sensed) ? 12U : 8U)
@@ -197,6 +224,8 @@ struct hb_status {
     float force_N;
     float energy_mJ;
     uint16_t counts[8]; /* in the order of the schema */
+    uint32_t stops;
+    uint16_t flags; /* 1 homed, 2 the hardware stop is open */
 };
 
 struct hb_set_reply {
@@ -207,11 +236,13 @@ struct hb_set_reply {
     float minimum_damping_N_s_per_m;
 };
 
+/* NOTICE, and PULSE, which answers a heartbeat */
 struct hb_notice {
     uint32_t tick;
     uint32_t boot_id;
     uint8_t state;
     uint8_t reason;
+    uint32_t stops;
 };
 
 struct hb_sample {
@@ -221,33 +252,33 @@ struct hb_sample {
     float sensed_N;
 };
 
-/*@ requires \valid(payload + (0 .. 55)) && \valid_read(config);
-    assigns payload[0 .. 55];
-    ensures \result == 56; */
-size_t hb_pack_hello_reply(const struct hb_config *config, uint32_t boot_id, uint8_t *payload);
-/*@ requires \valid(payload + (0 .. 31)) && \valid_read(config);
-    assigns payload[0 .. 31];
-    ensures \result == 32; */
+/*@ requires \valid(payload + (0 .. 59)) && \valid_read(config);
+    assigns payload[0 .. 59];
+    ensures \result == 60; */
+size_t hb_pack_hello_reply(const struct hb_config *config, uint32_t boot_id, uint32_t tick, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 43)) && \valid_read(config);
+    assigns payload[0 .. 43];
+    ensures \result == 44; */
 size_t hb_pack_limits(const struct hb_config *config, uint8_t *payload);
-/*@ requires \valid(payload + (0 .. 7));
-    assigns payload[0 .. 7];
-    ensures \result == 8; */
-size_t hb_pack_ack(uint8_t request, uint16_t set_id, uint32_t crc, uint8_t *payload);
+/*@ requires \valid(payload + (0 .. 11));
+    assigns payload[0 .. 11];
+    ensures \result == 12; */
+size_t hb_pack_ack(uint8_t request, uint16_t set_id, uint32_t crc, uint32_t stops, uint8_t *payload);
 /*@ requires \valid(payload + (0 .. 15)) && \valid_read(nack);
     assigns payload[0 .. 15];
     ensures \result == 16; */
 size_t hb_pack_nack(const struct hb_nack *nack, uint8_t *payload);
-/*@ requires \valid(payload + (0 .. 55)) && \valid_read(status);
-    assigns payload[0 .. 55];
-    ensures \result == 56; */
+/*@ requires \valid(payload + (0 .. 63)) && \valid_read(status);
+    assigns payload[0 .. 63];
+    ensures \result == 64; */
 size_t hb_pack_status(const struct hb_status *status, uint8_t *payload);
 /*@ requires \valid(payload + (0 .. 35)) && \valid_read(reply);
     assigns payload[0 .. 35];
     ensures \result == 36; */
 size_t hb_pack_set(const struct hb_set_reply *reply, uint8_t *payload);
-/*@ requires \valid(payload + (0 .. 11)) && \valid_read(notice);
-    assigns payload[0 .. 11];
-    ensures \result == 12; */
+/*@ requires \valid(payload + (0 .. 15)) && \valid_read(notice);
+    assigns payload[0 .. 15];
+    ensures \result == 16; */
 size_t hb_pack_notice(const struct hb_notice *notice, uint8_t *payload);
 /*@ requires \valid(payload + (0 .. 7));
     assigns payload[0 .. 7];

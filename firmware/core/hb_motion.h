@@ -1,4 +1,8 @@
-/* The states, and the requests that change them. */
+/* The states, and the requests that change them.
+ *
+ * Orders in time: `stops` counts every stop. START, DRIVE, CLEAR and HOME name the stop that their sender knew of, and do
+ * nothing after a later one. RUNNING and DRIVING end in a stop, and CLEAR ends the stop that it names, so that each of
+ * these orders acts at most once, whatever is lost, late or sent twice. */
 #ifndef HB_MOTION_H
 #define HB_MOTION_H
 
@@ -12,7 +16,8 @@ void hb_enter(struct hb_device *device, enum hb_state state, enum hb_cause cause
 enum hb_reason hb_start(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply);
 enum hb_reason hb_drive(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply);
 enum hb_reason hb_clear(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply);
+enum hb_reason hb_home_here(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply);
 void hb_stop(struct hb_device *device);
-void hb_estop(struct hb_device *device);
+void hb_estop(struct hb_device *device, enum hb_cause cause);
 
 #endif

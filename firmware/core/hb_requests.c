@@ -1,5 +1,7 @@
 #include "hb_requests.h"
 
+#include <string.h>
+
 #include "hb_motion.h"
 #include "hb_staging.h"
 
@@ -21,9 +23,10 @@ static enum hb_reason hello(struct hb_device *device, const struct hb_frame *fra
         return HB_NACK_SCHEMA;
     }
     device->greeted = true;
+    device->answered = false; /* what another conversation was answered is not for this one */
     hb_stream_begin(&device->stream, 0U, 0U);
     reply->type = HB_HELLO_REPLY;
-    reply->size = hb_pack_hello_reply(device->config, device->boot_id, reply->payload);
+    reply->size = hb_pack_hello_reply(device->config, device->boot_id, device->tick, reply->payload);
     return HB_ACCEPTED;
 }
 
@@ -81,6 +84,8 @@ static enum hb_reason get_status(const struct hb_device *device, struct hb_reply
         .energy_mJ = hb_energy_mJ(&device->safety),
         .counts = {count->input_held, count->saturated, count->slewed, count->controlled, count->holds, count->estops,
                    count->overruns, device->receiver.dropped},
+        .stops = device->stops,
+        .flags = (uint16_t)((device->safety.homed ? 1U : 0U) | (device->stop_open ? 2U : 0U)),
     };
     status.staging = (uint8_t)hb_staging_now(device, &status.ticks_until_ready);
     if (device->in_force) {
@@ -158,7 +163,7 @@ static enum hb_reason carry_out(struct hb_device *device, const struct hb_frame 
         hb_stop(device);
         return HB_ACCEPTED;
     case HB_ESTOP:
-        hb_estop(device);
+        hb_estop(device, HB_CAUSE_ESTOP);
         return HB_ACCEPTED;
     case HB_CLEAR:
         return hb_clear(device, frame, reply);
@@ -166,6 +171,8 @@ static enum hb_reason carry_out(struct hb_device *device, const struct hb_frame 
         return stream(device, frame, reply);
     case HB_DRIVE:
         return hb_drive(device, frame, reply);
+    case HB_HOME:
+        return hb_home_here(device, frame, reply);
     default:
         return echo(frame, reply);
     }
@@ -194,11 +201,17 @@ static enum hb_reason admit(const struct hb_device *device, const struct hb_fram
 static bool acts_once(uint8_t type)
 {
     return type == HB_SET_PARAMS || type == HB_SET_STATES || type == HB_COMMIT || type == HB_ABORT ||
-           type == HB_START || type == HB_CLEAR || type == HB_STREAM || type == HB_DRIVE;
+           type == HB_START || type == HB_CLEAR || type == HB_STREAM || type == HB_DRIVE || type == HB_HOME;
+}
+
+static void put_out(struct hb_device *device, const uint8_t *bytes, size_t size)
+{
+    (void)hb_output_put(&device->output, bytes, size, 0U);
 }
 
 static void answer(struct hb_device *device, const struct hb_frame *frame)
 {
+    uint8_t bytes[HB_MAX_FRAME];
     struct hb_reply reply = {.type = HB_ACK};
     enum hb_reason reason = admit(device, frame, &reply);
     if (reason == HB_ACCEPTED) {
@@ -210,24 +223,49 @@ static void answer(struct hb_device *device, const struct hb_frame *frame)
         reply.nack.reason = (uint8_t)reason;
         reply.size = hb_pack_nack(&reply.nack, reply.payload);
     } else if (reply.type == HB_ACK) {
-        reply.size = hb_pack_ack(frame->type, reply.set_id, reply.crc, reply.payload);
+        reply.size = hb_pack_ack(frame->type, reply.set_id, reply.crc, device->stops, reply.payload);
     }
-    device->answer_size = hb_frame_write(reply.type, frame->seq, reply.payload, reply.size, device->answer);
-    device->answered = acts_once(frame->type);
-    device->answered_seq = frame->seq;
-    device->answered_crc = frame->crc;
+    size_t size = hb_frame_write(reply.type, frame->seq, reply.payload, reply.size, bytes);
+    put_out(device, bytes, size);
+    if (acts_once(frame->type)) {
+        memcpy(device->answer, bytes, size);
+        device->answer_size = size;
+        device->answered = true;
+        device->answered_seq = frame->seq;
+        device->answered_crc = frame->crc;
+    }
+}
+
+/* A heartbeat is as old as the tick that its sender has heard: one that was long on its way, in either direction, feeds
+ * the watchdog no more than the ticks since then leave. */
+static void heartbeat(struct hb_device *device, const struct hb_frame *frame)
+{
+    struct hb_pair pair;
+    if (frame->size != hb_request_size(HB_HEARTBEAT, frame->payload, frame->size)) {
+        return;
+    }
+    hb_unpack_pair(frame->payload, &pair);
+    uint32_t age = device->tick - pair.second; /* of a tick that has not been: more than any watchdog */
+    if (pair.boot_id != device->boot_id) {
+        return;
+    }
+    if (age < device->heartbeat_age_ticks) {
+        device->heartbeat_age_ticks = age;
+    }
+    uint8_t payload[HB_MAX_PAYLOAD];
+    uint8_t bytes[HB_MAX_FRAME];
+    struct hb_notice pulse = {device->tick, device->boot_id, device->state, device->cause, device->stops};
+    size_t size = hb_pack_notice(&pulse, payload);
+    put_out(device, bytes, hb_frame_write(HB_PULSE, frame->seq, payload, size, bytes));
 }
 
 void hb_handle(struct hb_device *device, const struct hb_frame *frame)
 {
     if (frame->type == HB_HEARTBEAT) {
-        if (frame->size == 4U && hb_unpack_boot_id(frame->payload) == device->boot_id) {
-            device->heartbeat_age_ticks = 0U;
-        }
-        return;
-    }
-    if (!device->answered || frame->seq != device->answered_seq || frame->crc != device->answered_crc) {
+        heartbeat(device, frame);
+    } else if (device->answered && frame->seq == device->answered_seq && frame->crc == device->answered_crc) {
+        put_out(device, device->answer, device->answer_size);
+    } else {
         answer(device, frame);
     }
-    (void)hb_output_put(&device->output, device->answer, device->answer_size, 0U);
 }

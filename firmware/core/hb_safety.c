@@ -12,16 +12,41 @@ void hb_count_up(uint16_t *counter)
     }
 }
 
-static bool is_plausible(const struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input)
+void hb_safety_begin(struct hb_safety *safety, const struct hb_config *config)
 {
-    float position_mm = (float)input->position_counts * config->encoder_step_mm;
-    if (!input->position_valid || position_mm < config->position_low_mm || position_mm > config->position_high_mm) {
+    safety->homed = (config->capabilities & (uint8_t)HB_IS_HOMED_AT_BOOT) != 0U;
+    safety->placed = safety->homed;
+    safety->heat_share = 1.0F / (config->heating_s * (float)config->tick_rate_Hz);
+}
+
+void hb_home(struct hb_safety *safety, const struct hb_config *config, float position_mm)
+{
+    float steps = position_mm / config->encoder_step_mm;
+    int32_t counts = (int32_t)(steps < 0.0F ? steps - 0.5F : steps + 0.5F);
+    safety->zero_counts += safety->counts - counts;
+    safety->counts = counts;
+    safety->homed = true;
+}
+
+/* Before the device is homed, the stroke is unknown: any position that telemetry can tell is within it. */
+static bool is_within_stroke(const struct hb_safety *safety, const struct hb_config *config, int64_t counts)
+{
+    if (!safety->homed) {
+        return counts >= -32767 && counts <= 32767;
+    }
+    float position_mm = (float)counts * config->encoder_step_mm;
+    return position_mm >= config->position_low_mm && position_mm <= config->position_high_mm;
+}
+
+static bool is_plausible(const struct hb_safety *safety, const struct hb_config *config, bool valid, int64_t counts)
+{
+    if (!valid || !is_within_stroke(safety, config, counts)) {
         return false;
     }
     if (!safety->known) {
         return true;
     }
-    float step_mm = (float)(input->position_counts - safety->counts) * config->encoder_step_mm;
+    float step_mm = (float)(counts - safety->counts) * config->encoder_step_mm;
     return hb_absolute(step_mm) <= config->plausible_step_mm * (float)(safety->bad + 1U);
 }
 
@@ -38,8 +63,13 @@ static void believe(struct hb_safety *safety, int32_t counts)
 
 bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input)
 {
-    if (is_plausible(safety, config, input)) {
-        believe(safety, input->position_counts);
+    if (!safety->placed && input->position_valid) {
+        safety->zero_counts = input->position_counts;
+        safety->placed = true;
+    }
+    int64_t counts = (int64_t)input->position_counts - safety->zero_counts;
+    if (is_plausible(safety, config, input->position_valid, counts)) {
+        believe(safety, (int32_t)counts);
         return true;
     }
     hb_count_up(&safety->count.input_held);
@@ -135,6 +165,12 @@ float hb_slew(struct hb_safety *safety, const struct hb_config *config, float fo
         safety->flags |= (uint16_t)HB_FLAG_SLEWED;
     }
     return hb_clamp(force_N, safety->force_N - step_N, safety->force_N + step_N);
+}
+
+bool hb_is_too_hot(struct hb_safety *safety, const struct hb_config *config)
+{
+    safety->heat_N2 += safety->heat_share * (safety->force_N * safety->force_N - safety->heat_N2);
+    return safety->heat_N2 > config->continuous_force_N * config->continuous_force_N;
 }
 
 bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *config)

@@ -1,9 +1,9 @@
 /* The safety chain of one tick, and what it has to remember. The device calls the links in this order:
  *
- *     input check - model - passivity observer and controller - saturation - slew limit - velocity limit and overrun
+ *     input check - model - passivity observer and controller - saturation - slew limit - velocity, overrun, heating
  *
- * Whatever acts is counted and flagged. Input, velocity and overrun lead to HOLD, which the device decides. While a
- * model is rendered there is no force out of contact, and a force that falls is not slew-limited. */
+ * Whatever acts is counted and flagged. Input, velocity, overrun and heating lead to HOLD, which the device decides.
+ * While a model is rendered there is no force out of contact, and a force that falls is not slew-limited. */
 #ifndef HB_SAFETY_H
 #define HB_SAFETY_H
 
@@ -15,9 +15,11 @@
 
 /* What the port knows at a tick. */
 struct hb_input {
-    int32_t position_counts; /* of the encoder, 0 at the surface, positive into it */
+    int32_t position_counts; /* of the encoder, positive into the material; 0 at the surface where it is absolute */
     bool position_valid;     /* false where the encoder gave no number: counts as bad input */
-    bool overrun;            /* a tick was missed, or the last one took longer than its period */
+    bool overrun;            /* a tick was missed */
+    bool stop_open;          /* the hardware stop is open: ESTOP, for as long as it is */
+    uint32_t delay_us;       /* from when the last tick was due until its force was out */
     float sensed_N;          /* what pushes the handle towards positive positions; NaN where nothing was read.
                               * Only passed on to telemetry. */
 };
@@ -34,7 +36,10 @@ struct hb_counts {
 };
 
 struct hb_safety {
-    int32_t counts;      /* the last position that was believed */
+    bool homed;          /* `zero_counts` is the surface */
+    bool placed;         /* `zero_counts` is a position that was seen */
+    int32_t zero_counts; /* what the encoder counts at position 0 */
+    int32_t counts;      /* the last position that was believed, from there */
     int32_t step_counts; /* how it changed, over `step_ticks`; 0 while a position is held */
     uint16_t step_ticks;
     bool known;       /* there has been a position to compare with */
@@ -43,6 +48,8 @@ struct hb_safety {
     uint16_t loss;    /* HB_LOSS_OF_BAD more for each bad position, 1 less for each good one */
     bool touching;    /* in contact at the last tick */
     int64_t energy;   /* that went into the device during this touch, 2^-20 mJ */
+    float heat_N2;    /* the square of the command, averaged over the time constant of heating */
+    float heat_share; /* of one tick in that average */
     float force_N;    /* the last command */
     float ramp_N;     /* the command when HOLD or STOP began */
     uint16_t ramp_ticks; /* since then, up to hold_ticks */
@@ -57,6 +64,12 @@ struct hb_safety {
 
 /* One more, unless it is 65535. */
 void hb_count_up(uint16_t *counter);
+
+/* At boot. */
+void hb_safety_begin(struct hb_safety *safety, const struct hb_config *config);
+
+/* The handle stands at `position_mm`, which is within the stroke: from now on positions count from there. */
+void hb_home(struct hb_safety *safety, const struct hb_config *config, float position_mm);
 
 /* Believe the position, or keep the last one. False when the input is lost. */
 bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input);
@@ -86,6 +99,9 @@ float hb_saturate(struct hb_safety *safety, float force_N, float limit_N);
 /* Within one tick's change of the last command. `expected_N` is counted against, where the device itself is about to
  * take a difference back: it differs from `force_N` by what this tick took. */
 float hb_slew(struct hb_safety *safety, const struct hb_config *config, float force_N, float expected_N);
+
+/* One tick of heating by the last command; true above the continuous limit. */
+bool hb_is_too_hot(struct hb_safety *safety, const struct hb_config *config);
 
 /* The believed position moved faster than the limit. */
 bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *config);

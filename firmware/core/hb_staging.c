@@ -86,6 +86,14 @@ static void begin_history(struct hb_device *device)
     hb_renderer_rest(idle, hb_penetration_mm(&device->safety, device->config));
     device->warm_left = idle->warm_ticks;
     device->staging = (uint8_t)HB_WARMING;
+    hb_delay_begin(&device->delay_check, device->config);
+}
+
+void hb_rest_histories(struct hb_device *device)
+{
+    float x_mm = hb_penetration_mm(&device->safety, device->config);
+    hb_renderer_rest(&device->bank[0], x_mm);
+    hb_renderer_rest(&device->bank[1], x_mm);
 }
 
 enum hb_reason hb_stage_parameters(struct hb_device *device, const struct hb_frame *frame, struct hb_nack *nack)
@@ -158,11 +166,10 @@ enum hb_staging hb_staging_now(const struct hb_device *device, uint32_t *ticks)
     if (device->staging != (uint8_t)HB_WARMING) {
         return device->staging == (uint8_t)HB_EMPTY ? HB_EMPTY : HB_INCOMPLETE;
     }
-    if (device->warm_left == 0U || !hb_in_contact(&device->safety)) {
-        return HB_READY;
-    }
-    *ticks = device->warm_left;
-    return HB_WARMING;
+    uint32_t check = hb_delay_ticks_left(&device->delay_check);
+    uint32_t warm = hb_in_contact(&device->safety) ? device->warm_left : 0U;
+    *ticks = check > warm ? check : warm;
+    return *ticks == 0U ? HB_READY : HB_WARMING;
 }
 
 static bool names(const struct hb_confirmation *confirmation, const struct hb_device *device, uint8_t bank)
@@ -186,6 +193,12 @@ enum hb_reason hb_commit(struct hb_device *device, const struct hb_confirmation 
     if (staging != HB_READY) {
         return staging == HB_INCOMPLETE ? HB_NACK_STATES : HB_NACK_NOT_READY;
     }
+    if (!hb_delay_is_passive(&device->delay_check, &device->bank[idle], device->config)) {
+        device->staging = (uint8_t)HB_EMPTY;
+        nack->value = device->bank[idle].minimum_damping_N_s_per_m;
+        nack->limit = device->config->damping_N_s_per_m;
+        return HB_NACK_NOT_PASSIVE;
+    }
     nack->ticks = hb_busy_ticks(device);
     if (nack->ticks > 0U) {
         return HB_NACK_BUSY;
@@ -194,7 +207,6 @@ enum hb_reason hb_commit(struct hb_device *device, const struct hb_confirmation 
         hb_renderer_rest(&device->bank[idle], 0.0F);
     }
     device->flipped = device->in_force;
-    device->follows = device->in_force;
     device->in_force = true;
     device->active = idle;
     device->staging = (uint8_t)HB_EMPTY;
@@ -205,7 +217,7 @@ uint32_t hb_busy_ticks(const struct hb_device *device)
 {
     float step_N = device->config->slew_limit_N_per_s / (float)device->config->tick_rate_Hz;
     float ticks = hb_absolute(device->offset_N) / step_N;
-    uint32_t more = device->flipped || device->starting ? 1U : 0U;
+    uint32_t more = device->flipped ? 1U : 0U;
     if (device->offset_N != 0.0F) {
         more += 1U;
     }
@@ -216,10 +228,11 @@ float hb_render(struct hb_device *device, float x_mm, float *old_N)
 {
     struct hb_renderer *idle = idle_bank(device);
     *old_N = 0.0F;
-    if ((device->flipped || device->offset_N != 0.0F) && device->follows) {
+    if (device->flipped || device->offset_N != 0.0F) {
         *old_N = hb_renderer_step(idle, x_mm);
     } else if (device->staging == (uint8_t)HB_WARMING) {
         (void)hb_renderer_step(idle, x_mm);
+        hb_delay_step(&device->delay_check, idle, device->config);
         if (device->warm_left > 0U) {
             device->warm_left -= 1U;
         }

@@ -16,6 +16,9 @@ enum hb_reason hb_commit(struct hb_device *device, const struct hb_confirmation 
 /* What STATUS says about staging; `ticks` until COMMIT is possible. */
 enum hb_staging hb_staging_now(const struct hb_device *device, uint32_t *ticks);
 
+/* The handle's position has got another name: every history is at rest where it now is. */
+void hb_rest_histories(struct hb_device *device);
+
 /* Ticks until the difference of two forces has been taken back, 0 if there is none. */
 uint32_t hb_busy_ticks(const struct hb_device *device);
 

@@ -49,6 +49,9 @@ int shim_init(struct shim *shim, const double *n, uint32_t boot_id)
     c->servo_damping_N_s_per_mm = (float)n[25];
     c->servo_integral_N_per_mm_s = (float)n[26];
     c->servo_speed_mm_per_s = (float)n[27];
+    c->delay_us = (uint32_t)n[28];
+    c->continuous_force_N = (float)n[29];
+    c->heating_s = (float)n[30];
     return (int)hb_init(&shim->device, c, boot_id);
 }
 
@@ -75,10 +78,51 @@ size_t shim_transmit(struct shim *shim, uint8_t *bytes, size_t room)
     return hb_transmit(&shim->device, bytes, room);
 }
 
+static struct hb_parameters parameters(const double *n)
+{
+    return (struct hb_parameters){
+        .set_id = 1U,
+        .memory = (uint8_t)n[0],
+        .length = (uint16_t)n[1],
+        .tick_rate_Hz = (uint16_t)n[2],
+        .K0_N_per_mm = (float)n[3],
+        .K1_N_per_mm = (float)n[4],
+        .B1_N_s_alpha_per_mm = (float)n[5],
+        .alpha = (float)n[6],
+        .force_limit_N = 1000.0F,
+    };
+}
+
 float shim_tick(struct shim *shim, int32_t counts, int valid, int overrun, float sensed_N)
 {
-    struct hb_input input = {counts, valid != 0, overrun != 0, sensed_N};
+    struct hb_input input = {counts, valid != 0, overrun != 0, false, shim->config.delay_us, sensed_N};
     return hb_tick(&shim->device, &input);
+}
+
+/* A tick on a good position whose predecessor's force was out after so long, with the hardware stop open or closed. */
+float shim_tick_of_board(struct shim *shim, int32_t counts, uint32_t delay_us, int stop_open)
+{
+    struct hb_input input = {counts, true, false, stop_open != 0, delay_us, 0.0F};
+    return hb_tick(&shim->device, &input);
+}
+
+/* The damping that a set needs at a delay, as the device finds it angle by angle. */
+double shim_delayed_damping(const double *set, const float *weight, const float *loss, uint32_t delay_us)
+{
+    static struct hb_renderer renderer;
+    struct hb_parameters given = parameters(set);
+    struct hb_config config = {.tick_rate_Hz = given.tick_rate_Hz, .delay_us = delay_us, .damping_N_s_per_m = 1.0F};
+    struct hb_delay_check check;
+    hb_renderer_prepare(&renderer, &given);
+    for (size_t k = 0U; given.memory == (uint8_t)HB_FULL && k < given.length; k += 1U) {
+        hb_renderer_set_state(&renderer, k, weight[k], loss[k]);
+    }
+    hb_delay_begin(&check, &config);
+    while (hb_delay_ticks_left(&check) > 0U) {
+        hb_delay_step(&check, &renderer, &config);
+    }
+    (void)hb_delay_is_passive(&check, &renderer, &config);
+    return (double)renderer.minimum_damping_N_s_per_m;
 }
 
 uint32_t shim_flags(const struct shim *shim)
@@ -106,21 +150,6 @@ void shim_run(struct shim *shim, const int32_t *counts, size_t size, int beating
         forces[i] = shim_tick(shim, counts[i], 1, 0, 0.0F);
         flags[i] = shim->device.safety.flags;
     }
-}
-
-static struct hb_parameters parameters(const double *n)
-{
-    return (struct hb_parameters){
-        .set_id = 1U,
-        .memory = (uint8_t)n[0],
-        .length = (uint16_t)n[1],
-        .tick_rate_Hz = (uint16_t)n[2],
-        .K0_N_per_mm = (float)n[3],
-        .K1_N_per_mm = (float)n[4],
-        .B1_N_s_alpha_per_mm = (float)n[5],
-        .alpha = (float)n[6],
-        .force_limit_N = 1000.0F,
-    };
 }
 
 /* The renderer alone: forces (either sign) at positions x >= 0, from rest. 0 where the exponentials are refused. */

@@ -13,6 +13,8 @@ void shim_receive(struct shim *shim, const uint8_t *bytes, size_t size);
 size_t shim_receive_once(struct shim *shim, const uint8_t *bytes, size_t size);
 size_t shim_transmit(struct shim *shim, uint8_t *bytes, size_t room);
 float shim_tick(struct shim *shim, int32_t counts, int valid, int overrun, float sensed_N);
+float shim_tick_of_board(struct shim *shim, int32_t counts, uint32_t delay_us, int stop_open);
+double shim_delayed_damping(const double *set, const float *weight, const float *loss, uint32_t delay_us);
 uint32_t shim_flags(const struct shim *shim);
 double shim_offset_N(const struct shim *shim);
 uint32_t shim_warm_left(const struct shim *shim);

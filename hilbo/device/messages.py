@@ -27,10 +27,12 @@ __all__ = [
     "Heartbeat",
     "Hello",
     "HelloReply",
+    "Home",
     "Limits",
     "Message",
     "Nack",
     "Notice",
+    "Pulse",
     "Sample",
     "Set",
     "SetParams",
@@ -44,8 +46,8 @@ __all__ = [
     "name_of",
 ]
 
-VERSION = 1
-SCHEMA = 0x1A3DD452
+VERSION = 2
+SCHEMA = 0xD2AD5D8A
 """CRC-32 of the schema block of PROTOCOL.md: which bytes both sides mean."""
 
 U8 = Annotated[int, "u8"]
@@ -138,6 +140,7 @@ class Start:
     reserved: U16 = 0
     crc: U32
     boot_id: U32
+    stop: U32
 
 
 @_message
@@ -153,6 +156,7 @@ class Estop:
 @_message
 class Clear:
     boot_id: U32
+    stop: U32
 
 
 @_message
@@ -164,6 +168,7 @@ class Stream:
 @_message
 class Heartbeat:
     boot_id: U32
+    tick: U32
 
 
 @_message
@@ -176,11 +181,19 @@ class Drive:
     period_ticks: U32
     duration_ticks: U32
     boot_id: U32
+    stop: U32
 
 
 @_message
 class Echo:
     data: Annotated[bytes, "n*(byte:u8)"]
+
+
+@_message
+class Home:
+    boot_id: U32
+    stop: U32
+    position_mm: F32
 
 
 @_message
@@ -203,6 +216,7 @@ class HelloReply:
     most_taps: U16
     most_states: U8
     capabilities: U8
+    tick: U32
 
 
 @_message
@@ -215,6 +229,9 @@ class Limits:
     B1_high: F32
     alpha_low: F32
     alpha_high: F32
+    delay_us: U32
+    continuous_force_N: F32
+    heating_s: F32
 
 
 @_message
@@ -223,6 +240,7 @@ class Ack:
     reserved: U8 = 0
     set_id: U16
     crc: U32
+    stops: U32
 
 
 @_message
@@ -259,6 +277,9 @@ class Status:
     estops: U16
     overruns: U16
     frames_dropped: U16
+    stops: U32
+    flags: U16
+    reserved: U16 = 0
 
 
 @_message
@@ -285,6 +306,7 @@ class Notice:
     state: U8
     reason: U8
     reserved: U16 = 0
+    stops: U32
 
 
 @_message
@@ -301,11 +323,21 @@ class EchoReply:
     data: Annotated[bytes, "n*(byte:u8)"]
 
 
+@_message
+class Pulse:
+    tick: U32
+    boot_id: U32
+    state: U8
+    reason: U8
+    reserved: U16 = 0
+    stops: U32
+
+
 Message = Any  # one of the classes above
 # fmt: off
 _REQUESTS = (Hello, SetParams, SetStates, Commit, Abort, GetStatus, GetSet, GetLimits, Start, Stop, Estop, Clear,
-             Stream, Heartbeat, Drive, Echo)
-_ANSWERS = (HelloReply, Limits, Ack, Nack, Status, Set, Notice, Telemetry, EchoReply)
+             Stream, Heartbeat, Drive, Echo, Home)
+_ANSWERS = (HelloReply, Limits, Ack, Nack, Status, Set, Notice, Telemetry, EchoReply, Pulse)
 # fmt: on
 MESSAGES: dict[int, type] = dict(enumerate(_REQUESTS, 0x01)) | dict(enumerate(_ANSWERS, 0x41))
 """The class of each type on the wire."""

@@ -8,6 +8,7 @@ from enum import IntEnum, IntFlag
 __all__ = [
     "ABOUT_INPUT",
     "Capability",
+    "DeviceFlag",
     "HoldReason",
     "Memory",
     "NackReason",
@@ -54,6 +55,14 @@ class Capability(IntFlag):
     FORCE_SENSOR = 2
     PASSIVITY_CONTROLLER = 4
     SIMULATED = 8
+    HOMED_AT_BOOT = 16
+
+
+class DeviceFlag(IntFlag):
+    """`flags` of STATUS."""
+
+    HOMED = 1
+    STOP_OPEN = 2
 
 
 class SampleFlag(IntFlag):
@@ -83,6 +92,8 @@ class HoldReason(IntEnum):
     ENERGY = 6
     ESTOP = 7
     BOOT = 8
+    SWITCH = 9
+    HEAT = 10
 
 
 class NackReason(IntEnum):
@@ -118,6 +129,10 @@ class NackReason(IntEnum):
     NOT_CAPABLE = 28
     DRIVE_RANGE = 29
     NO_INPUT = 30
+    IN_CONTACT = 31
+    STALE = 32
+    NOT_HOMED = 33
+    STOP_OPEN = 34
 
 
 ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_TOO_SLOW, NackReason.DRIVE_RANGE}
@@ -125,14 +140,16 @@ ABOUT_INPUT = frozenset(NackReason(n) for n in range(9, 21)) | {NackReason.LINE_
 
 _HOLD = {
     HoldReason.NONE: "it was asked to",
-    HoldReason.WATCHDOG: "it heard no heartbeat from the host",
+    HoldReason.WATCHDOG: "no fresh heartbeat came from the host",
     HoldReason.INPUT: "too many positions were bad, or none changed while it pushed; check the encoder",
     HoldReason.VELOCITY: "it moved faster than its velocity limit",
-    HoldReason.OVERRUN: "a tick was missed or took too long",
+    HoldReason.OVERRUN: "a tick was missed, or its force came out later than the device's delay",
     HoldReason.MODEL: "the model's force was not finite",
     HoldReason.ENERGY: "the passivity observer stopped it",
     HoldReason.ESTOP: "the emergency stop was asked for",
     HoldReason.BOOT: "it has just started",
+    HoldReason.SWITCH: "the hardware stop is open",
+    HoldReason.HEAT: "the mean force was above what the motor bears continuously",
 }
 
 _NACK = {
@@ -167,11 +184,15 @@ _NACK = {
     NackReason.NOT_READY: "The staged set's history needs {ticks} more ticks, or no contact; wait, or let go.",
     NackReason.BUSY: "The device needs {ticks} more ticks for what it was asked before; wait.",
     NackReason.NO_SET: "The device has no set in force; send one first.",
-    NackReason.NO_HEARTBEAT: "The device hears no heartbeat; check the line from host to device.",
+    NackReason.NO_HEARTBEAT: "The device hears no fresh heartbeat; check the line in both directions.",
     NackReason.LINE_TOO_SLOW: "The line is too slow for this telemetry; every {limit:g}th tick is the most it carries.",
     NackReason.NOT_CAPABLE: "The device cannot do {request}.",
     NackReason.NO_INPUT: "The device's encoder gives no good position; check the encoder and its cable.",
-    NackReason.DRIVE_RANGE: "The drive asks for {value:.7g}, beyond the device's limit of {limit:.7g}.",
+    NackReason.DRIVE_RANGE: "{request} asks for {value:.7g}, beyond the device's limit of {limit:.7g}.",
+    NackReason.IN_CONTACT: "The handle is in the material; let it leave the surface, then start.",
+    NackReason.STALE: "The device has stopped since {request} was requested; look at its state, then request it again.",
+    NackReason.NOT_HOMED: "The device does not know where its handle is; home it first.",
+    NackReason.STOP_OPEN: "The hardware stop is open; close it, then clear.",
 }
 
 _WAY_OUT = {

@@ -12,6 +12,8 @@ struct sim_rig_config sim_rig_defaults(void)
         .world = sim_world_defaults(),
         .line_rate_baud = 921600,
         .has_sensor = true,
+        .is_homed = true,
+        .delay_us = 0,
     };
 }
 
@@ -20,7 +22,8 @@ struct sim_rig_config sim_rig_defaults(void)
 struct hb_config sim_rig_describe(const struct sim_rig_config *config)
 {
     const struct sim_world_config *world = &config->world;
-    const int capabilities = HB_CAN_DRIVE | HB_IS_SIMULATED | (config->has_sensor ? HB_CAN_SENSE_FORCE : 0);
+    const int capabilities = HB_CAN_DRIVE | HB_IS_SIMULATED | (config->has_sensor ? HB_CAN_SENSE_FORCE : 0) |
+                             (config->is_homed ? HB_IS_HOMED_AT_BOOT : 0);
     return (struct hb_config){
         .firmware = HB_FIRMWARE_HASH,
         .line_rate_baud = config->line_rate_baud,
@@ -30,8 +33,11 @@ struct hb_config sim_rig_describe(const struct sim_rig_config *config)
         .most_taps = HB_MAX_TAPS,
         .most_states = HB_MAX_STATES,
         .capabilities = (uint8_t)capabilities,
+        .delay_us = config->delay_us,
         .damping_N_s_per_m = (float)world->damping_N_s_per_m,
         .force_limit_N = 20.0F,
+        .continuous_force_N = 20.0F,
+        .heating_s = 10.0F,
         .position_low_mm = (float)(world->low_mm - 0.1), /* the encoder may round a stop outwards */
         .position_high_mm = (float)(world->high_mm + 0.1),
         .encoder_step_mm = (float)world->encoder_step_mm,
@@ -52,8 +58,10 @@ struct hb_config sim_rig_describe(const struct sim_rig_config *config)
 enum hb_error sim_rig_start(struct sim_rig *rig, const struct sim_rig_config *config, uint32_t boot_id)
 {
     rig->config = sim_rig_describe(config);
-    rig->bad_ticks = 0;
-    rig->late_ticks = 0;
+    rig->bad_ticks = rig->late_ticks = rig->late_us = 0;
+    rig->stop_open = false;
+    rig->delay_us = 0;
+    rig->motor_N = 0.0;
     sim_world_start(&rig->world, &config->world);
     return sim_rig_restart(rig, boot_id);
 }
@@ -70,15 +78,30 @@ static bool counted_down(uint32_t *left)
     return any;
 }
 
+/* The old force acts until the new one is out; an open stop lets neither through. */
+static void move_world(struct sim_rig *rig, double force_N, uint32_t delay_us)
+{
+    const double period_us = 1e6 * rig->world.config.tick_s;
+    const double share = (double)delay_us < period_us ? (double)delay_us / period_us : 1.0;
+    const double before_N = rig->stop_open ? 0.0 : -rig->motor_N;
+    sim_world_tick_late(&rig->world, before_N, rig->stop_open ? 0.0 : -force_N, share);
+    rig->motor_N = force_N;
+}
+
 float sim_rig_tick(struct sim_rig *rig)
 {
+    const uint32_t delay_us = rig->config.delay_us + rig->late_us;
+    rig->late_us = 0;
     const struct hb_input input = {
         .position_counts = sim_world_counts(&rig->world),
         .position_valid = !counted_down(&rig->bad_ticks),
         .overrun = counted_down(&rig->late_ticks),
+        .stop_open = rig->stop_open,
+        .delay_us = rig->delay_us,
         .sensed_N = (rig->config.capabilities & HB_CAN_SENSE_FORCE) != 0 ? (float)sim_world_sensed_N(&rig->world) : NAN,
     };
     const float force_N = hb_tick(&rig->device, &input);
-    sim_world_tick(&rig->world, -(double)force_N);
+    move_world(rig, (double)force_N, delay_us);
+    rig->delay_us = delay_us;
     return force_N;
 }

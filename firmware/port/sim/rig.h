@@ -12,6 +12,8 @@ struct sim_rig_config {
     struct sim_world_config world;
     uint32_t line_rate_baud;
     bool has_sensor;
+    bool is_homed;     /* at boot, as by an absolute encoder */
+    uint32_t delay_us; /* of the force, a multiple of a substep of the world */
 };
 
 struct sim_rig {
@@ -20,6 +22,10 @@ struct sim_rig {
     struct sim_world world;
     uint32_t bad_ticks;  /* so many positions to come are no numbers */
     uint32_t late_ticks; /* so many ticks to come are reported as overruns */
+    uint32_t late_us;    /* by how much more than the delay the next force comes late */
+    bool stop_open;      /* the hardware stop: no force reaches the handle */
+    uint32_t delay_us;   /* of the last force */
+    double motor_N;      /* of the last tick, until its successor comes */
 };
 
 struct sim_rig_config sim_rig_defaults(void);

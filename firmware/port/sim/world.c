@@ -89,9 +89,15 @@ static void substep(struct sim_world *world, double motor_N, double step_s)
 
 void sim_world_tick(struct sim_world *world, double motor_N)
 {
+    sim_world_tick_late(world, motor_N, motor_N, 0.0);
+}
+
+void sim_world_tick_late(struct sim_world *world, double old_N, double motor_N, double share)
+{
     const double step_s = world->config.tick_s / (double)world->config.substeps;
+    const long late = lround(share * (double)world->config.substeps);
     for (int i = 0; i < world->config.substeps; i++) {
-        substep(world, motor_N, step_s);
+        substep(world, i < late ? old_N : motor_N, step_s);
     }
     if (world->config.has_material) {
         /* The reading belongs to the tick's own sample, so before the past moves on. */

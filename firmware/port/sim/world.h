@@ -53,6 +53,9 @@ void sim_world_press(struct sim_world *world, enum sim_press press);
 /* One tick with the motor's force held. */
 void sim_world_tick(struct sim_world *world, double motor_N);
 
+/* One tick in which the motor's old force is held for a share of the period, to the nearest substep, and then the new. */
+void sim_world_tick_late(struct sim_world *world, double old_N, double motor_N, double share);
+
 /* What the encoder counts now. */
 int32_t sim_world_counts(const struct sim_world *world);
 
