@@ -185,6 +185,9 @@ static float command(struct hb_device *device, float wanted_N, enum hb_cause cau
         device->stops += 1U;
         hb_enter(device, HB_HOLDING, cause);
     } else if (hb_is_in(device, HB_DRIVING) && hb_drive_has_ended(&device->drive, device->config, safety)) {
+        if (device->drive.request.shape == (uint8_t)HB_DRIVE_NUDGE) {
+            safety->force_N = 0.0F; /* the ramp has work of its own, beyond what the nudge was given */
+        }
         hb_ramp_begin(safety);
         device->stops += 1U;
         hb_enter(device, HB_STOPPING, HB_CAUSE_NONE);

@@ -117,6 +117,27 @@ static void run_ticks(struct process *process, unsigned long count)
                  (unsigned long)device->heartbeat_age_ticks);
 }
 
+/* A fault of the hardware; false where the command names none. */
+static bool obey_fault(struct sim_rig *rig, const char *command)
+{
+    unsigned long count = 0;
+    if (sscanf(command, "bad %lu", &count) == 1) {
+        rig->bad_ticks = (uint32_t)count;
+    } else if (sscanf(command, "late %lu", &count) == 1) {
+        rig->late_ticks = (uint32_t)count;
+    } else if (sscanf(command, "late_us %lu", &count) == 1) {
+        rig->late_us = (uint32_t)count;
+    } else if (strcmp(command, "stop open") == 0) {
+        rig->stop_open = true;
+    } else if (strcmp(command, "stop closed") == 0) {
+        rig->stop_open = false;
+    } else {
+        return false;
+    }
+    (void)printf("%s\n", command);
+    return true;
+}
+
 /* One line from stdin; every command is answered by one line. */
 static void obey(struct process *process, const char *command)
 {
@@ -127,16 +148,10 @@ static void obey(struct process *process, const char *command)
         run_ticks(process, count);
     } else if (strcmp(command, "restart") == 0) {
         restart_device(process);
-    } else if (sscanf(command, "bad %lu", &count) == 1) {
-        process->rig.bad_ticks = (uint32_t)count;
-        (void)printf("bad %lu\n", count);
-    } else if (sscanf(command, "late %lu", &count) == 1) {
-        process->rig.late_ticks = (uint32_t)count;
-        (void)printf("late %lu\n", count);
     } else if (sscanf(command, "finger %15s", kind) == 1 && sim_press_by_name(kind, &press)) {
         sim_world_press(&process->rig.world, press);
         (void)printf("finger %s\n", kind);
-    } else {
+    } else if (!obey_fault(&process->rig, command)) {
         (void)printf("unknown %s\n", command);
     }
     (void)fflush(stdout);

@@ -18,6 +18,9 @@ const char OPTIONS_HELP[] =
     "                        restart     the device loses power and starts again; answers with its boot id\n"
     "                        bad N       the next N positions are no numbers\n"
     "                        late N      the next N ticks are reported as overruns\n"
+    "                        late_us N   the force of the next tick comes N us later than the delay\n"
+    "                        stop open   the hardware stop opens: no force reaches the handle\n"
+    "                        stop closed it closes again\n"
     "                        finger KIND another finger, from the beginning\n"
     "  --strict            a late tick of this process is an overrun and holds the device\n"
     "  --seed N            of finger and noise (0)\n"
@@ -32,6 +35,10 @@ const char OPTIONS_HELP[] =
     "  --start X           position at the start, mm (-1)\n"
     "  --noise S           of the force sensor, N (0)\n"
     "  --no-sensor         no force sensor\n"
+    "  --delay US          from a due tick to its force, a multiple of 50 up to 1000 us (0)\n"
+    "  --not-homed         an encoder that is not absolute: the position is unknown until HOME\n"
+    "  --inverted          the motor is wired the other way\n"
+    "  --encoder-inverted  the encoder counts the other way\n"
     "  --line-rate BAUD    what the device says its line carries (921600)\n";
 
 enum { MOST_NUMBERS = 5 };
@@ -113,6 +120,11 @@ static bool read_whole_option(struct options *options, const char *name, const c
     } else if (strcmp(name, "--line-rate") == 0) {
         good = whole(text, UINT32_MAX, &value) && value > 0;
         options->rig.line_rate_baud = (uint32_t)value;
+    } else if (strcmp(name, "--delay") == 0) {
+        const struct sim_world_config *world = &options->rig.world;
+        const uint64_t period_us = (uint64_t)lround(1e6 * world->tick_s);
+        good = whole(text, period_us, &value) && value % (period_us / (uint64_t)world->substeps) == 0;
+        options->rig.delay_us = (uint32_t)value;
     } else {
         *known = false;
     }
@@ -176,6 +188,12 @@ static bool read_switch(struct options *options, const char *name)
         options->control = true;
     } else if (strcmp(name, "--no-sensor") == 0) {
         options->rig.has_sensor = false;
+    } else if (strcmp(name, "--not-homed") == 0) {
+        options->rig.is_homed = false;
+    } else if (strcmp(name, "--inverted") == 0) {
+        options->rig.inverted = true;
+    } else if (strcmp(name, "--encoder-inverted") == 0) {
+        options->rig.encoder_inverted = true;
     } else if (strcmp(name, "--help") == 0) {
         options->help = true;
     } else {

@@ -14,6 +14,8 @@ struct sim_rig_config sim_rig_defaults(void)
         .has_sensor = true,
         .is_homed = true,
         .delay_us = 0,
+        .inverted = false,
+        .encoder_inverted = false,
     };
 }
 
@@ -62,6 +64,8 @@ enum hb_error sim_rig_start(struct sim_rig *rig, const struct sim_rig_config *co
     rig->stop_open = false;
     rig->delay_us = 0;
     rig->motor_N = 0.0;
+    rig->motor_sign = config->inverted ? 1.0 : -1.0;
+    rig->encoder_sign = config->encoder_inverted ? -1 : 1;
     sim_world_start(&rig->world, &config->world);
     return sim_rig_restart(rig, boot_id);
 }
@@ -83,9 +87,10 @@ static void move_world(struct sim_rig *rig, double force_N, uint32_t delay_us)
 {
     const double period_us = 1e6 * rig->world.config.tick_s;
     const double share = (double)delay_us < period_us ? (double)delay_us / period_us : 1.0;
-    const double before_N = rig->stop_open ? 0.0 : -rig->motor_N;
-    sim_world_tick_late(&rig->world, before_N, rig->stop_open ? 0.0 : -force_N, share);
-    rig->motor_N = force_N;
+    const double before_N = rig->motor_N;
+    rig->motor_N = rig->motor_sign * force_N;
+    const bool open = rig->stop_open;
+    sim_world_tick_late(&rig->world, open ? 0.0 : before_N, open ? 0.0 : rig->motor_N, share);
 }
 
 float sim_rig_tick(struct sim_rig *rig)
@@ -93,7 +98,7 @@ float sim_rig_tick(struct sim_rig *rig)
     const uint32_t delay_us = rig->config.delay_us + rig->late_us;
     rig->late_us = 0;
     const struct hb_input input = {
-        .position_counts = sim_world_counts(&rig->world),
+        .position_counts = rig->encoder_sign * sim_world_counts(&rig->world),
         .position_valid = !counted_down(&rig->bad_ticks),
         .overrun = counted_down(&rig->late_ticks),
         .stop_open = rig->stop_open,

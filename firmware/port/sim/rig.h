@@ -12,8 +12,10 @@ struct sim_rig_config {
     struct sim_world_config world;
     uint32_t line_rate_baud;
     bool has_sensor;
-    bool is_homed;     /* at boot, as by an absolute encoder */
-    uint32_t delay_us; /* of the force, a multiple of a substep of the world */
+    bool is_homed;         /* at boot, as by an absolute encoder */
+    uint32_t delay_us;     /* of the force, a multiple of a substep of the world */
+    bool inverted;         /* the motor is wired the other way: a positive command pushes the handle in */
+    bool encoder_inverted; /* the encoder counts the other way: down into the material */
 };
 
 struct sim_rig {
@@ -25,7 +27,9 @@ struct sim_rig {
     uint32_t late_us;    /* by how much more than the delay the next force comes late */
     bool stop_open;      /* the hardware stop: no force reaches the handle */
     uint32_t delay_us;   /* of the last force */
-    double motor_N;      /* of the last tick, until its successor comes */
+    double motor_N;      /* on the handle, positive inwards, of the last tick, until its successor comes */
+    double motor_sign;   /* of the force on the handle for a positive command */
+    int32_t encoder_sign;
 };
 
 struct sim_rig_config sim_rig_defaults(void);
