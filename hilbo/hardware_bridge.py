@@ -21,6 +21,7 @@ from functools import partial
 from typing import Any, Literal, SupportsFloat
 
 from hilbo.device import protocol
+from hilbo.device.condition import Condition, condition_of
 from hilbo.device.failures import DeviceError, RefusalError
 from hilbo.device.handshake import greet, take_over
 from hilbo.device.link import Link
@@ -232,6 +233,10 @@ class Renderer:
     def state(self) -> State:
         """The state alone."""
         return State(self.status().state)
+
+    def condition(self) -> Condition:
+        """Homed or not, hardware stop, delay, and what the motor bears."""
+        return condition_of(self.status(), self._link.request(protocol.GetLimits()))
 
     def limits(self) -> dict[str, tuple[float, float]]:
         """What the device takes: lowest and highest K0, K1 (N/mm), B1 (N·s^α/mm) and alpha."""

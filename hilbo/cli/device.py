@@ -14,10 +14,10 @@ from typing import Annotated, Any
 
 import typer
 
-from hilbo.cli import measure
+from hilbo.cli import commission, measure
 from hilbo.cli.console import ForceFile, JsonToo, fail, print_result
 from hilbo.cli.device_options import Chosen, Line, chosen_set, opened, sets_of, takes
-from hilbo.cli.device_output import decoded, said, set_words
+from hilbo.cli.device_output import condition_words, decoded, said, set_words
 from hilbo.cli.new_file import check_free, new_file
 from hilbo.errors import InputError
 
@@ -26,7 +26,7 @@ __all__ = ["app"]
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode="markdown", help="A rendering device: connect, send sets, feel, measure."
 )
-for name, command in measure.COMMANDS.items():
+for name, command in (measure.COMMANDS | commission.COMMANDS).items():
     app.command(name)(command)
 
 _PIECE = 1.0  # s of a recording between two writes to its file
@@ -55,9 +55,11 @@ def hello(line: Line, as_json: JsonToo = False) -> None:
     with opened(line) as device:
         about = asdict(device.device)
         in_force = device.in_force()
+        condition = device.condition()
         can = [flag.name.lower() for flag in Capability(about["capabilities"]) if flag.name]
         content = about | {
             "can": can,
+            **condition._asdict(),
             "limits": device.limits(),
             "telemetry_divisor": device.divisor,
             "in_force": in_force and in_force._asdict(),
@@ -67,7 +69,7 @@ def hello(line: Line, as_json: JsonToo = False) -> None:
     now = set_words(in_force) if in_force else "none"
     print_result(
         content,
-        f"{words}\ncan                        {', '.join(can)}\nlimits  {limits}\nin force  {now}",
+        f"{words}\ncan                        {', '.join(can)}\n{condition_words(condition)}\nlimits  {limits}\nin force  {now}",
         as_json,
     )
 

@@ -1,6 +1,6 @@
 """What the commands of `hilbo device` say of devices, their sets and the frames of a capture."""
 
-__all__ = ["decoded", "said", "set_words"]
+__all__ = ["condition_words", "decoded", "said", "set_words"]
 
 
 def said(name, value) -> str:
@@ -8,6 +8,18 @@ def said(name, value) -> str:
     if name in ("schema", "firmware", "boot_id"):
         return f"{value:08x}"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def condition_words(condition) -> str:
+    """Homed or not, hardware stop, delay and continuous force of a device (`Condition`), a line each."""
+    rows = {
+        "homed": "yes" if condition.homed else "no; `hilbo device home` tells it where its handle is",
+        "hardware stop": "open" if condition.stop_open else "closed",
+        "delay": f"sets are checked for {condition.delay_us} us; the longest since its start was"
+        f" {condition.longest_delay_us} us",
+        "continuous force": f"{condition.continuous_force_N:.6g} N (root mean square over {condition.heating_s:.6g} s)",
+    }
+    return "\n".join(f"{name:26} {words}" for name, words in rows.items())
 
 
 def set_words(current) -> str:

@@ -21,7 +21,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilbo.device.parameter_sets import InForce, wanted_for
-from hilbo.device.reasons import SampleFlag, held_because, meaning
+from hilbo.device.reasons import DeviceFlag, SampleFlag, held_because, meaning
 from hilbo.errors import InputError
 from hilbo.hardware_bridge import DeviceError, Renderer, State
 
@@ -74,7 +74,10 @@ class _View:
     def line(self) -> str:
         s = self.status
         state = meaning(State, s.state) + (f" ({held_because(s.hold_reason)})" if s.state >= State.HOLD else "")
-        return f"tick {s.tick}  {state}  set {s.active_id}  {s.position_mm:8.3f} mm  {s.force_N:7.3f} N"
+        faults = ("" if s.flags & DeviceFlag.HOMED else "  not homed") + (
+            "  hardware stop open" if s.flags & DeviceFlag.STOP_OPEN else ""
+        )
+        return f"tick {s.tick}  {state}  set {s.active_id}  {s.position_mm:8.3f} mm  {s.force_N:7.3f} N{faults}"
 
     def panel(self, width: int) -> Group:
         width = max(20, min(width - 26, 100))
@@ -93,7 +96,7 @@ class _View:
         table.add_row(
             "counts",
             f"holds {s.holds}, e-stops {s.estops}, saturated {s.saturated}, slewed {s.slewed},"
-            f" overruns {s.overruns}, frames lost {s.frames_dropped}, samples lost {counts.dropped + counts.missing}",
+            f" overruns {s.overruns}, longest delay {s.delay_us} us, frames lost {s.frames_dropped}, samples lost {counts.dropped + counts.missing}",
         )
         return Group(Text(self.title), table, *(Text(word) for word in self.words[-4:]))
 
@@ -116,6 +119,7 @@ class _View:
             "samples": self.seen,
             "largest_force_N": self.largest_N,
             "set": self.set._asdict() if self.set else None,
+            **self.device.condition()._asdict(),
         }
         return {
             "state": meaning(State, s.state),

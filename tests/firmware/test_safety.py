@@ -327,7 +327,7 @@ def test_a_nudge_ends_where_the_handle_has_moved():
     nudge = {"mode": 0, "shape": 3, "offset": 0.5, "amplitude": 0.254, "duration_ticks": 200, "boot_id": 7}
     device.must("DRIVE", **nudge)
     forces, _ = device.run([50] * 10 + [60] * 5 + [70] * 30)
-    assert np.all(forces[:15] == -0.5) and device.state == "STOPPED" and not np.any(forces[15 + HOLD :])
+    assert np.all(forces[:15] == -0.5) and device.state == "STOPPED" and not np.any(forces[15:])  # without a ramp
     assert device.refusal("DRIVE", **(nudge | {"amplitude": 0.0})) == "DRIVE_RANGE"
 
 

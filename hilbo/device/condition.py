@@ -1,0 +1,35 @@
+"""What a device tells of itself beside its state and its sets: homed or not, hardware stop, delay, continuous force."""
+
+from typing import NamedTuple
+
+from hilbo.device.messages import Limits, Status
+from hilbo.device.reasons import DeviceFlag
+
+__all__ = ["Condition", "condition_of"]
+
+
+class Condition(NamedTuple):
+    """`delay_us` is the delay for which sets are checked, `longest_delay_us` the longest since the device's start.
+
+    Both are times from a due tick to its force, µs. `continuous_force_N` is the root mean square over about `heating_s`
+    that the motor bears.
+    """
+
+    homed: bool
+    stop_open: bool
+    delay_us: int
+    longest_delay_us: int
+    continuous_force_N: float
+    heating_s: float
+
+
+def condition_of(status: Status, limits: Limits) -> Condition:
+    """The condition that a STATUS and a LIMITS message describe."""
+    return Condition(
+        bool(status.flags & DeviceFlag.HOMED),
+        bool(status.flags & DeviceFlag.STOP_OPEN),
+        limits.delay_us,
+        status.delay_us,
+        limits.continuous_force_N,
+        limits.heating_s,
+    )
