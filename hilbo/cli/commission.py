@@ -124,7 +124,8 @@ def _person(no_hand: str | None, encoder_checked: bool, position: float | None) 
         return _Script(position)
     if not sys.stdin.isatty():
         raise InputError(
-            f'A person must confirm that no hand is on the handle: use a terminal, or --no-hand-on-the-handle "{PHRASE}".'
+            "A person must confirm that no hand is on the handle: use a terminal, or"
+            f' --no-hand-on-the-handle "{PHRASE}".'
         )
     if position is not None:
         raise InputError("--position is for scripts; leave it out, and place the handle at the surface when asked.")
@@ -154,7 +155,7 @@ def _text(base: Path) -> str:
     try:
         return base.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{base}: cannot be read ({error}); give the header that the device was built with.") from error
+        raise InputError(f"{base}: cannot be read ({error}); give the device's last header.") from error
 
 
 def _content(result: Any, damping: float, delay_us: int) -> dict[str, Any]:
@@ -209,7 +210,8 @@ def _differences(content: dict[str, Any]) -> list[str]:
         )
     if delay["reported"] < delay["header"]:
         sentences.append(
-            f"the device's delay_us of {delay['reported']} has less margin than the {delay['header']} of the new header."
+            f"the device's delay_us of {delay['reported']} has less margin than the {delay['header']} of the"
+            " new header."
         )
     return sentences
 

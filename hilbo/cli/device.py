@@ -65,13 +65,11 @@ def hello(line: Line, as_json: JsonToo = False) -> None:
             "in_force": in_force and in_force._asdict(),
         }
     limits = ", ".join(f"{name} {low:g} to {high:g}" for name, (low, high) in content["limits"].items())
-    words = "\n".join(f"{name:26} {said(name, value)}" for name, value in about.items())
+    rows = [f"{name:26} {said(name, value)}" for name, value in about.items()]
+    rows += [f"{'can':26} {', '.join(can)}", condition_words(condition)]
     now = set_words(in_force) if in_force else "none"
-    print_result(
-        content,
-        f"{words}\ncan                        {', '.join(can)}\n{condition_words(condition)}\nlimits  {limits}\nin force  {now}",
-        as_json,
-    )
+    words = "\n".join([*rows, f"limits  {limits}", f"in force  {now}"])
+    print_result(content, words, as_json)
 
 
 @app.command("set")

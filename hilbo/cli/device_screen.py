@@ -96,7 +96,8 @@ class _View:
         table.add_row(
             "counts",
             f"holds {s.holds}, e-stops {s.estops}, saturated {s.saturated}, slewed {s.slewed},"
-            f" overruns {s.overruns}, longest delay {s.delay_us} us, frames lost {s.frames_dropped}, samples lost {counts.dropped + counts.missing}",
+            f" overruns {s.overruns}, longest delay {s.delay_us} us, frames lost {s.frames_dropped},"
+            f" samples lost {counts.dropped + counts.missing}",
         )
         return Group(Text(self.title), table, *(Text(word) for word in self.words[-4:]))
 

@@ -5,6 +5,7 @@ device was built with, and leaves the rest, such as the settings of a port, as i
 """
 
 import re
+from dataclasses import asdict
 
 import numpy as np
 
@@ -23,9 +24,9 @@ _BITS = {
 }
 
 _TEMPLATE = """\
-/* The numbers of one device. `hilbo device commission` has measured its damping and its delay; the others are those that
- * the device reports. The build sets `firmware`. A port's own settings, such as HILBO_SETTINGS of the STM32F405 port, are
- * no numbers of the core: copy them from the header that the device was built with. */
+/* The numbers of one device. `hilbo device commission` has measured its damping and its delay; the others are those
+ * that the device reports. The build sets `firmware`. A port's own settings, such as HILBO_SETTINGS of the STM32F405
+ * port, are no numbers of the core: copy them from the header that the device was built with. */
 #ifndef HILBO_DEVICE_CONFIG_H
 #define HILBO_DEVICE_CONFIG_H
 
@@ -73,7 +74,7 @@ def header(
 ) -> str:
     """The whole header, for a damping in N·s/m and a delay in µs; `about_…` are comments on how these were measured."""
     fastest = device.velocity_limit_mm_per_s
-    numbers = {name: getattr(part, name) for part in (device, limits) for name in part.__slots__}
+    numbers = asdict(device) | asdict(limits)
     numbers |= {"damping": _below(damping), "plausible_step_mm": 2 * fastest / device.tick_rate_Hz}
     numbers |= {"servo_speed_mm_per_s": min(50.0, fastest / 2), "delay_us": delay_us}
     words = {name: _c_float(value) if isinstance(value, float) else value for name, value in numbers.items()}
@@ -85,8 +86,8 @@ def header(
 def with_measured(base: str, where: str, device: HelloReply, limits: Limits, damping: float, delay_us: int) -> str:
     """A device's header `base` with other values of damping (N·s/m) and delay (µs).
 
-    `where` is the name of its file. Raises `InputError` where the header lacks one of the two, or has another value than
-    the device reports: then it is the header of another device.
+    `where` is the name of its file. Raises `InputError` where the header lacks one of the two, or has another value
+    than the device reports: then it is the header of another device.
     """
     reported = {"damping_N_s_per_m": device.damping_N_s_per_m, "delay_us": limits.delay_us}
     values = {"damping_N_s_per_m": _c_float(_below(damping)), "delay_us": str(delay_us)}

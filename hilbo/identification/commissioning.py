@@ -130,12 +130,19 @@ def _check_ready(device: Renderer) -> None:
             f"{name}: the device is {meaning(State, status.state)}: {held_because(status.hold_reason)}; find out why,"
             " then `hilbo device clear`."
         )
-    if condition.longest_delay_us > condition.delay_us:
+    _check_delay(device)
+
+
+def _check_delay(device: Renderer) -> int:
+    """The longest delay since the device's start, µs. Raises `DeviceError` where it is longer than the device's own."""
+    condition = device.condition()
+    longest = condition.longest_delay_us
+    if longest > condition.delay_us:
         raise DeviceError(
-            f"{name}: a force came out {condition.longest_delay_us} us after its tick was due, and the device's delay_us"
-            f" is {condition.delay_us}; set it to {delay_for(condition.longest_delay_us)} or more, then commission"
-            " again."
+            f"{device.link.name}: the device's delay_us of {condition.delay_us} is too short: a force came out"
+            f" {longest} us after its tick was due; set it to {delay_for(longest)} or more, then commission again."
         )
+    return longest
 
 
 def _check_encoder(device: Renderer) -> None:
@@ -232,9 +239,9 @@ def _heaviest_set(device: Renderer) -> list[str]:
     """Put a soft set with the longest memory in force, so that ticks take as long as they can; a note where none is."""
     low = {name: ends[0] for name, ends in device.limits().items()}
     taps = device.device.most_taps - (device.device.most_taps + 1) % 2
-    numbers = {"K0": 0.0, "K1": max(low["K1"], 1e-3), "B1": max(low["B1"], 1e-3), "alpha": max(low["alpha"], 0.2)}
+    K1, B1, alpha = max(low["K1"], 1e-3), max(low["B1"], 1e-3), max(low["alpha"], 0.2)
     try:
-        device.send(**numbers, N=taps, T=device.tick_s, wait=_WAITS)
+        device.send(K0=0.0, K1=K1, B1=B1, alpha=alpha, N=taps, T=device.tick_s, wait=_WAITS)
     except RefusalError as error:
         return [f"The delay was measured without a set in force, whose ticks take longer: {error}"]
     return []
@@ -242,7 +249,7 @@ def _heaviest_set(device: Renderer) -> list[str]:
 
 def _longest_delay(device: Renderer) -> int:
     """The longest delay since the device's start, µs. Raises `DeviceError` for a device that measures none."""
-    longest = device.condition().longest_delay_us
+    longest = _check_delay(device)
     if longest == 0 and not device.can & Capability.SIMULATED:
         raise DeviceError(
             f"{device.link.name}: the device reports a delay of 0 us, which no motor has; measure it in its port"

@@ -57,7 +57,7 @@ def test_hello(device):
     code, stdout, stderr = device("hello", "--json", *FAST)
     assert "this is the simulated device; --device PORT is a real one." in stderr
     said = json.loads(stdout)
-    assert (code, said["version"], said["in_force"]) == (0, 1, None)
+    assert (code, said["version"], said["in_force"]) == (0, protocol.VERSION, None)
     assert said["damping_N_s_per_m"] == pytest.approx(0.95)
     assert said["limits"]["K1"][1] == 64 and "simulated" in said["can"]
     assert "damping_N_s_per_m          0.95" in device("hello", *FAST)[1]

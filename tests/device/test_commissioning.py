@@ -82,7 +82,7 @@ def test_a_motor_that_is_wired_the_other_way_is_pushed_once_with_little_energy(r
     bounds = Bounds()
     options = NEW | {"inverted": True, "mass": mass, "coulomb": coulomb}
     with Renderer.open("sim", options=options) as device:
-        with pytest.raises(DeviceError, match="the motor pushes the wrong way: .* swap the motor's two wires"):
+        with pytest.raises(DeviceError, match=r"the motor pushes the wrong way: .* swap the motor's two wires"):
             find_signs(device, quiet, bounds)
         after = device.samples(0.2)
         assert device.state() == State.ESTOP and not after.force_N.any()
@@ -93,8 +93,23 @@ def test_a_motor_that_is_wired_the_other_way_is_pushed_once_with_little_energy(r
     assert all(force > 0 for force in forces) and (len(forces) == 1 or coulomb > bounds.first_N)
 
 
+@pytest.fixture
+def measured(monkeypatch):
+    """The measurement of damping, of some seconds, is left out."""
+    friction = Friction(Interval(0.95, 0.94, 0.96), *(Interval(0.3, 0.2, 0.4),) * 3, 0.01, 96, 24)
+    monkeypatch.setattr(commissioning, "measure_damping", lambda *_: friction)
+
+
+@pytest.mark.deep
+def test_the_measurement_takes_its_place_in_the_order(recorded):
+    with Renderer.open("sim", options=NEW) as device:
+        result = commission(device, Someone(device), quiet)
+    assert result.friction.damping.lower <= 0.95 <= result.friction.damping.upper
+    assert list(dict.fromkeys(way[0] for way in recorded[1])) == ["force", "position"]
+
+
 @pytest.mark.parametrize("coulomb", [0.02, 1.0])
-def test_a_device_in_order_is_commissioned(recorded, coulomb):
+def test_a_device_in_order_is_commissioned(recorded, measured, coulomb):
     with Renderer.open("sim", options=NEW | {"coulomb": coulomb, "delay": 150}) as device:
         person = Someone(device)
         result = commission(device, person, quiet)
@@ -103,15 +118,14 @@ def test_a_device_in_order_is_commissioned(recorded, coulomb):
     inwards, outwards = result.nudges
     assert inwards.force_N > 0 and inwards.moved_mm > 0 and outwards.force_N < 0 and outwards.moved_mm < 0
     assert all(0 < nudge.work_mJ <= Bounds().work_mJ and abs(nudge.force_N) > coulomb for nudge in result.nudges)
-    assert result.friction.damping.lower <= 0.95 <= result.friction.damping.upper
     assert (result.longest_delay_us, result.notes) == (150, ())
-    assert {way[:2] for way in recorded[1]} == {("force", "nudge"), ("force", "hold"), ("position", "triangle")}
+    assert {way[:2] for way in recorded[1]} == {("force", "nudge"), ("force", "hold")}
 
 
 def test_an_encoder_that_counts_the_other_way_is_found_before_the_motor_pushes(recorded):
     with Renderer.open("sim", options=NEW | {"encoder_inverted": True}) as device:
         person = Someone(device)
-        with pytest.raises(DeviceError, match="the encoder counts the wrong way: .* swap its channels A and B"):
+        with pytest.raises(DeviceError, match=r"the encoder counts the wrong way: .* swap its channels A and B"):
             commission(device, person, quiet)
         assert device.state() == State.ESTOP
     assert person.calls == ["push"] and recorded[1] == []
@@ -137,7 +151,7 @@ def test_the_force_of_a_handle_that_does_not_move_is_raised_to_its_most(recorded
 def test_a_handle_at_its_stop_is_no_wrong_sign():
     with (
         Renderer.open("sim", options=NEW | {"start": 20}) as device,
-        pytest.raises(DeviceError, match="nothing moves inwards .* off its mechanical stop"),
+        pytest.raises(DeviceError, match=r"nothing moves inwards .* off its mechanical stop"),
     ):
         find_signs(device, quiet, Bounds(most_N=0.5))
 
@@ -147,7 +161,11 @@ def test_a_handle_at_its_stop_is_no_wrong_sign():
     [
         ("stop open", {}, "the hardware stop is open; close it"),
         ("finger sine", {}, "has not come to rest by itself"),
-        ("late_us 300", {"delay": 100}, "400 us after its tick was due, and the device's delay_us is 100; set it to 500"),
+        (
+            "late_us 300",
+            {"delay": 100},
+            "delay_us of 100 is too short: a force came out 400 us after its tick was due; set it to 500",
+        ),
     ],
 )
 def test_a_device_that_is_not_ready_is_not_pushed(recorded, fault, options, words):
@@ -230,6 +248,21 @@ def test_forces_stay_below_what_the_motor_bears_and_the_encoder_can_tell():
         assert Bounds(most_N=0.1).forces(device) == [0.1]
         most = Bounds(most_N=100.0).forces(device)[-1]
         assert most * 4 * device.device.encoder_step_mm == pytest.approx(Bounds().work_mJ)
+
+
+def test_a_force_that_comes_late_ends_the_commissioning(measured):
+    with Renderer.open("sim", options=NEW | {"delay": 100}) as device:
+        person = Nobody(device)
+        place = person.place
+
+        def placed(moved):
+            device.simulator.tell("late_us 300")  # of the tick after, in which the device homes
+            return place(moved)
+
+        person.place = placed
+        person.take_hands_off = lambda: None
+        with pytest.raises(DeviceError, match="delay_us of 100 is too short: a force came out 400 us after"):
+            commission(device, person, quiet)
 
 
 def test_home_refuses_a_place_outside_of_the_stroke():
