@@ -20,7 +20,7 @@ from jaxtyping import Array, Complex, Float
 
 from hilbo.mechanics.delay import clear_of_spring, larger_root
 from hilbo.mechanics.fosls import pot_stiffness, share
-from hilbo.mechanics.memory import gl_coefficients, response, sums
+from hilbo.mechanics.memory import GLSums, gl_coefficients, response, sums
 from hilbo.mechanics.span import Span
 
 __all__ = ["ESTIMATED", "SAFE", "delayed_damping", "delayed_largest_K1", "largest_need"]
@@ -33,10 +33,17 @@ ESTIMATED = 1e-6
 _NODES_PER_TAP = 4
 _LEAST_NODES = 256
 _NODES_OF_FULL_MEMORY = 512
-_STRIDE = 4  # of the nodes on which K1 is first narrowed
-_EXCHANGES, _REFINEMENTS = 6, 2
-_HALVINGS = 40  # of the interval of K1/(K1 + β)
 _FINER = 16  # of a node's distance, for the parabola at the peak
+_ROUNDS = 20  # of the exchange at most; 4 to 6 are enough
+_HALVINGS = 40  # of the interval of K1/(K1 + β)
+
+
+class _Order(NamedTuple):
+    """An order α with its memory, and the sums of its coefficients."""
+
+    alpha: Float[Array, ""]
+    sums: GLSums
+    span: Span
 
 
 class _Nodes(NamedTuple):
@@ -67,7 +74,7 @@ def delayed_damping(
     T: Float[Array, ""],
     delay: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """b_min, N·s/m, to a relative 1e-6; inf where `K_eff` < 0."""
+    """b_min, N·s/m, to a relative `ESTIMATED`; inf where `K_eff` < 0, NaN for a `delay` above T."""
     lag = jnp.where(delay <= T, delay / T, jnp.nan)
     need, _ = largest_need(span, K1, pot_stiffness(B1, alpha, T), alpha, K_eff, lag)
     return jnp.where(K_eff < 0, jnp.inf, 500 * T * need)
@@ -82,11 +89,13 @@ def largest_need(
     lag: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The largest Y (N/mm) of a set, and its angle; `lag` is σ."""
-    rendering = _material(span, K1, beta, alpha, K_eff)
-    fixed, still, order = jax.lax.stop_gradient((rendering, lag, alpha))
-    angle = _peak(span, order, _grid(span, order), fixed, still)
+    order = _order(span, alpha)
+    rendering = _material(K1, beta, order, K_eff)
+    fixed, still, known = jax.lax.stop_gradient((rendering, lag, alpha))
+    steady = _order(span, known)
+    angle = _peak(steady, _grid(steady), fixed, still)
     # The angle is that of a maximum, so that first derivatives of Y need none of its own.
-    return _need(rendering, _at(span, alpha, angle[None]), lag)[0], angle
+    return _need(rendering, _at(order, angle[None]), lag)[0], angle
 
 
 def delayed_largest_K1(
@@ -101,16 +110,14 @@ def delayed_largest_K1(
     """K1max, N/mm, which needs between b·(1 - 2·SAFE) and b; inf where every K1 is passive, 0 where b is below
     `least_damping`. First derivatives are exact, second ones are those at the binding frequency."""
     lag = jnp.where(delay <= T, delay / T, jnp.nan)
-    Y = b / (500 * T) * (1 - SAFE)
+    Y, beta, order = b / (500 * T) * (1 - SAFE), pot_stiffness(B1, alpha, T), _order(span, alpha)
     impossible = (clear_of_spring(K_eff, lag) > Y) | (K_eff < 0)
-    K1, angle, unlimited = _solved(span, *jax.lax.stop_gradient((B1, alpha, Y, K_eff, T, lag)))
+    K1, angle, unlimited = _solved(span, ~impossible, *jax.lax.stop_gradient((beta, alpha, Y, K_eff, lag)))
     limited = ~impossible & ~unlimited
-    K1, angle = jnp.where(limited, K1, 1), jnp.where(limited, angle, 1)
+    K1, nodes = jnp.where(limited, K1, 1), _at(order, jnp.where(limited, angle, 1)[None])
 
     def need(K1):
-        return _need(
-            _material(span, K1, pot_stiffness(B1, alpha, T), alpha, K_eff), _at(span, alpha, angle[None]), lag
-        )[0]
+        return _need(_material(K1, beta, order, K_eff), nodes, lag)[0]
 
     # A step of Newton's method from the solution has the solution's derivatives.
     value, slope = jax.jvp(need, (K1,), (jnp.ones_like(K1),))
@@ -119,11 +126,11 @@ def delayed_largest_K1(
     return known + jnp.where(impossible, 0, jnp.where(unlimited, jnp.inf, K1))
 
 
-def _solved(span, B1, alpha, Y, K_eff, T, lag):
-    """K1max by exchange, the angle that binds, and whether every K1 is passive."""
-    beta, S = pot_stiffness(B1, alpha, T), sums(alpha, span).at_dc
-    grid = _grid(span, alpha)
-    coarse = _Nodes(*(values[::_STRIDE] for values in grid))
+def _solved(span, sought, beta, alpha, Y, K_eff, lag):
+    """K1max by exchange, the angle that binds, and whether every K1 is passive. NaN where the rounds do not end."""
+    order = _order(span, alpha)
+    grid, S = _grid(order), order.sums.at_dc
+    tolerance = max(SAFE / 4, 32 * float(jnp.finfo(beta.dtype).eps))
 
     def of(g):
         return _Material(K_eff, beta, S, g, 1 - g, g / (g + (1 - g) * S))
@@ -136,27 +143,29 @@ def _solved(span, B1, alpha, Y, K_eff, T, lag):
             more = _need(of(middle), node, lag)[0] > Y
             return jnp.where(more, ends[0], middle), jnp.where(more, middle, ends[1])
 
-        _, high = jax.lax.fori_loop(0, _HALVINGS, halve, (jnp.zeros_like(g), g))
-        return jnp.where(_need(of(g), node, lag)[0] > Y, high, g)
+        return jax.lax.fori_loop(0, _HALVINGS, halve, (jnp.zeros_like(g), g))[1]
 
-    def exchange(_, g):
-        most = jnp.argmax(_need(of(g), coarse, lag))
-        return reduced(g, _Nodes(*(values[most][None] for values in coarse)))
+    def exchange(carry):
+        count, g, _, _ = carry
+        angle = _peak(order, grid, of(g), lag)
+        node = _at(order, angle[None])
+        more = _need(of(g), node, lag)[0] > Y * (1 + tolerance)
+        return count + 1, jnp.where(more, reduced(g, node), g), angle, more
 
-    def refine(_, carry):
-        angle = _peak(span, alpha, grid, of(carry[0]), lag)
-        return reduced(carry[0], _at(span, alpha, angle[None])), angle
+    def unfinished(carry):
+        return carry[3] & (carry[0] < _ROUNDS)
 
-    all_of_it = jnp.ones_like(beta)
-    firm = _peak(span, alpha, grid, of(all_of_it), lag)
-    unlimited = _need(of(all_of_it), _at(span, alpha, firm[None]), lag)[0] <= Y
-    g = jax.lax.fori_loop(0, _EXCHANGES, exchange, all_of_it)
-    g, angle = jax.lax.fori_loop(0, _REFINEMENTS, refine, (g, firm))
-    return beta * g / (1 - g), angle, unlimited
+    start = 0, jnp.ones_like(beta), jnp.ones_like(beta), sought
+    _, g, angle, more = jax.lax.while_loop(unfinished, exchange, start)
+    return jnp.where(more, jnp.nan, beta * g / (1 - g)), angle, g == 1
 
 
-def _material(span, K1, beta, alpha, K_eff) -> _Material:
-    S = sums(alpha, span).at_dc
+def _order(span: Span, alpha: Float[Array, ""]) -> _Order:
+    return _Order(alpha, sums(alpha, span), span)
+
+
+def _material(K1, beta, order: _Order, K_eff) -> _Material:
+    S = order.sums.at_dc
     # A spring alone is one with β = 0 beside any K1.
     beta = jnp.where(K1 > 0, beta, 0)
     alone = beta == 0
@@ -187,27 +196,26 @@ def _count(span: Span) -> int:
     return max(_LEAST_NODES, 2 ** math.ceil(math.log2(_NODES_PER_TAP * (span.N + 1))))
 
 
-def _grid(span: Span, alpha: Float[Array, ""]) -> _Nodes:
+def _grid(order: _Order) -> _Nodes:
     """Nodes from 0 to π, in even steps of t."""
-    count = _count(span)
-    angle = _place(span, jnp.arange(count + 1, dtype=alpha.dtype) / count)
+    span, count = order.span, _count(order.span)
+    angle = _place(span, jnp.arange(count + 1, dtype=order.alpha.dtype) / count)
     if span.memory == "full":
-        return _at(span, alpha, angle)
-    C = jnp.fft.rfft(gl_coefficients(alpha, span.N), 2 * count)
-    return _nodes(span, alpha, angle, C)
+        return _at(order, angle)
+    return _nodes(order, angle, jnp.fft.rfft(gl_coefficients(order.alpha, span.N), 2 * count))
 
 
-def _at(span: Span, alpha: Float[Array, ""], angle: Float[Array, " n"]) -> _Nodes:
-    return _nodes(span, alpha, angle, response(alpha, angle, span))
+def _at(order: _Order, angle: Float[Array, " n"]) -> _Nodes:
+    return _nodes(order, angle, response(order.alpha, angle, order.span))
 
 
-def _nodes(span: Span, alpha: Float[Array, ""], angle: Float[Array, " n"], C: Complex[Array, " n"]) -> _Nodes:
+def _nodes(order: _Order, angle: Float[Array, " n"], C: Complex[Array, " n"]) -> _Nodes:
     moving = angle > 0
-    E = jnp.where(moving, C.imag / jnp.tan(jnp.where(moving, angle, 1) / 2), 2 * sums(alpha, span).moment)
+    E = jnp.where(moving, C.imag / jnp.tan(jnp.where(moving, angle, 1) / 2), 2 * order.sums.moment)
     return _Nodes(jax.lax.complex(jnp.cos(angle), jnp.sin(angle)), C, E)
 
 
-def _peak(span: Span, alpha: Float[Array, ""], grid: _Nodes, m: _Material, lag: Float[Array, ""]) -> Float[Array, ""]:
+def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Float[Array, ""]) -> Float[Array, ""]:
     """The angle of the largest Y: by the parabolas through neighbouring nodes, and one through closer ones."""
     Y, count = _need(m, grid, lag), grid.C.shape[0] - 1
     # Y is even about both ends.
@@ -216,8 +224,8 @@ def _peak(span: Span, alpha: Float[Array, ""], grid: _Nodes, m: _Material, lag: 
     best = jnp.argmax(top)
     t, step = (best + shift[best]) / count, 1 / (_FINER * count)
     near = jnp.abs(t + step * jnp.arange(-1.0, 2.0, dtype=t.dtype))
-    _, shift = _vertex(*_need(m, _at(span, alpha, _place(span, near)), lag))
-    return _place(span, jnp.clip(t + shift * step, 0, 1))
+    _, shift = _vertex(*_need(m, _at(order, _place(order.span, near)), lag))
+    return _place(order.span, jnp.clip(t + shift * step, 0, 1))
 
 
 def _vertex(

@@ -87,6 +87,7 @@ class RendererTable(_Table, frozen=True):
     states: Annotated[int, _text("a number of exponentials, for full memory", "10")] = 10
     T: Annotated[_Positive, msgspec.Meta(examples=["0.001"])] = 1e-3
     effective_damping: Annotated[tuple[float, float] | None, _text("a list of two numbers", "[10, 80]")] = None
+    delay: Annotated[_NotNegative, msgspec.Meta(examples=["0.0003"])] = 0.0
 
 
 _Length = Annotated[float, msgspec.Meta(ge=1e-3, le=1e3)]
