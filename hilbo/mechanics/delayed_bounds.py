@@ -47,11 +47,13 @@ class _Order(NamedTuple):
 
 
 class _Nodes(NamedTuple):
-    """Frequencies e^{jθ}, with what depends on α alone there: C, and E = cot(θ/2)·Im C, which is 2·M1 at θ = 0."""
+    """Frequencies, with what depends on α alone there. Real and imaginary parts apart: so they are vectorised."""
 
-    turn: Complex[Array, " n"]
-    C: Complex[Array, " n"]
-    E: Float[Array, " n"]
+    cos: Float[Array, " n"]
+    sin: Float[Array, " n"]
+    real: Float[Array, " n"]  # of C
+    imag: Float[Array, " n"]
+    lead: Float[Array, " n"]  # cot(θ/2)·Im C, which is 2·M1 at θ = 0
 
 
 class _Material(NamedTuple):
@@ -91,8 +93,8 @@ def largest_need(
     """The largest Y (N/mm) of a set, and its angle; `lag` is σ."""
     order = _order(span, alpha)
     rendering = _material(K1, beta, order, K_eff)
-    fixed, still, known = jax.lax.stop_gradient((rendering, lag, alpha))
-    steady = _order(span, known)
+    fixed, still, (known, its_sums) = jax.lax.stop_gradient((rendering, lag, (alpha, order.sums)))
+    steady = _Order(known, its_sums, span)
     angle = _peak(steady, _grid(steady), fixed, still)
     # The angle is that of a maximum, so that first derivatives of Y need none of its own.
     return _need(rendering, _at(order, angle[None]), lag)[0], angle
@@ -175,13 +177,12 @@ def _material(K1, beta, order: _Order, K_eff) -> _Material:
 
 def _need(m: _Material, nodes: _Nodes, lag: Float[Array, ""]) -> Float[Array, " n"]:
     """Y (N/mm) at each frequency."""
-    C, S, turn = nodes.C, m.S, nodes.turn
-    square = (m.g + m.h * C.real) ** 2 + (m.h * C.imag) ** 2
+    square = (m.g + m.h * nodes.real) ** 2 + (m.h * nodes.imag) ** 2
     size = m.beta * m.g / square
     # (C - S)·conj(g + h·C); the imaginary part is (g + h·S)·Im C, and g/slow = g + h·S.
-    real = m.K_eff + size * m.slow * ((C.real - S) * (m.g + m.h * C.real) + m.h * C.imag**2)
-    imaginary = size * m.g * C.imag
-    psi = real - size * m.g * nodes.E + 2 * lag * (turn.real * real + turn.imag * imaginary)
+    along = (nodes.real - m.S) * (m.g + m.h * nodes.real) + m.h * nodes.imag**2
+    real, imaginary = m.K_eff + size * m.slow * along, size * m.g * nodes.imag
+    psi = real - size * m.g * nodes.lead + 2 * lag * (nodes.cos * real + nodes.sin * imaginary)
     return larger_root(psi, lag * (1 - lag) * (real**2 + imaginary**2))
 
 
@@ -211,13 +212,13 @@ def _at(order: _Order, angle: Float[Array, " n"]) -> _Nodes:
 
 def _nodes(order: _Order, angle: Float[Array, " n"], C: Complex[Array, " n"]) -> _Nodes:
     moving = angle > 0
-    E = jnp.where(moving, C.imag / jnp.tan(jnp.where(moving, angle, 1) / 2), 2 * order.sums.moment)
-    return _Nodes(jax.lax.complex(jnp.cos(angle), jnp.sin(angle)), C, E)
+    lead = jnp.where(moving, C.imag / jnp.tan(jnp.where(moving, angle, 1) / 2), 2 * order.sums.moment)
+    return _Nodes(jnp.cos(angle), jnp.sin(angle), C.real, C.imag, lead)
 
 
 def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Float[Array, ""]) -> Float[Array, ""]:
     """The angle of the largest Y: by the parabolas through neighbouring nodes, and one through closer ones."""
-    Y, count = _need(m, grid, lag), grid.C.shape[0] - 1
+    Y, count = _need(m, grid, lag), grid.real.shape[0] - 1
     # Y is even about both ends.
     below, above = jnp.concatenate([Y[1:2], Y[:-1]]), jnp.concatenate([Y[1:], Y[-2:-1]])
     top, shift = _vertex(below, Y, above)
