@@ -186,7 +186,7 @@ def _need(m: _Material, nodes: _Nodes, lag: Float[Array, ""]) -> Float[Array, " 
     return larger_root(psi, lag * (1 - lag) * (real**2 + imaginary**2))
 
 
-def _place(span: Span, t: Float[Array, " n"]) -> Float[Array, " n"]:
+def _place(span: Span, t: Float[Array, "*a"]) -> Float[Array, "*a"]:
     """Angles of t in [0, 1]: even for taps, whose C ripples evenly; crowded at 0 for exponentials."""
     return math.pi * (t if span.memory == "short" else t**3)
 
@@ -223,7 +223,7 @@ def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Float[Array, ""]) -> F
     below, above = jnp.concatenate([Y[1:2], Y[:-1]]), jnp.concatenate([Y[1:], Y[-2:-1]])
     top, shift = _vertex(below, Y, above)
     best = jnp.argmax(top)
-    t, step = (best + shift[best]) / count, 1 / (_FINER * count)
+    t, step = (best.astype(Y.dtype) + shift[best]) / count, 1 / (_FINER * count)
     near = jnp.abs(t + step * jnp.arange(-1.0, 2.0, dtype=t.dtype))
     _, shift = _vertex(*_need(m, _at(order, _place(order.span, near)), lag))
     return _place(order.span, jnp.clip(t + shift * step, 0, 1))

@@ -29,7 +29,7 @@ _Polynomials = tuple[Float[Any, " n"], Float[Any, " n"], Float[Any, " n"]]
 
 def short_enclosure(model: FOSLS, lag: Float[Any, ""]) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
     """Bounds of max Y (N/mm) over all angles, and the angle of the largest Y found; `lag` is σ."""
-    *polynomials, least_A = _polynomials(model, lag)
+    polynomials, least_A = _polynomials(model, lag)
     A, U, W = polynomials
     xp = namespace_of(A)
     cells = cells_for(model.N + 1)
@@ -37,7 +37,7 @@ def short_enclosure(model: FOSLS, lag: Float[Any, ""]) -> tuple[Float[Any, ""], 
     a, u, w = (on_grid(rows(p, 1), cells)[0] for p in polynomials)
     value = larger_root(u / a, w / a)
     best = xp.argmax(value)
-    at = partial(_expand, (A, U, W))
+    at = partial(_expand, polynomials)
     peak = climb(at, model.N + 1, best.astype(A.dtype) * width, width)
     largest = xp.maximum(value[best], at(peak)[0])
 
@@ -59,7 +59,7 @@ def full_estimate(model: FOSLS, lag: Float[Any, ""]) -> tuple[Float[Array, ""], 
     return largest - error, largest + error, angle
 
 
-def _polynomials(model: FOSLS, lag: Float[Any, ""]) -> tuple[Float[Any, " n"], ...]:
+def _polynomials(model: FOSLS, lag: Float[Any, ""]) -> tuple[_Polynomials, Float[Any, ""]]:
     """Cosine coefficients of A, ψA and σ(1 - σ)·|H|²A, all of degree N + 1, and the least value of A."""
     parts = parts_of(model)
     xp = namespace_of(parts.A)
@@ -69,7 +69,7 @@ def _polynomials(model: FOSLS, lag: Float[Any, ""]) -> tuple[Float[Any, " n"], .
         return xp.concatenate([p, zero])
 
     late = longer(model.K0 * parts.A + parts.B) + 2 * lag * turned_of(parts, model.K0)
-    return longer(parts.A), late, longer(lag * (1 - lag) * square_of(parts, model.K0)), parts.least_A
+    return (longer(parts.A), late, longer(lag * (1 - lag) * square_of(parts, model.K0))), parts.least_A
 
 
 def _expand(polynomials: _Polynomials, angle: Float[Any, ""]) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:

@@ -51,8 +51,8 @@ def parts_of(model: FOSLS) -> Parts:
     return Parts(A, k * (g * V + h * square), (g + h * last) ** 2, c, square, g, h, k)
 
 
-def turned_of(parts: Parts, K0: Float[Any, ""]) -> Float[Any, " n+1"]:
-    """Cosine coefficients of Re(e^{-jθ}·H)·A."""
+def turned_of(parts: Parts, K0: Float[Any, ""]) -> Float[Any, " m"]:
+    """Cosine coefficients of Re(e^{-jθ}·H)·A, one more than those of A."""
     xp = namespace_of(parts.A)
     zero = xp.zeros(1, parts.A.dtype)
     late = xp.concatenate([zero, parts.C])  # Re(e^{-jθ}·C)
