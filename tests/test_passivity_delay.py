@@ -185,7 +185,7 @@ def test_gradients_match_finite_differences():
     np.testing.assert_allclose(slope, (np.asarray(above) - np.asarray(below)) / (2 * step), rtol=1e-6)
 
 
-def energy(witness, b, parts=200):
+def energy(witness, b, parts=1000):
     """Of one cycle, by a sum over short times: force in force times velocity, and the loss in the damping (mJ)."""
     split = round(parts * witness.delay / T)
     total = 0.0
@@ -244,7 +244,7 @@ def test_a_delay_that_is_none_is_refused(delay):
         lambda: passivity.certify(model, 0.95, delay=delay),
         lambda: passivity.largest_K1_beside(model, 0.95, delay=delay),
     ):
-        with pytest.raises(InputError, match="delay is .* s; it must be from 0 to the sampling time"):
+        with pytest.raises(InputError, match=r"delay is .* s; it must be from 0 to the sampling time"):
             call()
 
 
