@@ -1,6 +1,6 @@
 """What may be rendered: the renderer's mechanics and the device's damping, and which K1 they leave for B1 and α.
 
-A parameter set is passive for K1 up to `passivity.largest_K1`, at the delay of the device's force. With a range of
+A parameter set is passive for K1 up to `passivity.largest_K1`, of a prompt force and of one at the delay. With a range of
 effective damping B_eff there is a lowest K1 too: B_eff = 1000·T·β·M1·(K1/(K1 + β·S))² rises with K1 from 0 to
 1000·T·β·M1, so that the range is an interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are K1 = β·S·r/(1 - r),
 infinite for r >= 1.
@@ -9,6 +9,7 @@ The search keeps `SEARCH_MARGIN` away from the device's damping, so that a devic
 float32 never refuses a proposal.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Mapping
@@ -69,8 +70,7 @@ def passive(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
 def passive_on_device(m: Mechanics, physical: _Physical, damping: float, delay: float) -> Bool[Array, "..."]:
     """Whether parameter sets of a study are passive on a device that reports this damping (N·s/m) and delay (s),
     whatever the study counts on. Raises `InputError` for a delay that is not from 0 to T."""
-    place = *_model_parameters(physical), damping, m.K_eff, m.N, m.T
-    return passivity.is_passive(*place, memory=m.memory, delay=delay)
+    return minimum_damping(dataclasses.replace(m, delay=delay), physical) <= jnp.asarray(damping)
 
 
 def _slack(physical: _Physical) -> float:
@@ -78,8 +78,13 @@ def _slack(physical: _Physical) -> float:
 
 
 def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
-    """The least damping (N·s/m) of a device on which parameter sets are passive."""
-    return passivity.minimum_damping(*_model_parameters(physical), m.K_eff, m.N, m.T, memory=m.memory, delay=m.delay)
+    """The least damping (N·s/m) of a device on which parameter sets are passive, for a force without delay and for one at
+    the delay: the need first falls with the delay and then rises, so that the larger of both holds in between."""
+    place = *_model_parameters(physical), m.K_eff, m.N, m.T
+    prompt = passivity.minimum_damping(*place, memory=m.memory)
+    if m.delay == 0:
+        return prompt
+    return jnp.maximum(prompt, passivity.minimum_damping(*place, memory=m.memory, delay=m.delay))
 
 
 def K0_of(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
@@ -89,9 +94,12 @@ def K0_of(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
 
 
 def largest_K1(m: Mechanics, B1: _Batch, alpha: _Batch) -> _Batch:
-    """The largest K1 (N/mm) that is passive with the search margin."""
-    b = m.damping * (1 - SEARCH_MARGIN)
-    return passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory, delay=m.delay)
+    """The largest K1 (N/mm) that is passive with the search margin, without delay and at the delay."""
+    place = B1, alpha, m.damping * (1 - SEARCH_MARGIN), m.K_eff, m.N, m.T
+    prompt = passivity.largest_K1(*place, memory=m.memory)
+    if m.delay == 0:
+        return prompt
+    return jnp.minimum(prompt, passivity.largest_K1(*place, memory=m.memory, delay=m.delay))
 
 
 def K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:
