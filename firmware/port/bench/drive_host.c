@@ -16,8 +16,9 @@
 #include "clock.h"
 #include "hilbo_motor.h"
 #include "hilbo_renderer.h"
+#include "realtime.h"
 
-enum { FAILED = 1, BAD_USAGE = 2, PERIOD_NS = 1000000, BEAT_TICKS = 50, APART_TICKS = 1000, MOST_LINES = 400000 };
+enum { FAILED = 1, BAD_USAGE = 2, PERIOD_NS = 1000000, BEAT_TICKS = 50, APART_TICKS = 500, MOST_LINES = 400000 };
 
 enum line_kind { LINE_TICK, LINE_SET, LINE_START, LINE_CLEAR, LINE_STOP, LINE_BEAT };
 
@@ -27,6 +28,7 @@ struct line {
     double position_mm;
     double force_N;
     uint32_t missed;
+    uint32_t early; /* 1: answered with the force of the last tick */
     uint32_t late_us;
     uint32_t state;
     uint32_t fate;
@@ -39,6 +41,7 @@ struct drive {
     struct line *lines;
     size_t size;
     uint32_t missed;        /* that the log has */
+    uint32_t early;
     uint32_t running_ticks; /* with force, since the last fault */
     int64_t tick_ns;        /* of the last tick */
 };
@@ -96,8 +99,9 @@ static void tick(struct drive *drive)
     hilbo_motor_command(drive->motor, force_N);
     hilbo_state(drive->renderer, &drive->state);
     note(drive, &(struct line){LINE_TICK, time_s, position_mm, force_N, drive->state.missed - drive->missed,
-                               drive->state.late_us, drive->state.state, drive->state.set});
+                               drive->state.early - drive->early, drive->state.late_us, drive->state.state, drive->state.set});
     drive->missed = drive->state.missed;
+    drive->early = drive->state.early;
     const bool pushes = drive->state.state == (uint32_t)HILBO_RUNNING && force_N > 0.5;
     drive->running_ticks = pushes ? drive->running_ticks + 1U : drive->running_ticks;
 }
@@ -172,9 +176,9 @@ static bool write_log(const struct drive *drive, const char *name)
     FILE *file = fopen(name, "w");
     for (size_t i = 0; file != NULL && i < drive->size; i++) {
         const struct line *line = &drive->lines[i];
-        (void)fprintf(file, "%s %.17g %.17g %.9g %lu %lu %lu %lu\n", kinds[line->kind], line->time_s, line->position_mm,
-                      line->force_N, (unsigned long)line->missed, (unsigned long)line->late_us,
-                      (unsigned long)line->state, (unsigned long)line->fate);
+        (void)fprintf(file, "%s %.17g %.17g %.9g %lu %lu %lu %lu %lu\n", kinds[line->kind], line->time_s, line->position_mm,
+                      line->force_N, (unsigned long)line->missed, (unsigned long)line->early,
+                      (unsigned long)line->late_us, (unsigned long)line->state, (unsigned long)line->fate);
     }
     return file != NULL && fclose(file) == 0;
 }
@@ -217,6 +221,9 @@ int main(int count, char **words)
     }
     if (!begin(&drive, &set, words[1])) {
         return FAILED;
+    }
+    if (!realtime_ask()) {
+        (void)fprintf(stderr, "hilbo-drive: no real-time priority; ticks may be late.\n");
     }
     run(&drive, atof(words[3]), true);
     hilbo_stop(drive.renderer);

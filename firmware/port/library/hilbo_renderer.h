@@ -171,8 +171,8 @@ HILBO_API void hilbo_heartbeat(struct hilbo_renderer *renderer);
  * The calls need not be even: a call earlier than a quarter period before its tick is due is answered with the force of
  * the last tick, so that a loop may run faster than tick_rate_Hz; a tick that is later than delay_us is a HOLD; for
  * each period without a call the core gets a missed tick, so that after hold_ticks of silence the first force is 0. The
- * schedule follows a loop that is up to 0.2 % faster or 0.05 % slower. A time that is no number, or is not
- * after that of the call before: no force, and ESTOP. */
+ * schedule begins with the earliest of 20 calls, after a gap too, and follows a loop that is up to 0.2 % faster or
+ * 0.05 % slower. A time that is no number, or is not after that of the call before: no force, and ESTOP. */
 HILBO_API double hilbo_tick(struct hilbo_renderer *renderer, double position_mm, double velocity_mm_per_s,
                             double time_s);
 

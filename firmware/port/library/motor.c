@@ -15,6 +15,7 @@
 
 #include "clock.h"
 #include "hilbo_motor.h"
+#include "realtime.h"
 #include "world.h"
 
 enum { BAD_USAGE = 2, RATE_HZ = 1000, MOST_RECORDED = 1000 * 1000 };
@@ -113,6 +114,7 @@ int main(int count, char **words)
     tick(&driver);
     (void)printf("ready\n");
     (void)fflush(stdout);
+    (void)realtime_ask();
     struct clock clock;
     clock_start(&clock, 1000000000 / RATE_HZ);
     while (!is_over()) {

@@ -7,6 +7,7 @@ static const double FORWARDS = 2e-3;    /* of a period by which the schedule mov
 static const double BACKWARDS = 5e-4;   /* and towards a late one: clocks differ by less */
 static const double ROUNDING = 1e-6;    /* of a period */
 static const double MOST_MISSED = 1e9;
+enum { SETTLING_CALLS = 20 };
 enum { MOST_CALLS = 100 };              /* within a period */
 
 /* The schedule lies where the early ticks are, so that lateness is measured from there; it follows a program whose clock
@@ -14,14 +15,20 @@ enum { MOST_CALLS = 100 };              /* within a period */
 static void move_on(struct schedule *schedule, double late_s)
 {
     const double period_s = schedule->period_s;
-    const double shift_s = fmin(fmax(late_s, -FORWARDS * period_s), BACKWARDS * period_s);
+    double shift_s = fmin(fmax(late_s, -FORWARDS * period_s), BACKWARDS * period_s);
+    if (schedule->settling > 0U) {
+        schedule->settling -= 1U;
+        shift_s = fmin(late_s, 0.0);
+    }
     schedule->due_s += period_s + shift_s;
 }
 
+/* The call that begins may itself be a late one: the next ones tell. Nothing is rendered then, a gap being a HOLD. */
 static void begin(struct schedule *schedule, double time_s)
 {
     schedule->begun = true;
     schedule->due_s = time_s + schedule->period_s;
+    schedule->settling = SETTLING_CALLS;
 }
 
 struct arrival schedule_arrive(struct schedule *schedule, double time_s)
@@ -37,7 +44,7 @@ struct arrival schedule_arrive(struct schedule *schedule, double time_s)
     }
     const double late_s = schedule->begun ? time_s - schedule->due_s : 0.0;
     schedule->last_s = time_s;
-    if (late_s < -EARLIEST * schedule->period_s) {
+    if (late_s < -EARLIEST * schedule->period_s && schedule->settling == 0U) {
         arrival.moment = MOMENT_EARLY;
         return arrival;
     }

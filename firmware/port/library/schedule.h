@@ -10,7 +10,8 @@ struct schedule {
     double due_s;  /* when the next tick is due */
     double last_s; /* of the last call */
     bool begun;
-    uint32_t calls; /* since the last tick */
+    uint32_t calls;    /* since the last tick */
+    uint32_t settling; /* so many calls to come are all ticks, and the earliest of them says when ticks are due */
 };
 
 enum moment {
