@@ -134,7 +134,7 @@ def library() -> ctypes.CDLL:
         "estop": (None, [handle]),
         "heartbeat": (None, [handle]),
         "tick": (double, [handle, double, double, double]),
-        "state": (None, [handle, ctypes.POINTER(_State)]),
+        "get_state": (None, [handle, ctypes.POINTER(_State)]),
         "sentence": (None, [handle, ctypes.c_char_p, ctypes.c_size_t]),
         "cause_in_words": (ctypes.c_char_p, [u32]),
         "K0_of": (double, [ctypes.POINTER(_Set), u32, double]),
@@ -224,7 +224,7 @@ class HostRenderer:
     def state(self) -> HostState:
         """How it is now."""
         packed = _State()
-        self._lib.hilbo_state(self._handle, ctypes.byref(packed))
+        self._lib.hilbo_get_state(self._handle, ctypes.byref(packed))
         return HostState(*(getattr(packed, name) for name in HostState._fields))
 
     def sentence(self) -> str:

@@ -15,8 +15,8 @@
 
 #include "clock.h"
 #include "hilbo_motor.h"
+#include "hilbo_realtime.h"
 #include "hilbo_renderer.h"
-#include "realtime.h"
 
 enum { FAILED = 1, BAD_USAGE = 2, PERIOD_NS = 1000000, BEAT_TICKS = 50, APART_TICKS = 500, MOST_LINES = 400000 };
 
@@ -97,7 +97,7 @@ static void tick(struct drive *drive)
     const double velocity_mm_per_s = hilbo_motor_get(&drive->motor->velocity_mm_per_s);
     const double force_N = hilbo_tick(drive->renderer, position_mm, velocity_mm_per_s, time_s);
     hilbo_motor_command(drive->motor, force_N);
-    hilbo_state(drive->renderer, &drive->state);
+    hilbo_get_state(drive->renderer, &drive->state);
     note(drive, &(struct line){LINE_TICK, time_s, position_mm, force_N, drive->state.missed - drive->missed,
                                drive->state.early - drive->early, drive->state.late_us, drive->state.state, drive->state.set});
     drive->missed = drive->state.missed;
@@ -183,7 +183,7 @@ static bool write_log(const struct drive *drive, const char *name)
     return file != NULL && fclose(file) == 0;
 }
 
-static bool begin(struct drive *drive, const struct hilbo_set *set, const char *motor)
+static bool begin(struct drive *drive, const struct hilbo_parameters *set, const char *motor)
 {
     char sentence[256] = "";
     const char *why = "";
@@ -207,7 +207,7 @@ int main(int count, char **words)
 {
     static struct drive drive;
     const bool given = count == 8;
-    const struct hilbo_set set = {
+    const struct hilbo_parameters set = {
         .K0_N_per_mm = given ? atof(words[4]) : 0.1,
         .K1_N_per_mm = given ? atof(words[5]) : 0.6,
         .B1_N_s_alpha_per_mm = given ? atof(words[6]) : 0.5,
@@ -222,7 +222,7 @@ int main(int count, char **words)
     if (!begin(&drive, &set, words[1])) {
         return FAILED;
     }
-    if (!realtime_ask()) {
+    if (!hilbo_realtime()) {
         (void)fprintf(stderr, "hilbo-drive: no real-time priority; ticks may be late.\n");
     }
     run(&drive, atof(words[3]), true);

@@ -132,7 +132,7 @@ static void enter(struct hilbo_renderer *renderer)
     }
 }
 
-int hilbo_set(struct hilbo_renderer *renderer, const struct hilbo_set *set)
+int hilbo_set(struct hilbo_renderer *renderer, const struct hilbo_parameters *set)
 {
     enter(renderer);
     const int reason = orders_set(&renderer->orders, set);
@@ -271,7 +271,7 @@ static uint32_t cause_of(const struct hilbo_renderer *renderer)
     return clock ? (uint32_t)HILBO_CAUSE_CLOCK : renderer->device.cause;
 }
 
-void hilbo_state(struct hilbo_renderer *renderer, struct hilbo_state *state)
+void hilbo_get_state(struct hilbo_renderer *renderer, struct hilbo_state *state)
 {
     enter(renderer);
     const struct hb_device *device = &renderer->device;
@@ -313,7 +313,7 @@ void hilbo_sentence(struct hilbo_renderer *renderer, char *text, size_t room)
     orders_sentence(&orders, text, room);
 }
 
-double hilbo_K0_of(const struct hilbo_set *set, uint32_t tick_rate_Hz, double K_eff_N_per_mm)
+double hilbo_K0_of(const struct hilbo_parameters *set, uint32_t tick_rate_Hz, double K_eff_N_per_mm)
 {
     struct hb_renderer renderer;
     const bool is_short = set->exponentials == 0U && set->taps <= HB_MAX_TAPS;

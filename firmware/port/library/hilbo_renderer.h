@@ -5,7 +5,7 @@
  *     hilbo_set(renderer, &set);                                         parameters; commits by itself when it may
  *     each period:     force_N = hilbo_tick(renderer, position_mm, velocity_mm_per_s, time_s);   and output it at once
  *     now and then:    hilbo_heartbeat(renderer);    from the thread that may end the motion; at least every 100 ms
- *     hilbo_state(renderer, &state);  hilbo_start(renderer, state.stops);  ...  hilbo_stop(renderer);
+ *     hilbo_get_state(renderer, &state);  hilbo_start(renderer, state.stops);  ...  hilbo_stop(renderer);
  *
  * The safety chain is the device's, by the same code: input check, passivity, saturation, slew limit, velocity,
  * overrun, heating, watchdog, START only out of contact. What the library cannot do: it computes a force, and the motor
@@ -74,7 +74,7 @@ struct hilbo_device_numbers {
 };
 
 /* One parameter set, with short memory (`taps` past samples, odd, at most 255) or with full memory (`exponentials`). */
-struct hilbo_set {
+struct hilbo_parameters {
     double K0_N_per_mm;
     double K1_N_per_mm;
     double B1_N_s_alpha_per_mm;
@@ -146,7 +146,7 @@ HILBO_API void hilbo_close(struct hilbo_renderer *renderer); /* NULL is nothing 
 /* Check a set and stage it: 0, or the number of the refusal (NACK reason of firmware/PROTOCOL.md). Its history begins to
  * run, and it is put in force at the first tick that may, which is at once out of contact unless the device has a delay;
  * then hilbo_state has HILBO_IN_FORCE. A set that turns out not to be passive with the delay has HILBO_REFUSED. */
-HILBO_API int hilbo_set(struct hilbo_renderer *renderer, const struct hilbo_set *set);
+HILBO_API int hilbo_set(struct hilbo_renderer *renderer, const struct hilbo_parameters *set);
 
 /* Render the newest set, which must be in force, from out of contact: 0, or the number of the refusal. `stops` is that
  * of the hilbo_state which the caller has looked at: after a later stop the order does nothing and is refused. */
@@ -176,7 +176,7 @@ HILBO_API void hilbo_heartbeat(struct hilbo_renderer *renderer);
 HILBO_API double hilbo_tick(struct hilbo_renderer *renderer, double position_mm, double velocity_mm_per_s,
                             double time_s);
 
-HILBO_API void hilbo_state(struct hilbo_renderer *renderer, struct hilbo_state *state);
+HILBO_API void hilbo_get_state(struct hilbo_renderer *renderer, struct hilbo_state *state);
 
 /* What was refused last, and why, in a sentence with its numbers; "" if nothing was. Cut to `room` bytes with their 0. */
 HILBO_API void hilbo_sentence(struct hilbo_renderer *renderer, char *text, size_t room);
@@ -186,7 +186,7 @@ HILBO_API const char *hilbo_cause_in_words(uint32_t cause);
 
 /* K0 (N/mm) with which a set of `taps` past samples has the static stiffness K_eff; the K0 of `set` is not read. With
  * exponentials K0 is K_eff. */
-HILBO_API double hilbo_K0_of(const struct hilbo_set *set, uint32_t tick_rate_Hz, double K_eff_N_per_mm);
+HILBO_API double hilbo_K0_of(const struct hilbo_parameters *set, uint32_t tick_rate_Hz, double K_eff_N_per_mm);
 
 /* Along a surface's normal, a unit vector out of the material. A flat surface, or one whose normal hardly turns within a
  * touch: passivity is known along one direction. */

@@ -15,7 +15,7 @@
 
 #include "clock.h"
 #include "hilbo_motor.h"
-#include "realtime.h"
+#include "hilbo_realtime.h"
 #include "world.h"
 
 enum { BAD_USAGE = 2, RATE_HZ = 1000, MOST_RECORDED = 1000 * 1000 };
@@ -114,7 +114,7 @@ int main(int count, char **words)
     tick(&driver);
     (void)printf("ready\n");
     (void)fflush(stdout);
-    (void)realtime_ask();
+    (void)hilbo_realtime();
     struct clock clock;
     clock_start(&clock, 1000000000 / RATE_HZ);
     while (!is_over()) {

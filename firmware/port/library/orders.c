@@ -91,7 +91,7 @@ static uint32_t at_most_16_bits(uint32_t value)
     return value < UINT16_MAX ? value : UINT16_MAX;
 }
 
-static int parameters(struct orders *orders, const struct hilbo_set *set)
+static int parameters(struct orders *orders, const struct hilbo_parameters *set)
 {
     struct payload payload = {.size = 0};
     const bool full = set->exponentials > 0U;
@@ -110,7 +110,7 @@ static int parameters(struct orders *orders, const struct hilbo_set *set)
     return ask(orders, HB_SET_PARAMS, &payload);
 }
 
-int orders_set(struct orders *orders, const struct hilbo_set *set)
+int orders_set(struct orders *orders, const struct hilbo_parameters *set)
 {
     orders->set_id = orders->set_id < UINT16_MAX ? (uint16_t)(orders->set_id + 1U) : 1U;
     int reason = parameters(orders, set);

@@ -14,7 +14,7 @@ struct orders {
 
 /* HELLO. All return 0, or the reason of the refusal, which `refusal` then has with its numbers. */
 int orders_hello(struct orders *orders);
-int orders_set(struct orders *orders, const struct hilbo_set *set);
+int orders_set(struct orders *orders, const struct hilbo_parameters *set);
 int orders_commit(struct orders *orders);
 int orders_start(struct orders *orders, uint32_t stops);
 int orders_clear(struct orders *orders, uint32_t stops);
