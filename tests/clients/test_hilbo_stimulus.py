@@ -140,7 +140,7 @@ def test_a_device_that_stops_by_itself_voids_the_trial_which_comes_again(tmp_pat
         presenting.start()
         live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
         live.begin()
-        live.until(lambda _: live.events("void"), lambda: None)
+        live.until(lambda _: any(event.data["condition"] == "lost" for event in live.events("device")), lambda: None)
         all_answered(live)
         stimulus.close()
         presenting.join(PATIENCE)
