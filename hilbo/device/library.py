@@ -235,8 +235,8 @@ class HostRenderer:
 
     def why(self) -> str:
         """The state in words, and why it is in it."""
-        found = self.state()
-        return f"{State(found.state).name}: {self._lib.hilbo_cause_in_words(found.cause).decode()}"
+        now = self.state()
+        return f"{State(now.state).name}: {self._lib.hilbo_cause_in_words(now.cause).decode()}"
 
 
 def K0_of(*, K_eff: float, K1: float, B1: float, alpha: float, N: int = 101, tick_rate_Hz: int = 1000) -> float:

@@ -1,6 +1,7 @@
 """The examples that render by themselves, with the renderer library and a simulated motor, in sessions of the real
 server: a whole session, and a trial in which the program hangs for a moment."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -77,9 +78,9 @@ class Running:
 
 @pytest.mark.parametrize("language", ["c++", "python"])
 def test_it_renders_a_whole_session(language, example, tmp_path):
-    with LiveMaterial(tmp_path, blocks=BLOCKS, silence=2.0, within=20.0) as live:
-        with Running(example[language], live.link(), tmp_path):
-            sent = all_answered(live)
+    with LiveMaterial(tmp_path, blocks=BLOCKS, silence=2.0, within=20.0) as live, contextlib.ExitStack() as stack:
+        stack.enter_context(Running(example[language], live.link(), tmp_path))
+        sent = all_answered(live)
     answered = [data["values"] for data in sent]
     assert all(values in answered for values in RENDERED.values())
     assert all(data["force"] and data["program"].startswith("example_renderer") for data in sent)
