@@ -38,9 +38,7 @@ class Rendering:
         self.thread.start()
 
     def loop(self):
-        """A position, a tick, a force, once a millisecond and nothing else; before all other threads, where it may."""
-        with contextlib.suppress(AttributeError, PermissionError):
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+        """A position, a tick, a force, once a millisecond and nothing else."""
         due = time.perf_counter()
         while not self.ended:
             due += 0.001
@@ -139,6 +137,8 @@ class Rendering:
 def main(link):
     """Presents until Ctrl-C."""
     sys.setswitchinterval(0.0002)  # the loop waits so long for the other threads
+    with contextlib.suppress(AttributeError, PermissionError):  # where that is allowed, all go before other programs
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
     with SimulatedMotor() as motor, HostRenderer(MOTOR) as renderer:
         rendering = Rendering(renderer, motor)
         said = {"force": True, "go_neutral": renderer.stop, "neutral_within_s": 0.05}
