@@ -128,7 +128,7 @@ def test_after_a_late_call_the_schedule_is_that_of_the_others(phase):
 @pytest.mark.parametrize("slower", [-1e-3, 0.0, 4e-4])
 def test_a_clock_that_differs_a_little_is_followed(slower):
     run = running()
-    for _ in range(200):
+    for _ in range(100):
         run.order("beat")
         for _ in range(50):
             run.tick(2.0, after_s=1e-3 * (1 + slower))
@@ -174,6 +174,8 @@ def test_a_wrong_time_is_no_force_and_an_estop(wrong):
     run.follow(np.linspace(2, -1, 100))
     run.order("start")  # a new schedule has begun
     assert run.tick(-1.0) == 0 and run.state.state == State.RUNNING
+    run.renderer.estop()
+    assert run.state.cause == HoldReason.ESTOP
 
 
 def test_a_position_that_is_no_number_is_bad_input():

@@ -13,7 +13,6 @@ from hilbo.device.library import DeviceNumbers, Fate, HostRenderer, HostState
 __all__ = ["Core", "Recorded", "Row", "float_bits", "replayed"]
 
 _NAN = float("nan")
-_MORE_MISSED = 3  # ticks beyond those of HOLD's ramp that a gap is given to the core as
 
 
 class Row(NamedTuple):
@@ -150,7 +149,7 @@ class Core:
     def tick(self, row: Row) -> float:
         """With the ticks that were missed before it."""
         tick = self.lib.shim_tick
-        for _ in range(min(row.missed, self.numbers.hold_ticks + _MORE_MISSED)):
+        for _ in range(min(row.missed, self.numbers.hold_ticks)):
             tick(self.memory, 0, 0, 1, ctypes.c_float(0))
         if not abs(row.position_mm) < 1e6:
             return tick(self.memory, 0, 0, 0, ctypes.c_float(0))

@@ -161,10 +161,8 @@ int hilbo_start(struct hilbo_renderer *renderer, uint32_t stops)
     if (renderer->fate == HILBO_WAITING) {
         (void)hb_staging_now(&renderer->device, &ticks);
         reason = orders_refuse(&renderer->orders, (uint8_t)HB_START, HB_NACK_NOT_READY, ticks);
-    } else if (renderer->fate == HILBO_REFUSED) {
-        reason = orders_refuse(&renderer->orders, (uint8_t)HB_START, HB_NACK_SET_MISMATCH, 0U);
     } else {
-        reason = orders_start(&renderer->orders, stops);
+        reason = orders_start(&renderer->orders, stops); /* of the newest set, so that a refused one is a mismatch */
     }
     lock_leave(&renderer->lock);
     return reason;
@@ -214,8 +212,7 @@ static struct hb_input input_at(const struct hilbo_renderer *renderer, double po
 static void miss(struct hilbo_renderer *renderer, uint32_t missed)
 {
     const struct hb_input input = {.position_valid = false, .overrun = true, .sensed_N = NAN};
-    const uint32_t most = (uint32_t)renderer->config.hold_ticks + 3U;
-    for (uint32_t i = 0; i < missed && i < most; i++) {
+    for (uint32_t i = 0; i < missed && i < renderer->config.hold_ticks; i++) {
         (void)hb_tick(&renderer->device, &input);
     }
     renderer->missed += missed;
