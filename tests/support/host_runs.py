@@ -9,10 +9,13 @@ import numpy as np
 from helpers_firmware import NAMES, build, decode, frame, library, pack, schema, unpack
 
 from hilbo.device.library import DeviceNumbers, Fate, HostRenderer, HostState
+from hilbo.device.motor import MOTOR
+from hilbo.device.reasons import State
 
-__all__ = ["Core", "Recorded", "Row", "float_bits", "replayed"]
+__all__ = ["SOFT", "Core", "Recorded", "Row", "float_bits", "held_for", "replayed", "running"]
 
 _NAN = float("nan")
+SOFT = {"K0": 0.1, "K1": 0.6, "B1": 0.5, "alpha": 0.3}
 
 
 class Row(NamedTuple):
@@ -184,3 +187,19 @@ def replayed(rows: list[Row], numbers: DeviceNumbers) -> list[float]:
 def float_bits(forces: Any) -> list[bytes]:
     """Of binary32, so that -0 is not 0."""
     return [struct.pack("<f", force) for force in forces]
+
+
+def running(numbers=MOTOR, model=SOFT, at_mm=2.0, ticks=100):
+    """A renderer in contact."""
+    run = Recorded(numbers)
+    run.go(**model)
+    run.follow(np.linspace(-1, at_mm, 100))
+    run.follow([at_mm] * ticks)
+    assert run.state.state == State.RUNNING and run.state.force_N > 0.3
+    return run
+
+
+def held_for(run, cause):
+    """Whether it is in HOLD, and why."""
+    now = run.state
+    return (now.state, now.cause) == (State.HOLD, cause)
