@@ -47,7 +47,7 @@ API = {
         "study.trial_table study.folder study.validation_table statistics.paper_tables statistics.logits"
         " statistics.preferences report.comparison report.study report.result_tables",
     ),
-    "device": ("Device", "hardware_bridge device.protocol device.ports device.simulator"),
+    "device": ("Device", "hardware_bridge device.protocol device.ports device.simulator device.library device.motor"),
 }
 ELSEWHERE = {
     "README.md": "readme.md",
