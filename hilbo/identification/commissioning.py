@@ -66,10 +66,19 @@ class Bounds(NamedTuple):
         """Travel (mm) at which the device ends a nudge of this force (N)."""
         return min(self.travel_mm, self.work_mJ / force) / 2
 
+    def lasts(self, force: float, device: Renderer) -> float:
+        """Time (s) in which this force (N), which rises at the slew limit, has the impulse; at least a tick."""
+        slew = device.device.slew_limit_N_per_s
+        rises = force / (2 * slew)
+        whole = self.impulse_N_s / force
+        seconds = whole + rises if whole >= rises else math.sqrt(2 * self.impulse_N_s / slew)
+        return max(math.floor(seconds / device.tick_s + 1e-6), 1) * device.tick_s
+
     def forces(self, device: Renderer) -> list[float]:
         """Forces (N) to try, rising, for this device's encoder and motor."""
         bears = min(device.device.force_limit_N, device.condition().continuous_force_N)
-        most = min(self.most_N, bears, self.work_mJ / (2 * _FEWEST * device.device.encoder_step_mm))
+        told_apart = self.work_mJ / (2 * _FEWEST * device.device.encoder_step_mm)
+        most = min(self.most_N, bears, told_apart, self.impulse_N_s / device.tick_s)
         forces = [min(self.first_N, most)]
         while forces[-1] < most:
             forces.append(min(_RAISE * forces[-1], most))
@@ -194,9 +203,8 @@ def _nudge(device: Renderer, force: float, bounds: Bounds) -> Nudge:
     steps = device.device
     before = _rests(device)
     reach = max(bounds.reach(abs(force)), _FEWEST * steps.encoder_step_mm)
-    lasts = bounds.impulse_N_s / abs(force) + abs(force) / steps.slew_limit_N_per_s
     device.samples(0.0)
-    device.drive("force", "nudge", force, reach, duration=max(lasts, device.tick_s))
+    device.drive("force", "nudge", force, reach, duration=bounds.lasts(abs(force), device))
     wait_until(device, lambda: device.state() not in (State.DRIVING, State.STOPPING), "ended its nudge")
     seen, status = device.samples(0.05), device.status()
     if status.state != State.STOPPED:

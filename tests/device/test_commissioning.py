@@ -1,5 +1,7 @@
 """Commissioning against simulated devices whose wiring, encoder, friction or delay is not as it should be."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from simulated import needs_device, own_cache  # noqa: F401
@@ -108,6 +110,18 @@ def test_the_measurement_takes_its_place_in_the_order(recorded):
     assert list(dict.fromkeys(way[0] for way in recorded[1])) == ["force", "position"]
 
 
+def test_a_script_learns_how_far_the_nudges_have_moved_the_handle(measured, monkeypatch):
+    monkeypatch.setattr(commissioning, "find_signs", lambda *way: (commissioning._nudge(way[0], 0.3, way[2]),))
+    with Renderer.open("sim", options=NEW) as device:
+        moved = []
+        person = Nobody(device)
+        person.place = lambda by: moved.append((by, device.status().position_mm)) or START + by
+        commission(device, person, quiet)
+        by, position = moved[0]  # the device counts from where it started
+        assert by == pytest.approx(position, abs=1e-4) and by > 0.2
+        assert device.status().position_mm == pytest.approx(START + by, abs=0.0127)
+
+
 @pytest.mark.parametrize("coulomb", [0.02, 1.0])
 def test_a_device_in_order_is_commissioned(recorded, measured, coulomb):
     with Renderer.open("sim", options=NEW | {"coulomb": coulomb, "delay": 150}) as device:
@@ -144,6 +158,10 @@ def test_the_force_of_a_handle_that_does_not_move_is_raised_to_its_most(recorded
         with pytest.raises(DeviceError, match=r"nothing moves inwards up to 2 N; check .* --most-force"):
             find_signs(device, quiet, Bounds())
         assert device.state() == State.STOPPED
+    force = np.concatenate([piece.force_N for piece in recorded[0]])
+    ends = np.flatnonzero(np.diff(np.r_[0, force != 0, 0]))
+    impulses = [-force[begin:end].sum() * 1e-3 for begin, end in zip(ends[::2], ends[1::2], strict=True)]
+    assert len(impulses) == len(recorded[1]) and 0.012 < min(impulses) <= max(impulses) <= Bounds().impulse_N_s
     forces = [way[2] for way in recorded[1]]
     assert forces[0] == 0.3 and forces[-1] == 2.0 and np.all(np.diff(forces) > 0)
 
@@ -263,6 +281,21 @@ def test_a_force_that_comes_late_ends_the_commissioning(measured):
         person.take_hands_off = lambda: None
         with pytest.raises(DeviceError, match="delay_us of 100 is too short: a force came out 400 us after"):
             commission(device, person, quiet)
+
+
+@pytest.mark.parametrize("slew", [1.0, 20.0, 500.0])
+def test_a_slow_rise_of_the_force_keeps_the_impulse(monkeypatch, slew):
+    with Renderer.open("sim", options=NEW) as device:
+        device.device = replace(device.device, slew_limit_N_per_s=slew)
+        for force in Bounds().forces(device):
+            steps = np.minimum(np.arange(1, round(Bounds().lasts(force, device) * 1e3) + 1) * slew / 1e3, force)
+            assert 0.7 * Bounds().impulse_N_s < steps.sum() * 1e-3 < 1.05 * Bounds().impulse_N_s
+
+
+@pytest.mark.parametrize("delay", [75, 1050, "x"])
+def test_a_delay_that_the_simulated_world_cannot_have_is_refused(delay):
+    with pytest.raises(InputError, match=f"--delay {delay} makes no sense"):
+        Renderer.open("sim", options=NEW | {"delay": delay})
 
 
 def test_home_refuses_a_place_outside_of_the_stroke():
