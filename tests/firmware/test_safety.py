@@ -228,7 +228,7 @@ def test_nothing_starts_before_a_position_is_known():
 
 
 def test_a_heartbeat_is_as_old_as_the_tick_that_came_back(pressed):
-    """Nothing is lost on the line, and its delay grows: force ends `watchdog_ticks` after the tick that was last heard."""
+    """Nothing is lost on the line and its delay grows: force ends `watchdog_ticks` after the tick last heard."""
     heard = pressed.status()["tick"]
     for _ in range(30):
         pressed.feed(frame("HEARTBEAT", 0, pack("HEARTBEAT", boot_id=7, tick=heard)))
