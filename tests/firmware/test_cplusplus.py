@@ -10,7 +10,7 @@ import pytest
 from helpers_firmware import CORE, FIRMWARE
 
 SKETCH = FIRMWARE / "tests" / "cplusplus.cpp"
-STRICT_CPLUSPLUS = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Wshadow", "-Werror"]
+STRICT_CPLUSPLUS = ["-std=c++17", "-O1", "-Wall", "-Wextra", "-Wpedantic", "-Werror"]
 ORDINARY = ("-std=c11", "-O2", "-ffp-contract=off")
 FUSING = ("-std=c11", "-O2", "-ffp-contract=fast", "-mfma")
 FUSING_ARDUINO = ("-std=gnu11", "-O2", "-mfma")
