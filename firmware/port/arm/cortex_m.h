@@ -10,6 +10,8 @@
 #define CORTEX_M_SYSTICK_CONTROL register_at(0xE000E010U)
 #define CORTEX_M_SYSTICK_RELOAD register_at(0xE000E014U)
 #define CORTEX_M_SYSTICK_VALUE register_at(0xE000E018U)
+#define CORTEX_M_PENDING register_at(0xE000ED04U)
+#define CORTEX_M_PENDING_SYSTICK (UINT32_C(1) << 26)
 #define CORTEX_M_NVIC_ENABLE(interrupt) register_at(0xE000E100U + 4U * ((interrupt) / 32U))
 
 #if defined(__arm__)

@@ -25,6 +25,9 @@ uint32_t board_micros(void);
 /* From now on `systick_interrupt` at each period. */
 void board_start_ticks(uint32_t rate_Hz);
 
+/* The processor waits for an interrupt, which is served when they are on again; called with interrupts off. */
+void board_wait(void);
+
 /* A reset unless board_tick_is_over follows within about five periods (3 to 9, as the watchdog's own clock is), again and
  * again. */
 void board_start_watchdog(uint32_t period_us);

@@ -2,7 +2,8 @@
  * and counters without pins. Everything else is simulated here: a handle with a finger, as seen by a counter of 16 bits,
  * and a command in the steps of the real output. There is no watchdog and no flash.
  *
- * The emulator gives its counters 1 GHz. USART2 is the hand of a test; one letter each:
+ * The emulator gives its counters 1 GHz. It wakes the processor late when the computer that it runs on is busy; as no
+ * processor does, time stands still meanwhile. USART2 is the hand of a test; one letter each:
  *
  *     0 to 6   a finger that presses so (enum sim_press); at the start it rests where the handle is
  *     o, c     the stop is open, closed
@@ -43,6 +44,9 @@ static struct {
     bool encoder_is_bad;
     bool is_late;
     uint32_t began_ns;
+    uint32_t period_us;
+    uint32_t next_due_us;
+    uint32_t skipped_us;
     struct cost cost;
 } board;
 
@@ -97,12 +101,31 @@ uint32_t board_boot_id(void)
 
 uint32_t board_micros(void)
 {
-    return *TIM_CNT(TIM5);
+    return *TIM_CNT(TIM5) - board.skipped_us;
 }
 
 void board_start_ticks(uint32_t rate_Hz)
 {
+    board.period_us = 1000000U / rate_Hz;
+    board.next_due_us = board_micros() + board.period_us;
     cortex_m_start_systick(CLOCK_HZ, rate_Hz);
+}
+
+static bool has_passed(uint32_t time_us)
+{
+    return board_micros() - time_us < UINT32_C(0x80000000);
+}
+
+void board_wait(void)
+{
+    while (has_passed(board.next_due_us)) {
+        board.next_due_us += board.period_us;
+    }
+    cortex_m_wait();
+    if ((*CORTEX_M_PENDING & CORTEX_M_PENDING_SYSTICK) != 0U && has_passed(board.next_due_us)) {
+        board.skipped_us += board_micros() - board.next_due_us;
+        *CORTEX_M_SYSTICK_VALUE = 0; /* the next period begins now */
+    }
 }
 
 void board_start_watchdog(uint32_t period_us)

@@ -251,6 +251,11 @@ void board_start_ticks(uint32_t rate_Hz)
     cortex_m_start_systick(CLOCK_HZ, rate_Hz);
 }
 
+void board_wait(void)
+{
+    cortex_m_wait();
+}
+
 /* Its clock has 17 to 47 kHz, 32 as a rule, divided by 4. */
 void board_start_watchdog(uint32_t period_us)
 {

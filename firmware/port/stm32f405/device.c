@@ -21,6 +21,7 @@ static volatile uint32_t ticks_due;
 static uint32_t period_us;
 static uint32_t due_us;   /* when the last tick was due */
 static uint32_t delay_us; /* from then until its force was out */
+static bool is_late;      /* a tick was missed before this one */
 
 void systick_interrupt(void)
 {
@@ -36,6 +37,17 @@ static uint32_t take_ticks_due(void)
     return due;
 }
 
+/* When this tick was due. An interrupt of the timer that was itself missed is no tick: time goes on without it. */
+static void follow_time(uint32_t due)
+{
+    due_us += due * period_us;
+    const uint32_t late_us = board_micros() - due_us;
+    is_late = due > 1U || late_us >= period_us;
+    if (late_us >= period_us) {
+        due_us += late_us;
+    }
+}
+
 /* ESTOP cuts the driver off too, whoever asked for it. */
 static void put_out(float force_N)
 {
@@ -48,12 +60,11 @@ static void put_out(float force_N)
 
 static void tick(void)
 {
-    const uint32_t due = take_ticks_due();
-    due_us += due * period_us;
+    follow_time(take_ticks_due());
     const struct hb_input input = {
         .position_counts = encoder_extend(&encoder, board_encoder_counter()) * HILBO_SETTINGS.encoder_sign,
         .position_valid = board_encoder_is_good(),
-        .overrun = due > 1U,
+        .overrun = is_late,
         .stop_open = board_stop_is_open(),
         .delay_us = delay_us,
         .sensed_N = board_sensed_N(),
@@ -81,7 +92,9 @@ static bool transmit(void)
     uint8_t bytes[64];
     const size_t room = uart_room();
     const size_t size = hb_transmit(&device, bytes, room < sizeof bytes ? room : sizeof bytes);
-    uart_send(bytes, size);
+    if (size > 0) {
+        uart_send(bytes, size);
+    }
     return size > 0;
 }
 
@@ -90,7 +103,7 @@ static void rest(void)
 {
     cortex_m_interrupts_off();
     if (ticks_due == 0 && !uart_has_received()) {
-        cortex_m_wait();
+        board_wait();
     }
     cortex_m_interrupts_on();
 }
