@@ -13,7 +13,6 @@
 #include "../port/stm32f405/registers.h"
 #include "../port/stm32f405/uart.h"
 #include "cortex_m.h"
-#include "hb_device.h"
 #include "hilbo_device_config.h"
 #include "stm32f405_model.h"
 
@@ -225,8 +224,7 @@ int32_t model_encoder(const uint16_t *counters, size_t count)
 
 int model_config_error(void)
 {
-    static struct hb_device device;
-    return (int)hb_init(&device, &HILBO_DEVICE_CONFIG, 1);
+    return (int)hb_config_check(&HILBO_DEVICE_CONFIG);
 }
 
 /* Flash of a few words, whose supply fails in the operation `cut`: that leaves a word, or a sector, half done. */

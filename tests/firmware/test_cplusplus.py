@@ -1,4 +1,4 @@
-"""The core in programs that others build: C++ (Arduino, PlatformIO, SimpleFOC), and compilers that fuse multiply-adds."""
+"""The core in programs of others: C++ (Arduino, PlatformIO, SimpleFOC), and compilers that fuse multiply-adds."""
 
 import functools
 import platform

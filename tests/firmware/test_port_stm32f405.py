@@ -1,7 +1,7 @@
 """The STM32F405 port in the emulator: a whole session with a finger, the hardware stop, late ticks, and what it costs.
 
-The image is the chip's own loop (device.c) and line (uart.c) on board_emulated.c; the registers of the real board are in
-test_port_stm32f405_registers.py. The second serial line is the hand of the test.
+The image is the chip's own loop (device.c) and line (uart.c) on board_emulated.c; the registers of the real board are
+in test_port_stm32f405_registers.py. The second serial line is the hand of the test.
 """
 
 import ctypes
@@ -150,7 +150,7 @@ class Emulated:
         self.hand.socket.sendall(letter)
         self.wait_ticks(3)
 
-    def cost(self) -> tuple[int, int, int, int]:
+    def cost(self) -> tuple[int, ...]:
         """Ticks since the last time, mean and most of their instructions, and the longest delay (us)."""
         self.hand.socket.sendall(b"r")
         text = b""

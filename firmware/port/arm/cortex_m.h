@@ -6,6 +6,7 @@
 
 #include "register.h"
 
+#define CORTEX_M_VECTORS register_at(0xE000ED08U)
 #define CORTEX_M_CPACR register_at(0xE000ED88U) /* coprocessor access */
 #define CORTEX_M_SYSTICK_CONTROL register_at(0xE000E010U)
 #define CORTEX_M_SYSTICK_RELOAD register_at(0xE000E014U)

@@ -62,6 +62,13 @@ static void set_function(uint32_t port, uint32_t pin, uint32_t function, enum gp
     set_mode(port, pin, GPIO_ALTERNATE, pull);
 }
 
+/* The chip takes two cycles to do so, in which what is written to the peripheral is lost; reading back takes longer. */
+static void enable_clock(volatile uint32_t *clocks, uint32_t bits)
+{
+    *clocks |= bits;
+    (void)*clocks;
+}
+
 static bool wait_for(volatile uint32_t *value, uint32_t mask, uint32_t wanted)
 {
     uint32_t left = MOST_WAITS;
@@ -78,7 +85,7 @@ static bool start_clock(void)
     if (!wait_for(RCC_CR, RCC_CR_HSERDY, RCC_CR_HSERDY)) {
         return false;
     }
-    *RCC_APB1ENR |= RCC_APB1_PWR;
+    enable_clock(RCC_APB1ENR, RCC_APB1_PWR);
     *PWR_CR |= PWR_CR_VOS;
     *FLASH_ACR = FLASH_ACR_5_WAIT_STATES | FLASH_ACR_PREFETCH | FLASH_ACR_INSTRUCTION_CACHE | FLASH_ACR_DATA_CACHE;
     *RCC_PLLCFGR = settings->crystal_Hz / 2000000U | UINT32_C(168) << 6 | RCC_PLLCFGR_FROM_HSE | UINT32_C(7) << 24;
@@ -97,7 +104,7 @@ static bool start_clock(void)
 
 static void start_micros(uint32_t timer_Hz)
 {
-    *RCC_APB1ENR |= RCC_APB1_TIM5;
+    enable_clock(RCC_APB1ENR, RCC_APB1_TIM5);
     *TIM_PSC(TIM5) = timer_Hz / 1000000U - 1U;
     *TIM_ARR(TIM5) = UINT32_C(0xFFFFFFFF);
     *TIM_EGR(TIM5) = TIM_EGR_UPDATE; /* takes the divider over */
@@ -106,7 +113,7 @@ static void start_micros(uint32_t timer_Hz)
 
 static void start_line(uint32_t clock_Hz, uint32_t baud)
 {
-    *RCC_APB2ENR |= RCC_APB2_USART1;
+    enable_clock(RCC_APB2ENR, RCC_APB2_USART1);
     set_function(GPIOB, PIN_SENT, FUNCTION_USART1, GPIO_NO_PULL);
     set_function(GPIOB, PIN_RECEIVED, FUNCTION_USART1, GPIO_PULL_UP); /* a line that is unplugged is idle */
     uart_start(clock_Hz, baud);
@@ -114,7 +121,7 @@ static void start_line(uint32_t clock_Hz, uint32_t baud)
 
 static void start_encoder(void)
 {
-    *RCC_APB1ENR |= RCC_APB1_TIM3;
+    enable_clock(RCC_APB1ENR, RCC_APB1_TIM3);
     set_function(GPIOB, PIN_ENCODER_A, FUNCTION_TIM3, GPIO_PULL_UP);
     set_function(GPIOB, PIN_ENCODER_B, FUNCTION_TIM3, GPIO_PULL_UP);
     *TIM_ARR(TIM3) = 0xFFFF;
@@ -127,7 +134,7 @@ static void start_encoder(void)
 static void start_pwm(void)
 {
     const bool two = settings->output == SETTINGS_TWO_PWM;
-    *RCC_APB2ENR |= RCC_APB2_TIM1;
+    enable_clock(RCC_APB2ENR, RCC_APB2_TIM1);
     full_steps = (int32_t)((uint32_t)CLOCK_HZ / settings->pwm_Hz);
     *TIM_ARR(TIM1) = (uint32_t)full_steps - 1U;
     *TIM_CCMR1(TIM1) = TIM_CCMR1_PWM_PRELOADED;
@@ -148,7 +155,7 @@ static void start_pwm(void)
 
 static void start_dac(void)
 {
-    *RCC_APB1ENR |= RCC_APB1_DAC;
+    enable_clock(RCC_APB1ENR, RCC_APB1_DAC);
     full_steps = DAC_FULL;
     *DAC_DHR12R1 = DAC_ZERO;
     set_mode(GPIOA, PIN_DAC, GPIO_ANALOG, GPIO_NO_PULL);
@@ -158,7 +165,7 @@ static void start_dac(void)
 /* First of all, and on the clock of the reset: the driver is off. */
 static void start_pins(void)
 {
-    *RCC_AHB1ENR |= RCC_AHB1_GPIOA | RCC_AHB1_GPIOB;
+    enable_clock(RCC_AHB1ENR, RCC_AHB1_GPIOA | RCC_AHB1_GPIOB);
     set_pin(GPIOB, PIN_DRIVER, false);
     set_mode(GPIOB, PIN_DRIVER, GPIO_OUTPUT, GPIO_NO_PULL);
     set_function(GPIOA, PIN_STOP, FUNCTION_TIM1, GPIO_PULL_UP); /* a broken wire is an open stop */

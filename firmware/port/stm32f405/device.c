@@ -152,8 +152,8 @@ int main(void)
     board_start_watchdog(period_us);
     encoder.counter = board_encoder_counter();
     cortex_m_interrupts_off();
+    due_us = board_micros(); /* before the timer starts, so that no tick comes before it is due */
     board_start_ticks(config.tick_rate_Hz);
-    due_us = board_micros();
     cortex_m_interrupts_on();
     for (;;) {
         if (ticks_due > 0) {

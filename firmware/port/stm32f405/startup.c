@@ -36,6 +36,7 @@ _Static_assert(USART1_INTERRUPT == 37 && INTERRUPTS == 37 + 1 + 44, "the macros 
 
 _Noreturn void reset(void)
 {
+    *CORTEX_M_VECTORS = (uint32_t)(uintptr_t)VECTORS; /* a boot loader may have left its own */
     cortex_m_enable_fpu();
     const uint32_t *const here = __builtin_frame_address(0);
     cortex_m_fill(stack_low, here - 32, (uint32_t)PAINT); /* what this function itself may still use stays */
