@@ -151,7 +151,7 @@ class Emulated:
         self.wait_ticks(3)
 
     def cost(self) -> tuple[int, ...]:
-        """Ticks since the last time, mean and most of their instructions, and the longest delay (us)."""
+        """Ticks since the last time, mean and most of their instructions, longest delay (us), the driver's enable."""
         self.hand.socket.sendall(b"r")
         text = b""
         while not text.endswith(b"\n"):
@@ -240,11 +240,12 @@ def test_a_session_from_hello_to_estop(device):
     assert device.refused("HOME", **device.order(), position_mm=0.0) == "STATE"
     device.command(PRESSES)
     device.wait_ticks(3000)
-    assert device.status()["state"] == State.RUNNING
+    assert device.status()["state"] == State.RUNNING and device.cost()[-1] == 1
     device.acknowledged("ESTOP")
     device.wait_state(State.ESTOP)
     device.wait_ticks(3)
     stopped = device.status()
+    assert device.cost()[-1] == 0  # the driver is off
     assert (stopped["hold_reason"], stopped["force_N"], stopped["overruns"]) == (CAUSE_ESTOP, 0.0, 0)
     device.wait_ticks(20)
 
@@ -270,8 +271,10 @@ def test_the_hardware_stop(device):
     assert status["flags"] & 2
     assert device.refused("CLEAR", **device.order()) == "STOP_OPEN"
     device.command(b"c")
+    assert device.cost()[-1] == 0
     device.acknowledged("CLEAR", **device.order())
-    assert device.status()["state"] == State.STOPPED
+    device.wait_ticks(3)
+    assert device.status()["state"] == State.STOPPED and device.cost()[-1] == 1
 
 
 @pytest.mark.deep
@@ -303,10 +306,20 @@ def test_what_a_tick_costs(device):
     device.command(PRESSES)
     device.cost()
     device.wait_ticks(2000)
-    ticks, mean, most, delay_us = device.cost()
+    ticks, mean, most, delay_us, _ = device.cost()
     assert ticks >= 2000 and 500 < mean < 3000 and most < 6000
     # The emulator takes 8 ns an instruction: 125 MIPS, which is 1.3 cycles an instruction at 168 MHz.
     assert 50 < delay_us < 300
+
+
+def with_numbers(folder: Path, **numbers: str) -> Path:
+    """The emulated image of a device with other numbers than the template's."""
+    text = (FIRMWARE / "port" / "stm32f405" / "config" / "hilbo_device_config.h").read_text(encoding="utf-8")
+    for name, value in numbers.items():
+        text, count = re.subn(rf"\.{name} = [^,]+,", f".{name} = {value},", text)
+        assert count == 1, name
+    (folder / "hilbo_device_config.h").write_text(text, encoding="utf-8")
+    return make(folder, f"STM32F405_CONFIG={folder}")
 
 
 def make(folder: Path, *assignments: str) -> Path:
@@ -342,22 +355,20 @@ def test_a_build_that_fuses_products_and_sums_says_so(tmp_path):
 
 
 @pytest.mark.deep
-@pytest.mark.parametrize(
-    ("number", "value", "word"),
-    [("force_limit_N", "500.0F", "force limit"), ("full_scale_N", "1.0F", "full_scale_N"), ("delay_us", "0", None)],
-)
-def test_a_device_with_other_numbers(number, value, word, tmp_path):
-    """A wrong one is told on the line; a delay of 0 is only wrong where nothing is simulated."""
-    text = (FIRMWARE / "port" / "stm32f405" / "config" / "hilbo_device_config.h").read_text(encoding="utf-8")
-    changed, count = re.subn(rf"\.{number} = [^,]+,", f".{number} = {value},", text)
-    assert count == 1
-    (tmp_path / "hilbo_device_config.h").write_text(changed, encoding="utf-8")
-    kernel = make(tmp_path, f"STM32F405_CONFIG={tmp_path}")
-    if word:
-        assert word in sentence(tmp_path, kernel)
-    else:
-        with Emulated(tmp_path, kernel) as device:
-            assert device.hello() and device.ask("GET_LIMITS")[1]["delay_us"] == 0
+@pytest.mark.parametrize(("number", "value"), [("force_limit_N", "500.0F"), ("full_scale_N", "1.0F")])
+def test_a_wrong_number_is_told_on_the_line(number, value, tmp_path):
+    assert number.split("_")[0] in sentence(tmp_path, with_numbers(tmp_path, **{number: value}))
+
+
+@pytest.mark.deep
+def test_a_device_with_other_numbers(tmp_path):
+    """Both signs turned: the position rises into the material all the same."""
+    kernel = with_numbers(tmp_path, encoder_sign="-1", motor_sign="-1", delay_us="1000", force_limit_N="4.0F")
+    with Emulated(tmp_path, kernel) as device:
+        assert device.hello()["force_limit_N"] == 4.0 and device.ask("GET_LIMITS")[1]["delay_us"] == 1000
+        device.acknowledged("HOME", **device.order(), position_mm=HANDLE_MM)
+        device.command(PRESSES)
+        device.wait(lambda: device.status()["position_mm"] > 1.0, "finger that presses inwards")
 
 
 @pytest.mark.deep

@@ -9,8 +9,8 @@
  *     o, c     the stop is open, closed
  *     b        the next position is no number
  *     l        the next tick begins 2 ms late
- *     r        answers "ticks mean most delay\n": instructions of a tick from reading the position to the force, at
- *              -icount shift=3, and the longest delay in us; then all of them are forgotten */
+ *     r        answers "ticks mean most delay driver\n": instructions of a tick from reading the position to the force,
+ *              at -icount shift=3, the longest delay in us, and whether the driver is on; then counting begins anew */
 #include <math.h>
 
 #include "board.h"
@@ -160,7 +160,8 @@ static void report(void)
     say_number(cost->ticks, " ");
     say_number((uint32_t)mean, " ");
     say_number(cost->most, " ");
-    say_number(cost->longest_us, "\n");
+    say_number(cost->longest_us, " ");
+    say_number(board.driver_is_on ? 1U : 0U, "\n");
     *cost = (struct cost){0};
 }
 

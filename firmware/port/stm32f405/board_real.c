@@ -62,11 +62,12 @@ static void set_function(uint32_t port, uint32_t pin, uint32_t function, enum gp
     set_mode(port, pin, GPIO_ALTERNATE, pull);
 }
 
-/* The chip takes two cycles to do so, in which what is written to the peripheral is lost; reading back takes longer. */
+/* The chip takes a few cycles to do so, in which what is written to the peripheral is lost. */
 static void enable_clock(volatile uint32_t *clocks, uint32_t bits)
 {
     *clocks |= bits;
     (void)*clocks;
+    cortex_m_barrier();
 }
 
 static bool wait_for(volatile uint32_t *value, uint32_t mask, uint32_t wanted)
