@@ -170,6 +170,7 @@ class Emulated:
     def run(self) -> dict:
         """Homed, and RUNNING out of contact."""
         self.hello()
+        self.wait_ticks(5)
         self.acknowledged("HOME", **self.order(), position_mm=HANDLE_MM)
         named = self.stage()
         self.acknowledged("STREAM", divisor=1, fields=0)
@@ -278,13 +279,14 @@ def test_the_hardware_stop(device):
 
 
 @pytest.mark.deep
-def test_a_late_tick_and_a_bad_position(device):
+@pytest.mark.parametrize("late", [b"l", b"m"])
+def test_a_late_tick_and_a_bad_position(late, device):
     device.run()
     device.command(b"b")
     status = device.status()
     assert (status["state"], status["input_held"]) == (State.RUNNING, 1)
     assert device.cost()[3] < 400
-    device.command(b"l")
+    device.command(late)
     status = device.status()
     assert (status["state"], status["hold_reason"]) == (State.HOLD, CAUSE_OVERRUN) and status["overruns"] >= 1
     device.cost()
@@ -366,9 +368,11 @@ def test_a_device_with_other_numbers(tmp_path):
     kernel = with_numbers(tmp_path, encoder_sign="-1", motor_sign="-1", delay_us="1000", force_limit_N="4.0F")
     with Emulated(tmp_path, kernel) as device:
         assert device.hello()["force_limit_N"] == 4.0 and device.ask("GET_LIMITS")[1]["delay_us"] == 1000
+        device.wait_ticks(5)
         device.acknowledged("HOME", **device.order(), position_mm=HANDLE_MM)
         device.command(PRESSES)
-        device.wait(lambda: device.status()["position_mm"] > 1.0, "finger that presses inwards")
+        device.wait(lambda: abs(device.status()["position_mm"] - HANDLE_MM) > 1.5, "finger that presses")
+        assert device.status()["position_mm"] > 0
 
 
 @pytest.mark.deep

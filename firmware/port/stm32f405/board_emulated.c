@@ -9,6 +9,7 @@
  *     o, c     the stop is open, closed
  *     b        the next position is no number
  *     l        the next tick begins 2 ms late
+ *     m        likewise, with interrupts off, so that a tick is lost
  *     r        answers "ticks mean most delay driver\n": instructions of a tick from reading the position to the force,
  *              at -icount shift=3, the longest delay in us, and whether the driver is on; then counting begins anew */
 #include <math.h>
@@ -43,6 +44,7 @@ static struct {
     bool stop_is_open;
     bool encoder_is_bad;
     bool is_late;
+    bool is_masked;
     uint32_t began_ns;
     uint32_t period_us;
     uint32_t next_due_us;
@@ -173,8 +175,9 @@ static void obey(uint8_t letter)
         board.stop_is_open = letter == 'o';
     } else if (letter == 'b') {
         board.encoder_is_bad = true;
-    } else if (letter == 'l') {
+    } else if (letter == 'l' || letter == 'm') {
         board.is_late = true;
+        board.is_masked = letter == 'm';
     } else if (letter == 'r') {
         report();
     }
@@ -202,8 +205,12 @@ void board_tick_is_over(uint32_t delay_us)
     if (board.is_late) {
         const uint32_t began_us = board_micros();
         board.is_late = false;
+        if (board.is_masked) {
+            cortex_m_interrupts_off();
+        }
         while (board_micros() - began_us < LATE_US) {
         }
+        cortex_m_interrupts_on();
     }
 }
 
