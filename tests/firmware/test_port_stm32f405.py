@@ -19,11 +19,13 @@ import pytest
 from device_port import FIRMWARE, PATIENCE, SCHEMA, State, image
 from helpers_firmware import FLAGS, NAMES, REASONS, build, decode, frame, library, pack, unpack
 
+from hilbo.hardware_bridge import Renderer
+
 CAUSE_WATCHDOG, CAUSE_INPUT, CAUSE_OVERRUN, CAUSE_ESTOP, CAUSE_SWITCH = 1, 2, 4, 7, 9
 SET = {"set_id": 5, "memory": 0, "length": 101, "tick_rate_Hz": 1000, "force_limit_N": 5.0}
 SET |= {"K0_N_per_mm": 0.1, "K1_N_per_mm": 0.2, "B1_N_s_alpha_per_mm": 0.3, "alpha": 0.3}
 HANDLE_MM = -1.0  # where the simulated handle is at the start
-RESTS, PRESSES = b"1", b"6"
+PRESSES = b"6"
 EMULATED, REAL = "stm32f405-emulated", "stm32f405"
 
 
@@ -312,6 +314,30 @@ def test_what_a_tick_costs(device):
     assert ticks >= 2000 and 500 < mean < 3000 and most < 6000
     # The emulator takes 8 ns an instruction: 125 MIPS, which is 1.3 cycles an instruction at 168 MHz.
     assert 50 < delay_us < 300
+
+
+@pytest.mark.deep
+def test_the_host_on_a_terminal():
+    """hilbo's own host homes the device, puts a set in force, and renders it under the finger."""
+    command = ["qemu-system-arm", "-M", "netduinoplus2", "-display", "none", "-monitor", "none", "-icount", "shift=3"]
+    command += ["-serial", "pty", "-serial", "pty", "-kernel", str(image(EMULATED, "m4"))]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as emulator:
+        assert emulator.stdout
+        line, hand = (re.findall(r"/dev/\S+", emulator.stdout.readline())[0] for _ in range(2))
+        try:
+            with Renderer.open(line) as device, open(hand, "wb", buffering=0) as keys:
+                while device.status().tick < 5:  # until there has been a position
+                    pass
+                device.home(HANDLE_MM)
+                device.send(K0=0.1, K1=0.2, B1=0.3, alpha=0.3)
+                device.start()
+                keys.write(PRESSES)
+                table = device.telemetry(1.5)
+                assert device.status().overruns == 0 and device.delay == pytest.approx(400e-6)
+        finally:
+            emulator.kill()
+    assert len(table) >= 1500 and table["force_N"].max() > 0.2
+    assert ((table["force_N"] > 0) <= (table["position_mm"] > 0)).all()
 
 
 def with_numbers(folder: Path, **numbers: str) -> Path:
