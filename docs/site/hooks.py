@@ -26,7 +26,7 @@ API = {
     "mechanics": (
         "Mechanics and search space",
         "viscoelastic mechanics.fosls mechanics.memory mechanics.materials mechanics.continuous mechanics.switching"
-        " passivity mechanics.passivity_certificate search.space search.columns search.candidates",
+        " passivity mechanics.passivity_certificate mechanics.delay search.space search.columns search.candidates",
     ),
     "identification": (
         "Identification",
