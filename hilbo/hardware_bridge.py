@@ -228,8 +228,8 @@ class Renderer:
     def clear(self, *, stop: int | None = None) -> None:
         """Leave HOLD or ESTOP, once the reason is understood; the device first lets its force sink to zero.
 
-        `stop` is the stop that it ends (`link.stops`), by default the last one known at the call. A later stop stays, and
-        raises `DeviceError`.
+        `stop` is the stop that it ends (`link.stops`), by default the last one known at the call. A later stop stays,
+        and raises `DeviceError`.
         """
         clear = protocol.Clear(boot_id=self.device.boot_id, stop=self._link.stops if stop is None else stop)
         patiently(self._link, self.device, clear, self._link.now() + _SINKS)

@@ -79,7 +79,7 @@ def _slack(physical: _Physical) -> float:
 
 def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
     """The least damping (N·s/m) of a device on which parameter sets are passive, without delay of the force and at the
-    study's delay: the need first falls with the delay and then rises, so that the larger of both covers those between."""
+    study's delay: the need first falls with the delay and then rises, so that the larger of both covers all between."""
     place = *_model_parameters(physical), m.K_eff, m.N, m.T
     prompt = passivity.minimum_damping(*place, memory=m.memory)
     if m.delay == 0:

@@ -302,6 +302,8 @@ def test_a_device_that_is_not_homed_renders_nothing():
     device.hello()
     staged = device.stage(SET)
     device.confirm("COMMIT", staged)
+    device.hello_said = False  # so that this host waits for no tick
+    assert device.refusal("HOME", boot_id=7, position_mm=0.0) == "NO_INPUT"  # of a position that nobody knows yet
     device.run([7000] * 5)  # an encoder counts from anywhere
     device.beat()
     assert device.status()["flags"] == 0 and device.status()["position_mm"] == 0
