@@ -2,7 +2,7 @@
 
 What was measured is fitted: the recorded input (position in relaxation, force in creep) goes through a model
 (`sampled`) and its output is compared, so that no ideal step is assumed. Modulus data G(t), J(t) have no input; they
-are fitted by exact forms (`moduli`). A model has four coordinates, bounds and starts; this module brings models and
+are fitted by exact forms (`moduli`). A model has four coordinates or more, bounds and starts; this module brings models and
 tests together.
 
 Residuals are divided by the range of their curve; the cost is the sum over tests of NRMSE².
@@ -102,25 +102,33 @@ class Test(eqx.Module):
 
 @runtime_checkable
 class Model(Protocol):
-    """What is fitted: a prediction of four coordinates q, with bounds and starts that the data suggest.
+    """What is fitted: a prediction of p coordinates q, with bounds and starts that the data suggest.
 
     `sampled.Sampled`, `moduli.Continuous` and `moduli.FractionalMaxwell`. `labels` name the coordinates, `kinds` the
     tests that it can make.
     """
 
-    labels: tuple[str, ...]
     kinds: tuple[str, ...]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the p coordinates."""
+        ...
+
+    def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+        """Which lower and upper bounds are limits of nature, such as a stiffness of 0, and not of the search. (p,)."""
+        ...
 
     def at(self, tests: Sequence[Test]) -> "Model":
         """The same model, made ready for the times of the tests."""
         ...
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest q, (4,) each."""
+        """Lowest and highest q, (p,) each."""
         ...
 
     def starts(self, tests: Sequence[Test]) -> np.ndarray:
-        """Where the search begins, (s, 4)."""
+        """Where the search begins, (s, p)."""
         ...
 
     def prepare(self, test: Test) -> "Curve":
@@ -128,15 +136,15 @@ class Model(Protocol):
         ...
 
     def predict(self, q: Array, curve: "Curve", weights: Array) -> Array:
-        """The curve's output (m,) at the coordinates q (4,), under `weights` (R,) of the repeats."""
+        """The curve's output (m,) at the coordinates q (p,), under `weights` (R,) of the repeats."""
         ...
 
     def natural(self, q: Array) -> Array:
-        """q (4,) under its labels, in physical units."""
+        """q (p,) under its labels, in physical units."""
         ...
 
     def parameters(self, q: Array) -> dict[str, Array]:
-        """Name -> value in physical units, at q (4,)."""
+        """Name -> value in physical units, at q (p,)."""
         ...
 
 
@@ -145,7 +153,8 @@ class Curve(eqx.Module):
 
     The model is linear in its input, so the mean of the repeats is the response to the mean of their inputs, exactly.
     `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: where the
-    measured times lie on it; `scale`: what residuals are divided by.
+    measured times lie on it; `scale`: what residuals are divided by; `changes`: transforms of those changes of the
+    inputs from one sample to the next that stand clear of their noise (`instrument`).
     """
 
     kind: Kind = eqx.field(static=True)
@@ -157,6 +166,7 @@ class Curve(eqx.Module):
     before: Int[Array, " m"] | None = None
     share: Float[Array, " m"] | None = None
     length: int = eqx.field(static=True, default=0)
+    changes: Array | None = None
 
 
 class Fit(eqx.Module):
@@ -185,8 +195,13 @@ class Fit(eqx.Module):
 
     def held(self) -> Bool[Array, " p"]:
         """Coordinates within a millionth of the box's width of a bound: the data pull them out of it. (p,)."""
+        at_lower, at_upper = self.bounded(self.q)
+        return at_lower | at_upper
+
+    def bounded(self, q: Float[Array, " p"]) -> tuple[Bool[Array, " p"], Bool[Array, " p"]]:
+        """Whether each coordinate of q (p,) stands at its lower, and at its upper bound. Two arrays (p,)."""
         reach = 1e-6 * (self.upper - self.lower)
-        return (self.q - self.lower <= reach) | (self.upper - self.q <= reach)
+        return q - self.lower <= reach, self.upper - q <= reach
 
 
 def untared(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:

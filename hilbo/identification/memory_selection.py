@@ -29,13 +29,20 @@ class Row(NamedTuple):
     nrmse: dict[str, float]
 
 
-def select_memory(tests: Sequence[Test], T: float = 1e-3, choices: Sequence[int | None] = CHOICES) -> tuple[Row, ...]:
-    """Fit the tests with each memory."""
+def select_memory(
+    tests: Sequence[Test],
+    T: float = 1e-3,
+    choices: Sequence[int | None] = CHOICES,
+    lag: float = 0.0,
+    corner: float = np.inf,
+) -> tuple[Row, ...]:
+    """Fit the tests with each memory; `lag` (s) and `corner` (Hz) of the force channel are those of `sampled`."""
     if not choices:
         raise InputError("There is no number of taps to choose from.")
     rows = []
     for N in choices:
-        best_fit = fit(tests, Sampled(T=T, memory="full") if N is None else Sampled(N, T))
+        memory = {"memory": "full"} if N is None else {"N": N}
+        best_fit = fit(tests, Sampled(T=T, lag=lag, corner=corner, **memory))
         rows.append(Row(N, best_fit, nrmse(best_fit)))
     return tuple(rows)
 
