@@ -52,13 +52,15 @@ def characterise(
     seed: int = 0,
     choices: Sequence[int | None] = (),
     say: Callable[[str], None] = lambda text: None,
+    *,
+    find_filter: bool = True,
 ) -> Characterisation:
     """Fit tests by one parameter set and judge it; `choices` are the memories to compare (none: no comparison).
 
-    A `Sampled` with `lag="fit"` and no filter gets one where the residuals ask for it (`misfit`).
+    `find_filter`: a `Sampled` with `lag="fit"` and no filter gets one where the residuals ask for it (`misfit`).
     """
     say("fitting")
-    best_fit, sides = _fitted(tests, model, say)
+    best_fit, sides = _fitted(tests, model, say, find_filter)
     sampling = intervals.spread(best_fit)
     boot = None
     if min(test.repeats for test in tests) >= intervals.FEWEST_REPEATS:
@@ -83,7 +85,7 @@ def characterise(
 
 
 def _fitted(
-    tests: Sequence[Test], model: Any, say: Callable[[str], None]
+    tests: Sequence[Test], model: Any, say: Callable[[str], None], find_filter: bool
 ) -> tuple[Fit, intervals.Intervals]:
     """The best fit and its intervals, with what of the instrument can be fitted."""
     instrument = isinstance(model, Sampled) and model.lag == "fit"
@@ -91,7 +93,7 @@ def _fitted(
         model = Sampled(model.N, model.T, model.memory, lag=0.0, corner=model.corner)
         instrument = False
     best_fit = fit(tests, model)
-    if instrument and model.corner == np.inf and filter_score(best_fit) > _FILTERED:
+    if instrument and find_filter and model.corner == np.inf and filter_score(best_fit) > _FILTERED:
         say("a filter of the force")
         best_fit = fit(tests, Sampled(model.N, model.T, model.memory, lag="fit", corner="fit"))
     say("profile intervals")

@@ -153,8 +153,9 @@ class Curve(eqx.Module):
 
     The model is linear in its input, so the mean of the repeats is the response to the mean of their inputs, exactly.
     `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: where the
-    measured times lie on it; `scale`: what residuals are divided by; `changes`: transforms of those changes of the
-    inputs from one sample to the next that stand clear of their noise (`instrument`).
+    measured times lie on it; `scale`: what residuals are divided by; `changes`: transforms of those changes from
+    one sample to the next that stand clear of their noise, of the inputs or, `on_output`, of the outputs
+    (`instrument`); `regular`: there is a row for each sample of the model.
     """
 
     kind: Kind = eqx.field(static=True)
@@ -167,6 +168,8 @@ class Curve(eqx.Module):
     share: Float[Array, " m"] | None = None
     length: int = eqx.field(static=True, default=0)
     changes: Array | None = None
+    on_output: bool = eqx.field(static=True, default=False)
+    regular: bool = eqx.field(static=True, default=False)
 
 
 class Fit(eqx.Module):

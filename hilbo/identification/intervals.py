@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Fit, curve_residuals, residuals
-from hilbo.identification.residual_noise import autoregression, filtered, fitted_residuals
+from hilbo.identification.residual_noise import filtered, fitted_residuals, noises
 from hilbo.numerics.least_squares import Solution, least_squares, solve_symmetric
 from hilbo.numerics.tracing import program
 
@@ -79,8 +79,7 @@ def _spread(fit: Fit, quantile: float) -> Spread:
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(q)
     meat, effective = jnp.zeros_like(fit.solution.normal), jnp.zeros_like(q[0])
     unscaled = _inverse(fit.solution.normal, _free(fit))
-    for r, J in zip(fitted_residuals(fit, q), slopes, strict=True):
-        model = autoregression(r)
+    for r, J, model in zip(fitted_residuals(fit, q), slopes, noises(fit), strict=True):
         shape = filtered(J, model)  # Jᵀ Γ J / γ_0
         still = eqx.tree_at(lambda n: n.walk, model, jnp.zeros_like(model.walk))  # a walk's variance is as observed
         lost = jnp.sum(unscaled * filtered(J, still))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from hilbo.identification.fitting import Curve, Fit, Test, curve_residuals
 from hilbo.identification.intervals import inverse_of_free
-from hilbo.identification.residual_noise import autoregression, filtered, fitted_residuals
+from hilbo.identification.residual_noise import filtered, fitted_residuals, noises
 from hilbo.identification.sampled import Sampled
 from hilbo.numerics.tracing import program
 
@@ -36,7 +36,7 @@ def _filter_scores(fit: Fit, corners: Float[Array, " f"]) -> Float[Array, " f"]:
     """The score of each corner (Hz), positive where the filter lowers the cost."""
     before = fitted_residuals(fit, fit.q)
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(fit.q)
-    models = [autoregression(r) for r in before]
+    models = noises(fit)
     inverse = inverse_of_free(fit)
 
     def score(corner):

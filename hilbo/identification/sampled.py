@@ -59,6 +59,8 @@ class Sampled(eqx.Module):
             raise InputError(f"N is {self.N}; it must be at least 1: the number of past samples.")
         if not 0 < self.T < np.inf:
             raise InputError(f"T is {self.T}; it must be a time in s above 0.")
+        if any(isinstance(value, str) and value != "fit" for value in (self.lag, self.corner)):
+            raise InputError(f'lag and corner are {self.lag!r} and {self.corner!r}; each must be a number or "fit".')
         if isinstance(self.lag, float) and not abs(self.lag) <= instrument.LARGEST_LAG * self.T:
             most = 1e3 * instrument.LARGEST_LAG * self.T
             raise InputError(f"The lag is {1e3 * self.lag:g} ms; it must be between -{most:g} and {most:g} ms.")
@@ -92,7 +94,7 @@ class Sampled(eqx.Module):
         top = max(_secant(test) for test in tests)
         ends = np.log(0.99 / 0.01)
         least = 1e-6 if self.memory == "full" else 1e-4
-        lag, slow, fast = instrument.LARGEST_LAG, instrument.SLOWEST_FILTER, instrument.FASTEST_FILTER
+        lag, slow, fast = float(instrument.LARGEST_LAG), instrument.SLOWEST_FILTER, instrument.FASTEST_FILTER
         lower = np.array([1e-3 * top, 0.0, np.log(least), -ends, *self._of_fitted(-lag, -np.log(slow))])
         return lower, np.array([50 * top, 50 * top, np.log(1e4), ends, *self._of_fitted(lag, -np.log(fast))])
 
@@ -132,9 +134,10 @@ class Sampled(eqx.Module):
         inputs = _between(grid, elapsed, test.input, smooth) - offset[:, None]
         length = _transform_length(count)
         damping = _circle(length, inputs.dtype) ** -np.arange(count, dtype=inputs.dtype)
+        moved, on_output = instrument.moved_channel(test)
         row = np.minimum(np.searchsorted(place, np.arange(count)), place.size - 1)  # the end of each tick's line
-        clear = instrument.clear_changes(test.input - offset[:, None])[row]
-        changes = np.diff(inputs, axis=1, prepend=0.0) * clear
+        clear = instrument.clear_changes(moved)[row]
+        changes = np.diff(_between(grid, elapsed, moved, smooth), axis=1, prepend=0.0) * clear
         before = np.minimum(place.astype(int), count - 2)
         return Curve(
             test.kind,
@@ -147,6 +150,8 @@ class Sampled(eqx.Module):
             jnp.asarray(place - before),
             length,
             jnp.asarray(np.fft.rfft(changes * damping, length)),
+            on_output,
+            bool(place.size == count and np.all(place == np.arange(count))),
         )
 
     def _check_length(self, kind: str, seconds: float):
@@ -164,18 +169,37 @@ class Sampled(eqx.Module):
         `q` (p,), `weights` (R,) -> (m,), in mm or N.
         """
         assert curve.spectra is not None and curve.share is not None and curve.before is not None
-        H = self._transfer(q, curve.length)
+        H = self._transfer(q, curve.length, _circle(curve.length, q.dtype))
         creep = curve.kind == "creep"
         weighted = weights.astype(curve.spectra.dtype)
         spectrum = weighted @ curve.spectra
-        if self._has_instrument():
-            spectrum = spectrum + self._added(q, curve) * (weighted @ curve.changes)
+        added = self._added(q, curve) * (weighted @ curve.changes) if self._has_instrument() else 0.0
+        if not curve.on_output:
+            spectrum = spectrum + added
         spectrum = spectrum / H if creep else spectrum * H
+        if curve.on_output:
+            spectrum = spectrum - added
         growth = _circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
         response = jnp.fft.irfft(spectrum, curve.length)[: curve.length // 2] * growth
         rest = weights @ curve.offset
         rest = rest / q[1] if creep else rest * q[1]
         return rest + response[curve.before] * (1 - curve.share) + response[curve.before + 1] * curve.share
+
+    def as_input_noise(
+        self, q: Float[Array, " p"], curve: Curve, r: Float[Array, " m"]
+    ) -> tuple[Float[Array, " m"], Float[Array, " m+1"], Float[Array, ""]]:
+        """Residuals r (m,) of a regular curve as noise of its recorded input, which the model then passed on.
+
+        The noise (m,), over the scale of r; the factor by which the model multiplies its spectral density at πj/m,
+        j = 0 … m; and how many times larger the noise is than what comes of it in the same sample.
+        """
+        creep, radius, m = curve.kind == "creep", _circle(curve.length, q.dtype), r.size
+        H = self._transfer(q, curve.length, radius)
+        growth = radius ** jnp.arange(m, dtype=q.dtype)
+        spectrum = jnp.fft.rfft(r / growth, curve.length)
+        source = jnp.fft.irfft(spectrum * H if creep else spectrum / H, curve.length)[:m] * growth
+        gain = jnp.abs(self._transfer(q, 2 * m, 1.0)) ** 2
+        return source, (1 / gain if creep else gain), (q[0] if creep else 1 / q[0])
 
     def _has_instrument(self) -> bool:
         """Whether the force channel is anything but a perfect one."""
@@ -186,12 +210,13 @@ class Sampled(eqx.Module):
         return isinstance(self.corner, float) and bool(np.isinf(self.corner))
 
     def _added(self, q: Float[Array, " p"], curve: Curve) -> Complex[Array, " {curve.length//2+1}"]:
-        """What the input's changes are multiplied by, at the upper half of the circle."""
+        """What the changes are multiplied by, at the upper half of the circle."""
         lag = q[4] if _is_fitted(self.lag) else jnp.asarray(self.lag, q.dtype) / self.T
-        corner = jnp.exp(q[-1]) if _is_fitted(self.corner) else 2 * jnp.pi * self.T * self.corner
+        corner = jnp.exp(q[-1]) if _is_fitted(self.corner) else jnp.asarray(2 * np.pi * self.T * self.corner, q.dtype)
         angle = 2 * jnp.pi * jnp.arange(curve.length // 2 + 1, dtype=q.dtype) / curve.length
-        z = jax.lax.complex(jnp.cos(angle), jnp.sin(angle)) * _circle(curve.length, q.dtype)
-        return instrument.multiplier(curve.kind, lag, None if self._without_filter() else 1 / corner, z)
+        z = _circle(curve.length, q.dtype) * jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+        on_position = curve.on_output or curve.kind == "relaxation"
+        return instrument.multiplier(on_position, lag, None if self._without_filter() else 1 / corner, z)
 
     def parameters(self, q: Float[Array, " p"]) -> dict[str, Float[Array, ""]]:
         """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them. `q` (p,) -> scalars."""
@@ -228,10 +253,9 @@ class Sampled(eqx.Module):
         rest = self._of_fitted(lag / self.T, np.log(2 * np.pi * self.T * corner))
         return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha)), *rest])
 
-    def _transfer(self, q: Float[Array, " p"], length: int) -> Complex[Array, " {length//2+1}"]:
-        """H on the circle, at the upper half of `length` points."""
+    def _transfer(self, q: Float[Array, " p"], length: int, radius: float) -> Complex[Array, " {length//2+1}"]:
+        """H on the circle with a radius, at the upper half of `length` points."""
         kappa, alpha = jnp.exp(q[2]), jax.nn.sigmoid(q[3])
-        radius = _circle(length, q.dtype)
         taps, S = self._taps(alpha)
         if self.memory == "full":
             angle = 2 * jnp.pi * jnp.arange(length // 2 + 1, dtype=q.dtype) / length
