@@ -53,7 +53,7 @@ CASES = {
     "lag 0.7": Case("force late by 0.7 ms", lag=0.7),
     "lag -0.3": Case("position late by 0.3 ms", lag=-0.3),
     "filter": Case("first-order filter of the force, 200 Hz", corner=200.0),
-    "coarse": Case("a row every 5 ms", step=5),
+    "coarse": Case("a row every 5 ms, ramps between rows", step=5),
     "bound": Case("creep only, κ beyond the search", truth=BOUND, only="creep"),
 }
 
@@ -102,15 +102,15 @@ def records(case, number, hold):
         if case.only not in (None, kind):
             continue
         count = round(1e3 * seconds) + 1
-        t = np.arange(count * FINE) / FINE  # ms
+        t = np.arange(count * FINE) / FINE - (rng.integers(case.step) if case.step > 1 else 0)  # ms from the load
         walk = None
         positions, forces = [], []
         for size in scale:
             if kind == "relaxation":
-                x = size * 5 * np.minimum(t / 20, 1)
+                x = size * 5 * np.clip(t / 20, 0, 1)
                 F = finely(x, above, below)
             else:
-                F = size * (3 * np.minimum(t / 20, 1) - 2.5 * np.clip((t - 1e3 * hold) / 20, 0, 1))
+                F = size * (3 * np.clip(t / 20, 0, 1) - 2.5 * np.clip((t - 1e3 * hold) / 20, 0, 1))
                 x = finely(F, below, above)
             if walk is None or not case.common:
                 walk = case.drift * np.cumsum(rng.standard_normal(count)) / np.sqrt(count)

@@ -161,7 +161,8 @@ def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str
 
 def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
     """What the residuals of each test look like, and how they compare with the noise of the repeats."""
-    for test, autoregression in zip(tests, noise(best_fit), strict=True):
+    for test, curve, autoregression in zip(tests, best_fit.curves, noise(best_fit), strict=True):
+        values = test.output if curve.other_way is None else test.input
         row = {
             "autocorrelation": float(autoregression.lag_one),
             "order": int(autoregression.order),
@@ -171,9 +172,9 @@ def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
             "drift": float(autoregression.drift),
         }
         if test.repeats > 1:
-            scatter = np.sqrt(np.mean(np.var(test.output, axis=0, ddof=1)) / test.repeats)
-            size = float(autoregression.rms) * np.ptp(test.output.mean(axis=0))
-            if scatter > _ROUNDING * np.max(np.abs(test.output)):  # copies tell nothing about noise
+            scatter = np.sqrt(np.mean(np.var(values, axis=0, ddof=1)) / test.repeats)
+            size = float(autoregression.rms) * np.ptp(values.mean(axis=0))
+            if scatter > _ROUNDING * np.max(np.abs(values)):  # copies tell nothing about noise
                 row["over_repeat_noise"] = float(size / scatter)
         yield row
 

@@ -153,9 +153,9 @@ class Curve(eqx.Module):
 
     The model is linear in its input, so the mean of the repeats is the response to the mean of their inputs, exactly.
     `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: where the
-    measured times lie on it; `scale`: what residuals are divided by; `changes`: transforms of those changes from
-    one sample to the next that stand clear of their noise, of the inputs or, `on_output`, of the outputs
-    (`instrument`); `regular`: there is a row for each sample of the model.
+    measured times lie on it; `scale`: what residuals are divided by; `changes`: transforms of those changes of
+    the inputs from one sample to the next that stand clear of their noise (`instrument`); `regular`: there is a row for
+    each sample of the model; `other_way`: the same test with input and output exchanged, if it is fitted like that.
     """
 
     kind: Kind = eqx.field(static=True)
@@ -168,8 +168,13 @@ class Curve(eqx.Module):
     share: Float[Array, " m"] | None = None
     length: int = eqx.field(static=True, default=0)
     changes: Array | None = None
-    on_output: bool = eqx.field(static=True, default=False)
     regular: bool = eqx.field(static=True, default=False)
+    other_way: "Curve | None" = None
+
+    @property
+    def fitted(self) -> "Curve":
+        """The curve whose residuals are minimised."""
+        return self if self.other_way is None else self.other_way
 
 
 class Fit(eqx.Module):
@@ -303,13 +308,18 @@ def curve_residuals(model: Any, curve: Curve, weights: Float[Array, " R"], q: Fl
 
     `weights` (R,), `q` (p,) -> (m,), without unit.
     """
+    return _misfit(model, curve.fitted, weights, q)
+
+
+def _misfit(model: Any, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
+    """The same in the output of the test."""
     misfit = weights @ curve.output - model.predict(q, curve, weights)
     return misfit / (curve.scale * np.sqrt(curve.time.size).astype(curve.scale.dtype))
 
 
 def nrmse(fitted: Fit) -> dict[str, float]:
     """Root mean square of each test's residuals over its range. Kind of test -> share of the range, without unit."""
-    parts = [curve_residuals(fitted.model, c, w, fitted.q) for c, w in zip(fitted.curves, fitted.weights, strict=True)]
+    parts = [_misfit(fitted.model, c, w, fitted.q) for c, w in zip(fitted.curves, fitted.weights, strict=True)]
     return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(fitted.curves, parts, strict=True)}
 
 

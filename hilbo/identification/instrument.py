@@ -9,7 +9,8 @@ signal is taken as a straight line, for which all of them are exact:
     A x       = x - g/(1 - e/z)·Δ,                          e = exp(-T/τ),  g = (1 - e)·τ/T
     A⁻¹ F     = F + g/((1 - g) + (g - e)/z)·Δ
 
-Only those changes Δ enter that stand clear of the channel's noise. A shift of a fraction of a sample averages two
+They act on the input of a curve, the position or the force of a creep test. Only those changes Δ enter that stand
+clear of its noise. A shift of a fraction of a sample averages two
 samples, and a filter changes what is fast: applied to the noise they would lower or raise the residuals, and the fit
 would choose lag and filter for that reason.
 Units: lag in samples of T here and in coordinates, in ms under its name; corners 1/(2πτ) in Hz.
@@ -23,7 +24,7 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from hilbo.identification.fitting import Test
 
-__all__ = ["LARGEST_LAG", "SLOWEST_FILTER", "FASTEST_FILTER", "can_be_timed", "clear_changes", "moved_channel", "multiplier"]
+__all__ = ["LARGEST_LAG", "SLOWEST_FILTER", "FASTEST_FILTER", "can_be_timed", "clear_changes", "is_position_clearer", "multiplier", "without_noise"]
 
 LARGEST_LAG = 2  # samples, either way
 SLOWEST_FILTER, FASTEST_FILTER = 5.0, 0.05  # time constants, samples
@@ -33,7 +34,7 @@ _AROUND = 3  # rows before and after a clear change: ends of ramps, tails of fil
 
 def can_be_timed(tests: Sequence[Test]) -> bool:
     """Whether an input changes clearly from one row to the next, so that a lag shows."""
-    return any(bool(clear_changes(moved_channel(test)[0]).any()) for test in tests)
+    return any(bool(clear_changes(test.input).any()) for test in tests if test.input is not None)
 
 
 def clear_changes(values: Float[np.ndarray, "R m"]) -> Bool[np.ndarray, " m"]:
@@ -46,15 +47,24 @@ def clear_changes(values: Float[np.ndarray, "R m"]) -> Bool[np.ndarray, " m"]:
     return np.convolve(clear, np.ones(2 * _AROUND + 1), "same") > 0
 
 
-def moved_channel(test: Test) -> tuple[Float[np.ndarray, "R m"], bool]:
-    """The channel on which lag and filter act, counted from the state before the first row, and whether it is output.
+def without_noise(values: Float[np.ndarray, "R m"], clear: Bool[np.ndarray, " m"]) -> Float[np.ndarray, "R m"]:
+    """An input with each row that does not change clearly replaced by the mean of its neighbours that do not either.
 
-    It is the position, or the force of a creep test if its changes stand clearer of their noise. (R, m).
+    A fit lowers what noise of the input does to its residuals by too small a stiffness: an input that is held has no
+    changes that a mean of seven rows would lose. `values` (R, m) of rows at even times, `clear` (m,) -> (R, m).
     """
+    still = ~clear
+    window = np.ones(2 * _AROUND + 1)
+    count = np.convolve(still, window, "same")
+    sums = np.stack([np.convolve(np.where(still, row, 0.0), window, "same") for row in values])
+    return np.where(still, sums / np.maximum(count, 1), values)
+
+
+def is_position_clearer(test: Test) -> bool:
+    """Whether the changes of the position stand clearer of its noise than those of the force of theirs."""
     assert test.input is not None
-    put, out = ((v - v[:, :1]) if test.start == "equilibrium" else v for v in (test.input, test.output))
-    on_output = test.kind == "creep" and _clearness(out) >= _clearness(put)
-    return (out, True) if on_output else (put, False)
+    position, force = (test.input, test.output) if test.kind == "relaxation" else (test.output, test.input)
+    return _clearness(position) > _clearness(force)
 
 
 def _clearness(values: Float[np.ndarray, "R m"]) -> float:

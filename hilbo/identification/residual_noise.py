@@ -67,9 +67,9 @@ def noises(fitted: Fit) -> tuple[Noise, ...]:
 def _noise(fitted: Fit, curve: Curve, r: Float[Array, " m"]) -> Noise:
     """The autoregression of the residuals r, or that of the input's noise if it describes them better."""
     own = autoregression(r)
-    if not curve.regular:
+    if not curve.fitted.regular:
         return own
-    source, gain, first = fitted.model.as_input_noise(fitted.q, curve, r)
+    source, gain, first = fitted.model.as_input_noise(fitted.q, curve.fitted, r)
     other = autoregression(source)
     # Likelihoods of r: r = source/first + past samples.
     scores = _score(own, r.size), _score(other, r.size) - 2 * r.size * jnp.log(first)

@@ -9,7 +9,7 @@ from benchmarks import identification_coverage as study
 from hilbo.errors import InputError
 from hilbo.identification.characterise import characterise
 from hilbo.identification.fitting import Test, fit
-from hilbo.identification.instrument import can_be_timed, clear_changes, moved_channel
+from hilbo.identification.instrument import can_be_timed, clear_changes
 from hilbo.identification.sampled import Sampled
 
 
@@ -36,12 +36,12 @@ def data_set(case, number=0, hold=0.15, noise=None):
 def test_a_recorded_curve_is_that_of_the_fine_grid(lag, corner):
     for test in data_set(study.Case("", repeats=1, lag=lag, corner=corner), noise=1e-3):
         model = Sampled(lag=1e-3 * lag, corner=corner or np.inf)
-        q, curve = jnp.asarray(model.coordinates(*study.TRUTH)), model.prepare(test)
+        q, curve = jnp.asarray(model.coordinates(*study.TRUTH)), model.prepare(test).fitted
         predicted = jax.jit(lambda q, m=model, c=curve: m.predict(q, c, jnp.ones(1)))(q)
         ideal = Sampled().predict(q, curve, jnp.ones(1))
-        size = np.ptp(test.output)
-        assert np.abs(ideal - test.output[0]).max() > 5e-3 * size  # without an instrument
-        np.testing.assert_allclose(predicted, test.output[0], rtol=0, atol=2e-4 * size if lag < 0 else 5e-5 * size)
+        size, recorded = np.ptp(curve.output), curve.output[0]
+        assert np.abs(ideal - recorded).max() > 5e-3 * size  # without an instrument
+        np.testing.assert_allclose(predicted, recorded, rtol=0, atol=2e-4 * size if lag < 0 else 5e-5 * size)
 
 
 def test_a_shift_does_not_touch_noise():
@@ -51,13 +51,13 @@ def test_a_shift_does_not_touch_noise():
     assert clear[200:221].all() and not clear[:190].any() and not clear[230:].any()
 
 
-def test_the_clearer_channel_of_a_creep_test_is_shifted():
+def test_a_creep_test_is_fitted_in_the_channel_that_has_the_noise():
     creep = data_set(study.Case("", repeats=2))[1]
-    moved, on_output = moved_channel(creep)
-    assert on_output and moved is creep.output
+    curve = Sampled().prepare(creep)
+    assert curve.kind == "creep" and curve.fitted.kind == "relaxation"
+    np.testing.assert_array_equal(curve.fitted.output, creep.input)
     loud = creep.output + 0.3 * np.random.default_rng(0).standard_normal(creep.output.shape)
-    moved, on_output = moved_channel(Test("creep", creep.time, loud, creep.input))
-    assert not on_output and moved is creep.input
+    assert Sampled().prepare(Test("creep", creep.time, loud, creep.input)).other_way is None
 
 
 def test_slow_inputs_have_no_lag():

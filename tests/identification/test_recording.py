@@ -85,7 +85,7 @@ def test_copies_tell_nothing_about_noise(monkeypatch, apart, ratio):
     time = np.arange(50.0)
     curve = 3 + np.exp(-time / 5)
     test = Test("modulus", time, curve + apart * np.array([[1.0], [-1.0]]))
-    (row,) = characterise._noise(None, [test])
+    (row,) = characterise._noise(SimpleNamespace(curves=[SimpleNamespace(other_way=None)]), [test])
     assert row.get("over_repeat_noise") == (None if ratio is None else pytest.approx(ratio, rel=0.01))
 
 
