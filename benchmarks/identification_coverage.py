@@ -1,15 +1,16 @@
 """Do the intervals of an identification hold the truth when the instrument is not perfect?
 
     python benchmarks/identification_coverage.py [--sets 40] [--cases white drift ...] [--write]
-    python benchmarks/identification_coverage.py --source OLD [...]     with the hilbo in another checkout
+    python benchmarks/identification_coverage.py --source OLD --keep BEFORE [...]     with the hilbo in another checkout
+    python benchmarks/identification_coverage.py --before BEFORE --write             both side by side
 
 Every data set is the set S of the paper (N = 101, T = 1 ms) under the loads of `hilbo device characterise`: 5 mm held,
 and 3 N, then 0.5 N, with ramps of 20 ms; depth and load differ by half a per cent from repeat to repeat. The force
 channel has 20 mN of white noise, the position 2 µm. Nothing of this is hilbo's own: the material is the textbook
 recursion, run at ten phases of the sampling time, so that lags and filters act on a grid ten times finer.
-A parameter is *held* where its 95 % interval, an open end counting as endless, holds the truth; a parameter for which no
-interval is given is not held. *Named*: a warning says that the intervals are not to be trusted. --write puts
-the table into docs/methods/identification.md, which takes half an hour.
+A 95 % interval *contains* the truth, an open end counting as endless, or it does not, or none is given. Data sets that
+were done are kept, in a file for each case. --write puts the table into docs/methods/identification.md; all cases take
+half an hour.
 """
 
 import argparse
@@ -152,6 +153,48 @@ def holds(interval, truth):
     return bool((-np.inf if low is None else low) <= truth <= (np.inf if high is None else high))
 
 
+def counted(done, case, name):
+    """Intervals of a parameter that contain the truth, and those that are given."""
+    truth = truth_of(case)[name]
+    held = [holds(one["intervals"][name], truth) for one in done]
+    return sum(h is True for h in held), sum(h is not None for h in held)
+
+
+def safe(done, case):
+    """Data sets whose intervals of the worst parameter contain the truth, or are not given, or that have a warning."""
+    truth = truth_of(case)
+    return min(
+        sum(holds(one["intervals"][name], truth[name]) is not False or bool(one["warnings"]) for one in done)
+        for name in NAMES
+    )
+
+
+def width(done, name):
+    """Median width of the two-sided intervals."""
+    ends = [one["intervals"][name][1:3] for one in done]
+    widths = [high - low for low, high in ends if low is not None and high is not None]
+    return np.median(widths) if widths else np.nan
+
+
+def table(keep, before):
+    """All cases that were run, before and after."""
+    lines = [
+        "| data | | K1 | B1 | α | K_inst | K_eff | warned | contained or warned | width of K1, K_inst |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for name, case in CASES.items():
+        runs = {when: (folder / f"{name}.json") for when, folder in (("before", before), ("now", keep)) if folder}
+        runs = {when: json.loads(path.read_text()) for when, path in runs.items() if path.exists()}
+        for when, done in runs.items():
+            shares = ["{}/{}".format(*counted(done, case, p)) for p in ("K1", "B1", "alpha", "K_inst", "K_eff")]
+            warned = sum(bool(one["warnings"]) for one in done)
+            ratios = [width(done, p) / width(runs["before"], p) for p in ("K1", "K_inst")] if "before" in runs else []
+            ratio = ", ".join("–" if np.isnan(r) else f"{r:.2f}" for r in ratios) if when == "now" else ""
+            cells = [case.words, when, *shares, f"{warned}/{len(done)}", f"{safe(done, case)}/{len(done)}", ratio]
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
 def main():
     options = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     options.add_argument("--sets", type=int, default=40)
@@ -159,8 +202,13 @@ def main():
     options.add_argument("--hold", type=float, default=3.0, help="s")
     options.add_argument("--source", type=Path, default=ROOT, help="checkout whose hilbo is used")
     options.add_argument("--keep", type=Path, default=ROOT / "identification-coverage")
-    options.add_argument("--write", action="store_true")
+    options.add_argument("--before", type=Path, help="folder of an earlier version's data sets, to compare with")
+    options.add_argument("--write", action="store_true", help="only write the table of what was run")
     chosen = options.parse_args()
+    if chosen.write:
+        from pages import put
+
+        return put("methods/identification.md", "instrument", table(chosen.keep, chosen.before))
     sys.path.insert(0, str(chosen.source))
     import jax
 
@@ -175,9 +223,7 @@ def main():
         for number in range(len(done), chosen.sets):
             done.append(identified(CASES[name], number, chosen.hold))
         path.write_text(json.dumps(done))
-        truth = truth_of(CASES[name])
-        counts = {p: [holds(d["intervals"][p], truth[p]) for d in done] for p in NAMES}
-        words = {p: f"{sum(h is True for h in v)}/{sum(h is not None for h in v)}" for p, v in counts.items()}
+        words = {p: "{}/{}".format(*counted(done, CASES[name], p)) for p in NAMES}
         named = sum(bool(d["warnings"]) for d in done)
         print(f"{name}: {words} warned {named}/{len(done)}, {time.perf_counter() - begin:.0f} s", flush=True)
 

@@ -56,7 +56,7 @@ MATHS = {
         f"identification.{name}"
         for name in (
             *("fitting", "sampled", "moduli", "intervals", "residual_noise", "characterise"),
-            *("instrument", "misfit", "estimates", "sentences", "friction", "friction_laws"),
+            *("instrument", "misfit", "beginnings", "screening", "estimates", "sentences", "friction", "friction_laws"),
         )
     ),
     *("study.map_summary", "study.tolerance_intervals", "session.selection", "session.ask_tell", "simulation.simulate"),

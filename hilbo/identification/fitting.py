@@ -2,8 +2,8 @@
 
 What was measured is fitted: the recorded input (position in relaxation, force in creep) goes through a model
 (`sampled`) and its output is compared, so that no ideal step is assumed. Modulus data G(t), J(t) have no input; they
-are fitted by exact forms (`moduli`). A model has four coordinates or more, bounds and starts; this module brings models and
-tests together.
+are fitted by exact forms (`moduli`). A model has four coordinates or more, bounds and starts; this module brings
+models and tests together.
 
 Residuals are divided by the range of their curve; the cost is the sum over tests of NRMSE².
 Units: N, mm, s; B1 N·s^α/mm. Moduli keep their own unit.
@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
+from hilbo.identification.beginnings import correlation, off_zero
 from hilbo.numerics.least_squares import Solution, least_squares
 from hilbo.numerics.tracing import program
 
@@ -33,14 +34,12 @@ __all__ = [
     "polish",
     "residuals",
     "search",
-    "untared",
 ]
 
 Kind = Literal["relaxation", "creep", "modulus", "compliance"]
 MEASURED = ("relaxation", "creep")  # kinds with a recorded input
 FEWEST = 8  # points of a test
 _OPPOSED = -0.1  # correlation of position and force, about 0; noise does not bring a real test there
-_OFF_ZERO, _MOVED = 0.03, 0.2  # of a curve's range
 _RACE, _LONGEST = 12, 200  # steps of every start, and of the best one
 
 
@@ -83,11 +82,11 @@ class Test(eqx.Module):
     def _check_signs(self):
         """Refuse a repeat whose position and force oppose each other."""
         for place, (put, out) in enumerate(zip(() if self.input is None else self.input, self.output, strict=False), 1):
-            opposed = _correlation(self.time, put, out) < _OPPOSED
-            changes = _correlation(self.time, put - put[0], out - out[0])
+            opposed = correlation(self.time, put, out) < _OPPOSED
+            changes = correlation(self.time, put - put[0], out - out[0])
             if self.start == "equilibrium":
                 opposed = changes < _OPPOSED
-            elif _off_zero(put, out):  # an offset of one of them is no opposite sign
+            elif off_zero(put, out):  # an offset of one of them is no opposite sign
                 opposed = opposed and not changes >= _OPPOSED
             if opposed:
                 which = f" in repeat {place} of {self.repeats} (counted from 1)" if self.repeats > 1 else ""
@@ -210,49 +209,6 @@ class Fit(eqx.Module):
         """Whether each coordinate of q (p,) stands at its lower, and at its upper bound. Two arrays (p,)."""
         reach = 1e-6 * (self.upper - self.lower)
         return q - self.lower <= reach, self.upper - q <= reach
-
-
-def untared(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:
-    """Which has an offset, "input" or "output": its first row is not 0, although the other's is. (m,) each.
-
-    A step in the first row itself looks alike, but there the other one moves while this one stays.
-    """
-    name = _off_zero(put, out)
-    held, other = (put, out) if name == "input" else (out, put)
-    leaves = np.abs(held - held[0]) > max(0.05, 4 * _jitter(held)) * np.ptp(held)
-    before = int(np.argmax(leaves)) if leaves.any() else held.size
-    return name if np.ptp(other[:before]) <= _MOVED * np.ptp(other) else None
-
-
-def _off_zero(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:
-    """Which, "input" or "output", is clearly not 0 in the first row, where the other one is."""
-    for name, one, other in (("input", put, out), ("output", out, put)):
-        height = _height(one)
-        zero = _height(other) <= max(0.1 * min(height, 1.0), 2 * _jitter(other))
-        if zero and height > max(_OFF_ZERO, 6 * _jitter(one)):
-            return name
-    return None
-
-
-def _height(values: Float[np.ndarray, " m"]) -> float:
-    """The first of the values, over their range."""
-    first, width = abs(values[0]), np.ptp(values)
-    return float(first / width) if width > 0 else np.inf if first > 0 else 0.0
-
-
-def _jitter(values: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of the noise from row to row, over the range of the values."""
-    second = np.abs(np.diff(values, 2))  # has the variance of six samples
-    return float(1.4826 * np.median(second) / np.sqrt(6) / (np.ptp(values) or np.inf))
-
-
-def _correlation(time: Float[np.ndarray, " m"], put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> float:
-    """Of two curves about 0, over the time; nan where one of them is 0.
-
-    A storage modulus is above 0 at every frequency, and so is this of whatever a material can do from rest.
-    """
-    both, ones, others = (np.trapezoid(product, time) for product in (put * out, put * put, out * out))
-    return float(both / np.sqrt(ones * others)) if ones * others > 0 else np.nan
 
 
 def fit(tests: Sequence[Test], model: Any) -> Fit:

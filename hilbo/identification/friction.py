@@ -134,9 +134,7 @@ def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
     return Friction(damping, coulomb, mass, constant, *rest, law.name, *added[:1] or [None], law.speed)
 
 
-def _fitting(
-    blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]
-) -> list[tuple[Law, Blocks]]:
+def _fitting(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> list[tuple[Law, Blocks]]:
     """The law that fits and its terms, then those that fit about as well. Raises `DeviceError` where none does."""
     simplest, *others = candidates(speed, way)
     if not refuted(blocks, speed, way):

@@ -6,7 +6,8 @@
 
 Fitted by the first, a device of the second kind seems to have more damping than it has at the speeds of a hand, which
 is the unsafe side: passivity rests on b. A law is *refuted* where a term that it lacks is not 0: by a Wald test over
-periods, whose sweeps err alike. The terms that are tried on every law are the other laws' and two that bend freely.
+periods, whose sweeps err alike. The terms that are tried on every law are two that bend freely with
+the logarithm of the speed.
 """
 
 from collections.abc import Iterator
@@ -14,7 +15,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import f as fisher
 
 __all__ = ["LAWS", "Blocks", "Law", "candidates", "refuted"]
 
@@ -66,16 +66,18 @@ def candidates(speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> 
             yield Law(LAWS[2], way * np.exp(-((speed / scale) ** sharpness)), float(scale))
 
 
-def refuted(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"], probability=_LEVEL) -> bool:
+def refuted(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> bool:
     """Whether two terms that bend freely with the logarithm of the speed (mm/s) improve on a law."""
     height = np.log(speed / np.median(speed))
-    free = way[:, None] * np.stack([height, height**2, height**3], axis=1)[:, -2:]
+    free = way[:, None] * np.stack([height**2, height**3], axis=1)
     more = blocks._replace(terms=np.hstack([blocks.terms, free]))
-    return wald(more, free.shape[1]) < probability
+    return wald(more, free.shape[1]) < _LEVEL
 
 
 def wald(blocks: Blocks, last: int) -> float:
     """Probability of so large a value of the `last` terms if they are 0."""
+    from scipy.stats import f as fisher
+
     count, free = int(blocks.period.max()) + 1, blocks.terms.shape[1]
     value, covariance = blocks.best[-last:], blocks.covariance()[-last:, -last:]
     return float(fisher.sf(value @ np.linalg.solve(covariance, value) / last, last, count - free))

@@ -24,7 +24,16 @@ from jaxtyping import Array, Bool, Complex, Float
 
 from hilbo.identification.fitting import Test
 
-__all__ = ["LARGEST_LAG", "SLOWEST_FILTER", "FASTEST_FILTER", "can_be_timed", "clear_changes", "is_position_clearer", "multiplier", "without_noise"]
+__all__ = [
+    "FASTEST_FILTER",
+    "LARGEST_LAG",
+    "SLOWEST_FILTER",
+    "can_be_timed",
+    "clear_changes",
+    "is_position_clearer",
+    "multiplier",
+    "without_noise",
+]
 
 LARGEST_LAG = 2  # samples, either way
 SLOWEST_FILTER, FASTEST_FILTER = 5.0, 0.05  # time constants, samples

@@ -59,8 +59,7 @@ def noise(fitted: Fit) -> tuple[Noise, ...]:
 def noises(fitted: Fit) -> tuple[Noise, ...]:
     """The same within another program."""
     return tuple(
-        _noise(fitted, curve, r)
-        for curve, r in zip(fitted.curves, fitted_residuals(fitted, fitted.q), strict=True)
+        _noise(fitted, curve, r) for curve, r in zip(fitted.curves, fitted_residuals(fitted, fitted.q), strict=True)
     )
 
 

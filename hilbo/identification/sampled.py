@@ -25,7 +25,7 @@ from jaxtyping import Array, Complex, Float, Int
 from hilbo.errors import InputError
 from hilbo.identification import instrument
 from hilbo.identification.fitting import MEASURED, Curve, Test
-from hilbo.numerics.tracing import program
+from hilbo.identification.screening import screened, separate
 
 __all__ = ["Sampled"]
 
@@ -112,9 +112,9 @@ class Sampled(eqx.Module):
         scales = [jnp.asarray(np.ptp(test.output.mean(axis=0)) * _unit_of_force(test)) for test in tests]
         grid = jnp.asarray(np.stack(np.meshgrid(_LOG_KAPPA, _LOGIT_ALPHA, indexing="ij"), axis=-1))
         plain = eqx.tree_at(lambda m: (m.lag, m.corner), self, (0.0, np.inf))
-        costs, stiffness = (np.asarray(values) for values in _screen(plain, curves, scales, grid))
+        costs, stiffness = (np.asarray(values) for values in screened(plain, curves, scales, grid))
         rest = self._of_fitted(0.0, 0.0)
-        places = [np.concatenate([stiffness[index], np.asarray(grid[index]), rest]) for index in _separate(costs, 5)]
+        places = [np.concatenate([stiffness[index], np.asarray(grid[index]), rest]) for index in separate(costs, 5)]
         return np.clip(np.stack(places), lower, upper)
 
     def prepare(self, test: Test, *, smooth: bool = False) -> Curve:
@@ -313,40 +313,6 @@ def _between(
 def _unit_of_force(test: Test) -> float:
     """What turns the scale of an output into one of force: the mean stiffness for positions."""
     return _mean_secant(test) if test.kind == "creep" else 1.0
-
-
-@program
-def _screen(
-    model: Sampled, curves: tuple[Curve, ...], scales: list[Float[Array, ""]], grid: Float[Array, "K A 2"]
-) -> tuple[Float[Array, "K A"], Float[Array, "K A 2"]]:
-    """Cost and stiffnesses (K_inst, K_eff) of the best combination at each place of the grid."""
-    weights = [jnp.full(c.output.shape[0], 1 / c.output.shape[0], c.scale.dtype) for c in curves]
-    ends = jnp.eye(2, dtype=grid.dtype)
-
-    def best_at(kappa_alpha):
-        normal, right, total = jnp.zeros((2, 2), grid.dtype), jnp.zeros(2, grid.dtype), jnp.zeros((), grid.dtype)
-        for curve, scale, w in zip(curves, scales, weights, strict=True):
-            responses = [model.predict(jnp.concatenate([end, kappa_alpha]), curve, w) for end in ends]
-            basis = jnp.stack(responses) / (scale * np.sqrt(curve.time.size))
-            goal = w @ curve.output / (scale * np.sqrt(curve.time.size))
-            normal, right, total = normal + basis @ basis.T, right + basis @ goal, total + goal @ goal
-        a, b, c = normal[0, 0], normal[0, 1], normal[1, 1]
-        K_eff = jnp.maximum((a * right[1] - b * right[0]) / (a * c - b * b), 0)
-        stiffness = jnp.stack([(right[0] - b * K_eff) / a, K_eff])
-        return total - 2 * right @ stiffness + stiffness @ normal @ stiffness, stiffness
-
-    costs, stiffness = jax.lax.map(best_at, grid.reshape(-1, 2))
-    return costs.reshape(grid.shape[:-1]), stiffness.reshape(grid.shape)
-
-
-def _separate(costs: Float[np.ndarray, "K A"], count: int) -> list[tuple]:
-    """Indices of the lowest costs, none beside another."""
-    left, places = np.where(np.isfinite(costs), costs, np.inf), []
-    while len(places) < count and np.isfinite(left).any():
-        i, j = np.unravel_index(np.argmin(left), left.shape)
-        places.append((i, j))
-        left[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = np.inf
-    return places
 
 
 def _secant(test: Test) -> float:

@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from hilbo.identification.beginnings import untared
 from hilbo.identification.estimates import Estimate
-from hilbo.identification.fitting import Fit, Test, untared
+from hilbo.identification.fitting import Fit, Test
 from hilbo.identification.intervals import Intervals, Spread
 from hilbo.identification.misfit import is_coarse, moved_between_rows
 from hilbo.identification.residual_noise import DRIFTS

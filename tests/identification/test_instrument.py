@@ -107,7 +107,9 @@ def test_intervals_hold_the_truth_under_a_bad_instrument(name):
     truth, inside, kinds = study.truth_of(case), [], set()
     for number in range(4):
         result = characterise(data_set(case, number, hold=1.0), Sampled(lag="fit"))
-        kinds |= {words.split(":")[0].split(" is ")[1][:8] for words in result.warnings if words.startswith("The force")}
+        kinds |= {
+            words.split(":")[0].split(" is ")[1][:8] for words in result.warnings if words.startswith("The force")
+        }
         inside += [study.holds(tuple(result.estimates[p]), truth[p]) is True for p in ("K0", "K1", "B1", "alpha")]
     assert sum(inside) >= 13  # of 16
     assert ("filtered" if name == "filter" else "recorded") in kinds
