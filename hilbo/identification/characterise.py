@@ -162,7 +162,7 @@ def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str
 def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
     """What the residuals of each test look like, and how they compare with the noise of the repeats."""
     for test, curve, autoregression in zip(tests, best_fit.curves, noise(best_fit), strict=True):
-        values = test.output if curve.other_way is None else test.input
+        values = np.asarray(test.output if curve.other_way is None else test.input)
         row = {
             "autocorrelation": float(autoregression.lag_one),
             "order": int(autoregression.order),

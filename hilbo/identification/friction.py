@@ -130,8 +130,9 @@ def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
         again = _intervals(other, seed)[1]
         damping = Interval(damping.value, min(damping.lower, again.lower), max(damping.upper, again.upper))
     freedom = blocks.terms.shape[1]
-    rest = float(blocks.left.std(ddof=freedom)), len(sweeps), int(periods.size)
-    return Friction(damping, coulomb, mass, constant, *rest, law.name, *added[:1] or [None], law.speed)
+    residual, further = float(blocks.left.std(ddof=freedom)), added[0] if added else None
+    parts = damping, coulomb, mass, constant
+    return Friction(*parts, residual, len(sweeps), int(periods.size), law.name, further, law.speed)
 
 
 def _fitting(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> list[tuple[Law, Blocks]]:
@@ -139,7 +140,7 @@ def _fitting(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarr
     simplest, *others = candidates(speed, way)
     if not refuted(blocks, speed, way):
         return [(simplest, blocks)]
-    pairs = [(law, blocks._replace(terms=np.column_stack([blocks.terms, law.term]))) for law in others]
+    pairs = [(law, blocks.with_term(law)) for law in others]
     left = [float(np.sum(pair[1].left ** 2)) for pair in pairs]
     order = np.argsort(left)  # best first
     good = [pairs[i] for i in order if left[i] < _AS_WELL * left[order[0]] and not refuted(pairs[i][1], speed, way)]

@@ -38,6 +38,10 @@ class Blocks(NamedTuple):
     force: Float[np.ndarray, " n"]
     period: np.ndarray
 
+    def with_term(self, law: Law) -> "Blocks":
+        """The same with the further term of a law."""
+        return self if law.term is None else self._replace(terms=np.column_stack([self.terms, law.term]))
+
     @property
     def best(self) -> Float[np.ndarray, " p"]:
         """The estimate. (p,)."""

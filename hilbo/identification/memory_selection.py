@@ -41,8 +41,9 @@ def select_memory(
         raise InputError("There is no number of taps to choose from.")
     rows = []
     for N in choices:
-        memory = {"memory": "full"} if N is None else {"N": N}
-        best_fit = fit(tests, Sampled(T=T, lag=lag, corner=corner, **memory))
+        full = N is None
+        model = Sampled(T=T, memory="full", lag=lag, corner=corner) if full else Sampled(N, T, lag=lag, corner=corner)
+        best_fit = fit(tests, model)
         rows.append(Row(N, best_fit, nrmse(best_fit)))
     return tuple(rows)
 

@@ -177,6 +177,7 @@ class Sampled(eqx.Module):
         weighted = weights.astype(curve.spectra.dtype)
         spectrum = weighted @ curve.spectra
         if self._has_instrument():
+            assert curve.changes is not None
             spectrum = spectrum + self._added(q, curve) * (weighted @ curve.changes)
         spectrum = spectrum / H if creep else spectrum * H
         growth = _circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
