@@ -27,9 +27,9 @@ def counted_flags(table: pd.DataFrame, exclude: Collection[str]) -> FlagCounts:
     recorded = carried.map(bool)
     if COLUMN_OF_SAMPLES in table:
         recorded |= ~table[COLUMN_OF_SAMPLES].astype(str).str.strip().str.lower().isin(_EMPTY)
-    found = Counter(name for names in carried for name in names)
+    rows_of = Counter(name for names in carried for name in names)
     left_out = int(flagged(table, exclude).sum())
-    return FlagCounts(int(recorded.sum()), {name: found[name] for name in FLAGS if found[name]}, left_out)
+    return FlagCounts(int(recorded.sum()), {name: rows_of[name] for name in FLAGS if rows_of[name]}, left_out)
 
 
 def with_flag_counts(table: pd.DataFrame, counts: FlagCounts) -> pd.DataFrame:

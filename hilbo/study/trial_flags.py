@@ -47,11 +47,9 @@ def flag_words(flags: Iterable[str]) -> str:
 
 def flag_sentences(counts: FlagCounts, exclude: Collection[str], what: str = "trials") -> list[str]:
     """How many trials carried which flag, and how many are left out; nothing where no flag was recorded or excluded."""
-    named = ", ".join(exclude)
+    rule = f"[study] exclude_flags ({', '.join(exclude)})"
     if not counts.recorded:
-        return [f"No flags were recorded with these {what}; [study] exclude_flags ({named}) leaves out none."] * bool(
-            named
-        )
-    found = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.flagged.items()) or "none"
-    left = f"{counts.left_out or 'none'} left out by [study] exclude_flags ({named})" if named else "none left out"
-    return [f"Flags of the device in {counts.recorded} {what}: {found}; {left}."]
+        return [f"No device flags were recorded for these {what}; {rule} excludes none."] if exclude else []
+    words = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.flagged.items()) or "none occurred"
+    left = f"excluded by {rule}: {counts.left_out}" if exclude else "none is excluded for them"
+    return [f"Device flags were recorded for {counts.recorded} {what} ({words}); {left}."]
