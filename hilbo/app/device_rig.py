@@ -149,7 +149,8 @@ class DeviceRig:
         except DeviceError as error:
             if error.nack is None or error.nack.reason != NackReason.IN_CONTACT:
                 raise
-            return False  # the hand has come back since the look
+            self._see(self.snapshot._replace(contact=True))  # the hand has come back since the look
+            return False
         return True
 
     def _load(self, device: Renderer, wanted: dict[str, Any]) -> Loaded | None:

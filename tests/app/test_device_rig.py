@@ -154,7 +154,7 @@ def test_nothing_starts_and_no_set_goes_over_while_the_handle_is_pressed():
         device.pressed = True
         shown = asyncio.ensure_future(rig.show(RENDERING))
         await asyncio.sleep(0.05)
-        assert device.told == ["send"] and not shown.done()
+        assert device.told == ["send"] and device.starts == 0 and not shown.done()
         device.pressed = False
         await shown
         assert device.told == ["send", "start"]

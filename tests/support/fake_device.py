@@ -16,7 +16,8 @@ __all__ = ["FakeDevice"]
 
 
 class FakeDevice(Renderer):
-    """`pressed`: a hand presses the handle. `told`: what was carried out, in its order. `arrives(flags)`: samples."""
+    """`pressed`: a hand presses the handle. `told`: what was carried out, in its order; `starts`: how often START was
+    sent. `arrives(flags)`: samples of the telemetry."""
 
     notes = ()
     simulator = None
@@ -25,7 +26,7 @@ class FakeDevice(Renderer):
     device = SimpleNamespace(damping_N_s_per_m=1.0)
 
     def __init__(self, pressed=False):
-        self.pressed, self.told = pressed, []
+        self.pressed, self.told, self.starts = pressed, [], 0
         self.now, self.why, self.flags = State.STOPPED, HoldReason.BOOT, DeviceFlag.HOMED
         self.link = SimpleNamespace(name="fake", stops=0, restarted=False, faint=False)
         self._samples = []
@@ -48,6 +49,7 @@ class FakeDevice(Renderer):
         return SimpleNamespace(_asdict=lambda: numbers)
 
     def start(self, stop=None):
+        self.starts, self._samples = self.starts + 1, []
         self._check_time(stop)
         if self.now == State.RUNNING:
             return
