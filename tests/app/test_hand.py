@@ -65,7 +65,7 @@ def test_a_hand_that_stays_interrupts_the_trial_and_nothing_is_forced(tmp_path, 
         live.fake.pressed = False
         live.begin()
         live.answer()
-        assert [t.status for t in live.hub.state.trials][0] == "answered"
+        assert live.hub.state.trials[0].status == "answered"
         assert not live.hub.state.stops(0)  # the rendering is not blamed
         live.replays()
 

@@ -42,6 +42,22 @@ def write(folder, person, kind, session, doings=(), **facts):
     return driver.state
 
 
+def test_flags_are_columns_and_empty_where_there_is_no_record(tmp_path):
+    state = write(tmp_path / "logs", "P01", "optimisation", "1")
+    answered = [trial for trial in state.trials if trial.values is not None]
+    counts = [trial.telemetry for trial in answered]
+    assert None in counts and {"samples": 8} in counts and {"samples": 8, "slewed": 1, "saturated": 2} in counts
+    psych_ds([state], tmp_path / "out", STUDY)
+    path = tmp_path / "out" / "data" / "study-plain_table-trials_data.csv"
+    cells = pd.read_csv(path, dtype=str, keep_default_na=False)
+    cell = {None: ("", ""), 1: ("", "8"), 3: ("saturated slewed", "8")}
+    wanted = [cell[None if count is None else len(count)] for count in counts]
+    assert list(zip(cells["flags"], cells["telemetry_samples"], strict=True)) == wanted
+    sidecar = json.loads(path.with_suffix(".json").read_text())["variableMeasured"]
+    words = {variable["name"]: variable["description"] for variable in sidecar}
+    assert "saturated, slewed" in words["flags"] and "empty where none were recorded" in words["telemetry_samples"]
+
+
 TROUBLE = [("answer", 1)] * 2 + [("go", 0), ("answer", 2), ("answer", 0), ("undo", 0), ("void old", 2), ("answer", 1)]
 
 
