@@ -9,6 +9,7 @@ virtual time, and the processor's timer counts it. --write puts the tables into 
 
 import argparse
 import re
+import struct
 import subprocess
 import sys
 import tempfile
@@ -63,7 +64,7 @@ def begin(recording: Recording, N: int, states: int, name: str) -> bytes:
     recording.section("")
     recording.send(Type.COMMIT, named)
     recording.ticks([0] * 50)
-    recording.send(Type.START, named)
+    recording.send(Type.START, named + bytes(4))
     recording.ticks([0] * 50)
     return named
 
@@ -96,7 +97,7 @@ def scenes_recording() -> bytes:
     recording.section("")
     recording.ticks(PRESS[1001:1500])
     recording.section("HEARTBEAT")
-    recording.send(Type.HEARTBEAT, b"\1\0\0\0")
+    recording.send(Type.HEARTBEAT, struct.pack("<II", 1, recording.ticks_done))
     recording.section("GET_STATUS")
     recording.send(Type.GET_STATUS)
     recording.section("")

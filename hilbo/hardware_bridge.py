@@ -45,7 +45,7 @@ _LOCKSTEP = 30.0  # s, where no time passes meanwhile
 _POLL = 0.1  # s
 _SINKS = 1.0  # s for a force to sink to zero, of which the protocol allows 0.1
 _STALLED = 20  # polls without telemetry
-_SHAPES = {"hold": 0, "triangle": 1, "step": 2}
+_SHAPES = {"hold": 0, "triangle": 1, "step": 2, "nudge": 3}
 
 
 class Renderer:
@@ -143,6 +143,8 @@ class Renderer:
             self._buffer = TelemetryBuffer(self.device.encoder_step_mm)
             self._link.on_telemetry = self._buffer.add
             self.notes += take_over(self._link, self.device)
+            if self._link.ours:
+                self._link.pause(self.tick_s)  # a device knows its position from its first tick on
             self.stream()
         except BaseException:
             self._link.close()
@@ -177,17 +179,34 @@ class Renderer:
         """The set in force, or None."""
         return in_force(self._link.request(protocol.GetSet(bank=0)))
 
-    def start(self) -> None:
+    @property
+    def delay(self) -> float:
+        """Longest time from the sample of a position until its force is out, s: sets are checked for it."""
+        return self._link.request(protocol.GetLimits()).delay_us * 1e-6
+
+    def home(self, position: SupportsFloat = 0.0) -> None:
+        """Tell a device without an absolute encoder that its handle stands at `position` (mm) now.
+
+        Raises `DeviceError` while it moves, `RefusalError` for a position outside of its stroke.
+        """
+        home = protocol.Home(boot_id=self.device.boot_id, stop=self._link.stops, position_mm=float(position))
+        self._link.request(home)
+
+    def start(self, *, stop: int | None = None) -> None:
         """Render the set that is in force. Telemetry from before is dropped.
 
-        Raises `DeviceError` if no set is in force.
+        `stop` is the device's count of stops that the order follows (`link.stops`), by default what is known at the
+        call: after a later stop the device refuses it. Raises `DeviceError` if no set is in force, while the handle is
+        in the material, and where the device refuses for another reason.
         """
+        stop = self._link.stops if stop is None else stop
         current = self.in_force()
         if current is None:
             raise DeviceError("The device has no set in force; send one first.")
         self._link.heartbeat()
         self._buffer.take()
-        self._link.request(protocol.Start(set_id=current.set_id, crc=current.crc, boot_id=self.device.boot_id))
+        order = {"set_id": current.set_id, "crc": current.crc, "boot_id": self.device.boot_id, "stop": stop}
+        self._link.request(protocol.Start(**order))
 
     def stop(self) -> None:
         """Force to zero, smoothly."""
@@ -197,9 +216,13 @@ class Renderer:
         """Force to zero at once, latched until `clear`."""
         self._link.request(protocol.Estop())
 
-    def clear(self) -> None:
-        """Leave HOLD or ESTOP, once the reason is understood; the device first lets its force sink to zero."""
-        clear = protocol.Clear(boot_id=self.device.boot_id)
+    def clear(self, *, stop: int | None = None) -> None:
+        """Leave HOLD or ESTOP, once the reason is understood; the device first lets its force sink to zero.
+
+        `stop` is the stop that it ends (`link.stops`), by default the last one known at the call: a later one stays, and
+        is a `DeviceError`.
+        """
+        clear = protocol.Clear(boot_id=self.device.boot_id, stop=self._link.stops if stop is None else stop)
         patiently(self._link, self.device, clear, self._link.now() + _SINKS)
 
     def status(self) -> Status:
@@ -238,15 +261,17 @@ class Renderer:
     def drive(
         self,
         mode: Literal["force", "position"],
-        shape: Literal["hold", "triangle", "step"],
+        shape: Literal["hold", "triangle", "step", "nudge"],
         offset: SupportsFloat,
         amplitude: SupportsFloat = 0.0,
         *,
         period: SupportsFloat = 0.0,
         duration: SupportsFloat,
+        stop: int | None = None,
     ) -> None:
         """The device moves by itself for `duration` s: see DRIVE in PROTOCOL.md. Force in N, position in mm, s.
 
+        `stop`: as for `start`.
         Raises `InputError` for another mode or shape, `DeviceError` for a device that cannot move by itself.
         """
         if not self.can & Capability.DRIVE:
@@ -257,10 +282,11 @@ class Renderer:
             raise InputError(f'The drive is "{mode}", "{shape}"; it is force or position, and {", ".join(_SHAPES)}.')
         ticks = {"period_ticks": self._ticks("period", period), "duration_ticks": self._ticks("duration", duration)}
         numbers = {"offset": float(offset), "amplitude": float(amplitude)}
+        order = {"boot_id": self.device.boot_id, "stop": self._link.stops if stop is None else stop}
         self._link.heartbeat()
         self._link.request(
             protocol.Drive(
-                mode=int(mode == "position"), shape=_SHAPES[shape], **numbers, **ticks, boot_id=self.device.boot_id
+                mode=int(mode == "position"), shape=_SHAPES[shape], **numbers, **ticks, **order
             )
         )
 

@@ -217,7 +217,7 @@ def test_a_device_that_restarts_is_not_started_again(kind):
 def test_a_notice_tells_of_a_restart_too():
     peer = Peer()
     with peer.open(**PATIENT) as device:
-        peer.say(protocol.Notice(tick=1, boot_id=555, state=0, reason=8))
+        peer.say(protocol.Notice(tick=1, boot_id=555, state=0, reason=8, stops=0))
         device.status()
         assert device.events() == ["tick 1: STOPPED, it has just started"]
         with pytest.raises(DeviceError, match="restarted"):

@@ -16,8 +16,8 @@ const char *hb_error_sentence(enum hb_error error)
     case HB_ERROR_LINE:
         return "line_rate_baud must be 1200 to 100000000.";
     case HB_ERROR_LIMITS:
-        return "damping must be 0.001 to 1000 N.s/m, the force limit at most 100 N, the slew limit from the force limit "
-               "in 1 s to the force limit in 1 tick, the velocity limit one encoder step a tick or more.";
+        return "damping must be 0.001 to 1000 N.s/m, the force limit at most 100 N, the slew limit at least "
+               "the force limit in 1 s, the velocity limit at least one encoder step a tick; all finite.";
     case HB_ERROR_STROKE:
         return "The stroke must reach an encoder step or more to both sides of 0, within 32767 steps, each <= 0.1 mm.";
     case HB_ERROR_STEP:
@@ -61,7 +61,7 @@ static bool limits_are_good(const struct hb_config *c)
 {
     float rate_Hz = (float)c->tick_rate_Hz;
     return within(c->damping_N_s_per_m, 0.001F, 1000.0F) && within(c->force_limit_N, SMALLEST, 100.0F) &&
-           within(c->slew_limit_N_per_s, c->force_limit_N, c->force_limit_N * rate_Hz) &&
+           within(c->slew_limit_N_per_s, c->force_limit_N, LARGEST) &&
            within(c->velocity_limit_mm_per_s, SMALLEST, LARGEST) &&
            c->velocity_limit_mm_per_s >= c->encoder_step_mm * rate_Hz;
 }

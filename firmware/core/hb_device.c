@@ -141,6 +141,13 @@ static float drive(struct hb_device *device)
     return hb_slew(&device->safety, device->config, force_N, force_N);
 }
 
+static void note_delay(struct hb_device *device, uint32_t delay_us)
+{
+    if (delay_us > device->longest_delay_us) {
+        device->longest_delay_us = delay_us < UINT16_MAX ? (uint16_t)delay_us : UINT16_MAX;
+    }
+}
+
 /* A tick was missed, or the last force came out later than sets are checked for. */
 static bool is_late(const struct hb_device *device, const struct hb_input *input)
 {
@@ -220,6 +227,7 @@ float hb_tick(struct hb_device *device, const struct hb_input *input)
     if (device->heartbeat_age_ticks < config->watchdog_ticks) {
         device->heartbeat_age_ticks += 1U;
     }
+    note_delay(device, input->delay_us);
     bool late = is_late(device, input);
     if (late) {
         hb_count_up(&safety->count.overruns);

@@ -38,6 +38,7 @@ struct hb_device {
     uint8_t state;                /* enum hb_state */
     uint8_t cause;                /* enum hb_cause: why it is in this state */
     bool stop_open;               /* the hardware stop, at the last tick */
+    uint16_t longest_delay_us;    /* stays at 65535 */
     bool greeted;                 /* HELLO has been said */
     uint32_t heartbeat_age_ticks; /* since the last tick that the host is known to have heard; stays at watchdog_ticks */
     uint32_t stops;               /* STOPs, ESTOPs, HOLDs and ends of a DRIVE since the start */

@@ -256,7 +256,7 @@ size_t hb_pack_status(const struct hb_status *status, uint8_t *payload)
     }
     at = put_u32(payload, at, status->stops);
     at = put_u16(payload, at, status->flags);
-    return put_u16(payload, at, 0U);
+    return put_u16(payload, at, status->delay_us);
 }
 
 size_t hb_pack_set(const struct hb_set_reply *reply, uint8_t *payload)

@@ -11,7 +11,7 @@
 #include "hb_renderer.h"
 
 #define HB_PROTOCOL_VERSION 2U
-#define HB_SCHEMA_CRC 0xd2ad5d8aU /* CRC-32 of the schema block; a test compares it with PROTOCOL.md */
+#define HB_SCHEMA_CRC 0xeef43481U /* CRC-32 of the schema block; a test compares it with PROTOCOL.md */
 
 enum hb_type {
     HB_HELLO = 0x01,
@@ -225,7 +225,8 @@ struct hb_status {
     float energy_mJ;
     uint16_t counts[8]; /* in the order of the schema */
     uint32_t stops;
-    uint16_t flags; /* 1 homed, 2 the hardware stop is open */
+    uint16_t flags;    /* 1 homed, 2 the hardware stop is open */
+    uint16_t delay_us; /* longest so far */
 };
 
 struct hb_set_reply {

@@ -86,6 +86,7 @@ static enum hb_reason get_status(const struct hb_device *device, struct hb_reply
                    count->overruns, device->receiver.dropped},
         .stops = device->stops,
         .flags = (uint16_t)((device->safety.homed ? 1U : 0U) | (device->stop_open ? 2U : 0U)),
+        .delay_us = device->longest_delay_us,
     };
     status.staging = (uint8_t)hb_staging_now(device, &status.ticks_until_ready);
     if (device->in_force) {

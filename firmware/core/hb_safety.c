@@ -67,7 +67,7 @@ bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, co
         safety->zero_counts = input->position_counts;
         safety->placed = true;
     }
-    int64_t counts = (int64_t)input->position_counts - safety->zero_counts;
+    int64_t counts = input->position_counts - safety->zero_counts;
     if (is_plausible(safety, config, input->position_valid, counts)) {
         believe(safety, (int32_t)counts);
         return true;
@@ -90,7 +90,7 @@ bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, co
 
 bool hb_input_is_good(const struct hb_safety *safety)
 {
-    return safety->bad == 0U && !safety->lost;
+    return safety->known && safety->bad == 0U && !safety->lost;
 }
 
 float hb_position_mm(const struct hb_safety *safety, const struct hb_config *config)

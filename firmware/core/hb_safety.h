@@ -38,7 +38,7 @@ struct hb_counts {
 struct hb_safety {
     bool homed;          /* `zero_counts` is the surface */
     bool placed;         /* `zero_counts` is a position that was seen */
-    int32_t zero_counts; /* what the encoder counts at position 0 */
+    int64_t zero_counts; /* what the encoder counts at position 0 */
     int32_t counts;      /* the last position that was believed, from there */
     int32_t step_counts; /* how it changed, over `step_ticks`; 0 while a position is held */
     uint16_t step_ticks;
@@ -74,7 +74,7 @@ void hb_home(struct hb_safety *safety, const struct hb_config *config, float pos
 /* Believe the position, or keep the last one. False when the input is lost. */
 bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, const struct hb_input *input);
 
-/* The last position was a good one, or none was asked for yet. */
+/* There has been a position, and the last one was good. */
 bool hb_input_is_good(const struct hb_safety *safety);
 
 /* The position that is believed (mm), and the part of it that the model sees: x >= 0. */

@@ -26,7 +26,8 @@ struct rig {
     struct told staged;
     struct told confirmed;
     bool committed;
-    uint32_t silent_ticks; /* since the last heartbeat with the right boot id */
+    uint32_t silent_ticks; /* since the newest tick that came with a heartbeat of the right boot id */
+    uint32_t stops;        /* STOPs, ESTOPs and ends of a motion, as the harness counts them */
     uint32_t ramp_ticks;
     uint64_t held;   /* a bit for each of the last ticks whose position was not believed, the newest lowest; since it moves */
     bool zero_owed;  /* ESTOP was heeded, and no tick has put out zero since */
@@ -62,6 +63,7 @@ static struct hb_config config_with(uint8_t capabilities)
         .K0_N_per_mm = {-20.0F, 40.0F}, .K1_N_per_mm = {0.5F, 40.0F}, .B1_N_s_alpha_per_mm = {0.0005F, 40.0F},
         .alpha = {0.005F, 0.995F}, .servo_stiffness_N_per_mm = 1.0F, .servo_damping_N_s_per_mm = 0.02F,
         .servo_integral_N_per_mm_s = 5.0F, .servo_speed_mm_per_s = 100.0F,
+        .delay_us = (capabilities & 1U) != 0U ? 100U : 0U, .continuous_force_N = 20.0F, .heating_s = 0.5F,
     };
 }
 
@@ -88,7 +90,7 @@ static bool is_moving(uint8_t state)
 
 static void check_state(const struct hb_device *device)
 {
-    must(device->state <= (uint8_t)HB_ESTOPPED && device->cause <= (uint8_t)HB_CAUSE_BOOT, "state is not legal");
+    must(device->state <= (uint8_t)HB_ESTOPPED && device->cause <= (uint8_t)HB_CAUSE_HEAT, "state is not legal");
     must(device->staging <= (uint8_t)HB_WARMING && device->active <= 1U, "staging is not legal");
     must(device->receiver.size <= HB_MAX_ENCODED, "receiver");
     must(device->output.first < HB_OUTPUT_BYTES && device->output.size <= HB_OUTPUT_BYTES, "output");
@@ -108,17 +110,40 @@ static bool same_set(const struct hb_parameters *a, const struct hb_parameters *
            a->force_limit_N == b->force_limit_N;
 }
 
+/* What ends a motion is counted, and an order that names another count does nothing. */
+static void check_orders(struct rig *rig, const struct hb_frame *frame, const struct hb_pair *pair,
+                         const struct hb_device *before)
+{
+    const struct hb_device *device = &rig->device;
+    if ((frame->type == (uint8_t)HB_STOP || frame->type == (uint8_t)HB_ESTOP) && frame->size == 0U) {
+        rig->stops += 1U;
+    }
+    must(device->stops == rig->stops, "stops are not counted");
+    bool latched = before->state == (uint8_t)HB_ESTOPPED || before->state == (uint8_t)HB_HOLDING;
+    bool freed = latched && device->state == (uint8_t)HB_STOPPED;
+    must(!freed || (frame->type == (uint8_t)HB_CLEAR && pair->second == rig->stops), "cleared by an older order");
+    bool begins = is_moving(device->state) && !is_moving(before->state);
+    size_t at = frame->type == (uint8_t)HB_START ? 12U : 24U;
+    must(!begins || (frame->size >= at + 4U && hb_unpack_stop(frame->payload + at) == rig->stops), "an older order acted");
+    must(device->safety.zero_counts == before->safety.zero_counts || frame->type == (uint8_t)HB_HOME, "homed unasked");
+}
+
 /* What a frame that has arrived whole lets the device do. */
 static void check_frame(struct rig *rig, const struct hb_frame *frame, const struct hb_device *before)
 {
     const struct hb_device *device = &rig->device;
     struct hb_confirmation confirmation = {0U, 0U, 0U};
-    bool confirms = frame->size == 12U && hb_unpack_confirmation(frame->payload, &confirmation) &&
+    struct hb_pair pair = {0U, 0U};
+    bool confirms = frame->size >= 12U && hb_unpack_confirmation(frame->payload, &confirmation) &&
                     confirmation.boot_id == device->boot_id;
-    if (frame->type == (uint8_t)HB_HEARTBEAT && frame->size == 4U &&
-        hb_unpack_boot_id(frame->payload) == device->boot_id) {
-        rig->silent_ticks = 0U;
+    if (frame->size >= 8U) {
+        hb_unpack_pair(frame->payload, &pair);
     }
+    if (frame->type == (uint8_t)HB_HEARTBEAT && frame->size == 8U && pair.boot_id == device->boot_id &&
+        device->tick - pair.second < rig->silent_ticks) {
+        rig->silent_ticks = device->tick - pair.second;
+    }
+    check_orders(rig, frame, &pair, before);
     if (frame->type == (uint8_t)HB_SET_PARAMS && frame->size == 28U && device->staging != (uint8_t)HB_EMPTY &&
         device->crc[1U - device->active] == hb_crc32(0U, frame->payload, frame->size)) {
         (void)hb_unpack_parameters(frame->payload, &rig->staged.set);
@@ -139,6 +164,9 @@ static void check_frame(struct rig *rig, const struct hb_frame *frame, const str
              "RUNNING without START");
     }
     if (is_moving(device->state) && !is_moving(before->state)) {
+        must(device->safety.known, "moves before a position is known");
+        must(device->safety.homed || device->drive.request.shape == (uint8_t)HB_DRIVE_NUDGE, "moves before it is homed");
+        must(device->state != (uint8_t)HB_RUNNING || device->safety.counts <= 0, "starts in contact");
         must(!rig->zero_owed, "moves before ESTOP has put out zero");
         must((rig->held & 1U) == 0U, "moves on a bad position");
     }
@@ -183,7 +211,7 @@ static void drain(struct rig *rig, size_t room)
     must(size <= room, "more than there is room for");
     for (size_t i = 0U; i < size; i += 1U) {
         if (hb_receiver_push(&rig->answers, bytes[i], &frame)) {
-            must(frame.type >= (uint8_t)HB_HELLO_REPLY && frame.type <= (uint8_t)HB_ECHO_REPLY, "unknown answer");
+            must(frame.type >= (uint8_t)HB_HELLO_REPLY && frame.type <= (uint8_t)HB_PULSE, "unknown answer");
         }
     }
     must(rig->answers.dropped == 0U, "a broken frame went out");
@@ -211,8 +239,8 @@ static void check_rendering(const struct hb_device *before, const struct hb_devi
     }
     float x_mm = (float)safety->counts * after->config->encoder_step_mm;
     float new_N = felt_N(before, before->active, x_mm);
-    bool switching = before->flipped || before->starting || before->offset_N != 0.0F;
-    float old_N = !switching ? new_N : before->follows ? felt_N(before, 1U - before->active, x_mm) : 0.0F;
+    bool switching = before->flipped || before->offset_N != 0.0F;
+    float old_N = switching ? felt_N(before, 1U - before->active, x_mm) : new_N;
     bool controls = (after->config->capabilities & (uint8_t)HB_CAN_CONTROL_PASSIVITY) != 0U;
     float damped_N = 0.95F * fabsf((float)safety->step_counts * 0.0127F) / (float)safety->step_ticks;
     float low_N = controls ? 0.0F : fminf(old_N, new_N);
@@ -248,8 +276,15 @@ static void tick(struct rig *rig, uint8_t flags)
     float before_N = device->safety.force_N;
     uint8_t state = device->state;
     earlier = *device;
-    struct hb_input input = {rig->position, (flags & 1U) == 0U, (flags & 2U) != 0U, (flags & 4U) != 0U ? NAN : 1.0F};
+    uint32_t delay_us = (flags & 8U) != 0U ? rig->config.delay_us + 1U : rig->config.delay_us;
+    struct hb_input input = {rig->position,       (flags & 1U) == 0U, (flags & 2U) != 0U, (flags & 48U) == 48U, delay_us,
+                             (flags & 4U) != 0U ? NAN : 1.0F};
     float force_N = hb_tick(device, &input);
+    rig->stops += is_moving(state) && !is_moving(device->state) ? 1U : 0U;
+    rig->stops += !is_moving(state) && input.stop_open && device->stops != rig->stops ? 1U : 0U;
+    must(device->stops == rig->stops, "stops are not counted at a tick");
+    must(!input.stop_open || (device->state == (uint8_t)HB_ESTOPPED && force_N == 0.0F), "moves with an open stop");
+    must(!is_moving(device->state) || input.delay_us <= rig->config.delay_us, "moves though late");
     rig->silent_ticks += rig->silent_ticks < rig->config.watchdog_ticks ? 1U : 0U;
     must(isfinite(force_N) && fabsf(force_N) <= rig->config.force_limit_N, "force is not finite, or beyond its limit");
     check_state(device);
@@ -334,6 +369,13 @@ static size_t confirmation(const struct hb_device *device, uint8_t bank, uint8_t
     return put(payload, at, device->boot_id, 4U);
 }
 
+/* The last stop, or now and then one before or after it. */
+static uint32_t stop_of(const struct hb_device *device, struct input *input)
+{
+    uint8_t choice = next(input);
+    return choice < 224U ? device->stops : device->stops + choice - 240U;
+}
+
 static size_t good_drive(const struct hb_device *device, struct input *input, uint8_t *payload)
 {
     size_t at = put(payload, 0U, next(input) & 1U, 1U);
@@ -342,12 +384,13 @@ static size_t good_drive(const struct hb_device *device, struct input *input, ui
     at = put_float(payload, at, (float)next(input) * 0.1F);
     at = put(payload, at, 4U + next(input), 4U);
     at = put(payload, at, 1U + next(input), 4U);
-    return put(payload, at, device->boot_id, 4U);
+    return put(payload, put(payload, at, device->boot_id, 4U), stop_of(device, input), 4U);
 }
 
 /* The payload that a careful host would send. */
 static size_t good_payload(const struct hb_device *device, uint8_t type, struct input *input, uint8_t *payload)
 {
+    size_t at = 0U;
     switch (type) {
     case HB_HELLO:
         return put(payload, put(payload, 0U, HB_PROTOCOL_VERSION, 4U), HB_SCHEMA_CRC, 4U);
@@ -358,10 +401,14 @@ static size_t good_payload(const struct hb_device *device, uint8_t type, struct 
     case HB_COMMIT:
         return confirmation(device, (uint8_t)(1U - device->active), payload);
     case HB_START:
-        return confirmation(device, device->active, payload);
+        return put(payload, confirmation(device, device->active, payload), stop_of(device, input), 4U);
     case HB_CLEAR:
+        return put(payload, put(payload, 0U, device->boot_id, 4U), stop_of(device, input), 4U);
     case HB_HEARTBEAT:
-        return put(payload, 0U, device->boot_id, 4U);
+        return put(payload, put(payload, 0U, device->boot_id, 4U), device->tick - (next(input) >> 2), 4U);
+    case HB_HOME:
+        at = put(payload, put(payload, 0U, device->boot_id, 4U), stop_of(device, input), 4U);
+        return put_float(payload, at, 0.1F * (float)(int8_t)next(input));
     case HB_GET_SET:
         return put(payload, 0U, next(input) & 1U, 1U);
     case HB_STREAM:
@@ -436,7 +483,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size)
     if (!begun) {
         begun = atexit(say_ticks) == 0;
     }
-    start(&rig, next(&input) & 15U, 7U);
+    start(&rig, (next(&input) & 23U) | 8U, 7U);
     while (input.left > 0U) {
         uint8_t action = next(&input);
         uint8_t type = action & 31U;

@@ -74,19 +74,21 @@ static void send(struct loop *loop, uint8_t type, const uint8_t *payload, size_t
     (void)hb_transmit(&loop->rig.device, answers, sizeof answers);
 }
 
-static void send_boot_id(struct loop *loop, uint8_t type)
+/* CLEAR of the last stop, or a HEARTBEAT with the newest tick. */
+static void send_pair(struct loop *loop, uint8_t type, uint32_t second)
 {
-    uint8_t payload[4];
-    send(loop, type, payload, put(payload, 0U, loop->rig.device.boot_id, 4U));
+    uint8_t payload[8];
+    send(loop, type, payload, put(payload, put(payload, 0U, loop->rig.device.boot_id, 4U), second, 4U));
 }
 
 static void confirm(struct loop *loop, uint8_t type, uint8_t bank)
 {
     const struct hb_device *device = &loop->rig.device;
-    uint8_t payload[12];
+    uint8_t payload[16];
     size_t at = put(payload, 0U, device->bank[bank].set.set_id, 4U);
     at = put(payload, at, device->crc[bank], 4U);
-    send(loop, type, payload, put(payload, at, device->boot_id, 4U));
+    at = put(payload, at, device->boot_id, 4U);
+    send(loop, type, payload, type == (uint8_t)HB_START ? put(payload, at, device->stops, 4U) : at);
 }
 
 /* Sets are drawn until the device takes one: those that it finds passive. */
@@ -145,16 +147,16 @@ static void host(struct loop *loop, unsigned tick)
 {
     struct hb_device *device = &loop->rig.device;
     if (tick % 50U == 0U) {
-        send_boot_id(loop, HB_HEARTBEAT);
+        send_pair(loop, HB_HEARTBEAT, device->tick);
     }
     if (tick % 100U == 0U && device->state == (uint8_t)HB_HOLDING) {
-        send_boot_id(loop, HB_CLEAR);
+        send_pair(loop, HB_CLEAR, device->stops);
     }
     if (tick % 100U == 0U && device->state == (uint8_t)HB_STOPPED) {
         confirm(loop, HB_START, device->active);
     }
     if ((loop->kind & SWITCHES) != 0 && happens(loop, 0.01)) {
-        bool busy = device->offset_N != 0.0F || device->flipped || device->starting;
+        bool busy = device->offset_N != 0.0F || device->flipped;
         if (device->staging == (uint8_t)HB_EMPTY && !busy) {
             stage(loop);
         } else {

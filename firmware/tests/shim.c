@@ -135,6 +135,17 @@ double shim_offset_N(const struct shim *shim)
     return (double)shim->device.offset_N;
 }
 
+/* What a host knows that has heard everything. */
+uint32_t shim_stops(const struct shim *shim)
+{
+    return shim->device.stops;
+}
+
+uint32_t shim_now(const struct shim *shim)
+{
+    return shim->device.tick;
+}
+
 uint32_t shim_warm_left(const struct shim *shim)
 {
     return shim->device.warm_left;

@@ -17,6 +17,8 @@ float shim_tick_of_board(struct shim *shim, int32_t counts, uint32_t delay_us, i
 double shim_delayed_damping(const double *set, const float *weight, const float *loss, uint32_t delay_us);
 uint32_t shim_flags(const struct shim *shim);
 double shim_offset_N(const struct shim *shim);
+uint32_t shim_stops(const struct shim *shim);
+uint32_t shim_now(const struct shim *shim);
 uint32_t shim_warm_left(const struct shim *shim);
 void shim_run(struct shim *shim, const int32_t *counts, size_t size, int beating, float *forces, uint16_t *flags);
 int shim_render(const double *set, const float *weight, const float *loss, const float *x_mm, size_t size,

@@ -33,7 +33,8 @@ static struct hb_config golden_config(void)
 {
     return (struct hb_config){
         .firmware = 0xc0ffee01U, .line_rate_baud = 1000000U, .tick_rate_Hz = 1000U, .watchdog_ticks = 250U,
-        .hold_ticks = 20U, .most_taps = 255U, .most_states = 12U, .capabilities = 11U, .damping_N_s_per_m = 0.95F,
+        .hold_ticks = 20U, .most_taps = 255U, .most_states = 12U, .capabilities = 27U, .delay_us = 376U, .continuous_force_N = 8.0F,
+        .heating_s = 12.5F, .damping_N_s_per_m = 0.95F,
         .force_limit_N = 40.0F, .position_low_mm = -20.0F, .position_high_mm = 60.0F, .encoder_step_mm = 0.0127F,
         .slew_limit_N_per_s = 2000.0F, .velocity_limit_mm_per_s = 500.0F, .K0_N_per_mm = {-20.0F, 40.0F},
         .K1_N_per_mm = {0.5F, 40.0F}, .B1_N_s_alpha_per_mm = {0.0005F, 40.0F}, .alpha = {0.005F, 0.995F},
@@ -71,13 +72,13 @@ static size_t pack(const char *name, const uint8_t *payload, size_t size, uint8_
                name, "unpacked to other numbers");
     }
     if (strcmp(name, "HELLO_REPLY") == 0) {
-        return hb_pack_hello_reply(&config, BOOT, out);
+        return hb_pack_hello_reply(&config, BOOT, 123400U, out);
     }
     if (strcmp(name, "LIMITS") == 0) {
         return hb_pack_limits(&config, out);
     }
     if (strcmp(name, "ACK") == 0) {
-        return hb_pack_ack(HB_SET_PARAMS, 17U, set_crc, out);
+        return hb_pack_ack(HB_SET_PARAMS, 17U, set_crc, 7U, out);
     }
     if (strcmp(name, "NACK_NOT_PASSIVE") == 0) {
         struct hb_nack nack = {HB_SET_PARAMS, HB_NACK_NOT_PASSIVE, 0U, 1.34452F, 0.95F};
@@ -91,7 +92,7 @@ static size_t pack(const char *name, const uint8_t *payload, size_t size, uint8_
         uint32_t staged = (uint32_t)payload[20] | (uint32_t)payload[21] << 8 | (uint32_t)payload[22] << 16 |
                           (uint32_t)payload[23] << 24;
         struct hb_status status = {123456U, BOOT, HB_HOLDING, HB_CAUSE_WATCHDOG, HB_WARMING, 1U, 17U, 18U, set_crc,
-                                   staged, 412U, 3.81F, 1.25F, -0.125F, {1U, 2U, 3U, 4U, 5U, 6U, 7U, 65535U}};
+                                   staged, 412U, 3.81F, 1.25F, -0.125F, {1U, 2U, 3U, 4U, 5U, 6U, 7U, 65535U}, 8U, 3U, 311U};
         return hb_pack_status(&status, out);
     }
     if (strcmp(name, "SET") == 0) {
@@ -99,8 +100,12 @@ static size_t pack(const char *name, const uint8_t *payload, size_t size, uint8_
         return hb_pack_set(&reply, out);
     }
     if (strcmp(name, "NOTICE") == 0) {
-        struct hb_notice notice = {123457U, BOOT, HB_HOLDING, HB_CAUSE_WATCHDOG};
+        struct hb_notice notice = {123457U, BOOT, HB_HOLDING, HB_CAUSE_WATCHDOG, 9U};
         return hb_pack_notice(&notice, out);
+    }
+    if (strcmp(name, "PULSE") == 0) {
+        struct hb_notice pulse = {123458U, BOOT, HB_RUNNING, HB_CAUSE_NONE, 10U};
+        return hb_pack_notice(&pulse, out);
     }
     if (strcmp(name, "TELEMETRY") == 0 || strcmp(name, "TELEMETRY_SENSED") == 0) {
         return pack_telemetry(strcmp(name, "TELEMETRY_SENSED") == 0, out);

@@ -45,7 +45,7 @@ class Line(NamedTuple):
     """Which device, and what is counted on."""
 
     device: Where = "sim"
-    baud: Baud = 1_000_000
+    baud: Baud = 921_600
     sim: Sim = None
     study: Annotated[_Path, typer.Option("--study", help="Its damping must not exceed the device's.")] = None
     damping: Annotated[_Number, typer.Option(help="Damping that is counted on, N.s/m; else the study's.")] = None

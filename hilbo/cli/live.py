@@ -28,7 +28,7 @@ class Device(NamedTuple):
     """Which device."""
 
     device: Where = "sim"
-    baud: Baud = 1_000_000
+    baud: Baud = 921_600
     sim: Sim = None
 
     def open(self, damping: float | None) -> Any:

@@ -32,13 +32,18 @@ def selftest(
         result = device_tests.selftest(device, say, echoes)
         hold = device.device.hold_ticks
     good = (
-        result.echoes == result.asked and result.watchdog_ticks <= result.watchdog_limit and result.force_after_N == 0
+        result.echoes == result.asked
+        and result.watchdog_ticks <= result.watchdog_limit
+        and result.force_after_N == 0
+        and result.delay_us <= result.delay_limit_us
     )
     words = (
         f"loopback   {result.echoes} of {result.asked} came back whole\n"
         f"latency    median {result.median_ms:.2f} ms, 99 % below {result.p99_ms:.2f} ms, {result.retries} retries\n"
         f"watchdog   HOLD {result.watchdog_ticks} ticks after the last heartbeat (at most {result.watchdog_limit}),"
-        f" force {abs(result.force_after_N):g} N {hold} ticks later"
+        f" force {abs(result.force_after_N):g} N {hold} ticks later\n"
+        f"delay      at most {result.delay_us} us from a due tick to its force (sets are checked for"
+        f" {result.delay_limit_us} us)"
     )
     print_result(result._asdict() | {"passed": good}, words, as_json)
     if not good:

@@ -8,6 +8,7 @@ from hilbo.errors import InputError
 __all__ = [
     "DeviceError",
     "RefusalError",
+    "deserted",
     "fainted",
     "line_gone",
     "not_taken",
@@ -51,6 +52,11 @@ def fainted(line: str) -> str:
         f"{line}: heartbeats have ended, because this program hung for {GRACE:g} s or their process was ended; the"
         " device lets go: connect again."
     )
+
+
+def deserted(silent: str) -> str:
+    """A request of a known device has stayed unanswered; `silent` is the sentence that says so."""
+    return f"{silent} Heartbeats have ended, so that the device lets go: connect again."
 
 
 def line_gone(line: str, error: OSError) -> str:

@@ -20,7 +20,7 @@ __all__ = ["greet", "shortest", "take_over"]
 
 _BOOT = 3.0  # s that a board may take to start when its port is opened
 _STOPPING = 2.0  # s
-_BEATS = 3  # heartbeats that must fit into the device's watchdog
+_BEATS = 4  # heartbeats that must fit into the device's watchdog: each carries the tick of the answer before
 
 
 def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
@@ -45,7 +45,7 @@ def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
     silence = device.watchdog_ticks / device.tick_rate_Hz
     if silence < _BEATS * BEAT:
         raise DeviceError(
-            f"{link.name}: the device lets go after {silence:g} s without a heartbeat, and they come every {BEAT:g} s;"
+            f"{link.name}: the device lets go after {silence:g} s without a heartbeat, and one comes every {BEAT:g} s;"
             f" set its watchdog_ticks to {_BEATS * BEAT:g} s at least."
         )
     if damping is not None and not 0.0 <= float(damping) < math.inf:  # NaN neither

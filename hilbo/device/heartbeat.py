@@ -1,18 +1,20 @@
-"""Heartbeats that no computation delays: sent by a small process beside this one.
+"""Heartbeats that no computation delays, each with the last tick that came back: sent by a small process of their own.
 
-A Python process that imports or compiles can keep all of its threads waiting for a second or more, and a device that
-hears nothing for 250 ms lets go. So a helper shares the line and writes the same frame to it every 50 ms. What the
-heartbeats are for stays true: the helper ends at once when this process dies, however it dies, because its pipe ends
-then; and when this process has given no sign of life for `GRACE`, because it hangs. A thread here gives those signs.
+The device's watchdog watches the round trip: a heartbeat feeds it as far as the tick in it is fresh. A Python process
+that imports or compiles can keep all of its threads waiting for a second or more, in which it would neither send nor
+hear. So a helper process shares the line: it reads everything that arrives, passes it on through a pipe, and writes a
+heartbeat every 50 ms. The helper ends at once when this process dies, however it dies, because its own pipe ends then;
+and when this process has given no sign of life for `GRACE`, because it hangs. A thread here gives those signs.
 
-The helper is this file, run by itself: standard library only, and it knows nothing of the protocol. Where a line
-cannot be shared (Windows, or a port without `fileno`) a thread of this process sends the heartbeats.
+The helper is this file, run by itself: standard library, and the frame codec beside it. Where a line cannot be shared
+(Windows, or a port without `fileno`) a thread of this process sends the heartbeats, and the link itself reads.
 """
 
 import contextlib
 import os
 import select
 import signal
+import struct
 import subprocess
 import sys
 import threading
@@ -20,11 +22,38 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["BEAT", "GRACE", "HelperHeart", "ThreadHeart", "heart_for", "keep_beating"]
+if __name__ == "__main__":
+    sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
+    from frames import Frame, Receiver, closed  # type: ignore[import-not-found]
+else:
+    from hilbo.device.frames import Frame, Receiver, closed
+
+__all__ = ["BEAT", "GRACE", "HEARTBEAT", "WITH_TICK", "Heard", "HelperHeart", "ThreadHeart", "heart_for", "keep_beating"]
 
 BEAT = 0.05  # s between heartbeats, and between signs of life
 GRACE = 5.0  # s without a sign of life, after which the helper ends
+HEARTBEAT = 0x0E
+WITH_TICK = frozenset({0x45, 0x47, 0x48, 0x4A})  # STATUS, NOTICE, TELEMETRY, PULSE begin with the device's tick
 _LINE_GONE = 3  # the helper's exit code then
+_MOST_WAITING = 1 << 20  # bytes for a host that reads nothing; what comes after them is dropped
+
+
+class Heard:
+    """The newest tick of the device that has come back, from the bytes that arrive; `tick` is known at the start."""
+
+    def __init__(self, tick: int):
+        self.tick, self._receiver = tick, Receiver()
+
+    def feed(self, data: bytes) -> None:
+        """Bytes from the line."""
+        for frame in self._receiver.feed(data):
+            if frame.type in WITH_TICK and len(frame.payload) >= 4:
+                self.newer(int.from_bytes(frame.payload[:4], "little"))
+
+    def newer(self, tick: int) -> None:
+        """A tick that came back; ticks count modulo 2^32."""
+        if (tick - self.tick) % 2**32 < 2**31:
+            self.tick = tick
 
 
 class ThreadHeart:
@@ -49,32 +78,59 @@ class ThreadHeart:
 
 
 class HelperHeart:
-    """The helper, which writes `frame` to the open file `line`; `ended` is called when it has ended by itself."""
+    """The helper on the open file `line`, for a start of the device and the last tick heard of it.
 
-    def __init__(self, line: int, frame: bytes, ended: Callable[[], Any]):
-        command = [sys.executable, "-I", "-S", __file__, str(line), frame.hex(), str(GRACE)]
+    As long as it lives nobody else may read the line: `read` has what arrives. `ended` is called when the helper has
+    ended by itself. Raises OSError where it does not start.
+    """
+
+    def __init__(self, line: int, boot_id: int, tick: int, ended: Callable[[], Any]):
+        command = [sys.executable, "-I", "-S", __file__, str(line), str(boot_id), str(tick), str(GRACE)]
         pipe = subprocess.PIPE
         self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, bufsize=0, pass_fds=[line])
-        self._ended = ended
+        self._ended, self._drained = ended, threading.Event()
         assert self.process.stdout is not None
         if not self.process.stdout.readline():  # it says when it has begun
+            self._drained.set()
             self._bury()
             raise OSError(f"{sys.executable} does not start")
         self._signs = ThreadHeart(self._sign)
 
-    def close(self) -> None:
-        """Returns after the last heartbeat."""
+    def read(self, patience: float) -> bytes | None:
+        """What has arrived on the line within `patience` s; None once the helper has ended and all of it is read."""
+        pipe = self.process.stdout
+        assert pipe is not None
+        if self._drained.is_set():
+            return None
+        try:
+            if not select.select([pipe], [], [], patience)[0]:
+                return b""
+            data = os.read(pipe.fileno(), 65536)
+        except (OSError, ValueError):  # closed meanwhile
+            data = b""
+        if not data:
+            self._drained.set()
+        return data or None
+
+    def close(self, reader: threading.Thread) -> None:
+        """Returns after the last heartbeat, and once `reader`, which calls `read`, has read the rest."""
         self._signs.close()
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):
+            self.process.stdin.close()
+        if reader is not threading.current_thread() and reader.is_alive():
+            self._drained.wait(GRACE)
+        self._drained.set()
         self._bury()
 
     def _sign(self) -> None:
         assert self.process.stdin is not None
         try:
             self.process.stdin.write(b".")
-        except OSError:
+        except (OSError, ValueError):
             if self.process.wait() != _LINE_GONE:  # which the reading thread will find, and tell
                 self._ended()
-            raise
+            raise OSError("the helper has ended") from None
 
     def _bury(self) -> None:
         for pipe in (self.process.stdin, self.process.stdout):
@@ -83,34 +139,73 @@ class HelperHeart:
         self.process.wait()
 
 
-def heart_for(port: Any, frame: bytes, beat: Callable[[], Any], ended: Callable[[], Any]) -> HelperHeart | ThreadHeart:
+def heart_for(
+    port: Any, boot_id: int, tick: int, beat: Callable[[], Any], ended: Callable[[], Any]
+) -> HelperHeart | ThreadHeart:
     """A beating heart for a port: the helper, or a thread that calls `beat` where the line cannot be shared.
 
     `ended` is called when the helper has ended by itself. Raises OSError where it cannot be started.
     """
     shared = os.name == "posix" and hasattr(port, "fileno") and sys.executable and not hasattr(sys, "frozen")
-    return HelperHeart(port.fileno(), frame, ended) if shared else ThreadHeart(beat)
+    return HelperHeart(port.fileno(), boot_id, tick, ended) if shared else ThreadHeart(beat)
 
 
-def keep_beating(line: int, frame: bytes, signs: int, grace: float) -> None:
-    """The helper's life: `frame` to `line` every `BEAT`, until the pipe `signs` ends or has been silent for `grace` s.
-
-    Raises OSError when the line is gone.
-    """
-    os.set_blocking(signs, False)
-    parent, heard, due = os.getppid(), time.monotonic(), time.monotonic()
+def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace: float) -> None:
+    """The helper's life: heartbeats to `line` and what it brings to `out`, until the pipe `signs` ends or has been
+    silent for `grace` s. Raises OSError when the line is gone."""
+    for number in (line, signs, out):
+        os.set_blocking(number, False)
+    parent, alive, due, heard, waiting = os.getppid(), time.monotonic(), time.monotonic(), Heard(tick), b""
     while True:
-        select.select([signs], [], [], max(0.0, due - time.monotonic()))
-        with contextlib.suppress(BlockingIOError):
-            while os.read(signs, 4096):
-                heard = time.monotonic()
-            return  # the pipe has ended
+        reading, writing = [signs, line], [out] if waiting else []
+        ready = select.select(reading, writing, [], max(0.0, due - time.monotonic()))[0]
+        if signs in ready:
+            if not _newest(signs):
+                _pass_on(out, waiting, blocking=True)
+                return
+            alive = time.monotonic()
+        if line in ready:
+            data = _arrived(line)
+            heard.feed(data)
+            waiting += data if len(waiting) < _MOST_WAITING else b""
+        waiting = _pass_on(out, waiting)
         now = time.monotonic()
-        if os.getppid() != parent or now - heard > grace:  # another process may hold the pipe open
+        if os.getppid() != parent or now - alive > grace:  # another process may hold the pipe open
             return
         if now >= due:
-            _write(line, frame)
+            _write(line, closed(Frame(HEARTBEAT, 0, struct.pack("<II", boot_id, heard.tick))))
             due = max(due + BEAT, now)
+
+
+def _newest(signs: int) -> bool:
+    """Whether there was a sign of life; False at the end of its pipe."""
+    with contextlib.suppress(BlockingIOError):
+        return bool(os.read(signs, 4096))
+    return True
+
+
+def _arrived(line: int) -> bytes:
+    """What the line has brought. Raises OSError where it has ended."""
+    try:
+        data = os.read(line, 65536)
+    except BlockingIOError:
+        return b""
+    if not data:
+        raise OSError("the line has ended")
+    return data
+
+
+def _pass_on(out: int, waiting: bytes, blocking: bool = False) -> bytes:
+    """What `out` does not take now."""
+    os.set_blocking(out, blocking)
+    try:
+        while waiting:
+            waiting = waiting[os.write(out, waiting) :]
+    except BlockingIOError:
+        pass
+    except OSError:  # the host reads no more
+        return b""
+    return waiting
 
 
 def _write(line: int, frame: bytes) -> None:
@@ -126,10 +221,10 @@ def _write(line: int, frame: bytes) -> None:
 
 def _main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the host, which stops the device and ends this
-    line, frame, grace = int(sys.argv[1]), bytes.fromhex(sys.argv[2]), float(sys.argv[3])
+    line, boot_id, tick, grace = int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), float(sys.argv[4])
     os.write(1, b"\n")
     try:
-        keep_beating(line, frame, 0, grace)
+        keep_beating(line, boot_id, tick, 0, 1, grace)
     except OSError:
         sys.exit(_LINE_GONE)
 

@@ -1,10 +1,11 @@
-"""One conversation over one line: requests with answers, heartbeats, and what comes unasked.
+"""One conversation over one line: requests with answers, heartbeats, and unsolicited messages.
 
 One request is in flight at a time; without an answer the same bytes are sent again, three times in all. A thread reads
 beside the caller's, and a heart beats (`hilbo.device.heartbeat`): while a request waits, while this process computes,
-and for as long as it lives. Whatever ends the conversation ends the heartbeats: the device then hears nothing any more
-and lets go. ESTOP waits for no other request, and STOP and ESTOP are tried on a line that is lost one way only.
-firmware/PROTOCOL.md has the rules and the bytes.
+and for as long as it lives. Whatever ends the conversation ends the heartbeats, and so does a request that stays
+unanswered: the device then lets go. A START or DRIVE without an answer is followed by a STOP. ESTOP waits for no other
+request, and STOP and ESTOP are tried on a line that is lost one way only. firmware/PROTOCOL.md has the rules and the
+bytes.
 """
 
 import contextlib
@@ -18,8 +19,9 @@ from typing import Any
 from hilbo.device import failures, protocol
 from hilbo.device.failures import DeviceError
 from hilbo.device.frames import Receiver, WireError
-from hilbo.device.heartbeat import BEAT, HelperHeart, ThreadHeart, heart_for
-from hilbo.device.messages import Ack, Message, Nack, Notice, Status, Telemetry, code_of, name_of
+from hilbo.device.heartbeat import BEAT, Heard, HelperHeart, ThreadHeart, heart_for
+from hilbo.device.messages import Ack, HelloReply, Message, Nack, Notice, Pulse, Status, Telemetry, code_of, name_of
+from hilbo.device.ports import POLL
 from hilbo.device.reasons import NackReason
 from hilbo.errors import InputError
 
@@ -39,7 +41,8 @@ _ALWAYS = (protocol.Hello, protocol.GetStatus, protocol.Stop, protocol.Estop)  #
 class Link:
     """A conversation over a `ports.Port`, from construction to `close`.
 
-    `boot_id` is the device's, once known.
+    `boot_id` is the device's, once known, `stops` its count of stops as last heard, `heard` its newest tick. `faint` is
+    why heartbeats have ended, empty while they have not.
     `patience` is how long (s) an answer may take. `ticks` runs so many ticks of 1 ms of a device whose time is ours:
     it passes in `pause` alone then, and nothing beats by a clock. Counted: `retries`, `stray` answers that fit no
     request, `strange` frames that are no message of a device, `dropped` frames; `round_trips` has the last answers'
@@ -58,7 +61,8 @@ class Link:
         self.name, self.patience, self.tries = port.name, patience, tries
         self.boot_id: int | None = None
         self.lost: str | None = None
-        self.restarted = self.faint = False
+        self.restarted, self.faint = False, ""
+        self.stops, self.heard = 0, Heard(0)
         self.retries = self.stray = self.strange = self.received = 0
         self.round_trips: deque[float] = deque(maxlen=100_000)
         self.notices: deque[Notice] = deque(maxlen=1000)
@@ -71,6 +75,8 @@ class Link:
         self._asking, self._writing, self._news = threading.Lock(), threading.Lock(), threading.Condition()
         self._closing = threading.Event()
         self._heart: HelperHeart | ThreadHeart | None = None
+        self._handing_over = self._parked = False
+        self._reading: HelperHeart | None = None  # what arrives comes through it, to its end
         self._reader = threading.Thread(target=self._read, daemon=True)
         self.write(b"\0")
         self._reader.start()
@@ -88,7 +94,7 @@ class Link:
             raise DeviceError(failures.urgent(self.lost, name_of(type(message)), self.shout(message)))
         with self._asking:
             if (self.restarted or self.faint) and not self.lost and not isinstance(message, _ALWAYS):
-                raise DeviceError((failures.restarted if self.restarted else failures.fainted)(self.name))
+                raise DeviceError(failures.restarted(self.name) if self.restarted else self.faint)
             self._seq = (self._seq + 1) % 256
             try:
                 frame = protocol.encode(message, self._seq)
@@ -96,14 +102,23 @@ class Link:
                 raise InputError(f"{error}; send numbers that fit.") from error
             kind = type(message)
             answer = self._ask(frame, (self._seq, code_of(kind), _ANSWER.get(kind, Ack)))
-        if answer is None:
-            foreign = bool(self._receiver.dropped) and self.boot_id is None
-            raise DeviceError(
-                failures.silent(self.name, name_of(kind), self.tries, received=self.received > 0, foreign=foreign)
-            )
+            if answer is None:
+                raise DeviceError(self._unanswered(kind))
         if isinstance(answer, Nack):
             raise self._refusal(answer, name_of(kind))
         return answer
+
+    def _unanswered(self, kind: type) -> str:
+        """Why, in a sentence. A device that does not answer is left without heartbeats, and a motion is stopped."""
+        foreign = bool(self._receiver.dropped) and self.boot_id is None
+        why = failures.silent(self.name, name_of(kind), self.tries, received=self.received > 0, foreign=foreign)
+        if kind in (protocol.Start, protocol.Drive):
+            self.shout(protocol.Stop())
+        if self.boot_id is None:
+            return why
+        self.faint = self.faint or failures.deserted(why)
+        self._end_beats()
+        return failures.deserted(why)
 
     def _ask(self, frame, expected) -> Message:
         with self._news:
@@ -154,19 +169,32 @@ class Link:
         self.heartbeat()
         if self.ours:
             return
-        frame = protocol.encode(protocol.Heartbeat(boot_id=boot_id), 0)
+        self._park()
         try:
-            self._heart = heart_for(self._port, frame, self._beat_here, self._fainted)
+            heart = heart_for(self._port, boot_id, self.heard.tick, self._beat_here, self._fainted)
+            self._heart, self._reading = heart, heart if isinstance(heart, HelperHeart) else None
         except OSError as error:
             raise DeviceError(f"The process that sends heartbeats cannot be started: {error}.") from error
+        finally:
+            with self._news:
+                self._handing_over = False
+                self._news.notify_all()
         if self.lost:  # meanwhile
             self._end_beats()
 
     def _end_beats(self) -> None:
         with self._news:
             heart, self._heart = self._heart, None
-        if heart is not None:
+        if isinstance(heart, HelperHeart):
+            heart.close(self._reader)
+        elif heart is not None:
             heart.close()
+
+    def _park(self) -> None:
+        """Returns once the reading thread has let go of the port, which the helper will read."""
+        with self._news:
+            self._handing_over = True
+            self._news.wait_for(lambda: self._parked or self.lost or not self._reader.is_alive())
 
     @contextlib.contextmanager
     def silence(self) -> Iterator[None]:
@@ -181,7 +209,7 @@ class Link:
     def heartbeat(self) -> None:
         """One heartbeat, now, if the device is known."""
         if self.boot_id is not None:
-            self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id), 0))
+            self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id, tick=self.heard.tick), 0))
 
     @property
     def ours(self) -> bool:
@@ -224,12 +252,27 @@ class Link:
             raise OSError(str(error)) from error
 
     def _fainted(self) -> None:
-        self.faint = True
+        self.faint = self.faint or failures.fainted(self.name)
+
+    def _arrived(self) -> bytes:
+        """What has arrived, from the helper while there is one. Raises OSError when the line is gone."""
+        with self._news:
+            self._parked = self._handing_over
+            self._news.notify_all()
+            self._news.wait_for(lambda: not self._handing_over or self._closing.is_set())
+            self._parked, heart = False, self._reading
+        if heart is None:
+            return self._port.read()
+        data = heart.read(POLL)
+        if data is None:
+            with self._news:
+                self._reading = None if self._reading is heart else self._reading
+        return data or b""
 
     def _read(self) -> None:
         while not self._closing.is_set():
             try:
-                data = self._port.read()
+                data = self._arrived()
             except OSError as error:
                 self._lose(error)
                 return
@@ -252,8 +295,9 @@ class Link:
         except WireError:
             self.strange += 1
             return
-        if isinstance(message, Notice | Status) and self.boot_id not in (None, message.boot_id):
-            self.restarted = True
+        self._learn(message)
+        if isinstance(message, Pulse):
+            return
         if isinstance(message, Telemetry):
             if self.on_telemetry is not None:
                 self.on_telemetry(message)
@@ -261,6 +305,19 @@ class Link:
             self.notices.append(message)
         else:
             self._give(frame.seq, message)
+
+    def _learn(self, message: Message) -> None:
+        """What any message tells beside its own purpose: that the device has restarted, its tick, its stops."""
+        if isinstance(message, HelloReply):
+            self.heard.tick = message.tick
+        elif isinstance(message, Notice | Status | Pulse) and self.boot_id not in (None, message.boot_id):
+            self.restarted = True
+        elif isinstance(message, Notice | Status | Pulse | Telemetry):
+            self.heard.newer(message.tick)
+        if isinstance(message, Notice | Status | Pulse | Ack):
+            self.stops = message.stops
+        elif isinstance(message, Nack) and message.reason == NackReason.STALE:
+            self.stops = message.ticks
 
     def _give(self, seq, message) -> None:
         """Hands an answer to the request that waits for it; others are counted and dropped."""

@@ -47,7 +47,7 @@ __all__ = [
 ]
 
 VERSION = 2
-SCHEMA = 0xD2AD5D8A
+SCHEMA = 0xEEF43481
 """CRC-32 of the schema block of PROTOCOL.md: which bytes both sides mean."""
 
 U8 = Annotated[int, "u8"]
@@ -279,7 +279,7 @@ class Status:
     frames_dropped: U16
     stops: U32
     flags: U16
-    reserved: U16 = 0
+    delay_us: U16
 
 
 @_message

@@ -13,7 +13,7 @@ from hilbo.errors import InputError
 
 __all__ = ["BAUD", "POLL", "Port", "PortInfo", "SerialPort", "SocketPort", "list_ports", "open_port"]
 
-BAUD = 1_000_000
+BAUD = 921_600
 """Line rate (baud) where none is given; a pseudo-terminal and a USB device have none of their own."""
 POLL = 0.05  # s
 _STUCK = 10.0  # s, until a line that takes no bytes is given up

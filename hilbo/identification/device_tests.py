@@ -35,7 +35,11 @@ class CutShortError(DeviceError):
 
 
 class SelfTest(NamedTuple):
-    """`echoes` came back whole of `asked`; round trip in ms; `watchdog_ticks` from the last heartbeat to HOLD."""
+    """`echoes` came back whole of `asked`; round trip in ms; `watchdog_ticks` from the last heartbeat to HOLD.
+
+    `delay_us` is the longest time from when a tick was due until its force was out, as the device has measured it, and
+    `delay_limit_us` the delay for which it checks sets.
+    """
 
     asked: int
     echoes: int
@@ -46,6 +50,8 @@ class SelfTest(NamedTuple):
     watchdog_ticks: int
     watchdog_limit: int
     force_after_N: float
+    delay_us: int
+    delay_limit_us: int
 
 
 def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: float = _MOST) -> Any:
@@ -192,6 +198,8 @@ def selftest(device: Renderer, say: Callable[[str], None], echoes: int = 300) ->
         ticks,
         device.device.watchdog_ticks,
         force,
+        device.status().delay_us,
+        round(device.delay * 1e6),
     )
 
 

@@ -2,10 +2,13 @@
 
 import contextlib
 import os
+import socket
+import struct
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import fields
 
 import pytest
 from peer import Peer
@@ -13,7 +16,9 @@ from simulated import ENVIRONMENT
 
 from hilbo.device import heartbeat
 from hilbo.device.heartbeat import HelperHeart, ThreadHeart, keep_beating
+from hilbo.device.messages import MESSAGES, Heartbeat, Notice, Pulse, Telemetry, code_of
 from hilbo.device.ports import SocketPort
+from hilbo.device.protocol import Receiver, encode
 from hilbo.hardware_bridge import DeviceError
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="only POSIX shares an open line with another process")
@@ -77,36 +82,95 @@ def test_a_helper_that_ends_is_said_and_the_device_can_still_be_stopped():
         assert device.in_force() is None
 
 
-def beats(grace):
-    """A heart in this process: its thread, the end of its pipe, and what it has written."""
-    line, heard = os.pipe()
-    signs, ours = os.pipe()
-    thread = threading.Thread(target=keep_beating, args=(heard, FRAME, signs, grace))
-    thread.start()
-    return thread, ours, line
+class Helper:
+    """A heart in this process: its thread, its pipes, and the other end of its line."""
+
+    def __init__(self, grace=1e9, tick=0):
+        self.line, helpers = socket.socketpair()
+        self.line.settimeout(30)
+        signs, self.signs = os.pipe()
+        self.out, out = os.pipe()
+        self.receiver = Receiver()
+
+        def run():
+            try:
+                keep_beating(helpers.fileno(), 7, tick, signs, out, grace)
+            except OSError:
+                self.gone = True
+            for number in (out, signs):
+                os.close(number)
+            helpers.close()
+
+        self.gone = False
+        self.thread = threading.Thread(target=run)
+        self.thread.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        with contextlib.suppress(OSError):
+            os.close(self.signs)
+        self.thread.join()
+        self.line.close()
+        os.close(self.out)
+
+    def beat(self):
+        """Boot id and tick of the next heartbeat."""
+        while not (frames := self.receiver.feed(self.line.recv(100))):
+            pass
+        assert {frame.type for frame in frames} == {heartbeat.HEARTBEAT}
+        return struct.unpack("<II", frames[-1].payload)
 
 
 def test_a_host_that_hangs_has_no_heartbeats():
-    thread, ours, line = beats(0.2)
-    thread.join()  # without a sign of life, though the pipe is open
-    assert os.read(line, 100).startswith(FRAME)
-    os.close(ours)
+    with Helper(grace=0.2) as helper:
+        assert helper.beat() == (7, 0)
+        helper.thread.join()  # without a sign of life, though the pipe is open
 
 
-def test_the_end_of_the_pipe_is_the_end_of_the_heartbeats():
-    thread, ours, line = beats(1e9)
-    assert os.read(line, 100).startswith(FRAME)
-    assert os.read(line, 100).startswith(FRAME)
-    os.close(ours)
-    thread.join()
+def test_the_end_of_the_pipe_is_the_end_of_the_heartbeats_and_what_has_come_is_passed_on():
+    with Helper() as helper:
+        helper.beat()
+        helper.line.sendall(b"the last words")
+        assert os.read(helper.out, 100) == b"the last words"
+        os.close(helper.signs)
+        helper.thread.join()
+        assert os.read(helper.out, 100) == b""
 
 
 def test_another_parent_is_the_end_of_the_heartbeats(monkeypatch):
     """A copy of the pipe in a forked process would keep it open."""
-    thread, ours, _ = beats(1e9)
-    monkeypatch.setattr(os, "getppid", lambda: -1)
-    thread.join()
-    os.close(ours)
+    with Helper() as helper:
+        monkeypatch.setattr(os, "getppid", lambda: -1)
+        helper.thread.join()
+
+
+def test_a_heartbeat_has_the_newest_tick_that_came_back():
+    """Of every message that begins with one; a damaged frame and an older tick count for nothing."""
+    with Helper(tick=5) as helper:
+        known = {"boot_id": 7, "state": 1, "reason": 0, "stops": 0}
+        spoilt = bytearray(encode(Pulse(tick=900, **known), 0))
+        spoilt[5] ^= 1
+        for data, tick in (
+            (encode(Pulse(tick=60, **known), 0), 60),
+            (encode(Notice(tick=70, **known), 0), 70),
+            (encode(Telemetry(tick=80, divisor=1, fields=0, lost=0, samples=()), 0), 80),
+            (bytes(spoilt), 80),
+            (encode(Pulse(tick=75, **known), 0), 80),
+            (encode(Pulse(tick=2**31 + 60, **known), 0), 2**31 + 60),
+            (encode(Pulse(tick=3, **known), 0), 3),  # after 2^32 - 1
+        ):
+            helper.line.sendall(data)
+            assert os.read(helper.out, 1000) == data
+            helper.beat()
+            assert helper.beat() == (7, tick)
+
+
+def test_the_helper_knows_the_types_of_the_protocol():
+    assert code_of(Heartbeat) == heartbeat.HEARTBEAT
+    first = {code for code, kind in MESSAGES.items() if fields(kind) and fields(kind)[0].name == "tick"}
+    assert first == heartbeat.WITH_TICK
 
 
 def test_a_line_that_takes_nothing_is_waited_for():
@@ -123,14 +187,16 @@ def test_a_line_that_takes_nothing_is_waited_for():
 
 
 def test_a_line_that_is_gone_ends_the_helper_and_is_no_fainting():
-    line, heard = os.pipe()
+    ours, theirs = socket.socketpair()
     fainted = []
-    heart = HelperHeart(heard, FRAME, lambda: fainted.append(True))
-    assert os.read(line, 100).startswith(FRAME)
-    os.close(line)
+    heart = HelperHeart(ours.fileno(), 7, 0, lambda: fainted.append(True))
+    assert theirs.recv(100)
+    theirs.close()
+    until(lambda: heart.read(1.0) is None)
     heart._signs._thread.join()
     assert heart.process.returncode == 3 and fainted == []
-    heart.close()
+    heart.close(threading.current_thread())
+    ours.close()
 
 
 def test_without_an_interpreter_there_is_one_sentence(monkeypatch):

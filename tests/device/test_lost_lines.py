@@ -9,23 +9,9 @@ from peer import Peer
 
 from hilbo.device import protocol
 from hilbo.device.heartbeat import BEAT
-from hilbo.device.ports import SocketPort
 from hilbo.hardware_bridge import DeviceError
 
 PATIENT = {"patience": 30.0}
-
-
-class Deaf(SocketPort):
-    """A line that can still be written when `deaf` is set, and no longer read."""
-
-    def __init__(self, connected, name):
-        super().__init__(connected, name)
-        self.deaf = threading.Event()
-
-    def read(self):
-        if self.deaf.is_set():
-            raise OSError(errno.EIO, "input/output error")
-        return super().read()
 
 
 def until(done):
@@ -35,19 +21,13 @@ def until(done):
 
 @pytest.fixture(params=["helper", "thread"])
 def half(request, monkeypatch):
-    """A renderer on a line that has become deaf, and the device at its other end."""
-    peer, ports = Peer(), []
-
-    def made(connected, name):
-        ports.append(Deaf(connected, name))
-        return ports[-1]
-
-    monkeypatch.setattr("peer.SocketPort", made)
+    """A renderer on a line that brings nothing any more and still takes bytes, and the device at its other end."""
     if request.param == "thread":
         monkeypatch.setattr("hilbo.device.heartbeat.sys.executable", "")
+    peer = Peer()
     device = peer.open(**PATIENT)
     until(lambda: peer.heartbeats > 2)
-    ports[0].deaf.set()
+    peer.mute()
     until(lambda: device.link.lost)
     yield peer, device
     device.close()
@@ -114,5 +94,5 @@ def test_estop_waits_for_no_other_request():
 
 
 def test_a_device_whose_watchdog_is_too_short_for_the_heartbeats_is_refused():
-    with pytest.raises(DeviceError, match=r"lets go after 0.1 s without a heartbeat, and they come every 0.05 s"):
+    with pytest.raises(DeviceError, match=r"lets go after 0.1 s without a heartbeat, and one comes every 0.05 s"):
         Peer(watchdog_ticks=100).open()

@@ -145,7 +145,7 @@ def test_a_receiver_holds_one_frame_at_most():
 
 
 def test_a_wrong_crc_is_never_accepted():
-    whole = encode(protocol.Start(set_id=7, crc=0x12345678, boot_id=9), 3)
+    whole = encode(protocol.Start(set_id=7, crc=0x12345678, boot_id=9, stop=1), 3)
     for place in range(len(whole) - 1):
         for bit in range(8):
             broken = bytearray(whole)
@@ -158,10 +158,10 @@ def test_a_wrong_crc_is_never_accepted():
     [
         (Frame(0x33, 0, b""), "type 0x33 is not of this protocol"),
         (Frame(0x0A, 0, b"x"), "STOP has 1 bytes instead of 0"),
-        (Frame(0x43, 0, b"\1\1\0\0\0\0\0\0"), "ACK has a reserved field that is not 0"),
+        (Frame(0x43, 0, b"\1\1" + bytes(10)), "ACK has a reserved field that is not 0"),
         (Frame(0x48, 0, b"\0" * 8 + b"abc"), "TELEMETRY ends in the middle"),
         (Frame(0x03, 0, b"\1\0\0\2" + b"\0" * 8), "SET_STATES ends in the middle"),
-        (Frame(0x45, 0, b"\0" * 60), "STATUS has 60 bytes instead of 56"),
+        (Frame(0x45, 0, b"\0" * 60), "STATUS has 60 bytes instead of 64"),
     ],
 )
 def test_a_payload_that_is_no_message_is_refused(frame, words):
@@ -169,7 +169,7 @@ def test_a_payload_that_is_no_message_is_refused(frame, words):
         decode(frame)
 
 
-@pytest.mark.parametrize("message", [protocol.Clear(boot_id=2**32), protocol.Echo(data=bytes(65))])
+@pytest.mark.parametrize("message", [protocol.Clear(boot_id=2**32, stop=0), protocol.Echo(data=bytes(65))])
 def test_what_does_not_fit_is_refused(message):
     with pytest.raises(WireError):
         encode(message, 0)
@@ -229,7 +229,7 @@ def test_floats_are_rounded_once():
     message = decode(
         Receiver().feed(
             encode(
-                protocol.Drive(mode=1, shape=0, offset=0.1, amplitude=0.0, period_ticks=0, duration_ticks=1, boot_id=1),
+                protocol.Drive(mode=1, shape=0, offset=0.1, amplitude=0.0, period_ticks=0, duration_ticks=1, boot_id=1, stop=0),
                 0,
             )
         )[0]

@@ -105,9 +105,10 @@ def test_silence_of_the_host_is_hold(device):
         device.start()
     device_tests.wait_until(device, lambda: device.status().force_N == 0, "rested")
     device.clear()
+    device_tests.wait_until(device, lambda: not device.status().contact, "been let go")
     device.start()
     assert device.state() == State.RUNNING
-    assert any("HOLD, it heard no heartbeat" in words for words in device.events())
+    assert any("HOLD, no fresh heartbeat" in words for words in device.events())
 
 
 def test_self_test_of_a_good_device():
@@ -120,7 +121,7 @@ def test_self_test_of_a_good_device():
 
 def test_a_drive_that_is_out_of_range_is_refused():
     with Renderer.open("sim", options=FAST | {"finger": "none"}) as device:
-        with pytest.raises(RefusalError, match="The drive asks for 30, beyond the device's limit of 20"):
+        with pytest.raises(RefusalError, match="DRIVE asks for 30, beyond the device's limit of 20"):
             device.drive("position", "hold", 30, duration=1)
         with pytest.raises(RefusalError, match="The drive asks for 200000, beyond the device's limit of 120000"):
             device.drive("force", "hold", 1, duration=200)

@@ -166,8 +166,10 @@ def test_after_estop_the_force_is_zero_before_anything_else():
     assert device.tick(236) == 0
     device.must("CLEAR", boot_id=7)
     device.beat()
+    assert device.confirm("START", staged)[1]["reason"] == "IN_CONTACT"
+    device.run(np.linspace(236, 0, 20))
     assert device.confirm("START", staged)[0] == "ACK"
-    assert device.tick(236) == 0
+    assert device.tick(0) == 0
 
 
 def test_no_start_on_an_encoder_that_gives_no_number():

@@ -73,7 +73,7 @@ def conversation(boot_id: int) -> bytes:
         frame("SET_PARAMS", 1, parameters(SET)),
         frame("HEARTBEAT", 0, pack("HEARTBEAT", boot_id=boot_id)),
         frame("COMMIT", 2, pack("COMMIT", **identity)),
-        frame("START", 3, pack("START", **identity)),
+        frame("START", 3, pack("START", **identity, stop=0)),
         frame("SET_PARAMS", 4, parameters(SET | {"K1": 5.0}, 2)),
     ]
     return b"".join(parts)
@@ -86,8 +86,9 @@ def test_a_conversation_cut_after_every_byte():
     lib = library(build())
     for cut in range(len(whole) + 1):
         device = Device(7, lib, hello=False)
+        device.tick(0)
         device.feed(whole[:cut])
-        forces, _ = device.run(np.full(300, 200), beating=False)
+        forces, _ = device.run(np.minimum(50 * np.arange(1, 301), 200), beating=False)
         assert np.any(forces > 0) == (cut >= ends[4])
         assert not np.any(forces[250 + 20 :])
         device.collect()

@@ -28,7 +28,7 @@ NACK_NO_HELLO, NACK_BOOT_ID = 3, 8
 def test_a_conversation(compiler):
     with Port("--boot-id", "77", "--finger", "hold", compiler=compiler) as port:
         version, rate, schema, _, boot_id, line, damping = struct.unpack_from("<HHIIIIf", port.hello().payload)
-        assert (version, rate, schema, boot_id, line) == (1, 1000, SCHEMA, 77, 921600)
+        assert (version, rate, schema, boot_id, line) == (2, 1000, SCHEMA, 77, 921600)
         assert damping == np.float32(0.95)
         port.run()
         force = port.live(1500)
@@ -124,7 +124,7 @@ def killed(moment: int) -> None:
         status = port.status()
         assert status.state in (State.STOPPED, State.HOLD)
         if status.state == State.HOLD:
-            port.expect_ack(Type.CLEAR, struct.pack("<I", port.boot_id))
+            port.expect_ack(Type.CLEAR, port.clear())
         port.run(7)
         assert port.live(1500) > 0.5
         assert port.status().active_id == 7
@@ -188,15 +188,16 @@ def wait_for(port: Port, type: int, count: int):
 def test_a_restarted_device_knows_nothing_and_obeys_no_old_name(obeyed):
     payload = set_params(3, *FOAM)
     named = struct.pack("<HHII", 3, 0, set_crc(payload), 0x55)
-    steps = [(Type.HELLO, struct.pack("<HHI", 1, 0, SCHEMA)), (Type.SET_PARAMS, payload)]
-    steps += [(Type.COMMIT, named), (Type.START, named)]
+    steps = [(Type.HELLO, struct.pack("<HHI", 2, 0, SCHEMA)), (Type.SET_PARAMS, payload)]
+    steps += [(Type.COMMIT, named), (Type.START, named + bytes(4))]
     with Port("--boot-id", "0x55", "--finger", "hold") as port:
         port.boot_id = 0x55
-        port.live(800)  # the finger presses, so that force would be felt
+        port.live(2)  # the finger comes, and presses when there is force to be felt
         force = 0.0
         for type, body in steps[:obeyed]:
             assert port.request(type, body).type in (Type.ACK, Type.HELLO_REPLY)
-            force = port.live(300)
+            force = port.live(2)
+        force = port.live(1000)
         assert (force > 0.5) == (obeyed == 4) and (force == 0) == (obeyed < 4)
         _, new_id = port.command("restart")
         assert port.status().boot_id == int(new_id) != 0x55
@@ -264,9 +265,10 @@ def test_it_ends_cleanly(tmp_path):
 def drive(port: Port, mode: int, shape: int, offset: float, amplitude: float, period: int, duration: int):
     """Ticks, positions (mm) and sensed forces (N) of a DRIVE, from telemetry of every tick."""
     port.hello()
+    port.tick(1)
     port.expect_ack(Type.STREAM, bytes([1, 1]))
     port.heartbeat()
-    body = struct.pack("<BBHffIII", mode, shape, 0, offset, amplitude, period, duration, port.boot_id)
+    body = struct.pack("<BBHffIIII", mode, shape, 0, offset, amplitude, period, duration, port.boot_id, port.stops)
     port.expect_ack(Type.DRIVE, body)
     for _ in range(duration // 25 + 2):
         port.heartbeat()
@@ -322,9 +324,9 @@ def conversation(memory: str, parameters: list[float]) -> list[bytes]:
         weight, loss = (np.asarray(part).tolist() for part in exponentials(jnp.asarray(parameters[3]), 10))
         payloads = [set_params(1, *parameters, memory=1, length=10), *set_states(1, weight, loss)]
     named = struct.pack("<HHII", 1, 0, set_crc(*payloads), 1)
-    messages = [(Type.HELLO, struct.pack("<HHI", 1, 0, SCHEMA)), (Type.SET_PARAMS, payloads[0])]
+    messages = [(Type.HELLO, struct.pack("<HHI", 2, 0, SCHEMA)), (Type.SET_PARAMS, payloads[0])]
     messages += [(Type.SET_STATES, payload) for payload in payloads[1:]]
-    messages += [(Type.COMMIT, named), (Type.ECHO, b""), (Type.START, named)]
+    messages += [(Type.COMMIT, named), (Type.ECHO, b""), (Type.START, named + bytes(4))]
     return [encode(type, payload, seq) for seq, (type, payload) in enumerate(messages)]
 
 

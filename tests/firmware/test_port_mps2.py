@@ -39,7 +39,7 @@ def many_sets() -> bytes:
         if index == 0:
             recording.send(Type.COMMIT, named)
             recording.ticks([0] * 10)
-            recording.send(Type.START, named)
+            recording.send(Type.START, named + bytes(4))
         recording.ticks(counts[:1800])
         recording.send(Type.COMMIT, named)
         recording.ticks(counts[1800:])
@@ -104,7 +104,7 @@ def test_a_conversation_over_the_uart(cpu, tmp_path):
     with Emulator(cpu, tmp_path / "line") as device:
         device.send(b"\0")
         version, rate, schema, _, boot_id = struct.unpack_from("<HHIII", device.hello().payload)
-        assert (version, rate, schema) == (1, 1000, SCHEMA) and boot_id != 0
+        assert (version, rate, schema) == (2, 1000, SCHEMA) and boot_id != 0
         start = device.status()
         assert (start.boot_id, start.state, start.frames_dropped) == (boot_id, State.STOPPED, 0)
         device.send(b"no frame, and longer than any frame may be: " + 64 * b"?" + b"\0")
@@ -112,9 +112,9 @@ def test_a_conversation_over_the_uart(cpu, tmp_path):
         device.expect_ack(Type.COMMIT, device.named(9, crc))
         device.wait_for_tick(start.tick + 5)
         # In one piece, so that the heartbeat is fresh whatever this machine does in between.
-        named = device.named(9, crc)
         device.seq = 201
-        device.send(encode(Type.HEARTBEAT, struct.pack("<I", boot_id)) + encode(Type.START, named, 201))
+        beat = encode(Type.HEARTBEAT, struct.pack("<II", boot_id, device.heard))
+        device.send(beat + encode(Type.START, device.start(9, crc), 201))
         status = device.wait_for_tick(device.status().tick + 400)
         assert (status.active_id, status.active_crc, status.frames_dropped) == (9, crc, 1)
         assert (status.state, status.hold_reason, status.overruns) == (State.HOLD, 1, 0)  # nobody sent heartbeats

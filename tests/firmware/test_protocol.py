@@ -45,7 +45,7 @@ def test_empty_frames_are_ignored(device):
     assert device.status()["frames_dropped"] == 0
 
 
-@pytest.mark.parametrize("number", [0, 0x11, 0x40, TYPES["ACK"], TYPES["TELEMETRY"], 0xFF])
+@pytest.mark.parametrize("number", [0, 0x12, 0x40, TYPES["ACK"], TYPES["TELEMETRY"], 0xFF])
 def test_unknown_types(device, number):
     assert device.refusal(number, b"") == "UNKNOWN_TYPE"
 
@@ -68,7 +68,7 @@ def test_states_whose_count_does_not_fit(device, count):
 
 @pytest.mark.parametrize("name", ["HELLO", "SET_PARAMS", "COMMIT", "START", "DRIVE"])
 def test_reserved_fields(device, name):
-    values = {"version": 1} if name == "HELLO" else {"set_id": 1} if name != "DRIVE" else {}
+    values = {"version": 2} if name == "HELLO" else {"set_id": 1} if name != "DRIVE" else {}
     assert device.refusal(name, pack(name, reserved=1, **values)) == "RESERVED"
 
 
@@ -80,7 +80,8 @@ def test_reserved_fields(device, name):
         ("GET_SET", {"bank": 2}),
         ("STREAM", {"divisor": 10, "fields": 2}),
         ("DRIVE", {"mode": 2, "boot_id": 7}),
-        ("DRIVE", {"shape": 3, "boot_id": 7}),
+        ("DRIVE", {"shape": 4, "boot_id": 7}),
+        ("DRIVE", {"mode": 1, "shape": 3, "boot_id": 7}),
     ],
 )
 def test_numbers_without_a_name(device, name, values):
@@ -94,7 +95,7 @@ def test_before_hello_only_what_is_safe():
     for name in REQUESTS:
         device = Device(hello=False)
         if name in ("HELLO", "GET_STATUS", "STOP", "ESTOP"):
-            device.must(name, **({"version": 1, "schema": CRC} if name == "HELLO" else {}))
+            device.must(name, **({"version": 2, "schema": CRC} if name == "HELLO" else {}))
         elif name != "HEARTBEAT":
             assert device.refusal(name) == "NO_HELLO"
     assert Device(hello=False).refusal(0x77, b"") == "NO_HELLO"
@@ -104,9 +105,9 @@ CRC = zlib.crc32(DOCUMENT.split("```schema\n")[1].split("```")[0].encode())
 
 
 def test_hello_compares_version_and_schema(device):
-    assert device.refusal("HELLO", version=2, schema=CRC) == "VERSION"
-    assert device.refusal("HELLO", version=1, schema=CRC ^ 1) == "SCHEMA"
-    reply = device.must("HELLO", version=1, schema=CRC)
+    assert device.refusal("HELLO", version=1, schema=CRC) == "VERSION"
+    assert device.refusal("HELLO", version=2, schema=CRC ^ 1) == "SCHEMA"
+    reply = device.must("HELLO", version=2, schema=CRC)
     assert reply["schema"] == CRC and reply["boot_id"] == 7 and reply["damping_N_s_per_m"] == np.float32(0.95)
     assert (reply["most_taps"], reply["watchdog_ticks"], reply["firmware"]) == (255, 250, 0xDEADBEEF)
 
@@ -115,7 +116,7 @@ def test_hello_resets_the_stream_and_nothing_else(device):
     device.go(SET)
     device.must("STREAM", divisor=1, fields=0)
     device.hello()
-    device.run([100] * 20)
+    device.run([50] * 20)
     device.collect()
     assert device.telemetry == [] and device.state == "RUNNING"
 
@@ -123,7 +124,7 @@ def test_hello_resets_the_stream_and_nothing_else(device):
 # Sets
 
 
-@pytest.mark.parametrize("name", ["COMMIT", "START", "DRIVE", "CLEAR"])
+@pytest.mark.parametrize("name", ["COMMIT", "START", "DRIVE", "CLEAR", "HOME"])
 def test_another_boot_id(device, name):
     staged = device.stage(SET)
     device.confirm("COMMIT", staged)
@@ -147,15 +148,17 @@ def test_start(device):
 
 def test_states_in_which_requests_are_refused(device):
     staged = device.go(SET)
-    drive = pack("DRIVE", offset=1.0, duration_ticks=100, boot_id=7)
-    _, message = device.ask("DRIVE", drive)
+    drive = {"offset": 1.0, "duration_ticks": 100, "boot_id": 7}
+    _, message = device.ask("DRIVE", **drive)
     assert (message["reason"], message["value"]) == ("STATE", 1)
-    assert device.refusal("CLEAR", boot_id=7) == "STATE"
+    assert device.refusal("HOME", boot_id=7) == "STATE"
+    device.must("CLEAR", boot_id=7)  # of a stop that has ended: nothing
+    assert device.state == "RUNNING"
     device.must("STOP")
     assert device.confirm("START", staged)[1]["reason"] == "STATE"
     device.must("ESTOP")
     assert device.confirm("START", staged)[1]["reason"] == "STATE"
-    assert device.refusal("DRIVE", drive) == "STATE"
+    assert device.refusal("DRIVE", **drive) == "STATE"
     device.must("STOP")
     assert device.state == "ESTOP"
     device.must("CLEAR", boot_id=7)
@@ -165,7 +168,8 @@ def test_states_in_which_requests_are_refused(device):
 def test_heartbeats_that_do_not_count(device):
     staged = device.stage(SET)
     device.confirm("COMMIT", staged)
-    for payload in (pack("HEARTBEAT", boot_id=8), b"", pack("HEARTBEAT", boot_id=7) + b"\0"):
+    now = device.status()["tick"]
+    for payload in (pack("HEARTBEAT", boot_id=8, tick=now), b"", pack("HEARTBEAT", boot_id=7, tick=now) + b"\0"):
         assert device.exchange(frame("HEARTBEAT", 1, payload)) is None
         assert device.confirm("START", staged)[1]["reason"] == "NO_HEARTBEAT"
 
@@ -197,14 +201,87 @@ def test_a_repeated_refusal_is_the_same_and_a_new_seq_is_looked_at(device):
     assert device.confirm("COMMIT", staged)[0] == "ACK"
 
 
-def test_a_clear_that_comes_late_again_clears_no_other_stop(device):
-    clear = frame("CLEAR", 50, pack("CLEAR", boot_id=7))
+# Orders in time
+
+
+def test_a_clear_ends_the_stop_that_it_names_and_no_later_one(device):
+    """However often it comes, and whatever was asked in between: what was measured began with the ESTOP's own CLEAR,
+    whose answer was lost, and which the link sent again after the next ESTOP."""
     device.must("ESTOP")
-    assert device.exchange(clear)[0] == "ACK"
-    device.feed(frame("ESTOP", 51))
-    device.collect()
-    device.exchange(clear)  # not the last request any more: carried out, the host's own fault
+    clear = frame("CLEAR", 50, device.packed("CLEAR", boot_id=7))
+    assert device.exchange(clear)[0] == "ACK" and device.state == "STOPPED"
+    device.status()
+    assert device.exchange(clear)[0] == "ACK" and device.state == "STOPPED"
+    device.must("ESTOP")
+    for data in (clear, frame("CLEAR", 51, pack("CLEAR", boot_id=7, stop=device.stops - 1))):
+        device.exchange(data)
+        assert device.state == "ESTOP"
+    _, message = device.ask("CLEAR", boot_id=7, stop=device.stops - 1)
+    assert (message["reason"], message["ticks"]) == ("STALE", device.stops)
+
+
+@pytest.mark.parametrize("stop", ["STOP", "ESTOP"])
+def test_an_order_that_was_made_before_a_stop_does_nothing_after_it(device, stop):
+    staged = device.stage(SET)
+    device.confirm("COMMIT", staged)
+    device.beat()
+    named = {"set_id": staged[0], "crc": staged[1]}
+    orders = [("START", named), ("DRIVE", {"offset": 1.0, "duration_ticks": 9}), ("HOME", {}), ("CLEAR", {})]
+    late = [(name, device.packed(name, boot_id=7, **values)) for name, values in orders]
+    device.must(stop)  # of a device that rests already
+    before = device.state
+    for name, payload in late:
+        assert device.refusal(name, payload) == "STALE"
+        assert device.state == before
+
+
+def test_start_and_drive_act_once_whatever_comes_between(device):
+    staged = device.stage(SET)
+    device.confirm("COMMIT", staged)
+    device.beat()
+    start = device.packed("START", set_id=staged[0], crc=staged[1], boot_id=7)
+    assert [device.ask("START", start)[0] for _ in range(2)] == ["ACK", "ACK"]
+    device.must("STOP")
+    device.run([0] * 30)
+    assert device.refusal("START", start) == "STALE" and device.state == "STOPPED"
+    drive = device.packed("DRIVE", offset=1.0, duration_ticks=9, boot_id=7)
+    for seq in (0, 1):
+        assert device.ask("DRIVE", drive)[0] == "ACK", seq
+        device.status()
+    device.run([0] * 40)
     assert device.state == "STOPPED"
+    assert device.refusal("DRIVE", drive) == "STALE" and device.state == "STOPPED"
+
+
+def test_a_hold_ends_orders_too(device):
+    staged = device.go(SET)
+    start = device.packed("START", set_id=staged[0], crc=staged[1], boot_id=7)
+    device.run([0] * 300, beating=False)
+    assert device.state == "HOLD"
+    device.must("CLEAR", boot_id=7)
+    device.beat()
+    assert device.refusal("START", start) == "STALE" and device.state == "STOPPED"
+
+
+def test_what_is_read_in_between_forgets_no_answer(device):
+    data = frame("SET_PARAMS", 77, parameters(OTHER, 2))
+    first = device.exchange(data)
+    device.run([100] * 100)
+    device.status()
+    left = device.status()["ticks_until_ready"]
+    assert device.exchange(data) == first
+    assert device.status()["ticks_until_ready"] == left  # not carried out again
+
+
+def test_hello_ends_the_memory_of_answers(device):
+    """Another host may begin with the same seq and bytes as the last one ended with."""
+    data = frame("STREAM", 9, pack("STREAM", divisor=1, fields=0))
+    device.exchange(data)
+    device.hello()
+    device.exchange(data)
+    device.run([0] * 20)
+    device.collect()
+    assert device.telemetry
 
 
 def test_stop_and_estop_are_obeyed_each_time_with_any_seq(device):

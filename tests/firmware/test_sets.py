@@ -46,7 +46,7 @@ def device():
 )
 def test_a_refused_set_leaves_nothing_staged_and_what_is_in_force(device, change, reason, value, limit):
     device.go(SET)
-    device.run([100] * 10)
+    device.run([50] + [100] * 10)
     before, _ = device.run([100] * 5)
     device.stage(OTHER, 2)
     kind, message = device.ask("SET_PARAMS", parameters(SET | change, 3))
@@ -147,7 +147,7 @@ def test_commit_of_an_incomplete_set(device):
 
 def test_commit_in_contact_waits_for_the_history(device):
     device.go(SET)
-    device.run([200] * 50)
+    device.run([50, 100, 150] + [200] * 50)
     staged = device.stage(OTHER, 2)
     waited = []
     for _ in range(400):
@@ -167,5 +167,5 @@ def test_commit_in_contact_waits_for_the_history(device):
 
 def test_abort_forgets(device):
     staged = device.stage(SET)
-    assert device.ask("ABORT") == ("ACK", {"request": 5, "reserved": 0, "set_id": 0, "crc": 0, "repeated": []})
+    assert device.ask("ABORT") == ("ACK", {"request": 5, "reserved": 0, "set_id": 0, "crc": 0, "stops": 0, "repeated": []})
     assert device.confirm("COMMIT", staged)[1]["reason"] == "NOTHING_STAGED"

@@ -40,7 +40,7 @@ def test_telemetry(device):
     sensed = [float(i) for i in range(20)]
     forces = [device.tick(10 * i, sensed=sensed[i]) for i in range(20)]
     device.collect()
-    assert [message["tick"] for message in device.telemetry] == [1, 9]
+    assert [message["tick"] for message in device.telemetry] == [2, 10]
     rows = [row for message in device.telemetry for row in message["repeated"]]
     assert [row[0] for row in rows] == [20 * i for i in range(8)]
     assert [row[2] for row in rows] == forces[:16:2] and [row[3] for row in rows] == sensed[:16:2]
@@ -143,12 +143,19 @@ def test_a_notice_tells_of_the_start_and_of_every_change_of_state(device):
         ({"hold_ticks": 1001}, "hold_ticks"),
         ({"most_taps": 256}, "HB_MAX_TAPS"),
         ({"most_states": 13}, "HB_MAX_STATES"),
-        ({"capabilities": 16}, "capabilities"),
+        ({"capabilities": 32}, "capabilities"),
         ({"line_rate_baud": 1199}, "line_rate_baud"),
         ({"damping": 0.0}, "damping"),
         ({"damping": float("nan")}, "damping"),
-        ({"force_limit": 1001.0}, "force limit"),
+        ({"force_limit": 101.0}, "force limit"),
         ({"slew": float("inf")}, "slew"),
+        ({"slew": 39.0}, "slew"),
+        ({"velocity": 12.0}, "velocity"),
+        ({"damping": 1001.0}, "damping"),
+        ({"low": 0.0}, "stroke"),
+        ({"delay_us": 1001}, "delay_us"),
+        ({"continuous_force": 40.5}, "continuous_force_N"),
+        ({"heating": 0.0}, "heating_s"),
         ({"low": 1.0}, "stroke"),
         ({"high": 417.0}, "stroke"),
         ({"step": 0.2}, "stroke"),
@@ -168,5 +175,15 @@ def test_a_config_that_is_refused(change, word):
 
 def test_every_error_has_a_sentence_of_its_own():
     lib = library(build())
-    sentences = [lib.shim_sentence(error) for error in range(10)]
-    assert len(set(sentences)) == 10 and lib.shim_sentence(99) == lib.shim_sentence(10)
+    sentences = [lib.shim_sentence(error) for error in range(13)]
+    assert len(set(sentences)) == 13 and lib.shim_sentence(99) == lib.shim_sentence(13)
+
+
+def test_a_real_device_has_a_delay_and_every_start_has_an_id():
+    lib = library(build())
+    real = Device(hello=False)
+    real.config["capabilities"] = 3
+    real.boot(7)
+    assert b"delay_us" in lib.shim_sentence(real.error)
+    device = Device(hello=False, boot_id=0)
+    assert b"boot id" in lib.shim_sentence(device.error)

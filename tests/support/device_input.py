@@ -50,13 +50,13 @@ class Recording:
         while counts.size:
             room = TICKS_PER_HEARTBEAT - self.ticks_done % TICKS_PER_HEARTBEAT
             if room == TICKS_PER_HEARTBEAT:
-                self.send(Type.HEARTBEAT, struct.pack("<I", 1))
+                self.send(Type.HEARTBEAT, struct.pack("<II", 1, self.ticks_done))
             now, counts = counts[:room], counts[room:]
             self.bytes += struct.pack("<BH", 2, now.size) + now.tobytes()
             self.ticks_done += now.size
 
     def hello(self) -> None:
-        self.send(Type.HELLO, struct.pack("<HHI", 1, 0, SCHEMA))
+        self.send(Type.HELLO, struct.pack("<HHI", 2, 0, SCHEMA))
 
     def set(self, set_id: int, *parameters: float, states=None, N: int = 101) -> bytes:
         """Stages a set; the payload that COMMIT and START want. `states`: weights and losses of full memory."""

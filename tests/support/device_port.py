@@ -95,6 +95,9 @@ class Status(NamedTuple):
     estops: int
     overruns: int
     frames_dropped: int
+    stops: int
+    flags: int
+    delay_us: int
 
 
 class Talk:
@@ -106,7 +109,7 @@ class Talk:
         self.rest = b""
         self.joined_late = False
         self.unasked: list[Answer] = []
-        self.boot_id = 0
+        self.boot_id = self.stops = self.heard = 0
 
     def send(self, data: bytes) -> None:
         while data:
@@ -119,7 +122,7 @@ class Talk:
         while time.monotonic() < end:
             self.send(encode(type, payload, self.seq))  # again, too, where a full line has swallowed the answer
             while answers := self.listen():
-                mine = [a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY)]
+                mine = [a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY, Type.PULSE)]
                 self.unasked += [a for a in answers if a not in mine]
                 if mine:
                     return mine[0]
@@ -146,7 +149,7 @@ class Talk:
         return struct.unpack_from("<I", answer.payload, 4)[0]
 
     def hello(self) -> Answer:
-        answer = self.request(Type.HELLO, struct.pack("<HHI", 1, 0, SCHEMA))
+        answer = self.request(Type.HELLO, struct.pack("<HHI", 2, 0, SCHEMA))
         assert answer.type == Type.HELLO_REPLY, answer
         (self.boot_id,) = struct.unpack_from("<I", answer.payload, 12)
         return answer
@@ -154,16 +157,27 @@ class Talk:
     def status(self) -> Status:
         answer = self.request(Type.GET_STATUS)
         assert answer.type == Type.STATUS
-        return Status(*struct.unpack("<IIBBBBHHIIIfff8H", answer.payload))
+        status = Status(*struct.unpack("<IIBBBBHHIIIfff8HIHH", answer.payload))
+        self.heard, self.stops = status.tick, status.stops
+        return status
 
     def heartbeat(self) -> None:
-        """A heartbeat that has arrived."""
-        self.send(encode(Type.HEARTBEAT, struct.pack("<I", self.boot_id)))
+        """A heartbeat with a fresh tick that has arrived."""
+        self.status()
+        self.send(encode(Type.HEARTBEAT, struct.pack("<II", self.boot_id, self.heard)))
         self.request(Type.ECHO)
 
     def named(self, set_id: int, crc: int) -> bytes:
-        """Payload of COMMIT and START."""
+        """Payload of COMMIT."""
         return struct.pack("<HHII", set_id, 0, crc, self.boot_id)
+
+    def start(self, set_id: int, crc: int) -> bytes:
+        """Payload of START, after the stops that STATUS told last."""
+        return self.named(set_id, crc) + struct.pack("<I", self.stops)
+
+    def clear(self) -> bytes:
+        """Payload of CLEAR, of the stop that STATUS told last."""
+        return struct.pack("<II", self.boot_id, self.stops)
 
 
 class Port(Talk):
@@ -171,6 +185,7 @@ class Port(Talk):
 
     def __init__(self, *options: str, rate: str = "lockstep", compiler: str | None = None):
         command = [program("hilbo-device", compiler), "--rate", rate, "--control", *options]
+        self.finger = dict(zip(options, options[1:], strict=False)).get("--finger", "all")
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         assert self.process.stdout
         self.slave = self.process.stdout.readline().decode().strip()
@@ -216,14 +231,22 @@ class Port(Talk):
             force = self.tick(min(TICKS_PER_HEARTBEAT, count - done))
         return force
 
+    def let_go(self) -> None:
+        """The finger leaves the surface, and then begins again."""
+        if self.status().contact:
+            self.command("finger ramp")
+            while self.status().contact:
+                self.live(50)
+            self.command(f"finger {self.finger}")
+
     def run(self, set_id: int = 1, parameters: tuple[float, ...] = FOAM) -> int:
         """HELLO, one set in force, and START; the set's CRC."""
         self.hello()
         payload = set_params(set_id, *parameters)
         crc = self.expect_ack(Type.SET_PARAMS, payload)
         assert crc == set_crc(payload)
-        self.live(300)
+        self.let_go()
         self.expect_ack(Type.COMMIT, self.named(set_id, crc))
         self.live(2)
-        self.expect_ack(Type.START, self.named(set_id, crc))
+        self.expect_ack(Type.START, self.start(set_id, crc))
         return crc

@@ -57,7 +57,7 @@ NAMES = {number: name for name, number in TYPES.items()}
 _TABLE = DOCUMENT.split("| NACK reason |")[1]
 REASONS = {int(number): name for number, name in re.findall(r"^\| (\d+) \| ([A-Z_0-9]+) \|", _TABLE, re.M)}
 STATES = ("STOPPED", "RUNNING", "STOPPING", "DRIVING", "HOLD", "ESTOP")
-CAUSES = ("NONE", "WATCHDOG", "INPUT", "VELOCITY", "OVERRUN", "MODEL", "ENERGY", "ESTOP", "BOOT")
+CAUSES = ("NONE", "WATCHDOG", "INPUT", "VELOCITY", "OVERRUN", "MODEL", "ENERGY", "ESTOP", "BOOT", "SWITCH", "HEAT")
 FLAGS = ("contact", "held", "saturated", "slewed", "controlled", "switching", "hold", "estop", "running", "driving")
 
 
@@ -138,11 +138,11 @@ def build(
 
 CONFIG = {
     "firmware": 0xDEADBEEF, "line_rate_baud": 1_000_000, "tick_rate_Hz": 1000, "watchdog_ticks": 250, "hold_ticks": 20,
-    "most_taps": 255, "most_states": 12, "capabilities": 3, "damping": 0.95, "force_limit": 40.0, "low": -20.0,
+    "most_taps": 255, "most_states": 12, "capabilities": 27, "damping": 0.95, "force_limit": 40.0, "low": -20.0,
     "high": 60.0, "step": 0.0127, "slew": 2000.0, "velocity": 1000.0, "plausible": 2.0,
     "K0_low": -20.0, "K0_high": 40.0, "K1_low": 0.5, "K1_high": 40.0, "B1_low": 5e-4, "B1_high": 40.0,
     "alpha_low": 0.005, "alpha_high": 0.995, "servo_stiffness": 1.0, "servo_damping": 0.02, "servo_integral": 5.0,
-    "servo_speed": 100.0,
+    "servo_speed": 100.0, "delay_us": 0, "continuous_force": 40.0, "heating": 10.0,
 }  # fmt: skip
 """Numbers of a device that these tests are about, in the order of shim_init."""
 
@@ -152,7 +152,8 @@ def library(path: Path) -> ctypes.CDLL:
     for name, result in {
         "size": ctypes.c_size_t, "device_size": ctypes.c_size_t, "transmit": ctypes.c_size_t,
         "receive_once": ctypes.c_size_t, "tick": ctypes.c_float, "flags": ctypes.c_uint32, "offset_N": ctypes.c_double,
-        "warm_left": ctypes.c_uint32, "power": ctypes.c_float, "power_error": ctypes.c_double,
+        "warm_left": ctypes.c_uint32, "stops": ctypes.c_uint32, "now": ctypes.c_uint32,
+        "tick_of_board": ctypes.c_float, "delayed_damping": ctypes.c_double, "power": ctypes.c_float, "power_error": ctypes.c_double,
         "sentence": ctypes.c_char_p,
     }.items():  # fmt: skip
         getattr(lib, f"shim_{name}").restype = result
@@ -164,10 +165,15 @@ class Device:
 
     def __init__(self, boot_id: int = 7, lib: ctypes.CDLL | None = None, hello: bool = True, **changed):
         assert set(changed) <= set(CONFIG)
+        if "force_limit" in changed:
+            changed = {"continuous_force": changed["force_limit"]} | changed
+        if "capabilities" in changed and changed["capabilities"] < 32:
+            changed["capabilities"] |= 24  # simulated, homed at boot
         self.lib = library(build()) if lib is None else lib
         self.memory = ctypes.create_string_buffer(self.lib.shim_size())
         self.config = CONFIG | changed
-        self.notices, self.telemetry, self.seq = [], [], 0
+        self.notices, self.telemetry, self.pulses, self.seq = [], [], [], 0
+        self.hello_said = hello
         self.boot(boot_id)
         if hello:
             self.hello()
@@ -193,8 +199,8 @@ class Device:
             number, seq, payload = decode(encoded)
             name = NAMES[number]
             message = unpack(name, payload) if name != "ECHO_REPLY" else {"payload": payload}
-            if name in ("NOTICE", "TELEMETRY"):
-                (self.notices if name == "NOTICE" else self.telemetry).append(message)
+            if name in ("NOTICE", "TELEMETRY", "PULSE"):
+                {"NOTICE": self.notices, "TELEMETRY": self.telemetry, "PULSE": self.pulses}[name].append(message)
             else:
                 answers.append((name, seq, message))
         return answers
@@ -213,10 +219,23 @@ class Device:
 
     def ask(self, name: str | int, payload: bytes | None = None, repeated=(), **values) -> tuple[str, dict]:
         self.seq = (self.seq + 1) % 256
-        payload = pack(name, repeated, **values) if payload is None else payload
+        if name in ("START", "DRIVE", "HOME") and self.hello_said and self.lib.shim_now(self.memory) == 0:
+            self.tick()  # nothing moves before a position is known
+        payload = self.packed(name, repeated, **values) if payload is None else payload
         answer = self.exchange(frame(name, self.seq, payload))
         assert answer is not None, f"no answer to {name}"
         return answer
+
+    def packed(self, name: str, repeated=(), **values) -> bytes:
+        """Payload of a request by a host that has heard of every stop and every tick."""
+        known = {"stop": self.stops, "tick": self.lib.shim_now(self.memory)}
+        fields = {field for field, _ in FIELDS[name][0]} if isinstance(name, str) else set()
+        return pack(name, repeated, **({key: known[key] for key in known if key in fields} | values))
+
+    @property
+    def stops(self) -> int:
+        """How many stops the device has counted."""
+        return self.lib.shim_stops(self.memory)
 
     def must(self, name: str, **values) -> dict:
         """The answer, which is no NACK."""
@@ -231,7 +250,7 @@ class Device:
         return message["reason"]
 
     def hello(self) -> dict:
-        return self.must("HELLO", version=1, schema=zlib.crc32(schema().encode()))
+        return self.must("HELLO", version=2, schema=zlib.crc32(schema().encode()))
 
     def status(self) -> dict:
         return self.must("GET_STATUS")
@@ -241,7 +260,7 @@ class Device:
         return STATES[self.status()["state"]]
 
     def beat(self) -> None:
-        self.feed(frame("HEARTBEAT", 0, pack("HEARTBEAT", boot_id=self.boot_id)))
+        self.feed(frame("HEARTBEAT", 0, self.packed("HEARTBEAT", boot_id=self.boot_id)))
 
     def stage(self, model: dict, set_id: int = 1) -> tuple[int, int]:
         """SET_PARAMS and its SET_STATES; the id and the checksum that name the set."""

@@ -34,14 +34,15 @@ def main() -> None:
     for set_id, share in ((1, 1.0), (2, 0.9)):
         payload = set_params(set_id, *FOAM[:2], share * FOAM[2], FOAM[3])
         talk.expect_ack(Type.SET_PARAMS, payload)
-        for _ in range(5):
+        for _ in range(5 if set_id == 2 else 0):
             talk.heartbeat()
             ask("ticks 50")
         named = talk.named(set_id, set_crc(payload))
         talk.expect_ack(Type.COMMIT, named)
         ask("ticks 1")
         if set_id == 1:
-            talk.expect_ack(Type.START, named)
+            talk.heartbeat()
+            talk.expect_ack(Type.START, talk.start(set_id, set_crc(payload)))
         for _ in range(10):
             talk.heartbeat()
             ask("ticks 50")

@@ -32,7 +32,8 @@ class Peer:
         self.refuse, self.restart_at, self.lie = {}, None, {}
         self.kept = b""
         self.done: Counter = Counter()
-        self.heartbeats = 0
+        self.heartbeats = self.ticks = self.stops = 0
+        self.pulses = True
         self.boot_id, self.greeted = 100, False
         self.state, self.active, self.staged = State.STOPPED, None, None
         self.last, self.last_answer = None, b""
@@ -73,6 +74,11 @@ class Peer:
         with contextlib.suppress(OSError):
             self.socket.shutdown(socket.SHUT_RDWR)
 
+    def mute(self):
+        """Hears what comes and can answer nothing any more."""
+        self.pulses, self.swallow = False, 10**9
+        self.socket.shutdown(socket.SHUT_WR)
+
     def _serve(self, line):
         receiver = protocol.Receiver()
         with line, contextlib.suppress(OSError):
@@ -85,6 +91,9 @@ class Peer:
         message = protocol.decode(frame)
         if isinstance(message, protocol.Heartbeat):
             self.heartbeats += 1
+            self.ticks += 50
+            if self.pulses:
+                line.sendall(protocol.encode(self._pulse(), frame.seq))
             self.beats -= self.beats > 0
             if self.kept and not self.late and not self.beats:
                 answer, self.kept = self.kept, b""
@@ -124,10 +133,15 @@ class Peer:
     def _nack(self, kind, reason, ticks=0, value=0.0, limit=0.0):
         return protocol.Nack(request=code_of(kind), reason=int(reason), ticks=ticks, value=value, limit=limit)
 
+    def _pulse(self):
+        known = {"tick": self.ticks, "boot_id": self.boot_id, "state": int(self.state), "reason": 0}
+        return protocol.Pulse(**known, stops=self.stops)
+
     def _ack(self, message, crc=0, set_id=0):
+        self.stops += isinstance(message, protocol.Stop | protocol.Estop)
         changes = {protocol.Start: State.RUNNING, protocol.Stop: State.STOPPED, protocol.Estop: State.ESTOP}
         self.state = changes.get(type(message), self.state)
-        return protocol.Ack(request=code_of(type(message)), set_id=set_id, crc=crc)
+        return protocol.Ack(request=code_of(type(message)), set_id=set_id, crc=crc, stops=self.stops)
 
     def _hello(self, message):
         self.greeted = True
@@ -164,12 +178,12 @@ class Peer:
         ends = {
             f"{name}_{end}": float(end == "high") for name in ("K0", "K1", "B1", "alpha") for end in ("low", "high")
         }
-        return protocol.Limits(**ends)
+        return protocol.Limits(**ends, delay_us=0, continuous_force_N=20.0, heating_s=10.0)
 
     def _get_status(self, message):
         counts = {name: 0 for name, word in protocol._wire(protocol.Status).items() if word != "f32"}
         floats = {name: 0.0 for name, word in protocol._wire(protocol.Status).items() if word == "f32"}
-        known = {"boot_id": self.boot_id, "state": int(self.state)}
+        known = {"boot_id": self.boot_id, "state": int(self.state), "stops": self.stops, "tick": self.ticks}
         if self.active:
             known |= {"active_id": self.active[0].set_id, "active_crc": self.active[1]}
         return protocol.Status(**(counts | floats | known))

@@ -50,7 +50,9 @@ static void listen(struct press *press)
 
 static void send_heartbeat(struct press *press)
 {
-    static const uint8_t payload[4] = {BOOT_ID, 0, 0, 0};
+    const uint32_t tick = press->rig.device.tick; /* of a host that hears at once */
+    const uint8_t payload[8] = {BOOT_ID,        0, 0, 0, (uint8_t)(tick & 255U), (uint8_t)(tick >> 8 & 255U),
+                                (uint8_t)(tick >> 16 & 255U), (uint8_t)(tick >> 24)};
     uint8_t frame[HB_MAX_FRAME];
     give(press, frame, hb_frame_write(HB_HEARTBEAT, 0, payload, sizeof payload, frame));
 }
