@@ -112,12 +112,17 @@ async def _stopped_after_a_clear(rig):
     assert (await asyncio.wrap_future(rig.do(lambda device: device.state()))) == State.STOPPED
 
 
-def test_saturation_on_the_simulated_device_is_recorded_with_the_trial(tmp_path):
+def test_a_flag_of_the_simulated_device_is_recorded_with_its_trial(tmp_path):
     with contextlib.closing(Simulator(finger="none")) as simulator, Live(tmp_path, device=simulator.port) as live:
         live.begin()
         live.answer()
-        counts = live.events("answer")[0].data["telemetry"]
-        assert counts["samples"] > 0 and "saturated" not in counts
+        live.until(lambda view: view["phase"] == "answer" and view["trial"]["id"].startswith("tag:2."))
+        simulator.tell("bad 1")  # one position, which the device replaces by the last one
+        live.until(lambda _: "input_held" in (live.hub.rig.telemetry(2, 1) or {}))
+        live.answer()
+        first, second = (event.data["telemetry"] for event in live.events("answer"))
+        assert first["samples"] > 0 and "input_held" not in first
+        assert second["samples"] > second["input_held"] == 1
 
 
 def test_jobs_that_follow_each_other_put_off_no_look():

@@ -76,11 +76,11 @@ def test_no_order_ends_a_stop_that_came_after_it_was_requested(doings):
             super().estop()
             self.last_stop = clock[0]
 
-        def clear(self, stop=None):
-            self._effect("clear", lambda: FakeDevice.clear(self, stop))
+        def clear(self, *, stop=None):
+            self._effect("clear", lambda: FakeDevice.clear(self, stop=stop))
 
-        def start(self, stop=None):
-            self._effect("start", lambda: FakeDevice.start(self, stop))
+        def start(self, *, stop=None):
+            self._effect("start", lambda: FakeDevice.start(self, stop=stop))
 
         def _effect(self, name, order):
             before = self.now
@@ -169,10 +169,10 @@ def test_a_start_that_is_refused_in_contact_is_tried_again():
     class Pressed(FakeDevice):
         refused = 0
 
-        def start(self, stop=None):
+        def start(self, *, stop=None):
             self.pressed, self.refused = self.refused < 3, self.refused + 1
             try:
-                super().start(stop)
+                super().start(stop=stop)
             finally:
                 self.pressed = False
 

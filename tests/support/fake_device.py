@@ -48,7 +48,7 @@ class FakeDevice(Renderer):
         self.told.append("send")
         return SimpleNamespace(_asdict=lambda: numbers)
 
-    def start(self, stop=None):
+    def start(self, *, stop=None):
         self.starts, self._samples = self.starts + 1, []
         self._check_time(stop)
         if self.now == State.RUNNING:
@@ -75,7 +75,7 @@ class FakeDevice(Renderer):
         self.link.stops += 1
         self.now, self.why = state, why
 
-    def clear(self, stop=None):
+    def clear(self, *, stop=None):
         self._check_time(stop)
         if self.flags & DeviceFlag.STOP_OPEN:
             self._refuse(NackReason.STOP_OPEN)
