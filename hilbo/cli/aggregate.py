@@ -125,8 +125,7 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
     start()
     from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
-    from hilbo.study.flag_counts import flag_counts
-    from hilbo.study.trial_flags import flag_sentences
+    from hilbo.study.flag_counts import flag_sentences_of
     from hilbo.study.trial_table import read_trials
 
     whole = Study.load(study)
@@ -138,8 +137,7 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
         table = read_log_trials(trials, whole, material, others=False, note=remark)
     else:
         table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
-    counts = flag_counts(table)
-    sentences = flag_sentences(counts, chosen.exclude_flags) if counts.flagged or chosen.exclude_flags else []
+    sentences = flag_sentences_of(table, chosen.exclude_flags)
     for sentence in sentences:
         remark(sentence)
     return chosen, cohort_of(table, chosen), sentences

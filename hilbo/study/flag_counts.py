@@ -5,9 +5,9 @@ from collections.abc import Collection
 
 import pandas as pd
 
-from hilbo.study.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FLAGS, FlagCounts
+from hilbo.study.trial_flags import COLUMN, COLUMN_OF_SAMPLES, FLAGS, FlagCounts, flag_sentences
 
-__all__ = ["counted_flags", "flag_counts", "flagged", "with_flag_counts"]
+__all__ = ["counted_flags", "flag_counts", "flag_sentences_of", "flagged", "with_flag_counts"]
 
 _COUNTS = "hilbo flags"
 """Of the attributes that pandas carries along with a table, the one that holds its `FlagCounts`."""
@@ -26,7 +26,7 @@ def counted_flags(table: pd.DataFrame, exclude: Collection[str]) -> FlagCounts:
     carried = _carried(table)
     recorded = carried.map(bool)
     if COLUMN_OF_SAMPLES in table:
-        recorded |= ~table[COLUMN_OF_SAMPLES].astype(str).str.strip().str.lower().isin(_EMPTY)
+        recorded |= table[COLUMN_OF_SAMPLES].map(lambda cell: str(cell).strip().lower() not in _EMPTY)
     rows_of = Counter(name for names in carried for name in names)
     left_out = int(flagged(table, exclude).sum())
     return FlagCounts(int(recorded.sum()), {name: rows_of[name] for name in FLAGS if rows_of[name]}, left_out)
@@ -46,8 +46,15 @@ def flag_counts(*tables: pd.DataFrame) -> FlagCounts:
     return FlagCounts(sum(c.recorded for c in each), flags, sum(c.left_out for c in each))
 
 
+def flag_sentences_of(table: pd.DataFrame, exclude: Collection[str], what: str = "trials") -> list[str]:
+    """The sentences of `flag_sentences` for a table that carries its counts; nothing where no trial carries a flag and
+    none is excluded."""
+    counts = flag_counts(table)
+    return flag_sentences(counts, exclude, what) if counts.flagged or exclude else []
+
+
 def _carried(table: pd.DataFrame) -> pd.Series:
     """The flags of each row."""
     if COLUMN not in table:
         return pd.Series([frozenset()] * len(table), table.index, dtype=object)
-    return table[COLUMN].astype(str).map(lambda cell: frozenset(FLAGS).intersection(cell.split()))
+    return table[COLUMN].map(lambda cell: frozenset(FLAGS).intersection(str(cell).split()))

@@ -34,14 +34,18 @@ _RESERVED = ("a", "b", TIE)
 
 
 def read_validation(
-    path: str | os.PathLike, responses: Sequence[str] = RESPONSES, material: str | None = None
+    path: str | os.PathLike,
+    responses: Sequence[str] = RESPONSES,
+    material: str | None = None,
+    exclude_flags: Collection[str] = (),
 ) -> pd.DataFrame:
     """The comparisons of one material; `responses` are the study's, lowest first. Raises `InputError`.
 
+    Rows with one of `exclude_flags` are left out.
     All cells are text but `trial`; classes are labels, `preferred` and `first` names of sets (or "tie"), or empty.
     """
     text = read_cells(path, "a validation table needs a header and a comparison")
-    return of_material(check_validation(text, responses, str(path)), material, str(path))
+    return of_material(check_validation(text, responses, str(path), exclude_flags), material, str(path))
 
 
 def check_validation(

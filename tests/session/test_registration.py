@@ -69,7 +69,7 @@ def test_the_page_follows_the_study(page):
         PAPER.read_text()
         .replace('rule = "bcm"', 'rule = "learnt-1"')
         .replace("theta = 30.0\n", "")
-        .replace('[parameters.K1]', 'exclude = "trials < 10"\nexclude_flags = ["input_held"]\n[parameters.K1]', 1)
+        .replace("[parameters.K1]", 'exclude = "trials < 10"\nexclude_flags = ["input_held"]\n[parameters.K1]', 1)
         .replace('acquisition = "ucb"', 'acquisition = "top_category"')
     )
     assert "recipe learnt-1" in text and "the rest learnt" in text and "theta" not in text

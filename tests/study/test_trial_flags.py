@@ -1,5 +1,7 @@
 """Trials that a device flagged: which an analysis leaves out, and what is said of them."""
 
+import json
+
 import pandas as pd
 import pytest
 from commands import run
@@ -118,6 +120,21 @@ def test_comparisons_with_a_flag_are_left_out_too():
     assert len(check_validation(table)) == 3
     with pytest.raises(InputError, match="left out for their flags"):
         check_validation(table[1:], exclude_flags=("slewed", "hold"))
+
+
+def test_the_page_of_comparisons_says_which_are_left_out(tmp_path, capsys, monkeypatch):
+    read(tmp_path)
+    rows = "".join(
+        f"P{i},{n},best,worst,close,{('similar', 'different')[n % 2]},{'ab'[n % 3 == 0]},{'slewed' if n == 4 else ''}\n"
+        for i in range(4)
+        for n in range(1, 5)
+    )
+    (tmp_path / "v.csv").write_text(f"participant,trial,set_a,set_b,class_a,class_b,preferred,flags\n{rows}")
+    where = ("--study", tmp_path / "study.toml", "--out", tmp_path / "out", "--json")
+    code, stdout, err = run(capsys, monkeypatch, "validate", tmp_path / "v.csv", *where)
+    assert code == 0, err
+    said = "Device flags were recorded for 4 comparisons (slewed 4); excluded by [study] exclude_flags"
+    assert said in json.loads(stdout)["warnings"][0] and said in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_a_folder_counts_its_tables_together(tmp_path):
