@@ -16,6 +16,8 @@ _EMPTY = ("", "nan", "none", "<na>")
 
 def flagged(table: pd.DataFrame, exclude: Collection[str]) -> pd.Series:
     """Which rows carry one of these flags."""
+    if COLUMN not in table or not exclude:
+        return pd.Series(False, table.index)
     return _carried(table).map(lambda names: not names.isdisjoint(exclude)).astype(bool)
 
 

@@ -122,6 +122,7 @@ def test_comparisons_with_a_flag_are_left_out_too():
         check_validation(table[1:], exclude_flags=("slewed", "hold"))
 
 
+@pytest.mark.deep
 def test_the_page_of_comparisons_says_which_are_left_out(tmp_path, capsys, monkeypatch):
     read(tmp_path)
     rows = "".join(
