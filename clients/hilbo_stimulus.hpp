@@ -359,6 +359,9 @@ public:
   // What the last order asked for cannot be shown; the trial is void.
   bool failed(const std::string &why) { return say("failed", Texts(), why.substr(0, 500)); }
 
+  // What was presented is over, because a device has stopped by itself: the trial is void, and this program begins anew.
+  void begin_again(const std::string &why) { lost(why); }
+
   // Go neutral, and leave.
   void close() {
     {

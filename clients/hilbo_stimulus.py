@@ -184,6 +184,10 @@ class Stimulus:
         """What the last order asked for cannot be shown; the trial is void."""
         return self._say(self._handed, "failed", why=why[:500])
 
+    def begin_again(self, why: str) -> None:
+        """What was presented is over, because a device has stopped by itself: the trial is void; this begins anew."""
+        self._lost(why)
+
     def close(self) -> None:
         """Go neutral, and leave."""
         with self._changed:

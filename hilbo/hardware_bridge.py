@@ -57,10 +57,17 @@ class Renderer:
     `DeviceError` when device or line fail; both say in one sentence what to do.
     """
 
-    def __init__(self, connect: Callable[[], Link], *, damping: SupportsFloat | None = None, simulator: Any = None):
+    def __init__(
+        self,
+        connect: Callable[[], Link],
+        *,
+        damping: SupportsFloat | None = None,
+        delay: SupportsFloat | None = None,
+        simulator: Any = None,
+    ):
         self.notes: list[str] = []
         self.divisor = 0
-        self._connect, self._damping, self.simulator = connect, damping, simulator
+        self._connect, self._damping, self._delay, self.simulator = connect, damping, delay, simulator
         self._begin()
 
     @classmethod
@@ -69,6 +76,7 @@ class Renderer:
         where: str = "sim",
         *,
         damping: SupportsFloat | None = None,
+        delay: SupportsFloat | None = None,
         baud: int = BAUD,
         patience: SupportsFloat | None = None,
         capture: Callable[[bytes], Any] | None = None,
@@ -76,7 +84,8 @@ class Renderer:
     ) -> "Renderer":
         """Connect to "sim", a serial port, or "socket://host:port".
 
-        `damping` (N·s/m) is what a study counts on: a device with less is refused. `patience` (s) is for one answer,
+        `damping` (N·s/m) and `delay` (s) are what a study counts on: a device with less damping, or one that checks its
+        sets for a longer delay of the force, is refused. `patience` (s) is for one answer,
         0.1 on a line. `capture` gets every byte that arrives. `options` are those of the simulated device
         (`simulator.Simulator`). Raises `InputError` for a line that cannot be opened, and `DeviceError` for one on
         which no device of this protocol answers.
@@ -92,7 +101,7 @@ class Renderer:
         waits = None if patience is None else float(patience)
         connect = partial(_connected, simulator.port if simulator else where, baud, waits, capture, simulator)
         try:
-            return cls(connect, damping=damping, simulator=simulator)
+            return cls(connect, damping=damping, delay=delay, simulator=simulator)
         except BaseException:
             if simulator:
                 simulator.close()
@@ -139,7 +148,7 @@ class Renderer:
         """A new conversation: who is there, at rest, heartbeats, telemetry."""
         self._link = self._connect()
         try:
-            self.device = greet(self._link, self._damping)
+            self.device = greet(self._link, self._damping, self._delay)
             self._buffer = TelemetryBuffer(self.device.encoder_step_mm)
             self._link.on_telemetry = self._buffer.add
             self.notes += take_over(self._link, self.device)

@@ -16,6 +16,10 @@ A = β(C - S) - Y:
     A <= 0: every K1 is passive;  Y <= 0 or K_eff < 0: none is;  otherwise
     K1max = β·[Y(C + S) + sqrt(Y²(C + S)² + 4·A·Y·C·S)] / (2A).
 
+A force that comes `delay` seconds after its position, 0 to T, needs another damping, at a frequency below Nyquist, and
+there is no closed form: `mechanics.delay` has the theory, `mechanics.delayed_bounds` the search. A delay of 0 takes the
+forms above.
+
 With full memory S = 0, C = 2^α and K_eff = K0. For even N these forms are up to 2.8 % (N = 2) too low, so even N is
 refused; `certify` decides every N, and K1, B1 at their limits, for one parameter set at a time.
 
@@ -27,9 +31,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Real
+from jaxtyping import Array, Bool, Float, Real
 
 from hilbo.errors import InputError
+from hilbo.mechanics.delay import check_delay
+from hilbo.mechanics.delayed_bounds import delayed_damping, delayed_largest_K1
 from hilbo.mechanics.fosls import FOSLS, pot_stiffness, share
 from hilbo.mechanics.memory import sums
 from hilbo.mechanics.passivity_certificate import Certificate, Witness, certify, needed_damping, witness
@@ -41,12 +47,15 @@ __all__ = [
     "Certificate",
     "Witness",
     "certify",
+    "is_passive",
     "largest_K1",
     "largest_K1_beside",
     "minimum_damping",
     "needed_damping",
     "witness",
 ]
+
+_BATCH = 128  # sets whose grids of frequencies are in memory at once
 
 
 def __dir__() -> list[str]:
@@ -62,14 +71,20 @@ def minimum_damping(
     T: Real[ArrayLike, "..."] = 1e-3,
     *,
     memory: Memory = "short",
+    delay: Real[ArrayLike, "..."] = 0.0,
 ) -> Float[Array, "..."]:
     """Smallest device damping b (N·s/m) with which the rendering is passive; elementwise.
+
+    `delay`: from a sample of the position to its force, s, from 0 to T. Above 0 the error is 1e-6 of b.
 
     `inf` where `K_eff` < 0: a negative static stiffness is active whatever the damping. For a set with a K0 of its
     own, `K_eff` is its `viscoelastic.dc_gain`. Raises `InputError` for even N, and for values that no model has; where
     they are traced the result is NaN.
     """
-    return elementwise(_minimum_damping, _closed(memory, N), K1, B1, alpha, K_eff, T)
+    memory_span = _closed(memory, N)
+    if check_delay(delay, T):
+        return elementwise(delayed_damping, memory_span, K1, B1, alpha, K_eff, T, delay, batch=_BATCH)
+    return elementwise(_minimum_damping, memory_span, K1, B1, alpha, K_eff, T)
 
 
 def largest_K1(
@@ -81,20 +96,48 @@ def largest_K1(
     T: Real[ArrayLike, "..."] = 1e-3,
     *,
     memory: Memory = "short",
+    delay: Real[ArrayLike, "..."] = 0.0,
 ) -> Float[Array, "..."]:
     """Largest passive K1 (N/mm) on a device with damping `b` (N·s/m); elementwise.
 
     `inf` where every K1 is passive, 0 where none is. Differentiable, with derivative 0 at `inf` and at 0.
+    `delay`: from a sample of the position to its force, s, from 0 to T. Above 0 the K1 needs from b·(1 - 2e-5) to b;
+    first derivatives are exact, second ones are those at the frequency that binds; and K1 is 0 where b is below
+    `mechanics.delay.least_damping`, about what a spring of K_eff needs, though a few K1 may be passive.
     Raises `InputError` for even N, and for values that no model or device has; where they are traced the result is
     NaN, never a K1 that would pass for passive.
     """
-    return elementwise(_largest_K1, _closed(memory, N), B1, alpha, b, K_eff, T)
+    memory_span = _closed(memory, N)
+    if check_delay(delay, T):
+        return elementwise(delayed_largest_K1, memory_span, B1, alpha, b, K_eff, T, delay, batch=_BATCH)
+    return elementwise(_largest_K1, memory_span, B1, alpha, b, K_eff, T)
 
 
-def largest_K1_beside(model: FOSLS, b: float) -> float:
-    """`largest_K1` (N/mm) beside the B1, α, memory, T and static stiffness of a model, by NumPy where its numbers are
-    NumPy's. Raises ValueError for even N."""
+def is_passive(
+    K1: Real[ArrayLike, "..."],
+    B1: Real[ArrayLike, "..."],
+    alpha: Real[ArrayLike, "..."],
+    b: Real[ArrayLike, "..."],
+    K_eff: Real[ArrayLike, "..."] = 0.44,
+    N: int = 101,
+    T: Real[ArrayLike, "..."] = 1e-3,
+    *,
+    memory: Memory = "short",
+    delay: Real[ArrayLike, "..."] = 0.0,
+) -> Bool[Array, "..."]:
+    """Whether the rendering is passive on a device with damping `b` (N·s/m) and this `delay` (s); elementwise.
+
+    Passive with one delay does not mean passive with a shorter one: the needed damping first falls with the delay.
+    """
+    return minimum_damping(K1, B1, alpha, K_eff, N, T, memory=memory, delay=delay) <= jnp.asarray(b)
+
+
+def largest_K1_beside(model: FOSLS, b: float, *, delay: float = 0.0) -> float:
+    """`largest_K1` (N/mm) beside the B1, α, memory, T and static stiffness of a model, without a `delay` by NumPy where
+    its numbers are NumPy's. Raises ValueError for even N."""
     place = model.B1, model.alpha, b, model.dc_gain(), model.T
+    if check_delay(delay, model.T):
+        return float(elementwise(delayed_largest_K1, _closed(model.memory, model.N), *place, delay))
     if not on_host(model.B1, model.alpha):
         return float(elementwise(_largest_K1, _closed(model.memory, model.N), *place))
     return float(_largest_K1(_closed(model.memory, model.N), *map(np.float64, place)))

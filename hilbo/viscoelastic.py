@@ -127,15 +127,18 @@ def effective_damping(
     return elementwise(_effective_damping, span(memory, N, states), K1, B1, alpha, T)
 
 
-def elementwise(function: Callable, span: Span, *args: Real[ArrayLike, "..."]) -> Float[Array, "..."]:
-    """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once.
+def elementwise(
+    function: Callable, span: Span, *args: Real[ArrayLike, "..."], batch: int | None = None
+) -> Float[Array, "..."]:
+    """Apply `function(span, *scalars)` over broadcast arguments in their common floating dtype, compiled once; `batch`
+    elements at a time where one takes much memory.
 
     By the names of its parameters: raises `InputError` for what no model has; where that is traced, the result is NaN.
     """
     names = _ranged(function)
     check_ranges(**{name: args[i] for i, name in names})
     dtype = jnp.result_type(1.0, *args)
-    return _compiled(function, span, *(jnp.asarray(arg, dtype) for arg in args))
+    return _compiled(function, span, *(jnp.asarray(arg, dtype) for arg in args), batch=batch)
 
 
 @cache
@@ -145,13 +148,21 @@ def _ranged(function: Callable) -> tuple[tuple[int, str], ...]:
     return tuple((i, name) for i, name in enumerate(names) if name in RANGES and name != "K0")
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _compiled(function: Callable, span: Span, *args: Float[Array, "..."]) -> Float[Array, "..."]:
+@partial(jax.jit, static_argnums=(0, 1), static_argnames="batch")
+def _compiled(
+    function: Callable, span: Span, *args: Float[Array, "..."], batch: int | None = None
+) -> Float[Array, "..."]:
     def one(*scalars):
         allowed = possible(**{name: scalars[i] for i, name in _ranged(function)})
         return jnp.where(allowed, function(span, *scalars), jnp.nan)
 
-    return jnp.vectorize(one)(*args)
+    if batch is None:
+        return jnp.vectorize(one)(*args)
+    same = jnp.broadcast_arrays(*args)
+    if same[0].size <= batch:
+        return jnp.vectorize(one)(*same)
+    flat = jax.lax.map(lambda scalars: one(*scalars), tuple(arg.ravel() for arg in same), batch_size=batch)
+    return flat.reshape(same[0].shape)
 
 
 def _gl_sum(span: Span, alpha: Float[Array, ""]) -> Float[Array, ""]:

@@ -3,6 +3,8 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -369,3 +371,15 @@ def test_the_interpreter_ends_although_a_device_is_open():
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=os.environ | {"PYTHONPATH": paths}
     )
     assert (run.returncode, run.stdout) == (0, "STOPPED\n"), run.stderr
+
+
+def test_a_device_with_more_delay_than_the_study_counts_on_is_refused(monkeypatch):
+    peer = Peer()
+    monkeypatch.setattr(
+        peer, "_get_limits", lambda message, made=peer._get_limits: replace(made(message), delay_us=376)
+    )
+    connect = partial(peer.connect, patience=30.0)
+    with pytest.raises(InputError, match=r"at most 0 s and the device checks its sets for 0.000376 s; plan the study"):
+        Renderer(connect, delay=0.0)
+    with Renderer(connect, delay=376e-6) as device:
+        assert device.delay == pytest.approx(376e-6)

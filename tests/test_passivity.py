@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.stats import qmc
 
 from hilbo import passivity, viscoelastic
-from hilbo.mechanics import passivity_certificate
+from hilbo.mechanics import cosine_polynomials
 from hilbo.viscoelastic import FOSLS
 
 SETS = ((-2.89, 5.70, 5.89, 0.203), (-3.18, 5.58, 7.88, 0.176), (-5.01, 8.44, 10.28, 0.282))
@@ -196,10 +196,10 @@ def test_a_cell_is_bounded_from_below_and_closely():
 
     @jax.jit
     def bounded(p):
-        rows = passivity_certificate._rows(p, 9)
-        taylor, fine = passivity_certificate._on_grid(rows, cells), passivity_certificate._at_angles(rows, nodes)
-        coarse = passivity_certificate._lowest(taylor, jnp.asarray(radius), rows)
-        return taylor, fine, coarse, passivity_certificate._lowest(fine, jnp.asarray(1e-3), rows)
+        rows = cosine_polynomials.rows(p, 9)
+        taylor, fine = cosine_polynomials.on_grid(rows, cells), cosine_polynomials.at_angles(rows, nodes)
+        coarse = cosine_polynomials.lowest(taylor, jnp.asarray(radius), rows)
+        return taylor, fine, coarse, cosine_polynomials.lowest(fine, jnp.asarray(1e-3), rows)
 
     for _ in range(20):
         p = rng.normal(size=8)

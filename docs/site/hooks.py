@@ -26,7 +26,7 @@ API = {
     "mechanics": (
         "Mechanics and search space",
         "viscoelastic mechanics.fosls mechanics.memory mechanics.materials mechanics.continuous mechanics.switching"
-        " passivity mechanics.passivity_certificate search.space search.columns search.candidates",
+        " passivity mechanics.passivity_certificate mechanics.delay search.space search.columns search.candidates",
     ),
     "identification": (
         "Identification",
@@ -47,7 +47,7 @@ API = {
         "study.trial_table study.folder study.validation_table statistics.paper_tables statistics.logits"
         " statistics.preferences report.comparison report.study report.result_tables",
     ),
-    "device": ("Device", "hardware_bridge device.protocol device.ports device.simulator"),
+    "device": ("Device", "hardware_bridge device.protocol device.ports device.simulator device.library device.motor"),
 }
 ELSEWHERE = {
     "README.md": "readme.md",

@@ -1,10 +1,12 @@
 /* Closed loops: the device's core, a simulated handle and a random hand, with random accepted sets.
  *
- *     loops RUNS SEED [CONTROLS]   each run 3 s; one line for each of the 16 kinds of run
+ *     loops RUNS SEED [CONTROLS]   each run 3 s; one line for each of the 32 kinds of run
  *
  * The kind of a run is a sum: 1 a slew limit that is felt, 2 positions that are lost, 4 ticks that come late, 8 switches
- * of the set. A line: kind, runs, ticks while RUNNING, HOLDs, largest force out of contact (N), largest energy made in a
- * touch (mJ): by how much force and physical damping together ever gave the hand more than they had taken from it.
+ * of the set, 16 a force that comes 50 to 400 us late, for which the device checks its sets. The host asks for a START
+ * whenever the device is STOPPED, in contact too. A line: kind, runs, ticks while RUNNING, HOLDs, largest force out of
+ * contact (N), largest energy made in a touch (mJ): by how much force and physical damping together ever gave the hand
+ * more than they had taken from it; STARTs in contact, and touches that began with one.
  * CONTROLS 1: with the passivity controller. */
 #include <math.h>
 #include <stdio.h>
@@ -13,7 +15,7 @@
 
 #include "rig.h"
 
-enum { TICKS = 3000, KINDS = 16, SLEWED = 1, LOSSES = 2, LATE = 4, SWITCHES = 8 };
+enum { TICKS = 3000, KINDS = 32, SLEWED = 1, LOSSES = 2, LATE = 4, SWITCHES = 8, DELAYED = 16 };
 
 struct outcome {
     unsigned long runs;
@@ -21,6 +23,8 @@ struct outcome {
     unsigned long holds;
     double out_of_contact_N;
     double made_mJ;
+    unsigned long asked_in_contact;
+    unsigned long begun_in_contact;
 };
 
 struct loop {
@@ -31,8 +35,10 @@ struct loop {
     uint16_t set_id;
     uint8_t seq;
     bool controls;
-    bool free;       /* the last tick was RUNNING, out of contact: what is touched next has stored nothing */
-    bool whole;      /* this touch began so */
+    bool ran;        /* at the last tick it was RUNNING, */
+    bool touched;    /* and in contact */
+    bool pressed;    /* in contact, in any state */
+    unsigned long asked_in_contact;
     double taken_mJ; /* in this touch */
 };
 
@@ -129,17 +135,27 @@ static void begin(struct loop *loop)
     loop->rig.config = sim_rig_describe(&config);
     bool slewed = (loop->kind & SLEWED) != 0;
     loop->rig.config.slew_limit_N_per_s = slewed ? (float)exp(draw(loop, log(20.0), log(1000.0))) : 1e6F;
+    loop->rig.config.delay_us = (loop->kind & DELAYED) != 0 ? 50U * (uint32_t)draw(loop, 1.0, 9.0) : 0U;
     loop->rig.config.capabilities |= loop->controls ? (uint8_t)HB_CAN_CONTROL_PASSIVITY : 0U;
     loop->rig.bad_ticks = loop->rig.late_ticks = 0U;
     if (hb_init(&loop->rig.device, &loop->rig.config, 7U) != HB_OK) {
         abort();
     }
     loop->lost_share = draw(loop, 0.0, 0.2);
-    loop->free = loop->whole = false;
+    loop->rig.motor_N = 0.0;
+    loop->rig.stop_open = loop->ran = loop->touched = loop->pressed = false;
+    loop->rig.late_us = 0U;
+    loop->rig.delay_us = loop->rig.config.delay_us;
+    loop->asked_in_contact = 0UL;
     uint8_t payload[8];
     send(loop, HB_HELLO, payload, put(payload, put(payload, 0U, HB_PROTOCOL_VERSION, 4U), HB_SCHEMA_CRC, 4U));
-    stage(loop);
-    confirm(loop, HB_COMMIT, (uint8_t)(1U - loop->rig.device.active));
+    while (!loop->rig.device.in_force) { /* a set may turn out not to be passive at the delay */
+        if (loop->rig.device.staging == (uint8_t)HB_EMPTY) {
+            stage(loop);
+        }
+        (void)sim_rig_tick(&loop->rig);
+        confirm(loop, HB_COMMIT, (uint8_t)(1U - loop->rig.device.active));
+    }
 }
 
 /* What a host does between two ticks. */
@@ -153,6 +169,7 @@ static void host(struct loop *loop, unsigned tick)
         send_pair(loop, HB_CLEAR, device->stops);
     }
     if (tick % 100U == 0U && device->state == (uint8_t)HB_STOPPED) {
+        loop->asked_in_contact += device->safety.counts > 0 ? 1UL : 0UL;
         confirm(loop, HB_START, device->active);
     }
     if ((loop->kind & SWITCHES) != 0 && happens(loop, 0.01)) {
@@ -177,13 +194,14 @@ static void measure(struct loop *loop, double force_N, double before_mm, struct 
     if (running && !touches) {
         outcome->out_of_contact_N = fmax(outcome->out_of_contact_N, fabs(force_N));
     }
-    if (loop->free && touches) {
+    if (running && touches && !loop->touched) {
         loop->taken_mJ = 0.0;
-        loop->whole = true;
     }
-    loop->free = running && !touches;
-    loop->whole = loop->whole && running && touches;
-    if (loop->whole) {
+    outcome->begun_in_contact += running && touches && !loop->ran && loop->pressed ? 1UL : 0UL;
+    loop->ran = running;
+    loop->pressed = touches;
+    loop->touched = running && touches;
+    if (loop->touched) {
         double moved_mm = world->position_mm - before_mm;
         double speed_m_per_s = moved_mm / (1e3 * world->config.tick_s);
         loop->taken_mJ += (force_N + world->config.damping_N_s_per_m * speed_m_per_s) * moved_mm;
@@ -206,6 +224,7 @@ static void run(struct loop *loop, struct outcome *outcome)
     }
     outcome->runs += 1U;
     outcome->holds += loop->rig.device.safety.count.holds;
+    outcome->asked_in_contact += loop->asked_in_contact;
 }
 
 int main(int count, char **arguments)
@@ -221,7 +240,8 @@ int main(int count, char **arguments)
     }
     for (int kind = 0; kind < KINDS; kind++) {
         const struct outcome *o = &outcomes[kind];
-        (void)printf("%d %lu %lu %lu %.6g %.6g\n", kind, o->runs, o->ticks, o->holds, o->out_of_contact_N, o->made_mJ);
+        (void)printf("%d %lu %lu %lu %.6g %.6g %lu %lu\n", kind, o->runs, o->ticks, o->holds, o->out_of_contact_N, o->made_mJ,
+                     o->asked_in_contact, o->begun_in_contact);
     }
     return EXIT_SUCCESS;
 }

@@ -187,11 +187,12 @@ def _study(path: Path) -> Iterator[Check]:
 
 def _feasible(study: Any) -> Check:
     """What mechanics and constraints leave."""
+    from hilbo.search.rendering import delay_words
     from hilbo.search.space import share_of_cube
 
     space, parts = study.space, []
     if space.mechanics is not None:
-        parts.append(f"{100 * space.volume():.1f} % of the box can be shown passively")
+        parts.append(delay_words(space) or f"{100 * space.volume():.1f} % of the box can be shown passively")
     if space.constraints:
         share = share_of_cube(space)
         shown = f"{100 * share:.1f} %" if share >= 0.001 else "less than 0.1 %"

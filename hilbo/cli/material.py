@@ -83,6 +83,7 @@ def passivity(
     K0: Annotated[float | None, typer.Option("--K0", help="N/mm; else from --K-eff.")] = None,
     K_eff: Annotated[float | None, typer.Option("--K-eff", help="Effective stiffness H(1), N/mm.")] = None,
     damping: Annotated[float | None, typer.Option(help="Damping b of the device, N.s/m.")] = None,
+    delay: Annotated[float | None, typer.Option(help="From a sample of the position to its force, s.")] = None,
     taps: Annotated[int | None, typer.Option("--N", min=1, help="Past samples of the rendering.")] = None,
     period: Annotated[float | None, typer.Option("--T", help="Sampling time, s.")] = None,
     memory: Annotated[str | None, typer.Option(help='"short" (N samples) or "full".')] = None,
@@ -102,12 +103,12 @@ def passivity(
     from hilbo.report.json_text import quoted
     from hilbo.report.passivity import passivity_result, passivity_words
 
-    given = {"N": taps, "T": period, "memory": memory, "K_eff": K_eff, "damping": damping}
+    given = {"N": taps, "T": period, "memory": memory, "K_eff": K_eff, "damping": damping, "delay": delay}
     renderer = _renderer(study) | {name: value for name, value in given.items() if value is not None}
     if K0 is not None and K_eff is not None:
         raise InputError("--K0 and --K-eff are both given; one follows from the other, leave one out.")
     model = _rendered(K0, K1, B1, alpha, renderer)
-    content = passivity_result(model, renderer["damping"])
+    content = passivity_result(model, renderer["damping"], renderer["delay"])
     if out is not None:
         from hilbo.report.material import write_passivity
 
@@ -140,13 +141,13 @@ def _rendered(K0: float | None, K1: float, B1: float, alpha: float, renderer: di
 def _renderer(study):
     """[renderer] of a study, or the paper's."""
     if study is None:
-        return {"N": 101, "T": 1e-3, "memory": "short", "K_eff": 0.44, "damping": 0.95}
+        return {"N": 101, "T": 1e-3, "memory": "short", "K_eff": 0.44, "damping": 0.95, "delay": 0.0}
     from hilbo.study.study_file import StudyFile
 
     mechanics = StudyFile.load(study).space.mechanics
     if mechanics is None:
         raise InputError(f"{study}: has no [renderer], so that there is nothing to be passive.")
-    return {name: getattr(mechanics, name) for name in ("N", "T", "memory", "K_eff", "damping")}
+    return {name: getattr(mechanics, name) for name in ("N", "T", "memory", "K_eff", "damping", "delay")}
 
 
 def _order(alpha):

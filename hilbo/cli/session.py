@@ -157,6 +157,7 @@ def _plan_of(path, kind, source, people, materials, paths, trials, session, seed
 
     with progress() as say:
         study = _searchable(path) if kind == "optimisation" else _whole(path)
+        _say_delays(study, materials)
         return make_plan(
             study,
             people,
@@ -188,6 +189,17 @@ def _searchable(path) -> Any:
         return file
 
     return read_study(path, search_space_of)
+
+
+def _say_delays(study, materials) -> None:
+    """What the delay of the device leaves of the search space, of each material's where there are several."""
+    from hilbo.search.rendering import delay_words
+    from hilbo.search.space import SearchSpace
+
+    for name in materials or ("",):
+        box = (study.material(name) if name else study).space
+        if box.mechanics is not None and box.mechanics.delay:
+            remark((f"{name}: " if name else "") + delay_words(SearchSpace(box.parameters, box.mechanics)))
 
 
 def _whole(path) -> Any:

@@ -23,11 +23,11 @@ _STOPPING = 2.0  # s
 _BEATS = 4  # heartbeats that must fit into the device's watchdog: each carries the tick of the answer before
 
 
-def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
+def greet(link: Link, damping: SupportsFloat | None, delay: SupportsFloat | None = None) -> HelloReply:
     """HELLO, until a board that starts when its port is opened has started; checks what it says.
 
-    Raises `InputError` for a device with less damping than `damping` (N·s/m), `DeviceError` for one that is not of this
-    protocol.
+    Raises `InputError` for a device with less damping than `damping` (N·s/m) or more delay than `delay` (s),
+    `DeviceError` for one that is not of this protocol.
     """
     give_up = time.monotonic() + _BOOT
     while True:
@@ -55,7 +55,21 @@ def greet(link: Link, damping: SupportsFloat | None) -> HelloReply:
             f"{link.name}: the study counts on {shortest(float(damping))} N.s/m of damping and the device has"
             f" {shortest(device.damping_N_s_per_m)}; plan the study with the device's damping."
         )
+    if delay is not None:
+        _check_delay(link, float(delay))
     return device
+
+
+def _check_delay(link: Link, delay: float) -> None:
+    """A device refuses sets that are not passive at its own delay; a study that counts on less would propose them."""
+    if not 0.0 <= delay < math.inf:
+        raise InputError(f"The delay that the study counts on is {delay}; give a number from 0, in s.")
+    own = link.request(protocol.GetLimits()).delay_us
+    if own > round(delay * 1e6):
+        raise InputError(
+            f"{link.name}: the study counts on a delay of at most {delay:g} s and the device checks its sets for"
+            f" {own * 1e-6:g} s; plan the study with [renderer] delay = {own * 1e-6:g}."
+        )
 
 
 def take_over(link: Link, device: HelloReply) -> list[str]:

@@ -1,31 +1,23 @@
 """A device without a device: the firmware's own core as a process on a pseudo-terminal of this computer.
 
-The C sources travel with hilbo. They are built once with the C compiler that is there, into the user's cache folder,
-under a name made of sources, compiler and flags, so that nothing stale is ever run. The process ends with this one,
-however this one ends, because the pipe that it reads its commands from ends then.
+The C sources travel with hilbo, and are built once (`hilbo.device.compiled`). The process ends with this one, however
+this one ends, because the pipe that it reads its commands from ends then.
 """
 
 import contextlib
-import hashlib
 import os
-import shutil
 import subprocess
-import sys
-import tempfile
 import threading
-import zlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hilbo.device.compiled import compiled
 from hilbo.device.failures import DeviceError
 from hilbo.errors import InputError
 
 __all__ = ["Simulator", "built"]
 
 _PARTS = ("core", "port/sim", "port/host")
-_FLAGS = ("-std=c11", "-O2", "-ffp-contract=off", "-fno-strict-aliasing", "-D_XOPEN_SOURCE=700")
-_COMPILERS = ("cc", "gcc", "clang")
 
 
 class Simulator:
@@ -111,69 +103,7 @@ def built() -> Path:
         raise DeviceError(
             "This system has no pseudo-terminals for the simulated device; use WSL, or a device on a port."
         )
-    root, compiler = _sources(), _compiler()
-    files = [path for folder in _PARTS for path in sorted((root / folder).glob("*.[ch]"))]
-    flags = [*_FLAGS, f"-DHB_FIRMWARE_HASH={_firmware_hash(root)}U", *(f"-I{folder}" for folder in _PARTS)]
-    version = subprocess.run([compiler, "--version"], capture_output=True).stdout
-    digest = hashlib.sha256(repr((compiler, flags)).encode() + version)
-    for path in files:
-        digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    program = _cache() / f"device-{digest.hexdigest()[:16]}" / "hilbo-device"
-    if not program.exists():
-        _build(
-            program, [compiler, *flags, *(str(path.relative_to(root)) for path in files if path.suffix == ".c")], root
-        )
-    return program
-
-
-def _build(program: Path, command: Sequence[str], root: Path) -> None:
-    """Build beside the final place and move it there whole, so that two who build at once do no harm."""
-    try:
-        program.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix="build-", dir=program.parent))
-    except OSError as error:
-        raise DeviceError(
-            f"{program.parent}: the simulated device cannot be built there ({error.strerror}); set XDG_CACHE_HOME to a"
-            " folder of yours."
-        ) from error
-    try:
-        made = folder / program.name
-        done = subprocess.run([*command, "-o", str(made), "-lm"], cwd=root, capture_output=True, text=True)
-        if done.returncode:
-            first = next(iter(done.stderr.strip().splitlines()), "no reason given")
-            raise DeviceError(f"The simulated device does not compile with {command[0]}: {first}")
-        made.replace(program)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _sources() -> Path:
-    here = Path(__file__).parents[1]
-    for root in (here / "firmware", here.parent / "firmware"):  # installed; a checkout
-        if (root / "core").is_dir():
-            return root
-    raise DeviceError("This installation of hilbo lacks the sources of the simulated device; install hilbo again.")
-
-
-def _compiler() -> str:
-    for name in (os.environ.get("CC", ""), *_COMPILERS):
-        path = shutil.which(name) if name else None
-        if path:
-            return path
-    install = "xcode-select --install" if sys.platform == "darwin" else "on Debian: apt install gcc"
-    raise DeviceError(
-        f"The simulated device is built once from C, and there is no C compiler; install one ({install}), or use a"
-        " device on a port."
-    )
-
-
-def _firmware_hash(root: Path) -> int:
-    """As firmware/Makefile has it: the CRC-32 of the core's sources."""
-    return zlib.crc32(b"".join(path.read_bytes() for path in sorted((root / "core").glob("*.[ch]"))))
-
-
-def _cache() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "hilbo"
+    return compiled("hilbo-device", "the simulated device", _PARTS)
 
 
 def _arguments(options: dict[str, Any]) -> list[str]:

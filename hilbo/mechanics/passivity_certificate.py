@@ -1,20 +1,19 @@
 """Is a parameter set passive on a device? A certificate without gaps between frequencies; a motion that proves a no.
 
-With θ = ωT a rendering needs the damping (T/2)·φ(θ), φ = Re H - cot(θ/2)·Im H, and H(1) >= 0. Let g = K1/(K1 + β),
-h = 1 - g, k = K1·β/(K1 + β), and V = Re C - cot(θ/2)·Im C = S_N - 2·Σ_{j=1..N} (S_{j-1} - S_N)·cos jθ. Then
+With θ = ωT a rendering needs the damping (T/2)·φ(θ), φ = Re H - cot(θ/2)·Im H, and H(1) >= 0. In the terms of
+`response_polynomials`
 
-    p = (Y - φ)·A = (Y - K0)·A - B,   A = |g + h·C|² >= (g + h·S_N)² > 0,   B = k·(g·V + h·|C|²)
+    p = (Y - φ)·A = (Y - K0)·A - B
 
 is a cosine polynomial of degree N, finite for every K1 from 0 to inf. Where p >= 0 everywhere, the damping (T/2)·Y is
-enough. Around each of many angles Taylor's formula, with a remainder from the size of the coefficients, bounds p''
-from below on the cell, and so p by a parabola. Towards the largest φ the cells shrink in proportion to their distance
-from it, so that the bound is sharp to rounding. The result is an enclosure of the smallest passive damping, for even N
-as well as odd.
+enough. `cosine_polynomials` bounds p from below without gaps. The result is an enclosure of the smallest passive
+damping, for even N as well as odd. A force that is late needs (T/2)·Y(θ) of `delay`, enclosed by `delayed_enclosure`.
 
 With full memory the Nyquist frequency binds (docs/methods/mechanics.md), and b_min is closed.
 
-A violation is shown in time. The path between samples that loses least in the device's damping is straight, and the
-force is held, so that a cycle takes up the energy Σ F_n·Δx_n + b·Δx_n²/T: negative if it creates energy.
+A violation is shown in time, by a path that loses least in the device's damping. The force is held, so that between
+samples the path is straight, and a cycle takes up the energy Σ F_n·Δx_n + b·Δx_n²/T: negative if it creates energy. A
+late force changes between the samples, and there the path has a bend.
 
 Units: damping N·s/m, ω rad/s, x mm, F N, energy mJ (N·mm). Reference: Colgate and Schenkel (1997), J. Robotic Syst. 14,
 37-47.
@@ -22,6 +21,7 @@ Units: damping N·s/m, ω rad/s, x mm, F N, energy mJ (N·mm). Reference: Colgat
 
 import math
 from fractions import Fraction
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -32,20 +32,19 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Complex, Float, Real
 
 from hilbo.errors import InputError
+from hilbo.mechanics.cosine_polynomials import at_angles, cells_for, climb, least, on_grid, rounding_unit, rows
+from hilbo.mechanics.delay import check_delay, larger_root
+from hilbo.mechanics.delayed_enclosure import full_estimate, short_enclosure
 from hilbo.mechanics.exponentials import exponentials
-from hilbo.mechanics.fosls import FOSLS, series, share
+from hilbo.mechanics.fosls import FOSLS
 from hilbo.mechanics.memory import gl_coefficients
-from hilbo.numerics.host import namespace_of, on_host, scan
+from hilbo.mechanics.response_polynomials import parts_of
+from hilbo.numerics.host import namespace_of, on_host
 from hilbo.numerics.shown import concrete, shown
 from hilbo.numerics.tracing import program
 
 __all__ = ["Certificate", "Witness", "certify", "needed_damping", "witness"]
 
-_ORDER = 8  # of Taylor's formula
-_CELLS_PER_TAP = 8
-_LEAST_CELLS = 48
-_RINGS = 28
-_ROUNDING = 16  # units in the last place of Σ |p_j|
 _LONGEST_CYCLE = 4096  # samples
 
 
@@ -78,40 +77,64 @@ class Certificate(eqx.Module):
 
 
 class Witness(eqx.Module):
-    """A cycle that creates energy: `x` (mm) at its n + 1 samples, forces (N) held after the first n, energies (mJ)."""
+    """A cycle that creates energy: `x` (mm) at its n + 1 samples, forces (N) that follow the first n, energies (mJ).
+
+    Each force is held for T from `delay` (s) after its sample. There x is `bend` (mm), and straight in between.
+    """
 
     force: Float[np.ndarray, " n"]
     x: Float[np.ndarray, " n+1"]
+    bend: Float[np.ndarray, " n"]
     frequency: float  # rad/s; a cycle may hold several periods of it
     lost: float  # in the device's damping, >= 0
     energy: float  # taken up by device and rendering together, < 0
+    delay: float
 
 
-def needed_damping(model: FOSLS, omega: Real[ArrayLike, "*w"]) -> Float[Array, "*w"]:
-    """The damping (N·s/m) that passivity asks for at each ω in [0, π/T] (rad/s); at 0 the limit H(1)·T/2 - B_eff.
+def needed_damping(
+    model: FOSLS, omega: Real[ArrayLike, "*w"], *, delay: Real[ArrayLike, ""] = 0.0
+) -> Float[Array, "*w"]:
+    """The damping (N·s/m) that passivity asks for at each ω in [0, π/T] (rad/s); at 0 the limit, without `delay`
+    H(1)·T/2 - B_eff.
 
-    `omega` of any shape -> the same shape.
+    `delay`: from a sample of the position to its force, s. `omega` of any shape -> the same shape.
     """
+    late = check_delay(delay, model.T)
     angle = jnp.asarray(omega, model.K0.dtype) * model.T
     moving = angle > 0
     safe = jnp.where(moving, angle, 1)
     response = model.frequency_response(safe / model.T)
     # tan, not cot: at π the cotangent is 0 and the tangent only large.
     stiffness = response.real - response.imag / jnp.tan(safe / 2)
-    return jnp.where(moving, 500 * model.T * stiffness, 500 * model.T * model.dc_gain() - model.effective_damping())
+    if not late:
+        return jnp.where(moving, 500 * model.T * stiffness, 500 * model.T * model.dc_gain() - model.effective_damping())
+    lag, still = delay / model.T, model.dc_gain()
+    turned = jnp.cos(safe) * response.real + jnp.sin(safe) * response.imag
+    slow = still * (1 + 2 * lag) - model.effective_damping() / (500 * model.T)
+    psi = jnp.where(moving, stiffness + 2 * lag * turned, slow)
+    square = jnp.where(moving, response.real**2 + response.imag**2, still**2)
+    return 500 * model.T * larger_root(psi, lag * (1 - lag) * square)
 
 
-def certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
+def certify(model: FOSLS, b: Real[ArrayLike, ""], *, delay: Real[ArrayLike, ""] = 0.0) -> Certificate:
     """Whether the rendering is passive on a device with physical damping `b` (N·s/m); `jax.vmap` for several.
 
-    For any N. Not differentiable: see `minimum_damping`, and `needed_damping` at the certificate's frequency.
+    `delay`: from a sample of the position to its force, s, 0 to T. For any N. With full memory and a delay the bounds
+    are an estimate to a relative 1e-6, not proved. Not differentiable: see `minimum_damping`, and `needed_damping` at
+    the certificate's frequency.
     `b` is a scalar; so is every number of the certificate. Of a model of NumPy's numbers it is computed by NumPy.
-    Raises `InputError` for a `b` below 0.
+    Raises `InputError` for a `b` below 0 and for another delay.
     """
     if concrete(b) and not np.all(np.asarray(b) >= 0):
         raise InputError(f"b is {shown(b)}; the damping of a device is 0 or above, in N.s/m.")
-    host = model.memory == "short" and on_host(model.K0, model.K1, model.B1, model.alpha)
-    return _certificate(model, np.asarray(b, model.K0.dtype)) if host else _certify(model, b)
+    late = check_delay(delay, model.T)
+    host = model.memory == "short" and on_host(model.K0, model.K1, model.B1, model.alpha) and concrete(delay)
+    dtype = model.K0.dtype
+    if not late:
+        return _certificate(model, np.asarray(b, dtype)) if host else _certify(model, b)
+    if host:
+        return _late_certificate(model, np.asarray(b, dtype), np.asarray(delay, dtype))
+    return _certify_late(model, jnp.asarray(b, dtype), jnp.asarray(delay, dtype))
 
 
 @program
@@ -119,9 +142,22 @@ def _certify(model: FOSLS, b: Real[ArrayLike, ""]) -> Certificate:
     return _certificate(jax.lax.stop_gradient(model), jnp.asarray(b, model.K0.dtype))
 
 
+@program
+def _certify_late(model: FOSLS, b: Float[Array, ""], delay: Float[Array, ""]) -> Certificate:
+    return _late_certificate(jax.lax.stop_gradient(model), b, jax.lax.stop_gradient(delay))
+
+
 def _certificate(model: FOSLS, b: Float[Any, ""]) -> Certificate:
     enclose = _full_enclosure if model.memory == "full" else _short_enclosure
-    low, high, angle = enclose(model)
+    return _with_margin(model, b, *enclose(model))
+
+
+def _late_certificate(model: FOSLS, b: Float[Any, ""], delay: Float[Any, ""]) -> Certificate:
+    enclose = full_estimate if model.memory == "full" else short_enclosure
+    return _with_margin(model, b, *enclose(model, delay / model.T))
+
+
+def _with_margin(model, b, low, high, angle) -> Certificate:
     scale = 500 * model.T
     return Certificate(b - scale * high, b - scale * low, model.dc_gain(), angle / model.T)
 
@@ -135,117 +171,37 @@ def _full_enclosure(model: FOSLS) -> tuple[Float[Array, ""], Float[Array, ""], F
 
 def _short_enclosure(model: FOSLS) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
     """Bounds of max φ over all angles, and the angle of the largest φ found."""
-    A, B, least = _polynomials(model)
+    A, B, least_A, *_ = parts_of(model)
     xp = namespace_of(A)
-    cells = 2 ** math.ceil(math.log2(_CELLS_PER_TAP * model.N + _LEAST_CELLS))
+    cells = cells_for(model.N)
     width = math.pi / cells
-    value = _on_grid(_rows(B, 1), cells)[0] / _on_grid(_rows(A, 1), cells)[0]  # φ - K0
+    value = on_grid(rows(B, 1), cells)[0] / on_grid(rows(A, 1), cells)[0]  # φ - K0
     best = xp.argmax(value)
-    peak = _climb(A, B, best.astype(A.dtype) * width, width)
+    peak = climb(partial(_ratio, A, B), model.N, best.astype(A.dtype) * width, width)
     largest = xp.maximum(value[best], _ratio(A, B, peak)[0])
 
-    rounding = _ROUNDING * xp.finfo(A.dtype).eps * (xp.sum(xp.abs(A)) * xp.abs(largest) + xp.sum(xp.abs(B)))
-    p = _rows((largest + 4 * rounding) * A - B, _ORDER + 1)
-    beside = xp.abs(xp.arange(cells + 1) - best) <= 1
-    cell = _lowest(_on_grid(p, cells), xp.asarray(width / 2, A.dtype), p)
-    ring = 2 * width * 0.5 ** xp.arange(_RINGS, dtype=A.dtype)
-    centre = xp.concatenate([0.75 * ring, -0.75 * ring, xp.zeros_like(ring[:1])])
-    radius = xp.concatenate([0.25 * ring, 0.25 * ring, 0.5 * ring[-1:]])
-    near = _lowest(_at_angles(p, peak + centre), radius, p)
-    lowest = xp.minimum(xp.min(xp.where(beside, xp.inf, cell)), xp.min(near)) - rounding
-    high = largest + 4 * rounding + xp.maximum(-lowest, 0) / least
+    rounding = rounding_unit(A) * (xp.sum(xp.abs(A)) * xp.abs(largest) + xp.sum(xp.abs(B)))
+    lowest = least((largest + 4 * rounding) * A - B, cells, best, peak) - rounding
+    high = largest + 4 * rounding + xp.maximum(-lowest, 0) / least_A
     return model.K0 + largest - 4 * rounding, model.K0 + high, peak
-
-
-def _polynomials(model: FOSLS) -> tuple[Float[Any, " n"], Float[Any, " n"], Float[Any, ""]]:
-    """Cosine coefficients of A and B, and the least value of A."""
-    beta = model.beta
-    xp = namespace_of(model.alpha)
-    k = series(model.K1, beta)
-    g, h = xp.where(k > 0, share(model.K1, beta), 1), xp.where(k > 0, share(beta, model.K1), 0)
-    one = xp.ones(1, k.dtype)
-    i = xp.arange(1, model.N + 1, dtype=k.dtype)
-    partial = xp.concatenate([one, xp.cumprod(1 - model.alpha / i)])  # S_0 ... S_N
-    c = xp.concatenate([one, -(model.alpha / i) * partial[:-1]])
-    last = partial[-1]
-    square = xp.correlate(c, c, mode="full")[model.N :]
-    square = xp.concatenate([square[:1], 2 * square[1:]])
-    # Re C = Σ c_j cos jθ
-    A = h**2 * square + 2 * g * h * c + xp.concatenate([g[None] ** 2, xp.zeros(model.N, k.dtype)])
-    V = xp.concatenate([last[None], 2 * (last - partial[:-1])])
-    return A, k * (g * V + h * square), (g + h * last) ** 2
-
-
-def _rows(p: Float[Any, " n"], count: int) -> Float[Any, "{count} n"]:
-    """p_j·(j/N)^m/m! for m < `count`: with cos, -sin, -cos, sin of jθ in turn, Taylor terms of p in units of 1/N."""
-    xp = namespace_of(p)
-    j = xp.arange(p.shape[0], dtype=p.dtype) / (p.shape[0] - 1)
-    rows = [p]
-    for m in range(1, count):
-        rows.append(rows[-1] * j / m)
-    return xp.stack(rows)
-
-
-def _on_grid(rows: Float[Any, "m n"], cells: int) -> Float[Any, "m {cells+1}"]:
-    """Taylor terms at the angles πi/cells, i = 0 … cells, as (m, i)."""
-    xp = namespace_of(rows)
-    turn = xp.asarray([1j**m for m in range(len(rows))], np.result_type(rows.dtype, np.complex64))
-    half = xp.concatenate([2 * rows[:, :1], rows[:, 1:]], axis=1).astype(turn.dtype) * turn[:, None]
-    return cells * xp.fft.irfft(half, 2 * cells, axis=1)[:, : cells + 1]
-
-
-def _at_angles(rows: Float[Any, "m n"], angles: Float[Any, " i"]) -> Float[Any, "m i"]:
-    """Taylor terms at any angles, as (m, i)."""
-    xp = namespace_of(rows, angles)
-    turned = xp.arange(rows.shape[1], dtype=angles.dtype)[:, None] * angles[None, :]
-    cos, sin = rows @ xp.cos(turned), rows @ xp.sin(turned)
-    return xp.stack([(cos[m], -sin[m], -cos[m], sin[m])[m % 4] for m in range(len(rows))])
-
-
-def _lowest(taylor: Float[Any, "m i"], radius: Float[Any, "..."], rows: Float[Any, "m n"]) -> Float[Any, " i"]:
-    """Least value that p can take within `radius` of each angle; the last of the `rows` bounds the remainder."""
-    xp = namespace_of(taylor, rows)
-    order, scaled = len(rows) - 1, radius * (rows.shape[1] - 1)
-    term = [taylor[m] * scaled**m for m in range(order)]
-    remainder = xp.sum(xp.abs(rows[order])) * scaled**order
-    # Half the second derivative is never less than this, in units of the radius.
-    bend = term[2] - sum(math.comb(m, 2) * xp.abs(term[m]) for m in range(3, order)) - math.comb(order, 2) * remainder
-    slope = xp.abs(term[1])
-    inside = 2 * bend > slope
-    return term[0] - xp.where(inside, slope**2 / (4 * xp.where(inside, bend, 1)), slope - bend)
 
 
 def _ratio(
     A: Float[Any, " n"], B: Float[Any, " n"], angle: Float[Any, ""]
 ) -> tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]:
     """B/A, with the slope and bend of (B/A)·A - B for the number B/A, per 1/N."""
-    a, b = (_at_angles(_rows(p, 3), angle[None])[:, 0] for p in (A, B))
+    a, b = (at_angles(rows(p, 3), angle[None])[:, 0] for p in (A, B))
     value = b[0] / a[0]
     return value, value * a[1] - b[1], 2 * (value * a[2] - b[2])
 
 
-def _climb(A: Float[Any, " n"], B: Float[Any, " n"], start: Float[Any, ""], width: float) -> Float[Any, ""]:
-    """The angle of the largest B/A within a cell's width of `start`: Newton, kept inside."""
-    N = A.shape[0] - 1
-    xp = namespace_of(A)
-    low, high = xp.maximum(start - width, 0), xp.minimum(start + width, xp.pi)
-
-    def step(angle, _):
-        _, slope, bend = _ratio(A, B, angle)
-        curved = bend > 0
-        return xp.where(curved, xp.clip(angle - slope / xp.where(curved, bend, 1) / N, low, high), angle)
-
-    angle = scan(step, start, xp.arange(8))
-    return xp.where(_ratio(A, B, angle)[0] > _ratio(A, B, start)[0], angle, start)
-
-
-def witness(model: FOSLS, b: float) -> Witness | None:
+def witness(model: FOSLS, b: float, *, delay: float = 0.0) -> Witness | None:
     """A motion that creates energy with a rendering that `certify` calls violated for lack of damping; None for others.
 
     x has amplitude 1 mm. For full memory too. A set that is violated by H(1) < 0 alone needs no cycle: drawn slowly
     from x = 0 to x it gives back ½·|H(1)|·x².
     """
-    certificate = certify(model, b)
+    certificate = certify(model, b, delay=delay)
     if not bool(certificate.upper <= 0):
         return None
     angle = float(certificate.frequency) * model.T
@@ -260,8 +216,22 @@ def witness(model: FOSLS, b: float) -> Witness | None:
     scale = np.exp(-1j * np.angle(x[0])) / np.abs(x[0])
     x, force = (x * scale).real, (force * scale).real
     x = np.append(x, x[0])
+    frequency = 2 * math.pi * float(turns) / model.T
+    if delay:
+        return _late_witness(model, b, delay, force, x, frequency, b - float(certificate.upper))
     lost = b / 1000 / model.T * np.sum(np.diff(x) ** 2)
-    return Witness(force, x, 2 * math.pi * float(turns) / model.T, lost, lost + np.sum(force * np.diff(x)))
+    return Witness(force, x, x[:-1], frequency, lost, lost + np.sum(force * np.diff(x)), delay)
+
+
+def _late_witness(model, b, delay, force, x, frequency, needed) -> Witness:
+    """The cycle whose bends lose least in the damping that the set needs: with less it creates energy all the more."""
+    before = np.roll(force, 1)
+    mean, change = np.diff(x) / model.T, (force - before) / (2 * needed / 1000)  # mm/s
+    rest = model.T - delay
+    first, second = mean + rest / model.T * change, mean - delay / model.T * change
+    lost = b / 1000 * np.sum(delay * first**2 + rest * second**2)
+    energy = lost + np.sum(before * delay * first + force * rest * second)
+    return Witness(force, x, x[:-1] + delay * first, frequency, lost, energy, delay)
 
 
 def _fractional(model: FOSLS, y: Complex[np.ndarray, " n"]) -> Complex[np.ndarray, " n"]:

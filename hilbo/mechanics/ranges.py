@@ -23,6 +23,7 @@ RANGES = {
     "K1": _FROM_0,
     "B1": _FINITE,
     "b": _FROM_0,
+    "delay": _FINITE,
 }
 """Name -> whether values are allowed, elementwise; and what they must be, in words."""
 

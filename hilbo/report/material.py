@@ -130,15 +130,15 @@ def _model(result):
     return FOSLS(*place, N=int(model.N), T=model.T)
 
 
-def _set_figures(model, b):
+def _set_figures(model, b, delay=0.0):
     """Figures of one parameter set on a device."""
     from hilbo.report.figures import mechanics as plotting
 
     figures = {"bode": plotting.bode_figure(model)}
     if b is not None:
-        figures["passivity"] = plotting.passivity_figure(model, b)
+        figures["passivity"] = plotting.passivity_figure(model, b, delay)
         if model.memory == "full" or model.N % 2:
-            figures["passive-set"] = plotting.passive_set_figure(model, b, float(model.dc_gain()))
+            figures["passive-set"] = plotting.passive_set_figure(model, b, float(model.dc_gain()), delay)
     return figures
 
 
@@ -181,6 +181,6 @@ def write_passivity(model: FOSLS, content: dict[str, Any], folder: Path) -> None
         content=content | {"versions": versions()},
         warnings=[],
         verdict=passivity_words(content),
-        figures=save_figures(_set_figures(model, content["damping"]), folder),
+        figures=save_figures(_set_figures(model, content["damping"], content["delay"]), folder),
     )
     (folder / "report.html").write_text(page, encoding="utf-8")

@@ -9,12 +9,12 @@ from hilbo.viscoelastic import FOSLS
 __all__ = ["passivity_result", "passivity_words"]
 
 
-def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
-    """Status and margin by certificate, binding frequency, largest K1, a witness."""
-    certificate = passivity.certify(model, b)
+def passivity_result(model: FOSLS, b: float, delay: float = 0.0) -> dict[str, Any]:
+    """Status and margin by certificate, binding frequency, largest K1, a witness; `delay` of the force in s."""
+    certificate = passivity.certify(model, b, delay=delay)
     status, K_eff, largest = certificate.status, float(certificate.static_stiffness), None
     if model.memory == "full" or model.N % 2 == 1:
-        largest = passivity.largest_K1_beside(model, b)
+        largest = passivity.largest_K1_beside(model, b, delay=delay)
     content: dict[str, Any] = {
         "status": status,
         "margin": [float(certificate.lower), float(certificate.upper)],
@@ -28,8 +28,9 @@ def passivity_result(model: FOSLS, b: float) -> dict[str, Any]:
         "memory": model.memory,
         "N": model.N if model.memory == "short" else None,
         "T": model.T,
+        "delay": delay,
     }
-    if status == "violated" and (cycle := passivity.witness(model, b)) is not None:
+    if status == "violated" and (cycle := passivity.witness(model, b, delay=delay)) is not None:
         content["witness"] = {"frequency": cycle.frequency / (2 * math.pi), "energy_per_cycle": cycle.energy}
     return content
 
@@ -40,9 +41,11 @@ def passivity_words(content: dict[str, Any]) -> str:
     if K_eff < 0:
         return f"violated: the static stiffness H(1) = {K_eff:.4g} N/mm is negative, which no damping makes good."
     margin = content["margin"][0] if content["margin"][0] > 0 else content["margin"][1]
+    late = f" at a delay of {1e6 * content['delay']:g} µs" if content["delay"] else ""
     words = (
-        f"{content['status']}: the device has {b:g} N·s/m, {abs(margin):.4g} {'more' if margin > 0 else 'less'} than"
-        f" the {content['minimum_damping']:.5g} N·s/m that the set needs; {content['binding_frequency']:.4g} Hz binds."
+        f"{content['status']}{late}: the device has {b:g} N·s/m, {abs(margin):.4g} {'more' if margin > 0 else 'less'}"
+        f" than the {content['minimum_damping']:.5g} N·s/m that the set needs;"
+        f" {content['binding_frequency']:.4g} Hz binds."
     )
     largest, cycle = content["largest_K1"], content.get("witness")
     if largest is not None:

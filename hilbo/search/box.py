@@ -187,7 +187,8 @@ class Mechanics:
 
     `K_eff`: effective stiffness H(1), N/mm. `damping`: physical damping b of the device, N·s/m. `effective_damping`:
     optional range of dH/ds at s = 0, N·s/m. `N`: taps (odd) of short memory; `states`: exponentials of full memory,
-    for which alone the effective damping depends on them, and not on K1; `T`: s.
+    for which alone the effective damping depends on them, and not on K1; `T`: s. `delay`: from the sample of the
+    position to its force, s, 0 to T.
     """
 
     K_eff: float
@@ -197,12 +198,15 @@ class Mechanics:
     memory: Memory = "short"
     states: int = 10
     effective_damping: tuple[float, float] | None = None
+    delay: float = 0.0
 
     def __post_init__(self):
         for key, least in (("damping", 0.0), ("T", 0.0), ("K_eff", -math.ulp(0.0))):
             value = getattr(self, key)
             if not least < value < math.inf:
                 raise InputError(f"renderer.{key} is {value}; it must be {'0 or' if least else 'a number'} above 0.")
+        if not 0 <= self.delay <= self.T:
+            raise InputError(f"renderer.delay is {self.delay} s; it must be from 0 to T = {self.T} s.")
         if self.memory not in ("short", "full"):
             raise InputError(f'renderer.memory is "{self.memory}"; it must be short or full.')
         if self.memory == "full" and self.states not in STATES:

@@ -157,7 +157,8 @@ def check_volume(columns: Columns) -> None:
             f"{mechanics.damping} N.s/m and between {mechanics.effective_damping[0]} and "
             f"{mechanics.effective_damping[1]} N.s/m; widen it."
         )
+    late, lower = (f" at a delay of {mechanics.delay} s", "delay, ") if mechanics.delay else ("", "")
     raise InputError(
         f"renderer.damping is {mechanics.damping} N.s/m, with which no K1 from {K1.low} N/mm up is passive for any B1 "
-        "and alpha; check its unit, or lower K_eff or parameters.K1.low."
+        f"and alpha{late}; check its unit, or lower {lower}K_eff or parameters.K1.low."
     )

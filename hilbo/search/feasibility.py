@@ -1,13 +1,15 @@
 """What may be rendered: the renderer's mechanics and the device's damping, and which K1 they leave for B1 and α.
 
-A parameter set is passive for K1 up to `passivity.largest_K1`. With a range of effective damping B_eff there is a
-lowest K1 too: B_eff = 1000·T·β·M1·(K1/(K1 + β·S))² rises with K1 from 0 to 1000·T·β·M1, so that the range is an
-interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are K1 = β·S·r/(1 - r), infinite for r >= 1.
+A parameter set is passive for K1 up to `passivity.largest_K1`, of a prompt force and of one at the delay. With a range of
+effective damping B_eff there is a lowest K1 too: B_eff = 1000·T·β·M1·(K1/(K1 + β·S))² rises with K1 from 0 to
+1000·T·β·M1, so that the range is an interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are K1 = β·S·r/(1 - r),
+infinite for r >= 1.
 
 The search keeps `SEARCH_MARGIN` away from the device's damping, so that a device that checks passivity again in
 float32 never refuses a proposal.
 """
 
+import dataclasses
 import functools
 import math
 from collections.abc import Mapping
@@ -18,6 +20,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Real
 
 from hilbo import passivity, viscoelastic
+from hilbo.mechanics.delay import least_damping
 from hilbo.mechanics.fosls import pot_stiffness
 from hilbo.mechanics.memory import sums
 from hilbo.mechanics.span import Span, span
@@ -34,6 +37,7 @@ __all__ = [
     "largest_K1",
     "minimum_damping",
     "passive",
+    "passive_on_device",
 ]
 
 SEARCH_MARGIN = 1e-3
@@ -57,8 +61,16 @@ def allowed(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
 
 
 def passive(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
-    """Whether parameter sets are passive with the search margin."""
-    return minimum_damping(m, physical) <= m.damping * (1 - SEARCH_MARGIN) * (1 + _slack(physical))
+    """Whether parameter sets are passive with the search margin; with a delay, in a column that begins at K1 = 0."""
+    b = m.damping * (1 - SEARCH_MARGIN)
+    enough = minimum_damping(m, physical) <= b * (1 + _slack(physical))
+    return enough if m.delay == 0 else enough & (least_damping(m.K_eff, m.T, m.delay) <= b)
+
+
+def passive_on_device(m: Mechanics, physical: _Physical, damping: float, delay: float) -> Bool[Array, "..."]:
+    """Whether parameter sets of a study are passive on a device that reports this damping (N·s/m) and delay (s),
+    whatever the study counts on. Raises `InputError` for a delay that is not from 0 to T."""
+    return minimum_damping(dataclasses.replace(m, delay=delay), physical) <= jnp.asarray(damping)
 
 
 def _slack(physical: _Physical) -> float:
@@ -66,8 +78,13 @@ def _slack(physical: _Physical) -> float:
 
 
 def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
-    """The least damping (N·s/m) of a device on which parameter sets are passive."""
-    return passivity.minimum_damping(*_model_parameters(physical), m.K_eff, m.N, m.T, memory=m.memory)
+    """The least damping (N·s/m) of a device on which parameter sets are passive, for a force without delay and for one at
+    the delay: the need first falls with the delay and then rises, so that the larger of both holds in between."""
+    place = *_model_parameters(physical), m.K_eff, m.N, m.T
+    prompt = passivity.minimum_damping(*place, memory=m.memory)
+    if m.delay == 0:
+        return prompt
+    return jnp.maximum(prompt, passivity.minimum_damping(*place, memory=m.memory, delay=m.delay))
 
 
 def K0_of(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
@@ -77,9 +94,12 @@ def K0_of(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
 
 
 def largest_K1(m: Mechanics, B1: _Batch, alpha: _Batch) -> _Batch:
-    """The largest K1 (N/mm) that is passive with the search margin."""
-    b = m.damping * (1 - SEARCH_MARGIN)
-    return passivity.largest_K1(B1, alpha, b, m.K_eff, m.N, m.T, memory=m.memory)
+    """The largest K1 (N/mm) that is passive with the search margin, without delay and at the delay."""
+    place = B1, alpha, m.damping * (1 - SEARCH_MARGIN), m.K_eff, m.N, m.T
+    prompt = passivity.largest_K1(*place, memory=m.memory)
+    if m.delay == 0:
+        return prompt
+    return jnp.minimum(prompt, passivity.largest_K1(*place, memory=m.memory, delay=m.delay))
 
 
 def K1_range(m: Mechanics, B1: _Batch, alpha: _Batch) -> tuple[_Batch, _Batch]:

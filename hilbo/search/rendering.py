@@ -7,7 +7,7 @@ from jax.typing import ArrayLike
 
 from hilbo.search.space import SearchSpace
 
-__all__ = ["K0_range", "margin_of", "set_of"]
+__all__ = ["K0_range", "delay_words", "margin_of", "set_of"]
 
 
 def set_of(space: SearchSpace, x: ArrayLike) -> dict[str, Any]:
@@ -23,6 +23,15 @@ def margin_of(space: SearchSpace, x: ArrayLike) -> float | None:
     values = set_of(space, x)
     margin = space.passivity_margin({name: values[name] for name in space.names})
     return None if margin is None else float(margin)
+
+
+def delay_words(space: SearchSpace) -> str:
+    """What the delay of the device's force does to the passive part of the box; empty without a delay."""
+    if space.mechanics is None or not space.mechanics.delay:
+        return ""
+    late, prompt = (100 * each.volume() for each in (space, space.without_delay()))
+    delay = f"{1e6 * space.mechanics.delay:g} µs"
+    return f"{late:.1f} % of the box is passive at a delay of {delay}, {prompt:.1f} % without"
 
 
 def K0_range(space: SearchSpace) -> float:

@@ -15,6 +15,7 @@ Points that fill the feasible set evenly come from uniform numbers: by the width
 refusing or by hit and run between the walls of constraints.
 """
 
+import dataclasses
 import functools
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -224,6 +225,12 @@ class SearchSpace(eqx.Module):
     def volume(self) -> float:
         """Share of the unit cube that is passive: the mean width of its columns, on a grid; 1 without mechanics."""
         return 1.0 if self.mechanics is None else volume(self._passive)
+
+    def without_delay(self) -> "SearchSpace":
+        """The same space as if every force came at once; itself where it does."""
+        if self.mechanics is None or not self.mechanics.delay:
+            return self
+        return dataclasses.replace(self, mechanics=dataclasses.replace(self.mechanics, delay=0.0))
 
     def candidates(self, m: int, seed: int) -> Float[np.ndarray, "m d"]:
         """`m` points of the unit cube, uniform over the feasible set with low discrepancy (scrambled Sobol').

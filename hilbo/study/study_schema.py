@@ -18,6 +18,7 @@ from hilbo.study.trial_flags import FLAGS, TrialFlag
 
 __all__ = [
     "LEARN",
+    "NO_DELAY",
     "TABLES",
     "ConstraintTable",
     "GPTable",
@@ -82,6 +83,10 @@ class ConstraintTable(_Table, frozen=True):
     most: _Number | None = None
 
 
+NO_DELAY = 0.0
+"""msgspec leaves a number out of the content where it is this very object."""
+
+
 class RendererTable(_Table, frozen=True):
     K_eff: Annotated[_NotNegative, msgspec.Meta(examples=["0.44"])]
     damping: Annotated[_Positive, msgspec.Meta(examples=["0.95"])]
@@ -91,6 +96,7 @@ class RendererTable(_Table, frozen=True):
     states: Annotated[int, _text("a number of exponentials, for full memory", "10")] = 10
     T: Annotated[_Positive, msgspec.Meta(examples=["0.001"])] = 1e-3
     effective_damping: Annotated[tuple[float, float] | None, _text("a list of two numbers", "[10, 80]")] = None
+    delay: Annotated[_NotNegative, msgspec.Meta(examples=["0.0003"])] = NO_DELAY
 
 
 _Length = Annotated[float, msgspec.Meta(ge=1e-3, le=1e3)]

@@ -12,6 +12,7 @@ from hilbo.study.fields import check_keys, check_present, check_table, missing_k
 from hilbo.study.reserved_names import TRIAL_COLUMNS, is_reserved
 from hilbo.study.study_schema import (
     LEARN,
+    NO_DELAY,
     TABLES,
     ConstraintTable,
     GPTable,
@@ -45,7 +46,10 @@ def read(raw: Mapping[str, Any]) -> Tables:
     if "gp" in tables:
         tables["gp"] = _with_theta(tables["gp"], parameters.values())
     if "renderer" in raw:
-        tables["renderer"] = read_table(RendererTable, raw["renderer"], "renderer")
+        renderer = read_table(RendererTable, raw["renderer"], "renderer")
+        if renderer.delay == 0:  # however it is written, the study is the one without the key
+            renderer = msgspec.structs.replace(renderer, delay=NO_DELAY)
+        tables["renderer"] = renderer
     if "constraints" in raw:
         tables["constraints"] = _constraints(raw["constraints"])
     materials = check_table(raw.get("materials", {}), "materials")

@@ -33,6 +33,23 @@ def test_passivity_of_the_published_sets(capsys, monkeypatch):
     assert "creates" in stdout
 
 
+def test_passivity_at_a_delay(capsys, monkeypatch, tmp_path):
+    set_s = ["passivity", "--K1", 5.7, "--B1", 5.89, "--alpha", 0.203]
+    code, stdout, _ = run(capsys, monkeypatch, *set_s, "--delay", 271e-6, "--json")
+    content = json.loads(stdout)
+    assert (code, content["status"], content["delay"]) == (0, "violated", 271e-6)
+    assert content["minimum_damping"] == pytest.approx(1.11042, abs=1e-5) and content["witness"]["energy_per_cycle"] < 0
+    study = tmp_path / "late.toml"
+    study.write_text(Path(STUDY).read_text().replace("T = 0.001", "delay = 0.000271\nT = 0.001"))
+    _, stdout, _ = run(capsys, monkeypatch, *set_s, "--study", study)
+    assert stdout.startswith("violated at a delay of 271 µs: the device has 0.95 N·s/m, 0.1604 less than the 1.1104")
+    assert len(passivity_figure(FOSLS(-2.89, 5.7, 5.89, 0.203), 0.95, 271e-6).axes) == 2
+    for delay in ("nan", "-0.001", "0.002"):
+        study.write_text(Path(STUDY).read_text().replace("T = 0.001", f"delay = {delay}\nT = 0.001"))
+        code, _, stderr = run(capsys, monkeypatch, *set_s, "--study", study)
+        assert code == 2 and "renderer.delay is" in stderr and stderr.count("\n") == 1
+
+
 def test_a_set_far_from_passive_has_its_figure_too():
     figure = passivity_figure(FOSLS(-9.0, 5.58, 7.88, 0.176), 0.95)
     assert len(figure.axes[1].lines[0].get_xdata()) > 10
@@ -53,6 +70,7 @@ def test_an_even_number_of_taps_has_no_closed_form():
         (["passivity", "--K1", "5", "--B1", "1", "--alpha", "0.5", "--damping", "0"], "--damping is 0"),
         (["passivity", "--K1", "5", "--B1", "1", "--alpha", "0.5", "--K0", "1", "--K-eff", "1"], "leave one out"),
         (["passivity", "--K1", "5", "--B1", "1", "--alpha", "0.5", "--K0", "-9", "--memory", "full"], "0 or above"),
+        (["passivity", "--K1", "5", "--B1", "1", "--alpha", "0.5", "--delay", "nan"], "delay is nan s; it must be"),
         (["identify", "nothing.csv", "--out", "out"], "nothing.csv: cannot be read"),
         (["identify", "t.csv", "--out", "out"], 't.csv:1: column "time" has no unit'),
         (["identify", "t.csv", "--out", "out", "--memory", "long"], '--memory is "long"'),

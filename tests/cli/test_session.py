@@ -2,13 +2,15 @@
 
 import json
 import sys
+from pathlib import Path
 
 import msgspec
 import pytest
 from live import Driver
 
+import hilbo as hilbo_package
 from hilbo import Study
-from hilbo.cli import main
+from hilbo.cli import doctor, main
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.plan import make_plan, planned_header
@@ -368,3 +370,12 @@ def test_a_plan_of_one_material_or_of_all(hilbo, tmp_path):
     given = ("--kind", "aggregate-best", "--from", "foam=a.json", "--from", "soft=b.json")
     code, _, err = hilbo("plan", "study.toml", "--participants", 4, *given)
     assert code == 2 and "once for each material (foam, soft, hard)" in err
+
+
+@pytest.mark.deep
+def test_a_plan_says_what_the_delay_of_the_device_leaves(hilbo, tmp_path):
+    paper = (Path(hilbo_package.__file__).parent / "data" / "paper.toml").read_text()
+    (tmp_path / "study.toml").write_text(paper.replace("T = 0.001", "delay = 0.000271\nT = 0.001"))
+    code, _, err = hilbo("plan", "study.toml", "--participants", 2)
+    assert code == 0 and "18.4 % of the box is passive at a delay of 271 µs, 24.0 % without" in err
+    assert "at a delay of 271 µs" in doctor._feasible(Study.load("study.toml")).words

@@ -119,6 +119,36 @@ def test_a_new_link_ends_the_program_that_had_the_old_one(live):
             live.until(lambda _: False, lambda: old.stimulus.next(0.1))
 
 
+@pytest.mark.deep
+def test_a_device_that_stops_by_itself_voids_the_trial_which_comes_again(tmp_path):
+    stopped, limp = [], []
+    with LiveStimulus(tmp_path, blocks=SINGLE, felt=1.0) as live:
+        stimulus = module("hilbo_stimulus").Stimulus(
+            live.link(), name="haptic", force=True, go_neutral=lambda: limp.append(1)
+        )
+
+        def present():
+            for order in stimulus:
+                if order.do != "present":
+                    stimulus.neutral()
+                elif stimulus.presented() and order.show == "test" and not stopped:
+                    stopped.append(order.number)
+                    stimulus.begin_again("it held")
+                    assert limp
+
+        presenting = threading.Thread(target=present)
+        presenting.start()
+        live.until(lambda v: v["device"]["state"] == "stopped", live.whole)
+        live.begin()
+        live.until(lambda _: any(event.data["condition"] == "lost" for event in live.events("device")), lambda: None)
+        all_answered(live)
+        stimulus.close()
+        presenting.join(PATIENCE)
+        state = live.replayed()
+    assert sum(trial.status == "answered" for trial in state.trials) == 3
+    assert [str(trial.voided) for trial in state.trials if trial.status == "void"]
+
+
 def test_no_order_to_present_is_handed_over_while_somebody_touches(tmp_path):
     with LiveStimulus(tmp_path, blocks=SINGLE) as live:
         client, calls = module("hilbo_stimulus"), []

@@ -105,6 +105,7 @@ def test_silence_of_the_host_is_hold(device):
         device.start()
     device_tests.wait_until(device, lambda: device.status().force_N == 0, "rested")
     device.clear()
+    device.simulator.tell("finger ramp")
     device_tests.wait_until(device, lambda: not device.status().contact, "been let go")
     device.start()
     assert device.state() == State.RUNNING
@@ -123,7 +124,7 @@ def test_a_drive_that_is_out_of_range_is_refused():
     with Renderer.open("sim", options=FAST | {"finger": "none"}) as device:
         with pytest.raises(RefusalError, match="DRIVE asks for 30, beyond the device's limit of 20"):
             device.drive("position", "hold", 30, duration=1)
-        with pytest.raises(RefusalError, match="The drive asks for 200000, beyond the device's limit of 120000"):
+        with pytest.raises(RefusalError, match="DRIVE asks for 200000, beyond the device's limit of 120000"):
             device.drive("force", "hold", 1, duration=200)
         seen = device_tests.drive(device, "position", "hold", 3.0, duration=1.0)
         assert abs(seen.position_mm[-1] - 3) < 0.1

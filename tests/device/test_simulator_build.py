@@ -6,7 +6,7 @@ import sys
 import pytest
 from simulated import ENVIRONMENT, needs_device, own_cache  # noqa: F401
 
-from hilbo.device import simulator
+from hilbo.device import compiled, simulator
 from hilbo.hardware_bridge import DeviceError, Renderer
 
 pytestmark = needs_device
@@ -35,7 +35,7 @@ def test_a_cache_that_cannot_be_written_is_one_sentence(monkeypatch, tmp_path):
 def test_sources_that_do_not_compile_are_one_sentence(monkeypatch, tmp_path):
     (tmp_path / "core").mkdir()
     (tmp_path / "core" / "broken.c").write_text("int main(void) { return nothing; }\n")
-    monkeypatch.setattr(simulator, "_sources", lambda: tmp_path)
+    monkeypatch.setattr(compiled, "_sources", lambda _: tmp_path)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     with pytest.raises(DeviceError, match=r"does not compile with .*: .*broken\.c"):
         simulator.built()

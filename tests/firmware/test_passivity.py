@@ -157,3 +157,39 @@ def test_the_helper_stuffs_as_cobs_is_defined():
     assert cobs(b"\x11\x00\x00\x22") == bytes.fromhex("0211010222")
     assert cobs(b"\0") == b"\1\1"
     assert zlib.crc32(b"123456789") == 0xCBF43926
+
+
+# Delay
+
+
+def needed_at(angle, H, sigma):
+    """Damping/(T/2) at each angle: the largest eigenvalue of the held and late force's operator on all aliases.
+
+    The aliases of the angle are k = -K … K; what they leave out of the sums is below 1/K of them.
+    """
+    K = 1000
+    wave = angle[:, None] + 2 * np.pi * np.arange(-K, K + 1)
+    left, right = np.exp(-1j * sigma * wave) / wave, 1 / wave
+    change = (1 - np.exp(-1j * angle)) * H
+    inner = change * np.sum(left * right, 1)
+    size = np.abs(change) * np.sqrt(np.sum(np.abs(left) ** 2, 1) * np.sum(right**2, 1))
+    return np.real(inner) + np.sqrt(size**2 - np.imag(inner) ** 2)
+
+
+@pytest.mark.parametrize("delay", [100, 376, 1000])
+def test_the_damping_at_a_delay_against_a_truncated_operator(delay):
+    """The device looks at 256 angles and adds its margin: never below the largest of 250 others, nor 1 % above."""
+    rng = np.random.default_rng(delay)
+    angle = np.pi * (np.arange(250) + 1) / 250
+    lib = library(build())
+    for _ in range(6):
+        K1, B1, alpha, N = np.exp(rng.uniform(0, 3)), np.exp(rng.uniform(-3, 3)), rng.uniform(0.05, 0.95), 101
+        c = np.cumprod(np.r_[1, 1 - (1 + alpha) / np.arange(1, N + 1)])
+        beta = B1 * 1e3**alpha
+        K0 = 0.44 - K1 * beta * c.sum() / (K1 + beta * c.sum())
+        C = np.exp(-1j * np.outer(angle, np.arange(N + 1))) @ c
+        H = K0 + K1 * beta * C / (K1 + beta * C)
+        needed = max(0.5 * needed_at(angle, H, delay / 1000).max(), 0.5 * H[-1].real)
+        numbers = (ctypes.c_double * 7)(0, N, 1000, K0, K1, B1, alpha)
+        found = lib.shim_delayed_damping(numbers, None, None, ctypes.c_uint32(delay))
+        assert needed * (1 - 1e-3) <= found <= needed * 1.01

@@ -1,10 +1,25 @@
 """Which K1 a device and a range of effective damping leave: ends that the model itself confirms."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from hilbo.search.box import Mechanics
-from hilbo.search.feasibility import SEARCH_MARGIN, K0_of, K1_range, allowed, largest_K1, minimum_damping
+from hilbo import passivity
+from hilbo.errors import InputError
+from hilbo.mechanics.delay import least_damping
+from hilbo.search.box import Mechanics, Parameter
+from hilbo.search.columns import Columns
+from hilbo.search.feasibility import (
+    SEARCH_MARGIN,
+    K0_of,
+    K1_range,
+    allowed,
+    largest_K1,
+    minimum_damping,
+    passive_on_device,
+)
 from hilbo.viscoelastic import FOSLS
 
 DAMPED = Mechanics(K_eff=0.44, damping=0.95, effective_damping=(10.0, 80.0))
@@ -36,3 +51,43 @@ def test_a_set_outside_the_damping_range_is_refused():
     physical = {"K1": K1, "B1": jnp.full(4, B1[0]), "alpha": jnp.full(4, ALPHA[0])}
     device = Mechanics(K_eff=0.44, damping=5.0, effective_damping=(10.0, 80.0))
     assert allowed(device, physical).tolist() == [False, True, True, False]
+
+
+LATE = Mechanics(K_eff=0.44, damping=0.95, delay=271e-6)
+BOX = (Parameter("K1", 1.0, 32.0, "N/mm"), Parameter("B1", 0.001, 32.0), Parameter("alpha", 0.01, 0.99))
+
+
+def test_columns_end_where_a_late_set_is_passive_with_the_margin():
+    shares = np.random.default_rng(0).random((32, 3))
+    shares[::2, 0] = 1
+    x = Columns(BOX, LATE).from_shares(jnp.asarray(shares))
+    K1, B1, alpha = (p.to_physical(x[:, i]) for i, p in enumerate(BOX))
+    physical = {"K1": K1, "B1": B1, "alpha": alpha}
+    held = np.asarray(largest_K1(LATE, B1, alpha)) >= 1
+    assert held.sum() > 16
+    needed = np.asarray(minimum_damping(LATE, physical))
+    np.testing.assert_array_equal(needed <= 0.95 * (1 - SEARCH_MARGIN), held)
+    np.testing.assert_array_equal(allowed(LATE, physical), held)
+    at_end = held & (shares[:, 0] == 1) & (np.asarray(K1) < 32)
+    np.testing.assert_allclose(needed[at_end], 0.95 * (1 - SEARCH_MARGIN), rtol=2e-5)
+    assert np.any(np.asarray(K1) * 1.01 < np.asarray(largest_K1(dataclasses.replace(LATE, delay=0.0), B1, alpha)))
+
+
+def test_a_device_that_reports_a_delay_is_asked_for_each_set():
+    physical = {"K1": np.array([5.70, 5.58]), "B1": np.array([5.89, 7.88]), "alpha": np.array([0.203, 0.176])}
+    study = Mechanics(K_eff=0.44, damping=0.95)
+    assert passive_on_device(study, physical, 0.95, 0.0).tolist() == [True, True]
+    assert passive_on_device(study, physical, 0.95, 271e-6).tolist() == [False, True]
+    assert passive_on_device(LATE, physical, 1.2, 271e-6).tolist() == [True, True]
+    with pytest.raises(InputError, match="delay"):
+        passive_on_device(study, physical, 0.95, 2e-3)
+
+
+def test_no_set_is_allowed_on_a_device_that_hardly_holds_the_spring():
+    """A few K1 may be passive there, in no interval from 0 on."""
+    physical = {"K1": np.array([0.05]), "B1": np.array([0.0033]), "alpha": np.array([0.379])}
+    least = least_damping(0.44, 1e-3, 1e-3) / (1 - SEARCH_MARGIN)
+    for damping, fine in ((0.99 * least, False), (1.01 * least, True)):
+        late = Mechanics(K_eff=0.44, damping=damping, delay=1e-3)
+        assert passivity.is_passive(*(value[0] for value in physical.values()), damping, delay=1e-3)
+        assert allowed(late, physical).tolist() == [fine]

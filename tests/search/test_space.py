@@ -14,7 +14,8 @@ from scipy.stats import qmc
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
 from hilbo.search.box import Mechanics, Parameter
-from hilbo.search.feasibility import SEARCH_MARGIN
+from hilbo.search.feasibility import SEARCH_MARGIN, passive_on_device
+from hilbo.search.rendering import delay_words
 from hilbo.search.space import SearchSpace
 
 K1 = Parameter("K1", 1.0, 32.0, "N/mm")
@@ -161,6 +162,30 @@ def test_drawn_points_are_feasible_and_repeat(draw, damping, order):
     np.testing.assert_array_equal(getattr(space, draw)(count, seed=1), x)
     assert not np.array_equal(getattr(space, draw)(count, seed=2), x)
     assert getattr(space, draw)(0, seed=1).shape == (0, space.dim)
+
+
+@pytest.mark.deep
+@pytest.mark.parametrize("delay", [105e-6, 376e-6])
+def test_no_point_is_drawn_that_is_not_passive_at_the_delay(delay):
+    space = fosls(delay=delay)
+    prompt = space.without_delay()
+    assert prompt == fosls() and prompt.without_delay() is prompt
+    assert 0.1 < space.volume() < fosls().volume() and delay_words(space).startswith(f"{100 * space.volume():.1f} %")
+    for x in (space.candidates(4096, 0), space.walls(1024, 0), space.latin_hypercube(64, 0)):
+        K1, B1, alpha = np.asarray(compiled(space).to_physical(x)).T
+        needed = np.asarray(passivity.minimum_damping(K1, B1, alpha, delay=delay))
+        assert np.all(needed <= 0.95 * (1 - SEARCH_MARGIN)) and np.all(compiled(space).feasible(x))
+    points = dict(
+        zip(space.names, np.asarray(compiled(fosls()).to_physical(fosls().candidates(4096, 0))).T, strict=True)
+    )
+    passive = np.asarray(passive_on_device(fosls().mechanics, points, 0.95, delay))
+    assert 0.6 < passive.mean() < 0.99
+
+
+@pytest.mark.deep
+def test_a_delay_that_leaves_nothing_is_refused_in_one_sentence():
+    with pytest.raises(InputError, match=r"at a delay of 0.001 s; check its unit, or lower delay, K_eff"):
+        fosls(0.6, delay=1e-3)
 
 
 @pytest.mark.parametrize("draw", ["candidates", "latin_hypercube"])

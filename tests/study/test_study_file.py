@@ -47,6 +47,10 @@ def test_a_file_says_what_the_study_says(path):
         ("noise = 0.5\n", ""),
         ("trials = 25", "trials = 2"),
         ("N = 101", "N = 100"),
+        ("N = 101", "delay = nan"),
+        ("N = 101", "delay = -1e-6"),
+        ("N = 101", "delay = 0.00101"),
+        ("N = 101", "delay = true"),
         ("K_eff = 0.2", "K_eff = -0.2"),
         ("high = 16.0", "high = 0.5"),
         ('rule = "bcm"', 'rule = "median"'),
@@ -63,6 +67,19 @@ def test_both_refuse_the_same_in_the_same_words(path, was, wrong):
             kind.load(path)
         sentences.append(str(error.value))
     assert sentences[0] == sentences[1] and sentences[0].startswith(f"{path}:")
+
+
+def test_a_delay_of_0_is_no_part_of_a_studys_hash(path):
+    paper = StudyFile.load(DATA / "paper.toml")
+    assert paper.hash == "76f3e6c56626cc37" and "delay" not in paper.content
+    text = path.read_text()
+    hashes = []
+    for delay in ("", "delay = 0", "delay = 0.0", "delay = 0.000271"):
+        path.write_text(text.replace("N = 101", f"N = 101\n{delay}"))
+        file = StudyFile.load(path)
+        hashes.append(file.hash)
+    assert len(set(hashes[:3])) == 1 and hashes[3] != hashes[0]
+    assert file.space.mechanics.delay == file.material("gel").space.mechanics.delay == 0.000271
 
 
 def test_what_has_to_be_computed_is_the_studys_to_refuse(path):

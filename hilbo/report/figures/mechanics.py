@@ -117,17 +117,22 @@ def memory_figure(rows: Sequence[Row], limit: float = LIMIT) -> Figure:
     return figure
 
 
-def _needed(model, count=600):
+def _needed(model, delay, count=600):
     """Frequencies (Hz), the damping they ask for (N·s/m), and the curve whose real part that is."""
     omega = np.geomspace(2 * np.pi * 0.5, np.pi / model.T, count)
     response = np.asarray(model.frequency_response(jnp.asarray(omega)))
     cotangent = np.tan((np.pi - omega * model.T) / 2)
-    return omega / (2 * np.pi), 500 * model.T * (1 + 1j * cotangent) * response
+    curve = 500 * model.T * (1 + 1j * cotangent) * response
+    if delay:
+        curve = np.asarray(passivity.needed_damping(model, omega, delay=delay)) + 1j * curve.imag
+    return omega / (2 * np.pi), curve
 
 
-def passivity_figure(model: FOSLS, b: float) -> Figure:
-    """Left: Nyquist-type plot of (T/2)(1 + j cot(ωT/2))·H, which must stay left of b. Right: its real part over f."""
-    frequency, curve = _needed(model)
+def passivity_figure(model: FOSLS, b: float, delay: float = 0.0) -> Figure:
+    """Left: Nyquist-type plot of (T/2)(1 + j cot(ωT/2))·H, which must stay left of b. Right: its real part over f.
+
+    With a `delay` (s) the real part is the damping that is needed then."""
+    frequency, curve = _needed(model, delay)
     worst = int(np.argmax(curve.real))
     margin, most = b - curve.real[worst], max(b, curve.real[worst])
     colour, word = (GREEN, "margin") if margin >= 0 else (RED, "lacking")
@@ -158,10 +163,11 @@ def passivity_figure(model: FOSLS, b: float) -> Figure:
     return figure
 
 
-def passive_set_figure(model: FOSLS, b: float, K_eff: float) -> Figure:
-    """Largest passive K1 over (B1, α) of the paper's box, and slices of the passive set through it; odd N or full."""
+def passive_set_figure(model: FOSLS, b: float, K_eff: float, delay: float = 0.0) -> Figure:
+    """Largest passive K1 over (B1, α) of the paper's box, and slices of the passive set through it; odd N or full.
+    `delay` of the force in s."""
     B1, alpha = np.geomspace(0.1, 32, 121), np.linspace(0.01, 0.99, 121)
-    limit = np.asarray(_largest(model, B1[None, :], alpha[:, None], b, K_eff))
+    limit = np.asarray(_largest(model, B1[None, :], alpha[:, None], b, K_eff, delay))
     this_set = float(model.B1), float(model.alpha), float(model.K1)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(TWO_COLUMNS, 3.0), layout="constrained")
@@ -177,7 +183,7 @@ def passive_set_figure(model: FOSLS, b: float, K_eff: float) -> Figure:
         for order, (colour, dash) in zip(
             (0.1, this_set[1], 0.35, 0.6), ((ORANGE, "--"), (BLUE, "-"), (GREEN, "-."), (GREY, ":")), strict=True
         ):
-            line = np.asarray(_largest(model, B1, np.full_like(B1, order), b, K_eff))
+            line = np.asarray(_largest(model, B1, np.full_like(B1, order), b, K_eff, delay))
             width = 2.0 if order == this_set[1] else 1.2
             right.plot(
                 B1, np.minimum(line, 64), color=colour, linestyle=dash, linewidth=width, label=f"α = {order:.3g}"
@@ -191,8 +197,8 @@ def passive_set_figure(model: FOSLS, b: float, K_eff: float) -> Figure:
     return figure
 
 
-def _largest(model, B1, alpha, b, K_eff):
-    return passivity.largest_K1(B1, alpha, b, K_eff, model.N, model.T, memory=model.memory)
+def _largest(model, B1, alpha, b, K_eff, delay):
+    return passivity.largest_K1(B1, alpha, b, K_eff, model.N, model.T, memory=model.memory, delay=delay)
 
 
 def bode_figure(model: FOSLS) -> Figure:

@@ -1,0 +1,107 @@
+"""Cosine polynomials p(θ) = Σ p_j cos jθ: values and Taylor terms at many angles, and how low one can be near them.
+
+Around each angle Taylor's formula, with a remainder from the size of the coefficients, bounds p'' from below on a cell,
+and so p by a parabola. Towards the place where p is least the cells shrink in proportion to their distance from it, so
+that the bound is sharp to rounding. NumPy's numbers are computed by NumPy.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from hilbo.numerics.host import namespace_of, scan
+
+__all__ = ["at_angles", "cells_for", "climb", "least", "lowest", "on_grid", "rounding_unit", "rows"]
+
+_ORDER = 8  # of Taylor's formula
+_CELLS_PER_TAP = 8
+_LEAST_CELLS = 48
+_RINGS = 28
+_ROUNDING = 16  # units in the last place of Σ |p_j|
+
+
+def cells_for(degree: int) -> int:
+    """How many cells from 0 to π a polynomial of this degree is bounded on."""
+    return 2 ** math.ceil(math.log2(_CELLS_PER_TAP * degree + _LEAST_CELLS))
+
+
+def rounding_unit(p: Float[Any, " n"]) -> float:
+    """Rounding of a value, as a share of Σ |p_j|."""
+    return _ROUNDING * namespace_of(p).finfo(p.dtype).eps
+
+
+def least(p: Float[Any, " n"], cells: int, best: Any, peak: Float[Any, ""]) -> Float[Any, ""]:
+    """A lower bound of p, before rounding; sharp where p is least near the angle `peak`, a cell at most from the node
+    of number `best`."""
+    xp = namespace_of(p)
+    width = math.pi / cells
+    terms = rows(p, _ORDER + 1)
+    beside = xp.abs(xp.arange(cells + 1) - best) <= 1
+    cell = lowest(on_grid(terms, cells), xp.asarray(width / 2, p.dtype), terms)
+    ring = 2 * width * 0.5 ** xp.arange(_RINGS, dtype=p.dtype)
+    centre = xp.concatenate([0.75 * ring, -0.75 * ring, xp.zeros_like(ring[:1])])
+    radius = xp.concatenate([0.25 * ring, 0.25 * ring, 0.5 * ring[-1:]])
+    near = lowest(at_angles(terms, peak + centre), radius, terms)
+    return xp.minimum(xp.min(xp.where(beside, xp.inf, cell)), xp.min(near))
+
+
+def climb(
+    expand: Callable[[Float[Any, ""]], tuple[Float[Any, ""], Float[Any, ""], Float[Any, ""]]],
+    degree: int,
+    start: Float[Any, ""],
+    width: float,
+) -> Float[Any, ""]:
+    """The angle of the largest value within a cell's `width` of `start`: Newton, kept inside. `expand`: an angle -> its
+    value, and slope and bend per 1/degree of a polynomial that is least where the value is largest."""
+    xp = namespace_of(start)
+    low, high = xp.maximum(start - width, 0), xp.minimum(start + width, xp.pi)
+
+    def step(angle, _):
+        _, slope, bend = expand(angle)
+        curved = bend > 0
+        return xp.where(curved, xp.clip(angle - slope / xp.where(curved, bend, 1) / degree, low, high), angle)
+
+    angle = scan(step, start, xp.arange(8))
+    return xp.where(expand(angle)[0] > expand(start)[0], angle, start)
+
+
+def rows(p: Float[Any, " n"], count: int) -> Float[Any, "{count} n"]:
+    """p_j·(j/N)^m/m! for m < `count`: with cos, -sin, -cos, sin of jθ in turn, Taylor terms of p in units of 1/N."""
+    xp = namespace_of(p)
+    j = xp.arange(p.shape[0], dtype=p.dtype) / (p.shape[0] - 1)
+    rows = [p]
+    for m in range(1, count):
+        rows.append(rows[-1] * j / m)
+    return xp.stack(rows)
+
+
+def on_grid(rows: Float[Any, "m n"], cells: int) -> Float[Any, "m {cells+1}"]:
+    """Taylor terms at the angles πi/cells, i = 0 … cells, as (m, i)."""
+    xp = namespace_of(rows)
+    turn = xp.asarray([1j**m for m in range(len(rows))], np.result_type(rows.dtype, np.complex64))
+    half = xp.concatenate([2 * rows[:, :1], rows[:, 1:]], axis=1).astype(turn.dtype) * turn[:, None]
+    return cells * xp.fft.irfft(half, 2 * cells, axis=1)[:, : cells + 1]
+
+
+def at_angles(rows: Float[Any, "m n"], angles: Float[Any, " i"]) -> Float[Any, "m i"]:
+    """Taylor terms at any angles, as (m, i)."""
+    xp = namespace_of(rows, angles)
+    turned = xp.arange(rows.shape[1], dtype=angles.dtype)[:, None] * angles[None, :]
+    cos, sin = rows @ xp.cos(turned), rows @ xp.sin(turned)
+    return xp.stack([(cos[m], -sin[m], -cos[m], sin[m])[m % 4] for m in range(len(rows))])
+
+
+def lowest(taylor: Float[Any, "m i"], radius: Float[Any, "..."], rows: Float[Any, "m n"]) -> Float[Any, " i"]:
+    """Least value that p can take within `radius` of each angle; the last of the `rows` bounds the remainder."""
+    xp = namespace_of(taylor, rows)
+    order, scaled = len(rows) - 1, radius * (rows.shape[1] - 1)
+    term = [taylor[m] * scaled**m for m in range(order)]
+    remainder = xp.sum(xp.abs(rows[order])) * scaled**order
+    # Half the second derivative is never less than this, in units of the radius.
+    bend = term[2] - sum(math.comb(m, 2) * xp.abs(term[m]) for m in range(3, order)) - math.comb(order, 2) * remainder
+    slope = xp.abs(term[1])
+    inside = 2 * bend > slope
+    return term[0] - xp.where(inside, slope**2 / (4 * xp.where(inside, bend, 1)), slope - bend)

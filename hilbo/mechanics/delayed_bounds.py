@@ -1,0 +1,240 @@
+"""The damping that a late rendering needs, and the largest K1 of a device: the largest Y of `delay` over all
+frequencies, and the K1 at which it is that of the device.
+
+The largest Y lies at the Nyquist frequency for very short delays only, and no form of it is closed: it is sought on a
+grid of frequencies, and then between its nodes by a parabola. `certify` proves it for one set at a time, `ESTIMATED` is
+the difference.
+
+The largest K1 is found by exchange, from above: the frequency that needs most, then the K1 with which it needs what the
+device has, and so on. A share `SAFE` of the damping is kept in reserve.
+
+Units: K N/mm, B1 N·s^α/mm, T and delay s, damping N·s/m.
+"""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Complex, Float
+
+from hilbo.mechanics.delay import clear_of_spring, larger_root
+from hilbo.mechanics.fosls import pot_stiffness, share
+from hilbo.mechanics.memory import GLSums, gl_coefficients, response, sums
+from hilbo.mechanics.span import Span
+
+__all__ = ["ESTIMATED", "SAFE", "delayed_damping", "delayed_largest_K1", "largest_need"]
+
+SAFE = 1e-5
+"""`delayed_largest_K1` keeps this share of b in reserve: more than the error of the largest Y between nodes."""
+ESTIMATED = 1e-6
+"""Relative error of the largest Y that is found: 1e-9 with full memory, 1e-6 with short memory of 101 taps."""
+
+_NODES_PER_TAP = 4
+_LEAST_NODES = 256
+_NODES_OF_FULL_MEMORY = 512
+_FINER = 16  # of a node's distance, for the parabola at the peak
+_ROUNDS = 20  # of the exchange at most; 4 to 6 are enough
+_HALVINGS = 40  # of the interval of K1/(K1 + β)
+
+
+class _Order(NamedTuple):
+    """An order α with its memory, and the sums of its coefficients."""
+
+    alpha: Float[Array, ""]
+    sums: GLSums
+    span: Span
+
+
+class _Nodes(NamedTuple):
+    """Frequencies, with what depends on α alone there. Real and imaginary parts apart: so they are vectorised."""
+
+    cos: Float[Array, " n"]
+    sin: Float[Array, " n"]
+    real: Float[Array, " n"]  # of C
+    imag: Float[Array, " n"]
+    lead: Float[Array, " n"]  # cot(θ/2)·Im C, which is 2·M1 at θ = 0
+
+
+class _Material(NamedTuple):
+    """A rendering but for C: K0 + series(K1, βC) = K_eff + β·slow·g·(C - S)/(g + h·C), g = K1/(K1 + β) = 1 - h."""
+
+    K_eff: Float[Array, ""]
+    beta: Float[Array, ""]
+    S: Float[Array, ""]
+    g: Float[Array, ""]
+    h: Float[Array, ""]
+    slow: Float[Array, ""]  # K1/(K1 + β·S)
+
+
+def delayed_damping(
+    span: Span,
+    K1: Float[Array, ""],
+    B1: Float[Array, ""],
+    alpha: Float[Array, ""],
+    K_eff: Float[Array, ""],
+    T: Float[Array, ""],
+    delay: Float[Array, ""],
+) -> Float[Array, ""]:
+    """b_min, N·s/m, to a relative `ESTIMATED`; inf where `K_eff` < 0, NaN for a `delay` above T."""
+    lag = jnp.where(delay <= T, delay / T, jnp.nan)
+    need, _ = largest_need(span, K1, pot_stiffness(B1, alpha, T), alpha, K_eff, lag)
+    return jnp.where(K_eff < 0, jnp.inf, 500 * T * need)
+
+
+def largest_need(
+    span: Span,
+    K1: Float[Array, ""],
+    beta: Float[Array, ""],
+    alpha: Float[Array, ""],
+    K_eff: Float[Array, ""],
+    lag: Float[Array, ""],
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The largest Y (N/mm) of a set, and its angle; `lag` is σ."""
+    order = _order(span, alpha)
+    rendering = _material(K1, beta, order, K_eff)
+    fixed, still, (known, its_sums) = jax.lax.stop_gradient((rendering, lag, (alpha, order.sums)))
+    steady = _Order(known, its_sums, span)
+    angle = _peak(steady, _grid(steady), fixed, still)
+    # The angle is that of a maximum, so that first derivatives of Y need none of its own.
+    return _need(rendering, _at(order, angle[None]), lag)[0], angle
+
+
+def delayed_largest_K1(
+    span: Span,
+    B1: Float[Array, ""],
+    alpha: Float[Array, ""],
+    b: Float[Array, ""],
+    K_eff: Float[Array, ""],
+    T: Float[Array, ""],
+    delay: Float[Array, ""],
+) -> Float[Array, ""]:
+    """K1max, N/mm, which needs between b·(1 - 2·SAFE) and b; inf where every K1 is passive, 0 where b is below
+    `least_damping`. First derivatives are exact, second ones are those at the binding frequency."""
+    lag = jnp.where(delay <= T, delay / T, jnp.nan)
+    Y, beta, order = b / (500 * T) * (1 - SAFE), pot_stiffness(B1, alpha, T), _order(span, alpha)
+    impossible = (clear_of_spring(K_eff, lag) > Y) | (K_eff < 0)
+    K1, angle, unlimited = _solved(span, ~impossible, *jax.lax.stop_gradient((beta, alpha, Y, K_eff, lag)))
+    limited = ~impossible & ~unlimited
+    K1, nodes = jnp.where(limited, K1, 1), _at(order, jnp.where(limited, angle, 1)[None])
+
+    def need(K1):
+        return _need(_material(K1, beta, order, K_eff), nodes, lag)[0]
+
+    # A step of Newton's method from the solution has the solution's derivatives.
+    value, slope = jax.jvp(need, (K1,), (jnp.ones_like(K1),))
+    K1 = K1 - (value - Y) / jax.lax.stop_gradient(slope)
+    known = jnp.where(jnp.isnan(lag), jnp.nan, 0)
+    return known + jnp.where(impossible, 0, jnp.where(unlimited, jnp.inf, K1))
+
+
+def _solved(span, sought, beta, alpha, Y, K_eff, lag):
+    """K1max by exchange, the angle that binds, and whether every K1 is passive. NaN where the rounds do not end."""
+    order = _order(span, alpha)
+    grid, S = _grid(order), order.sums.at_dc
+    tolerance = max(SAFE / 4, 32 * float(jnp.finfo(beta.dtype).eps))
+
+    def of(g):
+        return _Material(K_eff, beta, S, g, 1 - g, g / (g + (1 - g) * S))
+
+    def reduced(g, node):
+        """The share up to `g` at which the need at a frequency rises through Y, to the precision of the halvings."""
+
+        def halve(_, ends):
+            middle = (ends[0] + ends[1]) / 2
+            more = _need(of(middle), node, lag)[0] > Y
+            return jnp.where(more, ends[0], middle), jnp.where(more, middle, ends[1])
+
+        return jax.lax.fori_loop(0, _HALVINGS, halve, (jnp.zeros_like(g), g))[1]
+
+    def exchange(carry):
+        count, g, _, _ = carry
+        angle = _peak(order, grid, of(g), lag)
+        node = _at(order, angle[None])
+        more = _need(of(g), node, lag)[0] > Y * (1 + tolerance)
+        return count + 1, jnp.where(more, reduced(g, node), g), angle, more
+
+    def unfinished(carry):
+        return carry[3] & (carry[0] < _ROUNDS)
+
+    start = 0, jnp.ones_like(beta), jnp.ones_like(beta), sought
+    _, g, angle, more = jax.lax.while_loop(unfinished, exchange, start)
+    return jnp.where(more, jnp.nan, beta * g / (1 - g)), angle, g == 1
+
+
+def _order(span: Span, alpha: Float[Array, ""]) -> _Order:
+    return _Order(alpha, sums(alpha, span), span)
+
+
+def _material(K1, beta, order: _Order, K_eff) -> _Material:
+    S = order.sums.at_dc
+    # A spring alone is one with β = 0 beside any K1.
+    beta = jnp.where(K1 > 0, beta, 0)
+    alone = beta == 0
+    g, h = jnp.where(alone, 1, share(K1, beta)), jnp.where(alone, 0, share(beta, K1))
+    return _Material(K_eff, beta, S, g, h, share(K1, beta * S))
+
+
+def _need(m: _Material, nodes: _Nodes, lag: Float[Array, ""]) -> Float[Array, " n"]:
+    """Y (N/mm) at each frequency."""
+    square = (m.g + m.h * nodes.real) ** 2 + (m.h * nodes.imag) ** 2
+    size = m.beta * m.g / square
+    # (C - S)·conj(g + h·C); the imaginary part is (g + h·S)·Im C, and g/slow = g + h·S.
+    along = (nodes.real - m.S) * (m.g + m.h * nodes.real) + m.h * nodes.imag**2
+    real, imaginary = m.K_eff + size * m.slow * along, size * m.g * nodes.imag
+    psi = real - size * m.g * nodes.lead + 2 * lag * (nodes.cos * real + nodes.sin * imaginary)
+    return larger_root(psi, lag * (1 - lag) * (real**2 + imaginary**2))
+
+
+def _place(span: Span, t: Float[Array, "*a"]) -> Float[Array, "*a"]:
+    """Angles of t in [0, 1]: even for taps, whose C ripples evenly; crowded at 0 for exponentials."""
+    return math.pi * (t if span.memory == "short" else t**3)
+
+
+def _count(span: Span) -> int:
+    if span.memory == "full":
+        return _NODES_OF_FULL_MEMORY
+    return max(_LEAST_NODES, 2 ** math.ceil(math.log2(_NODES_PER_TAP * (span.N + 1))))
+
+
+def _grid(order: _Order) -> _Nodes:
+    """Nodes from 0 to π, in even steps of t."""
+    span, count = order.span, _count(order.span)
+    angle = _place(span, jnp.arange(count + 1, dtype=order.alpha.dtype) / count)
+    if span.memory == "full":
+        return _at(order, angle)
+    return _nodes(order, angle, jnp.fft.rfft(gl_coefficients(order.alpha, span.N), 2 * count))
+
+
+def _at(order: _Order, angle: Float[Array, " n"]) -> _Nodes:
+    return _nodes(order, angle, response(order.alpha, angle, order.span))
+
+
+def _nodes(order: _Order, angle: Float[Array, " n"], C: Complex[Array, " n"]) -> _Nodes:
+    moving = angle > 0
+    lead = jnp.where(moving, C.imag / jnp.tan(jnp.where(moving, angle, 1) / 2), 2 * order.sums.moment)
+    return _Nodes(jnp.cos(angle), jnp.sin(angle), C.real, C.imag, lead)
+
+
+def _peak(order: _Order, grid: _Nodes, m: _Material, lag: Float[Array, ""]) -> Float[Array, ""]:
+    """The angle of the largest Y: by the parabolas through neighbouring nodes, and one through closer ones."""
+    Y, count = _need(m, grid, lag), grid.real.shape[0] - 1
+    # Y is even about both ends.
+    below, above = jnp.concatenate([Y[1:2], Y[:-1]]), jnp.concatenate([Y[1:], Y[-2:-1]])
+    top, shift = _vertex(below, Y, above)
+    best = jnp.argmax(top)
+    t, step = (best.astype(Y.dtype) + shift[best]) / count, 1 / (_FINER * count)
+    near = jnp.abs(t + step * jnp.arange(-1.0, 2.0, dtype=t.dtype))
+    _, shift = _vertex(*_need(m, _at(order, _place(order.span, near)), lag))
+    return _place(order.span, jnp.clip(t + shift * step, 0, 1))
+
+
+def _vertex(
+    below: Float[Array, "*a"], middle: Float[Array, "*a"], above: Float[Array, "*a"]
+) -> tuple[Float[Array, "*a"], Float[Array, "*a"]]:
+    """Height of the parabola through three even values where it has a top beside the middle one, and its place in
+    steps; else the middle value."""
+    bend, slope = 2 * middle - below - above, (above - below) / 2
+    inside = 2 * jnp.abs(slope) <= bend
+    shift = jnp.where(inside, slope / jnp.where(inside & (bend > 0), bend, 1), 0)
+    return middle + slope * shift / 2, shift
