@@ -125,3 +125,25 @@ def test_the_reason_of_a_hold_is_on_the_experimenter_s_page(tmp_path):
         assert ["Reason", words] in view["device"]["rows"]
         assert view["phase_words"] == f"Stopped: The device is in HOLD: {words}."
         live.until(lambda v: f"The device holds: {words}. W1 is void." in str(v["log"]), live.whole)
+
+
+def test_a_start_that_a_stop_has_overtaken_is_said_and_tried_again_from_the_first_step(tmp_path, monkeypatch):
+    session = LiveFake(tmp_path)
+    start = session.fake.start
+
+    def overtaken(**order):
+        monkeypatch.setattr(session.fake, "start", start)
+        session.fake.stop()
+        start(**order)
+
+    monkeypatch.setattr(session.fake, "start", overtaken)
+    with session as live:
+        monkeypatch.setattr(runner, "_LATER", 0.5)  # s for which the sentence is shown
+        live.begin()
+        view = live.until(lambda v: v["phase"] == "trouble", live.whole)
+        assert view["phase_words"] == "Stopped: refused: STALE" and live.fake.now == State.STOPPED
+        live.answer()
+        assert live.hub.state.trials[0].status == "answered"
+        steps = [(event.data["show"], event.data["on"]) for event in live.events("stimulus")][:6]
+        assert steps == [("reference", True), ("reference", False)] * 2 + [("a", True), ("a", False)]
+        live.replays()
