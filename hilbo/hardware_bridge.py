@@ -229,8 +229,8 @@ class Renderer:
     def clear(self, *, stop: int | None = None) -> None:
         """Leave HOLD or ESTOP, once the reason is understood; the device first lets its force sink to zero.
 
-        `stop` is the stop that it ends (`link.stops`), by default the last one known at the call: a later one stays, and
-        is a `DeviceError`.
+        `stop` is the stop that it ends (`link.stops`), by default the last one known at the call. A later stop stays,
+        and raises `DeviceError`.
         """
         clear = protocol.Clear(boot_id=self.device.boot_id, stop=self._link.stops if stop is None else stop)
         patiently(self._link, self.device, clear, self._link.now() + _SINKS)
@@ -299,9 +299,7 @@ class Renderer:
         order = {"boot_id": self.device.boot_id, "stop": self._link.stops if stop is None else stop}
         self._link.heartbeat()
         self._link.request(
-            protocol.Drive(
-                mode=int(mode == "position"), shape=_SHAPES[shape], **numbers, **ticks, **order
-            )
+            protocol.Drive(mode=int(mode == "position"), shape=_SHAPES[shape], **numbers, **ticks, **order)
         )
 
     def _ticks(self, what: str, seconds: SupportsFloat) -> int:

@@ -54,7 +54,10 @@ MATHS = {
     *(f"statistics.{name}" for name in ("ordered_logit", "separation", "cluster_robust", "regression")),
     *(
         f"identification.{name}"
-        for name in ("fitting", "sampled", "moduli", "intervals", "residual_noise", "characterise")
+        for name in (
+            *("fitting", "sampled", "moduli", "intervals", "residual_noise", "characterise"),
+            *("instrument", "misfit", "beginnings", "screening", "estimates", "sentences", "friction", "friction_laws"),
+        )
     ),
     *("study.map_summary", "study.tolerance_intervals", "session.selection", "session.ask_tell", "simulation.simulate"),
 }

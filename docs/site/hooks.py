@@ -31,7 +31,8 @@ API = {
     "identification": (
         "Identification",
         "identification.material_tables identification.sampled identification.fitting identification.intervals"
-        " identification.residual_noise identification.moduli identification.characterise report.material",
+        " identification.residual_noise identification.instrument identification.misfit identification.friction_laws"
+        " identification.moduli identification.characterise report.material",
     ),
     "sessions": (
         "Studies and sessions",

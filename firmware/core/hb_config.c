@@ -32,6 +32,8 @@ const char *hb_error_sentence(enum hb_error error)
         return "continuous_force_N must be above 0 and at most the force limit, heating_s 0.1 to 1000 s.";
     case HB_ERROR_BOOT_ID:
         return "The boot id is 0: give one that differs at every start.";
+    case HB_ERROR_CONTRACTION:
+        return "The compiler fuses products and sums, which changes the forces: build with -ffp-contract=off.";
     case HB_ERRORS:
     default:
         return "This error has no name.";

@@ -7,6 +7,10 @@
 
 #include <stdint.h>
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 #if defined(__FAST_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
 #error "build without -ffast-math: the checks against NaN and infinity are compiled away with it"
 #endif
@@ -89,6 +93,7 @@ enum hb_error {
     HB_ERROR_DELAY,
     HB_ERROR_HEATING,
     HB_ERROR_BOOT_ID, /* of hb_init, not of a config */
+    HB_ERROR_CONTRACTION, /* of the build */
     HB_ERRORS /* how many there are */
 };
 
@@ -97,5 +102,9 @@ const char *hb_error_sentence(enum hb_error error);
 
 /* HB_OK, or the first fault in the order of the enum; `config` is not NULL. */
 enum hb_error hb_config_check(const struct hb_config *config);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

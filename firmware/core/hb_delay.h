@@ -15,6 +15,10 @@
 
 #include "hb_renderer.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 #define HB_DELAY_ANGLES 256U
 #define HB_DELAY_ANGLES_PER_TICK 2U
 #define HB_DELAY_MARGIN 5e-4F
@@ -38,5 +42,9 @@ uint32_t hb_delay_ticks_left(const struct hb_delay_check *check);
 /* The device has the damping that the set needs with and without delay. `renderer` then holds the larger of both needs. */
 bool hb_delay_is_passive(const struct hb_delay_check *check, struct hb_renderer *renderer,
                          const struct hb_config *config);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -21,6 +21,9 @@ enum hb_error hb_init(struct hb_device *device, const struct hb_config *config, 
     if (error == HB_OK && boot_id == 0U) {
         error = HB_ERROR_BOOT_ID;
     }
+    if (error == HB_OK && hb_rounds_once()) {
+        error = HB_ERROR_CONTRACTION;
+    }
     if (error == HB_OK) {
         device->config = config;
         device->heartbeat_age_ticks = config->watchdog_ticks;

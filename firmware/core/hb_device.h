@@ -30,6 +30,10 @@
 #include "hb_renderer.h"
 #include "hb_safety.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* Owned by the caller; only hb_init and the functions below write to it, whoever likes may read. */
 struct hb_device {
     const struct hb_config *config; /* NULL where hb_init refused it: such a device gives no force and no answer */
@@ -93,5 +97,9 @@ size_t hb_transmit(struct hb_device *device, uint8_t *bytes, size_t room);
 /* One period: the force (N) to put out until the next tick, positive towards negative positions, at most
  * force_limit_N either way, and always finite. */
 float hb_tick(struct hb_device *device, const struct hb_input *input);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

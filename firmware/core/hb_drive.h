@@ -10,6 +10,10 @@
 #include "hb_messages.h"
 #include "hb_safety.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 enum hb_drive_mode { HB_DRIVE_FORCE = 0, HB_DRIVE_POSITION = 1 };
 /* A nudge is a force of `offset` that ends when the handle has moved by `amplitude`: by its own work it gives a handle at
  * most their product (N mm = mJ). It is for a device whose signs nobody has checked. */
@@ -50,5 +54,9 @@ bool hb_drive_is_stuck(const struct hb_drive *drive, const struct hb_config *con
 
 /* The command of one tick. */
 float hb_drive_step(struct hb_drive *drive, const struct hb_config *config, const struct hb_safety *safety);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -6,6 +6,10 @@
 #include <stddef.h>
 #include <stdint.h>
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 #define HB_MAX_PAYLOAD 64U
 #define HB_MAX_BODY (HB_MAX_PAYLOAD + 6U)
 #define HB_MAX_ENCODED (HB_MAX_BODY + 1U)   /* COBS adds one byte */
@@ -70,5 +74,9 @@ size_t hb_frame_write(uint8_t type, uint8_t seq, const uint8_t *payload, size_t 
     ensures \result ==> hb_frame_fits(frame) && byte == 0;
     ensures byte == 0 ==> receiver->size == 0; */
 bool hb_receiver_push(struct hb_receiver *receiver, uint8_t byte, struct hb_frame *frame);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

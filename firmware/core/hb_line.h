@@ -10,6 +10,10 @@
 #include "hb_frame.h"
 #include "hb_messages.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* A ring. */
 struct hb_output {
     uint8_t bytes[HB_OUTPUT_BYTES];
@@ -70,5 +74,9 @@ void hb_stream_begin(struct hb_stream *stream, uint8_t divisor, uint8_t fields);
     assigns *stream, output->bytes[0 .. HB_OUTPUT_BYTES - 1], output->size;
     ensures hb_stream_is_sound(stream) && hb_output_is_sound(output); */
 void hb_stream_tick(struct hb_stream *stream, struct hb_output *output, uint32_t tick, const struct hb_sample *sample);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

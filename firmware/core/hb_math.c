@@ -92,6 +92,17 @@ float hb_towards_zero(float value, float step)
     return value > 0.0F ? value - step : value + step;
 }
 
+/* (1 + 2^-12)^2 = 1 + 2^-11 + 2^-24, of which float keeps all but the last. The compiler does not know the operands, so
+ * that it treats this expression as any other. */
+bool hb_rounds_once(void)
+{
+    volatile float factor = 1.0F + 1.0F / 4096.0F;
+    volatile float rounded = -(1.0F + 1.0F / 2048.0F);
+    float a = factor;
+    float b = rounded;
+    return a * a + b != 0.0F;
+}
+
 uint32_t hb_bits_of_float(float value)
 {
     uint32_t bits;

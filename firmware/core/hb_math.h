@@ -5,6 +5,10 @@
 #include <stdbool.h>
 #include <stdint.h>
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* base^exponent for a whole base of 1 to 65535 and 0 <= exponent <= 1, within 0.6 units in the last place. */
 /*@ assigns \nothing; */
 float hb_power(uint32_t base, float exponent);
@@ -27,9 +31,17 @@ float hb_clamp(float value, float low, float high);
 /*@ assigns \nothing; */
 float hb_towards_zero(float value, float step);
 
+/* A product and a sum are rounded together, as by a fused multiply-add: this build gives other bits than every other. */
+/*@ assigns \nothing; */
+bool hb_rounds_once(void);
+
 /*@ assigns \nothing; */
 uint32_t hb_bits_of_float(float value);
 /*@ assigns \nothing; */
 float hb_float_of_bits(uint32_t bits);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

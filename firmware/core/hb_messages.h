@@ -10,6 +10,10 @@
 #include "hb_frame.h"
 #include "hb_renderer.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 #define HB_PROTOCOL_VERSION 2U
 #define HB_SCHEMA_CRC 0xeef43481U /* CRC-32 of the schema block; a test compares it with PROTOCOL.md */
 
@@ -289,5 +293,9 @@ size_t hb_pack_telemetry_head(uint32_t tick, uint8_t divisor, uint8_t fields, ui
     assigns payload[0 .. HB_SAMPLE_SIZE(with_sensed) - 1];
     ensures \result == HB_SAMPLE_SIZE(with_sensed); */
 size_t hb_pack_sample(const struct hb_sample *sample, bool with_sensed, uint8_t *payload);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

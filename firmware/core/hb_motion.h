@@ -8,6 +8,10 @@
 
 #include "hb_requests.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 bool hb_is_in(const struct hb_device *device, enum hb_state state);
 
 /* Change the state, and say so with a NOTICE. A difference of two forces ends with the state. */
@@ -19,5 +23,9 @@ enum hb_reason hb_clear(struct hb_device *device, const struct hb_frame *frame, 
 enum hb_reason hb_home_here(struct hb_device *device, const struct hb_frame *frame, struct hb_reply *reply);
 void hb_stop(struct hb_device *device);
 void hb_estop(struct hb_device *device, enum hb_cause cause);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -10,6 +10,10 @@
 
 #include "hb_renderer.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 struct hb_sums {
     float at_dc;      /* C(1) */
     float at_nyquist; /* C(-1) */
@@ -41,5 +45,9 @@ bool hb_static_stiffness_is_passive(const struct hb_parameters *set, float beta_
 /*@ requires \valid_read(set);
     assigns \nothing; */
 float hb_minimum_damping(const struct hb_parameters *set, float beta_N_per_mm, struct hb_sums sums);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

@@ -18,6 +18,10 @@
 
 #include "hb_config.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* What SET_PARAMS says. */
 struct hb_parameters {
     uint16_t set_id;
@@ -93,5 +97,9 @@ void hb_renderer_rest(struct hb_renderer *renderer, float x_mm);
       renderer->quiet, renderer->mean_mm[0 .. HB_MAX_STATES - 1], renderer->rest_mm[0 .. HB_MAX_STATES - 1];
     ensures hb_renderer_is_sound(renderer); */
 float hb_renderer_step(struct hb_renderer *renderer, float x_mm);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

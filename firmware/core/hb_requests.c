@@ -205,11 +205,6 @@ static bool acts_once(uint8_t type)
            type == HB_START || type == HB_CLEAR || type == HB_STREAM || type == HB_DRIVE || type == HB_HOME;
 }
 
-static void put_out(struct hb_device *device, const uint8_t *bytes, size_t size)
-{
-    (void)hb_output_put(&device->output, bytes, size, 0U);
-}
-
 static void answer(struct hb_device *device, const struct hb_frame *frame)
 {
     uint8_t bytes[HB_MAX_FRAME];
@@ -227,7 +222,7 @@ static void answer(struct hb_device *device, const struct hb_frame *frame)
         reply.size = hb_pack_ack(frame->type, reply.set_id, reply.crc, device->stops, reply.payload);
     }
     size_t size = hb_frame_write(reply.type, frame->seq, reply.payload, reply.size, bytes);
-    put_out(device, bytes, size);
+    (void)hb_output_put(&device->output, bytes, size, 0U);
     if (acts_once(frame->type)) {
         memcpy(device->answer, bytes, size);
         device->answer_size = size;
@@ -257,7 +252,8 @@ static void heartbeat(struct hb_device *device, const struct hb_frame *frame)
     uint8_t bytes[HB_MAX_FRAME];
     struct hb_notice pulse = {device->tick, device->boot_id, device->state, device->cause, device->stops};
     size_t size = hb_pack_notice(&pulse, payload);
-    put_out(device, bytes, hb_frame_write(HB_PULSE, frame->seq, payload, size, bytes));
+    size = hb_frame_write(HB_PULSE, frame->seq, payload, size, bytes);
+    (void)hb_output_put(&device->output, bytes, size, 2U * HB_MAX_FRAME); /* answers and notices come first */
 }
 
 void hb_handle(struct hb_device *device, const struct hb_frame *frame)
@@ -265,7 +261,7 @@ void hb_handle(struct hb_device *device, const struct hb_frame *frame)
     if (frame->type == HB_HEARTBEAT) {
         heartbeat(device, frame);
     } else if (device->answered && frame->seq == device->answered_seq && frame->crc == device->answered_crc) {
-        put_out(device, device->answer, device->answer_size);
+        (void)hb_output_put(&device->output, device->answer, device->answer_size, 0U);
     } else {
         answer(device, frame);
     }

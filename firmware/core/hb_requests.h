@@ -4,6 +4,10 @@
 
 #include "hb_device.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* The answer as it grows: an ACK with set_id and crc, unless a reason or another type is given. */
 struct hb_reply {
     uint8_t type;
@@ -16,5 +20,9 @@ struct hb_reply {
 
 /* Carry out a request, or answer it as before, and put the answer out. */
 void hb_handle(struct hb_device *device, const struct hb_frame *frame);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

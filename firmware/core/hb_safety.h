@@ -13,6 +13,10 @@
 #include "hb_config.h"
 #include "hb_messages.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* What the port knows at a tick. */
 struct hb_input {
     int32_t position_counts; /* of the encoder, positive into the material; 0 at the surface where it is absolute */
@@ -110,5 +114,9 @@ bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *conf
 void hb_ramp_begin(struct hb_safety *safety);
 float hb_ramp(struct hb_safety *safety, const struct hb_config *config);
 bool hb_ramp_has_ended(const struct hb_safety *safety, const struct hb_config *config);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

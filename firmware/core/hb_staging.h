@@ -4,6 +4,10 @@
 
 #include "hb_device.h"
 
+#ifdef __cplusplus
+extern "C" {
+#endif
+
 /* SET_PARAMS: check and stage. A refusal leaves nothing staged, and its numbers in `nack`. */
 enum hb_reason hb_stage_parameters(struct hb_device *device, const struct hb_frame *frame, struct hb_nack *nack);
 
@@ -25,5 +29,9 @@ uint32_t hb_busy_ticks(const struct hb_device *device);
 /* One tick of every history at x: the force of the set in force, of either sign. At the first tick of a new set `old_N`
  * is the force of the one before, otherwise 0. */
 float hb_render(struct hb_device *device, float x_mm, float *old_N);
+
+#ifdef __cplusplus
+}
+#endif
 
 #endif

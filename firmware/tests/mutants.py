@@ -3,8 +3,8 @@
     python firmware/tests/mutants.py [--count 200] [--seed 0]
 
 A mutant changes one place of the core: a comparison, a logical or arithmetic operator, a constant, a condition that is
-negated, a statement that is left out. One that does not compile is drawn anew. It prints a line for each survivor, and at
-the end "N of M noticed". Survivors are argued one by one in docs/device/firmware.md.
+negated, a statement that is left out. One that does not compile is drawn again. It prints a line for each survivor, and
+at the end "N of M noticed". Survivors are argued one by one in docs/device/firmware.md.
 """
 
 import argparse

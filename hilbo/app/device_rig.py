@@ -3,7 +3,8 @@
 Nothing here knows of trials or answers. A job gives a `Future`; whatever the device or the line does wrong is the job's
 `DeviceError`, and the snapshot that everybody may read says `lost` with the sentence; so it does of a device that has
 restarted, or hears no heartbeats. A lost device is tried again once a second; it comes back stopped. Sets go over to
-the device out of contact only: a job waits until nobody presses.
+the device, and START is sent, out of contact only: both are tried again until the hand has left. START and CLEAR carry
+the count of stops that was known when they were requested, so that neither acts after a stop that came meanwhile.
 """
 
 import asyncio
@@ -12,12 +13,14 @@ import math
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
 
 from hilbo.app.rig import Loaded, Showing, Snapshot
-from hilbo.device.reasons import HoldReason, held_because
+from hilbo.app.sample_flags import SampleCounter
+from hilbo.device.messages import Status
+from hilbo.device.reasons import DeviceFlag, HoldReason, NackReason, held_because
 from hilbo.hardware_bridge import Capability, DeviceError, Renderer, State
 from hilbo.search.box import Mechanics
 from hilbo.session.header_check import study_of
@@ -26,9 +29,8 @@ from hilbo.study.study_file import AnyStudy
 __all__ = ["DeviceRig"]
 
 _POLL = 0.1  # s between two looks at the device
-_NEAR = 0.01  # s between them while a set waits for the hand to leave
+_NEAR = 0.01  # s between two tries while a set, or START, waits for the hand to leave
 _RETRY = 1.0  # s
-_PUSHED = 1.0  # s
 COUNTERS = ("holds", "estops", "overruns", "saturated", "slewed", "controlled", "input_held", "frames_dropped")
 
 
@@ -50,6 +52,7 @@ class DeviceRig:
         self._jobs: queue.SimpleQueue[tuple[Callable[[], Any], Future] | None] = queue.SimpleQueue()
         self._ending = threading.Event()
         self.device = connect()
+        self._counter = SampleCounter(lambda: self.device.samples(0).flags)  # what has arrived, without waiting
         self.simulated = bool(self.device.can & Capability.SIMULATED)
         self.notes = list(self.device.notes)
         self.snapshot = self._look()
@@ -67,21 +70,27 @@ class DeviceRig:
         """Where it is, and its damping."""
         return f"{self.device.link.name}, damping {self.device.device.damping_N_s_per_m:.3g} N·s/m"
 
-    async def prepare(self, showing: Showing, stop: threading.Event, may_push: Callable[[], bool]) -> Loaded:
-        """The set in force once nobody presses; cancelled if `stop` was set before that.
-
-        While `may_push()`, a handle that was left pressed is pushed back by the set that is in force.
-        """
+    async def prepare(self, showing: Showing) -> Loaded:
+        """The set in force once nobody presses."""
         wanted = self._wanted(showing)
-        loaded = await asyncio.wrap_future(self.do(lambda device: self._load(device, wanted, stop, may_push)))
-        if loaded is None:
-            raise asyncio.CancelledError
+        while (loaded := await asyncio.wrap_future(self.do(lambda device: self._load(device, wanted)))) is None:
+            await asyncio.sleep(_NEAR)
         return loaded
 
     async def show(self, showing: Showing) -> None:
-        """The set in force, from now on; nothing where it is rendered already. The reference is no business of ours."""
-        if showing.values is not None:
-            await asyncio.wrap_future(self.do(self._render))
+        """The set in force, from now on, once nobody presses; nothing where it is rendered already. The reference is no
+        business of ours."""
+        if showing.step == 0:
+            self._counter.begin((showing.trial, showing.presentation))
+        if showing.values is None:
+            return
+        stop = self.device.link.stops
+        while not await asyncio.wrap_future(self.do(lambda device: self._render(device, stop))):
+            await asyncio.sleep(_NEAR)
+
+    def telemetry(self, trial: int, presentation: int) -> Mapping[str, int] | None:
+        """Counts of the samples since the first step of this presentation, up to the newest that has arrived."""
+        return self._counter.counts((trial, presentation))
 
     async def blank(self) -> None:
         """What is in force pushes the handle back when the hand leaves it, and stays."""
@@ -97,8 +106,9 @@ class DeviceRig:
         await asyncio.get_running_loop().run_in_executor(None, self.device.estop)
 
     async def clear(self) -> None:
-        """Go on after a hold."""
-        await asyncio.wrap_future(self.do(lambda device: device.clear()))
+        """Go on after the hold or stop that was known when this was called, and after no later one."""
+        stop = self.device.link.stops
+        await asyncio.wrap_future(self.do(lambda device: device.clear(stop=stop)))
 
     def hang_up(self) -> None:
         """Nobody waits for a device."""
@@ -125,22 +135,29 @@ class DeviceRig:
             raise DeviceError(self.snapshot.lost)
         return self.device
 
-    def _render(self, device) -> None:
+    def _render(self, device: Renderer, stop: int) -> bool:
+        """Whether the set is rendered now; not while something touches the handle. `stop`: the count of stops when that
+        was requested."""
         self._see(self._look())
-        if self.snapshot.state != "RUNNING":
-            device.start()
+        if self.snapshot.state == "RUNNING":
+            return True
+        if self.snapshot.state == "STOPPED" and self.snapshot.contact:
+            return False
+        self._counter.drain()  # START drops what has not been taken
+        try:
+            device.start(stop=stop)
+        except DeviceError as error:
+            if error.nack is None or error.nack.reason != NackReason.IN_CONTACT:
+                raise
+            self._see(self.snapshot._replace(contact=True))  # the hand has come back since the look
+            return False
+        return True
 
-    def _load(self, device, wanted, stop, may_push):
-        patient = time.monotonic() + _PUSHED
-        while True:
-            self._see(self._look())
-            if not self.snapshot.contact:
-                break
-            if stop.wait(_NEAR) or self._ending.is_set():
-                return None
-            resting = time.monotonic() > patient and self.snapshot.state == "STOPPED"
-            if resting and may_push() and device.in_force() is not None:
-                device.start()  # nothing but the last set's force brings a handle back that was left pressed
+    def _load(self, device: Renderer, wanted: dict[str, Any]) -> Loaded | None:
+        """The set in force; None while something touches the handle."""
+        self._see(self._look())
+        if self.snapshot.contact:
+            return None
         begun = time.perf_counter()
         in_force = device.send(**wanted)
         took = time.perf_counter() - begun
@@ -177,6 +194,7 @@ class DeviceRig:
             return
         try:
             self._see(self._look())
+            self._counter.drain()
             for sentence in self.device.events():
                 self._notice(sentence)
         except DeviceError as error:
@@ -204,11 +222,13 @@ class DeviceRig:
         force, position = (v if math.isfinite(v) else 0.0 for v in (status.force_N, status.position_mm))
         rows = [("Contact", "yes" if status.contact else "no"), ("Position", f"{position:.2f} mm")]
         rows += [("Force", f"{force:.2f} N"), *((n.replace("_", " "), str(v)) for n, v in counters.items() if v)]
+        rows += [] if status.flags & DeviceFlag.HOMED else [("Homed", "no")]
+        rows += [("Hardware stop", "open")] if status.flags & DeviceFlag.STOP_OPEN else []
         return Snapshot(
             state,
             bool(status.contact),
             None,
-            reason=held_because(status.hold_reason) if state in ("HOLD", "ESTOP") else "",
+            reason=_reason(status) if state in ("HOLD", "ESTOP") else "",
             facts={"counters": counters},
             rows=tuple(rows),
             excused=state == "HOLD" and status.hold_reason == HoldReason.WATCHDOG,
@@ -218,6 +238,13 @@ class DeviceRig:
         before, self.snapshot = self.snapshot, seen
         if seen != before:
             self._changed(seen)
+
+
+def _reason(status: Status) -> str:
+    """Why it holds or was stopped, in words."""
+    if status.hold_reason == HoldReason.SWITCH and not status.flags & DeviceFlag.STOP_OPEN:
+        return "the hardware stop was open"  # it is closed again, and can be cleared
+    return held_because(status.hold_reason)
 
 
 def _looked_at(done: asyncio.Future) -> None:

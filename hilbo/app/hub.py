@@ -207,7 +207,10 @@ class Hub:
             if asked.values is None and asked.presentation != presentation:
                 raise RefusedError("old-trial", "This trial has been begun again since.")
             self._came = came
-            return actions.answer(state, trial, message.client, message.answers, at, browser=browser)
+            telemetry = self.rig.telemetry(trial, presentation)
+            return actions.answer(
+                state, trial, message.client, message.answers, at, browser=browser, telemetry=telemetry
+            )
 
         came = time.perf_counter()
         try:

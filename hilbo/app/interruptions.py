@@ -1,4 +1,5 @@
-"""What interrupts a session though nobody asked for it: its device, a laptop that slept, a participant who is gone.
+"""What interrupts a session though nobody asked for it: its device, a laptop that slept, a participant who is gone, and
+a hand that does not leave.
 
     device, clocks, signs of life --> event in the log --> the runner begins anew
 
@@ -20,7 +21,7 @@ from hilbo.session import actions
 from hilbo.session.event_log import LogError
 from hilbo.session.state import LiveSession
 
-__all__ = ["Interruptions"]
+__all__ = ["Interruptions", "interrupt"]
 
 _STOPPED = {"HOLD": "hold", "ESTOP": "estop"}
 _LATER = 1.0  # s between two looks at the clock
@@ -123,7 +124,7 @@ class Interruptions:
         slept = max(abs((now - self._wall) - (mono - self._steady)), mono - self._steady - _LATER)
         self._wall, self._steady = now, mono
         if slept > _JUMP:
-            await self._interrupt(f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
+            await interrupt(hub, f"The computer's clock jumped by {slept:.0f} s: it slept, or was set.")
         await self._say()
         self._here, before = hub.watchers.participant_here, self._here
         if self._here != before:
@@ -134,17 +135,17 @@ class Interruptions:
             self._absent = mono
         elif mono - self._absent > _GONE:
             self._absent = None
-            await self._interrupt("The participant's page is closed.")
+            await interrupt(hub, "The participant's page is closed.")
 
-    async def _interrupt(self, why: str) -> None:
-        """What was being felt is felt again from its beginning, once somebody presses Begin."""
-        hub = self.hub
-        pending, hub.begun = hub.state.pending, False
-        with contextlib.suppress(InputError, LogError):
-            await hub.commit(lambda state, at: actions.note(state, why, at))
-            if pending is not None and pending.unfinished:
-                await hub.commit(actions.repeat)
-        hub.runner.restart()
+
+async def interrupt(hub: Held, why: str) -> None:
+    """What was being felt is felt again from its beginning, once somebody presses Begin. `why`: a note in the log."""
+    pending, hub.begun = hub.state.pending, False
+    with contextlib.suppress(InputError, LogError):
+        await hub.commit(lambda state, at: actions.note(state, why, at))
+        if pending is not None and pending.unfinished:
+            await hub.commit(actions.repeat)
+    hub.runner.restart()
 
 
 def _condition_of(seen: Snapshot) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 from hilbo.session.actions import restorable
 from hilbo.session.records import Event, Trial
 from hilbo.session.state import LiveSession
+from hilbo.study.trial_flags import FLAGS, SAMPLES
 
 __all__ = ["line", "meant", "place_of", "sentence", "table"]
 
@@ -68,7 +69,16 @@ def _answered(_state, name, data):
     classes = {side: values[f"class_{side}"] for side in "ab" if f"class_{side}" in values}
     words = list(classes.values()) if len(values) == 1 else [f"{s.upper()} {c}" for s, c in classes.items()]
     words += [f"{values['preferred'].upper()} preferred"] if "preferred" in values else []
-    return f"{name} is answered{'' if took is None else f' after {took:.1f} s'}: {', '.join(words)}."
+    after = "" if took is None else f" after {took:.1f} s"
+    return f"{name} is answered{after}: {', '.join(words)}.{_flags(data.get('telemetry'))}"
+
+
+def _flags(telemetry: Mapping[str, int] | None) -> str:
+    """How many samples of a trial the device flagged, as a sentence after another; empty where it flagged none."""
+    if telemetry is None or set(telemetry) == {SAMPLES}:
+        return ""
+    words = ", ".join(f"{name.replace('_', ' ')} {telemetry[name]}" for name in FLAGS if name in telemetry)
+    return f" Flagged of {telemetry[SAMPLES]} samples: {words}."
 
 
 def _repeated(trial, name, seq):
@@ -126,7 +136,9 @@ def _row(state: LiveSession, trial: Trial, chosen: bool) -> dict[str, Any]:
     answer, remark = " ".join((trial.values or {}).values()), _remark(state, trial)
     discarded = trial.status not in ("pending", "answered")
     kind = "voided" if discarded else "now" if trial.status == "pending" else "repeated" if remark else ""
-    row = {"kind": kind, "cells": [place_of(trial), answer, remark, *shown]}
+    flags = [name.replace("_", " ") for name in FLAGS if name in (trial.telemetry or {})]
+    remarks = "; ".join([remark] * bool(remark) + flags)
+    row = {"kind": kind, "cells": [place_of(trial), answer, remarks, *shown]}
     voided = trial.status == "void" and trial.values is not None
     return row | ({"restore": meant(trial)} if voided and restorable(state, trial.id) else {})
 

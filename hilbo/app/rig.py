@@ -5,8 +5,7 @@ A rig knows nothing of answers. It makes a rendering ready, shows it, rests, sto
 `Snapshot`, and it tells of each new one. The runner leads a trial through either in the same way.
 """
 
-import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from hilbo.study.protocols import Show
@@ -69,13 +68,18 @@ class Rig(Protocol):
         """What it is, for the experimenter."""
         ...
 
-    async def prepare(self, showing: Showing, stop: threading.Event, may_push: Callable[[], bool]) -> Loaded | None:
+    async def prepare(self, showing: Showing) -> Loaded | None:
         """Make a rendering ready while something else is shown. `Loaded` if it is in force by that; None if it will be
-        when it is shown. `stop`: nobody wants it any more. While `may_push()`, the rig may move by itself."""
+        when it is shown. A rig that touches the hand waits here, and in `show`, until the hand has left."""
         ...
 
     async def show(self, showing: Showing) -> Loaded | None:
         """Show it from now on; returns once it is shown. Raises `MissedError`."""
+        ...
+
+    def telemetry(self, trial: int, presentation: int) -> Mapping[str, int] | None:
+        """Counts of the samples since this presentation of a trial began: `samples`, and those with a flag of
+        `hilbo.study.trial_flags` by its name, where there are any. None where no telemetry was recorded with it."""
         ...
 
     async def blank(self) -> None:

@@ -3,18 +3,19 @@
 One task at a time, begun anew whenever an event changes what is to be felt (an answer, a break, an undo, a HOLD …).
 A rendering is made ready by the rig (`rig`) while the participant feels the reference or nothing, and a step begins
 when the rig says that it shows it. Nothing is shown before Begin, nor while something is compiled; whenever nobody is
-to feel anything the rig is told to rest, whatever it was doing. While the participant feels, the next proposal is made
-ready for every possible answer, so that after the answer it is only looked up.
+to feel anything the rig is told to rest, whatever it was doing. A hand that keeps a rendering from beginning is asked
+to leave; where it stays, the presentation is interrupted and nothing is forced. While the participant feels, the next
+proposal is made ready for every possible answer, so that after the answer it is only looked up.
 """
 
 import asyncio
 import contextlib
-import threading
 import time
 from concurrent.futures import Future
 from typing import Any
 
 from hilbo.app.held import Held
+from hilbo.app.interruptions import interrupt
 from hilbo.app.rig import Loaded, MissedError, Showing
 from hilbo.session import actions
 from hilbo.session.records import Event, RefusedError, Trial
@@ -24,6 +25,11 @@ __all__ = ["Runner"]
 _LATER = 1.0  # s until what the device refused is tried again
 _SOON = 0.05  # s
 _HAND = 0.15  # s that a hand may keep a rendering from being shown before it is asked to leave
+_LEAVES = 20.0  # s that it may stay after that, until the presentation is interrupted
+
+
+class HandError(RuntimeError):
+    """The hand has not left, and nothing begins under it."""
 
 
 class Runner:
@@ -36,7 +42,8 @@ class Runner:
         self.ends = 0.0
         self.clock: dict[str, float] = {}
         self._task: asyncio.Task | None = None
-        self._stop = threading.Event()
+        self._stop = asyncio.Event()
+        self._asked: float | None = None  # since when the hand has been asked to leave, monotonic
         self._in_force: tuple[int, int, str] | None = None
         self._showing: Showing | None = None  # what was asked for last
         self._differs = False  # whether what is presented has ever been something else than what was asked for
@@ -52,7 +59,7 @@ class Runner:
     def restart(self) -> None:
         """Leave what is going on, and begin with what the state says now."""
         self.cancel()
-        self._stop = threading.Event()
+        self._stop = asyncio.Event()
         self._task = asyncio.create_task(self._run(self._stop))
 
     def cancel(self) -> None:
@@ -61,7 +68,7 @@ class Runner:
         if self._task is not None:
             self._task.cancel()
             self._task = None
-        self.stage, self.step = "idle", None
+        self.stage, self.step, self._asked = "idle", None, None
 
     def wake(self) -> None:
         """What is waited for may have happened."""
@@ -71,14 +78,16 @@ class Runner:
         """The rig has no rendering any more."""
         self._in_force = None
 
-    async def _run(self, stop: threading.Event) -> None:
+    async def _run(self, stop: asyncio.Event) -> None:
         """Until there is nothing to do before somebody does something."""
         try:
             try:
-                await self._lead(stop)
+                await self._lead()
             except MissedError as error:
                 await self._missed(str(error))
                 self._again(stop)
+            except HandError as error:
+                await interrupt(self.hub, str(error))
         except RefusedError:  # the state has changed meanwhile, and with it what is to be done
             await asyncio.sleep(_SOON)
             self._again(stop)
@@ -88,7 +97,7 @@ class Runner:
             await asyncio.sleep(_LATER)
             self._again(stop)
 
-    async def _lead(self, stop: threading.Event) -> None:
+    async def _lead(self) -> None:
         hub = self.hub
         if hub.state.screen not in ("wait", "trial") or not hub.begun:
             self.clock = {}  # what follows a rest does not follow an answer
@@ -100,7 +109,7 @@ class Runner:
             else:
                 trial = hub.state.pending
                 assert trial is not None  # as the screen says
-                await self._present(trial, stop)
+                await self._present(trial)
                 return
         self._at("idle")
 
@@ -135,7 +144,7 @@ class Runner:
         await hub.commit(make, mine=True)
         self.clock["proposed"] = time.perf_counter()
 
-    async def _present(self, trial: Trial, stop: threading.Event) -> None:
+    async def _present(self, trial: Trial) -> None:
         hub = self.hub
         if (
             trial.step is not None and not trial.unfinished
@@ -146,7 +155,7 @@ class Runner:
         steps = hub.state.steps_of(trial)
         await hub.rig.blank()
         await self._rig_ready()
-        loading = self._loading(trial, _next_side(steps, 0), stop)
+        loading = self._loading(trial, _next_side(steps, 0))
         try:
             await asyncio.shield(hub.warm)  # a long arithmetic start, and a device that renders, do not go together
             while not hub.begun:
@@ -160,9 +169,9 @@ class Runner:
                 await asyncio.sleep(hub.gap)
             for i, (show, seconds) in enumerate(steps):
                 if show in trial.renderings:
-                    await self._arrived(loading)
+                    await self._untouched(loading)
                 elif i and loading.done():
-                    loading = self._loading(trial, _next_side(steps, i), stop)
+                    loading = self._loading(trial, _next_side(steps, i))
                 await self._step(trial, i, show, seconds)
             await hub.rig.blank()
         finally:
@@ -172,7 +181,12 @@ class Runner:
     async def _step(self, trial, i, show, seconds) -> None:
         commit = self.hub.commit
         self._showing = self._showing_of(trial, i, show)
-        loaded = await self._untouched(asyncio.ensure_future(self.hub.rig.show(self._showing)))
+        shown = asyncio.ensure_future(self.hub.rig.show(self._showing))
+        try:
+            loaded = await self._untouched(shown)
+        finally:
+            shown.cancel()
+        self._asked = None
         if loaded is not None:
             await self._in_log(trial, show, loaded)
         await commit(lambda state, at: actions.present(state, trial.id, i, True, at), mine=True)
@@ -180,36 +194,37 @@ class Runner:
         await asyncio.sleep(seconds)
         await commit(lambda state, at: actions.present(state, trial.id, i, False, at), mine=True)
 
-    async def _arrived(self, loading) -> None:
-        """What was to be made ready is."""
-        done, _ = await asyncio.wait([loading], timeout=_HAND)
-        if not done:
-            self._at("let-go")
-        await loading
+    async def _untouched(self, work: asyncio.Future) -> Any:
+        """The result of what waits until no hand touches the rig; a hand that stays is asked to leave. Raises
+        `HandError` once it has been asked for so long."""
+        wait = _HAND
+        while not (await asyncio.wait([work], timeout=wait))[0]:
+            touched, now = self.hub.rig.snapshot.contact, time.monotonic()
+            if touched:
+                self._asked = self._asked or now
+                if now - self._asked > _LEAVES:
+                    raise HandError(
+                        f"The hand did not leave the device within {_LEAVES:g} s; the trial waits for Begin."
+                    )
+            stage = "let-go" if touched else "showing"
+            if self.stage != stage:
+                self._at(stage)
+            wait = _SOON
+        return await work
 
-    async def _untouched(self, shown: asyncio.Task) -> Loaded | None:
-        """It is shown; if a hand keeps it from that, it is asked to leave."""
-        try:
-            done, _ = await asyncio.wait([shown], timeout=_HAND)
-            if not done:
-                self._at("let-go" if self.hub.rig.snapshot.contact else "showing")
-            return await shown
-        finally:
-            shown.cancel()
-
-    def _loading(self, trial, side, stop) -> asyncio.Task:
+    def _loading(self, trial, side) -> asyncio.Task:
         """`_load`, going on beside what the participant feels."""
-        task = asyncio.ensure_future(self._load(trial, side, stop))
+        task = asyncio.ensure_future(self._load(trial, side))
         task.add_done_callback(_looked_at)
         return task
 
-    async def _load(self, trial: Trial, side: str | None, stop: threading.Event) -> None:
+    async def _load(self, trial: Trial, side: str | None) -> None:
         """A side made ready, and in the log if it is in force by that."""
         if side is None or self._in_force == (trial.id, trial.presentation, side):
             return
         self._in_force = None  # nobody knows which, until this one is known to be
         showing = self._showing_of(trial, 0, side)
-        loaded = await self.hub.rig.prepare(showing, stop, self._may_push)
+        loaded = await self.hub.rig.prepare(showing)
         if loaded is not None:
             await self._in_log(trial, side, loaded)
             self._in_force = (trial.id, trial.presentation, side)
@@ -250,16 +265,12 @@ class Runner:
             if seen.lost is None and seen.state not in ("HOLD", "ESTOP"):
                 return
             self.clock = {}
-            self.trouble = seen.lost or f"The {self.hub.rig.title.lower()} is in {seen.state}."
+            why = f": {seen.reason}" if seen.reason else ""
+            self.trouble = seen.lost or f"The {self.hub.rig.title.lower()} is in {seen.state}{why}."
             self._at("trouble")
             self._wake.clear()
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._wake.wait(), _LATER)
-
-    def _may_push(self) -> bool:
-        """Whether the rig may move by itself: somebody sits there who has pressed Begin, and everything is ready."""
-        hub = self.hub
-        return hub.begun and hub.warm.done() and hub.watchers.participant_here
 
     def _look_ahead(self) -> None:
         """In the choosing's thread, while somebody feels: what comes next after each possible answer. It ends with the

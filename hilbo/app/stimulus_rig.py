@@ -11,7 +11,6 @@ docs/guides/stimulus.md has every message.
 import asyncio
 import contextlib
 import secrets
-import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -205,8 +204,11 @@ class StimulusRig:
 
     # What the session wants.
 
-    async def prepare(self, showing: Showing, stop: threading.Event, may_push: Callable[[], bool]) -> None:
+    async def prepare(self, showing: Showing) -> None:
         """A program is told when it is to present, and not before."""
+
+    def telemetry(self, trial: int, presentation: int) -> None:
+        """A program sends no telemetry."""
 
     async def show(self, showing: Showing) -> Loaded | None:
         """Ordered as soon as nobody touches it, where it moves something, and confirmed in time."""

@@ -50,7 +50,7 @@ def participant(hub: Held) -> dict[str, Any]:
     trial, screen = seen["trial"], seen["screen"]
     step = _step(hub, trial) if screen == "trial" and stage == "step" else None
     asking = screen == "trial" and trial["felt"] and (stage == "answer" or _last_of_one(hub, step))
-    title, message, phase = _words(screen, stage, session.text)
+    title, message, phase = _words(hub, screen, stage, session.text)
     if step is not None and trial is not None:
         title, message, phase = trial["steps"][step["index"]]["text"], "", "step"
     hello = screen == "trial" and stage == "hello"
@@ -73,11 +73,13 @@ def participant(hub: Held) -> dict[str, Any]:
     }
 
 
-def _words(screen, stage, text):
-    """Title, message and phase where nothing is felt."""
+def _words(hub, screen, stage, text):
+    """Title, message and phase where nothing is felt. How a program's stimulus is let go, the study's own text says."""
     if screen == "trial":
         key = {"hello": "title", "between": "sent", "let-go": "let_go", "trouble": "trouble"}.get(stage, "wait")
-        return text(key), text("hello") if stage == "hello" else "", stage if stage == "hello" else "wait"
+        more = {"hello": "hello"} | ({"let-go": "lift"} if hub.state.study.stimulus is None else {})
+        message = text(more[stage]) if stage in more else ""
+        return text(key), message, stage if stage == "hello" else "wait"
     heads = {"wait": "wait", "ready": "ready", "rest": "rest", "paused": "paused", "done": "done", "ended": "ended"}
     title, stop, message = text(heads[screen]).partition(". ")
     return title + stop.strip(), message, screen
@@ -236,6 +238,7 @@ def _device(hub):
     seen = hub.rig.snapshot
     level = "bad" if seen.lost or seen.state in ("HOLD", "ESTOP") else "good" if seen.state == "RUNNING" else "rest"
     state, rows = "lost" if seen.lost else seen.state.lower(), [list(row) for row in seen.rows]
+    rows = ([["Reason", seen.reason]] if seen.reason and not seen.lost else []) + rows
     words = seen.lost or hub.rig.words
     return {"title": hub.rig.title, "state": state, "level": level, "words": words, "rows": rows}
 

@@ -72,9 +72,10 @@ def aggregate(
         say = held.enter_context(progress(quiet=not team.writes))
         with team.agreement() as agree:
             folder = held.enter_context(results(out, force)) if team.writes else None
-            chosen, cohort = read_cohort(trials, study, material, say)
+            chosen, cohort, flagged = read_cohort(trials, study, material, say)
             cohort = _chosen(cohort, participants) if participants else cohort
             cohort, left_out = _included(chosen, cohort)  # by the study's own model, whatever --rule aggregates
+            left_out = [*flagged, *left_out]
             chosen = chosen if rule is None else by_rule(chosen, rule)
             cohort = cohort.first(first) if first else cohort
             agree(digest(chosen.content, chosen.rule, seed, individuals, cohort))
@@ -105,7 +106,7 @@ def robustness(
 ) -> None:
     """Do the optima stay where they are when the evidence chooses the hyperparameters?"""
     with results(out, force) as folder, progress() as say:
-        chosen, everybody = read_cohort(trials, study, material, say)
+        chosen, everybody, flagged = read_cohort(trials, study, material, say)
         cohort, left_out = _included(chosen, everybody)
         from hilbo.report.robustness import write_robustness
         from hilbo.study.robustness import robustness as check
@@ -113,16 +114,18 @@ def robustness(
         say("hyperparameters by maximum evidence")
         comparison = check(chosen, cohort, seed, learn=tuple(name.strip() for name in learn.split(",")), shared=not own)
         say("maps, figures and report")
-        content = write_robustness(chosen, cohort, comparison, folder, seed, left_out)
+        content = write_robustness(chosen, cohort, comparison, folder, seed, [*flagged, *left_out])
     finish(content, out, as_json)
 
 
-def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tuple[Any, Any]:
-    """The study and the cohort of a trial table, or of a folder of session logs. Raises `InputError`."""
+def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tuple[Any, Any, list[str]]:
+    """The study, the cohort of a trial table or of a folder of session logs, and what the device's flags left out, in
+    sentences. Raises `InputError`."""
     say("reading")
     start()
     from hilbo.study.cohort import cohort_of
     from hilbo.study.config import Study
+    from hilbo.study.flag_counts import flag_sentences_of
     from hilbo.study.trial_table import read_trials
 
     whole = Study.load(study)
@@ -134,7 +137,10 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
         table = read_log_trials(trials, whole, material, others=False, note=remark)
     else:
         table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
-    return chosen, cohort_of(table, chosen)
+    sentences = flag_sentences_of(table, chosen.exclude_flags)
+    for sentence in sentences:
+        remark(sentence)
+    return chosen, cohort_of(table, chosen), sentences
 
 
 def _only_material(trials: Path, study: Any) -> str | None:

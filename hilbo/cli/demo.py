@@ -23,7 +23,7 @@ def demo(
         for name in PARTS:
             (folder / name).mkdir()
         table, study = (Path(str(data / f"video_quality.{kind}")) for kind in ("csv", "toml"))
-        chosen, cohort = read_cohort(table, study, None, say)
+        chosen, cohort, _ = read_cohort(table, study, None, say)
         real = aggregate_cohort(chosen, cohort, folder / PARTS[0], seed, say)
         simulated = simulated_report(folder / PARTS[1], seed, say)["materials"][""]
     _print_demo(real, simulated, out)

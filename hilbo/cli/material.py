@@ -26,6 +26,11 @@ def identify(
     damping: Annotated[float | None, typer.Option(help="Damping of your device, N.s/m.")] = None,
     only: Annotated[str | None, typer.Option(help="Fit one kind of test alone: relaxation or creep.")] = None,
     begin: Annotated[str, typer.Option(help='Tests begin at "rest" or in "equilibrium" with the first row.')] = "rest",
+    lag: Annotated[str, typer.Option(help='Lag of the force against the position, ms; or "fit".')] = "fit",
+    corner: Annotated[
+        str,
+        typer.Option(help='Corner of the force\'s filter, Hz; or "fit", "none", "auto" (fit where the data show it).'),
+    ] = "auto",
     compare: Annotated[bool, typer.Option(help="Refit with other numbers of past samples.")] = True,
     model: Annotated[str, typer.Option(help='For moduli: "fosls" or "fractional-maxwell".')] = "fosls",
     weights: Annotated[str | None, typer.Option(help='For moduli: residuals over the "range", or "relative".')] = None,
@@ -42,6 +47,7 @@ def identify(
     _positive("T", period)
     _positive("damping", damping)
     _positive("longest", longest)
+    instrument = {"lag": _number("lag", lag, ("fit",)), "corner": _number("corner", corner, ("fit", "none", "auto"))}
     with results(out, force) as folder, progress() as say:
         say("reading")
         start()
@@ -52,9 +58,11 @@ def identify(
 
         measurements = read_material(table, material, begin=begin, only=only, longest=longest)
         measured = measurements.tests[0].kind in MEASURED
-        chosen = _model(measured, model, weights, taps, period, memory)
+        chosen = _model(measured, model, weights, taps, period, memory, instrument)
         choices = memory_selection.CHOICES if measured and compare else ()
-        result = characterise.characterise(measurements.tests, chosen, seed, choices, say)
+        result = characterise.characterise(
+            measurements.tests, chosen, seed, choices, say, find_filter=instrument["corner"] == "auto"
+        )
         say("figures and report")
         content = report_material.identification_result(
             table.name, measurements.tests, result, measurements.stiffness_unit, measurements.notes, damping
@@ -63,14 +71,16 @@ def identify(
     finish(content, out, as_json)
 
 
-def _model(measured, model, weights, taps, period, memory) -> Any:
+def _model(measured, model, weights, taps, period, memory, instrument) -> Any:
     from hilbo.identification.moduli import Continuous, FractionalMaxwell
     from hilbo.identification.sampled import Sampled
 
     if measured:
         if model != "fosls" or weights:
             raise InputError("--model and --weights are for tables of moduli; tests with a force have the FO-SLS only.")
-        return Sampled(taps, period, memory)
+        lag, corner = instrument["lag"], instrument["corner"]
+        corner = float("inf") if corner in ("none", "auto") else corner
+        return Sampled(taps, period, memory, lag=lag if lag == "fit" else 1e-3 * lag, corner=corner)
     if model == "fractional-maxwell":
         return FractionalMaxwell(weights or "relative")
     return Continuous(weights or "range")
@@ -153,6 +163,17 @@ def _renderer(study):
 def _order(alpha):
     if not 0 < alpha <= 1:
         raise InputError(f"alpha is {alpha}; it must be above 0 and at most 1: the order of the fractional element.")
+
+
+def _number(name: str, text: str, words: tuple[str, ...]) -> float | str:
+    """One of the words, or a number."""
+    if text in words:
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        allowed = " or ".join(f'"{word}"' for word in words)
+        raise InputError(f'--{name} is "{text}"; it must be a number or {allowed}.') from None
 
 
 def _positive(name, value):

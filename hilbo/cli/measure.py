@@ -6,7 +6,7 @@ Results on stdout, progress on stderr, exit codes as in `device`, which gives th
 import math
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -54,7 +54,7 @@ def selftest(
 def measure_damping(
     line: Line, seed: Annotated[int, seed_option("of the motion")] = 0, as_json: JsonToo = False
 ) -> None:
-    """Damping b and Coulomb friction of the free device, with 95 % intervals. It moves by itself."""
+    """Damping b and friction of the free device by the law that fits, with 95 % intervals. It moves by itself."""
     from hilbo.device.handshake import shortest
     from hilbo.identification import device_tests
 
@@ -64,7 +64,11 @@ def measure_damping(
     rows = (("damping", "N.s/m"), ("coulomb", "N"), ("mass", "kg"), ("constant", "N"))
     estimates = [(name, getattr(friction, name), unit) for name, unit in rows]
     content = {name: estimate._asdict() | {"unit": unit} for name, estimate, unit in estimates}
+    if friction.added is not None:
+        estimates.append(_added(friction))
+        content[estimates[-1][0]] = friction.added._asdict() | {"unit": estimates[-1][2]}
     words = [f"{name:9} {x.value:9.5f}  {x.lower:9.5f} to {x.upper:9.5f}  {unit}" for name, x, unit in estimates]
+    words.append(f"Friction law that fits the sweeps: {friction.law}{_at(friction.speed)}.")
     words.append(f"The device reports {shortest(reported)} N.s/m; {_advice(min(friction.damping.lower, reported))}")
     if reported > friction.damping.upper:
         print("hilbo: the device reports more damping than it has; fix its configuration.", file=sys.stderr)
@@ -73,8 +77,22 @@ def measure_damping(
         "sweeps": friction.sweeps,
         "periods": friction.periods,
         "reported": reported,
+        "law": friction.law,
+        "stribeck_speed_mm_per_s": friction.speed,
     }
     print_result(content | rest, "\n".join(words), as_json)
+
+
+def _added(friction: Any) -> tuple[str, Any, str]:
+    """The further term of a law: its name, its estimate, its unit."""
+    if friction.speed is None:
+        return "quadratic", friction.added, "N.s2/m2"
+    return "stribeck", friction.added, "N"
+
+
+def _at(speed: float | None) -> str:
+    """At which speed (mm/s) a Stribeck term has fallen."""
+    return "" if speed is None else f" (falling over {speed:.3g} mm/s)"
 
 
 def _advice(damping: float) -> str:

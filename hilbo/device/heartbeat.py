@@ -28,7 +28,17 @@ if __name__ == "__main__":
 else:
     from hilbo.device.frames import Frame, Receiver, closed
 
-__all__ = ["BEAT", "GRACE", "HEARTBEAT", "WITH_TICK", "Heard", "HelperHeart", "ThreadHeart", "heart_for", "keep_beating"]
+__all__ = [
+    "BEAT",
+    "GRACE",
+    "HEARTBEAT",
+    "WITH_TICK",
+    "Heard",
+    "HelperHeart",
+    "ThreadHeart",
+    "heart_for",
+    "keep_beating",
+]
 
 BEAT = 0.05  # s between heartbeats, and between signs of life
 GRACE = 5.0  # s without a sign of life, after which the helper ends

@@ -17,11 +17,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from hilbo.device import failures, protocol
+from hilbo.device.arrivals import Arrivals
 from hilbo.device.failures import DeviceError
 from hilbo.device.frames import Receiver, WireError
 from hilbo.device.heartbeat import BEAT, Heard, HelperHeart, ThreadHeart, heart_for
 from hilbo.device.messages import Ack, HelloReply, Message, Nack, Notice, Pulse, Status, Telemetry, code_of, name_of
-from hilbo.device.ports import POLL
 from hilbo.device.reasons import NackReason
 from hilbo.errors import InputError
 
@@ -75,8 +75,7 @@ class Link:
         self._asking, self._writing, self._news = threading.Lock(), threading.Lock(), threading.Condition()
         self._closing = threading.Event()
         self._heart: HelperHeart | ThreadHeart | None = None
-        self._handing_over = self._parked = False
-        self._reading: HelperHeart | None = None  # what arrives comes through it, to its end
+        self._arrivals = Arrivals(port)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self.write(b"\0")
         self._reader.start()
@@ -169,16 +168,13 @@ class Link:
         self.heartbeat()
         if self.ours:
             return
-        self._park()
+        self._arrivals.hand_over()
         try:
-            heart = heart_for(self._port, boot_id, self.heard.tick, self._beat_here, self._fainted)
-            self._heart, self._reading = heart, heart if isinstance(heart, HelperHeart) else None
+            self._heart = heart_for(self._port, boot_id, self.heard.tick, self._beat_here, self._fainted)
         except OSError as error:
             raise DeviceError(f"The process that sends heartbeats cannot be started: {error}.") from error
         finally:
-            with self._news:
-                self._handing_over = False
-                self._news.notify_all()
+            self._arrivals.resume(self._heart if isinstance(self._heart, HelperHeart) else None)
         if self.lost:  # meanwhile
             self._end_beats()
 
@@ -189,12 +185,6 @@ class Link:
             heart.close(self._reader)
         elif heart is not None:
             heart.close()
-
-    def _park(self) -> None:
-        """Returns once the reading thread has let go of the port, which the helper will read."""
-        with self._news:
-            self._handing_over = True
-            self._news.wait_for(lambda: self._parked or self.lost or not self._reader.is_alive())
 
     @contextlib.contextmanager
     def silence(self) -> Iterator[None]:
@@ -239,6 +229,7 @@ class Link:
         with self._news:
             self.lost = self.lost or f"{self.name}: the connection has been closed; open it again."
             self._news.notify_all()
+        self._arrivals.end()
         self.beat(None)
         if self._reader is not threading.current_thread():
             self._reader.join()  # a port neither reads nor writes for long
@@ -254,25 +245,10 @@ class Link:
     def _fainted(self) -> None:
         self.faint = self.faint or failures.fainted(self.name)
 
-    def _arrived(self) -> bytes:
-        """What has arrived, from the helper while there is one. Raises OSError when the line is gone."""
-        with self._news:
-            self._parked = self._handing_over
-            self._news.notify_all()
-            self._news.wait_for(lambda: not self._handing_over or self._closing.is_set())
-            self._parked, heart = False, self._reading
-        if heart is None:
-            return self._port.read()
-        data = heart.read(POLL)
-        if data is None:
-            with self._news:
-                self._reading = None if self._reading is heart else self._reading
-        return data or b""
-
     def _read(self) -> None:
         while not self._closing.is_set():
             try:
-                data = self._arrived()
+                data = self._arrivals.read()
             except OSError as error:
                 self._lose(error)
                 return
@@ -337,6 +313,7 @@ class Link:
             self.lost = self.lost or why
             self._news.notify_all()
             why = self.lost
+        self._arrivals.end()
         self._end_beats()
         return why
 

@@ -15,34 +15,21 @@ import numpy as np
 
 from hilbo import passivity
 from hilbo.identification import intervals
-from hilbo.identification.fitting import Fit, Test, fit, nrmse, polish, untared
+from hilbo.identification.estimates import Estimate
+from hilbo.identification.fitting import Fit, Test, fit, nrmse, polish
+from hilbo.identification.instrument import can_be_timed
 from hilbo.identification.memory_selection import Row, select_memory
+from hilbo.identification.misfit import filter_score
 from hilbo.identification.residual_noise import noise
 from hilbo.identification.sampled import Sampled
+from hilbo.identification.sentences import sentences
 
 __all__ = ["Characterisation", "Estimate", "characterise"]
 
 _DRAWS = 4000
 _RESTARTS = 3  # from a better place that the search for intervals came through
-_UNRELATED = 3.0  # times the repeats' own noise, above which the model misses something
 _ROUNDING = 1e-12  # of the largest value; repeats that differ less are copies
-_WIDE, _TICKS = 5.0, 10.0  # medians of the time between rows, and T, above which it is a hole
-_SURE = 4.0  # standard errors
-_SHARE = 0.2  # of the input's range; what a hole may hide of it
-
-
-class Estimate(NamedTuple):
-    """A parameter: the value of the best curve, its 95 % interval (an open end is None), and what it is worth."""
-
-    value: float
-    lower: float | None
-    upper: float | None
-    status: str
-
-    @property
-    def known(self) -> bool:
-        """Whether the digits of `value` mean something."""
-        return self.status == "identified"
+_FILTERED = 4.0  # standard deviations, above which a filter of the force is fitted
 
 
 class Characterisation(NamedTuple):
@@ -65,17 +52,15 @@ def characterise(
     seed: int = 0,
     choices: Sequence[int | None] = (),
     say: Callable[[str], None] = lambda text: None,
+    *,
+    find_filter: bool = True,
 ) -> Characterisation:
-    """Fit tests by one parameter set and judge it; `choices` are the memories to compare (none: no comparison)."""
+    """Fit tests by one parameter set and judge it; `choices` are the memories to compare (none: no comparison).
+
+    `find_filter`: a `Sampled` with `lag="fit"` and no filter gets one where the residuals ask for it (`misfit`).
+    """
     say("fitting")
-    best_fit = fit(tests, model)
-    say("profile intervals")
-    sides = intervals.profile_intervals(best_fit)
-    for _ in range(_RESTARTS):
-        if not bool(sides.lowest < best_fit.solution.cost * (1 - 1e-6)):
-            break
-        best_fit = polish(best_fit, sides.lowest_q)
-        sides = intervals.profile_intervals(best_fit)
+    best_fit, sides = _fitted(tests, model, say, find_filter)
     sampling = intervals.spread(best_fit)
     boot = None
     if min(test.repeats for test in tests) >= intervals.FEWEST_REPEATS:
@@ -86,8 +71,8 @@ def characterise(
     residuals = {test.kind: row for test, row in zip(tests, _noise(best_fit, tests), strict=True)}
     if choices:
         say("memory")
-    rows = select_memory(tests, model.T, choices) if choices else ()
-    words = _warnings(best_fit, sides, estimates, residuals, tests)
+    rows = select_memory(tests, model.T, choices, *_instrument(best_fit)) if choices else ()
+    words = sentences(best_fit, sides, sampling, estimates, residuals, tests)
     ends = None if boot is None else [np.asarray(best_fit.model.natural(end)) for end in boot]
     named = (
         None
@@ -97,6 +82,36 @@ def characterise(
     return Characterisation(
         best_fit, estimates, named, residuals, nrmse(best_fit), float(sampling.freedom), damping, rows, words
     )
+
+
+def _fitted(
+    tests: Sequence[Test], model: Any, say: Callable[[str], None], find_filter: bool
+) -> tuple[Fit, intervals.Intervals]:
+    """The best fit and its intervals, with what of the instrument can be fitted."""
+    instrument = isinstance(model, Sampled) and model.lag == "fit"
+    if instrument and not can_be_timed(tests):
+        model = Sampled(model.N, model.T, model.memory, lag=0.0, corner=model.corner)
+        instrument = False
+    best_fit = fit(tests, model)
+    if instrument and find_filter and model.corner == np.inf and filter_score(best_fit) > _FILTERED:
+        say("a filter of the force")
+        best_fit = fit(tests, Sampled(model.N, model.T, model.memory, lag="fit", corner="fit"))
+    say("profile intervals")
+    sides = intervals.profile_intervals(best_fit)
+    for _ in range(_RESTARTS):
+        if not bool(sides.lowest < best_fit.solution.cost * (1 - 1e-6)):
+            break
+        best_fit = polish(best_fit, sides.lowest_q)
+        sides = intervals.profile_intervals(best_fit)
+    return best_fit, sides
+
+
+def _instrument(best_fit: Fit) -> tuple[float, float]:
+    """Lag (s) and corner (Hz) of a fit, as they are held for fits with other memories."""
+    model = best_fit.model
+    named = dict(zip(model.labels, np.asarray(model.natural(best_fit.q)).tolist(), strict=True))
+    lag = 1e-3 * named["lag"] if "lag" in named else float(model.lag)
+    return lag, named["corner"] if "corner" in named else float(model.corner)
 
 
 def _estimates(best_fit: Fit, sides: intervals.Intervals, sampling: intervals.Spread, seed: int) -> dict[str, Estimate]:
@@ -146,18 +161,20 @@ def _quantiles(best_fit: Fit, sampling: intervals.Spread, seed: int) -> dict[str
 
 def _noise(best_fit: Fit, tests: Sequence[Test]) -> Iterator[dict[str, Any]]:
     """What the residuals of each test look like, and how they compare with the noise of the repeats."""
-    for test, autoregression in zip(tests, noise(best_fit), strict=True):
+    for test, curve, autoregression in zip(tests, best_fit.curves, noise(best_fit), strict=True):
+        values = np.asarray(test.output if curve.other_way is None else test.input)
         row = {
             "autocorrelation": float(autoregression.lag_one),
             "order": int(autoregression.order),
             "effective_samples": float(autoregression.effective),
             "samples": test.time.size,
             "repeats": test.repeats,
+            "drift": float(autoregression.drift),
         }
         if test.repeats > 1:
-            scatter = np.sqrt(np.mean(np.var(test.output, axis=0, ddof=1)) / test.repeats)
-            size = float(autoregression.rms) * np.ptp(test.output.mean(axis=0))
-            if scatter > _ROUNDING * np.max(np.abs(test.output)):  # copies tell nothing about noise
+            scatter = np.sqrt(np.mean(np.var(values, axis=0, ddof=1)) / test.repeats)
+            size = float(autoregression.rms) * np.ptp(values.mean(axis=0))
+            if scatter > _ROUNDING * np.max(np.abs(values)):  # copies tell nothing about noise
                 row["over_repeat_noise"] = float(size / scatter)
         yield row
 
@@ -171,70 +188,3 @@ def _minimum_damping(best_fit: Fit) -> float | None:
         return None
     parameters = values["K1"], values["B1"], values["alpha"], values["K_eff"]
     return float(passivity.minimum_damping(*parameters, int(model.N), model.T, memory=model.memory))
-
-
-def _warnings(
-    best_fit: Fit,
-    sides: intervals.Intervals,
-    estimates: dict[str, Estimate],
-    residuals: dict[str, dict[str, Any]],
-    tests: Sequence[Test],
-) -> tuple[str, ...]:
-    """Sentences for a person who would otherwise trust the digits."""
-    words = []
-    if not bool(best_fit.solution.converged):
-        words.append("The fit did not come to an end: the cost is flat in some direction, so no digits are printed.")
-    elif float(sides.lowest) < float(best_fit.solution.cost) * (1 - 1e-4):
-        words.append("A search for an interval found a better fit than the fit itself; the data have several optima.")
-    for name, estimate in estimates.items():
-        if estimate.status == "at bound":
-            words.append(f"The fit ran to the bound of {name}, {estimate.value:.3g}; the data do not determine it.")
-    unknown = [name for name, estimate in estimates.items() if estimate.status == "not identifiable"]
-    if unknown:
-        words.append(f"Not identifiable from these data: {', '.join(unknown)}.")
-    for kind, row in residuals.items():
-        if row.get("over_repeat_noise", 0.0) > _UNRELATED:
-            words.append(
-                f"The residuals of the {kind} test are {row['over_repeat_noise']:.0f} times the noise of its repeats:"
-                " the model misses part of the curve, and the intervals take that as correlated noise."
-            )
-    T = getattr(best_fit.model, "T", np.inf)
-    coarse = [t.kind for t in tests if np.median(np.diff(t.time)) > 1.001 * T]
-    if coarse:
-        words.append(
-            f"The samples of the {' and '.join(coarse)} test are further apart than T = {1000 * T:g} ms;"
-            " the input was interpolated linearly in between."
-        )
-    return (*words, *(sentence for test in tests for sentence in _recording(test, T)))
-
-
-def _recording(test: Test, T: float) -> Iterator[str]:
-    """What is amiss with the recorded input: a step that fell into a hole between rows, a beginning off 0."""
-    if test.input is None:
-        return
-    put, out, time = test.input.mean(axis=0), test.output.mean(axis=0), test.time - test.time[0]
-    apart, change = np.diff(time), np.abs(np.diff(put))
-    hole = (apart > _WIDE * np.median(apart)) & (apart > _TICKS * T) & (change > _SHARE * np.ptp(put))
-    if hole.any():
-        i = int(np.argmax(np.where(hole, change, 0)))
-        yield (
-            f"The {test.kind} test has no rows from {time[i]:g} s to {time[i + 1]:g} s, where its input changes by"
-            f" {change[i] / np.ptp(put):.0%} of its range: a straight line was taken there, and values and intervals"
-            " are wrong if the input went another way; record that part with rows as close as elsewhere."
-        )
-    offset = untared(put, out) if test.start == "rest" else None
-    if offset is not None and _above_scatter(test.input if offset == "input" else test.output):
-        names = ("position", "force") if (offset == "input") == (test.kind == "relaxation") else ("force", "position")
-        first = (put if offset == "input" else out)[0]
-        unit = "mm" if names[0] == "position" else "N"
-        yield (
-            f"The {test.kind} test does not begin at rest: its first row has a {names[0]} of {first:.3g} {unit} and no"
-            f" {names[1]}; unless that is noise, values and intervals are wrong: tare it (subtract that from every"
-            f" {names[0]})."
-        )
-
-
-def _above_scatter(values: np.ndarray) -> bool:
-    """Whether the repeats agree that their first row is not 0. (R, m)."""
-    first, repeats = values[:, 0], values.shape[0]
-    return repeats == 1 or bool(abs(first.mean()) > _SURE * np.std(first, ddof=1) / np.sqrt(repeats))

@@ -2,8 +2,8 @@
 
 What was measured is fitted: the recorded input (position in relaxation, force in creep) goes through a model
 (`sampled`) and its output is compared, so that no ideal step is assumed. Modulus data G(t), J(t) have no input; they
-are fitted by exact forms (`moduli`). A model has four coordinates, bounds and starts; this module brings models and
-tests together.
+are fitted by exact forms (`moduli`). A model has four coordinates or more, bounds and starts; this module brings
+models and tests together.
 
 Residuals are divided by the range of their curve; the cost is the sum over tests of NRMSE².
 Units: N, mm, s; B1 N·s^α/mm. Moduli keep their own unit.
@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hilbo.errors import InputError
+from hilbo.identification.beginnings import correlation, off_zero
 from hilbo.numerics.least_squares import Solution, least_squares
 from hilbo.numerics.tracing import program
 
@@ -33,14 +34,12 @@ __all__ = [
     "polish",
     "residuals",
     "search",
-    "untared",
 ]
 
 Kind = Literal["relaxation", "creep", "modulus", "compliance"]
 MEASURED = ("relaxation", "creep")  # kinds with a recorded input
 FEWEST = 8  # points of a test
 _OPPOSED = -0.1  # correlation of position and force, about 0; noise does not bring a real test there
-_OFF_ZERO, _MOVED = 0.03, 0.2  # of a curve's range
 _RACE, _LONGEST = 12, 200  # steps of every start, and of the best one
 
 
@@ -83,11 +82,11 @@ class Test(eqx.Module):
     def _check_signs(self):
         """Refuse a repeat whose position and force oppose each other."""
         for place, (put, out) in enumerate(zip(() if self.input is None else self.input, self.output, strict=False), 1):
-            opposed = _correlation(self.time, put, out) < _OPPOSED
-            changes = _correlation(self.time, put - put[0], out - out[0])
+            opposed = correlation(self.time, put, out) < _OPPOSED
+            changes = correlation(self.time, put - put[0], out - out[0])
             if self.start == "equilibrium":
                 opposed = changes < _OPPOSED
-            elif _off_zero(put, out):  # an offset of one of them is no opposite sign
+            elif off_zero(put, out):  # an offset of one of them is no opposite sign
                 opposed = opposed and not changes >= _OPPOSED
             if opposed:
                 which = f" in repeat {place} of {self.repeats} (counted from 1)" if self.repeats > 1 else ""
@@ -102,25 +101,33 @@ class Test(eqx.Module):
 
 @runtime_checkable
 class Model(Protocol):
-    """What is fitted: a prediction of four coordinates q, with bounds and starts that the data suggest.
+    """What is fitted: a prediction of p coordinates q, with bounds and starts that the data suggest.
 
     `sampled.Sampled`, `moduli.Continuous` and `moduli.FractionalMaxwell`. `labels` name the coordinates, `kinds` the
     tests that it can make.
     """
 
-    labels: tuple[str, ...]
     kinds: tuple[str, ...]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the p coordinates."""
+        ...
+
+    def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+        """Which lower and upper bounds are limits of nature, such as a stiffness of 0, and not of the search. (p,)."""
+        ...
 
     def at(self, tests: Sequence[Test]) -> "Model":
         """The same model, made ready for the times of the tests."""
         ...
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest q, (4,) each."""
+        """Lowest and highest q, (p,) each."""
         ...
 
     def starts(self, tests: Sequence[Test]) -> np.ndarray:
-        """Where the search begins, (s, 4)."""
+        """Where the search begins, (s, p)."""
         ...
 
     def prepare(self, test: Test) -> "Curve":
@@ -128,15 +135,15 @@ class Model(Protocol):
         ...
 
     def predict(self, q: Array, curve: "Curve", weights: Array) -> Array:
-        """The curve's output (m,) at the coordinates q (4,), under `weights` (R,) of the repeats."""
+        """The curve's output (m,) at the coordinates q (p,), under `weights` (R,) of the repeats."""
         ...
 
     def natural(self, q: Array) -> Array:
-        """q (4,) under its labels, in physical units."""
+        """q (p,) under its labels, in physical units."""
         ...
 
     def parameters(self, q: Array) -> dict[str, Array]:
-        """Name -> value in physical units, at q (4,)."""
+        """Name -> value in physical units, at q (p,)."""
         ...
 
 
@@ -145,7 +152,9 @@ class Curve(eqx.Module):
 
     The model is linear in its input, so the mean of the repeats is the response to the mean of their inputs, exactly.
     `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: where the
-    measured times lie on it; `scale`: what residuals are divided by.
+    measured times lie on it; `scale`: what residuals are divided by; `changes`: transforms of those changes of
+    the inputs from one sample to the next that stand clear of their noise (`instrument`); `regular`: there is a row for
+    each sample of the model; `other_way`: the same test with input and output exchanged, if it is fitted like that.
     """
 
     kind: Kind = eqx.field(static=True)
@@ -157,6 +166,14 @@ class Curve(eqx.Module):
     before: Int[Array, " m"] | None = None
     share: Float[Array, " m"] | None = None
     length: int = eqx.field(static=True, default=0)
+    changes: Array | None = None
+    regular: bool = eqx.field(static=True, default=False)
+    other_way: "Curve | None" = None
+
+    @property
+    def fitted(self) -> "Curve":
+        """The curve whose residuals are minimised."""
+        return self if self.other_way is None else self.other_way
 
 
 class Fit(eqx.Module):
@@ -185,51 +202,13 @@ class Fit(eqx.Module):
 
     def held(self) -> Bool[Array, " p"]:
         """Coordinates within a millionth of the box's width of a bound: the data pull them out of it. (p,)."""
+        at_lower, at_upper = self.bounded(self.q)
+        return at_lower | at_upper
+
+    def bounded(self, q: Float[Array, " p"]) -> tuple[Bool[Array, " p"], Bool[Array, " p"]]:
+        """Whether each coordinate of q (p,) stands at its lower, and at its upper bound. Two arrays (p,)."""
         reach = 1e-6 * (self.upper - self.lower)
-        return (self.q - self.lower <= reach) | (self.upper - self.q <= reach)
-
-
-def untared(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:
-    """Which has an offset, "input" or "output": its first row is not 0, although the other's is. (m,) each.
-
-    A step in the first row itself looks alike, but there the other one moves while this one stays.
-    """
-    name = _off_zero(put, out)
-    held, other = (put, out) if name == "input" else (out, put)
-    leaves = np.abs(held - held[0]) > max(0.05, 4 * _jitter(held)) * np.ptp(held)
-    before = int(np.argmax(leaves)) if leaves.any() else held.size
-    return name if np.ptp(other[:before]) <= _MOVED * np.ptp(other) else None
-
-
-def _off_zero(put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> str | None:
-    """Which, "input" or "output", is clearly not 0 in the first row, where the other one is."""
-    for name, one, other in (("input", put, out), ("output", out, put)):
-        height = _height(one)
-        zero = _height(other) <= max(0.1 * min(height, 1.0), 2 * _jitter(other))
-        if zero and height > max(_OFF_ZERO, 6 * _jitter(one)):
-            return name
-    return None
-
-
-def _height(values: Float[np.ndarray, " m"]) -> float:
-    """The first of the values, over their range."""
-    first, width = abs(values[0]), np.ptp(values)
-    return float(first / width) if width > 0 else np.inf if first > 0 else 0.0
-
-
-def _jitter(values: Float[np.ndarray, " m"]) -> float:
-    """Standard deviation of the noise from row to row, over the range of the values."""
-    second = np.abs(np.diff(values, 2))  # has the variance of six samples
-    return float(1.4826 * np.median(second) / np.sqrt(6) / (np.ptp(values) or np.inf))
-
-
-def _correlation(time: Float[np.ndarray, " m"], put: Float[np.ndarray, " m"], out: Float[np.ndarray, " m"]) -> float:
-    """Of two curves about 0, over the time; nan where one of them is 0.
-
-    A storage modulus is above 0 at every frequency, and so is this of whatever a material can do from rest.
-    """
-    both, ones, others = (np.trapezoid(product, time) for product in (put * out, put * put, out * out))
-    return float(both / np.sqrt(ones * others)) if ones * others > 0 else np.nan
+        return q - self.lower <= reach, self.upper - q <= reach
 
 
 def fit(tests: Sequence[Test], model: Any) -> Fit:
@@ -285,13 +264,18 @@ def curve_residuals(model: Any, curve: Curve, weights: Float[Array, " R"], q: Fl
 
     `weights` (R,), `q` (p,) -> (m,), without unit.
     """
+    return _misfit(model, curve.fitted, weights, q)
+
+
+def _misfit(model: Any, curve: Curve, weights: Float[Array, " R"], q: Float[Array, " p"]) -> Float[Array, " m"]:
+    """The same in the output of the test."""
     misfit = weights @ curve.output - model.predict(q, curve, weights)
     return misfit / (curve.scale * np.sqrt(curve.time.size).astype(curve.scale.dtype))
 
 
 def nrmse(fitted: Fit) -> dict[str, float]:
     """Root mean square of each test's residuals over its range. Kind of test -> share of the range, without unit."""
-    parts = [curve_residuals(fitted.model, c, w, fitted.q) for c, w in zip(fitted.curves, fitted.weights, strict=True)]
+    parts = [_misfit(fitted.model, c, w, fitted.q) for c, w in zip(fitted.curves, fitted.weights, strict=True)]
     return {c.kind: float(jnp.linalg.norm(r)) for c, r in zip(fitted.curves, parts, strict=True)}
 
 

@@ -6,7 +6,8 @@ w(t) = sin²(π t/L) over a stretch of length L, which vanishes with its slope a
 
     ∫wF = m·∫w''x - b·∫w'x + c·sign·∫w + f0·∫w,
 
-which is linear in what is sought and differentiates no encoder (Shinbrot 1954). Least squares over the stretches;
+which is linear in what is sought and differentiates no encoder (Shinbrot 1954). Where the residuals refute this law,
+one with a further term takes its place, or none (`friction_laws`). Least squares over the stretches;
 intervals by a bootstrap over whole periods, there and back, because what is wrong in one sweep, cogging or a servo that
 swings, is wrong in the next in the same way (Künsch 1989).
 Units: mm, N, s, b in N·s/m, m in kg.
@@ -19,11 +20,14 @@ import numpy as np
 from jaxtyping import Float
 
 from hilbo.errors import InputError
+from hilbo.hardware_bridge import DeviceError
+from hilbo.identification.friction_laws import LAWS, Blocks, Law, candidates, refuted
 
 __all__ = ["Friction", "Interval", "Sweep", "friction", "sweeps"]
 
 _FEWEST = 8  # periods
 _DRAWS = 4000
+_AS_WELL = 1.25  # times the least sum of squares: laws that the sweeps hardly tell apart
 _CREEPS = 0.008  # s after a turn, until the handle surely moves
 
 
@@ -45,7 +49,11 @@ class Interval(NamedTuple):
 
 
 class Friction(NamedTuple):
-    """What keeps a free device from moving; `residual` (N) is the standard deviation of what is left of the sweeps."""
+    """What keeps a free device from moving; `residual` (N) is the standard deviation of what is left of the sweeps.
+
+    `law` is one of `friction_laws.LAWS`, `added` the further term of the second (N·s²/m²) or third (N), whose v_s is
+    `speed` (mm/s). The interval of the damping holds those of all laws that fit about as well.
+    """
 
     damping: Interval  # N·s/m
     coulomb: Interval  # N
@@ -54,6 +62,9 @@ class Friction(NamedTuple):
     residual: float
     sweeps: int
     periods: int
+    law: str = LAWS[0]
+    added: Interval | None = None
+    speed: float | None = None
 
 
 def sweeps(
@@ -99,7 +110,10 @@ def _sweep(x: Float[np.ndarray, " n"], force: Float[np.ndarray, " n"], tick: flo
 
 
 def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
-    """Least squares over the sweeps, with intervals by a bootstrap over periods. Raises `InputError` for too few."""
+    """Least squares over the sweeps by the simplest law that fits, with intervals by a bootstrap over periods.
+
+    Raises `InputError` for too few sweeps, `DeviceError` where no law fits them.
+    """
     values = np.array([[s.force, s.velocity, s.acceleration] for s in sweeps])
     periods, period = np.unique([s.period for s in sweeps], return_inverse=True)
     if periods.size < _FEWEST or np.unique(np.abs(values[:, 1]).round(0)).size < 2:
@@ -109,17 +123,47 @@ def friction(sweeps: Sequence[Sweep], seed: int = 0) -> Friction:
         )
     # N = kg m/s^2 + (N s/m) m/s + N + N, from mm/s^2 and mm/s
     terms = np.stack([values[:, 2] / 1e3, values[:, 1] / 1e3, np.sign(values[:, 1]), np.ones(len(values))], axis=1)
-    products, sides = terms[:, :, None] * terms[:, None, :], terms * values[:, :1]
-    blocks = np.zeros((periods.size, 4, 4)), np.zeros((periods.size, 4))
-    np.add.at(blocks[0], period, products)
-    np.add.at(blocks[1], period, sides)
-    best = np.linalg.lstsq(terms, values[:, 0], rcond=None)[0]
-    drawn = np.random.default_rng(seed).multinomial(periods.size, np.full(periods.size, 1 / periods.size), _DRAWS)
-    normal, right = np.tensordot(drawn, blocks[0], 1), drawn @ blocks[1]
+    fits = _fitting(Blocks(terms, values[:, 0], period), np.abs(values[:, 1]), np.sign(values[:, 1]))
+    law, blocks = fits[0]
+    mass, damping, coulomb, constant, *added = _intervals(blocks, seed)
+    for _, other in fits[1:]:
+        again = _intervals(other, seed)[1]
+        damping = Interval(damping.value, min(damping.lower, again.lower), max(damping.upper, again.upper))
+    freedom = blocks.terms.shape[1]
+    residual, further = float(blocks.left.std(ddof=freedom)), added[0] if added else None
+    parts = damping, coulomb, mass, constant
+    return Friction(*parts, residual, len(sweeps), int(periods.size), law.name, further, law.speed)
+
+
+def _fitting(blocks: Blocks, speed: Float[np.ndarray, " n"], way: Float[np.ndarray, " n"]) -> list[tuple[Law, Blocks]]:
+    """The law that fits and its terms, then those that fit about as well. Raises `DeviceError` where none does."""
+    simplest, *others = candidates(speed, way)
+    if not refuted(blocks, speed, way):
+        return [(simplest, blocks)]
+    pairs = [(law, blocks.with_term(law)) for law in others]
+    left = [float(np.sum(pair[1].left ** 2)) for pair in pairs]
+    order = np.argsort(left)  # best first
+    good = [pairs[i] for i in order if left[i] < _AS_WELL * left[order[0]] and not refuted(pairs[i][1], speed, way)]
+    if not good:
+        raise DeviceError(
+            f"The friction of this device follows none of the laws that are known ({', '.join(LAWS)}): the sweeps leave"
+            f" {1e3 * blocks.left.std():.1f} mN that change with the speed, so that no damping is given. Look for"
+            " something that rubs or is loose, and measure again; until then plan no study with this device."
+        )
+    return sorted(good, key=lambda pair: LAWS.index(pair[0].name))  # the simpler law first; stable
+
+
+def _intervals(blocks: Blocks, seed: int) -> list[Interval]:
+    """Estimates of all terms, with a bootstrap over periods."""
+    count, best = int(blocks.period.max()) + 1, blocks.best
+    products = blocks.terms[:, :, None] * blocks.terms[:, None, :]
+    sums = np.zeros((count, *products.shape[1:])), np.zeros((count, best.size))
+    np.add.at(sums[0], blocks.period, products)
+    np.add.at(sums[1], blocks.period, blocks.terms * blocks.force[:, None])
+    drawn = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), _DRAWS)
+    normal, right = np.tensordot(drawn, sums[0], 1), drawn @ sums[1]
     estimates = np.linalg.solve(normal, right[:, :, None])[:, :, 0]
     # Basic bootstrap, widened for the few blocks as a t-interval is: the errors' distribution turned over.
-    wide = np.sqrt(periods.size / (periods.size - 4))
+    wide = np.sqrt(count / (count - best.size))
     lower, upper = best - wide * (np.quantile(estimates, [0.975, 0.025], axis=0) - best)
-    mass, damping, coulomb, constant = (Interval(*map(float, row)) for row in zip(best, lower, upper, strict=True))
-    left = values[:, 0] - terms @ best
-    return Friction(damping, coulomb, mass, constant, float(left.std(ddof=4)), len(sweeps), int(periods.size))
+    return [Interval(*map(float, row)) for row in zip(best, lower, upper, strict=True)]

@@ -27,11 +27,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Fit, curve_residuals, residuals
-from hilbo.identification.residual_noise import autoregression, filtered, fitted_residuals
+from hilbo.identification.residual_noise import filtered, fitted_residuals, noises
 from hilbo.numerics.least_squares import Solution, least_squares, solve_symmetric
 from hilbo.numerics.tracing import program
 
-__all__ = ["Intervals", "Spread", "block_bootstrap", "profile_intervals", "refits", "spread"]
+__all__ = ["Intervals", "Spread", "block_bootstrap", "inverse_of_free", "profile_intervals", "refits", "spread"]
 
 FEWEST_REPEATS = 5  # of a test, below which resampling them says nothing
 _CLOSE = 1e-3  # of the half-width, to which an end of an interval is found
@@ -53,7 +53,8 @@ class Spread(eqx.Module):
 class Intervals(eqx.Module):
     """An interval for each coordinate.
 
-    `open_*` says that the data set no end on that side before the box does (the number there is the box's bound).
+    `open_*` says that the data set no end on that side: the search came to the box's bound, or to a place where another
+    coordinate stands at a bound of its own (`Model.physical` excepted), so that a wider box would move the end.
     `bracketed` is False where the search failed; `lowest` is the lowest cost met: below the fit's, the fit was no
     minimum.
     """
@@ -78,10 +79,10 @@ def _spread(fit: Fit, quantile: float) -> Spread:
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(q)
     meat, effective = jnp.zeros_like(fit.solution.normal), jnp.zeros_like(q[0])
     unscaled = _inverse(fit.solution.normal, _free(fit))
-    for r, J in zip(fitted_residuals(fit, q), slopes, strict=True):
-        model = autoregression(r)
+    for r, J, model in zip(fitted_residuals(fit, q), slopes, noises(fit), strict=True):
         shape = filtered(J, model)  # Jᵀ Γ J / γ_0
-        lost = jnp.sum(unscaled * shape)
+        still = eqx.tree_at(lambda n: n.walk, model, jnp.zeros_like(model.walk))  # a walk's variance is as observed
+        lost = jnp.sum(unscaled * filtered(J, still))
         variance = r @ r / (r.size - lost)
         meat, effective = meat + variance * shape, effective + model.effective
     rows = jax.vmap(lambda turn: _inverse(fit.solution.normal, _free(fit) | turn))(jnp.eye(q.size, dtype=bool))
@@ -145,6 +146,7 @@ def _end(fit: Fit, sampling: Spread, j: Int[Array, ""], sign: Float[Array, ""]) 
     q, cut, row = fit.q, sampling.cut[j], sampling.inverse[j]
     room = jnp.where(sign > 0, fit.upper[j] - q[j], q[j] - fit.lower[j])
     is_j = jnp.arange(q.size) == j
+    below, above = (jnp.asarray(nature) | is_j for nature in fit.model.physical())
 
     def fitted_beside(distance, start):
         value = q[j] + sign * distance
@@ -163,7 +165,10 @@ def _end(fit: Fit, sampling: Spread, j: Int[Array, ""], sign: Float[Array, ""]) 
         start = jnp.where(is_j, q + sign * distance, state.q)  # beside the best point known to be inside
         solution = fitted_beside(distance, start)
         rise = solution.cost - fit.solution.cost
-        return _narrowed(state, distance, jnp.sqrt(jnp.maximum(rise, 0) / cut), solution, q, distance >= room)
+        at_lower, at_upper = fit.bounded(solution.q)
+        propped = jnp.any((at_lower & ~below) | (at_upper & ~above))
+        now = _narrowed(state, distance, jnp.sqrt(jnp.maximum(rise, 0) / cut), solution, q, distance >= room)
+        return now._replace(open=now.open | (now.done & propped))
 
     zero, infinite = jnp.zeros_like(cut), jnp.full_like(cut, jnp.inf)
     guess = jnp.sqrt(cut * row[j])
@@ -269,6 +274,11 @@ def _influences(fit: Fit, slopes: tuple[Float[Array, "_ p"], ...]) -> tuple[Floa
         alone = jax.vmap(lambda w, c=curve: curve_residuals(fit.model, c, w, fit.q))(jnp.eye(count, dtype=J.dtype))
         pulls.append(-alone @ J @ inverse)
     return tuple(pulls)
+
+
+def inverse_of_free(fit: Fit) -> Float[Array, "p p"]:
+    """A⁻¹ over the coordinates that are not held at a bound, 0 elsewhere. (p, p)."""
+    return _inverse(fit.solution.normal, _free(fit))
 
 
 def _free(fit: Fit) -> Bool[Array, " p"]:

@@ -29,13 +29,21 @@ class Row(NamedTuple):
     nrmse: dict[str, float]
 
 
-def select_memory(tests: Sequence[Test], T: float = 1e-3, choices: Sequence[int | None] = CHOICES) -> tuple[Row, ...]:
-    """Fit the tests with each memory."""
+def select_memory(
+    tests: Sequence[Test],
+    T: float = 1e-3,
+    choices: Sequence[int | None] = CHOICES,
+    lag: float = 0.0,
+    corner: float = np.inf,
+) -> tuple[Row, ...]:
+    """Fit the tests with each memory; `lag` (s) and `corner` (Hz) of the force channel are those of `sampled`."""
     if not choices:
         raise InputError("There is no number of taps to choose from.")
     rows = []
     for N in choices:
-        best_fit = fit(tests, Sampled(T=T, memory="full") if N is None else Sampled(N, T))
+        full = N is None
+        model = Sampled(T=T, memory="full", lag=lag, corner=corner) if full else Sampled(N, T, lag=lag, corner=corner)
+        best_fit = fit(tests, model)
         rows.append(Row(N, best_fit, nrmse(best_fit)))
     return tuple(rows)
 

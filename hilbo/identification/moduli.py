@@ -40,6 +40,10 @@ class Continuous(eqx.Module):
     labels = ("K_inst", "K_eff", "kappa", "alpha")
     kinds = ("modulus", "compliance")
 
+    def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+        """K_eff >= 0 is a limit of nature."""
+        return (False, True, False, False), (False,) * 4
+
     def at(self, tests: Sequence[Test]) -> "Continuous":
         """The model with its t0 in the middle of these data."""
         times = np.concatenate([test.time for test in tests])
@@ -87,6 +91,10 @@ class FractionalMaxwell(eqx.Module):
 
     labels = ("G_c", "tau", "alpha", "beta/alpha")
     kinds = ("modulus",)
+
+    def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+        """α <= 1 and β >= 0 are limits of nature."""
+        return (False, False, False, True), (False, False, True, False)
 
     def at(self, tests: Sequence[Test]) -> "FractionalMaxwell":
         """Itself: τ is where the data bend."""

@@ -23,8 +23,9 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from hilbo.errors import InputError
+from hilbo.identification import instrument
 from hilbo.identification.fitting import MEASURED, Curve, Test
-from hilbo.numerics.tracing import program
+from hilbo.identification.screening import screened, separate
 
 __all__ = ["Sampled"]
 
@@ -38,6 +39,9 @@ class Sampled(eqx.Module):
     """The FO-SLS as it is rendered: sampled every `T` s, with the last `N` samples or full memory.
 
     Full memory is the infinite sum, which `viscoelastic`'s sum of exponentials meets to 1e-4 of the largest force.
+    `lag` (s): how late the recorded force is against the position, negative where the position is late; `corner` (Hz)
+    of a first-order low-pass filter in the force channel (`instrument`). Each is a number or "fit", which appends a
+    coordinate: the lag in samples, the logarithm of the corner over 1/(2πT). No filter is a corner of infinity.
     """
 
     N: int | Int[Array, ""] = 101
@@ -45,7 +49,9 @@ class Sampled(eqx.Module):
     memory: Literal["short", "full"] = eqx.field(static=True, default="short")
     capacity: int = eqx.field(static=True, default=0)  # taps that are computed; models with one capacity compile once
 
-    labels = ("K_inst", "K_eff", "kappa", "alpha")
+    lag: Any = 0.0  # a number, an array of `at`, or "fit"
+    corner: Any = np.inf
+
     kinds = MEASURED
 
     def __check_init__(self):
@@ -53,21 +59,50 @@ class Sampled(eqx.Module):
             raise InputError(f"N is {self.N}; it must be at least 1: the number of past samples.")
         if not 0 < self.T < np.inf:
             raise InputError(f"T is {self.T}; it must be a time in s above 0.")
+        if any(isinstance(value, str) and value != "fit" for value in (self.lag, self.corner)):
+            raise InputError(f'lag and corner are {self.lag!r} and {self.corner!r}; each must be a number or "fit".')
+        if isinstance(self.lag, float) and not abs(self.lag) <= instrument.LARGEST_LAG * self.T:
+            most = 1e3 * instrument.LARGEST_LAG * self.T
+            raise InputError(f"The lag is {1e3 * self.lag:g} ms; it must be between -{most:g} and {most:g} ms.")
+        if isinstance(self.corner, float) and not self.corner >= self._corners()[0]:
+            raise InputError(f"The corner is {self.corner:g} Hz; it must be {self._corners()[0]:.3g} Hz or more.")
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Names of the coordinates."""
+        fitted = [name for name in ("lag", "corner") if _is_fitted(getattr(self, name))]
+        return ("K_inst", "K_eff", "kappa", "alpha", *fitted)
+
+    def physical(self) -> tuple[tuple[bool, ...], tuple[bool, ...]]:
+        """K_eff >= 0 is a limit of nature, and so is a filter too fast to matter."""
+        upper = tuple(name == "corner" for name in self.labels)
+        return tuple(name == "K_eff" for name in self.labels), upper
+
+    def _corners(self) -> tuple[float, float]:
+        """Lowest and highest corner that is told from none, Hz."""
+        slowest, fastest = instrument.SLOWEST_FILTER * self.T, instrument.FASTEST_FILTER * self.T
+        return 1 / (2 * np.pi * slowest), 1 / (2 * np.pi * fastest)
 
     def box(self, tests: Sequence[Test]) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of q: stiffness up to 50 times the largest secant, κ up to 1e4, α from 0.01 to 0.99.
 
         κ goes down to 1e-4, or 1e-6 with full memory. Far below S(α) the curve no longer depends on it, and K1 would
         grow as 1/κ for ever.
-        Two arrays (4,).
+        A fitted lag is up to two samples either way, a fitted filter's time constant from a twentieth of a sample to
+        five. Two arrays (p,).
         """
         top = max(_secant(test) for test in tests)
         ends = np.log(0.99 / 0.01)
         least = 1e-6 if self.memory == "full" else 1e-4
-        lower = np.array([1e-3 * top, 0.0, np.log(least), -ends])
-        return lower, np.array([50 * top, 50 * top, np.log(1e4), ends])
+        lag, slow, fast = float(instrument.LARGEST_LAG), instrument.SLOWEST_FILTER, instrument.FASTEST_FILTER
+        lower = np.array([1e-3 * top, 0.0, np.log(least), -ends, *self._of_fitted(-lag, -np.log(slow))])
+        return lower, np.array([50 * top, 50 * top, np.log(1e4), ends, *self._of_fitted(lag, -np.log(fast))])
 
-    def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts 4"]:
+    def _of_fitted(self, lag: float, corner: float) -> list[float]:
+        """Those of two numbers that belong to a fitted coordinate."""
+        return [value for value, own in ((lag, self.lag), (corner, self.corner)) if _is_fitted(own)]
+
+    def starts(self, tests: Sequence[Test]) -> Float[np.ndarray, "starts p"]:
         """The five best separate places of a grid in (κ, α).
 
         Read from position to force, every test is linear in K_inst and K_eff, which are solved for at each place.
@@ -76,13 +111,17 @@ class Sampled(eqx.Module):
         lower, upper = self.box(tests)
         scales = [jnp.asarray(np.ptp(test.output.mean(axis=0)) * _unit_of_force(test)) for test in tests]
         grid = jnp.asarray(np.stack(np.meshgrid(_LOG_KAPPA, _LOGIT_ALPHA, indexing="ij"), axis=-1))
-        costs, stiffness = (np.asarray(values) for values in _screen(self, curves, scales, grid))
-        places = [np.concatenate([stiffness[index], np.asarray(grid[index])]) for index in _separate(costs, 5)]
+        plain = eqx.tree_at(lambda m: (m.lag, m.corner), self, (0.0, np.inf))
+        costs, stiffness = (np.asarray(values) for values in screened(plain, curves, scales, grid))
+        rest = self._of_fitted(0.0, 0.0)
+        places = [np.concatenate([stiffness[index], np.asarray(grid[index]), rest]) for index in separate(costs, 5)]
         return np.clip(np.stack(places), lower, upper)
 
-    def prepare(self, test: Test) -> Curve:
-        """Inputs on the grid of the model, transformed; positions between grid points by linear interpolation.
+    def prepare(self, test: Test, *, smooth: bool = False) -> Curve:
+        """Inputs on the grid of the model, transformed; between rows by straight lines, or a `smooth` monotone cubic.
 
+        A creep test whose noise is in the force is fitted the other way round (`Curve.fitted`): noise of an input
+        passes through the model, and a fit would lower it by a stiffness above the true one.
         Raises `InputError` for a test of more samples than memory has room for.
         """
         assert test.input is not None
@@ -94,9 +133,14 @@ class Sampled(eqx.Module):
         count = int(np.ceil(place[-1])) + 1
         grid = np.arange(count) * self.T
         offset = test.input[:, 0] if test.start == "equilibrium" else np.zeros(test.repeats)
-        inputs = np.stack([np.interp(grid, elapsed, row) for row in test.input]) - offset[:, None]
+        clear = instrument.clear_changes(test.input - offset[:, None])
+        even = np.ptp(np.diff(place)) < 1e-6
+        rows = instrument.without_noise(test.input, clear) if even else test.input
+        inputs = _between(grid, elapsed, rows, smooth) - offset[:, None]
         length = _transform_length(count)
-        damped = inputs * _circle(length, inputs.dtype) ** -np.arange(count, dtype=inputs.dtype)
+        damping = _circle(length, inputs.dtype) ** -np.arange(count, dtype=inputs.dtype)
+        row = np.minimum(np.searchsorted(place, np.arange(count)), place.size - 1)  # the end of each tick's line
+        changes = np.diff(inputs, axis=1, prepend=0.0) * clear[row]
         before = np.minimum(place.astype(int), count - 2)
         return Curve(
             test.kind,
@@ -104,10 +148,13 @@ class Sampled(eqx.Module):
             jnp.asarray(test.output),
             jnp.asarray(offset),
             jnp.asarray(np.full(test.time.size, np.ptp(test.output.mean(axis=0)))),
-            jnp.asarray(np.fft.rfft(damped, length)),
+            jnp.asarray(np.fft.rfft(inputs * damping, length)),
             jnp.asarray(before),
             jnp.asarray(place - before),
             length,
+            jnp.asarray(np.fft.rfft(changes * damping, length)),
+            bool(place.size == count and np.all(place == np.arange(count))),
+            self.prepare(_position_driven(test), smooth=smooth) if _in_force(test) else None,
         )
 
     def _check_length(self, kind: str, seconds: float):
@@ -119,15 +166,19 @@ class Sampled(eqx.Module):
                 " larger --T, the sampling time of a slower rendering."
             )
 
-    def predict(self, q: Float[Array, " 4"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
+    def predict(self, q: Float[Array, " p"], curve: Curve, weights: Float[Array, " R"]) -> Float[Array, " m"]:
         """The response to the weighted mean of the inputs, at the measured times.
 
-        `q` (4,), `weights` (R,) -> (m,), in mm or N.
+        `q` (p,), `weights` (R,) -> (m,), in mm or N.
         """
         assert curve.spectra is not None and curve.share is not None and curve.before is not None
-        H = self._transfer(q, curve.length)
+        H = self._transfer(q, curve.length, _circle(curve.length, q.dtype))
         creep = curve.kind == "creep"
-        spectrum = weights.astype(curve.spectra.dtype) @ curve.spectra
+        weighted = weights.astype(curve.spectra.dtype)
+        spectrum = weighted @ curve.spectra
+        if self._has_instrument():
+            assert curve.changes is not None
+            spectrum = spectrum + self._added(q, curve) * (weighted @ curve.changes)
         spectrum = spectrum / H if creep else spectrum * H
         growth = _circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
         response = jnp.fft.irfft(spectrum, curve.length)[: curve.length // 2] * growth
@@ -135,36 +186,76 @@ class Sampled(eqx.Module):
         rest = rest / q[1] if creep else rest * q[1]
         return rest + response[curve.before] * (1 - curve.share) + response[curve.before + 1] * curve.share
 
-    def parameters(self, q: Float[Array, " 4"]) -> dict[str, Float[Array, ""]]:
-        """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them. `q` (4,) -> scalars."""
+    def as_input_noise(
+        self, q: Float[Array, " p"], curve: Curve, r: Float[Array, " m"]
+    ) -> tuple[Float[Array, " m"], Float[Array, " m+1"], Float[Array, ""]]:
+        """Residuals r (m,) of a regular curve as noise of its recorded input, which the model then passed on.
+
+        The noise (m,), over the scale of r; the factor by which the model multiplies its spectral density at πj/m,
+        j = 0 … m; and how many times larger the noise is than what comes of it in the same sample.
+        """
+        creep, radius, m = curve.kind == "creep", _circle(curve.length, q.dtype), r.size
+        H = self._transfer(q, curve.length, radius)
+        growth = radius ** jnp.arange(m, dtype=q.dtype)
+        spectrum = jnp.fft.rfft(r / growth, curve.length)
+        source = jnp.fft.irfft(spectrum * H if creep else spectrum / H, curve.length)[:m] * growth
+        gain = jnp.abs(self._transfer(q, 2 * m, 1.0)) ** 2
+        return source, (1 / gain if creep else gain), (q[0] if creep else 1 / q[0])
+
+    def _has_instrument(self) -> bool:
+        """Whether the force channel is anything but a perfect one."""
+        return not (isinstance(self.lag, float) and self.lag == 0 and self._without_filter())
+
+    def _without_filter(self) -> bool:
+        """Whether no filter is stated, nor fitted."""
+        return isinstance(self.corner, float) and bool(np.isinf(self.corner))
+
+    def _added(self, q: Float[Array, " p"], curve: Curve) -> Complex[Array, " {curve.length//2+1}"]:
+        """What the changes are multiplied by, at the upper half of the circle."""
+        lag = q[4] if _is_fitted(self.lag) else jnp.asarray(self.lag, q.dtype) / self.T
+        corner = jnp.exp(q[-1]) if _is_fitted(self.corner) else jnp.asarray(2 * np.pi * self.T * self.corner, q.dtype)
+        angle = 2 * jnp.pi * jnp.arange(curve.length // 2 + 1, dtype=q.dtype) / curve.length
+        z = _circle(curve.length, q.dtype) * jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+        return instrument.multiplier(curve.kind == "relaxation", lag, None if self._without_filter() else 1 / corner, z)
+
+    def parameters(self, q: Float[Array, " p"]) -> dict[str, Float[Array, ""]]:
+        """K0, K1 (N/mm), B1 (N·s^α/mm) and α, with K_inst and K_eff (N/mm) beside them. `q` (p,) -> scalars."""
         K_inst, K_eff, kappa, alpha = q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])
         S = self._taps(alpha)[1]
         K1 = (K_inst - K_eff) * (1 + kappa) * (kappa + S) / (kappa * (1 - S))
         K0, B1 = K_eff - K1 * S / (kappa + S), K1 / kappa * self.T**alpha
         return {"K0": K0, "K1": K1, "B1": B1, "alpha": alpha, "K_inst": K_inst, "K_eff": K_eff}
 
-    def natural(self, q: Float[Array, " 4"]) -> Float[Array, " 4"]:
-        """The coordinates under their labels: K_inst, K_eff (N/mm), κ and α. (4,) -> (4,)."""
-        return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3])])
+    def natural(self, q: Float[Array, " p"]) -> Float[Array, " p"]:
+        """The coordinates under their labels: K_inst, K_eff (N/mm), κ, α, lag (ms) and corner (Hz). (p,) -> (p,)."""
+        fitted = [1e3 * self.T * q[4]] if _is_fitted(self.lag) else []
+        fitted += [jnp.exp(q[-1]) / (2 * jnp.pi * self.T)] if _is_fitted(self.corner) else []
+        return jnp.stack([q[0], q[1], jnp.exp(q[2]), jax.nn.sigmoid(q[3]), *fitted])
 
     def at(self, tests: Sequence[Test]) -> "Sampled":
-        """The same with N as an array among at least 1024 taps, so that every N is the same compiled function."""
+        """The same with numbers as arrays, N among at least 1024 taps: every value is the same compiled function."""
         del tests
+        lag, corner = self.lag, self.corner
+        if self._has_instrument():
+            lag = lag if _is_fitted(lag) else jnp.asarray(lag)
+            corner = corner if _is_fitted(corner) or self._without_filter() else jnp.asarray(corner)
         if self.memory == "full" or self.capacity:
-            return self
-        return Sampled(jnp.asarray(self.N), self.T, self.memory, max(_TAPS, int(self.N)))
+            return Sampled(self.N, self.T, self.memory, self.capacity, lag, corner)
+        return Sampled(jnp.asarray(self.N), self.T, self.memory, max(_TAPS, int(self.N)), lag, corner)
 
-    def coordinates(self, K0: float, K1: float, B1: float, alpha: float) -> Float[np.ndarray, " 4"]:
-        """q of a parameter set. (4,); K0 and K1 in N/mm, B1 in N·s^α/mm."""
+    def coordinates(
+        self, K0: float, K1: float, B1: float, alpha: float, lag: float = 0.0, corner: float = np.inf
+    ) -> Float[np.ndarray, " p"]:
+        """q of a parameter set. (p,); K0 and K1 in N/mm, B1 in N·s^α/mm, lag in s, corner in Hz."""
         kappa = K1 * self.T**alpha / B1
         S = float(self._taps(jnp.asarray(alpha))[1])
         ends = K0 + K1 / (1 + kappa), K0 + K1 * S / (kappa + S)
-        return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha))])
+        rest = self._of_fitted(lag / self.T, np.log(2 * np.pi * self.T * corner))
+        return np.array([*ends, np.log(kappa), np.log(alpha / (1 - alpha)), *rest])
 
-    def _transfer(self, q: Float[Array, " 4"], length: int) -> Complex[Array, " {length//2+1}"]:
-        """H on the circle, at the upper half of `length` points."""
+    def _transfer(self, q: Float[Array, " p"], length: int, radius: float) -> Complex[Array, " {length//2+1}"]:
+        """H on the circle with a radius, at the upper half of `length` points."""
         kappa, alpha = jnp.exp(q[2]), jax.nn.sigmoid(q[3])
-        radius = _circle(length, q.dtype)
         taps, S = self._taps(alpha)
         if self.memory == "full":
             angle = 2 * jnp.pi * jnp.arange(length // 2 + 1, dtype=q.dtype) / length
@@ -188,9 +279,19 @@ class Sampled(eqx.Module):
         return jnp.concatenate([jnp.ones(1, alpha.dtype), -taps]), sums[-1]
 
 
+def _is_fitted(value: Any) -> bool:
+    """Whether a lag or a corner is a coordinate."""
+    return isinstance(value, str)
+
+
 def _force_and_position(test: Test) -> tuple[Any, Any]:
     """Both (R, m), whichever was applied."""
     return (test.output, test.input) if test.kind == "relaxation" else (test.input, test.output)
+
+
+def _in_force(test: Test) -> bool:
+    """Whether a creep test is fitted in its force."""
+    return test.kind == "creep" and instrument.is_position_clearer(test)
 
 
 def _position_driven(test: Test) -> Test:
@@ -199,43 +300,20 @@ def _position_driven(test: Test) -> Test:
     return Test("relaxation", test.time, force, position, test.start)
 
 
+def _between(
+    grid: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], rows: Float[np.ndarray, "R m"], smooth: bool
+) -> Float[np.ndarray, "R n"]:
+    """The rows at the times of the grid; after the last row they stay."""
+    if not smooth:
+        return np.stack([np.interp(grid, time, row) for row in rows])
+    from scipy.interpolate import PchipInterpolator
+
+    return PchipInterpolator(time, rows, axis=1)(np.minimum(grid, time[-1]))
+
+
 def _unit_of_force(test: Test) -> float:
     """What turns the scale of an output into one of force: the mean stiffness for positions."""
     return _mean_secant(test) if test.kind == "creep" else 1.0
-
-
-@program
-def _screen(
-    model: Sampled, curves: tuple[Curve, ...], scales: list[Float[Array, ""]], grid: Float[Array, "K A 2"]
-) -> tuple[Float[Array, "K A"], Float[Array, "K A 2"]]:
-    """Cost and stiffnesses (K_inst, K_eff) of the best combination at each place of the grid."""
-    weights = [jnp.full(c.output.shape[0], 1 / c.output.shape[0], c.scale.dtype) for c in curves]
-    ends = jnp.eye(2, dtype=grid.dtype)
-
-    def best_at(kappa_alpha):
-        normal, right, total = jnp.zeros((2, 2), grid.dtype), jnp.zeros(2, grid.dtype), jnp.zeros((), grid.dtype)
-        for curve, scale, w in zip(curves, scales, weights, strict=True):
-            responses = [model.predict(jnp.concatenate([end, kappa_alpha]), curve, w) for end in ends]
-            basis = jnp.stack(responses) / (scale * np.sqrt(curve.time.size))
-            goal = w @ curve.output / (scale * np.sqrt(curve.time.size))
-            normal, right, total = normal + basis @ basis.T, right + basis @ goal, total + goal @ goal
-        a, b, c = normal[0, 0], normal[0, 1], normal[1, 1]
-        K_eff = jnp.maximum((a * right[1] - b * right[0]) / (a * c - b * b), 0)
-        stiffness = jnp.stack([(right[0] - b * K_eff) / a, K_eff])
-        return total - 2 * right @ stiffness + stiffness @ normal @ stiffness, stiffness
-
-    costs, stiffness = jax.lax.map(best_at, grid.reshape(-1, 2))
-    return costs.reshape(grid.shape[:-1]), stiffness.reshape(grid.shape)
-
-
-def _separate(costs: Float[np.ndarray, "K A"], count: int) -> list[tuple]:
-    """Indices of the lowest costs, none beside another."""
-    left, places = np.where(np.isfinite(costs), costs, np.inf), []
-    while len(places) < count and np.isfinite(left).any():
-        i, j = np.unravel_index(np.argmin(left), left.shape)
-        places.append((i, j))
-        left[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = np.inf
-    return places
 
 
 def _secant(test: Test) -> float:

@@ -34,6 +34,7 @@ from hilbo.study.inference_data import groups, predictive_shares, write_groups
 from hilbo.study.map_file import map_dataset, write_map
 from hilbo.study.rule_comparison import compare
 from hilbo.study.set_table import ROLES
+from hilbo.study.trial_flags import flag_sentences
 
 __all__ = ["write_study"]
 
@@ -154,6 +155,7 @@ def _write_material(material, analysis: Analysis, validated, compared, folder: P
         table.to_csv(folder / f"{name}.csv", index=False)
     content |= {
         "left_out": analysis.left_out,
+        "flags": material.flags.content(),
         "limits": list(analysis.limits),
         "optimised": _optimised(analysis),
         "tolerance": tables["tolerance"].to_dict("records"),
@@ -199,6 +201,7 @@ def _section(material: Material, analysis: Analysis, validated, tables, pictures
         "answers": int(analysis.cohort.counts().sum()),
         "limits": analysis.limits,
         "left_out": analysis.left_out,
+        "flags": flag_sentences(material.flags, analysis.study.exclude_flags),
         "figures": pictures,
         "typical": analysis.cohort.names[typical_person(analysis)],
         "unknown": UNKNOWN,

@@ -23,6 +23,7 @@ from hilbo.statistics.preferences import rate
 from hilbo.statistics.regression import Regression
 from hilbo.study.cells import read_cells
 from hilbo.study.config import Study
+from hilbo.study.flag_counts import flag_sentences_of
 from hilbo.study.validation_table import RESPONSES, TIE, check_validation, of_material, read_validation, sets_frame
 
 __all__ = [
@@ -229,10 +230,11 @@ def write_validation(
         pictures = save_figures(validation_figures(validated), material_folder)
         contents.append(validation_content(validated))
         sections.append(validation_section(validated) | {"figures": pictures})
+    flags = flag_sentences_of(table, study.exclude_flags, "comparisons")
     content = {"materials": contents, "study": study.hash, "seed": seed, "versions": versions()}
-    content["warnings"] = named_warnings(dict(zip(names, contents, strict=True)))
+    content["warnings"] = [*flags, *named_warnings(dict(zip(names, contents, strict=True)))]
     (folder / "result.json").write_text(as_json(content), encoding="utf-8")
-    page = rendered("validation.html", study=study, content=content, warnings=[], sections=sections)
+    page = rendered("validation.html", study=study, content=content, warnings=flags, sections=sections)
     (folder / "report.html").write_text(page, encoding="utf-8")
     return content
 
@@ -240,9 +242,9 @@ def write_validation(
 def _read(path: Path, study: Study, material: str | None) -> pd.DataFrame:
     """The comparisons of all materials, or of one."""
     if material is not None:
-        return read_validation(path, study.responses, material)
+        return read_validation(path, study.responses, material, study.exclude_flags)
     cells = read_cells(path, "a validation table needs a header and a comparison")
-    return check_validation(cells, study.responses, str(path))
+    return check_validation(cells, study.responses, str(path), study.exclude_flags)
 
 
 def named_warnings(contents: Mapping[Any, Mapping[str, Any]]) -> list[str]:

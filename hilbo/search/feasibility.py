@@ -1,7 +1,7 @@
 """What may be rendered: the renderer's mechanics and the device's damping, and which K1 they leave for B1 and α.
 
-A parameter set is passive for K1 up to `passivity.largest_K1`, of a prompt force and of one at the delay. With a range of
-effective damping B_eff there is a lowest K1 too: B_eff = 1000·T·β·M1·(K1/(K1 + β·S))² rises with K1 from 0 to
+A parameter set is passive for K1 up to `passivity.largest_K1`, of a prompt force and of one at the delay. With a range
+of effective damping B_eff there is a lowest K1 too: B_eff = 1000·T·β·M1·(K1/(K1 + β·S))² rises with K1 from 0 to
 1000·T·β·M1, so that the range is an interval of K1: with r² = B_eff/(1000·T·β·M1), its ends are K1 = β·S·r/(1 - r),
 infinite for r >= 1.
 
@@ -78,8 +78,8 @@ def _slack(physical: _Physical) -> float:
 
 
 def minimum_damping(m: Mechanics, physical: _Physical) -> Float[Array, "..."]:
-    """The least damping (N·s/m) of a device on which parameter sets are passive, for a force without delay and for one at
-    the delay: the need first falls with the delay and then rises, so that the larger of both holds in between."""
+    """The least damping (N·s/m) of a device on which parameter sets are passive, without delay of the force and at the
+    study's delay: the need first falls with the delay and then rises, so that the larger of both covers all between."""
     place = *_model_parameters(physical), m.K_eff, m.N, m.T
     prompt = passivity.minimum_damping(*place, memory=m.memory)
     if m.delay == 0:

@@ -18,6 +18,7 @@ from hilbo.session.records import Event, Need, RefusedError, Trial
 from hilbo.session.state import LiveSession
 from hilbo.study.protocols import protocol
 from hilbo.study.text_cells import runs_in_a_spreadsheet
+from hilbo.study.trial_flags import FLAGS, SAMPLES
 
 __all__ = [
     "abort",
@@ -122,12 +123,15 @@ def answer(
     at: float,
     *,
     browser: Any = None,
+    telemetry: Mapping[str, int] | None = None,
     felt: bool = True,
 ) -> Event | None:
     """A participant's answer; None if this very answer (trial, client id and values) has been accepted already.
 
     `values`: class_a, class_b (responses of the study), preferred ("a" or "b"), as the phase asks. `browser`: its time
-    and the response time, s; numbers by name. `felt`: refuse an answer to what was not felt. Raises RefusedError.
+    and the response time, s; numbers by name. `telemetry`: counts of the device's samples while the trial was felt, all
+    of them (`samples`) and those with each flag; None where none were recorded. `felt`: refuse an answer to what was
+    not felt. Raises RefusedError.
     """
     if not isinstance(trial, int) or isinstance(trial, bool) or not isinstance(client, str) or not client:
         raise RefusedError("bad-answer", "an answer needs the number of its trial and the id of its client.")
@@ -146,7 +150,8 @@ def answer(
     if felt and asked.felt != frozenset(asked.renderings):
         raise RefusedError("unfelt", f"trial {trial} has not been felt yet.")
     _check_values(state, asked, values)
-    return _event(state, "answer", at, id=trial, client=client, values=dict(values), browser=_times(browser))
+    counts = {} if telemetry is None else {"telemetry": _counts(telemetry)}
+    return _event(state, "answer", at, id=trial, client=client, values=dict(values), browser=_times(browser), **counts)
 
 
 def undo(state: LiveSession, at: float, reason: str = "") -> Event:
@@ -328,6 +333,14 @@ def _times(browser):
     ):
         raise RefusedError("bad-answer", "the browser's times must be numbers of seconds.")
     return {name: float(value) for name, value in browser.items()}
+
+
+def _counts(telemetry: Mapping[str, int]) -> dict[str, int]:
+    """Counts of samples. Raises RefusedError for what are none."""
+    names, every = set(telemetry), telemetry.get(SAMPLES, -1)
+    if not names <= {SAMPLES, *FLAGS} or not all(0 <= count <= every for count in telemetry.values()):
+        raise RefusedError("bad-answer", f"the telemetry of a trial has {SAMPLES}, and of these those with a flag.")
+    return dict(telemetry)
 
 
 def _check_values(state, trial, values):

@@ -24,6 +24,7 @@ from hilbo.session.table_words import UNWRITTEN, presented_column
 from hilbo.study.set_table import role_of, source_of
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import runs_in_a_spreadsheet
+from hilbo.study.trial_flags import COLUMN, COLUMN_OF_SAMPLES, SAMPLES, flag_words
 from hilbo.study.trial_table import read_trials, write_trials
 
 __all__ = [
@@ -91,6 +92,7 @@ def trials_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
                     | {"voided": int(trial.status != "answered"), "status": trial.status}
                     | {"unblinded": state.header.unblinded or None}
                     | _times(trial)
+                    | _telemetry(trial)
                 )
     return _table(rows)
 
@@ -113,6 +115,7 @@ def validation_table(sessions: Sequence[LiveSession]) -> pd.DataFrame:
                     | {"preferred": sets[values["preferred"]]}
                     | _confirmed(state.study, trial)
                     | _times(trial)
+                    | _telemetry(trial)
                 )
     return _table(rows)
 
@@ -244,10 +247,19 @@ def _times(trial: Trial):
     }
 
 
+def _telemetry(trial: Trial) -> dict[str, Any]:
+    """The flags of a trial that was felt on a device, and the samples that were recorded with it."""
+    counts = trial.telemetry
+    flags = None if counts is None else flag_words(name for name in counts if name != SAMPLES)
+    return {COLUMN: flags, COLUMN_OF_SAMPLES: None if counts is None else counts[SAMPLES]}
+
+
 def _table(rows):
     """Without columns that say nothing."""
     table = pd.DataFrame(rows)
-    for column in ("material", "response_time", "unblinded"):
+    if COLUMN_OF_SAMPLES in table:
+        table[COLUMN_OF_SAMPLES] = table[COLUMN_OF_SAMPLES].astype("Int64")  # whole numbers, also where some lack
+    for column in ("material", "response_time", "unblinded", COLUMN, COLUMN_OF_SAMPLES):
         if column in table and table[column].isna().all():
             table = table.drop(columns=column)
     return table

@@ -8,6 +8,7 @@ import xarray as xr
 
 from hilbo.session.export import trials_table
 from hilbo.session.state import LiveSession
+from hilbo.study.flag_counts import flagged
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.trial_table import is_fitted
 
@@ -15,12 +16,14 @@ __all__ = ["netcdf"]
 
 
 def netcdf(sessions: Sequence[LiveSession], path: Path, study: AnyStudy) -> bool:
-    """The answers to single renderings that are fitted, without warm-up and repeats, as groups of a netCDF file:
-    observed_data has the categories and constant_data what they are about, along `obs_id`, levels by their names;
-    attributes name the study. xarray reads it as a DataTree, ArviZ as InferenceData. False, and no file, where there
-    are none."""
+    """The answers to single renderings that are fitted, without warm-up, repeats and excluded flags, as groups of a
+    netCDF file: observed_data has the categories and constant_data what they are about, along `obs_id`, levels by
+    their names; attributes name the study. xarray reads it as a DataTree, ArviZ as InferenceData. False, and no
+    file, where there are none."""
     table = trials_table(sessions)
-    table = table[(table["voided"] == 0) & is_fitted(table["phase"])] if len(table) else table
+    if len(table):
+        excluded = flagged(table, study.exclude_flags)
+        table = table[(table["voided"] == 0) & is_fitted(table["phase"]) & ~excluded]
     if table.empty:
         return False
     rows = {"obs_id": np.arange(len(table))}

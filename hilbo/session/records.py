@@ -96,6 +96,8 @@ class Trial:
     """A proposal and what became of it. `number` is the row's trial in tables, counted within phase and material.
 
     `confirmed`: side -> the values that count of what a program presented, where one does; of this presentation alone.
+    `telemetry`: counts of a device's samples while it was felt, up to the answer (`actions.answer`); None without such
+    a record.
     """
 
     id: int
@@ -115,6 +117,7 @@ class Trial:
     values: Mapping[str, str] | None = None
     client: str | None = None
     answered: Mapping[str, Any] | None = field(default=None, repr=False)
+    telemetry: Mapping[str, int] | None = None
     voided: Mapping[str, Any] | None = None
 
     @property

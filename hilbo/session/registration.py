@@ -131,10 +131,13 @@ def sought(rule: str) -> str:
 
 
 def _exclusion(study: StudyFile) -> list[str]:
-    rule = study.tables.study.exclude
+    rule, flags = study.tables.study.exclude, ", ".join(study.exclude_flags).replace("_", " ")
+    trials = f"Trials that the device flagged are left out ({flags}; `[study] exclude_flags`)."
     if rule:
-        return [f"Participants for whom `{rule}` holds are left out (`[study] exclude`)."]
-    return ["Nobody is left out for their answers (`[study] exclude` is empty)."]
+        people = f"Participants for whom `{rule}` holds are left out (`[study] exclude`)."
+    else:
+        people = "Nobody is left out for their answers (`[study] exclude` is empty)."
+    return [people, *([trials] if flags else [])]
 
 
 def _analysis(study: StudyFile) -> list[str]:

@@ -66,6 +66,7 @@ class _Answer(msgspec.Struct):
     client: Annotated[str, msgspec.Meta(min_length=1)]
     values: dict[Ask, str]
     browser: dict[str, float]
+    telemetry: dict[str, _Whole] | None = None
 
 
 class _Trial(msgspec.Struct):
@@ -110,7 +111,9 @@ _KINDS: dict[str, tuple[type, _Again]] = {
     "missed": (_Missed, lambda s, d, raw, at: actions.missed(s, d.id, d.show, d.reason, at)),
     "answer": (
         _Answer,
-        lambda s, d, raw, at: actions.answer(s, d.id, d.client, d.values, at, browser=d.browser, felt=False),
+        lambda s, d, raw, at: actions.answer(
+            s, d.id, d.client, d.values, at, browser=d.browser, telemetry=d.telemetry, felt=False
+        ),
     ),
     "undo": (_Trial, lambda s, d, raw, at: _worded(actions.undo(s, at), reason=d.reason)),
     "repeat": (_Trial, lambda s, d, raw, at: actions.repeat(s, at, d.id)),

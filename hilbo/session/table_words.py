@@ -1,6 +1,7 @@
 """What the columns of exported tables mean, in words; and what one is called that holds a parameter of one side."""
 
 from hilbo.study.study_file import AnyStudy
+from hilbo.study.trial_flags import FLAGS
 
 __all__ = ["UNWRITTEN", "column_words", "presented_column"]
 
@@ -18,6 +19,8 @@ _WORDS = {
     "status": "answered, undone, void, dropped, left out (by a person, after the device stopped it twice) or pending",
     "response_time": "Time from the question to the answer, s, by the browser's clock",
     "answered_at": "Time of the answer, s since 1970, by the server's clock",
+    "flags": f"Flags of the device's telemetry during the trial ({', '.join(FLAGS)}), separated by blanks; empty: none",
+    "telemetry_samples": "Telemetry samples from the first step to the answer; empty where none were recorded",
     "set_a": "Parameter set on side a",
     "set_b": "Parameter set on side b",
     "first": "The set that was felt first",

@@ -52,9 +52,8 @@ def _stimulus(state, event):
 def _answered(state, event):
     data = event.data
     facts = {"seq": event.seq, "time": event.time, "browser": data["browser"]}
-    return state.with_trial(
-        data["id"], status="answered", values=data["values"], client=data["client"], answered=facts, on=None
-    )
+    given = {"values": data["values"], "client": data["client"], "telemetry": data.get("telemetry")}
+    return state.with_trial(data["id"], status="answered", answered=facts, on=None, **given)
 
 
 def _without(wanted: tuple[int, ...], id: int | None) -> tuple[int, ...]:

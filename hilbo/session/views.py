@@ -157,5 +157,6 @@ def _whole_trial(state, trial: Trial):
         "presented": trial.presented,
         "values": trial.values,
         "answered": trial.answered,
+        "telemetry": trial.telemetry,
         "voided": trial.voided,
     }

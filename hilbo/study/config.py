@@ -38,6 +38,8 @@ class Study(eqx.Module):
     """What is judged, in words: labels of axes."""
     exclude: str = eqx.field(static=True)
     """The rule by which people are left out (`hilbo.population.response_quality`), empty for nobody."""
+    exclude_flags: tuple[str, ...] = eqx.field(static=True)
+    """Flags of the device for which an analysis leaves a trial out (`hilbo.study.trial_flags`)."""
     selection: Selection = eqx.field(static=True)
     inference: Inference = eqx.field(static=True)
     rule: AnyRule = eqx.field(static=True)
@@ -82,6 +84,7 @@ class Study(eqx.Module):
             responses=file.responses,
             attribute=file.tables.study.attribute,
             exclude=file.tables.study.exclude,
+            exclude_flags=file.exclude_flags,
             selection=file.selection,
             inference=file.tables.gp.inference,
             rule=file.tables.aggregation.rule,

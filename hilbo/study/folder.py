@@ -25,6 +25,8 @@ from hilbo.study.cells import numbers, parameter_values, read_cells
 from hilbo.study.cohort import Cohort, cohort_of
 from hilbo.study.config import Study
 from hilbo.study.departures import PHASE, Held, departures
+from hilbo.study.flag_counts import flag_counts, with_flag_counts
+from hilbo.study.trial_flags import FlagCounts, flag_sentences
 from hilbo.study.trial_table import NothingToFitError, check_texts, marked, ordered, read_trials
 from hilbo.study.validation_table import check_validation, sets_frame
 
@@ -42,6 +44,8 @@ class Material(NamedTuple):
     reference: Float[np.ndarray, " d"] | None
     """The system-identification set, or the truth of a simulated study, in the unit cube; where it lies in the box."""
     reference_name: str
+    flags: FlagCounts = FlagCounts()
+    """Trials that carry a flag of the device, and those that are left out for it."""
 
 
 class StudyFolder(NamedTuple):
@@ -53,7 +57,7 @@ class StudyFolder(NamedTuple):
     limits: tuple[str, ...]
     """What these tables cannot say, and what departs from the plan."""
     notes: tuple[str, ...] = ()
-    """What is as it was planned."""
+    """What is as it was planned, and the flags of comparisons."""
 
 
 def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
@@ -85,7 +89,8 @@ def read_folder(folder: Path, exclude: str | None = None) -> StudyFolder:
     materials = [_material(name, study, trials, compared, sets, truth) for name in names]
     departs, as_planned = _departures(folder, study, materials)
     limits = (*departs, *_missing_tables(study, materials, compared, sets))
-    return StudyFolder(study, materials, sets, limits, as_planned)
+    flags = flag_sentences(flag_counts(*validation), study.exclude_flags, "comparisons") if validation else []
+    return StudyFolder(study, materials, sets, limits, (*as_planned, *flags))
 
 
 def _with_exclusion(study: Study, exclude: str | None) -> Study:
@@ -121,7 +126,10 @@ def _sets(paths: list[Path], study: Study) -> pd.DataFrame | None:
 
 def _validation(path: Path, study: Study) -> pd.DataFrame:
     return check_validation(
-        read_cells(path, "a validation table needs a header and a comparison"), study.responses, str(path)
+        read_cells(path, "a validation table needs a header and a comparison"),
+        study.responses,
+        str(path),
+        study.exclude_flags,
     )
 
 
@@ -175,7 +183,7 @@ def _material(
     reference, words = _reference(material_study, name, sets, truth)
     validation = None if compared is None or compared.empty else compared
     cohort = cohort_of(marked(table, material_study), material_study)  # each table was checked as it was read
-    return Material(name, material_study, cohort, validation, reference, words)
+    return Material(name, material_study, cohort, validation, reference, words, flag_counts(table))
 
 
 def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:
@@ -192,7 +200,7 @@ def _answers(name: str, study: Study, paths: list[Path]) -> pd.DataFrame:
         raise empty[0]
     for error in empty:
         warn_caller(f"{error} It is left out.")
-    return ordered(pd.concat(tables, ignore_index=True))
+    return with_flag_counts(ordered(pd.concat(tables, ignore_index=True)), flag_counts(*tables))
 
 
 def _check_answers_once(table: pd.DataFrame, path: Path) -> None:

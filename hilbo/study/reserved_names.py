@@ -6,9 +6,14 @@ holds them against these lists. Loads no JAX.
 
 from collections.abc import Collection
 
+from hilbo.study.trial_flags import COLUMN, COLUMN_OF_SAMPLES
+
 __all__ = ["TRIAL_COLUMNS", "is_reserved"]
 
-TRIAL_COLUMNS = ("participant", "trial", "response", "category", "phase", "material", "voided", "unblinded")
+TRIAL_COLUMNS = (
+    *("participant", "trial", "response", "category", "phase", "material", "voided", "unblinded"),
+    *(COLUMN, COLUMN_OF_SAMPLES),
+)
 """Those that the reader of answers knows."""
 
 _TABLES = {

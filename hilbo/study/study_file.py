@@ -61,6 +61,11 @@ class StudyFile:
         return None if table is None else table.column
 
     @property
+    def exclude_flags(self) -> tuple[str, ...]:
+        """Flags of the device for which an analysis leaves a trial out."""
+        return self.tables.study.exclude_flags
+
+    @property
     def selection(self) -> Selection:
         """How trials are chosen."""
         return self.tables.selection
@@ -130,6 +135,9 @@ class AnyStudy(Protocol):
 
     @property
     def random_effect(self) -> str | None: ...
+
+    @property
+    def exclude_flags(self) -> tuple[str, ...]: ...
 
     @property
     def selection(self) -> Selection: ...

@@ -14,6 +14,7 @@ from hilbo.study.fields import words as _text
 from hilbo.study.protocols import SessionTable
 from hilbo.study.simulation_table import SimulationTable
 from hilbo.study.stimulus_table import StimulusTable
+from hilbo.study.trial_flags import FLAGS, TrialFlag
 
 __all__ = [
     "LEARN",
@@ -48,6 +49,9 @@ class StudyTable(_Table, frozen=True):
     ]
     attribute: Annotated[str, msgspec.Meta(min_length=1), _text("a text", '"perceived realism"')] = "perceived realism"
     exclude: Annotated[str, _text("a rule, or nothing", '"trials < 10 or lapse_low > 0.3"')] = ""
+    exclude_flags: Annotated[
+        tuple[TrialFlag, ...], _text("a list of some of " + ", ".join(FLAGS), '["saturated", "slewed"]')
+    ] = ()
 
 
 class ParameterTable(_Table, frozen=True):

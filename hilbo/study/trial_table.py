@@ -1,10 +1,11 @@
 """Trial tables: CSV or Parquet, one row per answer, checked before anything is fitted.
 
 Columns: `participant`, `trial`, `response` and one per parameter in physical units; optional `session`, `phase`,
-`material`, `voided`, `unblinded`; others are kept. A number means what its decimals say (correctly rounded), so that a
-table and the log it came from give the same bits. People come in the order of their names, whatever the order of the
-rows: the last digits of sums, and where a search ends, depend on it. Whatever is wrong is one sentence with the file
-and the line (Parquet: row). A table is read piece by piece, and a piece's text is gone when its numbers are known.
+`material`, `voided`, `unblinded`, `flags`, `telemetry_samples`; others are kept. A number means what its decimals say
+(correctly rounded), so that a table and the log it came from give the same bits. People come in the order of their
+names, whatever the order of the rows: the last digits of sums, and where a search ends, depend on it. Whatever is wrong
+is one sentence with the file and the line (Parquet: row). A table is read piece by piece, and a piece's text is gone
+when its numbers are known.
 """
 
 import hashlib
@@ -19,8 +20,10 @@ import pandas as pd
 
 from hilbo.errors import InputError, warn_caller
 from hilbo.study.cells import FRAME, answer_forms, cell_pieces, cells_of, numbers, parameter_values, place, refuse
+from hilbo.study.flag_counts import counted_flags, flagged, with_flag_counts
 from hilbo.study.study_file import AnyStudy
 from hilbo.study.text_cells import FORMULA_WORDS, ID_WORDS, but_for_case, check_text, formulas, no_ids
+from hilbo.study.trial_flags import COLUMN, COLUMN_OF_SAMPLES
 
 __all__ = [
     "NOT_FITTED",
@@ -65,7 +68,8 @@ def read_trials(
 ) -> pd.DataFrame:
     """The rows of a trial table that are to be fitted, in the order of their keys within each participant.
 
-    Adds the column `category` (0 = lowest response). Warm-up, repeated and voided rows are checked and left out.
+    Adds the column `category` (0 = lowest response). Warm-up, repeated and voided rows are checked and left out, and
+    so are those with a flag that the study excludes; the table carries their counts (`flag_counts.flag_counts`).
     `material` selects the rows of one material, and must be given if there are several. `others`: keep the columns that
     are nobody's business. `say` is told how many rows have been read, and `note` who has no answer that
     counts: a warning, if nothing else is given. Raises `InputError`.
@@ -103,15 +107,18 @@ def _read(
     del pieces
     _check_duplicates(table, source)
     fitted = table.pop("_fitted")
+    counts = counted_flags(table[fitted], study.exclude_flags)
+    fitted &= ~flagged(table, study.exclude_flags)
     left, table = table[~fitted], table[fitted]
     _check_blinded(table.pop("_blinded"), study, source)
+    besides = ", or left out for their flags" if study.exclude_flags else ""
     if table.empty:
-        raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided.")
+        raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided{besides}.")
     table = of_material(table, material, source)
-    _note_the_absent(left, table, source if material is None else f"{source} ({material})", note)
+    _note_the_absent(left, table, source if material is None else f"{source} ({material})", besides, note)
     if alike := but_for_case(table["participant"].unique()):
         note(f"{source}: {alike} differ in capitals only; they are taken for two people.")
-    return marked(ordered(table), study)
+    return with_flag_counts(marked(ordered(table), study), counts)
 
 
 def ordered(table: pd.DataFrame) -> pd.DataFrame:
@@ -124,7 +131,9 @@ def ordered(table: pd.DataFrame) -> pd.DataFrame:
     return table.iloc[np.lexsort(places)]
 
 
-def _note_the_absent(left: pd.DataFrame, table: pd.DataFrame, source: str, note: Callable[[str], Any]) -> None:
+def _note_the_absent(
+    left: pd.DataFrame, table: pd.DataFrame, source: str, besides: str, note: Callable[[str], Any]
+) -> None:
     """Say who has answers, and none that counts: without a word that person would be missing everywhere."""
     kept = set(table["participant"].unique())
     absent = [str(name) for name in left["participant"].unique() if name not in kept]
@@ -132,7 +141,8 @@ def _note_the_absent(left: pd.DataFrame, table: pd.DataFrame, source: str, note:
         who = ", ".join(absent[:_NAMED]) + (f" and {len(absent) - _NAMED} more" if len(absent) > _NAMED else "")
         answers = f"{len(left)} answers are" if len(left) > 1 else "1 answer is"
         have = "has" if len(absent) == 1 else "have"
-        note(f"{source}: {answers} voided, warm-up or repeated, and not fitted; {who} {have} no other answer in it.")
+        also = f"voided, warm-up or repeated{besides}, and not fitted"
+        note(f"{source}: {answers} {also}; {who} {have} no other answer in it.")
 
 
 def marked(table: pd.DataFrame, study: AnyStudy) -> pd.DataFrame:
@@ -167,7 +177,7 @@ def _checked(text: pd.DataFrame, study: AnyStudy, source: str, others: bool, tex
     for column in text.columns:
         if column in numeric:
             table[column] = np.nan  # its place among the columns
-        elif others or column in (*_KEY, study.random_effect):
+        elif others or column in (*_KEY, study.random_effect, COLUMN, COLUMN_OF_SAMPLES):
             table[column] = [texts.setdefault(cell, cell) for cell in text[column]]
     whole = numbers(text, "trial", source, "a whole number from 1", lambda v: (v >= 1) & (v % 1 == 0) & (v < 2**53))
     table["trial"] = whole.astype(int)

@@ -9,13 +9,14 @@ Whatever is wrong is one sentence with the file and the line.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import pandas as pd
 
 from hilbo.errors import InputError
 from hilbo.search.box import Parameter
 from hilbo.study.cells import answer_forms, numbers, read_cells, refuse
+from hilbo.study.flag_counts import counted_flags, flagged, with_flag_counts
 from hilbo.study.set_table import read_sets
 from hilbo.study.trial_table import check_people, check_texts, flags, is_fitted
 
@@ -33,21 +34,29 @@ _RESERVED = ("a", "b", TIE)
 
 
 def read_validation(
-    path: str | os.PathLike, responses: Sequence[str] = RESPONSES, material: str | None = None
+    path: str | os.PathLike,
+    responses: Sequence[str] = RESPONSES,
+    material: str | None = None,
+    exclude_flags: Collection[str] = (),
 ) -> pd.DataFrame:
     """The comparisons of one material; `responses` are the study's, lowest first. Raises `InputError`.
 
+    Rows with one of `exclude_flags` are left out.
     All cells are text but `trial`; classes are labels, `preferred` and `first` names of sets (or "tie"), or empty.
     """
     text = read_cells(path, "a validation table needs a header and a comparison")
-    return of_material(check_validation(text, responses, str(path)), material, str(path))
+    return of_material(check_validation(text, responses, str(path), exclude_flags), material, str(path))
 
 
 def check_validation(
-    table: pd.DataFrame, responses: Sequence[str] = RESPONSES, source: str = "validation table"
+    table: pd.DataFrame,
+    responses: Sequence[str] = RESPONSES,
+    source: str = "validation table",
+    exclude_flags: Collection[str] = (),
 ) -> pd.DataFrame:
     """Check a table however it was made, and bring it into the form that `read_validation` gives.
 
+    Rows with one of `exclude_flags` are left out; the table carries their counts (`flag_counts.flag_counts`).
     Raises `InputError` for a missing column, a table without rows, and values that cannot be.
     """
     _check_columns(table, source)
@@ -67,9 +76,12 @@ def check_validation(
     refuse(nothing, source, lambda row: "holds no answer; fill in class_a and class_b, or preferred, or leave it out.")
     _check_duplicates(out, source)
     counts = ~flags(text, "voided", source) & (is_fitted(text["phase"]) if "phase" in text else True)
+    flags_of = counted_flags(out[counts], exclude_flags)
+    counts &= ~flagged(out, exclude_flags)
     if not counts.any():
-        raise InputError(f"{source}: has no comparison that counts; all are warm-up, repeated or voided.")
-    return out[counts]
+        besides = ", or left out for their flags" if exclude_flags else ""
+        raise InputError(f"{source}: has no comparison that counts; all are warm-up, repeated or voided{besides}.")
+    return with_flag_counts(out[counts], flags_of)
 
 
 def _check_columns(table: pd.DataFrame, source: str) -> None:

@@ -1,18 +1,24 @@
 """When the device of a live session moves and when it rests: a simulated device of its own, and the real server."""
 
+import asyncio
 import contextlib
 import os
+import threading
 import time
 
-from live_server import PUSHED, Live, refused, until_held
+import pytest
+from live_server import Live, refused, until_held
 
+from hilbo.app import runner
 from hilbo.app.device_rig import DeviceRig
+from hilbo.app.rehearsal import _let_go
 from hilbo.device.simulator import Simulator
-from hilbo.hardware_bridge import Renderer
+from hilbo.hardware_bridge import DeviceError, Renderer, State
 from hilbo.study.study_file import StudyFile
 
 PAPER = "hilbo/data/paper.toml"
 
+WHILE = 0.3  # s for which a device is watched that must not move
 SET = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
 
 
@@ -46,20 +52,77 @@ def pressed(live):
     live.until(lambda _: live.hub.rig.snapshot.contact)
 
 
-def test_a_pressed_device_rests_until_begin_and_again_in_a_break(tmp_path):
+def test_a_pressed_device_rests_until_the_hand_has_left_and_again_in_a_break(tmp_path):
     with left_pressed() as simulator, Live(tmp_path, device=simulator.port) as live:
         seen = watched(live)
         live.until(lambda view: view["may"]["begin"])
         pressed(live)
-        time.sleep(3 * PUSHED)
-        assert set(seen) <= {"STOPPED"}
         live.begin()
+        view = live.until(lambda view: "handles" in view["title"])
+        assert "lift it" in view["message"]
+        time.sleep(WHILE)
+        assert set(seen) <= {"STOPPED"}
+        _let_go(simulator, live.whole)
         live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
         live.participant.post("/api/participant/break", {})
         live.until(lambda _: live.hub.rig.snapshot.state == "STOPPED")
         del seen[:]
-        time.sleep(2 * PUSHED)
+        time.sleep(WHILE)
         assert "RUNNING" not in seen
+
+
+def test_a_hand_that_stays_puts_the_trial_aside_and_feels_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "_LEAVES", WHILE)
+    with left_pressed() as simulator, Live(tmp_path, device=simulator.port) as live:
+        seen = watched(live)
+        pressed(live)
+        live.begin()
+        live.until(lambda _: live.events("note"))
+        assert "The hand did not leave the device" in live.events("note")[0].data["text"]
+        live.until(lambda view: view["may"]["begin"])
+        assert set(seen) <= {"STOPPED"} and live.hub.state.pending.presentation == 2
+        _let_go(simulator, live.whole)
+        live.answer(live.begin() or live.question())
+        live.replays()
+
+
+def test_an_emergency_stop_is_not_ended_by_a_clear_that_was_requested_before_it(tmp_path):
+    """On the simulated device itself: the order waits behind another one, and the stop overtakes it."""
+    study = StudyFile.load(PAPER)
+    with contextlib.closing(Simulator(finger="none")) as simulator:
+        rig = DeviceRig(study, lambda: Renderer.open(simulator.port, patience=10.0))
+        try:
+            asyncio.run(_stopped_after_a_clear(rig))
+        finally:
+            rig.close()
+
+
+async def _stopped_after_a_clear(rig):
+    await rig.estop()
+    busy = threading.Event()
+    rig.do(lambda _: busy.wait(10))
+    cleared = asyncio.ensure_future(rig.clear())
+    await asyncio.sleep(0)
+    await rig.estop()
+    busy.set()
+    with pytest.raises(DeviceError, match="has stopped since CLEAR was requested"):
+        await cleared
+    assert (await asyncio.wrap_future(rig.do(lambda device: device.state()))) == State.ESTOP
+    await rig.clear()
+    assert (await asyncio.wrap_future(rig.do(lambda device: device.state()))) == State.STOPPED
+
+
+def test_a_flag_of_the_simulated_device_is_recorded_with_its_trial(tmp_path):
+    with contextlib.closing(Simulator(finger="none")) as simulator, Live(tmp_path, device=simulator.port) as live:
+        live.begin()
+        live.answer()
+        live.until(lambda view: view["phase"] == "answer" and view["trial"]["id"].startswith("tag:2."))
+        simulator.tell("bad 1")  # one position, which the device replaces by the last one
+        live.until(lambda _: "input_held" in (live.hub.rig.telemetry(2, 1) or {}))
+        live.answer()
+        first, second = (event.data["telemetry"] for event in live.events("answer"))
+        assert first["samples"] > 0 and "input_held" not in first
+        assert second["samples"] > second["input_held"] == 1
 
 
 def test_jobs_that_follow_each_other_put_off_no_look():
@@ -86,14 +149,14 @@ def test_a_pressed_device_rests_while_something_is_still_compiled(tmp_path):
             seen = watched(live)
             live.participant.post("/api/participant/begin", {})
             pressed(live)
-            time.sleep(3 * PUSHED)
-            assert set(seen) <= {"STOPPED"}
+            time.sleep(WHILE)
             live.warmed.set()
-            live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
+            live.until(lambda view: "handles" in view["title"])
+            assert set(seen) <= {"STOPPED"}
 
 
 def test_a_stop_that_failed_is_said_and_sent_again(tmp_path, monkeypatch):
-    with left_pressed() as simulator, Live(tmp_path, device=simulator.port) as live:
+    with Live(tmp_path) as live:
         live.begin()
         live.until(lambda _: live.hub.rig.snapshot.state == "RUNNING")
         device, refused = live.hub.rig.device, []

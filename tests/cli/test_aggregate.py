@@ -40,7 +40,7 @@ def read(tmp_path):
 
 
 def test_a_table_of_one_material_is_read_as_that_material(read):
-    study, cohort = read("participant,trial,response,u,material\nA,1,yes,4.0,gel\n")
+    study, cohort, _ = read("participant,trial,response,u,material\nA,1,yes,4.0,gel\n")
     assert study.space.parameters[0].high == 8.0 and float(cohort.trials.x[0, 0, 0]) == 0.5
 
 
@@ -52,7 +52,7 @@ def test_a_table_of_two_materials_or_of_an_unknown_one_is_refused(read):
 
 
 def test_a_table_of_no_material_says_so(read, capsys):
-    study, _ = read("participant,trial,response,u\nA,1,yes,1\n")
+    study, *_ = read("participant,trial,response,u\nA,1,yes,1\n")
     assert study.space.parameters[0].high == 2.0
     assert "t.csv: names no material; it is read by" in capsys.readouterr().err
 

@@ -75,6 +75,8 @@ def test_an_even_number_of_taps_has_no_closed_form():
         (["identify", "t.csv", "--out", "out"], 't.csv:1: column "time" has no unit'),
         (["identify", "t.csv", "--out", "out", "--memory", "long"], '--memory is "long"'),
         (["identify", "t.csv", "--out", "out", "--T", "0"], "--T is 0"),
+        (["identify", "t.csv", "--out", "out", "--lag", "late"], '--lag is "late"; it must be a number or "fit".'),
+        (["identify", "t.csv", "--out", "out", "--corner", "low"], 'must be a number or "fit" or "none" or "auto".'),
         (
             ["identify", FISH, "--out", "out", "--longest", "0.001"],
             "no row up to 0.001 s; give a --longest above 0.0139 s",

@@ -229,7 +229,16 @@ def test_floats_are_rounded_once():
     message = decode(
         Receiver().feed(
             encode(
-                protocol.Drive(mode=1, shape=0, offset=0.1, amplitude=0.0, period_ticks=0, duration_ticks=1, boot_id=1, stop=0),
+                protocol.Drive(
+                    mode=1,
+                    shape=0,
+                    offset=0.1,
+                    amplitude=0.0,
+                    period_ticks=0,
+                    duration_ticks=1,
+                    boot_id=1,
+                    stop=0,
+                ),
                 0,
             )
         )[0]

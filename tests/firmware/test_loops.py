@@ -36,4 +36,5 @@ def test_no_force_in_free_air_and_no_energy_where_passivity_is_certified(runs, c
     if controls:
         assert np.all(rows[(kinds & SWITCHES) == 0, MADE] < 1.0)
     for row in rows:
-        print("kind {:.0f}: {:.0f} runs, {:.0f} ticks, {:.0f} holds, {:.3g} N, {:.3g} mJ, {:.0f} STARTs in contact, {:.0f} touches begun so".format(*row))
+        words = "kind {:.0f}: {:.0f} runs, {:.0f} ticks, {:.0f} holds, {:.3g} N, {:.3g} mJ"
+        print((words + ", {:.0f} STARTs in contact, {:.0f} touches begun so").format(*row))

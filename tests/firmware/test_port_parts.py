@@ -37,7 +37,7 @@ def shared(folder, *sources, include):
 @pytest.mark.parametrize("wraps", [False, True])
 def test_a_ring_that_is_full_drops_what_comes_and_gives_nothing_twice(tmp_path, wraps):
     (tmp_path / "ring.c").write_text(RING)
-    ring = ctypes.CDLL(str(shared(tmp_path, tmp_path / "ring.c", include=FIRMWARE / "port" / "mps2")))
+    ring = ctypes.CDLL(str(shared(tmp_path, tmp_path / "ring.c", include=FIRMWARE / "port" / "arm")))
     if wraps:
         ring.wrap()
     for byte in range(700):

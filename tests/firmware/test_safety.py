@@ -228,7 +228,7 @@ def test_nothing_starts_before_a_position_is_known():
 
 
 def test_a_heartbeat_is_as_old_as_the_tick_that_came_back(pressed):
-    """Nothing is lost on the line, and its delay grows: force ends `watchdog_ticks` after the tick that was last heard."""
+    """Nothing is lost on the line and its delay grows: force ends `watchdog_ticks` after the tick last heard."""
     heard = pressed.status()["tick"]
     for _ in range(30):
         pressed.feed(frame("HEARTBEAT", 0, pack("HEARTBEAT", boot_id=7, tick=heard)))
@@ -302,6 +302,8 @@ def test_a_device_that_is_not_homed_renders_nothing():
     device.hello()
     staged = device.stage(SET)
     device.confirm("COMMIT", staged)
+    device.hello_said = False  # so that this host waits for no tick
+    assert device.refusal("HOME", boot_id=7, position_mm=0.0) == "NO_INPUT"  # of a position that nobody knows yet
     device.run([7000] * 5)  # an encoder counts from anywhere
     device.beat()
     assert device.status()["flags"] == 0 and device.status()["position_mm"] == 0

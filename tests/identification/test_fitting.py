@@ -9,7 +9,8 @@ from helpers import check_grad
 from material import FOAM, foam_tests, force, loads, position
 
 from hilbo.errors import InputError
-from hilbo.identification.fitting import Test, fit, nrmse, untared
+from hilbo.identification.beginnings import untared
+from hilbo.identification.fitting import Test, fit, nrmse
 from hilbo.identification.memory_selection import select_memory, smallest
 from hilbo.identification.sampled import Sampled
 from hilbo.viscoelastic import FOSLS

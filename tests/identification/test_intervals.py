@@ -1,5 +1,6 @@
 """Intervals against brute force: profiles by scipy, spectra by Toeplitz matrices, the bootstrap by refits."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,9 +13,9 @@ from scipy.stats import t as student
 
 from hilbo.errors import InputError
 from hilbo.identification import intervals, residual_noise
-from hilbo.identification.fitting import Fit, Test, fit, residuals
+from hilbo.identification.fitting import Curve, Fit, Test, fit, residuals
 from hilbo.identification.sampled import Sampled
-from hilbo.numerics.least_squares import Solution
+from hilbo.numerics.least_squares import Solution, least_squares
 from hilbo.viscoelastic import FOSLS
 
 
@@ -84,6 +85,36 @@ def test_ends_of_a_profile_are_where_scipy_finds_them(fitted):
     assert float(sides.upper[j]) == pytest.approx(ends[1], abs=3e-3 * width)
     truth = fitted.model.coordinates(*FOAM)
     assert np.all((sides.lower < truth) & (truth < sides.upper))
+
+
+class Line(eqx.Module):
+    """An intercept and a slope, which are fitted to a rising line."""
+
+    free: bool = eqx.field(static=True, default=False)
+    labels = ("intercept", "slope")
+
+    def physical(self):
+        return (False, False), (False, self.free)
+
+    def predict(self, q, curve, weights):
+        return q[0] + q[1] * curve.time
+
+
+@pytest.mark.parametrize("natural", [False, True])
+def test_an_end_that_another_bound_sets_is_open(natural):
+    """Lower intercepts need a steeper slope than the box has: a wider box would move that end."""
+    t = jnp.linspace(0, 1, 50)
+    noise = 0.05 * np.random.default_rng(0).standard_normal(50)
+    curve = Curve("modulus", t, (1 + 2 * t + noise)[None], jnp.zeros(1), jnp.ones(50))
+    upper = jnp.asarray([5.0, 2.07])
+    lower, weights = jnp.asarray([-5.0, -5.0]), (jnp.ones(1),)
+    model = Line(natural)
+    solution = least_squares(
+        lambda q: residuals(model, (curve,), weights, q), jnp.asarray([1.0, 1.9]), lower, upper, max_steps=50
+    )
+    assert float(solution.q[1]) < 2.07
+    sides = intervals.profile_intervals(Fit(model, (curve,), solution, lower, upper, jnp.zeros(1), weights))
+    assert bool(sides.open_lower[0]) is not natural and not bool(sides.open_upper[0])
 
 
 @pytest.mark.deep

@@ -10,12 +10,13 @@ from hilbo.identification import characterise
 from hilbo.identification.fitting import Test
 from hilbo.identification.material_tables import read_material
 from hilbo.identification.sampled import Sampled
+from hilbo.identification.sentences import recording
 
 T = 1e-3
 
 
 def said(test, T=T):
-    return " ".join(characterise._recording(test, T))
+    return " ".join(recording(test, T))
 
 
 def shifted(test, x=0.0, F=0.0):
@@ -79,12 +80,12 @@ def test_repeats_that_begin_off_zero_by_chance_are_no_offset():
 
 @pytest.mark.parametrize(("apart", "ratio"), [(0.0, None), (1e-15, None), (1e-3, 1e-9)])
 def test_copies_tell_nothing_about_noise(monkeypatch, apart, ratio):
-    left = SimpleNamespace(lag_one=0.0, order=0, effective=50.0, rms=1e-12)
+    left = SimpleNamespace(lag_one=0.0, order=0, effective=50.0, rms=1e-12, drift=1.0)
     monkeypatch.setattr(characterise, "noise", lambda fitted: (left,))
     time = np.arange(50.0)
     curve = 3 + np.exp(-time / 5)
     test = Test("modulus", time, curve + apart * np.array([[1.0], [-1.0]]))
-    (row,) = characterise._noise(None, [test])
+    (row,) = characterise._noise(SimpleNamespace(curves=[SimpleNamespace(other_way=None)]), [test])
     assert row.get("over_repeat_noise") == (None if ratio is None else pytest.approx(ratio, rel=0.01))
 
 

@@ -257,13 +257,19 @@ def test_a_report_of_one_person(capsys, monkeypatch, tmp_path):
     folder, out = tmp_path / "folder", tmp_path / "out"
     folder.mkdir()
     parameters = Parameter("u", 0.0, 1.0), Parameter("v", 0.0, 1.0)
-    (folder / "study.toml").write_text(study_text(NewStudy("plain", parameters)))
+    text = study_text(NewStudy("plain", parameters))
+    (folder / "study.toml").write_text(text.replace("[study]\n", '[study]\nexclude_flags = ["slewed"]\n', 1))
     rows = {"participant": "P1", "trial": range(1, 10), "response": [plain().responses[q] for _, _, q in HILL]}
     table = pd.DataFrame(rows).assign(u=[u for u, _, _ in HILL], v=[v for _, v, _ in HILL])
-    table.to_csv(folder / "trials.csv", index=False)
-    code, _, err = run(capsys, monkeypatch, "report", folder, "--out", out, "--no-compare")
+    table["flags"] = ["slewed", "saturated", "controlled saturated"] + [""] * 6
+    table.assign(telemetry_samples=900).to_csv(folder / "trials.csv", index=False)
+    code, stdout, err = run(capsys, monkeypatch, "report", folder, "--out", out, "--no-compare", "--json")
     assert code == 0, err
-    assert "P1 is the only participant" in (out / "report.html").read_text()
+    page = " ".join((out / "report.html").read_text().split())
+    assert "P1 is the only participant" in page and "1 participant gave 8 answers" in page
+    assert "recorded for 9 trials (saturated 2, slewed 1, controlled 1); excluded by [study] exclude_flags" in page
+    counts = {"recorded": 9, "flagged": {"saturated": 2, "slewed": 1, "controlled": 1}, "left_out": 1}
+    assert json.loads(stdout)["materials"][""]["flags"] == counts
 
 
 @pytest.mark.deep

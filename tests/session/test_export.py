@@ -9,8 +9,9 @@ import pandas as pd
 import pytest
 import xarray as xr
 from commands import run
-from live import STUDY, Driver
+from live import RAW, STUDY, Driver
 
+from hilbo import Study
 from hilbo.errors import InputError
 from hilbo.session.event_log import EventLog, log_name
 from hilbo.session.export import read_log_trials, read_sessions, sets_table, trials_table
@@ -40,6 +41,32 @@ def write(folder, person, kind, session, doings=(), **facts):
         for event in driver.events:
             log.append(event)
     return driver.state
+
+
+def test_flags_are_columns_and_empty_where_there_is_no_record(tmp_path):
+    state = write(tmp_path / "logs", "P01", "optimisation", "1")
+    answered = [trial for trial in state.trials if trial.values is not None]
+    counts = [trial.telemetry for trial in answered]
+    assert None in counts and {"samples": 8} in counts and {"samples": 8, "slewed": 1, "saturated": 2} in counts
+    psych_ds([state], tmp_path / "out", STUDY)
+    path = tmp_path / "out" / "data" / "study-plain_table-trials_data.csv"
+    cells = pd.read_csv(path, dtype=str, keep_default_na=False)
+    cell = {None: ("", ""), 1: ("", "8"), 3: ("saturated slewed", "8")}
+    wanted = [cell[None if count is None else len(count)] for count in counts]
+    assert list(zip(cells["flags"], cells["telemetry_samples"], strict=True)) == wanted
+    leaves_out = Study.from_dict(RAW | {"study": RAW["study"] | {"exclude_flags": ["slewed"]}})
+    kept = [t.number for t in answered if t.data["phase"] == "optimisation" and len(t.telemetry or {}) < 2]
+    assert netcdf([state], tmp_path / "trials.nc", leaves_out)
+    with xr.open_dataset(tmp_path / "trials.nc", group="constant_data", engine="h5netcdf") as constant:
+        assert constant["trial"].values.tolist() == kept and 0 < len(kept) < 6
+    leaves_out = Study.from_dict(RAW | {"study": RAW["study"] | {"exclude_flags": ["slewed"]}})
+    kept = [t.number for t in answered if t.data["phase"] == "optimisation" and len(t.telemetry or {}) < 2]
+    assert netcdf([state], tmp_path / "trials.nc", leaves_out)
+    with xr.open_dataset(tmp_path / "trials.nc", group="constant_data", engine="h5netcdf") as constant:
+        assert constant["trial"].values.tolist() == kept and 0 < len(kept) < 6
+    sidecar = json.loads(path.with_suffix(".json").read_text())["variableMeasured"]
+    words = {variable["name"]: variable["description"] for variable in sidecar}
+    assert "saturated, slewed" in words["flags"] and "empty where none were recorded" in words["telemetry_samples"]
 
 
 TROUBLE = [("answer", 1)] * 2 + [("go", 0), ("answer", 2), ("answer", 0), ("undo", 0), ("void old", 2), ("answer", 1)]

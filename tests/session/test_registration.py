@@ -69,11 +69,12 @@ def test_the_page_follows_the_study(page):
         PAPER.read_text()
         .replace('rule = "bcm"', 'rule = "learnt-1"')
         .replace("theta = 30.0\n", "")
-        .replace('name = "memory foam"', 'name = "memory foam"\nexclude = "trials < 10"')
+        .replace("[parameters.K1]", 'exclude = "trials < 10"\nexclude_flags = ["input_held"]\n[parameters.K1]', 1)
         .replace('acquisition = "ucb"', 'acquisition = "top_category"')
     )
     assert "recipe learnt-1" in text and "the rest learnt" in text and "theta" not in text
     assert "`trials < 10` holds are left out" in text
+    assert "Trials that the device flagged are left out (input held; `[study] exclude_flags`)." in text
     assert "probability of the highest answer)" in text
 
 

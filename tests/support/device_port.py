@@ -122,7 +122,9 @@ class Talk:
         while time.monotonic() < end:
             self.send(encode(type, payload, self.seq))  # again, too, where a full line has swallowed the answer
             while answers := self.listen():
-                mine = [a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY, Type.PULSE)]
+                mine = [
+                    a for a in answers if a.seq == self.seq and a.type not in (Type.NOTICE, Type.TELEMETRY, Type.PULSE)
+                ]
                 self.unasked += [a for a in answers if a not in mine]
                 if mine:
                     return mine[0]
@@ -185,7 +187,7 @@ class Port(Talk):
 
     def __init__(self, *options: str, rate: str = "lockstep", compiler: str | None = None):
         command = [program("hilbo-device", compiler), "--rate", rate, "--control", *options]
-        self.finger = dict(zip(options, options[1:], strict=False)).get("--finger", "all")
+        self.finger = options[options.index("--finger") + 1] if "--finger" in options else "all"
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
         assert self.process.stdout
         self.slave = self.process.stdout.readline().decode().strip()

@@ -153,7 +153,8 @@ def library(path: Path) -> ctypes.CDLL:
         "size": ctypes.c_size_t, "device_size": ctypes.c_size_t, "transmit": ctypes.c_size_t,
         "receive_once": ctypes.c_size_t, "tick": ctypes.c_float, "flags": ctypes.c_uint32, "offset_N": ctypes.c_double,
         "warm_left": ctypes.c_uint32, "stops": ctypes.c_uint32, "now": ctypes.c_uint32,
-        "tick_of_board": ctypes.c_float, "delayed_damping": ctypes.c_double, "power": ctypes.c_float, "power_error": ctypes.c_double,
+        "tick_of_board": ctypes.c_float, "delayed_damping": ctypes.c_double,
+        "power": ctypes.c_float, "power_error": ctypes.c_double,
         "sentence": ctypes.c_char_p,
     }.items():  # fmt: skip
         getattr(lib, f"shim_{name}").restype = result

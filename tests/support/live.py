@@ -125,7 +125,10 @@ class Driver:
             self.feel(pending)
         elif kind == "answer" and pending:
             values = self.values(pending, number)
-            self.log(live.answer(state, pending.id, f"c{len(self.events)}", values, at, felt=False))
+            flags = {"samples": 8} | ({"slewed": 1, "saturated": 2} if number % 2 else {})
+            telemetry = None if number % 3 == 1 else flags
+            client = f"c{len(self.events)}"
+            self.log(live.answer(state, pending.id, client, values, at, telemetry=telemetry, felt=False))
             self.accepted[pending.id] = values
         elif kind == "twice" and self.accepted:
             trial = list(self.accepted)[number % len(self.accepted)]

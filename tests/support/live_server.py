@@ -30,11 +30,10 @@ from hilbo.session.state import LiveSession
 from hilbo.simulation.presets import preset_of
 from hilbo.study.config import Study
 
-__all__ = ["DATA", "PATIENCE", "PUSHED", "Live", "ask", "check_blinding", "listen", "refused", "study_of", "until_held"]
+__all__ = ["DATA", "PATIENCE", "Live", "ask", "check_blinding", "listen", "refused", "study_of", "until_held"]
 
 DATA = Path(__file__).parents[2] / "hilbo" / "data" / "paper.toml"
 PATIENCE = 120.0  # s: how long a test waits for what must come; no test asserts a time
-PUSHED = 0.1  # s until a handle that was left pressed may be pushed back
 
 
 class _Hasty:
@@ -51,7 +50,6 @@ SOONER = (
     (uvicorn.server, "asyncio", _Hasty()),
     (device_rig, "_POLL", 0.03),
     (device_rig, "_RETRY", 0.1),
-    (device_rig, "_PUSHED", PUSHED),
     (runner, "_LATER", 0.1),
     (interruptions, "_LATER", 0.1),
 )

@@ -1,7 +1,7 @@
 """A line to a simulated device whose delay can be changed while it is used, and that sees what the device really does.
 
-Nothing is lost: what is written comes out later, in order. The relay reads the device's telemetry on its own side, so that
-a test knows the device's ticks, however late its host hears of them.
+Nothing is lost: what is written comes out later, in order. The relay reads the device's telemetry on its own side, so
+that a test knows the device's ticks, however late its host hears of them.
 """
 
 import contextlib

@@ -8,7 +8,6 @@ static volatile uint32_t *at(uintptr_t address)
     return (volatile uint32_t *)address;
 }
 
-#define CPACR at(0xE000ED88U)      /* coprocessor access */
 #define NVIC_ENABLE at(0xE000E100U)
 #define SYSTICK_CONTROL at(0xE000E010U)
 #define SYSTICK_RELOAD at(0xE000E014U)
@@ -30,12 +29,6 @@ enum {
     UART_RECEIVED_INTERRUPTS = 1 << 3,
     UART_RECEIVED = 1 << 1,
 };
-
-void board_enable_fpu(void)
-{
-    *CPACR |= UINT32_C(0xF) << 20;
-    __asm volatile("dsb\n isb" ::: "memory");
-}
 
 void board_start_ticks(void)
 {

@@ -12,8 +12,6 @@ enum {
     BOARD_TICK_HZ = 1000,
 };
 
-void board_enable_fpu(void);
-
 /* Bytes of stack that have been used so far, at most. */
 uint32_t board_stack_bytes_used(void);
 

@@ -3,6 +3,8 @@
 
 #include <stddef.h>
 
+#include "cortex_m.h"
+
 extern uint32_t stack_low[], stack_high[], data_low[], data_high[], bss_low[], bss_high[];
 extern const uint32_t data_image[];
 
@@ -48,28 +50,13 @@ __attribute__((section(".vectors"), used)) static const union vector VECTORS[FIR
     [FIRST_INTERRUPT] = {.handler = uart_received_interrupt},
 };
 
-/* The linker's addresses are no bounds of one array to the compiler, so that they are compared as numbers. */
-static void copy(uint32_t *to, const uint32_t *end, const uint32_t *from)
-{
-    for (; (uintptr_t)to < (uintptr_t)end; to++, from++) {
-        *to = *from;
-    }
-}
-
-static void fill(uint32_t *to, const uint32_t *end, uint32_t value)
-{
-    for (; (uintptr_t)to < (uintptr_t)end; to++) {
-        *to = value;
-    }
-}
-
 _Noreturn void reset(void)
 {
-    board_enable_fpu();
+    cortex_m_enable_fpu();
     const uint32_t *const here = __builtin_frame_address(0);
-    fill(stack_low, here - 32, (uint32_t)PAINT); /* what this function itself may still use stays */
-    copy(data_low, data_high, data_image);
-    fill(bss_low, bss_high, 0);
+    cortex_m_fill(stack_low, here - 32, (uint32_t)PAINT); /* what this function itself may still use stays */
+    cortex_m_copy(data_low, data_high, data_image);
+    cortex_m_fill(bss_low, bss_high, 0);
     board_exit((uint32_t)main());
 }
 

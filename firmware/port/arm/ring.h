@@ -1,7 +1,7 @@
-/* Bytes between one interrupt that puts and one loop that takes. A byte without room is lost: its frame's CRC will tell.
- * Each index is written by one side alone, and neither is ever taken back. */
-#ifndef MPS2_RING_H
-#define MPS2_RING_H
+/* Bytes between one side that puts and one that takes, of which one is an interrupt. A byte without room is lost: its
+ * frame's CRC will tell. Each index is written by one side alone, and neither is ever taken back. */
+#ifndef ARM_RING_H
+#define ARM_RING_H
 
 #include <stdbool.h>
 #include <stdint.h>
@@ -10,13 +10,18 @@
 
 struct ring {
     volatile uint8_t bytes[RING_SIZE];
-    volatile uint32_t put; /* written by the interrupt */
-    volatile uint32_t got; /* written by the loop */
+    volatile uint32_t put; /* written by the side that puts */
+    volatile uint32_t got; /* written by the side that takes */
 };
 
 static inline bool ring_is_empty(const struct ring *ring)
 {
     return ring->got == ring->put;
+}
+
+static inline uint32_t ring_room(const struct ring *ring)
+{
+    return RING_SIZE - (ring->put - ring->got);
 }
 
 static inline void ring_put(struct ring *ring, uint8_t byte)

@@ -1,0 +1,116 @@
+"""What a force channel does to a recorded test: a lag against the position, and a first-order filter.
+
+The recorded force is F_r(t) = (A F)(t - d): d is the lag (negative where the position is late), A a low-pass filter of
+first order with the time constant τ. All parts are linear and do not change with time, so that the recorded force is
+also that of the position (A x)(t - d), and (A⁻¹ F_r)(t + d) the force of the recorded position. Between two samples a
+signal is taken as a straight line, for which all of them are exact:
+
+    x(t + s)  = x + s·z·Δ (s >= 0),  x + s·Δ (s < 0),      Δ_n = x_n - x_{n-1},  |s| <= 1 sample
+    A x       = x - g/(1 - e/z)·Δ,                          e = exp(-T/τ),  g = (1 - e)·τ/T
+    A⁻¹ F     = F + g/((1 - g) + (g - e)/z)·Δ
+
+They act on the input of a curve, the position or the force of a creep test. Only those changes Δ enter that stand
+clear of its noise. A shift of a fraction of a sample averages two
+samples, and a filter changes what is fast: applied to the noise they would lower or raise the residuals, and the fit
+would choose lag and filter for that reason.
+Units: lag in samples of T here and in coordinates, in ms under its name; corners 1/(2πτ) in Hz.
+"""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float
+
+from hilbo.identification.fitting import Test
+
+__all__ = [
+    "FASTEST_FILTER",
+    "LARGEST_LAG",
+    "SLOWEST_FILTER",
+    "can_be_timed",
+    "clear_changes",
+    "is_position_clearer",
+    "multiplier",
+    "without_noise",
+]
+
+LARGEST_LAG = 2  # samples, either way
+SLOWEST_FILTER, FASTEST_FILTER = 5.0, 0.05  # time constants, samples
+_CLEAR = 5.0  # standard deviations of the noise in a difference
+_AROUND = 3  # rows before and after a clear change: ends of ramps, tails of filters
+
+
+def can_be_timed(tests: Sequence[Test]) -> bool:
+    """Whether an input changes clearly from one row to the next, so that a lag shows."""
+    return any(bool(clear_changes(test.input).any()) for test in tests if test.input is not None)
+
+
+def clear_changes(values: Float[np.ndarray, "R m"]) -> Bool[np.ndarray, " m"]:
+    """Rows at which the mean of the repeats changes by more than its noise from the row before, and their neighbours.
+
+    The row before the first one is 0. `values` (R, m), in any unit -> (m,).
+    """
+    mean = values.mean(axis=0)
+    clear = np.abs(np.diff(mean, prepend=0.0)) > _CLEAR * _noise_of_change(mean)
+    return np.convolve(clear, np.ones(2 * _AROUND + 1), "same") > 0
+
+
+def without_noise(values: Float[np.ndarray, "R m"], clear: Bool[np.ndarray, " m"]) -> Float[np.ndarray, "R m"]:
+    """An input with each row that does not change clearly replaced by the mean of its neighbours that do not either.
+
+    A fit lowers what noise of the input does to its residuals by too small a stiffness: an input that is held has no
+    changes that a mean of seven rows would lose. `values` (R, m) of rows at even times, `clear` (m,) -> (R, m).
+    """
+    still = ~clear
+    window = np.ones(2 * _AROUND + 1)
+    count = np.convolve(still, window, "same")
+    sums = np.stack([np.convolve(np.where(still, row, 0.0), window, "same") for row in values])
+    return np.where(still, sums / np.maximum(count, 1), values)
+
+
+def is_position_clearer(test: Test) -> bool:
+    """Whether the changes of the position stand clearer of its noise than those of the force of theirs."""
+    assert test.input is not None
+    position, force = (test.input, test.output) if test.kind == "relaxation" else (test.output, test.input)
+    return _clearness(position) > _clearness(force)
+
+
+def _clearness(values: Float[np.ndarray, "R m"]) -> float:
+    """The largest change from row to row over the noise of one."""
+    mean = values.mean(axis=0)
+    noise = _noise_of_change(mean)
+    return float(np.max(np.abs(np.diff(mean, prepend=0.0))) / noise) if noise > 0 else np.inf
+
+
+def _noise_of_change(mean: Float[np.ndarray, " m"]) -> float:
+    """Standard deviation of the noise in a change from row to row."""
+    # A fourth difference, which a smooth curve does not have, has the variance of 70 samples, a first one that of two.
+    return float(1.4826 * np.median(np.abs(np.diff(mean, 4))) / np.sqrt(35))
+
+
+def multiplier(
+    on_position: bool, lag: Float[Array, ""], tau: Float[Array, ""] | None, z: Complex[Array, " w"]
+) -> Complex[Array, " w"]:
+    """What the changes are multiplied by and added to their channel: `lag` and time constant `tau` in samples.
+
+    `z` (w,): points of the plane at which the transforms are known -> (w,), without unit. `tau` None: no filter.
+    """
+    m = _shift(-lag if on_position else lag, z)
+    if tau is None:
+        return m
+    e, g = (value.astype(z.dtype) for value in (jnp.exp(-1 / tau), tau * (1 - jnp.exp(-1 / tau))))
+    if on_position:
+        return m - (g + g * (1 - 1 / z) * m) / (1 - e / z)
+    inverse = g / ((1 - g) + (g - e) / z)
+    return m + inverse * (1 + (1 - 1 / z) * m)
+
+
+def _shift(s: Float[Array, ""], z: Complex[Array, " w"]) -> Complex[Array, " w"]:
+    """The multiplier of an advance by s samples, a straight line from each sample to the next."""
+    total, later, earlier = jnp.zeros_like(z), z, jnp.ones_like(z)
+    for k in range(LARGEST_LAG):
+        ahead, behind = (jnp.clip(value, 0, 1).astype(z.dtype) for value in (s - k, -s - k))
+        total = total + ahead * later - behind * earlier
+        later, earlier = later * z, earlier / z
+    return total

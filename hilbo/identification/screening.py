@@ -1,0 +1,47 @@
+"""Where the search for a sampled model begins: the best separate places of a grid in (κ, α)."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hilbo.identification.fitting import Curve
+from hilbo.numerics.tracing import program
+
+__all__ = ["screened", "separate"]
+
+
+@program
+def screened(
+    model: Any, curves: tuple[Curve, ...], scales: list[Float[Array, ""]], grid: Float[Array, "K A 2"]
+) -> tuple[Float[Array, "K A"], Float[Array, "K A 2"]]:
+    """Cost and stiffnesses (K_inst, K_eff) of the best combination at each place of the grid."""
+    weights = [jnp.full(c.output.shape[0], 1 / c.output.shape[0], c.scale.dtype) for c in curves]
+    ends = jnp.eye(2, dtype=grid.dtype)
+
+    def best_at(kappa_alpha):
+        normal, right, total = jnp.zeros((2, 2), grid.dtype), jnp.zeros(2, grid.dtype), jnp.zeros((), grid.dtype)
+        for curve, scale, w in zip(curves, scales, weights, strict=True):
+            responses = [model.predict(jnp.concatenate([end, kappa_alpha]), curve, w) for end in ends]
+            basis = jnp.stack(responses) / (scale * np.sqrt(curve.time.size))
+            goal = w @ curve.output / (scale * np.sqrt(curve.time.size))
+            normal, right, total = normal + basis @ basis.T, right + basis @ goal, total + goal @ goal
+        a, b, c = normal[0, 0], normal[0, 1], normal[1, 1]
+        K_eff = jnp.maximum((a * right[1] - b * right[0]) / (a * c - b * b), 0)
+        stiffness = jnp.stack([(right[0] - b * K_eff) / a, K_eff])
+        return total - 2 * right @ stiffness + stiffness @ normal @ stiffness, stiffness
+
+    costs, stiffness = jax.lax.map(best_at, grid.reshape(-1, 2))
+    return costs.reshape(grid.shape[:-1]), stiffness.reshape(grid.shape)
+
+
+def separate(costs: Float[np.ndarray, "K A"], count: int) -> list[tuple]:
+    """Indices of the lowest costs, none beside another."""
+    left, places = np.where(np.isfinite(costs), costs, np.inf), []
+    while len(places) < count and np.isfinite(left).any():
+        i, j = np.unravel_index(np.argmin(left), left.shape)
+        places.append((i, j))
+        left[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2] = np.inf
+    return places

@@ -1,0 +1,136 @@
+"""Sentences about a fit for a person who would otherwise trust the digits: its search, residuals, instrument, rows."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from hilbo.identification.beginnings import untared
+from hilbo.identification.estimates import Estimate
+from hilbo.identification.fitting import Fit, Test
+from hilbo.identification.intervals import Intervals, Spread
+from hilbo.identification.misfit import is_coarse, moved_between_rows
+from hilbo.identification.residual_noise import DRIFTS
+
+__all__ = ["recording", "sentences"]
+
+_UNRELATED = 3.0  # times the repeats' own noise, above which the model misses something
+_WIDE, _TICKS = 5.0, 10.0  # medians of the time between rows, and T, above which it is a hole
+_SURE = 4.0  # standard errors
+_SHARE = 0.2  # of the input's range; what a hole may hide of it
+_CERTAIN = 1.75  # half-widths of the 95 % interval: a lag of 0 has a probability of 1 in 2,000
+_SHARE_OF_ERROR = 0.5
+
+
+def sentences(
+    best_fit: Fit,
+    sides: Intervals,
+    sampling: Spread,
+    estimates: dict[str, Estimate],
+    residuals: dict[str, dict[str, Any]],
+    tests: Sequence[Test],
+) -> tuple[str, ...]:
+    """Sentences for a person who would otherwise trust the digits; `residuals` by kind of test."""
+    words = [*_search(best_fit, sides, estimates), *_residuals(residuals), *_instrument(estimates)]
+    words += _coarse(best_fit, sampling, tests)
+    T = getattr(best_fit.model, "T", np.inf)
+    return (*words, *(sentence for test in tests for sentence in recording(test, T)))
+
+
+def _search(best_fit: Fit, sides: Intervals, estimates: dict[str, Estimate]) -> Iterator[str]:
+    """What the search did not find."""
+    if not bool(best_fit.solution.converged):
+        yield "The fit did not come to an end: the cost is flat in some direction, so no digits are printed."
+    elif float(sides.lowest) < float(best_fit.solution.cost) * (1 - 1e-4):
+        yield "A search for an interval found a better fit than the fit itself; the data have several optima."
+    for name, estimate in estimates.items():
+        if estimate.status == "at bound":
+            yield f"The fit ran to the bound of {name}, {estimate.value:.3g}; the data do not determine it."
+    unknown = [name for name, estimate in estimates.items() if estimate.status == "not identifiable"]
+    if unknown:
+        yield f"Not identifiable from these data: {', '.join(unknown)}."
+
+
+def _residuals(residuals: dict[str, dict[str, Any]]) -> Iterator[str]:
+    """What the residuals hold beside noise."""
+    for kind, row in residuals.items():
+        if row.get("over_repeat_noise", 0.0) > _UNRELATED:
+            yield (
+                f"The residuals of the {kind} test are {row['over_repeat_noise']:.0f} times the noise of its repeats:"
+                " the model misses part of the curve, and the intervals take that as correlated noise."
+            )
+        if row.get("drift", 1.0) < DRIFTS:
+            bootstrap = " The bootstrap does not contain a drift that all repeats share." if row["repeats"] > 1 else ""
+            yield (
+                f"The residuals of the {kind} test drift slowly, as a sensor that warms up does, or a curve that the"
+                " model misses: the intervals take them as a random walk, and are uncertain themselves; let the sensor"
+                f" settle and record again.{bootstrap}"
+            )
+
+
+def _instrument(estimates: dict[str, Estimate]) -> Iterator[str]:
+    """Lag and filter that were found."""
+    lag, corner = estimates.get("lag"), estimates.get("corner")
+    if lag is not None and lag.lower is not None and lag.upper is not None:
+        least = abs(lag.value) - _CERTAIN * (lag.upper - lag.lower) / 2
+        if least > 0:
+            late = "force is recorded" if lag.value > 0 else "position is recorded"
+            ends = sorted((abs(lag.lower), abs(lag.upper)))
+            yield (
+                f"The {late} {abs(lag.value):.2g} ms late ({ends[0]:.2g} to {ends[1]:.2g} ms); the fit takes that into"
+                " account, but one clock for both channels would make the intervals narrower."
+            )
+    if corner is not None and corner.known:
+        yield (
+            f"The force is filtered: the residuals show a first-order filter with a corner of {corner.value:.3g} Hz"
+            f" ({corner.lower:.3g} to {corner.upper:.3g} Hz), which the fit takes into account; state a known corner by"
+            " --corner."
+        )
+
+
+def _coarse(best_fit: Fit, sampling: Spread, tests: Sequence[Test]) -> Iterator[str]:
+    """Rows that are further apart than the samples of the rendering, and what hangs on the line between them."""
+    coarse = is_coarse(best_fit.model, tests)
+    if not coarse:
+        return
+    moved = np.abs(moved_between_rows(best_fit, tests))
+    errors = np.sqrt(np.diag(np.asarray(sampling.covariance)))
+    names = [n for n, m, e in zip(best_fit.model.labels, moved, errors, strict=True) if m > _SHARE_OF_ERROR * e]
+    so = f"; a curve in place of it moves {' and '.join(names)} by more than half a standard error" if names else ""
+    yield (
+        f"The samples of the {' and '.join(coarse)} test are further apart than T = {1000 * best_fit.model.T:g} ms;"
+        f" the input was interpolated linearly in between{so}, which the intervals do not contain: record a row every"
+        f" {1000 * best_fit.model.T:g} ms while the input changes."
+    )
+
+
+def recording(test: Test, T: float) -> Iterator[str]:
+    """What is amiss with the recorded input: a step that fell into a hole between rows, a beginning off 0."""
+    if test.input is None:
+        return
+    put, out, time = test.input.mean(axis=0), test.output.mean(axis=0), test.time - test.time[0]
+    apart, change = np.diff(time), np.abs(np.diff(put))
+    hole = (apart > _WIDE * np.median(apart)) & (apart > _TICKS * T) & (change > _SHARE * np.ptp(put))
+    if hole.any():
+        i = int(np.argmax(np.where(hole, change, 0)))
+        yield (
+            f"The {test.kind} test has no rows from {time[i]:g} s to {time[i + 1]:g} s, where its input changes by"
+            f" {change[i] / np.ptp(put):.0%} of its range: a straight line was taken there, and values and intervals"
+            " are wrong if the input went another way; record that part with rows as close as elsewhere."
+        )
+    offset = untared(put, out) if test.start == "rest" else None
+    if offset is not None and _above_scatter(test.input if offset == "input" else test.output):
+        names = ("position", "force") if (offset == "input") == (test.kind == "relaxation") else ("force", "position")
+        first = (put if offset == "input" else out)[0]
+        unit = "mm" if names[0] == "position" else "N"
+        yield (
+            f"The {test.kind} test does not begin at rest: its first row has a {names[0]} of {first:.3g} {unit} and no"
+            f" {names[1]}; unless that is noise, values and intervals are wrong: tare it (subtract that from every"
+            f" {names[0]})."
+        )
+
+
+def _above_scatter(values: np.ndarray) -> bool:
+    """Whether the repeats agree that their first row is not 0. (R, m)."""
+    first, repeats = values[:, 0], values.shape[0]
+    return repeats == 1 or bool(abs(first.mean()) > _SURE * np.std(first, ddof=1) / np.sqrt(repeats))
