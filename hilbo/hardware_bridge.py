@@ -44,6 +44,7 @@ _ANSWER = 0.1  # s
 _SIMULATED = 1.0  # s for an answer; the simulator shares this computer's processors
 _LOCKSTEP = 30.0  # s, where no time passes meanwhile
 _POLL = 0.1  # s
+_NEAR = 0.01  # s between two looks at a handle that is to leave
 _SINKS = 1.0  # s for a force to sink to zero, of which the protocol allows 0.1
 _STALLED = 20  # polls without telemetry
 _SHAPES = {"hold": 0, "triangle": 1, "step": 2, "nudge": 3}
@@ -202,12 +203,13 @@ class Renderer:
         home = protocol.Home(boot_id=self.device.boot_id, stop=self._link.stops, position_mm=float(position))
         self._link.request(home)
 
-    def start(self, *, stop: int | None = None) -> None:
+    def start(self, *, stop: int | None = None, wait: SupportsFloat = 0.0) -> None:
         """Render the set that is in force. Telemetry from before is dropped.
 
         `stop` is the device's count of stops that the order follows (`link.stops`), by default what is known at the
-        call: after a later stop the device refuses it. Raises `DeviceError` if no set is in force, while the handle is
-        in the material, and where the device refuses for another reason.
+        call: after a later stop the device refuses it. `wait` is how long (s) the handle may stay in the material, where
+        nothing is started. Raises `DeviceError` if no set is in force, if the handle has not left by then, and where the
+        device refuses for another reason.
         """
         stop = self._link.stops if stop is None else stop
         current = self.in_force()
@@ -216,7 +218,16 @@ class Renderer:
         self._link.heartbeat()
         self._buffer.take()
         order = {"set_id": current.set_id, "crc": current.crc, "boot_id": self.device.boot_id, "stop": stop}
-        self._link.request(protocol.Start(**order))
+        give_up = self._link.now() + float(wait)
+        while True:
+            try:
+                self._link.request(protocol.Start(**order))
+                return
+            except DeviceError as error:
+                in_contact = error.nack is not None and error.nack.reason == NackReason.IN_CONTACT
+                if not in_contact or self._link.now() > give_up:
+                    raise
+            self._link.pause(_NEAR)
 
     def stop(self) -> None:
         """Force to zero, smoothly."""

@@ -46,8 +46,11 @@ class Wanted(NamedTuple):
     """Of the reference that the participant's own page presents (`hilbo try`): the answers are unblinded."""
 
 
-def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable[[str], Any]) -> tuple[Hub, EventLog]:
-    """The hub of a session, new or resumed, and its open log. Raises `InputError`."""
+def opened(
+    wanted: Wanted, connect: Callable[[float | None, float | None], Any], say: Callable[[str], Any]
+) -> tuple[Hub, EventLog]:
+    """The hub of a session, new or resumed, and its open log; `connect(damping, delay)` opens a device that has at least
+    this damping (N·s/m) and at most this delay (s). Raises `InputError`."""
     study = Study.load(wanted.study)
     say("preparing what chooses")
     import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)
@@ -57,8 +60,9 @@ def opened(wanted: Wanted, connect: Callable[[float | None], Any], say: Callable
     if study.stimulus is not None:
         rig = functools.partial(StimulusRig, study, tag)
     else:
-        damping = max(_damping(study, block.material) for block in log.state.header.blocks)
-        rig = functools.partial(DeviceRig, study, lambda: connect(damping))
+        mechanics = [_mechanics(study, block.material) for block in log.state.header.blocks]
+        needs = max(m.damping for m in mechanics), min(m.delay for m in mechanics)
+        rig = functools.partial(DeviceRig, study, lambda: connect(*needs))
     hub = Hub(log, chooser, rig, tag=tag, maps=Maps)
     hub.settle = _set_memory_aside
     return hub, log
@@ -78,8 +82,8 @@ def let_go(log: EventLog, resumed: bool = False) -> None:
         log.path.unlink(missing_ok=True)
 
 
-def _damping(study, material) -> float:
-    return float((study if material is None else study.material(material)).space.mechanics.damping)
+def _mechanics(study, material) -> Any:
+    return (study if material is None else study.material(material)).space.mechanics
 
 
 def _begun(wanted, study) -> tuple[EventLog, LiveChooser]:

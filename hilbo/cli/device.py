@@ -23,12 +23,14 @@ from hilbo.errors import InputError
 
 __all__ = ["app"]
 
+
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode="markdown", help="A rendering device: connect, send sets, feel, measure."
 )
 for name, command in (measure.COMMANDS | commission.COMMANDS).items():
     app.command(name)(command)
 
+_LEAVES = 10.0  # s for a handle that is pressed to leave
 _PIECE = 1.0  # s of a recording between two writes to its file
 
 Seconds = Annotated[float | None, typer.Option(help="End after so many seconds of the device's time.")]
@@ -248,7 +250,9 @@ def simulate(line: Line) -> None:
 def _begin(device, wanted) -> None:
     if wanted is not None:
         print(f"in force: {set_words(device.send(**wanted))}", file=sys.stderr)
-    device.start()
+    if device.status().contact:
+        print("hilbo: let the handle leave the surface; it is rendered from then on", file=sys.stderr)
+    device.start(wait=_LEAVES)
 
 
 def _at_once(line, name, as_json) -> None:

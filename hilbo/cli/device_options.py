@@ -111,6 +111,7 @@ def opened(line: Line, **simulated: Any) -> Iterator[Any]:
             Renderer.open(
                 line.device,
                 damping=_damping(line),
+                delay=None if line.study is None else _mechanics(line).delay,
                 baud=line.baud,
                 patience=line.patience,
                 capture=capture.write if capture else None,

@@ -39,12 +39,12 @@ class Check(NamedTuple):
 
 def checks(
     study: Path | None,
-    connect: Callable[[float | None], Any],
+    connect: Callable[[float | None, float | None], Any],
     folder: Path,
     port: int,
     begin: Callable[[], Any] = lambda: None,
 ) -> Iterator[Check]:
-    """One check after the other. `connect(damping)` opens the device, logs go to `folder`, `port` is the server's.
+    """One check after the other. `connect(damping, delay)` opens the device, logs go to `folder`, `port` is the server's.
 
     What JAX is needed for comes last, after `begin`; the rest does not wait for it.
     """
@@ -222,13 +222,12 @@ def _step(study: Any) -> Check:
     )
 
 
-def _device(connect: Callable[[float | None], Any], file: Any) -> Iterator[Check]:
+def _device(connect: Callable[[float | None, float | None], Any], file: Any) -> Iterator[Check]:
     from hilbo.device.failures import DeviceError
 
     mechanics = file.space.mechanics if file is not None else None
-    needs = None if mechanics is None else float(mechanics.damping)
     try:
-        device = connect(None)
+        device = connect(None, None)
     except (InputError, DeviceError) as error:
         yield Check("device", "bad", str(error), "connect it, or try --device sim")
         return
@@ -236,8 +235,9 @@ def _device(connect: Callable[[float | None], Any], file: Any) -> Iterator[Check
         about = device.device
         yield Check("device", "good", f"{device.link.name}: {about.tick_rate_Hz} ticks a second, {device.state().name}")
         yield _loopback(device)
-        if needs is not None:
-            yield _damping(about.damping_N_s_per_m, needs)
+        if mechanics is not None:
+            yield _damping(about.damping_N_s_per_m, float(mechanics.damping))
+            yield _delay(device.delay, float(mechanics.delay))
 
 
 def _language(file: Any) -> Iterator[Check]:
@@ -328,3 +328,11 @@ def _damping(has: float, needs: float) -> Check:
     if has < needs * (1 - 1e-6):
         return Check("damping", "bad", words, "measure it (`hilbo device measure-damping`), then lower the study's")
     return Check("damping", "good", words)
+
+
+def _delay(has: float, counted: float) -> Check:
+    """The delay for which the device checks sets must be one that the study's search knows of."""
+    words = f"the study counts on at most {1e3 * counted:g} ms, the device checks its sets for {1e3 * has:g} ms"
+    if has > counted + 1e-9:
+        return Check("delay", "bad", words, f"write [renderer] delay = {has:g} and plan the study again")
+    return Check("delay", "good", words)

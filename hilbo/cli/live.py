@@ -31,14 +31,14 @@ class Device(NamedTuple):
     baud: Baud = 921_600
     sim: Sim = None
 
-    def open(self, damping: float | None) -> Any:
-        """A connected `Renderer` of a device that has at least this damping (N·s/m)."""
+    def open(self, damping: float | None, delay: float | None) -> Any:
+        """A connected `Renderer` of a device that has at least this damping (N·s/m) and at most this delay (s)."""
         from hilbo.hardware_bridge import Renderer
 
         options = sim_options(self.sim)
         if self.device == "sim":
             options = {"finger": "none"} | options
-        return Renderer.open(self.device, baud=self.baud, damping=damping, options=options)
+        return Renderer.open(self.device, baud=self.baud, damping=damping, delay=delay, options=options)
 
 
 class Served(NamedTuple):

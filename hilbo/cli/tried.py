@@ -66,7 +66,7 @@ def _opened(folder, seed, say):
     study = StudyFile.load(folder / "study.toml")
     reference = hidden_reference(study, seed)
     wanted = Wanted(folder / "study.toml", f"try-{seed}", seed=seed, logs=folder / "logs", reference=reference)
-    hub, log = opened(wanted, lambda _: None, say)
+    hub, log = opened(wanted, lambda *_: None, say)
     hub.gap = 0.4
     return hub, log, Tried(study, reference)
 
