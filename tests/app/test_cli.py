@@ -380,7 +380,7 @@ def test_links_are_for_this_computer_unless_the_network_is_asked_for(monkeypatch
 
 
 def test_the_doctor_finds_all_well_with_the_simulated_device(tmp_path, capsys):
-    def connect(damping):
+    def connect(damping, delay):
         return Renderer.open("sim", damping=damping, options={"finger": "none"}, patience=10.0)
 
     checks = {check.name: check for check in doctor.checks(DATA, connect, tmp_path, 0)}
@@ -393,7 +393,7 @@ def test_the_doctor_finds_all_well_with_the_simulated_device(tmp_path, capsys):
 
 
 def test_the_doctor_says_what_to_mend(tmp_path):
-    def connect(_):
+    def connect(*_):
         return Renderer.open("sim", options={"finger": "none", "damping": 0.5}, patience=10.0)
 
     with socket.socket() as other:
