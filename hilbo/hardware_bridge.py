@@ -207,9 +207,9 @@ class Renderer:
         """Render the set that is in force. Telemetry from before is dropped.
 
         `stop` is the device's count of stops that the order follows (`link.stops`), by default what is known at the
-        call: after a later stop the device refuses it. `wait` is how long (s) the handle may stay in the material, where
-        nothing is started. Raises `DeviceError` if no set is in force, if the handle has not left by then, and where the
-        device refuses for another reason.
+        call: after a later stop the device refuses it. `wait` is how long (s) the handle may stay in the material,
+        where nothing is started. Raises `DeviceError` if no set is in force, if the handle has not left by then, and
+        where the device refuses for another reason.
         """
         stop = self._link.stops if stop is None else stop
         current = self.in_force()

@@ -22,7 +22,7 @@ from typing import NamedTuple
 ROOT = Path(__file__).parents[2]
 CORE = ROOT / "firmware" / "core"
 FILES = ("hb_motion.c", "hb_requests.c", "hb_device.c", "hb_staging.c", "hb_safety.c", "hb_drive.c", "hb_delay.c")
-TESTS = ("protocol", "orders", "safety", "telemetry", "sets", "contact", "passivity", "switching")
+TESTS = ("protocol", "orders", "safety", "telemetry", "sets", "contact", "switching")
 SWAPS = {
     "<=": "<", ">=": ">", "==": "!=", "!=": "==", "&&": "||", "||": "&&", " < ": " <= ", " > ": " >= ",
     " + ": " - ", " - ": " + ", " * ": " / ", " += ": " -= ", " -= ": " += ",
@@ -80,8 +80,9 @@ def verdict(mutant: Mutant) -> str:
         text = (core / mutant.file).read_text(encoding="utf-8")
         (core / mutant.file).write_text(text[: mutant.start] + mutant.new + text[mutant.end :], encoding="utf-8")
         environment = os.environ | {"HILBO_FIRMWARE_CORE": str(core), "HILBO_FIRMWARE_FLAGS": "-Wno-error -w"}
-        tests = [str(ROOT / "tests" / "firmware" / f"test_{name}.py") for name in TESTS]
-        options = ["-x", "-q", "-n", "0", "-m", "not deep", "-p", "no:cacheprovider", "--no-header", "--tb=line"]
+        names = ("passivity", *TESTS) if mutant.file == "hb_delay.c" else TESTS
+        tests = [str(ROOT / "tests" / "firmware" / f"test_{name}.py") for name in names]
+        options = ["-x", "-q", "-n", "0", "-m", "not deep", "--noconftest", "-p", "no:cacheprovider", "--tb=line"]
         command = [sys.executable, "-m", "pytest", *options, *tests]
         try:
             done = subprocess.run(
@@ -99,6 +100,8 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=200)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
+    if verdict(Mutant("hb_delay.c", 0, 0, "")) != "survives":
+        sys.exit("The tests fail on the core as it is; mend that first.")
     drawn = [mutant for file in FILES for mutant in places(file)]
     random.Random(asked.seed).shuffle(drawn)
     noticed = tried = 0

@@ -49,8 +49,8 @@ class Wanted(NamedTuple):
 def opened(
     wanted: Wanted, connect: Callable[[float | None, float | None], Any], say: Callable[[str], Any]
 ) -> tuple[Hub, EventLog]:
-    """The hub of a session, new or resumed, and its open log; `connect(damping, delay)` opens a device that has at least
-    this damping (N·s/m) and at most this delay (s). Raises `InputError`."""
+    """The hub of a session, new or resumed, and its open log; `connect(damping, delay)` opens a device that has at
+    least this damping (N·s/m) and at most this delay (s). Raises `InputError`."""
     study = Study.load(wanted.study)
     say("preparing what chooses")
     import pandas  # noqa: F401  (what the device's bridge would load when it is in a hurry)

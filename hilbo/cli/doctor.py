@@ -44,7 +44,8 @@ def checks(
     port: int,
     begin: Callable[[], Any] = lambda: None,
 ) -> Iterator[Check]:
-    """One check after the other. `connect(damping, delay)` opens the device, logs go to `folder`, `port` is the server's.
+    """One check after the other. `connect(damping, delay)` opens the device, logs go to `folder`, `port` is that of the
+    server.
 
     What JAX is needed for comes last, after `begin`; the rest does not wait for it.
     """

@@ -108,21 +108,21 @@ def test_a_session_is_resumed_only_with_its_own_study_and_never_begun_twice(tmp_
     logs.mkdir()
     add_person(logs / "participants.csv", PERSON)
     wanted = Wanted(file, "P01", logs=logs)
-    hub, log = opened(wanted, lambda *_: None, lambda _: None)
+    hub, log = opened(wanted, lambda *_: None, lambda *_: None)
     assert log.state.header.consent == PERSON["consent_time"]
     with pytest.raises(InputError, match="another hilbo"):
-        opened(wanted._replace(resume=True), lambda *_: None, lambda _: None)
+        opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)
     log.close()
     with pytest.raises(InputError, match="--resume"):
-        opened(wanted, lambda *_: None, lambda _: None)
+        opened(wanted, lambda *_: None, lambda *_: None)
     with pytest.raises(InputError, match="another study"):
-        opened(wanted._replace(resume=True, study=DATA), lambda _: None, lambda _: None)
+        opened(wanted._replace(resume=True, study=DATA), lambda *_: None, lambda _: None)
     text = log.path.read_bytes()
     log.path.write_bytes(text.replace(b"P01", b"P02", 1))
     with pytest.raises(InputError, match="damaged"):
-        opened(wanted._replace(resume=True), lambda *_: None, lambda _: None)
+        opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)
     log.path.write_bytes(text)
-    again, log = opened(wanted._replace(resume=True), lambda *_: None, lambda _: None)
+    again, log = opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)
     log.close()
     assert again.tag == hub.tag
     assert again.state == hub.state
@@ -169,7 +169,7 @@ def a_map(study, path):
 
 def begun(wanted):
     """Log, first two proposals."""
-    hub, log = opened(wanted, lambda *_: None, lambda _: None)
+    hub, log = opened(wanted, lambda *_: None, lambda *_: None)
     with log:
         state, proposals = log.state, []
         for number, response in enumerate(("different", "close"), 1):
@@ -199,7 +199,7 @@ def test_a_warm_start_is_in_the_log_and_a_resumed_session_chooses_the_same(tmp_p
     again = wanted._replace(resume=True)
     assert begun(again)[1] == first
     with pytest.raises(InputError, match="give that map with --warm-start"):
-        opened(again._replace(warm_start=None), lambda _: None, lambda _: None)
+        opened(again._replace(warm_start=None), lambda *_: None, lambda _: None)
     candidates = read_warm_start(file, study, 7).points
     first_unit = study.space.to_unit(np.array([first[0]["renderings"]["a"][n] for n in study.space.names]))
     assert float(jnp.min(jnp.max(jnp.abs(candidates - first_unit[None, :]), axis=1))) < 1e-9
@@ -210,14 +210,14 @@ def test_a_warm_start_that_is_refused_leaves_no_log(tmp_path):
     logs = tmp_path / "logs"
     wanted = Wanted(tmp_path / "study.toml", "P01", logs=logs, warm_start=tmp_path / "none.nc", dry_run=True)
     with pytest.raises(InputError, match="is no map"):
-        opened(wanted, lambda *_: None, lambda _: None)
+        opened(wanted, lambda *_: None, lambda *_: None)
     plan = make_plan(
         study, ["P01"], 0, "validation", sets={"": example_sets(study, preset_of("paper"))}, source="aggregate"
     )
     (tmp_path / "plan.json").write_text(json.dumps(plan))
     planned = wanted._replace(plan=tmp_path / "plan.json", warm_start=a_map(study, tmp_path / "map.nc"))
     with pytest.raises(InputError, match="nothing is chosen"):
-        opened(planned, lambda _: None, lambda _: None)
+        opened(planned, lambda *_: None, lambda _: None)
     assert not list(tmp_path.rglob("*.jsonl"))
 
 
@@ -252,7 +252,7 @@ def test_a_session_that_was_begun_keeps_its_log_when_the_device_is_not_there(tmp
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of the tests")
     study_of(tmp_path)
     file, logs = tmp_path / "study.toml", tmp_path / "logs"
-    _, log = opened(Wanted(file, "P01", logs=logs, dry_run=True), lambda _: None, lambda _: None)
+    _, log = opened(Wanted(file, "P01", logs=logs, dry_run=True), lambda *_: None, lambda _: None)
     log.close()
     before = log.path.read_bytes()
     place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--dry-run", "--resume")
@@ -266,14 +266,14 @@ def test_a_log_of_somebody_else_or_of_another_material_is_not_resumed(tmp_path):
     file, logs = tmp_path / "study.toml", tmp_path / "logs"
     file.write_text(file.read_text() + "\n[materials.foam]\n[materials.gel]\n")
     wanted = Wanted(file, "P_1", "x", logs=logs, material="foam", dry_run=True)
-    opened(wanted, lambda *_: None, lambda _: None)[1].close()
+    opened(wanted, lambda *_: None, lambda *_: None)[1].close()
     for change, words in (
         ({"participant": "P", "session": "1_x"}, "is session x of participant P_1; choose another --session"),
         ({"material": "gel"}, "was begun with the material foam; choose another --session, or --material"),
     ):
         with pytest.raises(InputError, match=words):
-            opened(wanted._replace(resume=True, **change), lambda _: None, lambda _: None)
-    opened(wanted._replace(resume=True), lambda *_: None, lambda _: None)[1].close()
+            opened(wanted._replace(resume=True, **change), lambda *_: None, lambda _: None)
+    opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)[1].close()
 
 
 def test_options_that_contradict_the_plan_are_refused_and_another_label_begins_it_anew(tmp_path):
@@ -291,13 +291,13 @@ def test_options_that_contradict_the_plan_are_refused_and_another_label_begins_i
     ):
         for resume in (False, True):
             with pytest.raises(InputError, match=words):
-                opened(wanted._replace(resume=resume, **change), lambda _: None, lambda _: None)
+                opened(wanted._replace(resume=resume, **change), lambda *_: None, lambda _: None)
     assert not list(wanted.logs.iterdir())
     for same, name in (({"material": "gel", "seed": seed}, "P01_gel"), ({"session": "gel-2"}, "P01_gel-2")):
-        log = opened(wanted._replace(**same), lambda _: None, lambda _: None)[1]
+        log = opened(wanted._replace(**same), lambda *_: None, lambda _: None)[1]
         log.close()
         assert log.path.name == f"{name}.session.jsonl"
-        opened(wanted._replace(resume=True, **same), lambda _: None, lambda _: None)[1].close()
+        opened(wanted._replace(resume=True, **same), lambda *_: None, lambda _: None)[1].close()
     first, second = (read_log(wanted.logs / f"P01_{label}.session.jsonl")[0] for label in ("gel", "gel-2"))
     assert second == structs.replace(first, session="gel-2")
 
@@ -309,11 +309,11 @@ def test_a_session_is_resumed_by_a_plan_that_replaces_its_own(tmp_path):
     path.write_text(json.dumps(plan))
     wanted = Wanted(file, "P01", logs=logs, plan=path, dry_run=True)
     logs.mkdir()
-    opened(wanted, lambda *_: None, lambda _: None)[1].close()
+    opened(wanted, lambda *_: None, lambda *_: None)[1].close()
     path.write_text(json.dumps(reissue(plan, "P02", "P04")))
-    opened(wanted._replace(resume=True), lambda *_: None, lambda _: None)[1].close()
+    opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)[1].close()
     delete_participant(tmp_path, "P03")
-    opened(wanted._replace(resume=True), lambda *_: None, lambda _: None)[1].close()
+    opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)[1].close()
     changed = json.loads(path.read_text())
     assert len(changed["replaces"]) == 2
     for other in (
@@ -322,7 +322,7 @@ def test_a_session_is_resumed_by_a_plan_that_replaces_its_own(tmp_path):
     ):
         path.write_text(json.dumps(other | {"hash": plan_hash(other)}))
         with pytest.raises(InputError, match="was begun by another plan"):
-            opened(wanted._replace(resume=True), lambda *_: None, lambda _: None)
+            opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)
 
 
 def test_a_session_without_a_plan_needs_a_material_and_is_resumed_with_its_own_seed(tmp_path):
@@ -332,12 +332,12 @@ def test_a_session_without_a_plan_needs_a_material_and_is_resumed_with_its_own_s
     wanted = Wanted(file, "P01", logs=tmp_path / "logs", seed=3, dry_run=True)
     wanted.logs.mkdir()
     with pytest.raises(InputError, match="has the materials foam, gel; add --material with the one of this session"):
-        opened(wanted, lambda *_: None, lambda _: None)
+        opened(wanted, lambda *_: None, lambda *_: None)
     assert not list(wanted.logs.iterdir())
-    opened(wanted._replace(material="gel"), lambda _: None, lambda _: None)[1].close()
+    opened(wanted._replace(material="gel"), lambda *_: None, lambda _: None)[1].close()
     with pytest.raises(InputError, match="was begun with the seed 3; choose another --session, or --seed"):
-        opened(wanted._replace(resume=True, seed=4), lambda _: None, lambda _: None)
-    log = opened(wanted._replace(resume=True, seed=None), lambda _: None, lambda _: None)[1]
+        opened(wanted._replace(resume=True, seed=4), lambda *_: None, lambda _: None)
+    log = opened(wanted._replace(resume=True, seed=None), lambda *_: None, lambda _: None)[1]
     log.close()
     assert (log.state.header.seed, log.state.header.blocks[0].material) == (3, "gel")
 
@@ -351,13 +351,13 @@ def test_a_dry_run_stays_one_and_a_session_with_a_person_too(tmp_path, monkeypat
     place = (file, "--logs", logs, "--port", 0, "--participant", "P01", "--device", tmp_path / "ttyACM0")
     for session, dry, word in (("1", True, "begun as a dry run"), ("2", False, "leave --dry-run out")):
         wanted = Wanted(file, "P01", session, logs=logs, dry_run=dry)
-        _, log = opened(wanted, lambda *_: None, lambda _: None)
+        _, log = opened(wanted, lambda *_: None, lambda *_: None)
         log.close()
         assert read_log(log.path)[0].dry_run == dry
         other = () if dry else ("--dry-run",)
         assert word in refused(*place, "--session", session, "--resume", *other)
         assert "another hilbo" not in refused(*place, "--session", session, "--resume", *other)
-        opened(wanted._replace(resume=True), lambda *_: None, lambda _: None)[1].close()
+        opened(wanted._replace(resume=True), lambda *_: None, lambda *_: None)[1].close()
 
 
 def test_links_are_for_this_computer_unless_the_network_is_asked_for(monkeypatch):
@@ -380,7 +380,7 @@ def test_links_are_for_this_computer_unless_the_network_is_asked_for(monkeypatch
 
 
 def test_the_doctor_finds_all_well_with_the_simulated_device(tmp_path, capsys):
-    def connect(damping):
+    def connect(damping, delay):
         return Renderer.open("sim", damping=damping, options={"finger": "none"}, patience=10.0)
 
     checks = {check.name: check for check in doctor.checks(DATA, connect, tmp_path, 0)}
@@ -393,7 +393,7 @@ def test_the_doctor_finds_all_well_with_the_simulated_device(tmp_path, capsys):
 
 
 def test_the_doctor_says_what_to_mend(tmp_path):
-    def connect(_):
+    def connect(*_):
         return Renderer.open("sim", options={"finger": "none", "damping": 0.5}, patience=10.0)
 
     with socket.socket() as other:
@@ -409,7 +409,7 @@ def test_the_doctor_says_what_to_mend(tmp_path):
     assert all(check.fix for check in checks.values() if check.level == "bad")
     (broken := tmp_path / "study.toml").write_text("schema = 2")
     (tmp_path / "out").mkdir()
-    checks = {check.name: check for check in doctor.checks(broken, lambda _: unplugged(), tmp_path / "out", 0)}
+    checks = {check.name: check for check in doctor.checks(broken, lambda *_: unplugged(), tmp_path / "out", 0)}
     assert checks["study"].level == checks["device"].level == "bad"
     assert json.dumps([check._asdict() for check in checks.values()])
 
