@@ -200,8 +200,8 @@ class Renderer:
 
         Raises `DeviceError` while it moves, `RefusalError` for a position outside of its stroke.
         """
-        home = protocol.Home(boot_id=self.device.boot_id, stop=self._link.stops, position_mm=float(position))
-        self._link.request(home)
+        place = {"stop": self._link.stops, "position_mm": float(position)}
+        self._link.request(protocol.Home(boot_id=self.device.boot_id, **place))
 
     def start(self, *, stop: int | None = None, wait: SupportsFloat = 0.0) -> None:
         """Render the set that is in force. Telemetry from before is dropped.
