@@ -197,7 +197,6 @@ class Renderer:
 
     def home(self, position: SupportsFloat = 0.0) -> None:
         """Tell a device without an absolute encoder that its handle stands at `position` (mm) now.
-
         Raises `DeviceError` while it moves, `RefusalError` for a position outside of its stroke.
         """
         place = {"stop": self._link.stops, "position_mm": float(position)}
