@@ -53,7 +53,7 @@ static uint8_t next(struct input *input)
     return input->bytes[-1];
 }
 
-static struct hb_config config_with(uint8_t capabilities)
+static struct hb_config config_with(uint8_t capabilities, uint32_t delay_us)
 {
     return (struct hb_config){
         .line_rate_baud = 1000000U, .tick_rate_Hz = 1000U, .watchdog_ticks = 40U, .hold_ticks = 20U, .most_taps = 31U,
@@ -63,14 +63,14 @@ static struct hb_config config_with(uint8_t capabilities)
         .K0_N_per_mm = {-20.0F, 40.0F}, .K1_N_per_mm = {0.5F, 40.0F}, .B1_N_s_alpha_per_mm = {0.0005F, 40.0F},
         .alpha = {0.005F, 0.995F}, .servo_stiffness_N_per_mm = 1.0F, .servo_damping_N_s_per_mm = 0.02F,
         .servo_integral_N_per_mm_s = 5.0F, .servo_speed_mm_per_s = 100.0F,
-        .delay_us = (capabilities & 1U) != 0U ? 100U : 0U, .continuous_force_N = 20.0F, .heating_s = 0.5F,
+        .delay_us = delay_us, .continuous_force_N = 20.0F, .heating_s = 0.5F,
     };
 }
 
-static void start(struct rig *rig, uint8_t capabilities, uint32_t boot_id)
+static void start(struct rig *rig, uint8_t capabilities, uint32_t delay_us, uint32_t boot_id)
 {
     memset(rig, 0, sizeof *rig);
-    rig->config = config_with(capabilities);
+    rig->config = config_with(capabilities, delay_us);
     must(hb_init(&rig->device, &rig->config, boot_id) == HB_OK, "config refused");
     rig->silent_ticks = rig->config.watchdog_ticks;
 }
@@ -79,7 +79,7 @@ static void start(struct rig *rig, uint8_t capabilities, uint32_t boot_id)
 static void restart(struct rig *rig)
 {
     int32_t position = rig->position;
-    start(rig, rig->config.capabilities, rig->device.boot_id + 1U);
+    start(rig, rig->config.capabilities, rig->config.delay_us, rig->device.boot_id + 1U);
     rig->position = position;
 }
 
@@ -483,7 +483,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t size)
     if (!begun) {
         begun = atexit(say_ticks) == 0;
     }
-    start(&rig, (next(&input) & 23U) | 8U, 7U);
+    uint8_t kind = next(&input);
+    start(&rig, (kind & 23U) | 8U, (kind & 32U) != 0U ? 100U : 0U, 7U);
     while (input.left > 0U) {
         uint8_t action = next(&input);
         uint8_t type = action & 31U;

@@ -39,7 +39,7 @@ class Host:
             self.line.append((at, name, number, data))
 
     def hear(self, now: int) -> None:
-        """What has come back by now; half of all answers are lost or late."""
+        """What has come back by now; a third of all answers is lost, others are late."""
         for _, name, message in [answer for answer in self.back if answer[0] <= now]:
             if "stops" in message:
                 self.stops = message["stops"]
@@ -58,7 +58,7 @@ def deliver(device: Device, hosts: list[Host], host: Host, data: bytes, now: int
         message = unpack(name, payload)
         told = name if name in ("ACK", "NACK") else told
         for other in hosts:
-            if (other is host or name == "NOTICE") and other.rng.random() < 0.5:
+            if (other is host or name == "NOTICE") and other.rng.random() < 0.7:
                 other.back.append((now + int(other.rng.choice([0, 5, 120])), name, message))
     return told
 
@@ -79,7 +79,7 @@ def schedule(seed: int, orders: int, lib) -> dict[str, int]:
         for host in hosts:
             host.hear(now)
             if order < orders and rng.random() < 0.1:
-                name = ORDERS[rng.choice(len(ORDERS), p=[0.3, 0.3, 0.1, 0.1, 0.1, 0.1])]
+                name = ORDERS[rng.choice(len(ORDERS), p=[0.25, 0.35, 0.05, 0.1, 0.15, 0.1])]
                 number, order = number + 1, order + 1
                 made_at[number] = next(arrivals)
                 host.make(name, number, now)
@@ -101,7 +101,7 @@ def schedule(seed: int, orders: int, lib) -> dict[str, int]:
                     acted[which] = told
                     done[name] += 1
                 done[name] += name == "CLEAR" and before in ("HOLD", "ESTOP") and after == "STOPPED"
-            if rng.random() < 0.05:
+            if rng.random() < 0.1:
                 device.feed(frame("HEARTBEAT", 0, pack("HEARTBEAT", boot_id=7, tick=host.tick)))
                 deliver(device, hosts, host, b"", now)
         held = device.state
@@ -117,4 +117,4 @@ def schedule(seed: int, orders: int, lib) -> dict[str, int]:
 def test_no_order_outlives_a_later_stop_and_none_acts_twice(seed):
     """500 orders by default; 10,000 in all with the deep ones."""
     done = schedule(seed, 500, library(build()))
-    assert min(done[name] for name in ("CLEAR", "START", "DRIVE")) > 0
+    assert done["CLEAR"] > 3 and done["START"] + done["DRIVE"] > 3  # the schedule is no row of refusals
