@@ -3,6 +3,7 @@
 #include "hb_math.h"
 
 #define ENERGY_SCALE 1048576.0F                /* 2^20: units of energy in a mJ */
+#define MOST_COUNTS 32767                      /* of a position, which telemetry tells in 16 bits */
 #define LARGEST_ENERGY (INT64_C(1) << 60)      /* the observer stays there: centuries of pressing */
 
 void hb_count_up(uint16_t *counter)
@@ -29,18 +30,15 @@ void hb_home(struct hb_safety *safety, const struct hb_config *config, float pos
 }
 
 /* Before the device is homed, the stroke is unknown: any position that telemetry can tell is within it. */
-static bool is_within_stroke(const struct hb_safety *safety, const struct hb_config *config, int64_t counts)
+static bool is_within_stroke(const struct hb_safety *safety, const struct hb_config *config, int32_t counts)
 {
-    if (!safety->homed) {
-        return counts >= -32767 && counts <= 32767;
-    }
     float position_mm = (float)counts * config->encoder_step_mm;
-    return position_mm >= config->position_low_mm && position_mm <= config->position_high_mm;
+    return !safety->homed || (position_mm >= config->position_low_mm && position_mm <= config->position_high_mm);
 }
 
-static bool is_plausible(const struct hb_safety *safety, const struct hb_config *config, bool valid, int64_t counts)
+static bool is_plausible(const struct hb_safety *safety, const struct hb_config *config, int32_t counts)
 {
-    if (!valid || !is_within_stroke(safety, config, counts)) {
+    if (!is_within_stroke(safety, config, counts)) {
         return false;
     }
     if (!safety->known) {
@@ -68,7 +66,8 @@ bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, co
         safety->placed = true;
     }
     int64_t counts = input->position_counts - safety->zero_counts;
-    if (is_plausible(safety, config, input->position_valid, counts)) {
+    bool told = counts >= -MOST_COUNTS && counts <= MOST_COUNTS; /* no stroke reaches further */
+    if (input->position_valid && told && is_plausible(safety, config, (int32_t)counts)) {
         believe(safety, (int32_t)counts);
         return true;
     }

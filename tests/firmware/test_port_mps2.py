@@ -146,7 +146,8 @@ def test_what_a_tick_costs(cpu, tmp_path):
         assert (cost[name].mean < plain.mean) == (N < 101)
     # What a scene does not need is skipped: no contact costs as little as no set.
     idle = cost["no contact, forgotten"]
-    assert idle == cost["running, no contact"]._replace(ticks=idle.ticks, frames=idle.frames)
+    calls = {"ticks": idle.ticks, "frames": idle.frames, "most_of_a_frame": idle.most_of_a_frame}
+    assert idle == cost["running, no contact"]._replace(**calls)
     assert idle.mean < 0.6 * plain.mean and idle.mean < cost["stopped, no set"].mean + 150
     staged = cost["contact, another set of N = 101 staged"].mean
     assert plain.mean < staged < 2 * plain.mean
