@@ -202,7 +202,7 @@ class Renderer:
         place = {"stop": self._link.stops, "position_mm": float(position)}
         self._link.request(protocol.Home(boot_id=self.device.boot_id, **place))
 
-    def start(self, *, stop: int | None = None, wait: SupportsFloat = 0.0) -> None:
+    def start(self, *, stop: int | None = None, wait: SupportsFloat = 5.0) -> None:
         """Render the set that is in force. Telemetry from before is dropped.
 
         `stop` is the device's count of stops that the order follows (`link.stops`), by default what is known at the

@@ -145,7 +145,7 @@ class DeviceRig:
             return False
         self._counter.drain()  # START drops what has not been taken
         try:
-            device.start(stop=stop)
+            device.start(stop=stop, wait=0.0)
         except DeviceError as error:
             if error.nack is None or error.nack.reason != NackReason.IN_CONTACT:
                 raise

@@ -170,7 +170,7 @@ def _press(device, view, key, names, sets, felt) -> None:
         felt.append(name)
         view.words.append(f'"{name}" is in force')
     elif key == " ":
-        device.start() if device.state() == State.STOPPED else device.stop()
+        device.start(wait=0.0) if device.state() == State.STOPPED else device.stop()
     elif key == "e":
         device.estop()
     elif key == "c":

@@ -79,7 +79,7 @@ def test_no_order_ends_a_stop_that_came_after_it_was_requested(doings):
         def clear(self, *, stop=None):
             self._effect("clear", lambda: FakeDevice.clear(self, stop=stop))
 
-        def start(self, *, stop=None):
+        def start(self, *, stop=None, wait=0.0):
             self._effect("start", lambda: FakeDevice.start(self, stop=stop))
 
         def _effect(self, name, order):
@@ -169,7 +169,7 @@ def test_a_start_that_is_refused_in_contact_is_tried_again():
     class Pressed(FakeDevice):
         refused = 0
 
-        def start(self, *, stop=None):
+        def start(self, *, stop=None, wait=0.0):
             self.pressed, self.refused = self.refused < 3, self.refused + 1
             try:
                 super().start(stop=stop)

@@ -48,7 +48,7 @@ class FakeDevice(Renderer):
         self.told.append("send")
         return SimpleNamespace(_asdict=lambda: numbers)
 
-    def start(self, *, stop=None):
+    def start(self, *, stop=None, wait=0.0):
         self.starts, self._samples = self.starts + 1, []
         self._check_time(stop)
         if self.now == State.RUNNING:
