@@ -132,6 +132,32 @@ def test_the_passivity_controller_acts_in_contact_and_adds_no_more_than_the_devi
     assert np.all(with_it <= model + 0.95 * velocity + 1e-4)
 
 
+def test_the_passivity_controller_adds_as_much_as_the_device_s_damping():
+    """Where the hand moves in and is owed more than that: a bound below it would leave energy that could be taken back."""
+    device = Device(capabilities=3 | CONTROLLER)
+    device.go({"K0": 1.8, "K1": 0.5, "B1": 0.001, "alpha": 0.2})
+    positions = np.r_[np.linspace(1, 100, 30), 200 - 100 * np.cos(2 * np.pi * 20 * np.arange(1000) / 1000)].round()
+    with_it, flags = device.run(positions)
+    velocity = np.diff(np.r_[0, positions]) * STEP
+    extra = with_it - np.float32(1.8) * positions * STEP
+    owed = (flags & 16 > 0) & (velocity > 0.03)
+    assert np.max(extra[owed] / velocity[owed]) > 0.9
+
+
+def test_a_second_change_of_the_set_goes_on_from_the_first_one_s_limit():
+    """Of either bank: the force before the change is within its own set's limit."""
+    device = Device(slew=4e4)
+    device.go(SET | {"force_limit": 1.0}, 1)
+    device.run(counts(np.r_[np.linspace(0, 4, 200), np.full(50, 4.0)]))
+    for set_id, limit in ((2, 1.5), (3, 30.0)):
+        staged = device.stage(SET | {"B1": 7.0 + set_id, "force_limit": limit}, set_id)
+        device.run(np.full(400, 315))
+        assert device.confirm("COMMIT", staged)[0] == "ACK"
+        before = 1.0 if set_id == 2 else 1.5
+        assert device.tick(315) == pytest.approx(before, abs=1e-5)
+        device.run(np.full(100, 315))
+
+
 @pytest.mark.parametrize(("period", "good"), [(3, 1), (2, 1), (3, 2)], ids=["2 of 3 bad", "1 of 2 bad", "1 of 3 bad"])
 def test_an_encoder_that_fails_again_and_again_holds(period, good):
     device = Device()

@@ -245,11 +245,12 @@ def test_start_and_drive_act_once_whatever_comes_between(device):
     device.run([0] * 30)
     assert device.refusal("START", start) == "STALE" and device.state == "STOPPED"
     drive = device.packed("DRIVE", offset=1.0, duration_ticks=9, boot_id=7)
+    stops = device.stops
     for seq in (0, 1):
         assert device.ask("DRIVE", drive)[0] == "ACK", seq
         device.status()
     device.run([0] * 40)
-    assert device.state == "STOPPED"
+    assert device.state == "STOPPED" and device.stops == stops + 1
     assert device.refusal("DRIVE", drive) == "STALE" and device.state == "STOPPED"
 
 

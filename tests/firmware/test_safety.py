@@ -271,6 +271,11 @@ def test_a_hardware_stop_is_an_estop_of_its_own_cause(pressed):
 
 
 def test_a_tick_later_than_the_device_s_delay_holds():
+    device = Device(delay_us=300)
+    staged = device.stage(SET)  # needs 1.0 N.s/m at this delay, which 256 frequencies tell
+    device.run([0] * 130)
+    assert device.confirm("COMMIT", staged)[1]["reason"] == "NOT_PASSIVE"
+    assert device.status()["staging"] == 0 and device.status()["active_id"] == 0
     device = Device(delay_us=300, damping=2.0)
     staged = device.stage(SET)
     device.run([0] * 130)
@@ -319,6 +324,31 @@ def test_a_device_that_is_not_homed_renders_nothing():
     assert not np.any(forces[:99]) and np.all(forces[110:] > 0)
 
 
+def test_what_was_felt_before_a_home_is_forgotten_in_both_banks():
+    """The surface is elsewhere now: a history at the old one would be felt as a force of the past."""
+    device, fresh = Device(), Device()
+    for each in (device, fresh):
+        staged = each.go(OTHER, 1)
+        staged = each.stage(SET, 2)
+        each.confirm("COMMIT", staged)
+    device.run(np.r_[np.linspace(0, 300, 100), np.full(100, 300)])
+    device.must("STOP")
+    device.run([300] * 25)
+    device.must("HOME", boot_id=7, position_mm=-0.127)
+    fresh.must("STOP")
+    fresh.run([0] * 25)
+    fresh.must("HOME", boot_id=7, position_mm=-0.127)
+    press = np.linspace(0, 200, 60)
+    forces = []
+    for each, start in ((device, 300), (fresh, 0)):
+        each.tick(start)
+        each.beat()
+        assert each.confirm("START", staged)[0] == "ACK"
+        forces.append(each.run(start + press)[0])
+    np.testing.assert_array_equal(*forces)
+    assert forces[0].max() > 1
+
+
 def test_a_nudge_ends_where_the_handle_has_moved():
     device = Device(capabilities=3, slew=1e5)
     device.config["capabilities"] = 11
@@ -358,6 +388,9 @@ def test_the_passivity_controller_acts_where_the_config_switches_it_on():
         _, flags = device.run(np.r_[np.linspace(1, 100, 30), x])
         balance[capabilities], acted[capabilities] = device.status()["energy_mJ"], np.count_nonzero(flags & 16)
         assert device.status()["controlled"] == acted[capabilities]
+    quiet = Device(capabilities=4)
+    quiet.go(SET)
+    assert not np.any(quiet.run(np.linspace(0, 300, 200))[1] & 16)  # a hand that presses takes nothing
     assert balance[0] < -3 and acted[0] == 0
     assert balance[4] > -1 and acted[4] > 20
 
@@ -373,7 +406,12 @@ def test_drive_force_triangle():
     phase = np.arange(100) % 40
     wave = np.interp(phase, [0, 10, 30, 40], [0, 1, -1, 0])
     np.testing.assert_allclose(forces[:99], -(1 + 2 * wave)[:99], atol=1e-5)  # inwards is negative
-    assert np.all(flags[:99] & 512) and device.state == "STOPPED" and not np.any(forces[99 + HOLD :])
+    assert (
+        np.all(flags[:99] & 512)
+        and not np.any(flags[99:] & 512)
+        and device.state == "STOPPED"
+        and not np.any(forces[99 + HOLD :])
+    )
     assert [notice["state"] for notice in device.notices][-3:] == [3, 2, 0]
 
 

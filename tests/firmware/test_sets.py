@@ -53,7 +53,7 @@ def test_a_refused_set_leaves_nothing_staged_and_what_is_in_force(device, change
     if reason == "STATIC_STIFFNESS":
         kind, message = device.ask("SET_PARAMS", parameters(SET | {"K0": -4.0}, 3))
     assert (kind, message["reason"], message["limit"]) == ("NACK", reason, limit)
-    assert value is None or message["value"] == value
+    assert message["value"] == value if value is not None else message["value"] != 0
     status = device.status()
     assert (status["active_id"], status["staged_id"], status["staging"]) == (1, 0, 0)
     after, _ = device.run([100] * 5)
@@ -163,6 +163,22 @@ def test_commit_in_contact_waits_for_the_history(device):
     assert device.status()["active_id"] == 2 and device.offset != 0
     kind, message = device.ask("SET_PARAMS", parameters(SET, 3))
     assert (kind, message["reason"]) == ("NACK", "BUSY") and message["ticks"] > 0
+
+
+def test_the_longest_memories_are_taken(device):
+    """The most that LIMITS and HELLO promise, and no refusal at the bound itself."""
+    device.stage(SET | {"N": 255}, 1)
+    device.stage(full_set(), 2)
+    kind, message = device.ask("SET_PARAMS", parameters(full_set(states=[(0, 0)] * 12), 3))
+    assert kind == "ACK", message
+
+
+def test_exactly_the_device_s_damping_is_enough(device):
+    device.confirm("COMMIT", device.stage(SET))
+    needed = device.must("GET_SET", bank=0)["minimum_damping_N_s_per_m"]
+    assert Device(damping=needed).stage(SET)
+    less = Device(damping=float(np.nextafter(np.float32(needed), np.float32(0))))
+    assert less.refusal("SET_PARAMS", parameters(SET)) == "NOT_PASSIVE"
 
 
 def test_abort_forgets(device):

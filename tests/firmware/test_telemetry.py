@@ -109,6 +109,12 @@ def test_drive_out_of_range(device, change, reason, value, limit):
     assert device.state == "STOPPED"
 
 
+def test_a_stream_that_does_not_fit_is_told_what_does():
+    device = Device(line_rate_baud=9600)
+    _, message = device.ask("STREAM", divisor=2, fields=0)
+    assert (message["reason"], message["value"], message["limit"]) == ("LINE_TOO_SLOW", 2, 14)
+
+
 def test_drive_needs_a_heartbeat(device):
     kind, message = device.ask("DRIVE", offset=1.0, duration_ticks=100, boot_id=7)
     assert (kind, message["reason"]) == ("NACK", "NO_HEARTBEAT")
