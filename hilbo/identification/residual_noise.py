@@ -10,7 +10,8 @@ spectral density at ω_k = πk/m:
 
 - `slow`: the mean of c_k²/S(ω_k) over k = 9 … 48, at least 1, multiplies the density S up to ω_48.
 - `walk`: a random walk's density w/ω², w from k = 1 … 8, where those exceed the rest with a probability of less than
-  `DRIFTS` in noise without it. At ω = 0 it has the density with which the mean of a walk of m samples from 0 varies.
+  `DRIFTS` in noise without it: in the curve itself, or in all curves by Fisher's product of the probabilities, since
+  one sensor records them. At ω = 0 it has the density with which the mean of a walk of m samples from 0 varies.
 """
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from hilbo.numerics.tracing import program
 __all__ = ["Noise", "autoregression", "filtered", "fitted_residuals", "noise", "noises"]
 
 LONGEST_MEMORY = 8  # largest order of the autoregression
-DRIFTS = 0.003  # probability of a walk in noise without one
+DRIFTS = 0.01  # probability of a walk in noise without one
 _SLOWEST, _SLOW = 8, 48  # cosines that show a walk, and slow noise
 _START = 1.31  # ω·m at which a walk's density has that of its mean, about its start
 
@@ -58,9 +59,18 @@ def noise(fitted: Fit) -> tuple[Noise, ...]:
 
 def noises(fitted: Fit) -> tuple[Noise, ...]:
     """The same within another program."""
-    return tuple(
+    alone = [
         _noise(fitted, curve, r) for curve, r in zip(fitted.curves, fitted_residuals(fitted, fitted.q), strict=True)
-    )
+    ]
+    surprise = -sum(jnp.log(jnp.maximum(one.drift, jnp.finfo(one.lag_one.dtype).tiny)) for one in alone)
+    together = jax.scipy.special.gammaincc(float(len(alone)), surprise)
+    return tuple(_drifting(one, jnp.where(one.walk > 0, jnp.minimum(one.drift, together), one.drift)) for one in alone)
+
+
+def _drifting(model: Noise, drift: Float[Array, ""]) -> Noise:
+    """The noise with this probability of its slow part, and a walk only where that is small."""
+    walk = jnp.where(drift < DRIFTS, model.walk, 0)
+    return eqx.tree_at(lambda n: (n.walk, n.drift), model, (walk, drift))
 
 
 def _noise(fitted: Fit, curve: Curve, r: Float[Array, " m"]) -> Noise:
@@ -97,7 +107,7 @@ def fitted_residuals(fit: Fit, q: Float[Array, " p"]) -> tuple[Float[Array, " _"
 
 
 def autoregression(r: Float[Array, " m"]) -> Noise:
-    """Of one curve's residuals: Yule-Walker by Levinson's recursion, the order by BIC."""
+    """Of one curve's residuals: Yule-Walker by Levinson's recursion, the order by BIC; its walk whatever `drift` is."""
     m = r.size
     lags = jnp.stack([r[: m - k] @ r[k:] for k in range(LONGEST_MEMORY + 1)])
     rho = lags / lags[0]
@@ -127,7 +137,7 @@ def _slow(unit: Float[Array, " m"], known: Noise) -> tuple[Float[Array, ""], Flo
     few, rest = energy[:_SLOWEST], slow * density[:_SLOWEST]
     drift = jax.scipy.special.gammaincc(few.size / 2, jnp.sum(few / rest) / 2)
     walk = jnp.sum(few - rest) / jnp.sum(omega[:_SLOWEST] ** -2)
-    return slow, jnp.where(drift < DRIFTS, jnp.maximum(walk, 0), 0), drift
+    return slow, jnp.maximum(walk, 0), drift
 
 
 def _density(model: Noise, omega: Float[Array, " w"]) -> Float[Array, " w"]:
