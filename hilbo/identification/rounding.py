@@ -24,7 +24,8 @@ from hilbo.identification.recorded import circle, local_line
 __all__ = ["Rounding", "rounding", "variance_of_rounding"]
 
 _HARMONICS = 4
-_SMALLEST = 1e-7  # step, over the range: less is the arithmetic's
+_SMALLEST, _LARGEST = 1e-7, 5e-3  # step, over the range: less is the arithmetic's, more the programmed input's
+_SIZES = 3  # of changes from row to row, which a recording has
 _NEGLIGIBLE = 1e-3  # share of the first harmonic that noise leaves
 
 
@@ -37,11 +38,9 @@ class Rounding(eqx.Module):
 
 def rounding(values: Float[np.ndarray, "R m"], still: Bool[np.ndarray, " m"]) -> Rounding | None:
     """That of a channel at even times, None where noise covers it. `still` (m,): rows that do not move clearly."""
-    distinct = np.diff(np.unique(values))
-    distinct = distinct[distinct > _SMALLEST * np.ptp(values)]
-    if not distinct.size:
+    step = _step(values)
+    if step is None:
         return None
-    step = float(distinct.min())
     # A fourth difference, which a smooth curve does not have, has the variance of 70 samples.
     among = np.convolve(still, np.ones(5), "valid") == 5
     noise = np.square(np.diff(values, 4, axis=1)[:, among]).mean() / 70 - step**2 / 12 if among.any() else 0.0
@@ -51,6 +50,20 @@ def rounding(values: Float[np.ndarray, "R m"], still: Bool[np.ndarray, " m"]) ->
         return None
     turns = local_line(values, np.ones(values.shape[1], bool)) / step
     return Rounding(jnp.asarray(turns), jnp.asarray(step / (np.pi * h) * np.sqrt(left / 2)))
+
+
+def _step(values: Float[np.ndarray, "R m"]) -> float | None:
+    """The smallest difference of distinct values, None where that is no step of a recording.
+
+    An input as it was programmed has few values too, but changes by one size from row to row.
+    """
+    distinct = np.diff(np.unique(values))
+    distinct = distinct[distinct > _SMALLEST * np.ptp(values)]
+    if not distinct.size or distinct.min() > _LARGEST * np.ptp(values):
+        return None
+    step = float(distinct.min())
+    sizes = np.unique(np.round(np.abs(np.diff(values, axis=1)) / step))
+    return step if sizes.size >= _SIZES else None
 
 
 def variance_of_rounding(
@@ -77,9 +90,11 @@ def variance_of_rounding(
 def _summed(errors: Rounding, weights: Float[Array, " R"], response: Any, to_residuals: Float[Array, "m p"]) -> Any:
     """Over repeats and harmonics."""
 
+    order = jnp.arange(1, errors.sizes.size + 1, dtype=errors.sizes.dtype)
+
     def one(which):
         repeat, harmonic = which
-        angle = 2 * jnp.pi * (harmonic + 1) * errors.turns[repeat]
+        angle = 2 * jnp.pi * order[harmonic] * errors.turns[repeat]
         pull = response(jnp.stack([jnp.cos(angle), jnp.sin(angle)])) @ to_residuals
         return jnp.square(errors.sizes[harmonic] * weights[repeat]) * pull.T @ pull
 
