@@ -17,6 +17,7 @@ spectral density at ω_k = πk/m:
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hilbo.identification.fitting import Curve, Fit, curve_residuals
@@ -93,7 +94,7 @@ def _noise(fitted: Fit, curve: Curve, r: Float[Array, " m"]) -> Noise:
 
 def _score(model: Noise, m: int) -> Float[Array, ""]:
     """BIC, with the variance of each sample's innovation."""
-    return m * jnp.log(model.innovation * model.rms**2) + model.order * jnp.log(float(m))
+    return m * jnp.log(model.innovation * model.rms**2) + model.order.astype(model.rms.dtype) * float(np.log(m))
 
 
 def _mean(density: Float[Array, " w"]) -> Float[Array, ""]:

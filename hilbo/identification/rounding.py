@@ -74,8 +74,8 @@ def variance_of_rounding(
     to_residuals = slopes / (curve.scale * np.sqrt(curve.time.size))[:, None]
 
     def of_input(waves):
-        damped = waves * circle(curve.length, q.dtype) ** -jnp.arange(waves.shape[1], dtype=q.dtype)
-        spectra = jnp.fft.rfft(damped, curve.length)
+        damping = circle(curve.length, q.dtype) ** -jnp.arange(waves.shape[1], dtype=q.dtype)
+        spectra = jnp.fft.rfft(waves * damping[None, :], curve.length)
         alone = eqx.tree_at(
             lambda c: (c.spectra, c.changes, c.offset), curve, (spectra, jnp.zeros_like(spectra), jnp.zeros(2, q.dtype))
         )

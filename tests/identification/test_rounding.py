@@ -70,12 +70,12 @@ def test_a_local_line_keeps_lines_up_to_their_ends():
 
 @pytest.mark.deep
 def test_the_interval_contains_where_an_encoder_rounds_one_held_position_to():
-    case, inside = study.Case("", repeats=1, rounded=True), 0
+    case, inside = study.Case("", repeats=1), 0
     truth = study.truth_of(case)["K_eff"]
     rng = np.random.default_rng(2)
     for number in range(20):
         tests, size = [], 1 + 0.01 * rng.random()
-        for kind, t, x, F in study.records(study.Case("", repeats=1), number, 0.5):
+        for kind, t, x, F in study.records(case, number, 0.5):
             x = np.round(size * x / STEP) * STEP
             tests.append(Test(kind, t, *((size * F, x) if kind == "relaxation" else (x, size * F))))
         found = fit(tests, Sampled())
