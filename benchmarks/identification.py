@@ -139,18 +139,18 @@ def summary(folder, noise):
     truth = Sampled().coordinates(*TRUTH)
     lower = np.where(data["open_lower"], -np.inf, data["lower"])
     upper = np.where(data["open_upper"], np.inf, data["upper"])
-    two = ~data["open_lower"] & ~data["open_upper"] & data["found"]
+    two = ~data["open_lower"] & ~data["open_upper"] & data["bracketed"]
     holds = (lower <= truth) & (truth <= upper)
     boot = (data["boot_lower"] <= truth) & (truth <= data["boot_upper"])
     rows = {}
     for j, name in enumerate(NAMES):
-        chosen, open_ = two[:, j], ~two[:, j] & data["found"][:, j]
+        chosen, open_ = two[:, j], ~two[:, j] & data["bracketed"][:, j]
         rows[name] = {
             "profile": holds[chosen, j].mean(),
             "two-sided": int(chosen.sum()),
             "one-sided": int(open_.sum()),
             "one-sided holds": int(holds[open_, j].sum()),
-            "failed": int((~data["found"][:, j]).sum()),
+            "failed": int((~data["bracketed"][:, j]).sum()),
             "bootstrap": boot[:, j].mean(),
             "bias": float((data["q"][:, j] - truth[j]).mean() / data["q"][:, j].std()),
         }

@@ -64,7 +64,7 @@ def wait_until(device: Renderer, done: Callable[[], Any], what: str, seconds: fl
     return value
 
 
-def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: float = 0.0, **times: float) -> Samples:
+def drive(device: Renderer, mode: Any, shape: Any, offset: float, amplitude: float = 0.0, **times: Any) -> Samples:
     """Let the device move by itself, and return the samples of it. Raises `DeviceError` if it does not finish."""
     device.samples(0.0)
     device.drive(mode, shape, offset, amplitude, **times)

@@ -153,8 +153,9 @@ class Curve(eqx.Module):
     The model is linear in its input, so the mean of the repeats is the response to the mean of their inputs, exactly.
     `spectra` (R, L/2+1): damped transforms of the inputs on the model's time grid; `before`, `share`: where the
     measured times lie on it; `scale`: what residuals are divided by; `changes`: transforms of those changes of
-    the inputs from one sample to the next that stand clear of their noise (`instrument`); `regular`: there is a row for
-    each sample of the model; `other_way`: the same test with input and output exchanged, if it is fitted like that.
+    the inputs from one sample to the next, without noise (`instrument`); `regular`: there is a row for each sample of
+    the model; `rounded_*`: the rounding of a channel (`rounding`), where that is above its noise; `other_way`: the same
+    test with input and output exchanged, if it is fitted like that.
     """
 
     kind: Kind = eqx.field(static=True)
@@ -168,6 +169,8 @@ class Curve(eqx.Module):
     length: int = eqx.field(static=True, default=0)
     changes: Array | None = None
     regular: bool = eqx.field(static=True, default=False)
+    rounded_input: Any = None  # a rounding.Rounding
+    rounded_output: Any = None
     other_way: "Curve | None" = None
 
     @property

@@ -9,10 +9,10 @@ signal is taken as a straight line, for which all of them are exact:
     A x       = x - g/(1 - e/z)·Δ,                          e = exp(-T/τ),  g = (1 - e)·τ/T
     A⁻¹ F     = F + g/((1 - g) + (g - e)/z)·Δ
 
-They act on the input of a curve, the position or the force of a creep test. Only those changes Δ enter that stand
-clear of its noise. A shift of a fraction of a sample averages two
-samples, and a filter changes what is fast: applied to the noise they would lower or raise the residuals, and the fit
-would choose lag and filter for that reason.
+They act on the input of a curve, the position or the force of a creep test. Where its changes Δ do not stand clear of
+its noise, they are those of a smoothed input (`without_noise`). A shift of a fraction of a sample averages two samples,
+and a filter changes what is fast: applied to the noise they would lower or raise the residuals, and the fit would
+choose lag and filter for that reason.
 Units: lag in samples of T here and in coordinates, in ms under its name; corners 1/(2πτ) in Hz.
 """
 
@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 
 from hilbo.identification.fitting import Test
+from hilbo.identification.recorded import AROUND, local_line
 
 __all__ = [
     "FASTEST_FILTER",
@@ -30,6 +31,7 @@ __all__ = [
     "SLOWEST_FILTER",
     "can_be_timed",
     "clear_changes",
+    "is_fitted_in_force",
     "is_position_clearer",
     "multiplier",
     "without_noise",
@@ -38,7 +40,6 @@ __all__ = [
 LARGEST_LAG = 2  # samples, either way
 SLOWEST_FILTER, FASTEST_FILTER = 5.0, 0.05  # time constants, samples
 _CLEAR = 5.0  # standard deviations of the noise in a difference
-_AROUND = 3  # rows before and after a clear change: ends of ramps, tails of filters
 
 
 def can_be_timed(tests: Sequence[Test]) -> bool:
@@ -53,20 +54,16 @@ def clear_changes(values: Float[np.ndarray, "R m"]) -> Bool[np.ndarray, " m"]:
     """
     mean = values.mean(axis=0)
     clear = np.abs(np.diff(mean, prepend=0.0)) > _CLEAR * _noise_of_change(mean)
-    return np.convolve(clear, np.ones(2 * _AROUND + 1), "same") > 0
+    return np.convolve(clear, np.ones(2 * AROUND + 1), "same") > 0
 
 
 def without_noise(values: Float[np.ndarray, "R m"], clear: Bool[np.ndarray, " m"]) -> Float[np.ndarray, "R m"]:
-    """An input with each row that does not change clearly replaced by the mean of its neighbours that do not either.
+    """An input whose rows that do not change clearly are replaced by the line through such rows around them.
 
-    A fit lowers what noise of the input does to its residuals by too small a stiffness: an input that is held has no
-    changes that a mean of seven rows would lose. `values` (R, m) of rows at even times, `clear` (m,) -> (R, m).
+    A fit lowers what noise of the input does to its residuals by too small a stiffness, and a shift of that noise by a
+    lag. `values` (R, m) of rows at even times, `clear` (m,) -> (R, m).
     """
-    still = ~clear
-    window = np.ones(2 * _AROUND + 1)
-    count = np.convolve(still, window, "same")
-    sums = np.stack([np.convolve(np.where(still, row, 0.0), window, "same") for row in values])
-    return np.where(still, sums / np.maximum(count, 1), values)
+    return np.where(clear, values, local_line(values, ~clear))
 
 
 def is_position_clearer(test: Test) -> bool:
@@ -74,6 +71,11 @@ def is_position_clearer(test: Test) -> bool:
     assert test.input is not None
     position, force = (test.input, test.output) if test.kind == "relaxation" else (test.output, test.input)
     return _clearness(position) > _clearness(force)
+
+
+def is_fitted_in_force(test: Test) -> bool:
+    """Whether a test is a creep test that is fitted in its force."""
+    return test.kind == "creep" and is_position_clearer(test)
 
 
 def _clearness(values: Float[np.ndarray, "R m"]) -> float:

@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from hilbo.errors import InputError
 from hilbo.identification.fitting import Fit, curve_residuals, residuals
 from hilbo.identification.residual_noise import filtered, fitted_residuals, noises
+from hilbo.identification.rounding import variance_of_rounding
 from hilbo.numerics.least_squares import Solution, least_squares, solve_symmetric
 from hilbo.numerics.tracing import program
 
@@ -79,6 +80,9 @@ def _spread(fit: Fit, quantile: float) -> Spread:
     slopes = jax.jacfwd(lambda x: fitted_residuals(fit, x))(q)
     meat, effective = jnp.zeros_like(fit.solution.normal), jnp.zeros_like(q[0])
     unscaled = _inverse(fit.solution.normal, _free(fit))
+    curves = tuple(curve.fitted for curve in fit.curves)
+    for curve, w, J in zip(curves, fit.weights, slopes, strict=True):
+        meat = meat + variance_of_rounding(fit.model, q, curve, w, J)
     for r, J, model in zip(fitted_residuals(fit, q), slopes, noises(fit), strict=True):
         shape = filtered(J, model)  # Jᵀ Γ J / γ_0
         still = eqx.tree_at(lambda n: n.walk, model, jnp.zeros_like(model.walk))  # a walk's variance is as observed

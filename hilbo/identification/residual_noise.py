@@ -9,13 +9,17 @@ Two terms are therefore added, measured on the cosines c_k = √(2/m) Σ_t r_t c
 spectral density at ω_k = πk/m:
 
 - `slow`: the mean of c_k²/S(ω_k) over k = 9 … 48, at least 1, multiplies the density S up to ω_48.
-- `walk`: a random walk's density w/ω², w from k = 1 … 8, where those exceed the rest with a probability of less than
-  `DRIFTS` in noise without it. At ω = 0 it has the density with which the mean of a walk of m samples from 0 varies.
+- `walk`: a random walk's density w/ω², w from k = 1 … 8, where those exceed k = 9 … 48 with a probability of less than
+  `DRIFTS` in noise that is flat there (an autoregression of one record would take the walk for its own; it is the null
+  in records of less than 960 samples, whose cosines are faster): in the curve itself, or in all curves by Fisher's
+  product of the probabilities, since one sensor records them. At ω = 0 it has the density with which the mean of a walk
+  of m samples from 0 varies.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hilbo.identification.fitting import Curve, Fit, curve_residuals
@@ -26,6 +30,7 @@ __all__ = ["Noise", "autoregression", "filtered", "fitted_residuals", "noise", "
 LONGEST_MEMORY = 8  # largest order of the autoregression
 DRIFTS = 0.003  # probability of a walk in noise without one
 _SLOWEST, _SLOW = 8, 48  # cosines that show a walk, and slow noise
+_PERIOD = 60  # m over the fastest cosine for which noise is taken as flat: a period of 120 samples
 _START = 1.31  # ω·m at which a walk's density has that of its mean, about its start
 
 
@@ -58,9 +63,19 @@ def noise(fitted: Fit) -> tuple[Noise, ...]:
 
 def noises(fitted: Fit) -> tuple[Noise, ...]:
     """The same within another program."""
-    return tuple(
+    alone = [
         _noise(fitted, curve, r) for curve, r in zip(fitted.curves, fitted_residuals(fitted, fitted.q), strict=True)
-    )
+    ]
+    surprise = -sum(jnp.log(jnp.maximum(one.drift, jnp.finfo(one.lag_one.dtype).tiny)) for one in alone)
+    together = jax.scipy.special.gammaincc(float(len(alone)), surprise)
+    slower = [jnp.where(one.drift < 0.5, jnp.minimum(one.drift, together), one.drift) for one in alone]
+    return tuple(_drifting(one, drift) for one, drift in zip(alone, slower, strict=True))
+
+
+def _drifting(model: Noise, drift: Float[Array, ""]) -> Noise:
+    """The noise with this probability of its slow part, and a walk only where that is small."""
+    walk = jnp.where(drift < DRIFTS, model.walk, 0)
+    return eqx.tree_at(lambda n: (n.walk, n.drift), model, (walk, drift))
 
 
 def _noise(fitted: Fit, curve: Curve, r: Float[Array, " m"]) -> Noise:
@@ -83,7 +98,7 @@ def _noise(fitted: Fit, curve: Curve, r: Float[Array, " m"]) -> Noise:
 
 def _score(model: Noise, m: int) -> Float[Array, ""]:
     """BIC, with the variance of each sample's innovation."""
-    return m * jnp.log(model.innovation * model.rms**2) + model.order * jnp.log(float(m))
+    return m * jnp.log(model.innovation * model.rms**2) + model.order.astype(model.rms.dtype) * float(np.log(m))
 
 
 def _mean(density: Float[Array, " w"]) -> Float[Array, ""]:
@@ -97,7 +112,7 @@ def fitted_residuals(fit: Fit, q: Float[Array, " p"]) -> tuple[Float[Array, " _"
 
 
 def autoregression(r: Float[Array, " m"]) -> Noise:
-    """Of one curve's residuals: Yule-Walker by Levinson's recursion, the order by BIC."""
+    """Of one curve's residuals: Yule-Walker by Levinson's recursion, the order by BIC; its walk whatever `drift` is."""
     m = r.size
     lags = jnp.stack([r[: m - k] @ r[k:] for k in range(LONGEST_MEMORY + 1)])
     rho = lags / lags[0]
@@ -124,10 +139,19 @@ def _slow(unit: Float[Array, " m"], known: Noise) -> tuple[Float[Array, ""], Flo
     energy = 2 / m * jnp.square(jnp.cos(omega[:, None] * (jnp.arange(m, dtype=unit.dtype) + 0.5)[None, :]) @ unit)
     density = _density(known, omega)
     slow = jnp.maximum(jnp.mean((energy / density)[_SLOWEST:]), 1) if omega.size > _SLOWEST else jnp.ones_like(unit[0])
-    few, rest = energy[:_SLOWEST], slow * density[:_SLOWEST]
-    drift = jax.scipy.special.gammaincc(few.size / 2, jnp.sum(few / rest) / 2)
-    walk = jnp.sum(few - rest) / jnp.sum(omega[:_SLOWEST] ** -2)
-    return slow, jnp.where(drift < DRIFTS, jnp.maximum(walk, 0), 0), drift
+    few = energy[:_SLOWEST]
+    walk = jnp.sum(few - slow * density[:_SLOWEST]) / jnp.sum(omega[:_SLOWEST] ** -2)
+    flat = energy[_SLOWEST : m // _PERIOD]
+    if flat.size >= few.size:
+        return slow, jnp.maximum(walk, 0), _exceeds(few, flat)
+    rest = slow * density[:_SLOWEST]
+    return slow, jnp.maximum(walk, 0), jax.scipy.special.gammaincc(few.size / 2, jnp.sum(few / rest) / 2)
+
+
+def _exceeds(few: Float[Array, " a"], rest: Float[Array, " b"]) -> Float[Array, ""]:
+    """Probability of cosines so much larger than the rest in noise that is flat below the fastest of them."""
+    share = jnp.sum(rest) / (jnp.sum(rest) + jnp.sum(few))  # has a beta distribution
+    return jax.scipy.special.betainc(rest.size / 2, few.size / 2, share)
 
 
 def _density(model: Noise, omega: Float[Array, " w"]) -> Float[Array, " w"]:

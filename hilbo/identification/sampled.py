@@ -25,6 +25,8 @@ from jaxtyping import Array, Complex, Float, Int
 from hilbo.errors import InputError
 from hilbo.identification import instrument
 from hilbo.identification.fitting import MEASURED, Curve, Test
+from hilbo.identification.recorded import between, circle, position_driven, secant, transform_length, unit_of_force
+from hilbo.identification.rounding import rounding
 from hilbo.identification.screening import screened, separate
 
 __all__ = ["Sampled"]
@@ -91,7 +93,7 @@ class Sampled(eqx.Module):
         A fitted lag is up to two samples either way, a fitted filter's time constant from a twentieth of a sample to
         five. Two arrays (p,).
         """
-        top = max(_secant(test) for test in tests)
+        top = max(secant(test) for test in tests)
         ends = np.log(0.99 / 0.01)
         least = 1e-6 if self.memory == "full" else 1e-4
         lag, slow, fast = float(instrument.LARGEST_LAG), instrument.SLOWEST_FILTER, instrument.FASTEST_FILTER
@@ -107,9 +109,9 @@ class Sampled(eqx.Module):
 
         Read from position to force, every test is linear in K_inst and K_eff, which are solved for at each place.
         """
-        curves = tuple(self.prepare(_position_driven(test)) for test in tests)
+        curves = tuple(self.prepare(position_driven(test)) for test in tests)
         lower, upper = self.box(tests)
-        scales = [jnp.asarray(np.ptp(test.output.mean(axis=0)) * _unit_of_force(test)) for test in tests]
+        scales = [jnp.asarray(np.ptp(test.output.mean(axis=0)) * unit_of_force(test)) for test in tests]
         grid = jnp.asarray(np.stack(np.meshgrid(_LOG_KAPPA, _LOGIT_ALPHA, indexing="ij"), axis=-1))
         plain = eqx.tree_at(lambda m: (m.lag, m.corner), self, (0.0, np.inf))
         costs, stiffness = (np.asarray(values) for values in screened(plain, curves, scales, grid))
@@ -136,12 +138,15 @@ class Sampled(eqx.Module):
         clear = instrument.clear_changes(test.input - offset[:, None])
         even = np.ptp(np.diff(place)) < 1e-6
         rows = instrument.without_noise(test.input, clear) if even else test.input
-        inputs = _between(grid, elapsed, rows, smooth) - offset[:, None]
-        length = _transform_length(count)
-        damping = _circle(length, inputs.dtype) ** -np.arange(count, dtype=inputs.dtype)
-        row = np.minimum(np.searchsorted(place, np.arange(count)), place.size - 1)  # the end of each tick's line
-        changes = np.diff(inputs, axis=1, prepend=0.0) * clear[row]
+        inputs = between(grid, elapsed, rows, smooth) - offset[:, None]
+        length = transform_length(count)
+        damping = circle(length, inputs.dtype) ** -np.arange(count, dtype=inputs.dtype)
+        changes = np.diff(inputs, axis=1, prepend=0.0)
+        if not even:
+            ends = np.minimum(np.searchsorted(place, np.arange(count)), place.size - 1)  # of each tick's line
+            changes = changes * clear[ends]
         before = np.minimum(place.astype(int), count - 2)
+        regular = bool(place.size == count and np.all(place == np.arange(count)))
         return Curve(
             test.kind,
             jnp.asarray(elapsed),
@@ -153,8 +158,10 @@ class Sampled(eqx.Module):
             jnp.asarray(place - before),
             length,
             jnp.asarray(np.fft.rfft(changes * damping, length)),
-            bool(place.size == count and np.all(place == np.arange(count))),
-            self.prepare(_position_driven(test), smooth=smooth) if _in_force(test) else None,
+            regular,
+            rounding(test.input, ~clear) if regular else None,
+            rounding(test.output, ~instrument.clear_changes(test.output)) if regular else None,
+            self.prepare(position_driven(test), smooth=smooth) if instrument.is_fitted_in_force(test) else None,
         )
 
     def _check_length(self, kind: str, seconds: float):
@@ -172,7 +179,7 @@ class Sampled(eqx.Module):
         `q` (p,), `weights` (R,) -> (m,), in mm or N.
         """
         assert curve.spectra is not None and curve.share is not None and curve.before is not None
-        H = self._transfer(q, curve.length, _circle(curve.length, q.dtype))
+        H = self._transfer(q, curve.length, circle(curve.length, q.dtype))
         creep = curve.kind == "creep"
         weighted = weights.astype(curve.spectra.dtype)
         spectrum = weighted @ curve.spectra
@@ -180,7 +187,7 @@ class Sampled(eqx.Module):
             assert curve.changes is not None
             spectrum = spectrum + self._added(q, curve) * (weighted @ curve.changes)
         spectrum = spectrum / H if creep else spectrum * H
-        growth = _circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
+        growth = circle(curve.length, q.dtype) ** jnp.arange(curve.length // 2, dtype=q.dtype)
         response = jnp.fft.irfft(spectrum, curve.length)[: curve.length // 2] * growth
         rest = weights @ curve.offset
         rest = rest / q[1] if creep else rest * q[1]
@@ -194,7 +201,7 @@ class Sampled(eqx.Module):
         The noise (m,), over the scale of r; the factor by which the model multiplies its spectral density at πj/m,
         j = 0 … m; and how many times larger the noise is than what comes of it in the same sample.
         """
-        creep, radius, m = curve.kind == "creep", _circle(curve.length, q.dtype), r.size
+        creep, radius, m = curve.kind == "creep", circle(curve.length, q.dtype), r.size
         H = self._transfer(q, curve.length, radius)
         growth = radius ** jnp.arange(m, dtype=q.dtype)
         spectrum = jnp.fft.rfft(r / growth, curve.length)
@@ -215,7 +222,7 @@ class Sampled(eqx.Module):
         lag = q[4] if _is_fitted(self.lag) else jnp.asarray(self.lag, q.dtype) / self.T
         corner = jnp.exp(q[-1]) if _is_fitted(self.corner) else jnp.asarray(2 * np.pi * self.T * self.corner, q.dtype)
         angle = 2 * jnp.pi * jnp.arange(curve.length // 2 + 1, dtype=q.dtype) / curve.length
-        z = _circle(curve.length, q.dtype) * jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
+        z = circle(curve.length, q.dtype) * jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
         return instrument.multiplier(curve.kind == "relaxation", lag, None if self._without_filter() else 1 / corner, z)
 
     def parameters(self, q: Float[Array, " p"]) -> dict[str, Float[Array, ""]]:
@@ -282,59 +289,3 @@ class Sampled(eqx.Module):
 def _is_fitted(value: Any) -> bool:
     """Whether a lag or a corner is a coordinate."""
     return isinstance(value, str)
-
-
-def _force_and_position(test: Test) -> tuple[Any, Any]:
-    """Both (R, m), whichever was applied."""
-    return (test.output, test.input) if test.kind == "relaxation" else (test.input, test.output)
-
-
-def _in_force(test: Test) -> bool:
-    """Whether a creep test is fitted in its force."""
-    return test.kind == "creep" and instrument.is_position_clearer(test)
-
-
-def _position_driven(test: Test) -> Test:
-    """The test with force as its output."""
-    force, position = _force_and_position(test)
-    return Test("relaxation", test.time, force, position, test.start)
-
-
-def _between(
-    grid: Float[np.ndarray, " n"], time: Float[np.ndarray, " m"], rows: Float[np.ndarray, "R m"], smooth: bool
-) -> Float[np.ndarray, "R n"]:
-    """The rows at the times of the grid; after the last row they stay."""
-    if not smooth:
-        return np.stack([np.interp(grid, time, row) for row in rows])
-    from scipy.interpolate import PchipInterpolator
-
-    return PchipInterpolator(time, rows, axis=1)(np.minimum(grid, time[-1]))
-
-
-def _unit_of_force(test: Test) -> float:
-    """What turns the scale of an output into one of force: the mean stiffness for positions."""
-    return _mean_secant(test) if test.kind == "creep" else 1.0
-
-
-def _secant(test: Test) -> float:
-    """Largest force over largest position, N/mm."""
-    force, position = _force_and_position(test)
-    return float(np.max(np.abs(force)) / np.max(np.abs(position)))
-
-
-def _mean_secant(test: Test) -> float:
-    """Mean force over mean position, N/mm."""
-    force, position = _force_and_position(test)
-    return float(np.mean(np.abs(force)) / np.mean(np.abs(position)))
-
-
-def _transform_length(count: int) -> int:
-    """A length that transforms fast, at least three times as long as the data."""
-    from scipy.fft import next_fast_len
-
-    return 2 * next_fast_len((3 * count + 1) // 2)
-
-
-def _circle(length: int, dtype: Any) -> float:
-    """Radius of the circle on which `length` points damp what wraps around to eps^0.8."""
-    return float(np.finfo(dtype).eps ** (-0.8 / length))

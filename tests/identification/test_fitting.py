@@ -73,14 +73,8 @@ def test_derivatives_of_a_curve():
     check_grad(jax.jit(lambda q: model.predict(q, curve, ALONE)[pick]), q, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "kinds",
-    [
-        pytest.param(("relaxation",), marks=pytest.mark.deep),
-        pytest.param(("creep",), marks=pytest.mark.deep),
-        ("relaxation", "creep"),
-    ],
-)
+@pytest.mark.deep
+@pytest.mark.parametrize("kinds", [("relaxation",), ("creep",), ("relaxation", "creep")])
 def test_without_noise_the_parameters_come_back(kinds):
     tests = [test for test in foam_tests() if test.kind in kinds]
     fitted = fit(tests, Sampled())

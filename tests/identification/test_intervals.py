@@ -100,6 +100,7 @@ class Line(eqx.Module):
         return q[0] + q[1] * curve.time
 
 
+@pytest.mark.deep
 @pytest.mark.parametrize("natural", [False, True])
 def test_an_end_that_another_bound_sets_is_open(natural):
     """Lower intercepts need a steeper slope than the box has: a wider box would move that end."""

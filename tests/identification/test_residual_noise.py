@@ -45,6 +45,12 @@ def test_a_random_walk_is_drift_and_widens_the_interval_of_a_mean(described):
     assert np.mean(np.abs(ratios) < 1.96) > 0.75  # by the autoregression alone: 0.4
 
 
+def test_an_autoregression_does_not_hide_a_walk(described):
+    for number in range(20):
+        model = described(jnp.asarray(white(number) + walk(number, 10)))
+        assert int(model.order) > 0 and float(model.drift) < DRIFTS
+
+
 def test_noise_of_the_input_is_recognised_in_the_output():
     """What a force sensor adds to the input of a creep test reaches the prediction through 1/H."""
     creep = foam_tests(hold=0.3)[1]
