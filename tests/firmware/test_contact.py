@@ -133,7 +133,7 @@ def test_the_passivity_controller_acts_in_contact_and_adds_no_more_than_the_devi
 
 
 def test_the_passivity_controller_adds_as_much_as_the_device_s_damping():
-    """Where the hand moves in and is owed more than that: a bound below it would leave energy that could be taken back."""
+    """Where the hand moves in and is owed more than that: with a lower bound, energy would be left to be taken back."""
     device = Device(capabilities=3 | CONTROLLER)
     device.go({"K0": 1.8, "K1": 0.5, "B1": 0.001, "alpha": 0.2})
     positions = np.r_[np.linspace(1, 100, 30), 200 - 100 * np.cos(2 * np.pi * 20 * np.arange(1000) / 1000)].round()
