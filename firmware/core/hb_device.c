@@ -157,6 +157,15 @@ static bool is_late(const struct hb_device *device, const struct hb_input *input
     return input->overrun || input->delay_us > device->config->delay_us;
 }
 
+/* A device that moves by itself meets its stops with nobody's hand between. */
+static float fastest(const struct hb_device *device)
+{
+    const struct hb_config *config = device->config;
+    float driven_mm_per_s = HB_DRIVEN_SPEED * config->servo_speed_mm_per_s;
+    bool slower = hb_is_in(device, HB_DRIVING) && driven_mm_per_s < config->velocity_limit_mm_per_s;
+    return slower ? driven_mm_per_s : config->velocity_limit_mm_per_s;
+}
+
 static enum hb_cause fault(const struct hb_device *device, bool input_lost, bool late, bool hot, bool finite)
 {
     if (device->heartbeat_age_ticks >= device->config->watchdog_ticks) {
@@ -165,7 +174,7 @@ static enum hb_cause fault(const struct hb_device *device, bool input_lost, bool
     if (input_lost || (hb_is_in(device, HB_DRIVING) && hb_drive_is_stuck(&device->drive, device->config))) {
         return HB_CAUSE_INPUT;
     }
-    if (hb_is_too_fast(&device->safety, device->config)) {
+    if (hb_is_too_fast(&device->safety, device->config, fastest(device))) {
         return HB_CAUSE_VELOCITY;
     }
     if (late) {

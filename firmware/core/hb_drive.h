@@ -36,6 +36,9 @@ struct hb_drive {
 #define HB_STUCK_STEPS 128
 #define HB_STUCK_PER_S 20U
 
+/* DRIVE is held where the handle moves faster than this many times the servo's own speed. */
+#define HB_DRIVEN_SPEED 3.0F
+
 /* Its mode and shape have names. */
 bool hb_drive_is_named(const struct hb_drive_request *request);
 

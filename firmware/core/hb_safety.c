@@ -172,10 +172,10 @@ bool hb_is_too_hot(struct hb_safety *safety, const struct hb_config *config)
     return safety->heat_N2 > config->continuous_force_N * config->continuous_force_N;
 }
 
-bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *config)
+bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *config, float limit_mm_per_s)
 {
     float step_mm = hb_absolute((float)safety->step_counts * config->encoder_step_mm);
-    return step_mm * (float)config->tick_rate_Hz > config->velocity_limit_mm_per_s * (float)safety->step_ticks;
+    return step_mm * (float)config->tick_rate_Hz > limit_mm_per_s * (float)safety->step_ticks;
 }
 
 void hb_ramp_begin(struct hb_safety *safety)

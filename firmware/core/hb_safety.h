@@ -107,8 +107,8 @@ float hb_slew(struct hb_safety *safety, const struct hb_config *config, float fo
 /* One tick of heating by the last command; true above the continuous limit. */
 bool hb_is_too_hot(struct hb_safety *safety, const struct hb_config *config);
 
-/* The believed position moved faster than the limit. */
-bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *config);
+/* The believed position moved faster than a limit. */
+bool hb_is_too_fast(const struct hb_safety *safety, const struct hb_config *config, float limit_mm_per_s);
 
 /* Begin the way to zero force, and go one tick along it; at the end the force is 0 exactly. */
 void hb_ramp_begin(struct hb_safety *safety);

@@ -484,6 +484,21 @@ def test_drive_falls_silent_with_the_host():
     assert np.flatnonzero(forces)[-1] == WATCHDOG - 1 + HOLD - 2 and device.state == "HOLD"
 
 
+def test_a_drive_that_runs_away_lets_go_at_three_times_the_servo_s_speed():
+    """A force on a free handle of 0.3 kg met the stop at 464 mm/s, with the velocity limit at 1,000."""
+    device = Device()
+    device.beat()
+    device.must("DRIVE", mode=0, offset=3.0, duration_ticks=1000, boot_id=7)
+    x = v = force = fastest = 0.0
+    for _ in range(200):
+        v += -force / 0.3  # mm/s in a tick
+        x += 1e-3 * v
+        device.beat()
+        force = device.tick(round(x / STEP))
+        fastest = max(fastest, v if force else 0.0)
+    assert device.state == "HOLD" and cause(device) == "VELOCITY" and 290 < fastest < 420
+
+
 # Restart
 
 
