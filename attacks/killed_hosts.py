@@ -59,7 +59,7 @@ class Killing:
     """A device, and hosts that are killed one after the other; `seen` is what they left."""
 
     def __init__(self):
-        self.device, self.seen = Simulator(rate="lockstep", finger="hold"), list[Killed]()
+        self.device, self.seen = Simulator(rate="lockstep", finger="ramp"), list[Killed]()
 
     def __call__(self, rng: random.Random, _number: int) -> str:
         """One host; the word under which it counts."""
@@ -79,7 +79,7 @@ class Killing:
         ready.start()
         while ready.is_alive():
             self._keep_up()
-        for _ in range(rng.randrange(150, 400)):  # the finger takes some time to press
+        for _ in range(rng.randrange(500, 1100)):  # it began out of contact, and the finger takes some time to press
             self._keep_up()
         time.sleep(rng.uniform(0, 0.005))
         host.kill()
@@ -117,7 +117,7 @@ class Killing:
 
         with Renderer(connect) as device:
             assert device.notes == [
-                "The device is in HOLD: it heard no heartbeat from the host; clear it before the next start."
+                "The device is in HOLD: no fresh heartbeat came from the host; clear it before the next start."
             ]
             assert device.in_force() is not None
             device.clear()

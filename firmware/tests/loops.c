@@ -143,6 +143,8 @@ static void begin(struct loop *loop)
     }
     loop->lost_share = draw(loop, 0.0, 0.2);
     loop->rig.motor_N = 0.0;
+    loop->rig.motor_sign = 1.0;
+    loop->rig.encoder_sign = 1;
     loop->rig.stop_open = loop->ran = loop->touched = loop->pressed = false;
     loop->rig.late_us = 0U;
     loop->rig.delay_us = loop->rig.config.delay_us;

@@ -240,7 +240,10 @@ class HostRenderer:
 
 
 def K0_of(*, K_eff: float, K1: float, B1: float, alpha: float, N: int = 101, tick_rate_Hz: int = 1000) -> float:
-    """K0 (N/mm) of a set of short memory whose static stiffness is K_eff, as the library computes it."""
+    """K0 (N/mm) of a set of short memory whose static stiffness is K_eff, as the library computes it.
+
+    Raises `InputError` for an N that is no whole number, `DeviceError` where the library cannot be built.
+    """
     packed = _packed(0.0, K1, B1, alpha, N, (), math.nan)
     return library().hilbo_K0_of(ctypes.byref(packed), tick_rate_Hz, K_eff)
 

@@ -69,6 +69,7 @@ class SimulatedMotor:
     """A running simulated device, whose process ends with this one. `finger`: none, rest, ramp, hold, sine, tap, all.
 
     `record`: a file for time (CLOCK_MONOTONIC, ns), force and position of each of its ticks, written at its end.
+    Raises `DeviceError` where its program cannot be built or does not start.
     """
 
     def __init__(self, finger: str = "all", silence_ms: float = 15.0, record: Path | None = None):

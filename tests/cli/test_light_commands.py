@@ -50,7 +50,7 @@ import itertools, pathlib, sys
 from hilbo.cli.doctor import checks
 from hilbo.errors import InputError
 
-def connect(damping):
+def connect(damping, delay):
     raise InputError("there is none")
 
 print(*(check.name for check in itertools.islice(checks(pathlib.Path(sys.argv[1]), connect, pathlib.Path(), 0), 7)))
