@@ -5,7 +5,7 @@ import subprocess
 
 import numpy as np
 import pytest
-from helpers_firmware import CAUSES, CORE, STRICT, Device, compiler
+from helpers_firmware import CAUSES, CORE, STRICT, Device, compiler, parameters
 
 SET = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
 OTHER = {"K0": -2.5, "K1": 4.0, "B1": 6.0, "alpha": 0.2}
@@ -142,6 +142,20 @@ def test_the_passivity_controller_adds_as_much_as_the_device_s_damping():
     extra = with_it - np.float32(1.8) * positions * STEP
     owed = (flags & 16 > 0) & (velocity > 0.03)
     assert np.max(extra[owed] / velocity[owed]) > 0.9
+
+
+def test_what_is_left_of_a_difference_ends_with_the_contact():
+    device = Device(slew=50.0)
+    device.go(SET, 1)
+    device.run(counts(np.r_[np.linspace(0, 4, 200), np.full(50, 4.0)]))
+    staged = device.stage(SET | {"K0": -2.5, "K1": 4.0, "B1": 6.0}, 2)
+    device.run(np.full(400, 315))
+    device.confirm("COMMIT", staged)
+    device.run([315] * 3)
+    assert device.offset != 0
+    device.run(np.arange(315, -60, -60))
+    assert device.offset == 0
+    assert device.ask("SET_PARAMS", parameters(SET, 3))[0] == "ACK"  # no longer BUSY
 
 
 def test_a_second_change_of_the_set_goes_on_from_the_first_one_s_limit():

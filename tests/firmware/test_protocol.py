@@ -220,6 +220,12 @@ def test_a_clear_ends_the_stop_that_it_names_and_no_later_one(device):
     assert (message["reason"], message["ticks"]) == ("STALE", device.stops)
 
 
+def test_each_stop_counts_once(device):
+    for name in ("STOP", "ESTOP", "ESTOP", "STOP"):
+        before = device.stops
+        assert device.must(name)["stops"] == before + 1
+
+
 @pytest.mark.parametrize("stop", ["STOP", "ESTOP"])
 def test_an_order_that_was_made_before_a_stop_does_nothing_after_it(device, stop):
     staged = device.stage(SET)

@@ -189,6 +189,28 @@ def test_the_slew_limit_is_kept_and_flagged():
     assert np.count_nonzero(flags & 8) == device.status()["slewed"] > 50
 
 
+def test_a_drive_begins_with_no_energy_of_an_earlier_touch():
+    device = Device()
+    device.go(SET)
+    device.run(np.r_[np.linspace(0, 300, 200), np.linspace(300, 0, 200)])
+    assert device.status()["energy_mJ"] > 0.1
+    device.must("STOP")
+    device.run([0] * 25)
+    device.beat()
+    device.must("DRIVE", mode=0, offset=0.0, duration_ticks=50, boot_id=7)
+    assert device.status()["energy_mJ"] == 0
+
+
+def test_each_sample_says_whether_a_set_is_rendered():
+    device = Device()
+    device.go(SET)
+    _, flags = device.run([0] * 5)
+    assert np.all(flags & 256)
+    device.must("STOP")
+    _, flags = device.run([0] * 5)
+    assert not np.any(flags & 256)
+
+
 def test_force_only_pushes_and_follows_contact():
     device = Device()
     device.run([-200] * 3)
@@ -314,7 +336,9 @@ def test_a_device_that_is_not_homed_renders_nothing():
     assert device.status()["flags"] == 0 and device.status()["position_mm"] == 0
     assert device.confirm("START", staged)[1]["reason"] == "NOT_HOMED"
     assert device.refusal("DRIVE", mode=1, offset=1.0, duration_ticks=9, boot_id=7) == "NOT_HOMED"
-    assert device.refusal("HOME", boot_id=7, position_mm=61.0) == "DRIVE_RANGE"
+    for position, limit in ((61.0, 60.0), (-21.0, -20.0)):
+        _, message = device.ask("HOME", boot_id=7, position_mm=position)
+        assert (message["reason"], message["value"], message["limit"]) == ("DRIVE_RANGE", position, limit)
     assert device.refusal("HOME", boot_id=7, position_mm=float("nan")) == "NOT_FINITE"
     device.must("HOME", boot_id=7, position_mm=-1.27)
     device.tick(7000)

@@ -176,9 +176,24 @@ def test_the_longest_memories_are_taken(device):
 def test_exactly_the_device_s_damping_is_enough(device):
     device.confirm("COMMIT", device.stage(SET))
     needed = device.must("GET_SET", bank=0)["minimum_damping_N_s_per_m"]
-    assert Device(damping=needed).stage(SET)
+    just = Device(damping=needed)
+    assert just.confirm("COMMIT", just.stage(SET))[0] == "ACK"
     less = Device(damping=float(np.nextafter(np.float32(needed), np.float32(0))))
     assert less.refusal("SET_PARAMS", parameters(SET)) == "NOT_PASSIVE"
+
+
+def test_status_names_what_is_in_force_and_what_is_staged(device):
+    """From either bank, of either memory: `stage` compares each answer with what was sent."""
+    first = device.go(SET, 1)
+    second = device.stage(full_set(), 2)
+    status = device.status()
+    assert (status["active_id"], status["active_crc"]) == first
+    assert (status["staged_id"], status["staged_crc"]) == second
+    assert device.confirm("COMMIT", second)[0] == "ACK"
+    device.tick()
+    third = device.stage(full_set(K1=0.9), 3)
+    status = device.status()
+    assert (status["active_id"], status["active_crc"], status["staged_crc"]) == (*second, third[1])
 
 
 def test_abort_forgets(device):

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from helpers_firmware import CAUSES, CONFIG, DOCUMENT, Device, build, frame, library
+from helpers_firmware import CAUSES, CONFIG, DOCUMENT, NAMES, Device, build, decode, frame, library
 
 SET = {"K0": -3.18, "K1": 5.58, "B1": 7.88, "alpha": 0.176}
 
@@ -94,6 +94,7 @@ def test_what_a_device_cannot_do_is_refused():
         ({"mode": 1, "offset": -21.0}, "DRIVE_RANGE", -21, -20),
         ({"shape": 1, "offset": 30.0, "amplitude": 11.0, "period_ticks": 10}, "DRIVE_RANGE", 41, 40),
         ({"shape": 1, "offset": 3e38, "amplitude": 3e38, "period_ticks": 10}, "DRIVE_RANGE", float("inf"), 40),
+        ({"shape": 1, "offset": -30.0, "amplitude": 11.0, "period_ticks": 10}, "DRIVE_RANGE", -41, -40),
         ({"shape": 2, "amplitude": -41.0, "period_ticks": 10}, "DRIVE_RANGE", -41, -40),
         ({"shape": 1, "period_ticks": 3}, "DRIVE_RANGE", 3, 4),
         ({"shape": 2, "period_ticks": 120001}, "DRIVE_RANGE", 120001, 120000),
@@ -126,6 +127,15 @@ def test_limits_are_those_of_the_config(device):
     for name in ("K0", "K1", "B1", "alpha"):
         assert limits[f"{name}_low"] == np.float32(CONFIG[f"{name}_low"])
         assert limits[f"{name}_high"] == np.float32(CONFIG[f"{name}_high"])
+
+
+def test_notices_and_pulses_have_the_seq_of_nobody_s_request(device):
+    device.drain()
+    device.seq = 9
+    device.feed(frame("ESTOP", 9))
+    device.beat()
+    told = [decode(part) for part in device.drain().split(b"\0") if part]
+    assert [(NAMES[kind], seq) for kind, seq, _ in told] == [("NOTICE", 0), ("ACK", 9), ("PULSE", 0)]
 
 
 def test_a_notice_tells_of_the_start_and_of_every_change_of_state(device):
