@@ -69,7 +69,9 @@ def test_force_ends_within_20_ms_of_each_fault_and_has_the_bits_of_the_core(tmp_
         print(f"{kind}: {len(afters)}, force zero after {words}")
     assert all(found.values())
     resumed = [row for row in ticks if row.missed > 100]
-    assert len(resumed) >= len(found["stall"]) - 1 > 0 and all((row.force_N, row.state) == (0, State.HOLD) for row in resumed)
+    assert len(resumed) >= len(found["stall"]) - 1 > 0 and all(
+        (row.force_N, row.state) == (0, State.HOLD) for row in resumed
+    )
     assert any(row.fate == Fate.IN_FORCE for row in ticks) and max(row.force_N for row in ticks) > 0.5
     assert float_bits(replayed(rows, MOTOR)) == float_bits(row.force_N for row in ticks)
 

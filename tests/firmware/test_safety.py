@@ -348,13 +348,15 @@ def test_a_device_that_is_not_homed_renders_nothing():
     assert not np.any(forces[:99]) and np.all(forces[110:] > 0)
 
 
-def test_what_was_felt_before_a_home_is_forgotten_in_both_banks():
+@pytest.mark.parametrize("changes", [1, 2])
+def test_what_was_felt_before_a_home_is_forgotten_in_both_banks(changes):
     """The surface is elsewhere now: a history at the old one would be felt as a force of the past."""
     device, fresh = Device(), Device()
     for each in (device, fresh):
-        staged = each.go(OTHER, 1)
-        staged = each.stage(SET, 2)
-        each.confirm("COMMIT", staged)
+        staged = each.go(SET, 1)
+        for set_id in range(2, changes + 1):
+            staged = each.stage(SET, set_id)
+            each.confirm("COMMIT", staged)
     device.run(np.r_[np.linspace(0, 300, 100), np.full(100, 300)])
     device.must("STOP")
     device.run([300] * 25)
