@@ -51,11 +51,11 @@ def finished(study, folder, arguments, kills, most):
 
 
 def essence(events):
-    """Proposals and answers, without their times."""
+    """Proposals and answers, without what is measured meanwhile: times, a browser's clock, a device's samples."""
     kept = []
     for event in events:
         if event.kind in ("propose", "answer", "go_on"):
-            kept.append((event.kind, {k: v for k, v in event.data.items() if k != "browser"}))
+            kept.append((event.kind, {k: v for k, v in event.data.items() if k not in ("browser", "telemetry")}))
     return kept
 
 
