@@ -223,8 +223,7 @@ class Renderer:
                 self._link.request(protocol.Start(**order))
                 return
             except DeviceError as error:
-                in_contact = error.nack is not None and error.nack.reason == NackReason.IN_CONTACT
-                if not in_contact or self._link.now() > give_up:
+                if not error.in_contact or self._link.now() > give_up:
                     raise
             self._link.pause(_NEAR)
 

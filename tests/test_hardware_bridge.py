@@ -1,8 +1,11 @@
 """The bridge against a scripted device that misbehaves in every way of the protocol's rules."""
 
+import contextlib
 import os
+import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,6 +16,8 @@ from peer import Peer
 
 from hilbo import hardware_bridge
 from hilbo.device import protocol
+from hilbo.device.link import Link
+from hilbo.device.ports import SocketPort
 from hilbo.device.protocol import NackReason, Sample
 from hilbo.device.telemetry import TelemetryBuffer
 from hilbo.errors import InputError
@@ -383,3 +388,29 @@ def test_a_device_with_more_delay_than_the_study_counts_on_is_refused(monkeypatc
         Renderer(connect, delay=0.0)
     with Renderer(connect, delay=376e-6) as device:
         assert device.delay == pytest.approx(376e-6)
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_start_without_an_answer_is_followed_by_a_stop(lost):
+    """Whether its tries are over, or the line brings nothing any more before an answer came."""
+    peer = Peer()
+    device = Renderer(partial(peer.connect, patience=30.0 if lost else 0.05))
+    peer.pulses, peer.swallow = False, 10**9
+    if lost:
+        peer.socket.shutdown(socket.SHUT_WR)
+    with pytest.raises(DeviceError):
+        device.link.request(protocol.Start(set_id=1, crc=0, boot_id=device.device.boot_id, stop=0))
+    while not peer.done[protocol.Stop]:
+        time.sleep(0.005)
+    with contextlib.suppress(DeviceError):
+        device.close()
+
+
+def test_a_line_that_cannot_be_written_is_given_back():
+    ours, theirs = socket.socketpair()
+    port = SocketPort(ours, "peer")
+    ours.shutdown(socket.SHUT_WR)
+    with pytest.raises(DeviceError):
+        Link(port)
+    assert ours.fileno() == -1
+    theirs.close()

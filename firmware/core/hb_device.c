@@ -247,8 +247,9 @@ float hb_tick(struct hb_device *device, const struct hb_input *input)
     if (late) {
         hb_count_up(&safety->count.overruns);
     }
+    bool opens = input->stop_open && !device->stop_open;
     device->stop_open = input->stop_open;
-    if (input->stop_open) {
+    if (opens) {
         hb_estop(device, HB_CAUSE_SWITCH);
     }
     bool hot = hb_is_too_hot(safety, config);

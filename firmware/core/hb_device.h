@@ -45,7 +45,7 @@ struct hb_device {
     uint16_t longest_delay_us;    /* stays at 65535 */
     bool greeted;                 /* HELLO has been said */
     uint32_t heartbeat_age_ticks; /* since the last tick that the host is known to have heard; stays at watchdog_ticks */
-    uint32_t stops;               /* STOPs, ESTOPs, HOLDs and ends of a DRIVE since the start */
+    uint32_t stops;               /* since the start: what makes earlier orders stale (hb_motion.h) */
     uint32_t drive_crc;           /* of the request for the DRIVE that runs */
 
     struct hb_renderer bank[2];

@@ -41,7 +41,8 @@ static enum hb_reason check_time(const struct hb_device *device, uint32_t boot_i
     return HB_ACCEPTED;
 }
 
-/* What every motion needs: a host that hears the device, an encoder, a hardware stop that is closed. */
+/* What every motion needs: a host that hears the device, and an encoder. While the hardware stop is open the device is
+ * in ESTOP. */
 static enum hb_reason check_readiness(const struct hb_device *device)
 {
     if (device->heartbeat_age_ticks >= device->config->watchdog_ticks) {
@@ -154,6 +155,7 @@ enum hb_reason hb_home_here(struct hb_device *device, const struct hb_frame *fra
         return HB_NACK_NO_INPUT;
     }
     hb_home(&device->safety, config, request.position_mm);
+    device->stops += 1U; /* an order that was made for the old positions is stale */
     hb_rest_histories(device);
     return HB_ACCEPTED;
 }
@@ -170,12 +172,8 @@ void hb_stop(struct hb_device *device)
 
 void hb_estop(struct hb_device *device, enum hb_cause cause)
 {
-    bool latched = hb_is_in(device, HB_ESTOPPED);
-    if (latched && cause == HB_CAUSE_SWITCH && device->cause == (uint8_t)cause) {
-        return; /* the switch is still open */
-    }
     device->stops += 1U;
-    if (!latched || cause == HB_CAUSE_SWITCH) {
+    if (!hb_is_in(device, HB_ESTOPPED) || cause == HB_CAUSE_SWITCH) {
         hb_count_up(&device->safety.count.estops);
         hb_enter(device, HB_ESTOPPED, cause);
     }

@@ -1,8 +1,9 @@
 /* The states, and the requests that change them.
  *
- * Orders in time: `stops` counts every stop. START, DRIVE, CLEAR and HOME name the stop that their sender knew of, and do
- * nothing after a later one. RUNNING and DRIVING end in a stop, and CLEAR ends the stop that it names, so that each of
- * these orders acts at most once, whatever is lost, late or sent twice. */
+ * Orders in time: `stops` counts every STOP, ESTOP, HOLD, end of a DRIVE, opening of the hardware stop, and HOME. START,
+ * DRIVE, CLEAR and HOME name the count that their sender knew, and do nothing after a later stop. RUNNING and DRIVING end
+ * in a stop, CLEAR ends the stop that it names, and HOME is counted itself, so that each of these orders acts at most
+ * once, whatever is lost, late or sent twice. */
 #ifndef HB_MOTION_H
 #define HB_MOTION_H
 

@@ -24,6 +24,12 @@ void hb_home(struct hb_safety *safety, const struct hb_config *config, float pos
 {
     float steps = position_mm / config->encoder_step_mm;
     int32_t counts = (int32_t)(steps < 0.0F ? steps - 0.5F : steps + 0.5F);
+    float rounded_mm = (float)counts * config->encoder_step_mm;
+    if (rounded_mm > config->position_high_mm) {
+        counts -= 1; /* rounded out of the stroke, where every position would be bad */
+    } else if (rounded_mm < config->position_low_mm) {
+        counts += 1;
+    }
     safety->zero_counts += safety->counts - counts;
     safety->counts = counts;
     safety->homed = true;
@@ -84,6 +90,8 @@ bool hb_check_input(struct hb_safety *safety, const struct hb_config *config, co
     safety->loss = HB_LOSS_LIMIT;
     safety->known = false; /* the next position within the stroke is a new beginning */
     safety->lost = true;
+    /* An incremental encoder may have missed counts meanwhile: where the surface is must be told again. */
+    safety->homed = safety->homed && (config->capabilities & (uint8_t)HB_IS_HOMED_AT_BOOT) != 0U;
     return false;
 }
 

@@ -27,7 +27,8 @@ struct rig {
     struct told confirmed;
     bool committed;
     uint32_t silent_ticks; /* since the newest tick that came with a heartbeat of the right boot id */
-    uint32_t stops;        /* STOPs, ESTOPs and ends of a motion, as the harness counts them */
+    uint32_t stops;        /* what makes earlier orders stale, as the harness counts it */
+    bool stop_open;        /* at the last tick */
     uint32_t ramp_ticks;
     uint64_t held;   /* a bit for each of the last ticks whose position was not believed, the newest lowest; since it moves */
     bool zero_owed;  /* ESTOP was heeded, and no tick has put out zero since */
@@ -118,10 +119,15 @@ static void check_orders(struct rig *rig, const struct hb_frame *frame, const st
     if ((frame->type == (uint8_t)HB_STOP || frame->type == (uint8_t)HB_ESTOP) && frame->size == 0U) {
         rig->stops += 1U;
     }
+    if (frame->type == (uint8_t)HB_HOME && device->stops != before->stops) {
+        must(before->state == (uint8_t)HB_STOPPED && pair->second == rig->stops, "homed by an older order");
+        rig->stops += 1U;
+    }
     must(device->stops == rig->stops, "stops are not counted");
     bool latched = before->state == (uint8_t)HB_ESTOPPED || before->state == (uint8_t)HB_HOLDING;
     bool freed = latched && device->state == (uint8_t)HB_STOPPED;
     must(!freed || (frame->type == (uint8_t)HB_CLEAR && pair->second == rig->stops), "cleared by an older order");
+    must(!freed || !rig->stop_open, "cleared with an open stop");
     bool begins = is_moving(device->state) && !is_moving(before->state);
     size_t at = frame->type == (uint8_t)HB_START ? 12U : 24U;
     must(!begins || (frame->size >= at + 4U && hb_unpack_stop(frame->payload + at) == rig->stops), "an older order acted");
@@ -280,8 +286,9 @@ static void tick(struct rig *rig, uint8_t flags)
     struct hb_input input = {rig->position,       (flags & 1U) == 0U, (flags & 2U) != 0U, (flags & 48U) == 48U, delay_us,
                              (flags & 4U) != 0U ? NAN : 1.0F};
     float force_N = hb_tick(device, &input);
-    rig->stops += is_moving(state) && !is_moving(device->state) ? 1U : 0U;
-    rig->stops += !is_moving(state) && input.stop_open && device->stops != rig->stops ? 1U : 0U;
+    bool opens = input.stop_open && !rig->stop_open;
+    rig->stop_open = input.stop_open;
+    rig->stops += opens || (is_moving(state) && !is_moving(device->state)) ? 1U : 0U;
     must(device->stops == rig->stops, "stops are not counted at a tick");
     must(!input.stop_open || (device->state == (uint8_t)HB_ESTOPPED && force_N == 0.0F), "moves with an open stop");
     must(!is_moving(device->state) || input.delay_us <= rig->config.delay_us, "moves though late");

@@ -141,6 +141,11 @@ uint32_t shim_stops(const struct shim *shim)
     return shim->device.stops;
 }
 
+int shim_state(const struct shim *shim)
+{
+    return shim->device.state;
+}
+
 uint32_t shim_now(const struct shim *shim)
 {
     return shim->device.tick;

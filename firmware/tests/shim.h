@@ -18,6 +18,7 @@ double shim_delayed_damping(const double *set, const float *weight, const float 
 uint32_t shim_flags(const struct shim *shim);
 double shim_offset_N(const struct shim *shim);
 uint32_t shim_stops(const struct shim *shim);
+int shim_state(const struct shim *shim);
 uint32_t shim_now(const struct shim *shim);
 uint32_t shim_warm_left(const struct shim *shim);
 void shim_run(struct shim *shim, const int32_t *counts, size_t size, int beating, float *forces, uint16_t *flags);

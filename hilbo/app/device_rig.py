@@ -20,7 +20,7 @@ from typing import Any
 from hilbo.app.rig import Loaded, Showing, Snapshot
 from hilbo.app.sample_flags import SampleCounter
 from hilbo.device.messages import Status
-from hilbo.device.reasons import DeviceFlag, HoldReason, NackReason, held_because
+from hilbo.device.reasons import DeviceFlag, HoldReason, held_because
 from hilbo.hardware_bridge import Capability, DeviceError, Renderer, State
 from hilbo.search.box import Mechanics
 from hilbo.session.header_check import study_of
@@ -147,7 +147,7 @@ class DeviceRig:
         try:
             device.start(stop=stop, wait=0.0)
         except DeviceError as error:
-            if error.nack is None or error.nack.reason != NackReason.IN_CONTACT:
+            if not error.in_contact:
                 raise
             self._see(self.snapshot._replace(contact=True))  # the hand has come back since the look
             return False

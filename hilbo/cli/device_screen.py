@@ -11,6 +11,7 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ class _View:
     def __init__(self, device: Renderer, title: str):
         self.device, self.title = device, title
         self.words: list[str] = []
+        self.start_after: int | None = None  # the device's count of stops when the start that waits was asked for
         keep = round(_SHOWN / device.tick_s / max(1, device.divisor))
         self.position: deque[float] = deque(maxlen=keep)
         self.force: deque[float] = deque(maxlen=keep)
@@ -146,20 +148,25 @@ def feel(device: Renderer, sets: Mapping[str, Mapping[str, Any]], seconds: float
     view = _View(device, f"{title}\nspace: start or stop   e: emergency stop   c: clear   q: end")
     felt: list[str] = []
 
-    def obey(view: _View, keys: Iterator[str]) -> bool:
+    def obey(order: Callable[[], None]) -> None:
+        try:
+            order()
+        except (DeviceError, InputError) as error:
+            view.words.append(str(error))
+            if device.link.lost:
+                raise
+
+    def go_on(keys: Iterator[str]) -> bool:
         for key in keys:
             if key == "q":
                 return False
-            try:
-                _press(device, view, key, names, sets, felt)
-            except (DeviceError, InputError) as error:
-                view.words.append(str(error))
-                if device.link.lost:
-                    raise
+            obey(partial(_press, device, view, key, names, sets, felt))
+        if view.start_after is not None:
+            obey(partial(_start_when_free, device, view))
         return True
 
     with _keyboard() as pressed:
-        content = _show(view, seconds, lambda shown: obey(shown, pressed()))
+        content = _show(view, seconds, lambda _view: go_on(pressed()))
     return content | {"felt": felt, "words": view.words}
 
 
@@ -169,12 +176,29 @@ def _press(device, view, key, names, sets, felt) -> None:
         view.set = device.send(**sets[name])
         felt.append(name)
         view.words.append(f'"{name}" is in force')
+    elif key == " " and view.start_after is None and device.state() == State.STOPPED:
+        view.start_after = device.link.stops
+        if device.status().contact:
+            view.words.append("let the handle leave the surface; it is rendered from then on")
     elif key == " ":
-        device.start(wait=0.0) if device.state() == State.STOPPED else device.stop()
+        view.start_after = None
+        device.stop()
     elif key == "e":
+        view.start_after = None
         device.estop()
     elif key == "c":
         device.clear()
+
+
+def _start_when_free(device, view) -> None:
+    """Start what the space bar asked for, unless the handle is still in the material."""
+    stop, view.start_after = view.start_after, None
+    try:
+        device.start(stop=stop, wait=0.0)
+    except DeviceError as error:
+        if not error.in_contact:
+            raise
+        view.start_after = stop
 
 
 def _show(view, seconds, go_on: Callable[[_View], bool]) -> dict[str, Any]:

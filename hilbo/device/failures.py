@@ -2,7 +2,7 @@
 
 from hilbo.device.heartbeat import GRACE
 from hilbo.device.messages import Nack
-from hilbo.device.reasons import ABOUT_INPUT, sentence
+from hilbo.device.reasons import ABOUT_INPUT, NackReason, sentence
 from hilbo.errors import InputError
 
 __all__ = [
@@ -25,6 +25,11 @@ class DeviceError(RuntimeError):
     def __init__(self, words: str, nack: Nack | None = None):
         super().__init__(words)
         self.nack = nack
+
+    @property
+    def in_contact(self) -> bool:
+        """A motion was refused because the handle is in the material."""
+        return self.nack is not None and self.nack.reason == NackReason.IN_CONTACT
 
 
 class RefusalError(InputError):

@@ -44,6 +44,7 @@ BEAT = 0.05  # s between heartbeats, and between signs of life
 GRACE = 5.0  # s without a sign of life, after which the helper ends
 HEARTBEAT = 0x0E
 WITH_TICK = frozenset({0x45, 0x47, 0x48, 0x4A})  # STATUS, NOTICE, TELEMETRY, PULSE begin with the device's tick
+_ALIVE, _QUIET, _LOUD = b".", b"-", b"+"  # what this process writes to the helper
 _LINE_GONE = 3  # the helper's exit code then
 _MOST_WAITING = 1 << 20  # bytes for a host that reads nothing; what comes after them is dropped
 
@@ -122,21 +123,29 @@ class HelperHeart:
             self._drained.set()
         return data or None
 
+    def hush(self, quiet: bool) -> None:
+        """No heartbeats from now on, or heartbeats again; the helper goes on reading."""
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError, ValueError):  # it has ended, and its heartbeats with it
+            self.process.stdin.write(_QUIET if quiet else _LOUD)
+
     def close(self, reader: threading.Thread) -> None:
         """Returns after the last heartbeat, and once `reader`, which calls `read`, has read the rest."""
         self._signs.close()
         assert self.process.stdin is not None
         with contextlib.suppress(OSError):
             self.process.stdin.close()
-        if reader is not threading.current_thread() and reader.is_alive():
-            self._drained.wait(GRACE)
+        give_up = time.monotonic() + GRACE
+        while reader is not threading.current_thread() and reader.is_alive() and time.monotonic() < give_up:
+            if self._drained.wait(0.02):  # a reader that ends reads no more
+                break
         self._drained.set()
         self._bury()
 
     def _sign(self) -> None:
         assert self.process.stdin is not None
         try:
-            self.process.stdin.write(b".")
+            self.process.stdin.write(_ALIVE)
         except (OSError, ValueError):
             if self.process.wait() != _LINE_GONE:  # which the reading thread will find, and tell
                 self._ended()
@@ -166,14 +175,17 @@ def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace
     for number in (line, signs, out):
         os.set_blocking(number, False)
     parent, alive, due, heard, waiting = os.getppid(), time.monotonic(), time.monotonic(), Heard(tick), b""
+    quiet = False
     while True:
         reading, writing = [signs, line], [out] if waiting else []
         ready = select.select(reading, writing, [], max(0.0, due - time.monotonic()))[0]
         if signs in ready:
-            if not _newest(signs):
+            told = _told(signs)
+            if not told:
                 _pass_on(out, waiting, blocking=True)
                 return
-            alive = time.monotonic()
+            alive, last = time.monotonic(), told.replace(_ALIVE, b"")[-1:]
+            quiet = last == _QUIET if last else quiet
         if line in ready:
             data = _arrived(line)
             heard.feed(data)
@@ -183,15 +195,16 @@ def keep_beating(line: int, boot_id: int, tick: int, signs: int, out: int, grace
         if os.getppid() != parent or now - alive > grace:  # another process may hold the pipe open
             return
         if now >= due:
-            _write(line, closed(Frame(HEARTBEAT, 0, struct.pack("<II", boot_id, heard.tick))))
+            if not quiet:
+                _write(line, closed(Frame(HEARTBEAT, 0, struct.pack("<II", boot_id, heard.tick))))
             due = max(due + BEAT, now)
 
 
-def _newest(signs: int) -> bool:
-    """Whether there was a sign of life; False at the end of its pipe."""
+def _told(signs: int) -> bytes:
+    """What the host has written to its pipe, where there is something to read; empty at its end."""
     with contextlib.suppress(BlockingIOError):
-        return bool(os.read(signs, 4096))
-    return True
+        return os.read(signs, 4096)
+    return _ALIVE
 
 
 def _arrived(line: int) -> bytes:

@@ -77,7 +77,12 @@ class Link:
         self._heart: HelperHeart | ThreadHeart | None = None
         self._arrivals = Arrivals(port)
         self._reader = threading.Thread(target=self._read, daemon=True)
-        self.write(b"\0")
+        self._quiet = False  # no heartbeats, until an ESTOP is acknowledged
+        try:
+            self.write(b"\0")
+        except DeviceError:
+            port.close()
+            raise
         self._reader.start()
 
     @property
@@ -88,6 +93,7 @@ class Link:
     def request(self, message: Message) -> Message:
         """The answer to a request. Raises `RefusalError` or `DeviceError`, each with one sentence."""
         if isinstance(message, protocol.Estop) and not self.lost:
+            self._hush(True)  # should the line lose every ESTOP, the device's watchdog ends its force
             self.shout(message)
         if isinstance(message, protocol.Stop | protocol.Estop) and self.lost:
             raise DeviceError(failures.urgent(self.lost, name_of(type(message)), self.shout(message)))
@@ -100,19 +106,24 @@ class Link:
             except WireError as error:
                 raise InputError(f"{error}; send numbers that fit.") from error
             kind = type(message)
-            answer = self._ask(frame, (self._seq, code_of(kind), _ANSWER.get(kind, Ack)))
-            if answer is None:
-                raise DeviceError(self._unanswered(kind))
+            try:
+                answer = self._ask(frame, (self._seq, code_of(kind), _ANSWER.get(kind, Ack)))
+                if answer is None:
+                    raise DeviceError(self._unanswered(kind))
+            except BaseException:
+                if kind in (protocol.Start, protocol.Drive):
+                    self.shout(protocol.Stop())  # it may move
+                raise
         if isinstance(answer, Nack):
             raise self._refusal(answer, name_of(kind))
+        if kind is protocol.Estop:
+            self._hush(False)
         return answer
 
     def _unanswered(self, kind: type) -> str:
-        """Why, in a sentence. A device that does not answer is left without heartbeats, and a motion is stopped."""
+        """Why, in a sentence. A device that does not answer is left without heartbeats."""
         foreign = bool(self._receiver.dropped) and self.boot_id is None
         why = failures.silent(self.name, name_of(kind), self.tries, received=self.received > 0, foreign=foreign)
-        if kind in (protocol.Start, protocol.Drive):
-            self.shout(protocol.Stop())
         if self.boot_id is None:
             return why
         self.faint = self.faint or failures.deserted(why)
@@ -175,7 +186,9 @@ class Link:
             raise DeviceError(f"The process that sends heartbeats cannot be started: {error}.") from error
         finally:
             self._arrivals.resume(self._heart if isinstance(self._heart, HelperHeart) else None)
-        if self.lost:  # meanwhile
+        if self._quiet:  # meanwhile, as below
+            self._hush(True)
+        if self.lost:
             self._end_beats()
 
     def _end_beats(self) -> None:
@@ -197,9 +210,16 @@ class Link:
             self.beat(boot_id)
 
     def heartbeat(self) -> None:
-        """One heartbeat, now, if the device is known."""
-        if self.boot_id is not None:
+        """One heartbeat, now, if the device is known and no ESTOP waits for its answer."""
+        if self.boot_id is not None and not self._quiet:
             self.write(protocol.encode(protocol.Heartbeat(boot_id=self.boot_id, tick=self.heard.tick), 0))
+
+    def _hush(self, quiet: bool) -> None:
+        """Stop the heartbeats at once, or go on with them."""
+        with self._news:
+            self._quiet, heart = quiet, self._heart
+        if isinstance(heart, HelperHeart):
+            heart.hush(quiet)
 
     @property
     def ours(self) -> bool:

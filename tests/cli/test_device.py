@@ -233,6 +233,13 @@ def test_feel_with_keys_from_a_pipe(device, sets, monkeypatch):
     assert "STOPPED" in stderr
 
 
+def test_feel_starts_when_the_handle_has_left_the_surface(device, sets, monkeypatch):
+    """The start is asked for once, with the handle in the material."""
+    monkeypatch.setattr(sys, "stdin", io.StringIO("1 111111"))
+    code, stdout, _ = device("feel", sets, "--json", *FAST, "--sim", "finger=tap")
+    assert (code, json.loads(stdout)["state"]) == (0, "RUNNING"), stdout
+
+
 def test_feel_takes_as_many_sets_as_there_are_keys(device, sets):
     rows = "".join(f"s{n},1,2,0.5\n" for n in range(10))
     sets.write_text(f"set_id,K1,B1,alpha\n{rows}")

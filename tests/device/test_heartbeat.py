@@ -167,6 +167,24 @@ def test_a_heartbeat_has_the_newest_tick_that_came_back():
             assert helper.beat() == (7, tick)
 
 
+def test_a_hushed_helper_reads_on_and_beats_no_more():
+    with Helper() as helper:
+        helper.beat()
+        os.write(helper.signs, b".-.")
+        time.sleep(2 * heartbeat.BEAT)
+        helper.line.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            helper.receiver.feed(helper.line.recv(1000))
+        time.sleep(4 * heartbeat.BEAT)
+        with pytest.raises(BlockingIOError):
+            helper.line.recv(1000)
+        helper.line.sendall(b"heard")
+        helper.line.setblocking(True)
+        assert os.read(helper.out, 100) == b"heard"
+        os.write(helper.signs, b"+")
+        helper.beat()
+
+
 def test_the_helper_knows_the_types_of_the_protocol():
     assert code_of(Heartbeat) == heartbeat.HEARTBEAT
     first = {code for code, kind in MESSAGES.items() if fields(kind) and fields(kind)[0].name == "tick"}

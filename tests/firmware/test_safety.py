@@ -292,6 +292,16 @@ def test_a_hardware_stop_is_an_estop_of_its_own_cause(pressed):
     assert pressed.state == "STOPPED"
 
 
+def test_each_opening_of_the_hardware_stop_is_a_stop_of_its_own(pressed):
+    press = pressed.lib.shim_tick_of_board
+    press(pressed.memory, 300, 0, 1)
+    press(pressed.memory, 300, 0, 0)
+    clear = pressed.packed("CLEAR", boot_id=7)  # of the first opening
+    press(pressed.memory, 300, 0, 1)
+    press(pressed.memory, 300, 0, 0)
+    assert pressed.refusal("CLEAR", clear) == "STALE" and pressed.state == "ESTOP"
+
+
 def test_a_tick_later_than_the_device_s_delay_holds():
     device = Device(delay_us=300)
     staged = device.stage(SET)  # needs 1.0 N.s/m at this delay, which 256 frequencies tell
@@ -346,6 +356,49 @@ def test_a_device_that_is_not_homed_renders_nothing():
     assert device.confirm("START", staged)[0] == "ACK"
     forces, _ = device.run(7000 + np.linspace(0, 300, 300))
     assert not np.any(forces[:99]) and np.all(forces[110:] > 0)
+
+
+def incremental():
+    """A device that waits for HOME."""
+    device = Device()
+    device.config["capabilities"] = 11
+    device.boot(7)
+    device.hello()
+    device.tick(0)
+    return device
+
+
+def test_a_home_acts_once():
+    """Again, after another request and a move of the handle, it would hide that the handle is in the material."""
+    device = incremental()
+    home = device.packed("HOME", boot_id=7, position_mm=0.0)
+    assert device.ask("HOME", home)[0] == "ACK"
+    device.must("STREAM", divisor=0, fields=0)
+    device.run(np.linspace(0, 500, 100))
+    assert device.refusal("HOME", home) == "STALE" and device.status()["contact"] == 1
+
+
+@pytest.mark.parametrize("end", [-20.0, 60.0])
+def test_a_home_at_the_end_of_the_stroke_is_within_it(end):
+    """The nearest count may be outside, where every position would be bad input."""
+    device = incremental()
+    device.must("HOME", boot_id=7, position_mm=end)
+    device.run([0] * 5)
+    assert device.status()["input_held"] == 0
+    assert device.status()["position_mm"] == pytest.approx(end, abs=STEP)
+
+
+def test_a_lost_input_ends_the_knowledge_of_the_surface():
+    device = incremental()
+    device.must("HOME", boot_id=7, position_mm=-1.0)
+    for _ in range(5):
+        device.tick(0, valid=False)
+    device.tick(0)
+    assert device.status()["flags"] == 0
+    absolute = Device()
+    for _ in range(5):
+        absolute.tick(0, valid=False)
+    assert absolute.status()["flags"] == 1
 
 
 @pytest.mark.parametrize("changes", [1, 2])

@@ -14,6 +14,7 @@ import tty
 from collections import deque
 
 from hilbo.device import protocol
+from hilbo.device.frames import opened
 
 __all__ = ["SlowLine"]
 
@@ -21,11 +22,13 @@ __all__ = ["SlowLine"]
 class SlowLine:
     """`with SlowLine(pty) as line:` - `line.where` is the address for a host; `line.delay` is in s, each way.
 
-    `deaf` until so many seconds from now: what either side says before that is lost, as by a board that starts.
+    Until `deaf_until` (monotonic, s) what either side sends is lost, as by a board that starts. `lose` is a class of
+    requests that never arrive; a host writes whole frames.
     """
 
     def __init__(self, pty: str):
         self.delay, self.deaf_until = 0.0, 0.0
+        self.lose: type | None = None
         self.samples: list[tuple[int, float, int]] = []  # tick, force (N), flags
         self._file = os.open(pty, os.O_RDWR | os.O_NOCTTY)
         tty.setraw(self._file, termios.TCSANOW)
@@ -72,7 +75,7 @@ class SlowLine:
                     data = host.recv(4096)
                     if not data:
                         return
-                    ways[0].append((now + self.delay, data))
+                    ways[0].append((now + self.delay, self._kept(data)))
                 with contextlib.suppress(BlockingIOError):
                     data = os.read(self._file, 4096)
                     self._see(data)
@@ -85,6 +88,13 @@ class SlowLine:
                 _, data = way.popleft()
                 if time.monotonic() >= self.deaf_until:
                     send(data)
+
+    def _kept(self, data: bytes) -> bytes:
+        """The bytes of a host without the requests that are lost."""
+        if self.lose is None:
+            return data
+        frames = [part for part in data.split(b"\0") if part]
+        return b"".join(part + b"\0" for part in frames if opened(part).type != protocol.code_of(self.lose))
 
     def _see(self, data: bytes) -> None:
         for frame in self._receiver.feed(data):
