@@ -125,11 +125,16 @@ def is_passive(
     memory: Memory = "short",
     delay: Real[ArrayLike, "..."] = 0.0,
 ) -> Bool[Array, "..."]:
-    """Whether the rendering is passive on a device with damping `b` (N·s/m) and this `delay` (s); elementwise.
+    """Whether the rendering is passive on a device with damping `b` (N·s/m) at every delay of the force from 0 to
+    `delay` (s), as a device checks its sets; elementwise.
 
-    Passive with one delay does not mean passive with a shorter one: the needed damping first falls with the delay.
+    The needed damping first falls with the delay and then rises, so that both ends cover all between.
     """
-    return minimum_damping(K1, B1, alpha, K_eff, N, T, memory=memory, delay=delay) <= jnp.asarray(b)
+    place = K1, B1, alpha, K_eff, N, T
+    passive = minimum_damping(*place, memory=memory) <= jnp.asarray(b)
+    if not check_delay(delay, T):
+        return passive
+    return passive & (minimum_damping(*place, memory=memory, delay=delay) <= jnp.asarray(b))
 
 
 def largest_K1_beside(model: FOSLS, b: float, *, delay: float = 0.0) -> float:

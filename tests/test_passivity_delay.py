@@ -11,6 +11,7 @@ from scipy.stats import qmc
 from hilbo import passivity, viscoelastic
 from hilbo.errors import InputError
 from hilbo.mechanics.delay import least_damping
+from hilbo.report.passivity import passivity_result
 from hilbo.viscoelastic import FOSLS
 
 T = 1e-3
@@ -148,6 +149,16 @@ def test_is_passive_knows_damping_and_delay():
     K1, B1, alpha = np.array(SETS).T
     passive = [passivity.is_passive(K1, B1, alpha, 0.95, delay=delay).tolist() for delay in (0.0, 105e-6, 271e-6)]
     assert passive == [[True, True, False], [True, True, False], [False, True, False]]
+
+
+def test_passive_at_a_delay_means_at_every_shorter_one():
+    """The identified set needs 0.915 N·s/m without delay, and 0.882 at 50 µs."""
+    K1, B1, alpha = SETS[0]
+    assert not passivity.is_passive(K1, B1, alpha, 0.9, delay=50e-6)
+    content = passivity_result(host_model(K1, B1, alpha), 0.9, 50e-6)
+    assert content["status"] == "violated" and content["binding_delay"] == 0
+    assert content["largest_K1"] == pytest.approx(float(passivity.largest_K1(B1, alpha, 0.9)))
+    assert passivity_result(host_model(K1, B1, alpha), 0.95, 271e-6)["binding_delay"] == 271e-6
 
 
 def test_no_k1_is_given_on_a_device_that_hardly_holds_the_spring():

@@ -77,9 +77,14 @@ def delayed_damping(
     delay: Float[Array, ""],
 ) -> Float[Array, ""]:
     """b_min, N·s/m, to a relative `ESTIMATED`; inf where `K_eff` < 0, NaN for a `delay` above T."""
-    lag = jnp.where(delay <= T, delay / T, jnp.nan)
+    lag = _lag(delay, T)
     need, _ = largest_need(span, K1, pot_stiffness(B1, alpha, T), alpha, K_eff, lag)
     return jnp.where(K_eff < 0, jnp.inf, 500 * T * need)
+
+
+def _lag(delay: Float[Array, ""], T: Float[Array, ""]) -> Float[Array, ""]:
+    """σ, NaN for a delay above T."""
+    return jnp.where(delay <= T, delay / T, jnp.nan)
 
 
 def largest_need(
@@ -111,7 +116,7 @@ def delayed_largest_K1(
 ) -> Float[Array, ""]:
     """K1max, N/mm, which needs between b·(1 - 2·SAFE) and b; inf where every K1 is passive, 0 where b is below
     `least_damping`. First derivatives are exact, second ones are those at the binding frequency."""
-    lag = jnp.where(delay <= T, delay / T, jnp.nan)
+    lag = _lag(delay, T)
     Y, beta, order = b / (500 * T) * (1 - SAFE), pot_stiffness(B1, alpha, T), _order(span, alpha)
     impossible = (clear_of_spring(K_eff, lag) > Y) | (K_eff < 0)
     K1, angle, unlimited = _solved(span, ~impossible, *jax.lax.stop_gradient((beta, alpha, Y, K_eff, lag)))

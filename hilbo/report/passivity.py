@@ -10,11 +10,19 @@ __all__ = ["passivity_result", "passivity_words"]
 
 
 def passivity_result(model: FOSLS, b: float, delay: float = 0.0) -> dict[str, Any]:
-    """Status and margin by certificate, binding frequency, largest K1, a witness; `delay` of the force in s."""
-    certificate = passivity.certify(model, b, delay=delay)
+    """Status and margin by certificate, binding frequency, largest K1, a witness.
+
+    For every delay of the force up to `delay` (s), as a device checks its sets and a study its space: the needed
+    damping first falls with the delay and then rises, so that it is largest either without delay or at `delay`:
+    `binding_delay`.
+    """
+    delays = (0.0, delay) if delay else (0.0,)
+    certificate, binding = min(
+        ((passivity.certify(model, b, delay=each), each) for each in delays), key=lambda pair: float(pair[0].lower)
+    )
     status, K_eff, largest = certificate.status, float(certificate.static_stiffness), None
     if model.memory == "full" or model.N % 2 == 1:
-        largest = passivity.largest_K1_beside(model, b, delay=delay)
+        largest = min(passivity.largest_K1_beside(model, b, delay=each) for each in delays)
     content: dict[str, Any] = {
         "status": status,
         "margin": [float(certificate.lower), float(certificate.upper)],
@@ -29,8 +37,9 @@ def passivity_result(model: FOSLS, b: float, delay: float = 0.0) -> dict[str, An
         "N": model.N if model.memory == "short" else None,
         "T": model.T,
         "delay": delay,
+        "binding_delay": binding,
     }
-    if status == "violated" and (cycle := passivity.witness(model, b, delay=delay)) is not None:
+    if status == "violated" and (cycle := passivity.witness(model, b, delay=binding)) is not None:
         content["witness"] = {"frequency": cycle.frequency / (2 * math.pi), "energy_per_cycle": cycle.energy}
     return content
 
@@ -41,11 +50,12 @@ def passivity_words(content: dict[str, Any]) -> str:
     if K_eff < 0:
         return f"violated: the static stiffness H(1) = {K_eff:.4g} N/mm is negative, which no damping makes good."
     margin = content["margin"][0] if content["margin"][0] > 0 else content["margin"][1]
-    late = f" at a delay of {1e6 * content['delay']:g} µs" if content["delay"] else ""
+    late = f" at delays up to {1e6 * content['delay']:g} µs" if content["delay"] else ""
+    at = f" at a delay of {1e6 * content['binding_delay']:g} µs" if content["delay"] else ""
     words = (
         f"{content['status']}{late}: the device has {b:g} N·s/m, {abs(margin):.4g} {'more' if margin > 0 else 'less'}"
         f" than the {content['minimum_damping']:.5g} N·s/m that the set needs;"
-        f" {content['binding_frequency']:.4g} Hz binds."
+        f" {content['binding_frequency']:.4g} Hz{at} binds."
     )
     largest, cycle = content["largest_K1"], content.get("witness")
     if largest is not None:

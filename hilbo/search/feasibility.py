@@ -9,7 +9,6 @@ The search keeps `SEARCH_MARGIN` away from the device's damping, so that a devic
 float32 never refuses a proposal.
 """
 
-import dataclasses
 import functools
 import math
 from collections.abc import Mapping
@@ -37,7 +36,6 @@ __all__ = [
     "largest_K1",
     "minimum_damping",
     "passive",
-    "passive_on_device",
 ]
 
 SEARCH_MARGIN = 1e-3
@@ -65,12 +63,6 @@ def passive(m: Mechanics, physical: _Physical) -> Bool[Array, "..."]:
     b = m.damping * (1 - SEARCH_MARGIN)
     enough = minimum_damping(m, physical) <= b * (1 + _slack(physical))
     return enough if m.delay == 0 else enough & (least_damping(m.K_eff, m.T, m.delay) <= b)
-
-
-def passive_on_device(m: Mechanics, physical: _Physical, damping: float, delay: float) -> Bool[Array, "..."]:
-    """Whether parameter sets of a study are passive on a device that reports this damping (N·s/m) and delay (s),
-    whatever the study counts on. Raises `InputError` for a delay that is not from 0 to T."""
-    return minimum_damping(dataclasses.replace(m, delay=delay), physical) <= jnp.asarray(damping)
 
 
 def _slack(physical: _Physical) -> float:

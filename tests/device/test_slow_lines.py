@@ -44,7 +44,7 @@ def pressed(line, **options) -> Renderer:
 
 @pytest.mark.parametrize("delay", [0.0, 0.05, 0.2, 2.0])
 def test_estop_acts_within_the_watchdog_whatever_the_delay(line, delay):
-    with contextlib.suppress(DeviceError), pressed(line) as device:
+    with contextlib.suppress(DeviceError), pressed(line):
         line.delay = delay
         asked = line.tick
         threading.Thread(target=device.link.shout, args=(Estop(),)).start()
@@ -56,7 +56,7 @@ def test_estop_acts_within_the_watchdog_whatever_the_delay(line, delay):
 
 def test_estop_ends_force_where_the_line_loses_every_estop(line):
     """Heartbeats end with the request, so that the device lets go by itself; 3,245 ticks were measured before."""
-    with contextlib.suppress(DeviceError), pressed(line) as device:
+    with contextlib.suppress(DeviceError), pressed(line):
         line.lose = protocol.Estop
         asked = line.tick
         stopping = threading.Thread(target=unanswered, args=(device.estop,))
@@ -74,7 +74,7 @@ def unanswered(ask):
 
 
 def test_a_delay_that_grows_ends_force_before_anybody_asks(line):
-    with contextlib.suppress(DeviceError), pressed(line) as device:
+    with contextlib.suppress(DeviceError), pressed(line):
         begun = time.monotonic()
         while (passed := time.monotonic() - begun) < 3:
             line.delay = passed  # grows by a second a second, so that half of all that was sent is on its way

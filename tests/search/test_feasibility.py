@@ -4,10 +4,8 @@ import dataclasses
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from hilbo import passivity
-from hilbo.errors import InputError
 from hilbo.mechanics.delay import least_damping
 from hilbo.search.box import Mechanics, Parameter
 from hilbo.search.columns import Columns
@@ -18,7 +16,6 @@ from hilbo.search.feasibility import (
     allowed,
     largest_K1,
     minimum_damping,
-    passive_on_device,
 )
 from hilbo.viscoelastic import FOSLS
 
@@ -71,16 +68,6 @@ def test_columns_end_where_a_late_set_is_passive_with_the_margin():
     at_end = held & (shares[:, 0] == 1) & (np.asarray(K1) < 32)
     np.testing.assert_allclose(needed[at_end], 0.95 * (1 - SEARCH_MARGIN), rtol=2e-5)
     assert np.any(np.asarray(K1) * 1.01 < np.asarray(largest_K1(dataclasses.replace(LATE, delay=0.0), B1, alpha)))
-
-
-def test_a_device_that_reports_a_delay_is_asked_for_each_set():
-    physical = {"K1": np.array([5.70, 5.58]), "B1": np.array([5.89, 7.88]), "alpha": np.array([0.203, 0.176])}
-    study = Mechanics(K_eff=0.44, damping=0.95)
-    assert passive_on_device(study, physical, 0.95, 0.0).tolist() == [True, True]
-    assert passive_on_device(study, physical, 0.95, 271e-6).tolist() == [False, True]
-    assert passive_on_device(LATE, physical, 1.2, 271e-6).tolist() == [True, True]
-    with pytest.raises(InputError, match="delay"):
-        passive_on_device(study, physical, 0.95, 2e-3)
 
 
 def test_no_set_is_allowed_on_a_device_that_hardly_holds_the_spring():
