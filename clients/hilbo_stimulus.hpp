@@ -359,7 +359,7 @@ public:
   // What the last order asked for cannot be shown; the trial is void.
   bool failed(const std::string &why) { return say("failed", Texts(), why.substr(0, 500)); }
 
-  // What was presented is over, because a device has stopped by itself: the trial is void, and this program begins anew.
+  // Report that a device has stopped by itself: the trial is void, and this program registers again.
   void begin_again(const std::string &why) { lost(why); }
 
   // Go neutral, and leave.

@@ -185,7 +185,7 @@ class Stimulus:
         return self._say(self._handed, "failed", why=why[:500])
 
     def begin_again(self, why: str) -> None:
-        """What was presented is over, because a device has stopped by itself: the trial is void; this begins anew."""
+        """Report that a device has stopped by itself: the trial is void, and the program registers again."""
         self._lost(why)
 
     def close(self) -> None:

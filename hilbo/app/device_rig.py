@@ -78,8 +78,8 @@ class DeviceRig:
         return loaded
 
     async def show(self, showing: Showing) -> None:
-        """The set in force, from now on, once nobody presses; nothing where it is rendered already. The reference is no
-        business of ours."""
+        """The set in force, from now on, once nobody presses; nothing where it is rendered already. The reference
+        is not rendered here."""
         if showing.step == 0:
             self._counter.begin((showing.trial, showing.presentation))
         if showing.values is None:

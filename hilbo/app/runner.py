@@ -200,12 +200,12 @@ class Runner:
         wait = _HAND
         while not (await asyncio.wait([work], timeout=wait))[0]:
             touched, now = self.hub.rig.snapshot.contact, time.monotonic()
-            if touched:
-                self._asked = self._asked or now
-                if now - self._asked > _LEAVES:
-                    raise HandError(
-                        f"The hand did not leave the device within {_LEAVES:g} s; the trial waits for Begin."
-                    )
+            self._asked = (self._asked or now) if touched else None
+            if self._asked is not None and now - self._asked > _LEAVES:
+                raise HandError(
+                    f"The participant did not release the device within {_LEAVES:g} s; the trial restarts after Begin"
+                    " is pressed."
+                )
             stage = "let-go" if touched else "showing"
             if self.stage != stage:
                 self._at(stage)

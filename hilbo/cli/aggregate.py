@@ -137,10 +137,7 @@ def read_cohort(trials: Path, study: Path, material: str | None, say: Any) -> tu
         table = read_log_trials(trials, whole, material, others=False, note=remark)
     else:
         table = read_trials(trials, chosen, material, others=False, say=lambda rows: say("rows read", rows))
-    sentences = flag_sentences_of(table, chosen.exclude_flags)
-    for sentence in sentences:
-        remark(sentence)
-    return chosen, cohort_of(table, chosen), sentences
+    return chosen, cohort_of(table, chosen), flag_sentences_of(table, chosen.exclude_flags)
 
 
 def _only_material(trials: Path, study: Any) -> str | None:

@@ -1,6 +1,6 @@
-"""`hilbo device home` and `hilbo device commission`: a device that is new, and what only a person at it can see.
+"""`hilbo device home` and `hilbo device commission`: commissioning of a new device, with a person at the handle.
 
-What a person is asked stands on stderr. Exit codes as in `device`, which gives these commands their place.
+Prompts go to stderr. Exit codes are those of `hilbo.cli.device`, which registers these commands.
 """
 
 import sys
@@ -22,10 +22,10 @@ PHRASE = "no hand is on the handle"
 @takes(line=Line)
 def home(
     line: Line,
-    position: Annotated[float, typer.Option(help="Where the handle stands now, mm; 0 is the surface.")],
+    position: Annotated[float, typer.Option(help="Current position of the handle, mm; 0 is the surface.")],
     as_json: JsonToo = False,
 ) -> None:
-    """Tell a device without an absolute encoder where its handle stands. Positions count from there."""
+    """Set the current position of a device without an absolute encoder (homing)."""
     with opened(line) as device:
         device.home(position)
         position = device.status().position_mm
@@ -37,16 +37,23 @@ def commission(
     line: Line,
     out: Annotated[Path, typer.Option("--out", help="C header to write.")] = Path("hilbo_device_config.h"),
     base: Annotated[
-        Path | None, typer.Option("--base", help="Header that the device was built with; else a new one is written.")
+        Path | None,
+        typer.Option(
+            "--base", help="Header that the device was built with, to be updated. Default: write a new header."
+        ),
     ] = None,
     no_hand: Annotated[
         str | None, typer.Option("--no-hand-on-the-handle", help=f'For scripts: exactly "{PHRASE}".')
     ] = None,
     encoder_checked: Annotated[
-        bool, typer.Option("--encoder-checked", help="The encoder is known to count up into the material.")
+        bool,
+        typer.Option(
+            "--encoder-checked",
+            help="The encoder sign has been checked by hand (position increases into the material).",
+        ),
     ] = False,
     position: Annotated[
-        float | None, typer.Option("--position", help="For scripts: where the handle stands at the start, mm.")
+        float | None, typer.Option("--position", help="For scripts: position of the handle at the start, mm.")
     ] = None,
     first_force: Annotated[float, typer.Option(min=0.01, help="First force of the nudges, N.")] = 0.3,
     most_force: Annotated[float, typer.Option(min=0.01, help="Largest force of the nudges, N.")] = 2.0,
@@ -92,7 +99,7 @@ class _Terminal:
     def place(self, moved_mm: float) -> float:
         _ask("The motor is at rest. Place the handle at the surface, hold it there, and press Enter.")
         if not sys.stdin.readline():
-            raise InputError("Nobody has placed the handle; commission the device again.")
+            raise InputError("The handle was not placed at the surface (end of input); commission the device again.")
         return 0.0
 
 
@@ -139,7 +146,7 @@ def _check_phrase(given: str, what: str) -> None:
 
 def _check_position(device: Any, person: Any) -> None:
     if isinstance(person, _Script) and person.position is None and not device.condition().homed:
-        raise InputError("The device is not homed; say with --position where its handle stands now, mm.")
+        raise InputError("The device is not homed; give the current position of its handle with --position, in mm.")
 
 
 def _ask(words: str) -> None:
@@ -166,7 +173,8 @@ def _content(result: Any, damping: float, delay_us: int) -> dict[str, Any]:
     measured = damping_for(result.friction)
     if measured < 1e-3:
         raise DeviceError(
-            "The measurement does not tell the damping from 0: see that the handle is free, then commission again."
+            "The measured damping is not significantly above 0; make sure that the handle moves freely, then commission"
+            " again."
         )
     return {
         "nudges": [nudge._asdict() for nudge in result.nudges],
@@ -190,7 +198,7 @@ def _header(device: Any, content: dict[str, Any], base: Path | None, text: str |
     if delay["header"] > 1e6 * device.tick_s:
         raise DeviceError(
             f"The longest delay is {delay['longest']} us, and with its margin {delay['header']} us, longer than a tick;"
-            " make the firmware faster, or the ticks fewer."
+            " make the firmware faster, or lower its tick rate."
         )
     about, limits = device.device, device.link.request(protocol.GetLimits())
     if text is not None:
@@ -205,8 +213,8 @@ def _differences(content: dict[str, Any]) -> list[str]:
     damping, delay, sentences = content["damping"], content["delay_us"], []
     if damping["reported"] > damping["lower"]:
         sentences.append(
-            f"the device counts on {damping['reported']:.4g} N.s/m of damping and may have only {damping['lower']:.4g};"
-            " build it with the new header before anybody touches it."
+            f"the device is configured with {damping['reported']:.4g} N.s/m of damping but may have only"
+            f" {damping['lower']:.4g}; rebuild its firmware with the new header before a person touches it."
         )
     if delay["reported"] < delay["header"]:
         sentences.append(

@@ -251,7 +251,7 @@ def _begin(device, wanted) -> None:
     if wanted is not None:
         print(f"in force: {set_words(device.send(**wanted))}", file=sys.stderr)
     if device.status().contact:
-        print("hilbo: let the handle leave the surface; it is rendered from then on", file=sys.stderr)
+        print("hilbo: the handle is in the material; rendering starts when it leaves the surface", file=sys.stderr)
     device.start(wait=_LEAVES)
 
 

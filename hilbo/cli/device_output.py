@@ -13,7 +13,7 @@ def said(name, value) -> str:
 def condition_words(condition) -> str:
     """Homed or not, hardware stop, delay and continuous force of a device (`Condition`), a line each."""
     rows = {
-        "homed": "yes" if condition.homed else "no; `hilbo device home` tells it where its handle is",
+        "homed": "yes" if condition.homed else "no; set its position with `hilbo device home`",
         "hardware stop": "open" if condition.stop_open else "closed",
         "delay": f"sets are checked for {condition.delay_us} us; the longest since its start was"
         f" {condition.longest_delay_us} us",

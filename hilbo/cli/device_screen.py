@@ -179,7 +179,7 @@ def _press(device, view, key, names, sets, felt) -> None:
     elif key == " " and view.start_after is None and device.state() == State.STOPPED:
         view.start_after = device.link.stops
         if device.status().contact:
-            view.words.append("let the handle leave the surface; it is rendered from then on")
+            view.words.append("the handle is in the material; rendering starts when it leaves the surface")
     elif key == " ":
         view.start_after = None
         device.stop()

@@ -333,7 +333,9 @@ def _damping(has: float, needs: float) -> Check:
 
 def _delay(has: float, counted: float) -> Check:
     """The delay for which the device checks sets must be one that the study's search knows of."""
-    words = f"the study counts on at most {1e3 * counted:g} ms, the device checks its sets for {1e3 * has:g} ms"
+    words = (
+        f"the study assumes a delay of at most {1e3 * counted:g} ms; the device checks its sets for {1e3 * has:g} ms"
+    )
     if has > counted + 1e-9:
         return Check("delay", "bad", words, f"write [renderer] delay = {has:g} and plan the study again")
     return Check("delay", "good", words)

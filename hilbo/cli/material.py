@@ -81,6 +81,8 @@ def _model(measured, model, weights, taps, period, memory, instrument) -> Any:
         lag, corner = instrument["lag"], instrument["corner"]
         corner = float("inf") if corner in ("none", "auto") else corner
         return Sampled(taps, period, memory, lag=lag if lag == "fit" else 1e-3 * lag, corner=corner)
+    if instrument != {"lag": "fit", "corner": "auto"}:
+        raise InputError("--lag and --corner are for tests with a force; a table of moduli has neither lag nor filter.")
     if model == "fractional-maxwell":
         return FractionalMaxwell(weights or "relative")
     return Continuous(weights or "range")
@@ -93,7 +95,9 @@ def passivity(
     K0: Annotated[float | None, typer.Option("--K0", help="N/mm; else from --K-eff.")] = None,
     K_eff: Annotated[float | None, typer.Option("--K-eff", help="Effective stiffness H(1), N/mm.")] = None,
     damping: Annotated[float | None, typer.Option(help="Damping b of the device, N.s/m.")] = None,
-    delay: Annotated[float | None, typer.Option(help="From a sample of the position to its force, s.")] = None,
+    delay: Annotated[
+        float | None, typer.Option(help="Delay from the sample of the position to the output of its force, s.")
+    ] = None,
     taps: Annotated[int | None, typer.Option("--N", min=1, help="Past samples of the rendering.")] = None,
     period: Annotated[float | None, typer.Option("--T", help="Sampling time, s.")] = None,
     memory: Annotated[str | None, typer.Option(help='"short" (N samples) or "full".')] = None,

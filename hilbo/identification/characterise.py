@@ -88,14 +88,16 @@ def _fitted(
     tests: Sequence[Test], model: Any, say: Callable[[str], None], find_filter: bool
 ) -> tuple[Fit, intervals.Intervals]:
     """The best fit and its intervals, with what of the instrument can be fitted."""
-    instrument = isinstance(model, Sampled) and model.lag == "fit"
-    if instrument and not can_be_timed(tests):
+    timed = isinstance(model, Sampled) and can_be_timed(tests)
+    if isinstance(model, Sampled) and model.lag == "fit" and not timed:
         model = Sampled(model.N, model.T, model.memory, lag=0.0, corner=model.corner)
-        instrument = False
     best_fit = fit(tests, model)
-    if instrument and find_filter and model.corner == np.inf and filter_score(best_fit) > _FILTERED:
-        say("a filter of the force")
-        best_fit = fit(tests, Sampled(model.N, model.T, model.memory, lag="fit", corner="fit"))
+    if timed and find_filter and model.corner == np.inf:
+        # With a lag that is given the fit may be too far off for the score, whose fit a free lag brings near.
+        near = best_fit if model.lag == "fit" else fit(tests, Sampled(model.N, model.T, model.memory, lag="fit"))
+        if filter_score(near) > _FILTERED:
+            say("a filter of the force")
+            best_fit = fit(tests, Sampled(model.N, model.T, model.memory, lag=model.lag, corner="fit"))
     say("profile intervals")
     sides = intervals.profile_intervals(best_fit)
     for _ in range(_RESTARTS):

@@ -1,4 +1,4 @@
-"""Commissioning: a device whose signs nobody has checked is tested with little energy, homed and measured.
+"""Commissioning: a device with unchecked signs is tested at low energy, homed and measured.
 
 The order is the order of trust. With the motor at rest a person pushes the handle in, which gives the encoder's sign.
 Nudges (DRIVE, shape 3) then give the motor's: a force that ends by itself when the handle has moved, bounded by
@@ -33,7 +33,7 @@ _MARGIN, _LEAST_MARGIN, _ROUND = 0.25, 50, 10  # share, µs, µs
 
 @runtime_checkable
 class Person(Protocol):
-    """Who stands at the device; each method returns once the person, or a script in their place, has done as asked."""
+    """The person at the device; each method returns once the person, or a script, has done what was requested."""
 
     def encoder_checked(self) -> bool:
         """Whether the encoder is known to count up into the material; else the person is now asked to push it in."""
@@ -193,8 +193,9 @@ def _first_that_moves(device: Renderer, say: Callable[[str], None], bounds: Boun
             " device's header, then commission again."
         )
     raise DeviceError(
-        f"{device.link.name}: nothing moves {way} up to {forces[-1]:.2g} N; check the motor's supply, the amplifier's"
-        " enable and the encoder's cable, move the handle off its mechanical stop, or allow more with --most-force."
+        f"{device.link.name}: the handle did not move {way} at up to {forces[-1]:.2g} N; check the motor's supply, the"
+        " amplifier's enable and the encoder's cable, move the handle off its mechanical stop, or allow more with"
+        " --most-force."
     )
 
 

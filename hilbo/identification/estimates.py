@@ -1,4 +1,4 @@
-"""What a fit says of one parameter: a value, an interval, and whether the digits mean something."""
+"""Estimate of one parameter: its value, interval, and whether the data identify it."""
 
 from typing import NamedTuple
 

@@ -49,7 +49,7 @@ class Interval(NamedTuple):
 
 
 class Friction(NamedTuple):
-    """What keeps a free device from moving; `residual` (N) is the standard deviation of what is left of the sweeps.
+    """The friction of a free device; `residual` (N) is the standard deviation of the residuals of the sweeps.
 
     `law` is one of `friction_laws.LAWS`, `added` the further term of the second (N·s²/m²) or third (N), whose v_s is
     `speed` (mm/s). The interval of the damping holds those of all laws that fit about as well.

@@ -8,6 +8,7 @@ signal is taken as a straight line, for which all of them are exact:
     x(t + s)  = x + s·z·Δ (s >= 0),  x + s·Δ (s < 0),      Δ_n = x_n - x_{n-1},  |s| <= 1 sample
     A x       = x - g/(1 - e/z)·Δ,                          e = exp(-T/τ),  g = (1 - e)·τ/T
     A⁻¹ F     = F + g/((1 - g) + (g - e)/z)·Δ
+    (A x)(t - f) = x - (f + τ·(1 - E)/T + E·g/(z - e))·Δ,   E = exp(-(T - f)/τ), 0 <= f < T
 
 They act on the input of a curve, the position or the force of a creep test. Where its changes Δ do not stand clear of
 its noise, they are those of a smoothed input (`without_noise`). A shift of a fraction of a sample averages two samples,
@@ -98,14 +99,24 @@ def multiplier(
 
     `z` (w,): points of the plane at which the transforms are known -> (w,), without unit. `tau` None: no filter.
     """
-    m = _shift(-lag if on_position else lag, z)
     if tau is None:
-        return m
-    e, g = (value.astype(z.dtype) for value in (jnp.exp(-1 / tau), tau * (1 - jnp.exp(-1 / tau))))
+        return _shift(-lag if on_position else lag, z)
     if on_position:
-        return m - (g + g * (1 - 1 / z) * m) / (1 - e / z)
+        return _late_filter(lag, tau, z)
+    m = _shift(lag, z)
+    e, g = (value.astype(z.dtype) for value in (jnp.exp(-1 / tau), tau * (1 - jnp.exp(-1 / tau))))
     inverse = g / ((1 - g) + (g - e) / z)
     return m + inverse * (1 + (1 - 1 / z) * m)
+
+
+def _late_filter(lag: Float[Array, ""], tau: Float[Array, ""], z: Complex[Array, " w"]) -> Complex[Array, " w"]:
+    """The multiplier of A x at a time `lag` samples earlier, exact also within a sample: lag and filter do not act one
+    after the other, because the shifted signal is bent between samples."""
+    whole = jnp.clip(jnp.floor(lag), -LARGEST_LAG, LARGEST_LAG - 1)
+    part, m = lag - whole, _shift(-whole, z)
+    e, g, decay = jnp.exp(-1 / tau), tau * (1 - jnp.exp(-1 / tau)), jnp.exp((part - 1) / tau)
+    at_part, from_before, e = (value.astype(z.dtype) for value in (part + tau * (1 - decay), decay * g, e))
+    return m - (1 + (1 - 1 / z) * m) * (at_part + from_before / (z - e))
 
 
 def _shift(s: Float[Array, ""], z: Complex[Array, " w"]) -> Complex[Array, " w"]:

@@ -32,7 +32,16 @@ from hilbo.identification.rounding import variance_of_rounding
 from hilbo.numerics.least_squares import Solution, least_squares, solve_symmetric
 from hilbo.numerics.tracing import program
 
-__all__ = ["Intervals", "Spread", "block_bootstrap", "inverse_of_free", "profile_intervals", "refits", "spread"]
+__all__ = [
+    "FEWEST_REPEATS",
+    "Intervals",
+    "Spread",
+    "block_bootstrap",
+    "inverse_of_free",
+    "profile_intervals",
+    "refits",
+    "spread",
+]
 
 FEWEST_REPEATS = 5  # of a test, below which resampling them says nothing
 _CLOSE = 1e-3  # of the half-width, to which an end of an interval is found

@@ -1,4 +1,4 @@
-"""What the residuals of a fit say about the instrument: a filter in the force channel, an input between the rows.
+"""Signs of the instrument in the residuals of a fit: a filter in the force channel, an input between the rows.
 
 Each question is one direction v in which the residuals r would change if the answer were yes. Less what the free
 coordinates can make of it, v' = v - J A⁻¹ Jᵀ v, the score v'ᵀr has the variance v'ᵀ Γ v' under the noise of the fit,

@@ -32,6 +32,7 @@ from hilbo.identification.screening import screened, separate
 __all__ = ["Sampled"]
 
 _TAPS = 1024
+_ROUNDING = 1e-9  # of a bound: a fit that ends there may lie beyond it once it is in s and Hz
 _MOST = 2_000_000  # samples of a test; a fit takes 1.3 kB for each, its intervals more
 _LOG_KAPPA = np.log(10.0) * np.arange(-5.0, 3.1, 0.5)
 _LOGIT_ALPHA = np.array([-3.5, -2.2, -1.4, -0.6, 0.0, 0.6, 1.4, 2.2, 3.5, 4.4])
@@ -63,10 +64,10 @@ class Sampled(eqx.Module):
             raise InputError(f"T is {self.T}; it must be a time in s above 0.")
         if any(isinstance(value, str) and value != "fit" for value in (self.lag, self.corner)):
             raise InputError(f'lag and corner are {self.lag!r} and {self.corner!r}; each must be a number or "fit".')
-        if isinstance(self.lag, float) and not abs(self.lag) <= instrument.LARGEST_LAG * self.T:
+        if isinstance(self.lag, float) and not abs(self.lag) <= instrument.LARGEST_LAG * self.T * (1 + _ROUNDING):
             most = 1e3 * instrument.LARGEST_LAG * self.T
             raise InputError(f"The lag is {1e3 * self.lag:g} ms; it must be between -{most:g} and {most:g} ms.")
-        if isinstance(self.corner, float) and not self.corner >= self._corners()[0]:
+        if isinstance(self.corner, float) and not self.corner >= self._corners()[0] * (1 - _ROUNDING):
             raise InputError(f"The corner is {self.corner:g} Hz; it must be {self._corners()[0]:.3g} Hz or more.")
 
     @property
@@ -140,11 +141,13 @@ class Sampled(eqx.Module):
         rows = instrument.without_noise(test.input, clear) if even else test.input
         inputs = between(grid, elapsed, rows, smooth) - offset[:, None]
         length = transform_length(count)
-        damping = circle(length, inputs.dtype) ** -np.arange(count, dtype=inputs.dtype)
+        damping = circle(length, inputs.dtype) ** -np.arange(count + instrument.LARGEST_LAG, dtype=inputs.dtype)
         changes = np.diff(inputs, axis=1, prepend=0.0)
         if not even:
             ends = np.minimum(np.searchsorted(place, np.arange(count)), place.size - 1)  # of each tick's line
             changes = changes * clear[ends]
+        # A position that is late is that of a force which knows more: the input goes on as it ended.
+        changes = np.pad(changes, ((0, 0), (0, instrument.LARGEST_LAG)), mode="edge")
         before = np.minimum(place.astype(int), count - 2)
         regular = bool(place.size == count and np.all(place == np.arange(count)))
         return Curve(
@@ -153,7 +156,7 @@ class Sampled(eqx.Module):
             jnp.asarray(test.output),
             jnp.asarray(offset),
             jnp.asarray(np.full(test.time.size, np.ptp(test.output.mean(axis=0)))),
-            jnp.asarray(np.fft.rfft(inputs * damping, length)),
+            jnp.asarray(np.fft.rfft(inputs * damping[:count], length)),
             jnp.asarray(before),
             jnp.asarray(place - before),
             length,

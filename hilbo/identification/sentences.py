@@ -1,4 +1,4 @@
-"""Sentences about a fit for a person who would otherwise trust the digits: its search, residuals, instrument, rows."""
+"""Warnings about a fit: its search, residuals, instrument and rows."""
 
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -8,7 +8,7 @@ import numpy as np
 from hilbo.identification.beginnings import untared
 from hilbo.identification.estimates import Estimate
 from hilbo.identification.fitting import Fit, Test
-from hilbo.identification.intervals import Intervals, Spread
+from hilbo.identification.intervals import FEWEST_REPEATS, Intervals, Spread
 from hilbo.identification.misfit import is_coarse, moved_between_rows
 from hilbo.identification.residual_noise import DRIFTS
 
@@ -40,7 +40,7 @@ def sentences(
 def _search(best_fit: Fit, sides: Intervals, estimates: dict[str, Estimate]) -> Iterator[str]:
     """What the search did not find."""
     if not bool(best_fit.solution.converged):
-        yield "The fit did not come to an end: the cost is flat in some direction, so no digits are printed."
+        yield "The fit did not converge: the cost is flat in some direction, so no values are printed."
     elif float(sides.lowest) < float(best_fit.solution.cost) * (1 - 1e-4):
         yield "A search for an interval found a better fit than the fit itself; the data have several optima."
     for name, estimate in estimates.items():
@@ -60,11 +60,15 @@ def _residuals(residuals: dict[str, dict[str, Any]]) -> Iterator[str]:
                 " the model misses part of the curve, and the intervals take that as correlated noise."
             )
         if row.get("drift", 1.0) < DRIFTS:
-            bootstrap = " The bootstrap does not contain a drift that all repeats share." if row["repeats"] > 1 else ""
+            bootstrap = (
+                " The bootstrap does not contain a drift that all repeats share."
+                if row["repeats"] >= FEWEST_REPEATS
+                else ""
+            )
             yield (
-                f"The residuals of the {kind} test drift slowly, as a sensor that warms up does, or a curve that the"
-                " model misses: the intervals take them as a random walk, and are uncertain themselves; let the sensor"
-                f" settle and record again.{bootstrap}"
+                f"The residuals of the {kind} test drift slowly: the sensor may have been warming up, or the model"
+                " misses part of the curve. The intervals take the drift as a random walk and are uncertain themselves;"
+                f" let the sensor settle and record again.{bootstrap}"
             )
 
 

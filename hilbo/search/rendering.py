@@ -26,7 +26,7 @@ def margin_of(space: SearchSpace, x: ArrayLike) -> float | None:
 
 
 def delay_words(space: SearchSpace) -> str:
-    """What the delay of the device's force does to the passive part of the box; empty without a delay."""
+    """The passive share of the box with and without the delay of the device's force; empty without a delay."""
     if space.mechanics is None or not space.mechanics.delay:
         return ""
     late, prompt = (100 * each.volume() for each in (space, space.without_delay()))

@@ -338,7 +338,11 @@ def _times(browser):
 def _counts(telemetry: Mapping[str, int]) -> dict[str, int]:
     """Counts of samples. Raises RefusedError for what are none."""
     names, every = set(telemetry), telemetry.get(SAMPLES, -1)
-    if not names <= {SAMPLES, *FLAGS} or not all(0 <= count <= every for count in telemetry.values()):
+    if (
+        SAMPLES not in names
+        or not names <= {SAMPLES, *FLAGS}
+        or not all(0 <= count <= every for count in telemetry.values())
+    ):
         raise RefusedError("bad-answer", f"the telemetry of a trial has {SAMPLES}, and of these those with a flag.")
     return dict(telemetry)
 

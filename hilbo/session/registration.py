@@ -132,11 +132,11 @@ def sought(rule: str) -> str:
 
 def _exclusion(study: StudyFile) -> list[str]:
     rule, flags = study.tables.study.exclude, ", ".join(study.exclude_flags).replace("_", " ")
-    trials = f"Trials that the device flagged are left out ({flags}; `[study] exclude_flags`)."
+    trials = f"Trials with these device flags are excluded: {flags} (`[study] exclude_flags`)."
     if rule:
         people = f"Participants for whom `{rule}` holds are left out (`[study] exclude`)."
     else:
-        people = "Nobody is left out for their answers (`[study] exclude` is empty)."
+        people = "No participant is excluded because of their responses (`[study] exclude` is empty)."
     return [people, *([trials] if flags else [])]
 
 

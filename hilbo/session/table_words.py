@@ -19,7 +19,7 @@ _WORDS = {
     "status": "answered, undone, void, dropped, left out (by a person, after the device stopped it twice) or pending",
     "response_time": "Time from the question to the answer, s, by the browser's clock",
     "answered_at": "Time of the answer, s since 1970, by the server's clock",
-    "flags": f"Flags of the device's telemetry during the trial ({', '.join(FLAGS)}), separated by blanks; empty: none",
+    "flags": f"Flags of the device's telemetry during the trial ({', '.join(FLAGS)}), separated by spaces; empty: none",
     "telemetry_samples": "Telemetry samples from the first step to the answer; empty where none were recorded",
     "set_a": "Parameter set on side a",
     "set_b": "Parameter set on side b",

@@ -11,7 +11,7 @@ __all__ = ["counted_flags", "flag_counts", "flag_sentences_of", "flagged", "with
 
 _COUNTS = "hilbo flags"
 """Of the attributes that pandas carries along with a table, the one that holds its `FlagCounts`."""
-_EMPTY = ("", "nan", "none", "<na>")
+_NONE_RECORDED = ("", "0", "0.0", "nan", "none", "<na>")
 
 
 def flagged(table: pd.DataFrame, exclude: Collection[str]) -> pd.Series:
@@ -28,10 +28,10 @@ def counted_flags(table: pd.DataFrame, exclude: Collection[str]) -> FlagCounts:
     carried = _carried(table)
     recorded = carried.map(bool)
     if COLUMN_OF_SAMPLES in table:
-        recorded |= table[COLUMN_OF_SAMPLES].map(lambda cell: str(cell).strip().lower() not in _EMPTY)
+        recorded |= table[COLUMN_OF_SAMPLES].map(lambda cell: str(cell).strip().lower() not in _NONE_RECORDED)
     rows_of = Counter(name for names in carried for name in names)
-    left_out = int(flagged(table, exclude).sum())
-    return FlagCounts(int(recorded.sum()), {name: rows_of[name] for name in FLAGS if rows_of[name]}, left_out)
+    excluded = Counter(table.loc[flagged(table, exclude), "participant"].map(str))
+    return FlagCounts(int(recorded.sum()), {name: rows_of[name] for name in FLAGS if rows_of[name]}, excluded)
 
 
 def with_flag_counts(table: pd.DataFrame, counts: FlagCounts) -> pd.DataFrame:
@@ -45,7 +45,8 @@ def flag_counts(*tables: pd.DataFrame) -> FlagCounts:
     each = [table.attrs.get(_COUNTS, FlagCounts()) for table in tables]
     total = sum((Counter(counts.flagged) for counts in each), Counter())
     flags = {name: total[name] for name in FLAGS if total[name]}
-    return FlagCounts(sum(c.recorded for c in each), flags, sum(c.left_out for c in each))
+    excluded = sum((Counter(counts.excluded) for counts in each), Counter())
+    return FlagCounts(sum(c.recorded for c in each), flags, excluded)
 
 
 def flag_sentences_of(table: pd.DataFrame, exclude: Collection[str], what: str = "trials") -> list[str]:

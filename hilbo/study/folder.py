@@ -12,6 +12,7 @@ or in the tables' column `material` alone, when they share everything. Whatever 
 """
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -260,7 +261,8 @@ def _departures(folder: Path, study: Study, materials: list[Material]) -> tuple[
         return (), ()
     counts: dict[str, list[int]] = {}
     for material in materials:
-        for name, count in zip(material.cohort.names, material.cohort.counts().tolist(), strict=True):
+        answers = Counter(dict(zip(material.cohort.names, material.cohort.counts().tolist(), strict=True)))
+        for name, count in (answers + Counter(material.flags.excluded)).items():
             counts.setdefault(name, []).append(count)
     return departures(path, study.hash, study.selection.trials, counts, _held(folder))
 

@@ -17,6 +17,7 @@ _MODEL = """
 [renderer]                           # our device renders the FO-SLS; K1, B1 and alpha are its parameters
 K_eff = 0.44                         # N/mm, of the reference: measure yours (hilbo device characterise)
 damping = 0.95                       # N.s/m, of the device: measure yours (hilbo device measure-damping)
+# delay = 0.0003                     # s, from a position to its force: that of your device (hilbo device hello)
 """
 _STIMULUS = """
 [stimulus]                           # a program of yours presents (docs/guides/stimulus.md)

@@ -1,6 +1,6 @@
 """Flags that the telemetry of a device may mark a trial with, and sentences about them. Loads no JAX and no pandas.
 
-In tables the column `flags` holds the flags of a trial, separated by blanks: "saturated slewed". Other words in it are
+In tables the column `flags` holds the flags of a trial, separated by spaces: "saturated slewed". Other words in it are
 ignored. `telemetry_samples` is the number of samples that were recorded with the trial; it is empty where there was no
 telemetry, which tells such a trial from one without flags. `hilbo.study.flag_counts` reads these columns.
 """
@@ -28,11 +28,16 @@ COLUMN, COLUMN_OF_SAMPLES = "flags", "telemetry_samples"
 
 class FlagCounts(NamedTuple):
     """Trials that an analysis would take: how many have a record of the device's flags, how many carry each flag, and
-    how many are left out for theirs."""
+    how many of each participant's are excluded for theirs."""
 
     recorded: int = 0
     flagged: Mapping[str, int] = {}
-    left_out: int = 0
+    excluded: Mapping[str, int] = {}
+
+    @property
+    def left_out(self) -> int:
+        """Excluded trials of all participants."""
+        return sum(self.excluded.values())
 
     def content(self) -> dict[str, int | dict[str, int]]:
         """As result.json has it."""
@@ -46,10 +51,10 @@ def flag_words(flags: Iterable[str]) -> str:
 
 
 def flag_sentences(counts: FlagCounts, exclude: Collection[str], what: str = "trials") -> list[str]:
-    """How many trials carried which flag, and how many are left out; nothing where no flag was recorded or excluded."""
+    """How many trials carried which flag, and how many are excluded; nothing where no flag was recorded or excluded."""
     rule = f"[study] exclude_flags ({', '.join(exclude)})"
     if not counts.recorded:
         return [f"No device flags were recorded for these {what}; {rule} excludes none."] if exclude else []
     words = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.flagged.items()) or "none occurred"
-    left = f"excluded by {rule}: {counts.left_out}" if exclude else "none is excluded for them"
+    left = f"excluded by {rule}: {counts.left_out}" if exclude else f"no {what[:-1]} is excluded"
     return [f"Device flags were recorded for {counts.recorded} {what} ({words}); {left}."]

@@ -111,7 +111,7 @@ def _read(
     fitted &= ~flagged(table, study.exclude_flags)
     left, table = table[~fitted], table[fitted]
     _check_blinded(table.pop("_blinded"), study, source)
-    besides = ", or left out for their flags" if study.exclude_flags else ""
+    besides = ", or excluded by `exclude_flags`" if study.exclude_flags else ""
     if table.empty:
         raise NothingToFitError(f"{source}: has no rows to fit; all are warm-up, repeated or voided{besides}.")
     table = of_material(table, material, source)

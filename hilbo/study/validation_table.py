@@ -41,11 +41,13 @@ def read_validation(
 ) -> pd.DataFrame:
     """The comparisons of one material; `responses` are the study's, lowest first. Raises `InputError`.
 
-    Rows with one of `exclude_flags` are left out.
+    Rows with one of `exclude_flags` are excluded.
     All cells are text but `trial`; classes are labels, `preferred` and `first` names of sets (or "tie"), or empty.
     """
     text = read_cells(path, "a validation table needs a header and a comparison")
-    return of_material(check_validation(text, responses, str(path), exclude_flags), material, str(path))
+    if "material" in text:
+        text["material"] = text["material"].str.strip()
+    return check_validation(of_material(text, material, str(path)), responses, str(path), exclude_flags)
 
 
 def check_validation(
@@ -79,7 +81,7 @@ def check_validation(
     flags_of = counted_flags(out[counts], exclude_flags)
     counts &= ~flagged(out, exclude_flags)
     if not counts.any():
-        besides = ", or left out for their flags" if exclude_flags else ""
+        besides = ", or excluded by `exclude_flags`" if exclude_flags else ""
         raise InputError(f"{source}: has no comparison that counts; all are warm-up, repeated or voided{besides}.")
     return with_flag_counts(out[counts], flags_of)
 

@@ -78,7 +78,7 @@ def test_a_hand_that_stays_puts_the_trial_aside_and_feels_nothing(tmp_path, monk
         pressed(live)
         live.begin()
         live.until(lambda _: live.events("note"))
-        assert "The hand did not leave the device" in live.events("note")[0].data["text"]
+        assert "The participant did not release the device" in live.events("note")[0].data["text"]
         live.until(lambda view: view["may"]["begin"])
         assert set(seen) <= {"STOPPED"} and live.hub.state.pending.presentation == 2
         _let_go(simulator, live.whole)

@@ -55,9 +55,12 @@ def test_a_hand_that_stays_interrupts_the_trial_and_nothing_is_forced(tmp_path, 
         live.begin()
         live.until(lambda _: live.events("note"))
         (note,) = live.events("note")
-        assert note.data["text"] == "The hand did not leave the device within 0.2 s; the trial waits for Begin."
+        assert (
+            note.data["text"]
+            == "The participant did not release the device within 0.2 s; the trial restarts after Begin is pressed."
+        )
         live.until(lambda view: view["may"]["begin"])
-        assert "The hand did not leave" in str(live.whole()["log"])
+        assert "The participant did not release" in str(live.whole()["log"])
         trial = live.hub.state.pending
         assert (trial.id, trial.presentation, trial.step, trial.status) == (1, 2, None, "pending")
         assert "start" not in live.fake.told and live.fake.now == State.STOPPED

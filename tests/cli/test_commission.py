@@ -76,7 +76,7 @@ def test_hello_and_monitor_tell_whether_a_device_is_homed(device):
     assert (content["delay_us"], content["continuous_force_N"], content["heating_s"]) == (150, 20, 10)
     stdout = device("hello", *FAST, *NEW)[1]
     for words in (
-        "homed                      no; `hilbo device home` tells it",
+        "homed                      no; set its position with `hilbo device home`",
         "hardware stop              closed",
         "delay                      sets are checked for 0 us",
         "continuous force           20 N (root mean square over 10 s)",
@@ -139,7 +139,7 @@ def test_a_header_that_compiles_and_that_the_core_accepts(device, tmp_path, meas
     assert code == 0 and content["file"] == "hilbo_device_config.h"
     assert content["delay_us"] == {"longest": 150, "header": 200, "reported": 150}
     assert compiled(tmp_path) == ["0", f"{np.float32(0.9421):.9g}", "200"]
-    assert "counts on 0.95 N.s/m of damping and may have only 0.9421" in stderr
+    assert "is configured with 0.95 N.s/m of damping but may have only 0.9421" in stderr
     assert "delay_us of 150 has less margin" in stderr
     code, _, stderr = device("commission", *SCRIPT, *NEW)
     assert code == 2 and "exists already" in stderr
@@ -194,12 +194,12 @@ def test_a_person_pushes_the_handle(device, measured, monkeypatch):
             '--no-hand-on-the-handle is "yes"; the device moves only after exactly',
         ),
         (None, ["--no-hand-on-the-handle", PHRASE], "then add --encoder-checked"),
-        (None, SCRIPT[:3], "say with --position where its handle stands"),
+        (None, SCRIPT[:3], "give the current position of its handle with --position"),
         (None, [*SCRIPT, "--out", "no/where.h"], "cannot be written"),
         (None, [*SCRIPT, "--base", "none.h"], "none.h: cannot be read"),
         ("ok\n", ["--encoder-checked"], 'The answer is "ok"; the device moves only after exactly'),
         ("", ["--encoder-checked"], 'The answer is ""'),
-        (f"{PHRASE}\n", ["--encoder-checked"], "Nobody has placed the handle"),
+        (f"{PHRASE}\n", ["--encoder-checked"], "The handle was not placed at the surface"),
         ("", ["--position", 0], "--position is for scripts"),
     ],
 )
@@ -215,7 +215,7 @@ def test_nothing_moves_before_somebody_has_confirmed(device, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("friction", "delay", "words"),
     [
-        (Interval(0.01, -0.01, 0.03), 0, "does not tell the damping from 0"),
+        (Interval(0.01, -0.01, 0.03), 0, "is not significantly above 0"),
         (Interval(0.95, 0.94, 0.96), 950, "with its margin 1190 us, longer than a tick"),
     ],
 )

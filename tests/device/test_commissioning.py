@@ -155,7 +155,7 @@ def test_both_signs_wrong_are_found_though_nudges_cannot_see_it():
 
 def test_the_force_of_a_handle_that_does_not_move_is_raised_to_its_most(recorded):
     with Renderer.open("sim", options=NEW | {"coulomb": 5.0}) as device:
-        with pytest.raises(DeviceError, match=r"nothing moves inwards up to 2 N; check .* --most-force"):
+        with pytest.raises(DeviceError, match=r"the handle did not move inwards at up to 2 N; check .* --most-force"):
             find_signs(device, quiet, Bounds())
         assert device.state() == State.STOPPED
     force = np.concatenate([piece.force_N for piece in recorded[0]])
@@ -169,7 +169,7 @@ def test_the_force_of_a_handle_that_does_not_move_is_raised_to_its_most(recorded
 def test_a_handle_at_its_stop_is_no_wrong_sign():
     with (
         Renderer.open("sim", options=NEW | {"start": 20}) as device,
-        pytest.raises(DeviceError, match=r"nothing moves inwards .* off its mechanical stop"),
+        pytest.raises(DeviceError, match=r"the handle did not move inwards .* off its mechanical stop"),
     ):
         find_signs(device, quiet, Bounds(most_N=0.5))
 

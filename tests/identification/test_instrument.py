@@ -30,7 +30,10 @@ def data_set(case, number=0, hold=0.15, noise=None):
     [
         (0.3, None),
         (0.0, 200.0),
-        *(pytest.param(*pair, marks=pytest.mark.deep) for pair in ((-0.3, None), (0.7, None), (1.4, None))),
+        *(
+            pytest.param(*pair, marks=pytest.mark.deep)
+            for pair in ((-0.3, None), (0.7, None), (1.4, None), (0.4, 250.0), (-0.3, 250.0))
+        ),
     ],
 )
 def test_a_recorded_curve_is_that_of_the_fine_grid(lag, corner):
@@ -78,6 +81,18 @@ def test_slow_inputs_have_no_lag():
 def test_bad_instruments_get_one_sentence(options, words):
     with pytest.raises(InputError, match=words):
         Sampled(**options)
+
+
+def test_a_fit_at_the_bounds_of_lag_and_corner_can_be_held():
+    for corner in Sampled()._corners():
+        Sampled(lag=2e-3 * (1 + 1e-15), corner=corner * (1 - 1e-15))
+
+
+@pytest.mark.deep
+def test_a_filter_is_sought_beside_a_lag_that_is_given():
+    tests = data_set(study.Case("", repeats=1, lag=0.0, corner=200.0), hold=1.0, noise=1e-3)
+    result = characterise(tests, Sampled(lag=0.0), choices=())
+    assert result.estimates["corner"].value == pytest.approx(200, rel=0.05) and "lag" not in result.estimates
 
 
 def test_coordinates_are_named_with_their_units():

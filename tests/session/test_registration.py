@@ -60,7 +60,7 @@ def test_what_is_fixed_stands_on_the_page(page):
         assert part in text
     assert "25 trials that count" in text and "5 spread over" in text and "weight 0.7" in text
     assert "theta 30, variance 1, thresholds (-0.5, 0.5), noise 0.5" in text
-    assert "passive on the device" in text and "Nobody is left out" in text
+    assert "passive on the device" in text and "No participant is excluded" in text
     assert text.count("To be written by you") == 4
 
 
@@ -74,7 +74,7 @@ def test_the_page_follows_the_study(page):
     )
     assert "recipe learnt-1" in text and "the rest learnt" in text and "theta" not in text
     assert "`trials < 10` holds are left out" in text
-    assert "Trials that the device flagged are left out (input held; `[study] exclude_flags`)." in text
+    assert "Trials with these device flags are excluded: input held (`[study] exclude_flags`)." in text
     assert "probability of the highest answer)" in text
 
 

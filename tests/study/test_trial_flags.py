@@ -14,7 +14,7 @@ from hilbo.study.folder import read_folder
 from hilbo.study.study_file import StudyFile
 from hilbo.study.trial_flags import FLAGS, flag_sentences, flag_words
 from hilbo.study.trial_table import NothingToFitError, read_trials
-from hilbo.study.validation_table import check_validation
+from hilbo.study.validation_table import check_validation, read_validation
 
 TOML = """\
 schema = 1
@@ -69,7 +69,7 @@ def test_without_the_key_every_trial_is_fitted_and_the_digest_is_as_before(tmp_p
     table = read(tmp_path, rule="")
     assert len(table) == 6 and flag_counts(table).left_out == 0
     (said,) = flag_sentences(flag_counts(table), ())
-    assert said.endswith("(saturated 1, slewed 2, controlled 1); none is excluded for them.")
+    assert said.endswith("(saturated 1, slewed 2, controlled 1); no trial is excluded.")
     assert StudyFile.load(tmp_path / "study.toml").hash == "e39dc5a71740fb33"  # as before there was such a key
     empty = PLAIN | {"study": PLAIN["study"] | {"exclude_flags": []}}
     named = PLAIN | {"study": PLAIN["study"] | {"exclude_flags": ["hold"]}}
@@ -86,10 +86,10 @@ def test_a_table_without_a_record_of_flags_is_read_and_that_is_said(tmp_path):
 
 def test_whoever_has_no_other_answer_is_named(tmp_path):
     with pytest.warns(
-        InputRemark, match="repeated, or left out for their flags, and not fitted; B has no other answer"
+        InputRemark, match="repeated, or excluded by `exclude_flags`, and not fitted; B has no other answer"
     ):
         read(tmp_path, "\n".join(TABLE.splitlines()[:-1]) + "\n")
-    with pytest.raises(NothingToFitError, match="all are warm-up, repeated or voided, or left out for their flags"):
+    with pytest.raises(NothingToFitError, match="all are warm-up, repeated or voided, or excluded by `exclude_flags`"):
         read(tmp_path, "\n".join(line for line in TABLE.splitlines() if "slewed" in line or "part" in line) + "\n")
 
 
@@ -118,7 +118,7 @@ def test_comparisons_with_a_flag_are_left_out_too():
     assert kept["trial"].tolist() == [1, 2]
     assert flag_counts(kept).content() == {"recorded": 3, "flagged": {"slewed": 1, "hold": 1}, "left_out": 1}
     assert len(check_validation(table)) == 3
-    with pytest.raises(InputError, match="left out for their flags"):
+    with pytest.raises(InputError, match="excluded by `exclude_flags`"):
         check_validation(table[1:], exclude_flags=("slewed", "hold"))
 
 
@@ -148,6 +148,34 @@ def test_a_folder_counts_its_tables_together(tmp_path):
     assert folder.materials[0].cohort.counts().tolist() == [3, 1, 3, 1]
     assert any("recorded for 1 comparisons (slewed 1); excluded by" in note for note in folder.notes)
     assert len(folder.materials[0].validation) == 1
+    assert folder.materials[0].flags.excluded == {"A": 1, "B": 1, "C": 1, "D": 1}
+
+
+def test_excluded_trials_were_held_as_planned(tmp_path):
+    """They do not make a plan of two trials each look unfinished."""
+    text = (
+        "participant,trial,response,u,flags\nA,1,close,0.1,\nA,2,close,0.2,slewed\nB,1,close,0.1,\nB,2,similar,0.3,\n"
+    )
+    read(tmp_path, text, rule=RULE)
+    with (tmp_path / "study.toml").open("a") as file:
+        file.write("[selection]\ntrials = 2\nspace_filling = 1\n")
+    people = [{"participant": name, "blocks": []} for name in "AB"]
+    plan = {
+        "study": StudyFile.load(tmp_path / "study.toml").hash,
+        "hash": "0",
+        "phase": "optimisation",
+        "participants": people,
+    }
+    (tmp_path / "plan.json").write_text(json.dumps(plan))
+    assert not any("number of answers" in limit for limit in read_folder(tmp_path).limits)
+
+
+def test_a_material_s_comparisons_are_counted_alone(tmp_path):
+    rows = "A,foam,1,x,y,close,similar,a,slewed\nA, gel ,1,x,y,close,similar,a,\nA,gel,2,x,y,close,similar,a,hold\n"
+    path = tmp_path / "validation.csv"
+    path.write_text(f"participant,material,trial,set_a,set_b,class_a,class_b,preferred,flags\n{rows}")
+    table = read_validation(path, material="gel", exclude_flags=("slewed",))
+    assert len(table) == 2 and flag_counts(table).content() == {"recorded": 1, "flagged": {"hold": 1}, "left_out": 0}
 
 
 def test_the_cell_of_some_flags():
