@@ -103,7 +103,7 @@ def largest_K1(
     `inf` where every K1 is passive, 0 where none is. Differentiable, with derivative 0 at `inf` and at 0.
     `delay`: from a sample of the position to its force, s, from 0 to T. Above 0 the returned K1 needs a damping from
     b·(1 - 2e-5) to b; first derivatives are exact, second ones are those at the frequency that binds; and K1 is
-    0 where b is below `mechanics.delay.least_damping`, about what a spring of K_eff needs, though a few K1 may be passive.
+    0 where b is below `mechanics.delay.least_damping`, about what a spring of K_eff needs; a few K1 may be passive.
     Raises `InputError` for even N, and for values that no model or device has; where they are traced the result is
     NaN, never a K1 that would pass for passive.
     """
